@@ -8,7 +8,7 @@ import numpy as np
 
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.spectrum_model import SpectrumModel
+from lbt_synth.identification.fit.spectrum_model import Background, SpectrumModel
 from lbt_synth.identification.fit.whittle import density
 
 NOISE = 30.0  # variance [nm^2]
@@ -32,7 +32,8 @@ def empty_search() -> Search:
 
 def white_noise() -> SpectrumModel:
     """Return noise alone, without a roll-off."""
-    return SpectrumModel(0.0, float(np.log(NOISE)), 0.0, 0.0, ()).without_roll_off()
+    background = Background(0.0, float(np.log(NOISE)), 0.0, 0.0)
+    return SpectrumModel((background,), ()).without_roll_off()
 
 
 def drawn_search(truth: SpectrumModel, seed: int) -> Search:

@@ -60,14 +60,13 @@ def identify_series(
     stretches: object = None,
     sensor_gain: float | None = None,
     sensor_gain_error: float = 0.0,
-    assumed_gain: float = 1.0,
     start: lbt.identification.IdentifiedAxis | None = None,
     **options: object,
 ) -> lbt.identification.IdentifiedAxis:
     """Identify the series of one axis, at a sensor gain with an error if it is given."""
     data = axis_periodogram(measurement, correction, frame_rate_hz, stretches)
     search = Search(data=data, gain=sensor_gain, **options)
-    axis = find_axis(search, assumed_gain=assumed_gain, start=start)
+    axis = find_axis(search, start=start)
     if not sensor_gain_error:
         return axis
     return refit_axis(axis, search, sensor_gain_error / sensor_gain, "given")

@@ -2,7 +2,7 @@
 
 One criterion decides: the log-likelihood less the price of all that a model has. The Bayesian
 price of a component is ``3 / 2 log n``, for three parameters among n values, and that of a corner
-or a colour ``1 / 2 log n`` (G. Schwarz, Ann. Statist. 6, 461 (1978), doi:10.1214/aos/1176344136).
+``1 / 2 log n`` (G. Schwarz, Ann. Statist. 6, 461 (1978), doi:10.1214/aos/1176344136).
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ POSSIBLE_GAINS = (0.08, 2.5)  # of a sensor at all, with light lost or commands 
 GAIN_ERROR = 0.5  # of the logarithm of a sensor gain, before the data say more
 TYPICAL_GAIN = 0.7  # of a sensor, before the data say more
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
+_COLOURED = 9.0  # the same of a colour of the noise, which a wrong gain can explain, too
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
 _LOWEST = 0.1  # bins: a component below is a slope without a frequency
 _SHIFTS = np.arange(-2, 2.01, 0.25)  # bins by which a narrow line is moved
@@ -117,7 +118,7 @@ class Search:
         return self.component("drift", 2 * DRIFT_RATIO * corner_hz, DRIFT_RATIO, power)
 
     def priors(self, spectrum: SpectrumModel) -> Priors:
-        """Return the priors of a fit; components but for the turbulence stay in the band."""
+        """Return the priors of a fit; lines of two axes stay in the band."""
         prior = (float(np.log(TYPICAL_GAIN)), GAIN_ERROR)
         gain = prior if self.finds_gain and len(spectrum.axes) == 1 else _FIXED
         corner = (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH)
@@ -134,7 +135,7 @@ class Search:
         priors = Priors(centre=centre, width=width)
         low, high = (np.full(centre.size, end) for end in priors.bounds)
         for i, c in enumerate(spectrum.components):
-            if c.kind != "turbulence":
+            if c.kind == "line" and len(spectrum.axes) > 1:
                 low[spectrum.place(i)] = self.log_angle(_LOWEST * self.data.step_hz)
                 high[spectrum.place(i)] = _HIGHEST
         return replace(priors, bounds=(low, high))
@@ -234,7 +235,8 @@ def total_price(search: Search, spectrum: SpectrumModel) -> float:
     """Return the price of all that a model has beside its turbulence."""
     prices = sum(required_evidence(search, component) for component in spectrum.components[1:])
     background = spectrum.background
-    return prices + (bool(background.colour) + background.rolls_off) * search.parameter_price
+    colour = _COLOURED if background.colour else 0.0
+    return prices + colour + background.rolls_off * search.parameter_price
 
 
 def cost(search: Search, model: FittedModel) -> float:

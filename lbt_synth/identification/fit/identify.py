@@ -27,7 +27,7 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedModel,
 )
 from lbt_synth.identification.fit.jumps import cut_at_jumps, find_correction_jumps, find_jumps
-from lbt_synth.identification.fit.order_search import find_components, find_rivals
+from lbt_synth.identification.fit.order_search import find_components, find_models, find_rivals
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
@@ -161,12 +161,13 @@ def identify(
     fit = partial(_fit_axes, record, step, options)
     early = find_correction_jumps(record.corrections(), pieces)
     pieces, notes = cut_at_jumps(pieces, early, "commands")
-    axes = fit(pieces, gains, [None] * record.axes if start is None else start.axes)
+    starts: Sequence[IdentifiedAxis | None] = start.axes if start else [None] * record.axes
+    axes = fit(pieces, gains, starts)
     series = record.pseudo_open_loop([axis.sensor_gain for axis in axes])
     late = find_jumps(series, axes, pieces)
     cut, late_notes = cut_at_jumps(pieces, late, "pseudo-open loop")
     if cut != pieces:
-        axes = fit(cut, gains, axes)
+        axes = fit(cut, gains, starts)
     notes += late_notes
     if len(axes) > 1 and all(axis.sensor_gain_error is not None for axis in axes):
         axes, note = _pool_gains(axes, step, options)
@@ -259,15 +260,17 @@ def _pool_gains(
 ) -> tuple[list[IdentifiedAxis], str]:
     """Fit the axes again with the mean of their gains, if they agree; options are of a search.
 
-    What is known of a gain beforehand counts once. Where the gains scatter by more than their
+    An axis that leaves its gain open takes that of the other. What is known of a gain beforehand
+    counts once. Where the gains scatter by more than their
     errors, the error of the mean is scaled by ``sqrt(chi^2 / (n - 1))`` (Particle Data Group,
     doi:10.1093/ptep/ptac097, section 5.2.2).
     """
     gains = np.array([axis.sensor_gain for axis in axes])
     errors = np.array([axis.sensor_gain_error for axis in axes], dtype=float)
     log, weight = np.log(gains), (gains / errors) ** 2
+    weight[errors > OPEN_GAIN * gains] *= bool(np.all(errors > OPEN_GAIN * gains))
     mean = float(np.sum(weight * log) / np.sum(weight))
-    if np.any(np.abs(log - mean) * gains > DIFFERENT * errors):
+    if np.any(weight * (log - mean) ** 2 > DIFFERENT**2):
         values = ", ".join(f"{g:.3f} +- {e:.3f}" for g, e in zip(gains, errors, strict=True))
         return axes, (
             f"warning: the axes have different sensor gains, {values}: the commands of one may be "
@@ -380,7 +383,8 @@ def _identify_spectra(
 def find_axis(search: Search, *, start: IdentifiedAxis | None = None) -> IdentifiedAxis:
     """Identify one axis from its periodogram, and from a model of earlier data."""
     closed = search.data.closed
-    model = find_components(search, None if start is None else start.fitted_model.spectrum)
+    models = find_models(search, None if start is None else start.fitted_model.spectrum)
+    model = models[0]
     if not search.finds_gain:
         note = (
             "1: of an open loop it has no meaning"
@@ -388,9 +392,7 @@ def find_axis(search: Search, *, start: IdentifiedAxis | None = None) -> Identif
             else ("given" if closed else "given: the series is divided by it")
         )
         return describe_axis(search, add_evidence(search, model), None, note)
-    near = [model]
-    if not _is_clear(model, start):
-        model, near = find_rivals(search, model)
+    model, near = find_rivals(search, models, other_gains=not _is_clear(model, start))
     model = add_evidence(search, model)
     background = model.spectrum.background
     rivals = [rival.spectrum.background for rival in near]

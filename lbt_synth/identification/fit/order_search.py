@@ -9,6 +9,7 @@ polished: fitted to these, given what it lacks, and pruned.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise, product
 
@@ -19,7 +20,12 @@ from lbt_synth.identification.fit import fitting
 from lbt_synth.identification.fit.fitting import GAINS, Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import SEARCHED
-from lbt_synth.identification.fit.spectrum_model import Background, Component, SpectrumModel
+from lbt_synth.identification.fit.spectrum_model import (
+    Background,
+    Component,
+    SpectrumModel,
+    damping_parameter,
+)
 from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
 from lbt_synth.validation import FloatArray
 
@@ -33,14 +39,72 @@ _TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz] and damp
 _CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a drift beside turbulence may meet the noise
 _OVERDAMPED = 3.0  # damping ratio of turbulence that may stand for a drift
 _SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
+_WIDEST_LINE = 0.98  # damping ratio
 _BANDS = 80  # of the background
 _WIDEST = 0.3  # of its frequency: a band that is tried, and the damping ratio of a new component
 _NARROWEST = 1e-4  # damping ratio of a new component
 _OTHER_GAINS = (0.35, 0.6, 1.0)  # of a sensor, from which models that are as likely are sought
 _SAME_GAIN = 0.15  # of a logarithm: nearer gains have the same optimum
-_AS_LIKELY = 5.0  # log-likelihood by which one of two gains is excluded
+_AS_LIKELY = 7.0  # log-likelihood by which one of two gains is excluded
 
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
+
+
+def find_models(search: Search, start: SpectrumModel | None = None) -> list[FittedModel]:
+    """Return the model of one axis, and what explains it as well with another noise.
+
+    Wide resonances and a drift fit most spectra that fall, and so does a colour of the noise.
+    """
+    model = find_components(search, start)
+    spectrum = model.spectrum
+    plain = spectrum.keep(lambda c: c.is_narrow or c.kind == "slow")
+    other = plain.with_background(colour=0.0 if spectrum.background.colour else _COLOUR)
+    if start is not None or plain == spectrum:
+        rival = fitting.fit(search, spectrum.with_background(colour=other.background.colour))
+    else:
+        rival = find_components(search, other)
+    return sorted([model, *_settled([rival])], key=lambda one: _cost_of_noise(search, one))
+
+
+def find_rivals(
+    search: Search, models: Sequence[FittedModel], *, other_gains: bool
+) -> tuple[FittedModel, list[FittedModel]]:
+    """Return the likeliest of models, also from other gains, and all that are as likely.
+
+    Wide resonances, or a colour of the noise, can explain what a wrong gain leaves; the places of
+    lines cannot.
+    """
+    model, rivals = models[0], list(models)
+    for gain in _OTHER_GAINS if other_gains else ():
+        if abs(np.log(gain) - model.spectrum.background.log_gain) >= _SAME_GAIN:
+            with suppress(NumericalError):
+                held = find_components(replace(search, gain=gain), rounds=FEW_ROUNDS)
+                rivals += _settled([fitting.fit(search, held.spectrum)])
+    best, near = min(rivals, key=lambda rival: _cost_of_noise(search, rival)), list[FittedModel]()
+    for rival in rivals:
+        above = (cost(search, rival) - cost(search, best) for cost in (fitting.cost, _cost_of_noise))
+        near += [rival] * (min(above) < _AS_LIKELY)
+    if best is not model:
+        best = fitting.prune(search, best, thorough=True)
+    return best, near
+
+
+def _settled(models: Sequence[FittedModel | None]) -> list[FittedModel]:
+    """Return the fits that settled, of noise that is no drift and has no opposite neighbours.
+
+    Sensors and filters make neighbouring frames alike, hardly ever opposite.
+    """
+    return [
+        model
+        for model in models
+        if model is not None and 0 <= model.spectrum.background.colour < _MOST_COLOUR
+    ]
+
+
+def _cost_of_noise(search: Search, model: FittedModel) -> float:
+    """Return the cost of a model in which wide resonances count twice."""
+    spare = sum(not c.is_narrow for c in model.spectrum.lines)
+    return fitting.cost(search, model) + search.price * spare
 
 
 def find_components(
@@ -63,41 +127,24 @@ def find_components(
         if better is None:
             break
         model = better
-    return fitting.prune(search, fitting.simplify(search, model), thorough=start is None)
+    model = fitting.prune(search, fitting.simplify(search, model), thorough=start is None)
+    return _restore_turbulence(search, model)
 
 
-def find_rivals(search: Search, model: FittedModel) -> tuple[FittedModel, list[FittedModel]]:
-    """Return the likeliest model from several gains and kinds of noise, and all as likely.
-
-    Wide resonances, or a colour of the noise, can explain what a wrong gain leaves; the places of
-    lines cannot.
-    """
-    spectrum, rivals = model.spectrum, [model]
-    colour, log_gain = spectrum.background.colour, spectrum.background.log_gain
-    coloured = spectrum.with_background(colour=0.0 if colour else _COLOUR)
-    rivals += [free for free in [_fit_white_enough(search, coloured)] if free is not None]
-    for gain in _OTHER_GAINS:
-        if abs(np.log(gain) - log_gain) < _SAME_GAIN:
-            continue
-        try:
-            held = find_components(replace(search, gain=gain), spectrum)
-        except NumericalError:
-            continue
-        free = _fit_white_enough(search, held.spectrum)
-        rivals += [] if free is None else [free]
-    best = fitting.likeliest(search, rivals) or model
-    least = fitting.cost(search, best)
-    near = [rival for rival in rivals if fitting.cost(search, rival) < least + _AS_LIKELY]
-    if best is not model:
-        best = fitting.prune(search, best, thorough=True)
-    return best, near
-
-
-def _fit_white_enough(search: Search, spectrum: SpectrumModel) -> FittedModel | None:
-    """Fit a model; None if no fit settles, or its noise is a drift."""
-    model = fitting.fit(search, spectrum)
-    if model is None or abs(model.spectrum.background.colour) > _MOST_COLOUR:
-        return None
+def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
+    """Make the strongest slow component the turbulence, where a resonance took its place."""
+    spectrum, lowest = model.spectrum, search.log_angle(search.lowest_line_hz)
+    first = spectrum.components[0]
+    slow = [i for i, c in enumerate(spectrum.components) if c.kind == "slow"]
+    if first.log_frequency < lowest or not slow or first.damping_ratio > _WIDEST_LINE:
+        return model
+    i = max(slow, key=lambda k: spectrum.components[k].log_power)
+    damping = damping_parameter("line", first.damping_ratio)
+    exchanged = spectrum.exchange(i, replace(first, kind="line", damping=damping))
+    turbulence = replace(spectrum.components[i], kind="turbulence")
+    restored = fitting.fit(search, exchanged.exchange(0, turbulence))
+    if restored and fitting.cost(search, restored) < fitting.cost(search, model) + search.price:
+        return restored
     return model
 
 
@@ -122,9 +169,7 @@ def _trials(
 ) -> Iterator[tuple[list[SpectrumModel], float]]:
     """Yield models with other turbulence, new lines or other places, and what they must save."""
     others = []
-    if moves and not spectrum.background.colour:
-        others.append(spectrum.with_background(colour=_COLOUR))
-    if moves and all(c.kind != "drift" for c in spectrum.components):
+    if all(c.kind != "drift" for c in spectrum.components):
         others.append(_add_drift(search, spectrum))
     excesses = find_excesses(search, spectrum)
     excesses = [excess for excess in excesses if excess[0] > 0.25 * excesses[0][0]]

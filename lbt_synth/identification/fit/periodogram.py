@@ -62,6 +62,11 @@ class LoopPeriodogram:
         return half_angle_square(self.frequency_hz, self.frame_rate_hz)
 
     @cached_property
+    def log_frame_mean(self) -> FloatArray:
+        """Logarithm of the power that the mean over a frame leaves, (f,)."""
+        return np.asarray(2 * np.log(np.sinc(self.frequency_hz / self.frame_rate_hz)))
+
+    @cached_property
     def periods(self) -> FloatArray:
         """Periods of each frequency within a tapered segment, (f,)."""
         assert self.duration_s is not None
@@ -118,8 +123,8 @@ class LoopPeriodogram:
     @staticmethod
     def _seen(gains: FloatArray, slopes: tuple[int, int]) -> FloatArray:
         """Return the weights of (Y1, C1) times (Y2, C2), or of their slopes by a gain, (2, 2)."""
-        rows = [[0.0 if slope else 1.0, gain] for gain, slope in zip(gains, slopes, strict=True)]
-        return np.outer(*rows)
+        (one, first), (other, second) = zip(gains, slopes, strict=True)
+        return np.outer([1.0 - first, one], [1.0 - second, other])
 
     @property
     def _between(self) -> FloatArray:

@@ -14,12 +14,13 @@ from lbt_synth.identification.fit.identified_model import (
     Kind,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, Whiteness
-from lbt_synth.identification.fit.spectrum_model import BACKGROUND, GAIN, SpectrumModel
+from lbt_synth.identification.fit.spectrum_model import BACKGROUND, CORNER, GAIN, SpectrumModel
 from lbt_synth.identification.fit.whittle import (
     FittedModel,
     density,
     derivatives,
     invert_information,
+    minimise,
     part_density,
 )
 from lbt_synth.models import ARModel
@@ -108,11 +109,11 @@ def describe_axis(
     correlation = float(np.tanh(background.colour))
     colour = errors.background.colour if background.colour else _colour_error(search, spectrum)
     parts = [resonance for resonance in resonances if resonance.rms_nm * gain > _LEAST_PART * noise]
-    corner = float(np.exp(background.log_corner)) * rate / (2 * np.pi)
+    corner = float(np.exp(background.log_corner)) / data.angle_s
     corners = (
         (corner, corner * errors.background.log_corner) if background.rolls_off else (None,) * 2
     )
-    turbulence = _turbulence_process(spectrum, rate)
+    turbulence = _turbulence_process(_nearest_process(search, spectrum), rate)
     slow = replace(
         first,
         kind="turbulence",
@@ -198,6 +199,27 @@ def _without_fast_pole(frequency: float, damping: float) -> tuple[float, float]:
     slow, fast = frequency / (damping + root), min(frequency * (damping + root), _FASTEST)
     natural = float(np.sqrt(slow * fast))
     return natural, (slow + fast) / (2 * natural)
+
+
+def _nearest_process(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
+    """Return the turbulence as a process of the third order, the nearest by its likelihood.
+
+    The noise, the wide resonances and the gain stay; narrow lines do not matter.
+    """
+    if not spectrum.background.rolls_off:
+        return spectrum
+    alone = replace(spectrum, components=spectrum.components[:1])
+    data = search.merge(alone)
+    wide = (c for c in spectrum.components[1:] if not c.is_narrow)
+    held = density(data, spectrum.alone(*wide))
+    seen, zero = density(data, alone) + held, np.zeros_like(held)
+    fitted = replace(data, measured=seen, crossed=zero, corrected=zero)
+    priors = search.priors(alone)
+    width = priors.width.copy()
+    width[:CORNER] = 0.0  # only the turbulence and its corner move
+    start = replace(alone, roll_off_order=1.0)
+    nearest = minimise(fitted, start, replace(priors, width=width), held=held)
+    return start if nearest is None else nearest.spectrum
 
 
 def _turbulence_process(spectrum: SpectrumModel, rate: float) -> ARModel:

@@ -48,6 +48,7 @@ _APART = 4.0  # standard errors between frequencies that differ
 _UNFITTED = 10.0  # log-likelihood that a fit may add to a line that the axes share
 _HARDLY = 2.0  # the same of one that a single axis shows
 _COHERENT = 0.5  # squared coherence of lines that are worth a fit all the same
+_HIGHEST_HZ = 10.0  # natural frequency of turbulence
 _MOST_SHARED = 0.9  # of the turbulence, where a fit begins
 _LEAST_RATIO = 1e-3  # of the amplitudes, where a fit of a line that one axis shows begins
 
@@ -102,20 +103,36 @@ def find_shared(search: Search, models: Sequence[FittedModel]) -> FittedModel | 
     ]
     backgrounds = tuple(model.spectrum.background for model in models)
     apart = SpectrumModel(backgrounds, tuple(chain(*rows)))
-    model, pairs = _share_turbulence(search, apart), list[Pair]()
-    rest = _find_pairs(search, models, rows)
+    pairs = _find_pairs(search, models, rows)
+    model, shared = _share_lines(search, None, apart, [], pairs)
+    slow = _share_turbulence(search, apart if model is None else model.spectrum)
+    if slow is None:
+        return model
+    # turbulence of both axes may look like weak parts of lines
+    kept = _keep_asked(search, slow.spectrum, shared) if shared else (slow, [])
+    model, shared = (slow, []) if kept[0] is None else kept
+    return _share_lines(search, model, model.spectrum, shared, pairs)[0]
+
+
+def _share_lines(
+    search: Search,
+    model: FittedModel | None,
+    spectrum: SpectrumModel,
+    shared: list[Pair],
+    pairs: Sequence[Pair],
+) -> tuple[FittedModel | None, list[Pair]]:
+    """Return the fit with all lines that the axes share, and their pairs, from a model with some."""
     while True:  # a line may come to light once a neighbour has its direction
-        spectrum, trials = apart if model is None else model.spectrum, list(pairs)
-        for pair in rest:
-            shared = _share(search, spectrum, pair)
-            if shared is not None:
+        trial, trials = spectrum, list(shared)
+        for pair in pairs:
+            line = None if pair in shared else _share(search, trial, pair)
+            if line is not None:
                 trials.append(pair)
-                spectrum = _replace(spectrum, pair, shared)
-        better, kept = _keep_asked(search, spectrum, trials)
-        if better is None or len(kept) <= len(pairs):
-            return model
-        model, pairs = better, kept
-        rest = [pair for pair in rest if pair not in kept]
+                trial = _replace(trial, pair, line)
+        better, kept = _keep_asked(search, trial, trials)
+        if better is None or len(kept) <= len(shared):
+            return model, shared
+        model, spectrum, shared = better, better.spectrum, kept
 
 
 def _keep_asked(
@@ -172,12 +189,14 @@ def _share_turbulence(search: Search, apart: SpectrumModel) -> FittedModel | Non
         log_ratio=turbulence[1].log_power - turbulence[0].log_power,
         sign=1.0 if coherence > 0 else -1.0,
     )
-    model = fitting.fit(search, replace(apart, components=(*components, shared)), accuracy=EXACT)
+    spectrum = replace(apart, components=(*components[:1], shared, *components[1:]))
+    model = fitting.fit(search, spectrum, accuracy=EXACT)
     if model is None:
         return None
     data = search.merge(model.spectrum)
     saved = contrast(data, apart) - contrast(data, model.spectrum)
-    return model if saved > search.price else None
+    is_slow = search.place(model.spectrum.components[1])[0] < _HIGHEST_HZ
+    return model if is_slow and saved > search.price else None
 
 
 def _find_pairs(

@@ -24,6 +24,7 @@ from lbt_synth.validation import FloatArray
 GAIN, NOISE, COLOUR, CORNER, BACKGROUND = range(
     5
 )  # places of an axis' own parameters, their number
+TILT_ORDER = 5 / 6  # of the roll-off: tilt falls with f^(-17/3), a second-order process with f^-4
 _NO_CORNER = 50.0  # angle per frame; a corner above it is none
 _LEAST = 0.05  # damping ratio of slow components; narrower ones are lines
 _NOTHING = float(np.log(np.finfo(float).tiny))  # as a logarithm
@@ -133,6 +134,7 @@ class SpectrumModel:
 
     axes: tuple[Background, ...]
     components: tuple[Component, ...]
+    roll_off_order: float = TILT_ORDER  # 1 for a process of finite order
 
     @property
     def background(self) -> Background:
@@ -189,7 +191,7 @@ class SpectrumModel:
             components.append(
                 Component(c.kind, f, damping, power, c.announced, c.axis, log_ratio, c.sign, c.name)
             )
-        return SpectrumModel(tuple(axes), tuple(components))
+        return SpectrumModel(tuple(axes), tuple(components), self.roll_off_order)
 
     def with_background(self, **changes: float) -> SpectrumModel:
         """Return the model with other noise, corner or gain of its first axis."""
@@ -221,4 +223,4 @@ class SpectrumModel:
         """Return what axis i shows, its own components first."""
         own = [replace(c, axis=0, log_ratio=0.0) for c in self.components if c.axis == i]
         shared = [c.on(i) for c in self.components if c.axis is None]
-        return SpectrumModel((self.axes[i],), (*own, *shared))
+        return SpectrumModel((self.axes[i],), (*own, *shared), self.roll_off_order)

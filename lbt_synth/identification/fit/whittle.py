@@ -215,15 +215,26 @@ def _smear(
             slopes[i, 1, start:stop] += by_width[inner]
 
 
+def _log_fall(
+    data: LoopPeriodogram, log_corner: float, order: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the roll-off of turbulence as frames show it, a logarithm, and its slope, (f,).
+
+    The mean over a frame takes ``sinc^2`` of the phase. A process of finite order is one of means.
+    """
+    fall, slope = log_roll_off(float(np.exp(log_corner)), order, data.half_angle_square)
+    return fall if order == 1 else fall + data.log_frame_mean, slope
+
+
 @lru_cache(maxsize=64)
 def component_density(
-    data: LoopPeriodogram, component: Component, log_corner: float | None = None
+    data: LoopPeriodogram, component: Component, roll_off: tuple[float, float] | None = None
 ) -> FloatArray:
-    """Return the density of a component, behind the roll-off of a corner, (f,)."""
+    """Return the density of a component, behind a roll-off of a corner and an order, (f,)."""
     s, c = data.half_angle_square, component
     density = unit_density(c.frequency, c.damping_ratio, s)
-    if log_corner is not None:
-        density *= np.exp(log_roll_off(float(np.exp(log_corner)), 1.0, s)[0])
+    if roll_off is not None:
+        density *= np.exp(_log_fall(data, *roll_off)[0])
     _smear(data, [c], density[None])
     return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * density)
 
@@ -233,7 +244,8 @@ def part_density(data: LoopPeriodogram, spectrum: SpectrumModel, i: int) -> Floa
     component = spectrum.components[i]
     if component.kind != "turbulence":
         return component_density(data, component)
-    return component_density(data, component, spectrum.axes[component.axis or 0].log_corner)
+    log_corner = spectrum.axes[component.axis or 0].log_corner
+    return component_density(data, component, (log_corner, spectrum.roll_off_order))
 
 
 def density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:
@@ -316,8 +328,8 @@ def densities(
     by_corner = np.zeros_like(density)
     for i, component in enumerate(components):
         if component.kind == "turbulence":
-            corner = float(np.exp(spectrum.axes[component.axis or 0].log_corner))
-            fall, by_corner[i] = log_roll_off(corner, 1.0, s)
+            log_corner = spectrum.axes[component.axis or 0].log_corner
+            fall, by_corner[i] = _log_fall(data, log_corner, spectrum.roll_off_order)
             density[i] *= np.exp(fall)
     _smear(data, components, density, slopes)
     slopes[:, 1] *= slope[:, None]

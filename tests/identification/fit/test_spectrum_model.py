@@ -1,53 +1,40 @@
-"""The parameters of spectra, and what is left when a shared resonance goes."""
+"""The parameters of spectra, of one axis and of two."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from lbt_synth.identification.fit.spectrum_model import (
-    SHARED,
-    Component,
-    Spectra,
-    SpectrumModel,
-)
+from lbt_synth.identification.fit.spectrum_model import Background, Component, SpectrumModel
+
+TURBULENCE = Component("turbulence", -5.0, -0.7, 10.6)
+LINE = Component("line", -1.4, -3.9, 5.4)
 
 
 def test_parameters_keep_their_names_in_a_vector() -> None:
-    turbulence = Component("turbulence", -5.0, -0.7, 10.6)
-    line = Component("line", -1.4, -3.9, 5.4)
-    spectrum = SpectrumModel(-0.4, 3.4, 0.3, -2.1, (turbulence, line))
-    theta = spectrum.pack()
-    assert spectrum.unpack(theta) == spectrum
+    spectrum = SpectrumModel((Background(-0.4, 3.4, 0.3, -2.1),), (TURBULENCE, LINE))
+    assert spectrum.unpack(spectrum.pack()) == spectrum
     named = spectrum.unpack(np.arange(10.0))
-    assert (named.log_gain, named.log_noise, named.colour, named.log_corner) == (0, 1, 2, 3)
+    assert named.background == Background(0, 1, 2, 3)
     turbulence, line = named.components
     assert (turbulence.log_frequency, turbulence.damping, turbulence.log_power) == (4, 5, 6)
     assert (line.log_frequency, line.damping, line.log_power) == (7, 8, 9)
-    with pytest.raises(ValueError, match="zip"):
-        spectrum.unpack(theta[:-3])
 
 
-def test_shared_resonances_have_parameters_on_both_axes() -> None:
-    turbulence, line = Component("turbulence", -5.0, -0.7, 10.6), Component("line", -1.4, -3.9, 5.4)
-    own = (
-        SpectrumModel(-0.4, 3.4, 0.3, -2.1, (turbulence, line)),
-        SpectrumModel(-0.2, 3.1, 0.0, -2.0, (turbulence,)),
+def test_an_axis_shows_its_own_components_and_its_share_of_the_others() -> None:
+    backgrounds = (Background(-0.4, 3.4, 0.3, -2.1), Background(-0.2, 3.1, 0.0, -2.0))
+    shared = Component("line", -2.0, -3.0, 4.0, axis=None, log_ratio=-0.5, sign=-1.0, name=7)
+    other = Component("turbulence", -5.0, -0.7, 9.0, axis=1)
+    spectrum = SpectrumModel(backgrounds, (TURBULENCE, LINE, other, shared))
+    assert spectrum.unpack(spectrum.pack()) == spectrum
+    assert spectrum.pack().size == 2 * 4 + 4 * 4
+    assert spectrum.shared == (3,)
+    assert spectrum.directions == pytest.approx(
+        np.array([[1, 0], [1, 0], [0, 1], [1, -np.exp(-0.25)]])
     )
-    shared = Component("line", -2.0, -3.0, 4.0, log_ratio=-0.5, phase=2.5, before=(line, None))
-    spectra = Spectra(own, (shared,))
-    theta = spectra.pack()
-    assert theta.size == 10 + 7 + SHARED
-    assert spectra.unpack(theta) == spectra
-    assert [c.log_power for c in spectra.lines] == [4.0, 5.4]
-    for i, power in enumerate((4.0, 3.5)):
-        whole = spectra.whole(i)
-        assert whole.components[-1] == Component("line", -2.0, -3.0, power)
-        step = np.random.default_rng(i).standard_normal(theta.size)
-        moved = spectra.unpack(theta + step).whole(i).pack() - whole.pack()
-        assert spectra.axis_map(i) @ step == pytest.approx(moved)
-    apart = spectra.release(0, *shared.before)
-    assert not apart.shared
-    assert [len(axis.components) for axis in apart.axes] == [3, 1]
-    assert apart.axes[0].components[2] == line
-    assert spectra.release(0).axes == own
+    first, second = (spectrum.on(i) for i in range(2))
+    assert first.axes == backgrounds[:1]
+    assert first.components[:2] == (TURBULENCE, LINE)
+    assert [c.log_power for c in first.components] == [10.6, 5.4, 4.0]
+    assert [c.log_power for c in second.components] == [9.0, 3.5]
+    assert all(c.axis == 0 for c in (*first.components, *second.components))

@@ -18,21 +18,21 @@ import lbt_synth as lbt
 from lbt_synth.identification.fit.fitting import Search, fit
 from lbt_synth.identification.fit.periodogram import TAPER, LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import (
+    BACKGROUND,
     GAIN,
+    Background,
     Component,
-    Spectra,
     SpectrumModel,
 )
 from lbt_synth.identification.fit.whittle import (
     WIDE,
-    FittedModel,
     contrast,
     density,
     derivatives,
-    joint_density,
     log_smearing,
     observe_information,
     smearing_reach,
+    spectral_matrix,
 )
 
 W = 2 * np.pi / RATE
@@ -130,12 +130,12 @@ def case(*, drift: bool = False) -> tuple[LoopPeriodogram, SpectrumModel]:
     data = loop_periodogram(y[:, 0], c[:, 0], frame_rate_hz=RATE, stretches=[(0, len(y))])
     turbulence = Component("turbulence", np.log(1.1 * W), np.log(0.5), np.log(200.0**2))
     line = Component("line", np.log(39 * W), np.log(0.02 / 0.98), np.log(15.0**2))
-    components = (turbulence, line)
-    if drift:  # then all that is slow rolls off
-        first = Component("drift", np.log(20 * W), np.log(300.0), np.log(50.0**2))
-        slow = Component("slow", np.log(3 * W), 0.3, np.log(50.0**2))
-        components = (first, turbulence.convert("slow"), line, slow)
-    return data, SpectrumModel(np.log(0.7), np.log(30), 0.3, np.log(20 * W), components)
+    components = [turbulence, line]
+    if drift:
+        components.append(Component("drift", np.log(20 * W), np.log(300.0), np.log(50.0**2)))
+        components.append(Component("slow", np.log(3 * W), 0.3, np.log(50.0**2)))
+    background = Background(np.log(0.7), np.log(30), 0.3, np.log(20 * W))
+    return data, SpectrumModel((background,), tuple(components))
 
 
 @pytest.mark.parametrize("drift", [False, True])
@@ -201,14 +201,10 @@ def test_second_derivatives_of_the_likelihood(drift: bool, taper: bool) -> None:
     assert found == pytest.approx(found.T, rel=1e-12)
 
 
-def spectrum(*parts: Component) -> SpectrumModel:
-    turbulence = Component("turbulence", np.log(1.1 * W), np.log(0.5), np.log(280.0**2))
-    return SpectrumModel(0.0, np.log(40), 0.0, np.log(30 * W), (turbulence, *parts))
-
-
-def line(frequency: float, ratio: float, rms: float) -> Component:
+def line(frequency: float, ratio: float, rms: float, **changes: object) -> Component:
     odds = float(np.log(ratio / (1 - ratio)))
-    return Component("line", float(np.log(frequency * W)), odds, 2 * float(np.log(rms)))
+    logs = (float(np.log(frequency * W)), odds, 2 * float(np.log(rms)))
+    return dataclasses.replace(Component("line", *logs), **changes)
 
 
 @pytest.fixture(scope="module")
@@ -225,45 +221,39 @@ def both() -> LoopPeriodogram:
 
 
 @pytest.fixture
-def coupled() -> Spectra:
-    shared = dataclasses.replace(line(41, 0.02, 35), log_ratio=2 * np.log(25 / 35), phase=2.5)
-    return Spectra((spectrum(line(70, 0.05, 20)), spectrum()), (shared,))
-
-
-def matrices(diagonal: np.ndarray, crossed: np.ndarray) -> np.ndarray:
-    rows = [[diagonal[0], crossed], [crossed.conj(), diagonal[1]]]
-    return np.moveaxis(np.array(rows), -1, 0)
+def coupled() -> SpectrumModel:
+    """Return two axes with a line, a drift and turbulence of their own, and one line along both."""
+    backgrounds = tuple(
+        Background(np.log(gain), np.log(40), colour, np.log(30 * W))
+        for gain, colour in ((0.7, 0.1), (1.3, 0.0))
+    )
+    slow = Component("turbulence", np.log(1.1 * W), np.log(0.5), np.log(280.0**2))
+    drift = Component("drift", np.log(20 * W), np.log(300.0), np.log(50.0**2), axis=1)
+    shared = line(41, 0.02, 35, axis=None, log_ratio=2 * np.log(25 / 35), sign=-1.0)
+    components = (slow, line(70, 0.05, 20), dataclasses.replace(slow, axis=1), drift, shared)
+    return SpectrumModel(backgrounds, components)
 
 
 def test_the_likelihood_of_two_axes_is_that_of_the_matrices(both, coupled) -> None:
-    gains = np.array([0.7, 1.3])
-    for i, gain in enumerate(gains):
-        model = dataclasses.replace(coupled.axes[i], log_gain=float(np.log(gain)))
-        coupled = coupled.on_axis(i, model)
-    *diagonal, crossed = joint_density(both, coupled)
-    seen, _ = both.cross_power(gains)
-    power = both.power(gains[:, None])
-    S, data = matrices(np.array(diagonal), crossed), matrices(power, seen)
-    trace = np.trace(np.linalg.solve(S, data), axis1=1, axis2=2).real
+    S = np.moveaxis(spectral_matrix(both, coupled), -1, 0)
+    data = np.moveaxis(both.matrix(coupled.gains), -1, 0)
+    trace = np.trace(np.linalg.solve(S, data), axis1=1, axis2=2)
     value = np.sum(both.count * (np.linalg.slogdet(S)[1] + trace))
     assert contrast(both, coupled) == pytest.approx(value, rel=1e-12)
     assert derivatives(both, coupled)[0] == pytest.approx(value, rel=1e-12)
 
 
 def test_axes_without_shared_resonances_are_separate(both, coupled) -> None:
-    apart = dataclasses.replace(coupled, shared=())
-    each = (contrast(both.row(i), model) for i, model in enumerate(apart.axes))
-    assert contrast(both, apart) == pytest.approx(sum(each))
+    apart = coupled.exchange(coupled.shared[0])
+    rows = (contrast(both.row(i), apart.on(i)) for i in range(2))
+    assert contrast(both, apart) == pytest.approx(sum(rows))
+    matrix = spectral_matrix(both, coupled)
+    for i in range(2):
+        assert matrix[i, i] == pytest.approx(density(both, coupled.on(i)))
+    assert np.all(matrix[0, 1] < 0)  # along (1, -r)
 
 
-@pytest.mark.parametrize("drift", [False, True])
-def test_slopes_of_two_axes_are_those_of_differences(both, coupled, drift) -> None:
-    """With a drift in the first place, slow components that are shared roll off on either axis."""
-    if drift:
-        first = Component("drift", np.log(0.3 * W), np.log(8.0), np.log(50.0**2))
-        axes = (dataclasses.replace(axis, components=(first,)) for axis in coupled.axes)
-        slow = Component("slow", np.log(20 * W), 0.3, np.log(90.0**2), log_ratio=0.4)
-        coupled = Spectra(tuple(axes), (*coupled.shared, slow))
+def test_slopes_of_two_axes_are_those_of_differences(both, coupled) -> None:
     theta = coupled.pack()
     _, slope, _ = derivatives(both, coupled)
     numeric = np.array(
@@ -277,12 +267,12 @@ def test_slopes_of_two_axes_are_those_of_differences(both, coupled, drift) -> No
 
 
 def test_information_is_the_second_derivative_where_the_data_are_the_model(both, coupled) -> None:
-    *diagonal, crossed = joint_density(both, coupled)
-    zero = np.zeros_like(both.measured)
-    between = np.zeros_like(both.between)
-    between[0, 0] = crossed
+    matrix = spectral_matrix(both, coupled)
+    zero, between = np.zeros_like(both.measured), np.zeros_like(both.between)
+    between[0, 0] = matrix[0, 1]
+    measured = np.array([matrix[0, 0], matrix[1, 1]])
     pure = dataclasses.replace(
-        both, measured=np.array(diagonal), crossed=zero, corrected=zero, between=between
+        both, measured=measured, crossed=zero, corrected=zero, between=between
     )
     theta = coupled.pack()
     _, slope, information = derivatives(pure, coupled)
@@ -296,7 +286,7 @@ def test_information_is_the_second_derivative_where_the_data_are_the_model(both,
     assert information == pytest.approx(exact, abs=1e-5 * np.max(exact))
     # gains change the data, and what they move is exact
     _, _, information = derivatives(both, coupled)
-    gains = [start + GAIN for start in coupled.starts[:-1]]
+    gains = [GAIN, BACKGROUND + GAIN]
     others = [i for i in range(theta.size) if i not in gains]
     for gain in gains:
         h = 1e-5 * np.eye(theta.size)[gain]
@@ -305,9 +295,9 @@ def test_information_is_the_second_derivative_where_the_data_are_the_model(both,
         assert information[gain][others] == pytest.approx(row, rel=1e-3, abs=1e-5 * max(abs(row)))
 
 
-def test_a_component_that_would_leave_the_band_stays_at_its_end(both) -> None:
+def test_a_component_that_would_leave_the_band_stays_at_its_end(both, coupled) -> None:
     """Noise that falls towards the Nyquist frequency draws a wide component beyond it."""
     wide = Component("line", np.log(3.1), 0.0, 2 * np.log(20.0))
-    found = fit(Search(data=both, gain=1.0), Spectra((spectrum(wide), spectrum())))
-    assert isinstance(found, FittedModel)
-    assert found.spectra.axes[0].components[-1].frequency < np.pi
+    model = fit(Search(data=both, gain=1.0), coupled.exchange(1, wide))
+    assert model is not None
+    assert model.spectrum.components[1].frequency < np.pi
