@@ -260,18 +260,19 @@ def simplify(search: Search, model: FittedModel) -> FittedModel:
 def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> FittedModel:
     """Drop the components that add less than they must, the least first.
 
-    Others may take over what a wide one explains, but only after a long fit: ``thorough`` makes
-    it.
+    Others may take over what a wide one explains, or one that overlaps another, but only after a
+    long fit: ``thorough`` makes it.
     """
     trials, spectrum = [], model.spectrum
     data = search.merge(spectrum)
     whole = contrast(data, spectrum)
     for i, component in enumerate(spectrum.components):
-        less = _drop(data, spectrum, i)
+        neighbour = _overlapping(search, spectrum, i)
+        less = _drop(data, spectrum, i, neighbour)
         if less is not None:
             required = required_evidence(search, component)
             spare = contrast(data, less) - whole - 4 * required
-            patient = thorough and not component.is_narrow
+            patient = thorough and (neighbour is not None or not component.is_narrow)
             if patient or spare <= 0:
                 trials.append((spare, required, less, None if patient else model))
     for _, required, less, bound in sorted(trials, key=lambda trial: trial[0]):
@@ -281,13 +282,32 @@ def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> Fitt
     return model
 
 
-def _drop(data: LoopPeriodogram, spectrum: SpectrumModel, i: int) -> SpectrumModel | None:
-    """Return the model without a component; None for its turbulence.
+def _overlapping(search: Search, spectrum: SpectrumModel, i: int) -> int | None:
+    """Return the nearest line that overlaps line i; None if there is none."""
+    if spectrum.components[i].kind != "line":
+        return None
+    centre, half = search.place(spectrum.components[i])
+    apart = {}
+    for k, other in enumerate(spectrum.components):
+        away = abs(search.place(other)[0] - centre)
+        if k != i and other.kind == "line" and away < half + search.place(other)[1]:
+            apart[k] = away
+    return min(apart, key=apart.__getitem__, default=None)
+
+
+def _drop(
+    data: LoopPeriodogram, spectrum: SpectrumModel, i: int, neighbour: int | None
+) -> SpectrumModel | None:
+    """Return the model without a component, whose power a neighbour takes; None for turbulence.
 
     A wide component may have taken the place of the noise: its white part then becomes noise.
     """
     if i == 0:
         return None
+    if neighbour is not None:
+        line = spectrum.components[neighbour]
+        power = float(np.logaddexp(line.log_power, spectrum.components[i].log_power))
+        return spectrum.exchange(neighbour, replace(line, log_power=power)).exchange(i)
     less, noise = spectrum.exchange(i), float(np.exp(spectrum.background.log_noise))
     lost = density(data, spectrum) - density(data, less)
     white = float(np.min(lost)) * data.frame_rate_hz / 2

@@ -43,9 +43,9 @@ _WIDEST_LINE = 0.98  # damping ratio
 _BANDS = 80  # of the background
 _WIDEST = 0.3  # of its frequency: a band that is tried, and the damping ratio of a new component
 _NARROWEST = 1e-4  # damping ratio of a new component
-_OTHER_GAINS = (0.35, 0.6, 1.0)  # of a sensor, from which models that are as likely are sought
+_OTHER_GAINS = (0.4, 0.9)  # of a sensor, from which models that are as likely are sought
 _SAME_GAIN = 0.15  # of a logarithm: nearer gains have the same optimum
-_AS_LIKELY = 7.0  # log-likelihood by which one of two gains is excluded
+_AS_LIKELY = 5.0  # log-likelihood by which one of two gains is excluded
 
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
 
@@ -82,7 +82,9 @@ def find_rivals(
                 rivals += _settled([fitting.fit(search, held.spectrum)])
     best, near = min(rivals, key=lambda rival: _cost_of_noise(search, rival)), list[FittedModel]()
     for rival in rivals:
-        above = (cost(search, rival) - cost(search, best) for cost in (fitting.cost, _cost_of_noise))
+        above = (
+            cost(search, rival) - cost(search, best) for cost in (fitting.cost, _cost_of_noise)
+        )
         near += [rival] * (min(above) < _AS_LIKELY)
     if best is not model:
         best = fitting.prune(search, best, thorough=True)
@@ -149,41 +151,38 @@ def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
 
 
 def _improve(search: Search, model: FittedModel, *, moves: bool) -> FittedModel | None:
-    """Return the best of the first trials of which one is clearly better; None if none is."""
+    """Return the first trial that is clearly better; None if none is."""
     least, price = fitting.cost(search, model), fitting.total_price(search, model.spectrum)
-    for trials, saved in _trials(search, model.spectrum, moves):
-        margins = [max(0.0, price - fitting.total_price(search, trial)) for trial in trials]
-        fits = (
-            fitting.fit(search, trial, better_than=model, margin=margin)
-            for trial, margin in zip(trials, margins, strict=True)
-        )
-        white = (one for one in fits if one and abs(one.spectrum.background.colour) < _MOST_COLOUR)
-        best = fitting.likeliest(search, [fitting.prune(search, one) for one in white])
-        if best is not None and fitting.cost(search, best) < least - saved:
-            return best
+    for trial, saved in _trials(search, model.spectrum, moves):
+        margin = max(0.0, price - fitting.total_price(search, trial))
+        better = fitting.fit(search, trial, better_than=model, margin=margin)
+        if better is None or abs(better.spectrum.background.colour) > _MOST_COLOUR:
+            continue
+        better = fitting.prune(search, better)
+        if fitting.cost(search, better) < least - saved:
+            return better
     return None
 
 
 def _trials(
     search: Search, spectrum: SpectrumModel, moves: bool
-) -> Iterator[tuple[list[SpectrumModel], float]]:
+) -> Iterator[tuple[SpectrumModel, float]]:
     """Yield models with other turbulence, new lines or other places, and what they must save."""
-    others = []
-    if all(c.kind != "drift" for c in spectrum.components):
-        others.append(_add_drift(search, spectrum))
     excesses = find_excesses(search, spectrum)
     excesses = [excess for excess in excesses if excess[0] > 0.25 * excesses[0][0]]
-    yield [*([_add_centred(search, spectrum, excesses)] if excesses else []), *others], _LITTLE
-    while excesses := excesses[: len(excesses) // 2]:
-        yield [_add_centred(search, spectrum, excesses)], _LITTLE
+    while excesses:
+        yield _add_centred(search, spectrum, excesses), _LITTLE
+        excesses = excesses[: len(excesses) // 2]
+    if all(c.kind != "drift" for c in spectrum.components):
+        yield _add_drift(search, spectrum), _LITTLE
     for i, component in enumerate(spectrum.components):
         if moves and component.kind == "line":
-            yield from (([trial], _CLEARLY) for trial in _line_moves(search, spectrum, i))
+            yield from ((trial, _CLEARLY) for trial in _line_moves(search, spectrum, i))
     if any(c.kind == "slow" for c in spectrum.components):
         lines = [c for c in spectrum.components if c.kind == "line"]
         ground = fit_background(search, spectrum.background.gain, lines)
         if ground is not None:
-            yield [ground.spectrum.add(*lines)], _LITTLE
+            yield ground.spectrum.add(*lines), _LITTLE
 
 
 def _begin(search: Search) -> FittedModel | None:
@@ -201,11 +200,11 @@ def _begin(search: Search) -> FittedModel | None:
         if model is None or not clear:
             break
         model = fitting.fit(held, _add_centred(held, model.spectrum, clear))
-    if model is None or not search.finds_gain:
-        return model
+    if model is None:
+        return None
     drifting = fitting.fit(held, _add_drift(held, model.spectrum), better_than=model)
     model = fitting.likeliest(held, [model, drifting]) or model
-    return fitting.fit(search, model.spectrum)
+    return model if not search.finds_gain else fitting.fit(search, model.spectrum)
 
 
 def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:

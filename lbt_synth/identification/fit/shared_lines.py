@@ -121,7 +121,7 @@ def _share_lines(
     shared: list[Pair],
     pairs: Sequence[Pair],
 ) -> tuple[FittedModel | None, list[Pair]]:
-    """Return the fit with all lines that the axes share, and their pairs, from a model with some."""
+    """Return the fit with all lines that the axes share, and their pairs."""
     while True:  # a line may come to light once a neighbour has its direction
         trial, trials = spectrum, list(shared)
         for pair in pairs:

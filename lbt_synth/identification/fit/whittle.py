@@ -52,7 +52,7 @@ from lbt_synth.models.resonance_spectrum import (
     resonance_densities,
     unit_density,
 )
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, IntArray
 
 DIFFERENCE = 1e-4  # of a logarithm
 WIDE = 30.0  # half width above which a line is not smeared
@@ -301,10 +301,18 @@ def _vector(matrices: FloatArray) -> FloatArray:
 
     The product of two vectors is the trace of the product of their matrices.
     """
-    rows, columns = np.triu_indices(matrices.shape[-2])
-    scale = np.where(rows == columns, 0.5, np.sqrt(0.5))[:, None]
+    if matrices.shape[-2] == 1:
+        return np.asarray(matrices[..., 0, :, :])
+    rows, columns, scale = _upper_triangle(matrices.shape[-2])
     both = matrices[..., rows, columns, :] + matrices[..., columns, rows, :]
     return np.asarray(scale * both)
+
+
+@lru_cache(maxsize=4)
+def _upper_triangle(n: int) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return rows and columns of the entries of a vector (m,), and half their weights (m, 1)."""
+    rows, columns = np.triu_indices(n)
+    return rows, columns, np.where(rows == columns, 0.5, np.sqrt(0.5))[:, None]
 
 
 def _outer(one: FloatArray, other: FloatArray) -> FloatArray:
