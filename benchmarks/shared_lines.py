@@ -299,7 +299,9 @@ def table(kind: str, results: list[dict]) -> None:
             )
         turned = np.abs([line["turned"] for line in found])
         if turned.size:
-            print(f"  direction: median error {np.median(turned):.2f} deg, largest {turned.max():.1f}")
+            print(
+                f"  direction: median error {np.median(turned):.2f} deg, largest {turned.max():.1f}"
+            )
     false = sum(r["false"] for r in results)
     print(f"  false couplings {false}")
     variance = np.array([r["variances"] for r in results])

@@ -85,15 +85,18 @@ def allowed_gains(record: LoopRecord, model: IdentifiedModel) -> FloatArray:
 
 
 def _running_gains(record: LoopRecord) -> tuple[float, float]:
-    """Return the possible gains at which the law that ran was stable, or all without a law."""
+    """Return the ends of the possible gains beyond which the law that ran was unstable."""
     law = record_law(record)
     if law is None or law.kind == "none" or law.lag_frames < 0:
         return POSSIBLE_GAINS
     gains, one = np.geomspace(*POSSIBLE_GAINS, _STEPS), np.ones((1, record.axes))
-    running = [
-        gain for gain in gains.tolist() if could_have_run(CommandRepair(), gain * one, record, law)
-    ]
-    return (running[0], running[-1]) if running else POSSIBLE_GAINS
+    running = np.flatnonzero(
+        [could_have_run(CommandRepair(), gain * one, record, law) for gain in gains]
+    )
+    if not running.size:
+        return POSSIBLE_GAINS
+    beyond = max(running[0] - 1, 0), min(running[-1] + 1, _STEPS - 1)
+    return float(gains[beyond[0]]), float(gains[beyond[1]])
 
 
 def unstable_gains(

@@ -8,7 +8,7 @@ the recorded ``ybar`` has the state that it would have if it had always run: no 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.design import FilterDesign, kalman
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
 from lbt_synth.identification.fit.fitting import Search
-from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedModel
+from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.fit.identify import axis_periodogram, find_axis
 from lbt_synth.linear.block_filtering import last_state
 from lbt_synth.loop import close_loop
@@ -44,8 +44,8 @@ class TrackingController:
     """A filter in the loop that is identified and designed again while it runs.
 
     Every ``update_s`` seconds the fit of :func:`identify` finds turbulence, lines and noise of
-    each axis in the last ``window_s`` seconds, from the last model; the sensor gain stays that of
-    the plant. The filter for them runs over the record, and takes over between two frames.
+    each axis in the last ``window_s`` seconds; the sensor gain stays that of the plant. The filter
+    for them runs over the record, and takes over between two frames.
 
     No update can stop the loop: if more than 1 % of the window's frames have no measurement, the
     fit fails, the design does not pass its certificate, or its loop would be unstable, the running
@@ -134,7 +134,6 @@ class TrackingController:
         self._position = np.zeros((self._mirror.n_states, hw.n_commands))
         self._command = np.zeros(hw.n_commands)
         self._history: list[TrackingUpdate] = []
-        self._axes: Sequence[IdentifiedAxis | None] = [None] * hw.modes
         self._take(self._first)
         self._state = np.zeros(len(self._filter[0]))
 
@@ -187,9 +186,8 @@ class TrackingController:
         self._history.append(update)
 
     def _identify(self) -> TipTiltPlant:
-        """Return the plant of the last window, from the last model."""
+        """Return the plant of the last window."""
         hw, rows = self._hardware, self._rows(self._window)
-        last, self._axes = self._axes, [None] * hw.modes  # a fit that fails is no start
         share = float(np.mean(self._spoilt[rows]))
         if share > _MOST_SPOILT:
             raise ProblemError(
@@ -199,8 +197,8 @@ class TrackingController:
         each = zip(self._measurements[rows].T, self._corrections[rows].T, strict=True)
         periodograms = [axis_periodogram(y, c, hw.frame_rate_hz, None) for y, c in each]
         axes = tuple(
-            find_axis(Search(data=data, gain=gain, most_lines=self._most_lines), start=start)
-            for data, gain, start in zip(periodograms, self._gains, last, strict=True)
+            find_axis(Search(data=data, gain=gain, most_lines=self._most_lines))
+            for data, gain in zip(periodograms, self._gains, strict=True)
         )
         model = IdentifiedModel(
             axes=axes,
@@ -208,7 +206,6 @@ class TrackingController:
             delay_frames=hw.delay_frames,
             mirror=hw.mirror,
         )
-        self._axes = axes
         return replace(model.plant(), hardware=hw)
 
     def _change_over(self, design: FilterDesign) -> None:

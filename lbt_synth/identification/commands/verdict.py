@@ -491,7 +491,7 @@ def _fit(
         try:
             model = find_components(search, rounds=FEW_ROUNDS)
             if other_gains:
-                model, _ = find_rivals(search, model)
+                model, _ = find_rivals(search, [model], other_gains=True)
         except NumericalError:
             total = np.inf
         else:

@@ -227,8 +227,8 @@ def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
     variance = float(np.sum(np.exp([c.log_power for c in slow])))
     starts = [replace(c, kind="turbulence") for c in slow]
     starts += [
-        search.component("turbulence", *place, variance * share)
-        for place, share in product(_TURBULENCE[:2], _SHARES)
+        search.component("turbulence", hz, ratio, variance * share)
+        for (hz, ratio), share in product(_TURBULENCE[:2], _SHARES)
     ]
     trials = [
         replace(spectrum, components=(turbulence, *lines, drift))

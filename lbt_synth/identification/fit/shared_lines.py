@@ -109,8 +109,8 @@ def find_shared(search: Search, models: Sequence[FittedModel]) -> FittedModel | 
     if slow is None:
         return model
     # turbulence of both axes may look like weak parts of lines
-    kept = _keep_asked(search, slow.spectrum, shared) if shared else (slow, [])
-    model, shared = (slow, []) if kept[0] is None else kept
+    begun, shared = _keep_asked(search, slow.spectrum, shared)
+    model = begun or slow
     return _share_lines(search, model, model.spectrum, shared, pairs)[0]
 
 
@@ -129,6 +129,8 @@ def _share_lines(
             if line is not None:
                 trials.append(pair)
                 trial = _replace(trial, pair, line)
+        if len(trials) == len(shared):
+            return model, shared
         better, kept = _keep_asked(search, trial, trials)
         if better is None or len(kept) <= len(shared):
             return model, shared
@@ -138,7 +140,7 @@ def _share_lines(
 def _keep_asked(
     search: Search, spectrum: SpectrumModel, pairs: list[Pair]
 ) -> tuple[FittedModel | None, list[Pair]]:
-    """Fit a model, and take apart what costs more together; None if nothing is left."""
+    """Fit a model, and take apart what costs more together; None if no fit settles."""
     while pairs:
         model = fitting.fit(search, spectrum, accuracy=EXACT)
         if model is None:
@@ -150,7 +152,7 @@ def _keep_asked(
             return model, pairs
         spectrum = _release(model.spectrum, first + worst, pairs[worst])
         pairs = pairs[:worst] + pairs[worst + 1 :]
-    return None, []
+    return fitting.fit(search, spectrum, accuracy=EXACT), []
 
 
 def _replace(spectrum: SpectrumModel, pair: Pair, shared: Component) -> SpectrumModel:
@@ -239,7 +241,8 @@ def _share(search: Search, spectrum: SpectrumModel, pair: Pair) -> Component | N
     with the other one: the excess of the cross-spectrum over the model's.
     """
     current = {c.name: c for c in spectrum.components}
-    first, second = pair = tuple(None if c is None else current[c.name] for c in pair)
+    first, second = (None if c is None else current[c.name] for c in pair)
+    pair = (first, second)
     strong = max((c for c in pair if c is not None), key=lambda c: c.log_power)
     data = search.merge(spectrum)
     densities = [

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from lbt_synth.identification.likeliest_gain import allowed_gains
 from support.control_laws import ordinary_loop
 from support.wrong_commands import record
 
@@ -13,7 +14,6 @@ import lbt_synth as lbt
 from lbt_synth.identification.commands.coarse_spectrum import CoarseRecord
 from lbt_synth.identification.commands.doubts import gain_dilution, held_while_moving
 from lbt_synth.identification.commands.verdict import explain_commands
-from lbt_synth.identification.likeliest_gain import allowed_gains
 
 RATE_HZ, FRAMES = 800.0, 8000
 HELD = np.arange(FRAMES) // 2000 % 2 == 1
