@@ -188,7 +188,7 @@ def explain_commands(
     if not coarse.stretches:
         return _explain_by_law(refuse, law, early)
     steps = "" if known is not None else doubt_steps(coarse)
-    if law is not None and (doubt := doubt_axes(coarse, law) or (steps if law.is_ordinary else "")):
+    if law is not None and (doubt := doubt_axes(coarse, law)):
         return refuse(explanation=steps or doubt)
     plausible = PLAUSIBLE_GAINS
     if known is not None:
