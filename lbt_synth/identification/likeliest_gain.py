@@ -13,7 +13,6 @@ import numpy as np
 from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError, SynthesisError
 from lbt_synth.identification.commands.coarse_spectrum import CoarseRecord, dispersion
-from lbt_synth.identification.commands.doubts import STEPPED, command_steps, gain_dilution
 from lbt_synth.identification.commands.repair import CommandRepair
 from lbt_synth.identification.commands.verdict import could_have_run, record_law
 from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, POSSIBLE_GAINS, Search
@@ -43,9 +42,9 @@ def identify_with_gains(
 
     None for an open loop, or a gain that is given. Where the coarse spectrum asks for other gains
     than the fit, and a fit that is held at these is clearly less likely, the fit decides: but not
-    where the commands are recorded in steps, which move the gain of the fit more, nor where its
-    own gain is implausible. A gain that no sensor has, or that was not found, gives way to the
-    middle of those that the record allows; where these are implausible, to all plausible ones.
+    where its own gain is implausible. A gain that no sensor has, or that was not found, gives way
+    to the middle of those that the record allows; where these are implausible, to all plausible
+    ones.
     ``options`` are those of :func:`identify`.
     """
     model = identify(record, **options)
@@ -62,8 +61,7 @@ def identify_with_gains(
     if agrees(model, allowed):
         return model, allowed
     best, excluded = _compare(record, model, allowed, options)
-    stepped = np.max(command_steps(record)[1]) > STEPPED
-    if excluded and not stepped and _is_plausible(best):
+    if excluded and _is_plausible(best):
         allowed = np.repeat(np.array(best.sensor_gains)[:, None], 2, axis=1)
     return best, allowed
 
@@ -209,7 +207,6 @@ def allowed_gains(record: LoopRecord, model: IdentifiedModel | None = None) -> F
     allowed[np.arange(len(grid)), np.argmin(excess, axis=1)] = True
     ends = [(np.min(row[good]), np.max(row[good])) for row, good in zip(grid, allowed, strict=True)]
     low, high = np.array(ends, dtype=np.float64).T
-    high = high * gain_dilution(coarse)[0] ** 2  # in steps, a gain looks smaller
     intervals: FloatArray = np.clip(np.column_stack([low, high]), _LEAST, _MOST)
     law = record_law(record)
     if law is None or law.kind == "none" or law.lag_frames < 0:

@@ -311,7 +311,7 @@ class _Regression:
         table = np.concatenate(parts, axis=1)
         table -= table.mean(axis=0)
         self.scale = np.maximum(np.sqrt(np.mean(table**2, axis=0)), 1e-300)
-        self.factor = np.linalg.qr(table / self.scale, mode="r")
+        self.factor: FloatArray = np.asarray(np.linalg.qr(table / self.scale, mode="r"))
         self.moving = [i for i in range(self.axes) if self.scale[i] ** 2 > 1e-30]
 
     def columns(self, axis: int, shape: _Shape) -> list[int]:
