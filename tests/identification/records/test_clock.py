@@ -197,7 +197,7 @@ def test_a_lost_frame_that_rounding_hides_is_refused():
         loop_record(noise(3999), frame_rate_hz=1000.1, times_s=kept / 1000, unit="nm")
     # 300 frames of 999 Hz in ms: one step of 2 ms, by rounding or by a frame that is lost
     times = np.floor(np.arange(300) / 999 * 1e3 + 0.9) / 1e3
-    with pytest.raises(ProblemError, match="cannot tell rounding from missing"):
+    with pytest.raises(ProblemError, match="cannot tell which frames are missing"):
         loop_record(noise(300), frame_rate_hz=999, times_s=times, unit="nm")
 
 
