@@ -6,7 +6,7 @@ The columns of a file that make a record, by their names or as they were chosen.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,7 +26,7 @@ from lbt_synth.identification.records.columns import (
 from lbt_synth.storage.array_file import error_reason, open_fits, read_numpy
 from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.validation import FloatArray, choice, integer, sequence
+from lbt_synth.validation import choice, integer, sequence
 
 FITS = (".fits", ".fit", ".fts")
 TEXTS = (".csv", ".tsv", ".txt", ".dat")
@@ -38,7 +38,6 @@ _SUFFIXES = {  # of numbers that are texts
 }
 _GAPS = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
 _DELIMITERS = (";", "\t", ",", "|")  # else blanks
-_LOOKED_AT = 20  # rows, to find decimal commas
 _DELAY_CARD = "DELAY"
 _IN_FRAMES = ("[frame]", "[frames]")  # the unit of a card, where the FITS standard has it
 # The roles that give the series of each kind of record, and what is needed beside it.
@@ -205,8 +204,8 @@ def _read_text(out: Contents, content: bytes) -> None:
     above = ""  # the last comment before the table, which may have the names
     for number, raw in enumerate(text.splitlines(), start=1):
         line = raw.strip("\r\n ")
-        if line.lstrip().startswith("#"):
-            comment = line.lstrip().lstrip("#").strip()
+        if line.startswith("#"):
+            comment = line.lstrip("#").strip()
             above = above if rows else comment
             _add_comment(out, comment)
         elif line:
@@ -215,7 +214,7 @@ def _read_text(out: Contents, content: bytes) -> None:
         raise TelemetryError("it has no rows.")
     sign = next((sign for sign in _DELIMITERS if sign in rows[0][1]), None)
     names = _split_heading(rows[0][1], sign)
-    sample = "".join(line for _, line in rows[1:_LOOKED_AT])
+    sample = "".join(line for _, line in rows[1:20])
     if sign in (";", "\t") and "," in sample and "." not in sample:
         out.notes.append("commas were taken for decimal points")
         rows = [(number, line.replace(",", ".")) for number, line in rows]
@@ -223,21 +222,46 @@ def _read_text(out: Contents, content: bytes) -> None:
         rows = rows[1:]
     else:
         cells = _split_heading(above, sign)
-        numbers = [cell for cell in cells if not cell or _parse_number(cell) is not None]
-        names = [""] * len(names) if numbers or len(cells) != len(names) else cells
+        named = len(cells) == len(names) and all(
+            cell and _parse_number(cell) is None for cell in cells
+        )
+        names = cells if named else [""] * len(names)
     if not rows:
         raise TelemetryError("it has a heading and no rows.")
-    parsed = [parse_column(name, np.empty(0)) for name in names]
-    # a text that no role needs, as a remark or a date
-    spare = [bool(each.name) and each.role is None for each in parsed]
-    table, texts = _parse_rows(rows, sign, spare)
-    if all(texts):
-        raise TelemetryError(f"each cell of a column must be a number; got {rows[0][1].strip()!r}.")
-    for each, column, is_text in zip(parsed, table.T, texts, strict=True):
-        if is_text:
-            out.left_out.append(f"{each.name} holds texts")
+    _add_table_of_text(out, rows, names, sign)
+
+
+def _add_table_of_text(
+    out: Contents, rows: list[tuple[int, str]], names: list[str], sign: str | None
+) -> None:
+    """Add the columns of rows of a text; leave out those of texts that no role needs."""
+    lines, columns = [line for _, line in rows], [parse_column(name, np.empty(0)) for name in names]
+    with suppress(ValueError):  # the quick way, which knows no gaps
+        numbers = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
+        if numbers.shape == (len(rows), len(names)):
+            each = zip(columns, numbers.T, strict=True)
+            out.columns += [replace(column, values=values) for column, values in each]
+            return
+    table = (
+        [line.split() for line in lines] if sign is None else [*csv.reader(lines, delimiter=sign)]
+    )
+    for (number, _), cells in zip(rows, table, strict=True):
+        if len(cells) != len(names):
+            raise TelemetryError(f"line {number} must have {len(names)} cells; got {len(cells)}.")
+    for at, (column, cells) in enumerate(zip(columns, zip(*table, strict=True), strict=True)):
+        values = [_parse_number(cell) for cell in cells]
+        if None not in values:
+            out.columns.append(replace(column, values=np.array(values, dtype=np.float64)))
+        elif column.name and column.role is None:  # as a remark or a date
+            out.left_out.append(f"{column.name} holds texts")
         else:
-            out.columns.append(replace(each, values=column))
+            bad = values.index(None)
+            raise TelemetryError(
+                f"cell {at + 1} of line {rows[bad][0]} must be a number; got "
+                f"{cells[bad].strip()!r}."
+            )
+    if not out.columns:
+        raise TelemetryError(f"each cell of a column must be a number; got {lines[0]!r}.")
 
 
 def _add_comment(out: Contents, comment: str) -> None:
@@ -251,13 +275,9 @@ def _add_comment(out: Contents, comment: str) -> None:
             out.add_fact(fact, value, f"the comment {key}")
 
 
-def _split_cells(lines: Iterable[str], sign: str | None) -> Iterator[list[str]]:
-    """Yield the cells of each line."""
-    return map(str.split, lines) if sign is None else csv.reader(lines, delimiter=sign)
-
-
 def _split_heading(line: str, sign: str | None) -> list[str]:
-    return [cell.strip().strip('"') for cell in next(_split_cells([line], sign), [])]
+    cells = line.split() if sign is None else next(csv.reader([line], delimiter=sign), [])
+    return [cell.strip().strip('"') for cell in cells]
 
 
 def _parse_number(cell: str) -> float | None:
@@ -265,30 +285,6 @@ def _parse_number(cell: str) -> float | None:
         return float(cell)
     except ValueError:
         return float("nan") if cell.strip().lower() in _GAPS else None
-
-
-def _parse_rows(
-    rows: list[tuple[int, str]], sign: str | None, spare: list[bool]
-) -> tuple[FloatArray, list[bool]]:
-    """Return the numbers of rows, and which columns have texts: only ``spare`` ones may."""
-    lines, out = [line for _, line in rows], np.empty((len(rows), len(spare)))
-    texts = [False] * len(spare)
-    with suppress(ValueError):  # the quick way, which knows no gaps
-        numbers = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
-        if numbers.shape == out.shape:
-            return numbers, texts
-    table = _split_cells(lines, sign)
-    for values, (number, _), cells in zip(out, rows, table, strict=True):
-        if len(cells) != len(spare):
-            raise TelemetryError(f"line {number} must have {len(spare)} cells; got {len(cells)}.")
-        for at, value in enumerate(map(_parse_number, cells)):
-            if value is None and not spare[at]:
-                raise TelemetryError(
-                    f"cell {at + 1} of line {number} must be a number; got {cells[at].strip()!r}."
-                )
-            texts[at] |= value is None
-            values[at] = np.nan if value is None else value
-    return out, texts
 
 
 def select_series(
@@ -326,8 +322,6 @@ def select_series(
         for each in (role, _BESIDE.get(kind), *clocks)
         if each in found
     }
-    if kind == "closed_loop":
-        _require_same_axes(chosen)
     notes += [f"{each.replace('_', ' ')}: {join_names(own)}" for each, own in chosen.items()]
     used = {id(column.values) for own in chosen.values() for column in own}
     if left := [column for column in there if id(column.values) not in used]:
@@ -457,19 +451,6 @@ def choose_axes(given: Any, name: str, count: int, what: str) -> list[int]:
             f"got {list(given)}."
         )
     return axes
-
-
-def _require_same_axes(chosen: Roles) -> None:
-    """Refuse measurements of one axis with commands of another."""
-    y, u = chosen["measurements"], chosen["commands"]
-    mine, theirs = ([each.axis for each in own] for own in (y, u))
-    from_one = sorted([mine, theirs], key=str) == [[0, 1], [1, 2]]  # one of them counts from 1
-    if None not in (*mine, *theirs) and len(y) == len(u) and mine != theirs and not from_one:
-        raise ProblemError(
-            f"measurements and commands must be of the same axes; got {join_names(y)} with "
-            f"{join_names(u)}. Choose by columns={{'measurements': ..., 'commands': ...}} if they "
-            "do belong together."
-        )
 
 
 def join_names(columns: Sequence[Column]) -> str:

@@ -17,7 +17,6 @@ from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 _SHORTEST_RUN = 5  # equal values, a stuck sensor
 _RARE = 1e-3  # runs of chance allowed in a record
-_QUANTISED = 2**20  # levels at most, where equal neighbours say little
 _MANY_RUNS = 100  # needed to compute a chance
 _SAME_LEVEL = 1e-9  # of the range
 _LEAST_AT_LIMIT = 4  # values at an end of the range
@@ -61,32 +60,16 @@ def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
     """Find frames of a value that is held for longer than chance or quantisation hold it."""
     if not good.any():
         return np.zeros(len(series), dtype=np.bool_)
-    each = equal_runs(series, good)
-    lengths = each[:, 1] - each[:, 0]
-    repeated = float(np.mean(lengths > 1))  # chance that a value is seen again
-    if _is_quantised(series[good]):
-        # a slow series stays on a level longer than the mean run tells: the largest such chance
-        longer = np.cumsum(np.bincount(lengths)[::-1])[::-1]  # runs of at least that length
-        many = longer[1:] >= _MANY_RUNS
-        chances = longer[2:][many[:-1]] / longer[1:-1][many[:-1]]
-        repeated = max(repeated, float(np.max(chances, initial=0.0)))
-    if repeated >= 1:
-        least = np.inf if len(lengths) > 1 else 0.0
-    elif repeated > 0:
-        least = 1 + np.log(_RARE / len(series)) / np.log(repeated)
-    else:
-        least = 0.0
-    return mark(each[lengths >= max(least, _SHORTEST_RUN)], len(series))
-
-
-def _is_quantised(values: FloatArray) -> bool:
-    """Whether all values are whole multiples of a step that is not tiny."""
-    steps = np.abs(np.diff(values))
-    step = float(np.min(steps[steps > 0], initial=np.inf))
-    if not 0 < float(np.ptp(values)) <= _QUANTISED * step:
-        return False
-    counts = steps / step
-    return bool(np.all(np.abs(counts - np.round(counts)) < 1e-3))
+    stretches = equal_runs(series, good)
+    lengths = stretches[:, 1] - stretches[:, 0]
+    # the chance that a value is held on: a slow series in steps stays on a level longer than its
+    # mean run tells, so the largest one of any length counts
+    longer = np.cumsum(np.bincount(lengths)[::-1])[::-1]  # runs of at least that length
+    many = longer[1:] >= _MANY_RUNS
+    chances = longer[2:][many[:-1]] / longer[1:-1][many[:-1]]
+    chance = max(float(np.max(chances, initial=0.0)), np.finfo(float).tiny)
+    least = np.inf if chance >= 1 else 1 + np.log(_RARE / len(series)) / np.log(chance)
+    return mark(stretches[lengths >= max(least, _SHORTEST_RUN)], len(series))
 
 
 def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:

@@ -38,8 +38,8 @@ _BRIDGED_FRACTION = 0.01
 NOT_KNOWN = "correction not known"
 _Delay: TypeAlias = Annotated[float, ("at_least", 1), ("at_most", 100)]
 
-_LEAST_FRAMES = 4096  # that show a model
-LEAST_SECONDS = 4.0
+_LEAST_FRAMES = 1024  # half of which, two segments, show a model to be tested on the others
+LEAST_SECONDS = 2.0  # slower turbulence moves no filter by much
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -151,6 +151,17 @@ class LoopRecord:
     def duration_s(self) -> float:
         """Length of the record [s]."""
         return self.frames / self.frame_rate_hz
+
+    @property
+    def first_known(self) -> int:
+        """First frame whose correction has no command from before the record."""
+        closed = self.commands is not None and self.delay_frames is not None
+        return len(self.mirror_taps) if closed else 0
+
+    @property
+    def lost(self) -> float:
+        """Part of the frames that is spoilt, of those whose commands the record has."""
+        return float(1 - np.mean(self.usable[min(self.first_known, self.frames - 1) :]))
 
     @property
     def hardware(self) -> LoopHardware:
@@ -321,13 +332,12 @@ def require_length(
     >>> lbt.identification.require_length(brief)  # doctest: +ELLIPSIS
     Traceback (most recent call last):
         ...
-    lbt_synth.errors.ProblemError: the record needs 4096 usable frames (5.12 s at 800 Hz) ...
+    lbt_synth.errors.ProblemError: the record needs 1600 usable frames (2 s at 800 Hz) in ...
     """
     rate = record.frame_rate_hz
     needed = integer(frames, "frames", at_least=1)
     needed = max(needed, int(np.ceil(rate * number(seconds, "seconds", at_least=0) * (1 - 1e-12))))
-    known = record.commands is None or record.delay_frames is None
-    before = 0 if known else len(record.hardware.mirror_taps)  # commands that no record knows
+    before = record.first_known
     lengths = [stop - (start if start > before else 0) for start, stop in record.stretches()]
     count = sum(length for length in lengths if length >= SHORTEST_SEGMENT)
     longest = max(lengths, default=0)
