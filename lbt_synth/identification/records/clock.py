@@ -171,7 +171,7 @@ def _lay_by_steps(times: FloatArray, period: float) -> IntArray:
     rate = _fit_rate(times, np.arange(len(times)))
     spread = float(np.ptp((times - times[0]) * rate - np.arange(len(times))))
     odd = int(np.sum(counts != 1)) if _quantum(times) > _COARSE * period else 0
-    if odd > _MOST_UNEVEN * len(times) or (odd >= _FEW and spread < 1.2 * rate * period):
+    if odd >= _FEW and (odd > _MOST_UNEVEN * len(times) or spread < 1.2 * rate * period):
         raise ProblemError(
             f"the steps in time are those of missing or repeated frames at {1 / period:.6g} Hz, or "
             f"of no such frame at {rate:.6g} Hz: the times may be rounded. Give frame_rate_hz."

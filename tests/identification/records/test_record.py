@@ -231,6 +231,6 @@ def test_frames_before_the_first_commands_are_not_lost():
     seen = loop_record(y, y, frame_rate_hz=RATE, delay_frames=2.5, unit="nm")
     assert (seen.first_known, seen.lost) == (3, 0.0)
     y[50] = np.nan
-    seen = loop_record(y, 0 * y, frame_rate_hz=RATE, delay_frames=2.5, unit="nm")
+    seen = loop_record(y, np.zeros((100, 1)), frame_rate_hz=RATE, delay_frames=2.5, unit="nm")
     assert seen.lost == pytest.approx(1 / 97)
     assert seen.with_delay(1.0).lost == pytest.approx(1 / 99)
