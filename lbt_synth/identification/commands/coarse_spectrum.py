@@ -246,10 +246,6 @@ class CoarseAxis:
         narrow = [*resonances, *((f, _LINE_DAMPING) for f in places if f > 0)]
         known = [resonance(square, np.sqrt(warp(np.array(f))), ratio) for f, ratio in narrow]
         self.shapes = _shapes(square, frequency_hz[0], known)  # of at most 1, (k, b)
-        upper = np.triu_indices(len(self.shapes))
-        self.pairs = (self.shapes[upper[0]] * self.shapes[upper[1]]).T
-        self.pair = np.zeros((len(self.shapes), len(self.shapes)), dtype=np.intp)  # their places
-        self.pair[upper] = self.pair.T[upper] = np.arange(upper[0].size)
 
     def fit_profile(self, gains: FloatArray) -> CoarseFit:
         """Fit the spectrum with a single repair at each of its gains (n,)."""
@@ -318,10 +314,7 @@ class CoarseAxis:
     def _derivatives(
         self, theta: FloatArray, guess: IntArray, *, free: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Return gradients (rows, p) and information (rows, p, p) of the contrast.
-
-        The information of the shapes is a product of two matrices.
-        """
+        """Return gradients (rows, p) and information (rows, p, p) of the contrast."""
         gain, a = theta[:, 0], np.exp(theta[:, 1:])
         model = a @ self.shapes
         bands, peaks = self.bands.row(guess), self.peaks.row(guess)
@@ -335,7 +328,7 @@ class CoarseAxis:
         information[:, 0, 0] = (bands.corrected / model) @ (2 * count)
         information[:, 0, 0] += at_peaks**2 @ peaks.count
         information[:, 0, 1:] = -a * ((count * by_gain / model) @ self.shapes.T)
-        pairs = ((count / model**2) @ self.pairs)[:, self.pair]
+        pairs = (self.shapes * (count / model**2)[:, None]) @ self.shapes.T
         information[:, 1:, 1:] = a[:, :, None] * pairs * a[:, None]
         if not free:
             gradient[:, 0] = information[:, 0, 1:] = 0.0

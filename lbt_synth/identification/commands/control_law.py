@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import product
 from operator import itemgetter
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,6 +63,9 @@ _MOST_ODD = 0.1  # of the frames: more of them are a law of their own
 # measurements and commands (frames, axes), and the frames (frames,) that are measured, that are
 # commanded, and whose command is a result of the law
 _Series: TypeAlias = tuple[FloatArray, FloatArray, BoolArray, BoolArray, BoolArray]
+# weights of past commands (axes, order) and measurements (axes, lags, axes), and the errors of the
+# first of these, (axes,), and of the sums of the others over their lags, (axes, axes)
+_Coefficients: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 _Shape: TypeAlias = tuple[int, range]  # order of a law, and the lags of its measurements
 
 
@@ -363,15 +366,16 @@ class _Regression:
         richest = self.residual((self.order, range(lags[0], self.lags.stop)))
         return min(_ALIKE * richest, richest + _SPARE * (1 - richest)) + _FLOOR
 
-    def coefficients(self, shape: _Shape) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the weights of past commands (axes, order) and measurements (axes, lags, axes).
+    def no_coefficients(self, shape: _Shape) -> _Coefficients:
+        """Return the coefficients of commands that do not move."""
+        axes, (order, lags) = self.axes, shape
+        taps = np.zeros((axes, len(lags), axes))
+        return np.zeros((axes, order)), taps, np.zeros(axes), np.zeros((axes, axes))
 
-        Then the errors of the sums of both over their lags, (axes,) and (axes, axes).
-        """
+    def coefficients(self, shape: _Shape) -> _Coefficients:
+        """Return the coefficients of a law, zeros where commands do not move."""
         order, lags = shape
-        past, past_error = np.zeros((self.axes, order)), np.zeros(self.axes)
-        taps = np.zeros((self.axes, len(lags), self.axes))
-        sum_error = np.zeros((self.axes, self.axes))
+        past, taps, past_error, sum_error = self.no_coefficients(shape)
         for axis in self.moving:
             chosen = self.columns(axis, shape)
             weights, left = self.solve(axis, chosen, order)
@@ -432,23 +436,14 @@ def _describe(regression: _Regression, shape: _Shape | None) -> ControlLaw:
     coherence, residual = np.zeros(axes), 1.0
     if shape is not None:
         coherence, residual = regression.coherence(shape), regression.residual(shape)
-    rest: dict[str, Any] = {"residual": residual, "axis_coherence": read_only(coherence)}
     if shape is None or np.max(coherence) < FOLLOWED:
-        return ControlLaw(
-            kind="none",
-            lag_frames=0,
-            gain=read_only(np.zeros((axes, axes))),
-            gain_error=read_only(np.zeros((axes, axes))),
-            axes_kind="zero",
-            signs=(0,) * axes,
-            poles=read_only(np.zeros((axes, 0), dtype=np.complex128)),
-            past=read_only(np.zeros((axes, 0))),
-            taps=read_only(np.zeros((axes, 1, axes))),
-            **rest,
-        )
-    past, taps, past_error, sum_error = regression.coefficients(shape)
+        shape = 0, range(1)
+        past, taps, past_error, sum_error = regression.no_coefficients(shape)
+        kind: LawKind = "none"
+    else:
+        past, taps, past_error, sum_error = regression.coefficients(shape)
+        kind = _kind(shape[0], _poles(past), past_error)
     poles = _poles(past)
-    kind = _kind(shape[0], poles, past_error)
     # at low frequencies, but for the poles at 1
     others = poles[:, 2 if kind == "double integrator" else 1 :]
     scale = np.prod(abs(1 - others), axis=1)[:, None]
@@ -465,7 +460,8 @@ def _describe(regression: _Regression, shape: _Shape | None) -> ControlLaw:
         poles=read_only(poles),
         past=read_only(past),
         taps=read_only(taps),
-        **rest,
+        residual=residual,
+        axis_coherence=read_only(coherence),
     )
 
 

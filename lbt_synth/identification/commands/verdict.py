@@ -170,7 +170,7 @@ def explain_commands(
         law = None if sure is None else replace(sure, lag_frames=0)
     coarse = CoarseRecord(record)
     if not coarse.stretches:
-        return _explain_by_law(refuse, law, early)
+        return _explain_by_law(refuse, record, law, early)
     plausible = PLAUSIBLE_GAINS
     if known is not None:
         plausible = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
@@ -265,18 +265,16 @@ def _explain_moving(
 
 
 def _explain_by_law(
-    refuse: Callable[..., CommandVerdict], law: ControlLaw | None, early: int
+    refuse: Callable[..., CommandVerdict], record: LoopRecord, law: ControlLaw | None, early: int
 ) -> CommandVerdict:
     """Return the verdict on commands whose likelihood no stretch is long enough to tell."""
-    repair = CommandRepair(shift_frames=early)
+    repair = _GIVEN
     if law is not None and law.exact:
-        swapped = law.axes_kind == "swapped"
-        signs = law.signs[::-1] if swapped else law.signs
-        repair = axes_repair(swapped, tuple(sign or 1 for sign in signs))
-        repair = replace(repair, shift_frames=early, increments=law.order == 0)
+        repairs = list_repairs(record.axes, record.hardware.delay_frames)
+        repair = next((each for each in repairs if not _is_unusual(each, law, 0)), _GIVEN)
+    repair = replace(repair, shift_frames=early)
     if repair.options:
-        words = " and ".join(repair.words())
-        return refuse(explanation=f"by their law {words}", repair=repair)
+        return refuse(explanation=f"by their law {' and '.join(repair.words())}", repair=repair)
     note = "the commands were not tested: no stretch of usable frames is long enough"
     return refuse(explanation=AS_GIVEN, accepted=True, notes=(note,))
 
