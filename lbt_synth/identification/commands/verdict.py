@@ -37,7 +37,7 @@ from lbt_synth.identification.commands.repair import (
     repair_commands,
 )
 from lbt_synth.identification.fit.fitting import GAINS, PLAUSIBLE_GAINS, Search, cost
-from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components, try_other_gains
+from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
@@ -351,7 +351,8 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
     best = int(np.argmin(contrast + penalty))
     clear = CLEAR * float(spread[best])
     if not asked[best] and (
-        contrast[0] - contrast[best] < clear or _finer_saving(coarse, repairs[best]) < _CLEAR_FINER
+        contrast[0] - contrast[best] < clear
+        or _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] < _CLEAR_FINER
     ):
         best = 0
     saved = coarse.unrelated() - np.min(axis_contrast, axis=1)
@@ -463,11 +464,7 @@ def _doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray
 
 
 def _fit(
-    coarse: CoarseRecord,
-    repair: CommandRepair,
-    held: FloatArray | None = None,
-    *,
-    other_gains: bool = False,
+    coarse: CoarseRecord, repair: CommandRepair, held: FloatArray | None = None
 ) -> tuple[float, FloatArray]:
     """Return the criterion of the fit over all axes, and the gains (axes,), nan where one failed.
 
@@ -489,23 +486,11 @@ def _fit(
         search = Search(data=data, gain=gain, most_lines=_LINES)
         try:
             model = find_components(search, None, rounds=FEW_ROUNDS)
-            if other_gains:
-                model, _ = try_other_gains(search, model)
         except NumericalError:
             total = np.inf
         else:
             total, gains[i] = total + cost(search, model), model.spectrum.gain
     return total, gains
-
-
-def _finer_saving(coarse: CoarseRecord, repair: CommandRepair) -> float:
-    """Return how much likelier a repair is than the record as given, by the model of the fit.
-
-    Before a saving is clear, the record as given is fitted from other gains as well.
-    """
-    other, _ = _fit(coarse, repair)
-    saving = _fit(coarse, _GIVEN)[0] - other
-    return saving if saving < _CLEAR_FINER else _fit(coarse, _GIVEN, other_gains=True)[0] - other
 
 
 def _scale(
