@@ -47,16 +47,13 @@ _ROWS_PER_VALUE = 16  # of each coefficient: a law from fewer frames explains it
 _EXACT = 1e-6  # part of the increments' variance that single precision leaves of an exact law
 _SURE = 0.05  # part that rounded or filtered measurements leave of a law whose lag counts
 FOLLOWED = 0.1  # least coherence of an axis that follows its measurements; other nights have 0.02
-_SHORT_ORDER, _LONG_ORDER = 3, 32  # past commands: integrators, and filters of turbulence and lines
+SHORT_ORDER, _LONG_ORDER = 3, 32  # past commands: integrators, and filters of turbulence and lines
 _MOST_ROWS = 16_000  # frames of a regression: more move no law, and take seconds
 _ADDS_UP = 0.2  # distance from 1 of the pole of an integrator, a leaky one included
-_NEARLY = 2.0  # times the residual of a law that knows the future, which one that does not may have
-_SIGMAS = 4.0  # standard errors within which a weight is zero
-_TOLERANCE = 0.05  # of the largest element, within which another one is zero
-_ALIKE = 3.0  # times the residual of the richest law, within which a simple one explains as much
+SIGMAS = 4.0  # standard errors within which two numbers are the same
+_TOLERANCE = 0.05  # of the largest element or the residual, which counts as nothing
+_ALIKE = 3.0  # times the residual of a law, within which a simpler one explains as much
 _SPARE = 0.2  # of what the richest law explains, which a simple one may leave unexplained
-_FLOOR = 1e-10  # part of the increments' variance that rounding in double precision may leave
-_SAME = 1.05  # times the residual, within which a tap is idle
 _ODD = 8.0  # deviations from the law of a frame that follows another one
 _MOST_ODD = 0.1  # of the frames: more of them are a law of their own
 
@@ -259,7 +256,7 @@ def _rows(series: _Series, order: int, lags: range) -> IntArray:
 
 def _search(series: _Series) -> ControlLaw:
     """Return the shortest law that explains as much as a long one."""
-    for order in (_SHORT_ORDER, _LONG_ORDER):
+    for order in (SHORT_ORDER, _LONG_ORDER):
         regression = _regression(series, order)
         if not regression.moving:
             return _describe(regression, None)
@@ -275,7 +272,7 @@ def _search(series: _Series) -> ControlLaw:
         later = _describe(regression, _simplest_shape(regression, range(first, _LAGS.stop)))
         if later.kind == "none":
             continue
-        if later.residual < _NEARLY * law.residual or not law.is_sure:
+        if later.residual < _ALIKE * law.residual or not law.is_sure:
             return later
     return law
 
@@ -364,7 +361,7 @@ class _Regression:
     def most_residual(self, lags: range = _LAGS) -> float:
         """Return what a simple law may leave, to explain as much as the richest one."""
         richest = self.residual((self.order, range(lags[0], self.lags.stop)))
-        return min(_ALIKE * richest, richest + _SPARE * (1 - richest)) + _FLOOR
+        return min(_ALIKE * richest, richest + _SPARE * (1 - richest)) + _EXACT**2
 
     def no_coefficients(self, shape: _Shape) -> _Coefficients:
         """Return the coefficients of commands that do not move."""
@@ -402,10 +399,10 @@ def _simplest_shape(regression: _Regression, lags: range) -> _Shape:
     most = regression.most_residual(lags)
     tried = [
         (order, more)
-        for order, more in product(range(_SHORT_ORDER + 1), repeat=2)
+        for order, more in product(range(SHORT_ORDER + 1), repeat=2)
         if order - 1 <= more <= order
     ]
-    order = _SHORT_ORDER
+    order = SHORT_ORDER
     while order < regression.order:
         order = min(2 * order, regression.order)
         tried.append((order, order))
@@ -420,7 +417,7 @@ def _simplest_shape(regression: _Regression, lags: range) -> _Shape:
 
 def _without_idle_taps(regression: _Regression, residual: float, shape: _Shape) -> _Shape:
     """Return the law without the first and last taps that explain nothing."""
-    most = _SAME * residual + _FLOOR
+    most = (1 + _TOLERANCE) * residual + _EXACT**2
     for early, late in ((1, 0), (0, -1)):
         while len(shape[1]) > 1:
             shorter = shape[0], range(shape[1].start + early, shape[1].stop + late)
@@ -478,7 +475,7 @@ def _kind(order: int, poles: ComplexArray, past_error: FloatArray) -> LawKind:
         return "proportional"
     distance = abs(poles - 1)
     if order == 1:
-        is_pure = np.all(distance <= np.maximum(_EXACT, _SIGMAS * past_error)[:, None])
+        is_pure = np.all(distance <= np.maximum(_EXACT, SIGMAS * past_error)[:, None])
         return "pure integrator" if is_pure else "leaky integrator"
     if order == 2 and np.all(distance < _ADDS_UP):
         return "double integrator"
@@ -493,7 +490,7 @@ def classify_matrix(values: ArrayLike, errors: ArrayLike = 0.0) -> tuple[AxisKin
     other.
     """
     g = square(values, "values")
-    doubt = _SIGMAS * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
+    doubt = SIGMAS * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
     small = _TOLERANCE * np.max(np.abs(g), initial=0.0)
     least = np.where(np.isfinite(doubt), np.maximum(doubt, small), np.inf)
     g = np.where(np.abs(g) <= least, 0.0, g)

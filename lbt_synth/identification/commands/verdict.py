@@ -26,6 +26,8 @@ from lbt_synth.identification.commands.coarse_spectrum import (
 )
 from lbt_synth.identification.commands.control_law import (
     FOLLOWED,
+    SHORT_ORDER,
+    SIGMAS,
     ControlLaw,
     classify_matrix,
     fit_control_law,
@@ -51,24 +53,18 @@ AS_GIVEN = "as given"
 _MORE_DIGITS = "Record more digits, cut the record, or give the sensor gain"
 _FIND = "find the commands that belong to these measurements"
 _GIVEN = CommandRepair()
-_CLEAR_FINER = 8.0  # nats that decide by the model of the fit, which has the lines of the record
-_ODD = 10.0  # nats by which a matrix, a part of a frame or what no law asks for must be likelier
-_SURPRISING = 60.0  # nats by which a repair must be likelier that contradicts a law with errors
-_RELATED = 30.0  # nats by which the commands of an axis must be likelier than none
+_ODD = 10.0  # nats by which what no law asks for must be likelier, by the model of the fit as well
+_SURPRISING = 3 * CLEAR  # nats by which a repair must be likelier that a law with errors denies
 _ABSURD = 3e4  # scale of commands without a law, which are rather of another night
-_NOT_SHOWN = 3.0  # factor beyond plausible gains of a coarse gain that is none
-_WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
-_FIT_ERRORS = 4.0  # of a fitted gain from a plausible one that refute the unit
+_WRONG_GAIN = 2.0  # factor beyond a given or plausible gain, which a coarse one does not reach
 _WORST_CONDITION = 100.0  # of the gain of a law: beyond, it has no inverse
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
 _HIDES = 0.01  # part of their changes that commands leave unexplained, which moves a gain by 10 %
 _USUAL_GAIN = 0.7  # of a sensor, by whose distance units are told apart
 _COARSE = 1.5  # factor by which a coarse gain may be wrong
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
-_SHORT_LAW = 3  # order of a law that does not couple axes, and whose loop can be judged
 _RAN = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
 _ANY = np.geomspace(1.0, 1e-6, 19)[:, None]  # gains of a loop that may be of no sensor
-_LINES = 10  # at most, of the search for lines
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -199,7 +195,7 @@ def explain_commands(
     if np.any(scale != 1):
         words_of_repair.append(wrong_scale(scale, choice.gain))
     shown = choice.gain / scale
-    hidden = (shown <= plausible[0] / _NOT_SHOWN) | (shown >= plausible[1] * _NOT_SHOWN)
+    hidden = (shown <= plausible[0] / _WRONG_GAIN) | (shown >= plausible[1] * _WRONG_GAIN)
     return CommandVerdict(
         explanation=" and ".join(words_of_repair) or AS_GIVEN,
         accepted=not words_of_repair,
@@ -352,7 +348,7 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
     clear = CLEAR * float(spread[best])
     if not asked[best] and (
         contrast[0] - contrast[best] < clear
-        or _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] < _CLEAR_FINER
+        or _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] < _ODD
     ):
         best = 0
     saved = coarse.unrelated() - np.min(axis_contrast, axis=1)
@@ -363,7 +359,7 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
         float(contrast[0] - contrast[best]),
         float(contrast[best]),
         clear,
-        (followed < FOLLOWED) & (saved < _RELATED * spread[best]),
+        (followed < FOLLOWED) & (saved < CLEAR * spread[best]),
     )
 
 
@@ -411,7 +407,7 @@ def _is_unusual(repair: CommandRepair, law: ControlLaw | None, lag: int) -> bool
     if kind == "swapped" or min(signs) < 0:
         return True
     # a long law may couple the axes, as a filter of lines along diagonals does
-    return kind != "diagonal" and law.order <= _SHORT_LAW
+    return kind != "diagonal" and law.order <= SHORT_ORDER
 
 
 def could_have_run(
@@ -452,7 +448,7 @@ def _doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray
 
     ``gains`` (axes,) are the likeliest ones.
     """
-    if law is None or not law.exact or law.order > _SHORT_LAW:
+    if law is None or not law.exact or law.order > SHORT_ORDER:
         return ""
     tried = np.vstack([gains, 0.3 * gains, 0.1 * gains, *(_ANY * np.ones(record.axes))])
     if could_have_run(_GIVEN, tried, record, law):
@@ -483,7 +479,7 @@ def _fit(
     for i, (y, c) in enumerate(series):
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
         gain = None if held is None else float(np.clip(held[i], GAINS["above"], GAINS["below"]))
-        search = Search(data=data, gain=gain, most_lines=_LINES)
+        search = Search(data=data, gain=gain)
         try:
             model = find_components(search, None, rounds=FEW_ROUNDS)
         except NumericalError:
@@ -553,7 +549,7 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
 
     The fit shows gains beyond the plausible ones where the coarse model leaves them open.
     """
-    accepted = not np.all(gains - _FIT_ERRORS * errors > PLAUSIBLE_GAINS[1])
+    accepted = not np.all(gains - SIGMAS * errors > PLAUSIBLE_GAINS[1])
     scale = np.ones(gains.size) if accepted else likely_factors(gains, PLAUSIBLE_GAINS)
     return CommandVerdict(
         explanation=AS_GIVEN if accepted else wrong_scale(scale, gains),

@@ -19,13 +19,11 @@ _SHORTEST_RUN = 5  # equal values, a stuck sensor
 _RARE = 1e-3  # runs of chance allowed in a record
 _MANY_RUNS = 100  # needed to compute a chance
 _SAME_LEVEL = 1e-9  # of the range
-_LEAST_AT_LIMIT = 4  # values at an end of the range
-_LIMIT_RATIO = 4  # over the next values inside
+_LIMIT_RATIO = 4  # of values at an end of the range over those at the next levels
 _LEVELS = 3
 _OUTLIER = 6.5  # standard deviations of the second difference: 1e-4 clean frames in a million
 MAD = 1.482602218505602  # standard deviation of a normal law over its median deviation
 _BLOCK = 256  # frames of a local scale
-_PASSES = 6
 
 
 def runs(flags: BoolArray) -> IntArray:
@@ -80,7 +78,7 @@ def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
     """
     out = np.zeros(len(series), dtype=np.bool_)
     values = series[good]
-    span = float(np.ptp(values)) if values.size > _LEAST_AT_LIMIT else 0.0
+    span = float(np.ptp(values)) if values.size else 0.0
     if span == 0:
         return out
     tolerance = _SAME_LEVEL * span
@@ -91,7 +89,7 @@ def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
             near, ends = _sort_levels(sign * values, tolerance)
         counts = np.diff(np.concatenate([[0], ends, [near.size]]))[: _LEVELS + 1]
         inside = int(np.max(counts[1:], initial=1))
-        if counts[0] >= max(_LEAST_AT_LIMIT, _LIMIT_RATIO * inside):
+        if counts[0] >= _LIMIT_RATIO * inside:
             out |= good & (sign * series >= end - tolerance)
     return out
 
@@ -113,7 +111,7 @@ def find_outliers(series: FloatArray, good: BoolArray) -> BoolArray:
     steps = np.abs(np.diff(series))[good[1:] & good[:-1]]
     rising = steps[steps > 0]
     smallest = float(rising.min()) / 2 if rising.size else 0.0
-    for _ in range(_PASSES):
+    while True:
         bend, valid = _second_difference(series, good)
         if not valid.any():
             break

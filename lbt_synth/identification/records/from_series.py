@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records import faults
 from lbt_synth.identification.records.clock import build_clock
 from lbt_synth.identification.records.columns import (
@@ -51,7 +52,6 @@ _UNITS = {
 _LARGEST_NM = 1e30  # a larger number is a filler
 _OPEN_FRAMES = 20  # of zero or equal commands
 TREND = 2.0  # ratio of scatters
-_LEAST_QUARTER = 64  # pairs of frames that show a trend
 
 Finders = tuple[tuple[str, Callable[[FloatArray, BoolArray], BoolArray]], ...]
 
@@ -551,7 +551,7 @@ def end_scatters(series: FloatArray, good: BoolArray) -> tuple[float, float]:
     """
     steps = np.diff(series)[good[1:] & good[:-1]]
     quarter = steps.size // 4
-    if quarter < _LEAST_QUARTER:
+    if quarter < SHORTEST_SEGMENT:
         return float("nan"), float("nan")
     first, last = (float(np.sqrt(np.mean(part**2))) for part in (steps[:quarter], steps[-quarter:]))
     return first, last

@@ -65,7 +65,6 @@ def test_rows_that_come_twice():
         ({"frame_numbers": [0, 1, 2, 0, 1, 2], "frame_rate_hz": 2}, "frame_numbers must not run b"),
         ({"frame_numbers": [0, 1, 2, 2.5, 3, 4], "frame_rate_hz": 2}, "must be whole numbers"),
         ({"frame_rate_hz": 0}, "frame_rate_hz must be above 0"),
-        ({"frame_rate_hz": 1e300}, "frame_rate_hz must be at most 1000000000"),
     ],
 )
 def test_clocks_that_are_refused(clock, words):
