@@ -390,12 +390,10 @@ def loop_record(
 
     Notes
     -----
-    A frame is spoilt where a measurement is missing, not finite, held (a run of equal values
-    longer than chance), at an end of the range that is reached repeatedly, or outlying: a second
-    difference of more than 6.5 standard deviations, by median deviations of the record and of
-    the frames around. A command that is missing, not finite or at a limit spoils the
-    frames whose correction it is part of. Commands that are zero or held, and a scatter that
-    changes by more than 2 between the first quarter and the last, are reported only.
+    A frame is spoilt where a measurement is missing, not finite, held, at an end of the range that
+    is reached repeatedly, or outlying. A command that is missing, not finite or at a limit spoils
+    the frames whose correction it is part of. Commands that are zero or held, and a scatter that
+    changes, are reported only. The page on records has the thresholds.
 
     Examples
     --------

@@ -200,15 +200,15 @@ class LoopRecord:
         They are ``y(k)/gain + c(k) = phi_tot(k-1) + w(k)/gain``, with one real gain of the sensor
         or one per axis. A closed loop has to have a known delay.
         """
-        return np.asarray(self.measurements / self._gains(sensor_gain) + self.corrections())
-
-    def _gains(self, sensor_gain: ArrayLike) -> FloatArray:
-        return one_or_each(sensor_gain, "sensor_gain", self.axes, above=0)
+        return np.asarray(self.measurements / self.known_gains(sensor_gain) + self.corrections())
 
     def known_gains(self, sensor_gain: ArrayLike) -> FloatArray:
         """Return the gain of each axis, (axes,), from one for all, alone or in a list, or each."""
-        given = np.atleast_1d(real_array(sensor_gain, "sensor_gain"))
-        return np.broadcast_to(self._gains(given[0] if given.size == 1 else given), (self.axes,))
+        gains = np.atleast_1d(real_array(sensor_gain, "sensor_gain"))
+        gains = one_or_each(
+            gains[0] if gains.size == 1 else gains, "sensor_gain", self.axes, above=0
+        )
+        return np.broadcast_to(gains, (self.axes,))
 
     def stretches(self) -> tuple[tuple[int, int], ...]:
         """Return (start, stop) of each stretch of contiguous usable frames."""
@@ -273,7 +273,7 @@ class LoopRecord:
         if not count:
             return self
         new = (usable & ~self.usable)[:, None]
-        back = self._gains(sensor_gain) * (series - self.corrections())
+        back = self.known_gains(sensor_gain) * (series - self.corrections())
         note = f"{count} frames in {len(chosen)} holes of at most {longest} were interpolated"
         if left := int(np.sum(lengths <= longest)) - len(chosen):
             note += f"; {left} more such holes were left, beyond {100 * part:g} %"

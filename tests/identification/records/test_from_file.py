@@ -338,7 +338,7 @@ FRAMES = 60
     ("text", "words"),
     [
         ("frequency_hz,error_hz\n20,0.1\n,0.2\n", "row 2 of the numbers has no frequency"),
-        ("frequency_hz,rms_nm\n20,300\n", "must be frequency_hz, and frequency_error_hz.*rms_nm"),
+        ("frequency_hz,rms_nm\n20,300\n", "must be frequency_hz, and error_hz.*rms_nm"),
         ("frequency_khz\n0.02\n", "must be frequency_hz"),
         ("f_hz,frequency_hz\n20,20\n", "must be frequency_hz"),
         ("error_hz\n20\n", "must be frequency_hz.*got error_hz"),
