@@ -68,6 +68,8 @@ class CoarseRecord:
         resonances: Sequence[Sequence[tuple[float, float]]] | None = None,
     ) -> None:
         self.record = record
+        open_loop = np.zeros(record.measurements.shape)
+        self.commands: FloatArray = open_loop if record.commands is None else record.commands
         self.resonances = [()] * record.axes if resonances is None else resonances
         most = MOST_SHIFT_FRAMES  # no shift leaves the stretch
         trimmed = [(a + most, b - most) for a, b in record.stretches()]
@@ -83,9 +85,7 @@ class CoarseRecord:
 
     def _unturned(self, repair: CommandRepair) -> FloatArray:
         """Return the corrections of repaired commands, but for the matrix, (frames, axes) [nm]."""
-        assert self.record.commands is not None
-        u = self.record.commands
-        u = np.cumsum(u, axis=0) if repair.increments else u
+        u = np.cumsum(self.commands, axis=0) if repair.increments else self.commands
         corrections = past_corrections(self.record.mirror_taps, u)
         return np.roll(corrections, repair.shift_frames, axis=0)
 
@@ -109,8 +109,8 @@ class CoarseRecord:
 
     def profile(self, repair: CommandRepair, gains: FloatArray) -> FloatArray:
         """Return the contrasts (axes, n) at gains (axes, n)."""
-        each = enumerate(zip(self.transform(repair), gains, strict=True))
-        return np.array([self._axis(i, c[None]).fit_profile(g)[0] for i, (c, g) in each])
+        pairs = enumerate(zip(self.transform(repair), gains, strict=True))
+        return np.array([self._axis(i, c[None]).fit_profile(g)[0] for i, (c, g) in pairs])
 
     def unrelated(self) -> FloatArray:
         """Return the contrast of each axis if commands do not reach the measurements, (axes,)."""

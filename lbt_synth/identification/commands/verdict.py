@@ -152,9 +152,12 @@ def explain_commands(
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
     known = None if sensor_gain is None else record.known_gains(sensor_gain)
-    law, moves = record_law(record), _moving_axes(record)
+    law, moves = record_law(record), _moving_axes(record.commands[record.usable])
     if moves.any() and not moves.all():
-        return _explain_moving(record, moves, law, known)
+        one = replace(
+            record, measurements=record.measurements[:, moves], commands=record.commands[:, moves]
+        )
+        return _explain_moving(one, moves, law, known)
     refuse = partial(CommandVerdict, accepted=False, gain=np.full(record.axes, np.nan), law=law)
     sure = law if law is not None and law.is_sure else None
     if sure is not None and (doubt := _doubt_law(sure)):
@@ -236,7 +239,8 @@ def _note_law(delay_frames: float, lag: int, hiding: str) -> tuple[str, ...]:
 
 def record_law(record: LoopRecord) -> ControlLaw | None:
     """Return the control law of a closed-loop record; None where the frames are too few."""
-    assert record.commands is not None
+    if record.commands is None:
+        return None
     measured = record.usable if record.measured is None else record.measured
     with suppress(ProblemError):
         return fit_control_law(
@@ -248,13 +252,9 @@ def record_law(record: LoopRecord) -> ControlLaw | None:
 def _explain_moving(
     record: LoopRecord, moves: BoolArray, law: ControlLaw | None, known: FloatArray | None
 ) -> CommandVerdict:
-    """Explain the commands of the axis that moves; the loop of the other one was open."""
-    assert record.commands is not None
-    one = replace(
-        record, measurements=record.measurements[:, moves], commands=record.commands[:, moves]
-    )
-    verdict = explain_commands(one, sensor_gain=None if known is None else known[moves].tolist())
-    gain = np.full(record.axes, np.nan)
+    """Explain the commands of the axis that moves, of a record of it; the other loop was open."""
+    verdict = explain_commands(record, sensor_gain=None if known is None else known[moves].tolist())
+    gain = np.full(moves.size, np.nan)
     gain[moves] = verdict.gain
     note = f"the commands of axis {int(np.argmin(moves))} stand still: its loop was open"
     return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
@@ -275,11 +275,10 @@ def _explain_by_law(
     return refuse(explanation=AS_GIVEN, accepted=True, notes=(note,))
 
 
-def _moving_axes(record: LoopRecord) -> BoolArray:
-    """Return the axes whose commands move, (axes,)."""
-    assert record.commands is not None
-    used: FloatArray = record.commands[record.usable]
-    return np.asarray(np.ptp(used, axis=0) > 0) if used.size else np.ones(record.axes, dtype=bool)
+def _moving_axes(commands: FloatArray) -> BoolArray:
+    """Return the axes whose commands (frames, axes) move, (axes,); all of no frames."""
+    moves = np.ptp(commands, axis=0) > 0 if commands.size else np.ones(commands.shape[1])
+    return np.asarray(moves, dtype=np.bool_)
 
 
 def _doubt_law(law: ControlLaw) -> str:
@@ -379,9 +378,9 @@ def _penalties(
     unusual = np.array([_is_unusual(repair, law, lag) for repair in repairs])
     impossible = np.zeros(len(repairs), dtype=np.bool_)
     if law is not None and law.is_sure:
-        tried = [np.vstack([gain, 0.3 * gain, _RAN * np.ones(record.axes)]) for gain in gains.T]
-        each = zip(repairs, tried, strict=True)
-        impossible = ~np.array([could_have_run(*one, record, law) for one in each])
+        for i, (repair, gain) in enumerate(zip(repairs, gains.T, strict=True)):
+            tried = np.vstack([gain, 0.3 * gain, _RAN * np.ones(record.axes)])
+            impossible[i] = not could_have_run(repair, tried, record, law)
         impossible &= not impossible.all()
     odd = unusual | impossible
     # a law with a lag is that of a late record, or of a slow computer
@@ -416,17 +415,14 @@ def could_have_run(
     """Return whether the recorded law would have been stable at any gains (n, axes)."""
     if repair.increments:
         return True  # another law computes the positions
-    assert record.delay_frames is not None
     controller = law_controller(law, record.frame_rate_hz)
-    path = LoopHardware(
-        frame_rate_hz=record.frame_rate_hz,
-        delay_frames=max(record.delay_frames + repair.shift_frames, 1.0),
-        modes=record.axes,
+    path = replace(
+        record.hardware,
+        delay_frames=max(record.hardware.delay_frames + repair.shift_frames, 1.0),
         influence_matrix=repair.turn(record.axes),
-        mirror=record.mirror,
     )
-    each = (replace(path, sensor_matrix=np.diag(gain)) for gain in gains)
-    return any(_moving_radius(loop, controller) < 1 for loop in each)
+    paths = (replace(path, sensor_matrix=np.diag(gain)) for gain in gains)
+    return any(_moving_radius(path, controller) < 1 for path in paths)
 
 
 def _moving_radius(path: LoopHardware, controller: Controller) -> float:
@@ -437,7 +433,7 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     """
     weaker = replace(path, sensor_matrix=0.8 * path.sensor)
     poles, others = (
-        np.linalg.eigvals(close_loop(each, controller).system.A) for each in (path, weaker)
+        np.linalg.eigvals(close_loop(loop, controller).system.A) for loop in (path, weaker)
     )
     moves = np.min(abs(poles[:, None] - others), axis=1) > _HIDDEN
     return float(np.max(abs(poles[moves]))) if moves.any() else np.inf
