@@ -50,7 +50,6 @@ from lbt_synth.storage.words import count_text
 from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_instance
 
 AS_GIVEN = "as given"
-_MORE_DIGITS = "Record more digits, cut the record, or give the sensor gain"
 _FIND = "find the commands that belong to these measurements"
 _GIVEN = CommandRepair()
 _ODD = 10.0  # nats by which what no law asks for must be likelier, by the model of the fit as well
@@ -174,41 +173,51 @@ def explain_commands(
     if known is not None:
         plausible = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
     choice = _choose(coarse, law, lag)
-    repair, scale = choice.repair, np.ones(record.axes)
+    scale = np.ones(record.axes)
     if not choice.unrelated.any():
         scale = _scale(coarse, law, choice, plausible)
-    lawless = law is None or law.kind == "none"
-    if choice.unrelated.all() or (lawless and np.max(abs(np.log(scale))) > np.log(_ABSURD)):
-        words = "they have nothing to do with the measurements, as if of another night"
-        return refuse(explanation=words, gain=np.zeros(record.axes))
-    if choice.unrelated.any():
-        axis = int(np.argmax(choice.unrelated))
-        words = f"those of axis {axis} have nothing to do with its measurements"
-        return refuse(explanation=words)
-    if repair == _GIVEN and (doubt := _doubt_running(record, law, choice.gain)):
+    if doubt := _doubt_choice(record, law, choice, scale):
         return refuse(explanation=doubt)
-    hiding = _unexplained(law)
-    if hiding and np.any(scale < 1):
-        return refuse(explanation=f"{hiding}, which hides the sensor gain. {_MORE_DIGITS}")
+    repair = choice.repair
     off = repair.shift_frames and repair.shift_frames + lag
     repair = replace(repair, shift_frames=early or (-lag if repair.shift_frames else 0))
-    words_of_repair = repair.words()
+    words = repair.words()
     if off:
-        words_of_repair.append(f"the total delay is {delay + off:g} frames, not {delay:g}")
+        words.append(f"the total delay is {delay + off:g} frames, not {delay:g}")
     if np.any(scale != 1):
-        words_of_repair.append(wrong_scale(scale, choice.gain))
+        words.append(wrong_scale(scale, choice.gain))
     shown = choice.gain / scale
     hidden = (shown <= plausible[0] / _WRONG_GAIN) | (shown >= plausible[1] * _WRONG_GAIN)
     return CommandVerdict(
-        explanation=" and ".join(words_of_repair) or AS_GIVEN,
-        accepted=not words_of_repair,
+        explanation=" and ".join(words) or AS_GIVEN,
+        accepted=not words,
         repair=replace(repair, scale=tuple(scale)),
         delay_frames=delay + off if off else None,
         nats=max(choice.nats, 0.0),
         gain=frozen_copy(np.where(hidden, np.nan, shown)),
         law=law if not early else sure,
-        notes=() if words_of_repair else _note_law(delay, lag, hiding),
+        notes=() if words else _note_law(delay, lag, _unexplained(law)),
     )
+
+
+def _doubt_choice(
+    record: LoopRecord, law: ControlLaw | None, choice: _Choice, scale: FloatArray
+) -> str:
+    """Return what the best repair and scale leave wrong, in words; empty if there is nothing."""
+    lawless = law is None or law.kind == "none"
+    if choice.unrelated.all() or (lawless and np.max(abs(np.log(scale))) > np.log(_ABSURD)):
+        return "they have nothing to do with the measurements, as if of another night"
+    if choice.unrelated.any():
+        axis = int(np.argmax(choice.unrelated))
+        return f"those of axis {axis} have nothing to do with its measurements"
+    if choice.repair == _GIVEN and (doubt := _doubt_running(record, law, choice.gain)):
+        return doubt
+    if np.any(scale < 1) and (hiding := _unexplained(law)):
+        return (
+            f"{hiding}, which hides the sensor gain. Record more digits, cut the record, or give "
+            "the sensor gain"
+        )
+    return ""
 
 
 def _unexplained(law: ControlLaw | None) -> str:
