@@ -61,6 +61,7 @@ _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units,
 _HIDES = 0.01  # part of their changes that commands leave unexplained, which moves a gain by 10 %
 _USUAL_GAIN = 0.7  # of a sensor, by whose distance units are told apart
 _COARSE = 1.5  # factor by which a coarse gain may be wrong
+_LINES = 10  # at most, of a fit that tells gains apart: more of them take minutes
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
 _RAN = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
 _ANY = np.geomspace(1.0, 1e-6, 19)[:, None]  # gains of a loop that may be of no sensor
@@ -484,7 +485,7 @@ def _fit(
     for i, (y, c) in enumerate(series):
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
         gain = None if held is None else float(np.clip(held[i], GAINS["above"], GAINS["below"]))
-        search = Search(data=data, gain=gain)
+        search = Search(data=data, gain=gain, most_lines=_LINES)
         try:
             model = find_components(search, None, rounds=FEW_ROUNDS)
         except NumericalError:
