@@ -244,8 +244,8 @@ class CoarseAxis:
         # side of its peak stands for one between them
         places = np.concatenate([lines - width, lines + width])
         narrow = [*resonances, *((f, _LINE_DAMPING) for f in places if f > 0)]
-        known = [resonance(square, np.sqrt(warp(np.array(f))), ratio) for f, ratio in narrow]
-        self.shapes = _shapes(square, frequency_hz[0], known)  # of at most 1, (k, b)
+        skirts = [resonance(square, np.sqrt(warp(np.array(f))), ratio) for f, ratio in narrow]
+        self.shapes = _shapes(square, frequency_hz[0], skirts)  # of at most 1, (k, b)
 
     def fit_profile(self, gains: FloatArray) -> CoarseFit:
         """Fit the spectrum with a single repair at each of its gains (n,)."""
@@ -253,9 +253,9 @@ class CoarseAxis:
 
     def fit_guesses(self, starts: FloatArray) -> CoarseFit:
         """Fit spectrum and gain of each repair, from each of its starting gains (repairs, s)."""
-        guesses, each = starts.shape
-        fits = self._minimise(starts.ravel(), np.repeat(np.arange(guesses), each), free=True)
-        best = np.argmin(fits[0].reshape(guesses, each), axis=1) + each * np.arange(guesses)
+        guesses, count = starts.shape
+        fits = self._minimise(starts.ravel(), np.repeat(np.arange(guesses), count), free=True)
+        best = np.argmin(fits[0].reshape(guesses, count), axis=1) + count * np.arange(guesses)
         contrast, gain, misfit = (values[best] for values in fits)
         return contrast, gain, misfit
 
@@ -267,10 +267,10 @@ class CoarseAxis:
         for _ in range(MOST_STEPS):
             gradient, information = self._derivatives(theta[rows], guess[rows], free=free)
             diagonal = np.einsum("rii->ri", information)
-            more = damping[rows, None] * diagonal
-            more += 1e-9 * np.max(diagonal, axis=1, keepdims=True)
-            more[:, 1:] += 1e-3
-            stiff = information + np.eye(theta.shape[1]) * more[:, :, None]
+            ridge = damping[rows, None] * diagonal
+            ridge += 1e-9 * np.max(diagonal, axis=1, keepdims=True)
+            ridge[:, 1:] += 1e-3
+            stiff = information + np.eye(theta.shape[1]) * ridge[:, :, None]
             step = -np.linalg.solve(stiff, gradient[:, :, None])[:, :, 0]
             trial = theta[rows] + step
             trial[:, 0] = np.maximum(trial[:, 0], 0.2 * theta[rows, 0])

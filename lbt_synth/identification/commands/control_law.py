@@ -332,8 +332,9 @@ class _Regression:
             target = target + self.factor[:, past] * self.scale[past] / self.scale[axis]
         table = self.factor[:, chosen]
         weights = np.linalg.lstsq(table, target, rcond=None)[0]
-        left = target - table @ weights
-        return weights * self.scale[axis] / self.scale[chosen], float(left @ left) / self.rows
+        unexplained = target - table @ weights
+        residual = float(unexplained @ unexplained) / self.rows
+        return weights * self.scale[axis] / self.scale[chosen], residual
 
     def residuals(self, shape: _Shape) -> list[float]:
         """Return the part of the increments' variance that a law leaves of each moving axis."""
@@ -375,12 +376,12 @@ class _Regression:
         past, taps, past_error, sum_error = self.no_coefficients(shape)
         for axis in self.moving:
             chosen = self.columns(axis, shape)
-            weights, left = self.solve(axis, chosen, order)
+            weights, unexplained = self.solve(axis, chosen, order)
             taps[axis] = weights[order:].reshape(len(lags), self.axes)
             inverse = np.linalg.pinv(self.factor[:, chosen])
             scale = self.scale[axis] / self.scale[chosen]
             spare = max(self.rows - len(chosen), 1)
-            half = scale[:, None] * inverse * np.sqrt(left * self.rows / spare)
+            half = scale[:, None] * inverse * np.sqrt(unexplained * self.rows / spare)
             sums = half[order:].reshape(len(lags), self.axes, -1).sum(axis=0)
             sum_error[axis] = np.linalg.norm(sums, axis=1)
             if order:
@@ -398,17 +399,17 @@ def _simplest_shape(regression: _Regression, lags: range) -> _Shape:
     """
     most = regression.most_residual(lags)
     tried = [
-        (order, more)
-        for order, more in product(range(SHORT_ORDER + 1), repeat=2)
-        if order - 1 <= more <= order
+        (order, taps)
+        for order, taps in product(range(SHORT_ORDER + 1), repeat=2)
+        if order - 1 <= taps <= order
     ]
     order = SHORT_ORDER
     while order < regression.order:
         order = min(2 * order, regression.order)
         tried.append((order, order))
-    for order, more in tried:
-        shapes = [(order, range(lag, lag + more + 1)) for lag in lags]
-        residuals = [regression.residual(each) for each in shapes]
+    for order, taps in tried:
+        shapes = [(order, range(lag, lag + taps + 1)) for lag in lags]
+        residuals = [regression.residual(candidate) for candidate in shapes]
         residual, shape = min(zip(residuals, shapes, strict=True), key=itemgetter(0))
         if residual <= most:
             break
@@ -464,8 +465,8 @@ def _describe(regression: _Regression, shape: _Shape | None) -> ControlLaw:
 
 def _poles(past: FloatArray) -> ComplexArray:
     """Return the poles of each axis, (axes, order), the one nearest 1 first."""
-    each = [np.roots(np.append(1.0, -row)).astype(np.complex128) for row in past]
-    padded = [np.append(row, np.zeros(past.shape[1] - row.size)) for row in each]
+    roots = [np.roots(np.append(1.0, -row)).astype(np.complex128) for row in past]
+    padded = [np.append(row, np.zeros(past.shape[1] - row.size)) for row in roots]
     return np.array([row[np.argsort(abs(row - 1), kind="stable")] for row in padded])
 
 

@@ -151,13 +151,13 @@ def explain_commands(
     delay = record.hardware.delay_frames  # refuses a record without one
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
-    known = None if sensor_gain is None else record.known_gains(sensor_gain)
+    gains = None if sensor_gain is None else record.known_gains(sensor_gain)
     law, moves = record_law(record), _moving_axes(record.commands[record.usable])
     if moves.any() and not moves.all():
         one = replace(
             record, measurements=record.measurements[:, moves], commands=record.commands[:, moves]
         )
-        return _explain_moving(one, moves, law, known)
+        return _explain_moving(one, moves, law, gains)
     refuse = partial(CommandVerdict, accepted=False, gain=np.full(record.axes, np.nan), law=law)
     sure = law if law is not None and law.is_sure else None
     if sure is not None and (doubt := _doubt_law(sure)):
@@ -171,8 +171,8 @@ def explain_commands(
     if not coarse.stretches:
         return _explain_by_law(refuse, record, law, early)
     plausible = PLAUSIBLE_GAINS
-    if known is not None:
-        plausible = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
+    if gains is not None:
+        plausible = float(np.min(gains)) / _WRONG_GAIN, float(np.max(gains)) * _WRONG_GAIN
     choice = _choose(coarse, law, lag)
     scale = np.ones(record.axes)
     if not choice.unrelated.any():
@@ -277,7 +277,8 @@ def _explain_by_law(
     repair = _GIVEN
     if law is not None and law.exact:
         repairs = list_repairs(record.axes, record.hardware.delay_frames)
-        repair = next((each for each in repairs if not _is_unusual(each, law, 0)), _GIVEN)
+        ordinary = [repair for repair in repairs if not _is_unusual(repair, law, 0)]
+        repair = ordinary[0] if ordinary else _GIVEN
     repair = replace(repair, shift_frames=early)
     if repair.options:
         return refuse(explanation=f"by their law {' and '.join(repair.words())}", repair=repair)
@@ -318,18 +319,18 @@ def list_repairs(
     still follow from the past of the measurements; it stands for another delay, too.
     """
     signs = list(product((1, -1), repeat=axes))
-    out = [axes_repair(bool(swapped), each) for swapped in range(axes) for each in signs]
-    near = range(-MOST_SHIFT_FRAMES, MOST_SHIFT_FRAMES + 1)
-    shifts = [k for k in near if k and k >= 1 - lag - delay_frames]
+    out = [axes_repair(bool(swapped), sign) for swapped in range(axes) for sign in signs]
+    short_shifts = range(-MOST_SHIFT_FRAMES, MOST_SHIFT_FRAMES + 1)
+    shifts = [k for k in short_shifts if k and k >= 1 - lag - delay_frames]
     shifts += [-lag] if lag > MOST_SHIFT_FRAMES else []
     out += [CommandRepair(shift_frames=k) for k in shifts]
     out.append(CommandRepair(increments=True))
     general = law is not None and law.is_sure and law.axes_kind == "general"
     if law is not None and general and np.linalg.cond(law.gain) < _WORST_CONDITION:
         # what undoes the gain of the law: a turn, and all of it
-        one, _, other = np.linalg.svd(law.gain)
+        U, _, Vh = np.linalg.svd(law.gain)
         inverse = np.linalg.inv(law.gain)
-        for undoing in ((one @ other).T, inverse / np.sqrt(abs(np.linalg.det(inverse)))):
+        for undoing in ((U @ Vh).T, inverse / np.sqrt(abs(np.linalg.det(inverse)))):
             out.append(CommandRepair(matrix=tuple(undoing.ravel().tolist())))
     return out
 
@@ -503,8 +504,8 @@ def _scale(
     one, inside = np.ones(choice.gain.size), np.geomspace(low, high, 8)
     if np.all((choice.gain >= low) & (choice.gain <= high)):
         return one
-    near = coarse.profile(choice.repair, np.tile(inside, (one.size, 1)))
-    if np.sum(np.min(near, axis=1)) - choice.contrast < choice.clear:
+    plausible_contrasts = coarse.profile(choice.repair, np.tile(inside, (one.size, 1)))
+    if np.sum(np.min(plausible_contrasts, axis=1)) - choice.contrast < choice.clear:
         return one
     # wide resonances that the coarse spectrum lacks move its gains: the fit decides, of commands
     # that are scaled by these
@@ -574,9 +575,9 @@ def wrong_scale(scale: FloatArray, gain: FloatArray) -> str:
     ]
     words = f"they are {sizes[0]}"
     if np.ptp(scale):
-        each = zip(sizes, scale, strict=True)
+        pairs = zip(sizes, scale, strict=True)
         words = " and ".join(
-            f"those of axis {i} are {size}" for i, (size, factor) in enumerate(each) if factor != 1
+            f"those of axis {i} are {size}" for i, (size, factor) in enumerate(pairs) if factor != 1
         )
     gains = ", ".join(f"{value:.3g}" for value in gain)
     return f"{words} (with them the sensor has a gain of {gains})"

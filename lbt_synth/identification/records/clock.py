@@ -202,7 +202,7 @@ def _lay_by_rate(times: FloatArray, rate: float) -> IntArray:
     for k in wide if step < 1 else ():
         frame = np.floor(place - (parts[k] + gaps[k] / 2))
         frame -= frame[0]
-        is_new = not any(np.array_equal(frame, each) for each in layouts)
+        is_new = not any(np.array_equal(frame, layout) for layout in layouts)
         if is_new and not np.any(np.diff(frame)[np.diff(times) > 0] <= 0):
             layouts.append(frame)
         if len(layouts) > 1:

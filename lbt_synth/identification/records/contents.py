@@ -146,8 +146,7 @@ def _read_fits(out: Contents, content: bytes) -> None:
             if isinstance(unit, fits.BinTableHDU | fits.TableHDU):
                 _add_table(out, unit)
             elif unit.is_image and unit.data is not None:
-                own = unit.header.get("BUNIT")
-                out.add_array(name, unit.data, None if own is None else str(own))
+                out.add_array(name, unit.data, str(unit.header.get("BUNIT", "")) or None)
 
 
 def _add_card(out: Contents, card: Any, where: str) -> None:
@@ -184,8 +183,8 @@ def _add_named(out: Contents, name: str, array: npt.NDArray[Any]) -> None:
     """Add an array, each field of a structured one, or a number or text as a fact."""
     fact = recognise_fact(name)
     if array.dtype.names:
-        for each in array.dtype.names:
-            out.add_array(each, array[each])
+        for field_name in array.dtype.names:
+            out.add_array(field_name, array[field_name])
     elif array.size == 1 and (array.ndim == 0 or array.dtype.kind in "US" or fact is not None):
         if fact is None:
             out.notes.append(f"not used: {name}, a single value")
@@ -239,8 +238,8 @@ def _add_table_of_text(
     with suppress(ValueError):  # the quick way, which knows no gaps
         numbers = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
         if numbers.shape == (len(rows), len(names)):
-            each = zip(columns, numbers.T, strict=True)
-            out.columns += [replace(column, values=values) for column, values in each]
+            pairs = zip(columns, numbers.T, strict=True)
+            out.columns += [replace(column, values=values) for column, values in pairs]
             return
     table = (
         [line.split() for line in lines] if sign is None else [*csv.reader(lines, delimiter=sign)]
@@ -303,13 +302,13 @@ def select_series(
     notes += [f"{why}; it was left out" for why in contents.left_out]
     if not there:
         raise ProblemError(f"the file holds no series of numbers{_left_out(contents)}.")
-    found = _assign_roles(there, columns) or _assign_by_kind(there, kind, notes)
-    kind = _find_kind(found, contents) if kind is None else kind
-    if kind == "open_loop" and "open_loop" not in found and "measurements" in found:
-        found["open_loop"] = own = found["measurements"]
+    roles = _assign_roles(there, columns) or _assign_by_kind(there, kind, notes)
+    kind = _find_kind(roles, contents) if kind is None else kind
+    if kind == "open_loop" and "open_loop" not in roles and "measurements" in roles:
+        roles["open_loop"] = own = roles["measurements"]
         if len({each.axis for each in own} - {None}) < len(own) and _are_two_axes(own):
-            found["open_loop"] = number_axes(own)
-    role = _series_role(found, kind)
+            roles["open_loop"] = number_axes(own)
+    role = _series_role(roles, kind)
     if role is None:
         needed = [role for role in (_SERIES[kind][0], _BESIDE.get(kind)) if role is not None]
         raise ProblemError(
@@ -318,22 +317,22 @@ def select_series(
         )
     clocks = () if kind == "spectrum" else CLOCKS
     chosen = {
-        each: _choose_axes(found[each], each, axes)
+        each: _choose_axes(roles[each], each, axes)
         for each in (role, _BESIDE.get(kind), *clocks)
-        if each in found
+        if each in roles
     }
     notes += [f"{each.replace('_', ' ')}: {join_names(own)}" for each, own in chosen.items()]
     used = {id(column.values) for own in chosen.values() for column in own}
-    if left := [column for column in there if id(column.values) not in used]:
-        notes.append(f"not used: {join_names(left)}")
-    if kind == "open_loop" and "commands" in found:
+    if unused := [column for column in there if id(column.values) not in used]:
+        notes.append(f"not used: {join_names(unused)}")
+    if kind == "open_loop" and "commands" in roles:
         notes.append("commands were left out: the record is of an open loop")
     return kind, chosen
 
 
 def number_axes(columns: Sequence[Column]) -> list[Column]:
     """Return columns numbered as axes, in their order."""
-    return [replace(each, axis=axis) for axis, each in enumerate(columns)]
+    return [replace(column, axis=axis) for axis, column in enumerate(columns)]
 
 
 def _series_role(found: Roles, kind: str) -> str | None:
@@ -371,10 +370,10 @@ def _find_columns(columns: Sequence[Column], wanted: Any) -> list[Column]:
     """Find the columns of a name, all of an array, or of a number."""
     if isinstance(wanted, str):
         name = wanted.strip().lower()
-        hits = [each for each in columns if each.name.strip().lower() == name]
+        hits = [column for column in columns if column.name.strip().lower() == name]
         if len(hits) > 1:
             raise ProblemError(f"{len(hits)} columns are named {wanted!r}; choose by numbers.")
-        hits = hits or [each for each in columns if each.name.lower().startswith(f"{name}[")]
+        hits = hits or [column for column in columns if column.name.lower().startswith(f"{name}[")]
         if not hits:
             raise ProblemError(f"there is no column {wanted!r}; got {join_names(columns)}.")
         return hits
@@ -396,7 +395,7 @@ def _assign_by_kind(columns: Sequence[Column], kind: str | None, notes: list[str
 
 def _are_two_axes(columns: Sequence[Column]) -> bool:
     """Return whether two columns are the series of two axes: none rises all the time as a clock."""
-    return len(columns) == 2 and not any(np.all(np.diff(each.values) > 0) for each in columns)
+    return len(columns) == 2 and not any(np.all(np.diff(column.values) > 0) for column in columns)
 
 
 def _find_kind(found: Roles, contents: Contents) -> str:
@@ -422,8 +421,8 @@ def _find_kind(found: Roles, contents: Contents) -> str:
 def _choose_axes(found: list[Column], role: str, axes: Sequence[int] | None) -> list[Column]:
     """Return the columns of the axes, in the order that their names tell."""
     of_axes = role in OF_AXES
-    known = {each.axis for each in found if each.axis is not None and of_axes}
-    if len(found) > 1 and len(known) < len(found):
+    named_axes = {column.axis for column in found if column.axis is not None and of_axes}
+    if len(found) > 1 and len(named_axes) < len(found):
         raise ProblemError(
             f"{join_names(found)} are all named as {role}"
             f"{', and not each of an axis of its own' if of_axes else ''}; choose by "
@@ -431,7 +430,7 @@ def _choose_axes(found: list[Column], role: str, axes: Sequence[int] | None) -> 
         )
     if not of_axes:
         return found
-    ordered = sorted(found, key=lambda each: each.axis or 0)
+    ordered = sorted(found, key=lambda column: column.axis or 0)
     return [ordered[i] for i in choose_axes(axes, "axes", len(found), f"columns of {role}")]
 
 
@@ -455,7 +454,7 @@ def choose_axes(given: Any, name: str, count: int, what: str) -> list[int]:
 
 def join_names(columns: Sequence[Column]) -> str:
     """Return the names of columns in one text."""
-    return ", ".join(each.name or "a column without a name" for each in columns)
+    return ", ".join(column.name or "a column without a name" for column in columns)
 
 
 def _left_out(contents: Contents) -> str:

@@ -84,10 +84,11 @@ def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
     tolerance = _SAME_LEVEL * span
     for sign in (1.0, -1.0):
         end = float(np.max(sign * values))
-        near, ends = _sort_levels(sign * values[sign * values > end - 0.25 * span], tolerance)
+        upper = sign * values[sign * values > end - 0.25 * span]
+        upper, ends = _sort_levels(upper, tolerance)
         if len(ends) <= _LEVELS:  # of coarse numbers there are few
-            near, ends = _sort_levels(sign * values, tolerance)
-        counts = np.diff(np.concatenate([[0], ends, [near.size]]))[: _LEVELS + 1]
+            upper, ends = _sort_levels(sign * values, tolerance)
+        counts = np.diff(np.concatenate([[0], ends, [upper.size]]))[: _LEVELS + 1]
         inside = int(np.max(counts[1:], initial=1))
         if counts[0] >= _LIMIT_RATIO * inside:
             out |= good & (sign * series >= end - tolerance)
@@ -96,8 +97,8 @@ def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
 
 def _sort_levels(values: FloatArray, tolerance: float) -> tuple[FloatArray, IntArray]:
     """Return the values from the largest down, and where each next level begins."""
-    near = np.sort(values)[::-1]
-    return near, np.flatnonzero(-np.diff(near) > tolerance) + 1
+    sorted_values = np.sort(values)[::-1]
+    return sorted_values, np.flatnonzero(-np.diff(sorted_values) > tolerance) + 1
 
 
 def find_outliers(series: FloatArray, good: BoolArray) -> BoolArray:
@@ -117,18 +118,18 @@ def find_outliers(series: FloatArray, good: BoolArray) -> BoolArray:
             break
         size = np.abs(bend)
         scale = np.maximum(_local_scale(size, valid), smallest)
-        found = valid & (size > _OUTLIER * scale) & (size >= 0.9 * _neighbours(size))
-        if not found.any():
+        outliers = valid & (size > _OUTLIER * scale) & (size >= 0.9 * _neighbours(size))
+        if not outliers.any():
             break
         # a frame at an edge has no second difference: it may be the one that bends its neighbour
-        found |= good & ~valid & (_neighbours(found) > 0)
-        out |= found
-        good &= ~found
+        outliers |= good & ~valid & (_neighbours(outliers) > 0)
+        out |= outliers
+        good &= ~outliers
     if out.any():  # frames between outliers that are too few to be judged
         beside = _neighbours(out) > 0
-        left = runs(good)
-        few = np.array([b - a < 3 and beside[a:b].any() for a, b in left], dtype=np.bool_)
-        out |= mark(left[few], len(series))
+        stretches = runs(good)
+        few = np.array([b - a < 3 and beside[a:b].any() for a, b in stretches], dtype=np.bool_)
+        out |= mark(stretches[few], len(series))
     return out
 
 
@@ -145,15 +146,15 @@ def _second_difference(series: FloatArray, good: BoolArray) -> tuple[FloatArray,
 def _local_scale(size: FloatArray, valid: BoolArray) -> FloatArray:
     """Return the scale of the second difference at each frame, at least that of the record."""
     frames = len(size)
-    whole = MAD * float(np.median(size[valid]))
+    global_scale = MAD * float(np.median(size[valid]))
     blocks = -(-frames // _BLOCK)
     padded = np.full(blocks * _BLOCK, np.nan)
     padded[:frames] = np.where(valid, size, np.nan)
     table = padded.reshape(blocks, _BLOCK)
     enough = np.sum(np.isfinite(table), axis=1) >= _BLOCK // 4
-    local = np.full(blocks, whole)
+    local = np.full(blocks, global_scale)
     if enough.any():
-        local[enough] = np.maximum(whole, MAD * np.nanmedian(table[enough], axis=1))
+        local[enough] = np.maximum(global_scale, MAD * np.nanmedian(table[enough], axis=1))
     return np.repeat(np.maximum(local, _neighbours(local)), _BLOCK)[:frames]
 
 
@@ -194,7 +195,7 @@ class RecordHealth:
     @property
     def clean(self) -> bool:
         """Whether nothing was found that spoils a frame."""
-        return not any(found.spoils for found in self.findings)
+        return not any(finding.spoils for finding in self.findings)
 
     def summary(self) -> str:
         """Return one line: how many frames are usable, and why the others are not."""

@@ -115,13 +115,13 @@ def _require_facts(
 ) -> None:
     """Refuse a loop of which several facts are missing, all of them in one message."""
     of_file = "".join(map(str, contents.facts.get("unit", {}).values()))
-    found = [
+    units_of_columns = [
         (column, column.unit or of_file or unit or "")
         for role, unit in units.items()
         for column in columns.get(role, ())
     ]
-    bare = [column for column, unit in found if not unit]
-    angles = facts["diameter_m"] is None and any(is_angle(unit) for _, unit in found)
+    bare = [column for column, unit in units_of_columns if not unit]
+    angles = facts["diameter_m"] is None and any(is_angle(unit) for _, unit in units_of_columns)
     no_rate = facts["frame_rate_hz"] is None and "times" not in columns
     no_delay = facts["delay_frames"] is None and "commands" in columns
     checks = (
@@ -138,17 +138,17 @@ def _require_facts(
 def _find_fact(contents: Contents, name: str, given: Any) -> Any:
     """Return what was given, or what the source has; refuse two values of a source."""
     places = contents.facts.get(name, {})
-    own = {where: number(value, f"{where} ({name})") for where, value in places.items()}
+    values = {where: number(value, f"{where} ({name})") for where, value in places.items()}
     if given is None:
-        if len(set(own.values())) > 1:
-            found = ", ".join(f"{value:.9g} by {where}" for where, value in own.items())
-            raise ProblemError(f"the file gives {name} twice: {found}. Choose one in the call.")
-        for where, value in own.items():
+        if len(set(values.values())) > 1:
+            listing = ", ".join(f"{value:.9g} by {where}" for where, value in values.items())
+            raise ProblemError(f"the file gives {name} twice: {listing}. Choose one in the call.")
+        for where, value in values.items():
             contents.notes.append(f"{name} {value:.9g}, by {where}")
             return int(value) if name == "averages" else value
         return None
     wanted = number(given, name)
-    for where, value in own.items():
+    for where, value in values.items():
         if abs(value - wanted) > 1e-6 * wanted:
             if name == "frame_rate_hz":
                 raise ProblemError(
@@ -191,13 +191,13 @@ def _find_unit(
 
 
 def _stack_columns(chosen: Sequence[Column]) -> FloatArray:
-    sizes = {len(each.values) for each in chosen}
+    sizes = {len(column.values) for column in chosen}
     if len(sizes) > 1:
         raise ProblemError(
-            f"{' and '.join(each.name for each in chosen)} must be equally long; got "
+            f"{' and '.join(column.name for column in chosen)} must be equally long; got "
             f"{' and '.join(map(str, sorted(sizes)))} rows."
         )
-    return np.column_stack([each.values for each in chosen])
+    return np.column_stack([column.values for column in chosen])
 
 
 def _build_spectrum(
@@ -248,20 +248,20 @@ def join_commands(contents: Contents, other: Contents, path: Path) -> None:
     Rows are matched by the counters of both files, or else by the times of both (within a
     quarter of a step). Without a common clock both files must have equally many rows.
     """
-    named = [each for each in other.columns if each.role == "commands"] or [
-        each for each in other.columns if each.role in (None, "measurements")
+    named = [column for column in other.columns if column.role == "commands"] or [
+        column for column in other.columns if column.role in (None, "measurements")
     ]
     if not named:
         raise TelemetryError(f"{path} holds no commands.", path=path)
     named = _match_commands(contents, other, named, path)
-    if len(named) > 1 and any(each.axis is None for each in named):
+    if len(named) > 1 and any(column.axis is None for column in named):
         named = number_axes(named)
-    own = [each for each in contents.columns if each.role != "commands"]
-    if not any(each.role in ("measurements", "open_loop") for each in own):
-        plain = number_axes([each for each in own if each.role is None])
-        own = [each for each in own if each.role is not None]
-        own += [replace(each, role="measurements") for each in plain]
-    contents.columns = own + [replace(each, role="commands") for each in named]
+    columns = [column for column in contents.columns if column.role != "commands"]
+    if not any(column.role in ("measurements", "open_loop") for column in columns):
+        plain = number_axes([column for column in columns if column.role is None])
+        columns = [column for column in columns if column.role is not None]
+        columns += [replace(column, role="measurements") for column in plain]
+    contents.columns = columns + [replace(column, role="commands") for column in named]
     for fact, places in other.facts.items():
         if fact != "unit":
             for where, value in places.items():
@@ -275,7 +275,7 @@ def _match_commands(
     contents: Contents, other: Contents, commands: list[Column], path: Path
 ) -> list[Column]:
     """Return the commands in the rows of the measurements, NaN where there are none."""
-    counts = [{len(column.values) for column in own} for own in (contents.columns, commands)]
+    counts = [{len(each.values) for each in columns} for columns in (contents.columns, commands)]
     for role in CLOCKS:
         clocks = [c for file in (contents, other) for c in file.columns if c.role == role]
         if len(clocks) != 2 or [{len(clock.values)} for clock in clocks] != counts:
@@ -316,9 +316,10 @@ def _match_rows(one: FloatArray, other: FloatArray, role: str, path: Path) -> In
             "measurements; got two rows alike.",
             path=path,
         )
-    near = _SAME_TIME * min(float(np.median(step)) for step in steps) if role == "times" else 0.0
+    within = _SAME_TIME if role == "times" else 0.0
+    tolerance = within * min(float(np.median(step)) for step in steps)
     at = np.searchsorted((other[1:] + other[:-1]) / 2, one, side="right")
-    at = np.where(np.abs(other[at] - one) <= near, at, -1)
+    at = np.where(np.abs(other[at] - one) <= tolerance, at, -1)
     if np.mean(at >= 0) < 0.5:
         raise TelemetryError(
             f"only {int(np.sum(at >= 0))} of {len(one)} measurements have a command in {path} by "
@@ -410,8 +411,8 @@ def loop_record(
     scale = nm_per(unit, diameter_m=diameter_m)
     y, u = _series_in_nm(measurements, "measurements", scale), None
     if commands is not None:
-        own = unit if command_unit is None else command_unit
-        scale = nm_per(own, diameter_m=diameter_m, name="command_unit")
+        unit_of_commands = unit if command_unit is None else command_unit
+        scale = nm_per(unit_of_commands, diameter_m=diameter_m, name="command_unit")
         u = _series_in_nm(commands, "commands", scale)
         if u.shape != y.shape:
             raise DimensionError(f"commands must match measurements {y.shape}; got {u.shape}.")
@@ -496,9 +497,9 @@ def _judge_series(
         good = there & np.isfinite(column)
         findings += findings_in(there & ~good, "not finite", name, axis)
         for kind, finder in finders:
-            found = finder(np.where(np.isfinite(column), column, 0.0), good)
-            findings += findings_in(found, kind, name, axis)
-            good &= ~found
+            faulty = finder(np.where(np.isfinite(column), column, 0.0), good)
+            findings += findings_in(faulty, kind, name, axis)
+            good &= ~faulty
         out[:, axis] = faults.fill(column, good)
         all_good &= good
     return out, all_good
@@ -551,5 +552,5 @@ def end_scatters(series: FloatArray, good: BoolArray) -> tuple[float, float]:
     quarter = steps.size // 4
     if quarter < SHORTEST_SEGMENT:
         return float("nan"), float("nan")
-    first, last = (float(np.sqrt(np.mean(part**2))) for part in (steps[:quarter], steps[-quarter:]))
-    return first, last
+    first, last = (np.sqrt(np.mean(ends**2)) for ends in (steps[:quarter], steps[-quarter:]))
+    return float(first), float(last)

@@ -97,14 +97,14 @@ def load_lines(lines: str | os.PathLike[str] | Sequence[Any] | FloatArray) -> tu
     [16.0, 45.5]
     """
     if isinstance(lines, str | os.PathLike):
-        found = _read_lines(Path(lines))
+        priors = _read_lines(Path(lines))
     elif isinstance(lines, list | tuple | np.ndarray):
-        found = [_line_prior(one, "list") for one in lines]
+        priors = [_line_prior(one, "list") for one in lines]
     else:
         raise ProblemError(
             f"lines must be a file or a list of frequencies; got {type(lines).__name__}."
         )
-    return tuple(sorted(found, key=lambda line: line.frequency_hz))
+    return tuple(sorted(priors, key=lambda line: line.frequency_hz))
 
 
 def _line_prior(one: Any, source: str) -> LinePrior:
@@ -261,8 +261,8 @@ def _whole_segments(series: FloatArray, good: BoolArray, length: int) -> FloatAr
     """Return the steps of the segments without a spoilt frame, one after another."""
     steps, fine = np.diff(series, axis=0), good[1:] & good[:-1]
     count = len(steps) // length
-    whole = np.repeat(fine[: count * length].reshape(count, length).all(axis=1), length)
-    return np.asarray(steps[: count * length][whole])
+    complete = np.repeat(fine[: count * length].reshape(count, length).all(axis=1), length)
+    return np.asarray(steps[: count * length][complete])
 
 
 def _find_lines(

@@ -225,7 +225,7 @@ class LoopRecord:
             frame_rate_hz=self.frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
         )
         measured = self.usable if self.measured is None else self.measured
-        findings = tuple(found for found in self.health.findings if found.kind != NOT_KNOWN)
+        findings = tuple(finding for finding in self.health.findings if finding.kind != NOT_KNOWN)
         usable = measured
         if self.commands is not None:
             spoilt = [False] * self.frames if self.commanded is None else ~self.commanded
@@ -257,14 +257,14 @@ class LoopRecord:
         first: those of at most ``most`` frames, up to ``most_fraction`` of the record.
         """
         longest = integer(most, "most", at_least=1)
-        part = number(most_fraction, "most_fraction", at_least=0, at_most=1)
+        fraction = number(most_fraction, "most_fraction", at_least=0, at_most=1)
         series, usable = self.pseudo_open_loop(sensor_gain), self.usable.copy()
         holes = runs(~self.usable)
         holes = holes[(holes[:, 0] > 0) & (holes[:, 1] < self.frames)]
         lengths = holes[:, 1] - holes[:, 0]
         order = np.argsort(lengths, kind="stable")
         chosen = order[
-            (lengths[order] <= longest) & (np.cumsum(lengths[order]) <= part * self.frames)
+            (lengths[order] <= longest) & (np.cumsum(lengths[order]) <= fraction * self.frames)
         ]
         for start, stop in holes[chosen]:
             series[start:stop] = _interpolate_hole(series, self.usable, int(start), int(stop))
@@ -275,8 +275,8 @@ class LoopRecord:
         new = (usable & ~self.usable)[:, None]
         back = self.known_gains(sensor_gain) * (series - self.corrections())
         note = f"{count} frames in {len(chosen)} holes of at most {longest} were interpolated"
-        if left := int(np.sum(lengths <= longest)) - len(chosen):
-            note += f"; {left} more such holes were left, beyond {100 * part:g} %"
+        if unbridged := int(np.sum(lengths <= longest)) - len(chosen):
+            note += f"; {unbridged} more such holes were left, beyond {100 * fraction:g} %"
         health = replace(
             self.health,
             usable=int(np.sum(usable)),
@@ -291,12 +291,12 @@ class LoopRecord:
 
 def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: int) -> FloatArray:
     """Interpolate a hole by the polynomial through two frames on either side, or one."""
-    known = np.array([start - 2, start - 1, stop, stop + 1])
-    if known[0] < 0 or known[-1] >= len(series) or not usable[known].all():
-        known = known[1:3]
-    powers = np.vander(known - start, increasing=True)
-    inside = np.vander(np.arange(stop - start), known.size, increasing=True)
-    return np.asarray(inside @ np.linalg.solve(powers, series[known]))
+    nodes = np.array([start - 2, start - 1, stop, stop + 1])
+    if nodes[0] < 0 or nodes[-1] >= len(series) or not usable[nodes].all():
+        nodes = nodes[1:3]
+    powers = np.vander(nodes - start, increasing=True)
+    inside = np.vander(np.arange(stop - start), nodes.size, increasing=True)
+    return np.asarray(inside @ np.linalg.solve(powers, series[nodes]))
 
 
 def require_length(
