@@ -356,10 +356,14 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
     penalty, asked = _penalties(repairs, gain, record, law, lag, spread)
     best = int(np.argmin(contrast + penalty))
     clear = CLEAR * float(spread[best])
-    if not asked[best] and (
-        contrast[0] - contrast[best] < clear
-        or _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] < _ODD
-    ):
+    nats = contrast[0] - contrast[best]
+    if asked[best]:
+        is_shown = penalty[0] >= _SURPRISING or nats >= clear / 2
+    else:
+        is_shown = (
+            nats >= clear and _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] >= _ODD
+        )
+    if not is_shown:
         best = 0
     saved = coarse.unrelated() - np.min(axis_contrast, axis=1)
     followed = np.zeros(record.axes) if law is None else law.axis_coherence
@@ -394,11 +398,14 @@ def _penalties(
             impossible[i] = not could_have_run(repair, tried, record, law)
         impossible &= not impossible.all()
     odd = unusual | impossible
-    # a law with a lag is that of a late record, or of a slow computer
-    slow = lag > 0 and bool(np.all(np.clip(gains[:, 0], *PLAUSIBLE_GAINS) == gains[:, 0]))
-    asked = ~odd & (odd[0] and not slow)
+    asked = ~odd & odd[0]
+    refuted = np.array(odd if asked.any() else impossible)
+    # a slow computer has a lag, and a matrix may couple axes on purpose: the sensor tells
+    is_plausible = np.all(np.clip(gains[:, 0], *PLAUSIBLE_GAINS) == gains[:, 0])
+    if is_plausible and law is not None and law.order > 0:
+        refuted[0] = False
     surprise = np.inf if law is not None and law.exact else _SURPRISING * spread
-    cost_of_odd = np.where(odd if asked.any() else impossible, surprise, _ODD * unusual)
+    cost_of_odd = np.where(refuted, surprise, _ODD * odd)
     fraction = (record.hardware.delay_frames % 1 > 0) & (np.arange(len(repairs)) > 0)
     nameless = fraction | [bool(repair.matrix) for repair in repairs]
     return np.asarray(cost_of_odd + _ODD * nameless), asked

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.control_laws import TRUTH, ordinary_loop
+from support.control_laws import TRUTH, SteppedLaw, ordinary_loop, run_law
 from support.hidden_gains import hidden_gain_loop
 from support.recorded_loops import LINE, RATE, crowded_record, resonant_record, spliced_record
 from support.wrong_commands import FAULTS, record, wrong_record
@@ -146,6 +146,11 @@ def test_a_slow_computer_is_not_a_late_record() -> None:
     assert verdict.accepted
     assert verdict.law.lag_frames == 1
     assert "the total delay of a new design is 3 frames" in verdict.notes[0]
+
+
+def test_a_law_may_couple_the_axes_on_purpose() -> None:
+    y, u = run_law(SteppedLaw([[0.4, 0.1], [-0.1, 0.3]]), frames=10_000)
+    assert explain_commands(record(y, u)).accepted
 
 
 @pytest.mark.parametrize("sign_only", [False, True])
