@@ -150,7 +150,7 @@ def design_from_record(
     Raises
     ------
     ProblemError
-        If less than 8 s of the record, or 4096 frames, are usable, its delay is missing, or a
+        If less than 4 s of the record, or 1024 frames, are usable, its delay is missing, or a
         value is out of range.
     RecordError
         If the commands do not reach the measurements as the record says.

@@ -135,14 +135,14 @@ def test_auto_refuses_what_it_cannot_do(tmp_path, capsys, recorded_night):
 
 
 def test_a_short_record_is_refused_in_the_words_of_the_command_line(tmp_path, capsys) -> None:
-    record, file = spliced_record(frames=5000), tmp_path / "brief.npz"
+    record, file = spliced_record(frames=3000), tmp_path / "brief.npz"
     np.savez(file, measurements=record.measurements, commands=record.commands)
     known = ("--frame-rate-hz", 1000, "--unit", "nm", "--no-figure", "-o", tmp_path / "q.fits")
     for options, message in (
         (
             ("--delay-frames", 2),
-            "the record needs 8000 usable frames (8 s at 1000 Hz) in stretches of at least 256; "
-            "got 4996 (5 s), the longest stretch 4996.",
+            "the record needs 4000 usable frames (4 s at 1000 Hz) in stretches of at least 256; "
+            "got 2996 (3 s), the longest stretch 2996.",
         ),
         (("--delay-frames", 0.2), "--delay-frames must be"),
         ((), "not known; give --delay-frames, from the middle"),

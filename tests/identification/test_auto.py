@@ -62,7 +62,7 @@ def test_a_design_needs_a_delay_and_data():
         noise[:900], frame_rate_hz=RATE, delay_frames=2, unit="nm"
     )
     with pytest.raises(
-        lbt.errors.ProblemError, match=r"needs 8000 usable frames \(8 s at 1000 Hz\).*got 900 \(0.9"
+        lbt.errors.ProblemError, match=r"needs 4000 usable frames \(4 s at 1000 Hz\).*got 900 \(0.9"
     ):
         lbt.design_from_record(short)
     with pytest.raises(lbt.errors.ProblemError, match="method"):

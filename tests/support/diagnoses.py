@@ -34,7 +34,7 @@ def given_design():
     )
 
 
-def short_record(change=1.0, *, frames=3000, axes=1):
+def short_record(change=1.0, *, frames=1000, axes=1):
     """A record that is too short for a model, with its commands changed."""
     record = line_record()
     y, u = (np.hstack([x[:frames]] * axes) for x in (record.measurements, record.commands))

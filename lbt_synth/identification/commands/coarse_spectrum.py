@@ -30,25 +30,25 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
-_MARGIN = 5  # frames of a stretch, on either side, that no shift leaves
+MOST_SHIFT_FRAMES = 3  # by which commands are tried earlier and later
 _NATURAL_GAINS = np.array([0.08, 0.28, 0.8])  # starts, of the gain that makes powers equal
-_STEADY = 1e-24  # of the measured power
 _ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
-SEGMENT_S = 6.0
+SEGMENT_S = 6.0  # resolves lines 0.3 Hz apart, and leaves several segments of half a minute
 CLEAR = 20.0  # nats that decide
 _SHORTEST_SEGMENT = 2 * SHORTEST_SEGMENT  # frames, where the record has them
-_MOST_SEGMENTS = 24
-_BAND, _WIDEST_BAND = 0.06, 0.02  # of its frequency, and of the frame rate
-_SLOWEST_HZ, _FASTEST_HZ = 0.15, 6.0  # corners of the turbulence
+_MOST_SEGMENTS = 24  # more make the answer slower and not another one
+_BAND = 0.06  # of its frequency: width of a band, in which turbulence is a straight line
+_FASTEST_HZ = 6.0  # corner of the turbulence of an 8 m telescope
 _CORNERS, _ORDERS = 5, (1, 2, 3)  # slopes of -2, -4, -6
 _BUMPS_HZ, _BUMPS, _BUMP_DAMPING = (1.5, 25.0), 8, 0.18
-_LINE_DAMPING = 0.004
-_SMALLEST = 1e-9  # of the measured power
-_FIRST_PASSES, _SETTLED = 20, 0.01
+_LINE_DAMPING = 0.004  # of the skirts of a line, which do not show it
+_SMALLEST = 1e-9  # of the measured power: what a noise-free record leaves of rounding
+_FIRST_PASSES = 20  # multiplicative updates of the amplitudes before the scoring
+_SETTLED = 0.003  # nats that a step still gains
 _LARGEST = 2.0  # step of the logarithm of an amplitude
-_PEAK, _SKIRT = 3.0, 1.25  # over the surroundings
-_REACH, _MOST_PEAKS = 40, 16  # frequencies on either side of a peak, peaks
-_APART = 4  # frequencies between peaks
+_PEAK, _SKIRT = 3.0, 1.25  # factors of a peak, and of its skirt, over the surroundings
+_REACH = 40  # frequencies on either side of a peak, which are its surroundings
+_MOST_PEAKS = 16  # each adds two shapes to the fit
 
 # minus the logarithm of the likelihood of each repair, its best gain, and its misfit: the mean
 # deviance of a band, about 1 if the shapes suffice
@@ -68,8 +68,11 @@ class CoarseRecord:
         resonances: Sequence[Sequence[tuple[float, float]]] | None = None,
     ) -> None:
         self.record = record
+        open_loop = np.zeros(record.measurements.shape)
+        self.commands: FloatArray = open_loop if record.commands is None else record.commands
         self.resonances = [()] * record.axes if resonances is None else resonances
-        trimmed = [(a + _MARGIN, b - _MARGIN) for a, b in record.stretches()]
+        most = MOST_SHIFT_FRAMES  # no shift leaves the stretch
+        trimmed = [(a + most, b - most) for a, b in record.stretches()]
         self.stretches = [(a, b) for a, b in trimmed if b - a >= _SHORTEST_SEGMENT]
         self._known: dict[tuple[bool, int], ComplexArray] = {}
         if self.stretches:
@@ -82,9 +85,7 @@ class CoarseRecord:
 
     def _unturned(self, repair: CommandRepair) -> FloatArray:
         """Return the corrections of repaired commands, but for the matrix, (frames, axes) [nm]."""
-        assert self.record.commands is not None
-        u = self.record.commands
-        u = np.cumsum(u, axis=0) if repair.increments else u
+        u = np.cumsum(self.commands, axis=0) if repair.increments else self.commands
         corrections = past_corrections(self.record.mirror_taps, u)
         return np.roll(corrections, repair.shift_frames, axis=0)
 
@@ -108,8 +109,8 @@ class CoarseRecord:
 
     def profile(self, repair: CommandRepair, gains: FloatArray) -> FloatArray:
         """Return the contrasts (axes, n) at gains (axes, n)."""
-        each = enumerate(zip(self.transform(repair), gains, strict=True))
-        return np.array([self._axis(i, c[None]).fit_profile(g)[0] for i, (c, g) in each])
+        pairs = enumerate(zip(self.transform(repair), gains, strict=True))
+        return np.array([self._axis(i, c[None]).fit_profile(g)[0] for i, (c, g) in pairs])
 
     def unrelated(self) -> FloatArray:
         """Return the contrast of each axis if commands do not reach the measurements, (axes,)."""
@@ -131,8 +132,8 @@ class CoarseRecord:
         high = self.frequency_hz > 0.05 * self.record.frame_rate_hz
         level = np.mean(abs(self.measured[i][:, high]) ** 2)
         steps = np.mean(abs(corrections[..., high]) ** 2, axis=(1, 2))
-        least = max(_STEADY * level, np.finfo(float).tiny)  # clipped commands may hardly move
-        natural = np.sqrt(level / np.maximum(steps, least))
+        rounding = np.finfo(float).eps ** 2 * level  # clipped commands may hardly move
+        natural = np.sqrt(level / np.maximum(steps, max(rounding, np.finfo(float).tiny)))
         return self._axis(i, corrections).fit_guesses(natural[:, None] * _NATURAL_GAINS)
 
 
@@ -157,29 +158,24 @@ def find_spectral_peaks(
     frequency_hz: FloatArray, power: FloatArray
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Return the frequencies at peaks (f,), where the peaks are and their widths [Hz], (l,)."""
-    from scipy.ndimage import median_filter
-    from scipy.signal import find_peaks
+    from scipy.ndimage import binary_dilation, label, maximum, median_filter
 
     log = np.log(np.convolve(np.pad(power, 1, mode="edge"), np.full(3, 1 / 3), mode="valid"))
     above = log - median_filter(log, size=2 * _REACH + 1, mode="nearest")
-    tops, _ = find_peaks(above, height=float(np.log(_PEAK)), distance=_APART)
-    is_peak = np.zeros(power.size, dtype=np.bool_)
-    for top in tops[np.argsort(-above[tops], kind="stable")][:_MOST_PEAKS]:
-        low, high = max(top - _REACH, 0), min(top + _REACH + 1, power.size)
-        ends = np.flatnonzero(above[low:high] <= np.log(_SKIRT)) + low
-        start = np.max(ends[ends < top], initial=low)
-        stop = np.min(ends[ends > top], initial=high - 1)
-        is_peak[max(start - 1, 0) : stop + 2] = True
+    region, count = label(above > np.log(_SKIRT))
+    height = np.array(maximum(above, region, np.arange(1, count + 1)), dtype=np.float64)
+    strongest = np.argsort(-height, kind="stable")[:_MOST_PEAKS]
+    peaks = 1 + strongest[height[strongest] > np.log(_PEAK)]
+    is_peak = np.asarray(binary_dilation(np.isin(region, peaks), iterations=2))
     edges = np.flatnonzero(np.diff(np.r_[False, is_peak, False].astype(int))).reshape(-1, 2)
     tops = np.array([a + np.argmax(power[a:b]) for a, b in edges], dtype=np.intp)
     width = np.maximum(2.0, 0.3 * (edges[:, 1] - edges[:, 0]))
     return is_peak, frequency_hz[tops], width * (frequency_hz[1] - frequency_hz[0])
 
 
-def _bands(frequency_hz: FloatArray, frame_rate_hz: float, step: float) -> IntArray:
+def _bands(frequency_hz: FloatArray, step: float) -> IntArray:
     """Return where bands of at least one step begin among the frequencies."""
-    width = np.minimum(_BAND * frequency_hz, _WIDEST_BAND * frame_rate_hz)
-    band = np.floor(np.cumsum(step / np.maximum(width, step)) - 1e-9)
+    band = np.floor(np.cumsum(step / np.maximum(_BAND * frequency_hz, step)) - 1e-9)
     return np.flatnonzero(np.diff(band, prepend=-np.inf) > 0)
 
 
@@ -189,7 +185,7 @@ def _shapes(square: FloatArray, lowest_hz: float, known: Sequence[FloatArray]) -
     Nothing but noise and the skirts of slower parts has a place at high frequencies: there the
     corrections of a wrong guess show.
     """
-    corners = np.geomspace(max(lowest_hz / 2, _SLOWEST_HZ), _FASTEST_HZ, _CORNERS)
+    corners = np.geomspace(lowest_hz, _FASTEST_HZ, _CORNERS)
     falls = [(1 + square / corner**2) ** -order for corner in corners for order in _ORDERS]
     bumps = [
         resonance(square, centre, _BUMP_DAMPING) for centre in np.geomspace(*_BUMPS_HZ, _BUMPS)
@@ -237,7 +233,7 @@ class CoarseAxis:
             resolution_hz=step,
         )
         bands, self.peaks = every.take(~is_peak), every.take(is_peak)
-        self.bands = bands.merge(_bands(bands.frequency_hz, frame_rate_hz, step))
+        self.bands = bands.merge(_bands(bands.frequency_hz, step))
 
         def warp(f: FloatArray) -> FloatArray:
             return half_angle_square(f, frame_rate_hz) * (frame_rate_hz / (2 * np.pi)) ** 2
@@ -248,12 +244,8 @@ class CoarseAxis:
         # side of its peak stands for one between them
         places = np.concatenate([lines - width, lines + width])
         narrow = [*resonances, *((f, _LINE_DAMPING) for f in places if f > 0)]
-        known = [resonance(square, np.sqrt(warp(np.array(f))), ratio) for f, ratio in narrow]
-        self.shapes = _shapes(square, frequency_hz[0], known)  # of at most 1, (k, b)
-        upper = np.triu_indices(len(self.shapes))
-        self.pairs = (self.shapes[upper[0]] * self.shapes[upper[1]]).T
-        self.pair = np.zeros((len(self.shapes), len(self.shapes)), dtype=np.intp)  # their places
-        self.pair[upper] = self.pair.T[upper] = np.arange(upper[0].size)
+        skirts = [resonance(square, np.sqrt(warp(np.array(f))), ratio) for f, ratio in narrow]
+        self.shapes = _shapes(square, frequency_hz[0], skirts)  # of at most 1, (k, b)
 
     def fit_profile(self, gains: FloatArray) -> CoarseFit:
         """Fit the spectrum with a single repair at each of its gains (n,)."""
@@ -261,9 +253,9 @@ class CoarseAxis:
 
     def fit_guesses(self, starts: FloatArray) -> CoarseFit:
         """Fit spectrum and gain of each repair, from each of its starting gains (repairs, s)."""
-        guesses, each = starts.shape
-        fits = self._minimise(starts.ravel(), np.repeat(np.arange(guesses), each), free=True)
-        best = np.argmin(fits[0].reshape(guesses, each), axis=1) + each * np.arange(guesses)
+        guesses, count = starts.shape
+        fits = self._minimise(starts.ravel(), np.repeat(np.arange(guesses), count), free=True)
+        best = np.argmin(fits[0].reshape(guesses, count), axis=1) + count * np.arange(guesses)
         contrast, gain, misfit = (values[best] for values in fits)
         return contrast, gain, misfit
 
@@ -275,10 +267,10 @@ class CoarseAxis:
         for _ in range(MOST_STEPS):
             gradient, information = self._derivatives(theta[rows], guess[rows], free=free)
             diagonal = np.einsum("rii->ri", information)
-            more = damping[rows, None] * diagonal
-            more += 1e-9 * np.max(diagonal, axis=1, keepdims=True)
-            more[:, 1:] += 1e-3
-            stiff = information + np.eye(theta.shape[1]) * more[:, :, None]
+            ridge = damping[rows, None] * diagonal
+            ridge += 1e-9 * np.max(diagonal, axis=1, keepdims=True)
+            ridge[:, 1:] += 1e-3
+            stiff = information + np.eye(theta.shape[1]) * ridge[:, :, None]
             step = -np.linalg.solve(stiff, gradient[:, :, None])[:, :, 0]
             trial = theta[rows] + step
             trial[:, 0] = np.maximum(trial[:, 0], 0.2 * theta[rows, 0])
@@ -322,10 +314,7 @@ class CoarseAxis:
     def _derivatives(
         self, theta: FloatArray, guess: IntArray, *, free: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Return gradients (rows, p) and information (rows, p, p) of the contrast.
-
-        The information of the shapes is a product of two matrices.
-        """
+        """Return gradients (rows, p) and information (rows, p, p) of the contrast."""
         gain, a = theta[:, 0], np.exp(theta[:, 1:])
         model = a @ self.shapes
         bands, peaks = self.bands.row(guess), self.peaks.row(guess)
@@ -339,7 +328,7 @@ class CoarseAxis:
         information[:, 0, 0] = (bands.corrected / model) @ (2 * count)
         information[:, 0, 0] += at_peaks**2 @ peaks.count
         information[:, 0, 1:] = -a * ((count * by_gain / model) @ self.shapes.T)
-        pairs = ((count / model**2) @ self.pairs)[:, self.pair]
+        pairs = (self.shapes * (count / model**2)[:, None]) @ self.shapes.T
         information[:, 1:, 1:] = a[:, :, None] * pairs * a[:, None]
         if not free:
             gradient[:, 0] = information[:, 0, 1:] = 0.0

@@ -10,9 +10,10 @@ laws apart is in their increments.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
-from typing import Any, Literal, TypeAlias
+from operator import itemgetter
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,39 +43,26 @@ LawKind: TypeAlias = Literal[
 ]
 AxisKind: TypeAlias = Literal["diagonal", "swapped", "general", "zero"]
 _LAGS = range(-4, 5)  # frames by which the first measurement may be late
-_LEAST_ROWS = 400
-_EXACT = 1e-6  # part of the increments' variance, below which a law is exact
-_SURE = 0.05  # most that a law leaves unexplained whose lag counts
-FOLLOWED = 0.5  # coherence of an axis whose law counts
-_SHORT_ORDER, _LONG_ORDER = 3, 32
-_SHORT_ROWS, _LONG_ROWS = 60_000, 16_000
-_ROWS_PER_VALUE = 8
-_LEAST_COHERENCE = 0.1
-_PASSES = 3
-_ADDS_UP = 0.2  # distance from 1 of the pole of a law that adds up
-_NEAR_ONE = 0.1  # distance of both poles of a double integrator
-_LEAKY = 0.5  # least pole of a leaky one
-_PURE = 1e-6
-_ROUNDING = 1e-12
-_AS_GOOD = 0.9
-_NEARLY = 2.0  # times the residual of a law that knows the future, which one that does not may have
-_SIGMAS = 4.0  # standard errors within which a weight is zero
-_TOLERANCE = 0.05  # of the largest element
-_CUTOFF = 1e-11  # of the largest singular value
-_BLOCK = 2048  # rows of a triangular factor
-_ALIKE = 3.0  # over the residual of the richest law, within which a simple one explains as much
-_FLOOR = 1e-10  # part of the increments' variance that rounding may leave
-_SAME = 1.05  # times the residual, within which a tap is idle
-_SPARE = 0.2  # of what the richest law explains, that a simple one may leave
-_JUMP = 30.0  # median deviations
-_MOST_JUMPS = 0.02  # of the frames
-_ODD = 8.0  # deviations of a frame that follows another law
-_ODD_FLOOR = 1e-3  # of the increments
-_MOST_ODD = 0.1  # of the frames
+_ROWS_PER_VALUE = 16  # of each coefficient: a law from fewer frames explains its own noise
+_EXACT = 1e-6  # part of the increments' variance that single precision leaves of an exact law
+_SURE = 0.05  # part that rounded or filtered measurements leave of a law whose lag counts
+FOLLOWED = 0.1  # least coherence of an axis that follows its measurements; other nights have 0.02
+SHORT_ORDER, _LONG_ORDER = 3, 32  # past commands: integrators, and filters of turbulence and lines
+_MOST_ROWS = 16_000  # frames of a regression: more move no law, and take seconds
+_ADDS_UP = 0.2  # distance from 1 of the pole of an integrator, a leaky one included
+SIGMAS = 4.0  # standard errors within which two numbers are the same
+_TOLERANCE = 0.05  # of the largest element or the residual, which counts as nothing
+_ALIKE = 3.0  # times the residual of a law, within which a simpler one explains as much
+_SPARE = 0.2  # of what the richest law explains, which a simple one may leave unexplained
+_ODD = 8.0  # deviations from the law of a frame that follows another one
+_MOST_ODD = 0.1  # of the frames: more of them are a law of their own
 
 # measurements and commands (frames, axes), and the frames (frames,) that are measured, that are
 # commanded, and whose command is a result of the law
 _Series: TypeAlias = tuple[FloatArray, FloatArray, BoolArray, BoolArray, BoolArray]
+# weights of past commands (axes, order) and measurements (axes, lags, axes), and the errors of the
+# first of these, (axes,), and of the sums of the others over their lags, (axes, axes)
+_Coefficients: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 _Shape: TypeAlias = tuple[int, range]  # order of a law, and the lags of its measurements
 
 
@@ -104,7 +92,6 @@ class ControlLaw:
     residual: float  # unexplained part of the variance of the increments of u
     # (axes,); part that past commands leave and measurements explain: 1 of a deterministic law
     axis_coherence: FloatArray
-    odd_frames: int = 0  # frames left out because they do not follow the law of the others
 
     @property
     def order(self) -> int:
@@ -133,12 +120,6 @@ class ControlLaw:
     def is_sure(self) -> bool:
         """Whether it explains so much that its lag counts."""
         return self.kind != "none" and self.residual < _SURE
-
-    @property
-    def is_ordinary(self) -> bool:
-        """Whether it is sure, without a lag, and each axis follows its own measurements."""
-        own = self.axes_kind == "diagonal" and min(self.signs) > 0
-        return self.is_sure and self.lag_frames == 0 and own
 
     @property
     def adds_up(self) -> bool:
@@ -229,36 +210,30 @@ def fit_control_law(
     free = moved.copy()
     for column in u.T:
         free &= ~find_saturated(column, free)
-    series = y, u, good, free, ~_jumps(u)
-    for _ in range(_PASSES):
-        law = _search(series)
+    series = y, u, good, free, np.ones(len(y), dtype=np.bool_)
+    law = _search(series)
+    for _ in range(2):  # jumps hide the other frames that do not follow the law
         odd = _odd_frames(series, law)
-        if not odd.any() or law.kind == "none":
-            break
-        series = *series[:4], series[4] & ~odd
-    return replace(law, odd_frames=int(np.sum(~series[4])))
-
-
-def _jumps(u: FloatArray) -> BoolArray:
-    """Return the frames whose commands jump, as at a reset, if they are few, (frames,)."""
-    size = np.abs(np.diff(u, axis=0, prepend=u[:1]))
-    jumps = np.any(size > _JUMP * np.median(size, axis=0) + 1e-300, axis=1)
-    return jumps if np.mean(jumps) < _MOST_JUMPS else np.zeros(len(u), dtype=np.bool_)
+        if odd.any():
+            series = *series[:4], series[4] & ~odd
+            law = _search(series)
+    return law
 
 
 def _odd_frames(series: _Series, law: ControlLaw) -> BoolArray:
-    """Return the frames that are far from a law, if they are few, (frames,)."""
+    """Return the frames that are far from a law, or jump where there is none, if they are few."""
     y, u, *_ = series
     lags = range(law.lag_frames, law.lag_frames + law.taps.shape[1])
     rows = _rows(series, law.order, lags)
-    left = u[rows].copy()
-    for j in range(law.order):
-        left -= law.past[:, j] * u[rows - 1 - j]
+    past = np.ones((u.shape[1], 1)) if law.kind == "none" else law.past
+    rest = u[rows].copy()
+    for j in range(past.shape[1]):
+        rest -= past[:, j] * u[rows - 1 - j]
     for index, lag in enumerate(lags):
-        left -= y[rows - lag] @ law.taps[:, index].T
-    left = np.abs(left - np.median(left, axis=0))
-    floor = _ODD_FLOOR * np.std(u[rows] - u[rows - 1], axis=0)
-    beyond = np.any(left > np.maximum(_ODD * MAD * np.median(left, axis=0), floor), axis=1)
+        rest -= y[rows - lag] @ law.taps[:, index].T
+    rest = np.abs(rest - np.median(rest, axis=0))
+    floor = np.sqrt(_EXACT) * np.median(np.abs(u[rows] - u[rows - 1]), axis=0)
+    beyond = np.any(rest > np.maximum(_ODD * MAD * np.median(rest, axis=0), floor), axis=1)
     odd = np.zeros(len(u), dtype=np.bool_)
     if np.mean(beyond) < _MOST_ODD:
         odd[rows[beyond]] = True
@@ -281,42 +256,39 @@ def _rows(series: _Series, order: int, lags: range) -> IntArray:
 
 def _search(series: _Series) -> ControlLaw:
     """Return the shortest law that explains as much as a long one."""
-    regression = _regression(series, _SHORT_ORDER, _SHORT_ROWS)
-    if not regression.moving:
-        return _describe(regression, None)
-    shape = _simplest_shape(regression, only_short=True)
-    if shape is None or regression.residual(shape) > _EXACT:
-        regression = _regression(series, _LONG_ORDER, _LONG_ROWS)
-        if shape is None or regression.residual(shape) > regression.most_residual():
-            shape = _simplest_shape(regression)
+    for order in (SHORT_ORDER, _LONG_ORDER):
+        regression = _regression(series, order)
+        if not regression.moving:
+            return _describe(regression, None)
+        shape = _simplest_shape(regression, _LAGS)
+        if regression.residual(shape) < _EXACT:
+            break
     law = _describe(regression, shape)
-    if law.lag_frames >= 0 or law.exact:
+    if law.exact:
         return law
     # among laws nearly as good the one that knows least of the future: the sensor's answer to
     # commands may explain more, later and with the other sign
     for first in range(0, law.lag_frames, -1):
-        shape = _simplest_shape(regression, range(first, _LAGS.stop))
-        later = _describe(regression, shape)
-        if later.kind != "none" and later.residual < _NEARLY * law.residual:
+        later = _describe(regression, _simplest_shape(regression, range(first, _LAGS.stop)))
+        if later.kind == "none":
+            continue
+        if later.residual < _ALIKE * law.residual or not law.is_sure:
             return later
-        if first == 0 and not law.is_sure:
-            as_good = np.max(later.axis_coherence) > _AS_GOOD * np.max(law.axis_coherence)
-            if as_good or np.sum(later.taps[:, 0] * law.taps[:, 0]) < 0:
-                return later
     return law
 
 
-def _regression(series: _Series, order: int, most_rows: int) -> _Regression:
+def _regression(series: _Series, order: int) -> _Regression:
     """Return the regression of laws of an order, or of the most that the frames allow."""
     y, u, *_ = series
     while True:
         lags = range(_LAGS[0], _LAGS[-1] + order + 1)
         rows = _rows(series, order, lags)
-        if rows.size >= max(_LEAST_ROWS, _ROWS_PER_VALUE * (order + u.shape[1] * len(lags))):
-            return _Regression(y, u, rows, order, lags, most_rows)
+        needed = _ROWS_PER_VALUE * (order + u.shape[1] * len(lags))
+        if rows.size >= needed:
+            return _Regression(y, u, rows, order, lags)
         if order <= 1:
             raise ProblemError(
-                f"the control law needs {_LEAST_ROWS} frames whose neighbours are good; got "
+                f"the control law needs {needed} frames whose neighbours are good; got "
                 f"{rows.size} of {len(u)}. Give a longer record, or one with fewer holes."
             )
         order //= 2
@@ -326,11 +298,11 @@ class _Regression:
     """Triangular factor of the increments and of all that may explain them."""
 
     def __init__(
-        self, y: FloatArray, u: FloatArray, rows: IntArray, order: int, lags: range, most_rows: int
+        self, y: FloatArray, u: FloatArray, rows: IntArray, order: int, lags: range
     ) -> None:
-        """Factorise ``most_rows`` frames at most, evenly spread."""
-        if rows.size > most_rows:
-            rows = rows[np.linspace(0, rows.size - 1, most_rows).astype(np.int64)]
+        """Factorise some frames, evenly spread."""
+        if rows.size > _MOST_ROWS:
+            rows = rows[np.linspace(0, rows.size - 1, _MOST_ROWS).astype(np.int64)]
         self.order, self.lags, self.axes, self.rows = order, lags, u.shape[1], rows.size
         increments = np.diff(u, axis=0, prepend=u[:1])
         parts = [increments[rows], u[rows - 1]]
@@ -339,7 +311,7 @@ class _Regression:
         table = np.concatenate(parts, axis=1)
         table -= table.mean(axis=0)
         self.scale = np.maximum(np.sqrt(np.mean(table**2, axis=0)), 1e-300)
-        self.factor = _triangular_factor(table / self.scale)
+        self.factor: FloatArray = np.asarray(np.linalg.qr(table / self.scale, mode="r"))
         self.moving = [i for i in range(self.axes) if self.scale[i] ** 2 > 1e-30]
 
     def columns(self, axis: int, shape: _Shape) -> list[int]:
@@ -359,9 +331,10 @@ class _Regression:
             past = axis + self.axes
             target = target + self.factor[:, past] * self.scale[past] / self.scale[axis]
         table = self.factor[:, chosen]
-        weights = np.linalg.lstsq(table, target, rcond=_CUTOFF)[0]
-        left = target - table @ weights
-        return weights * self.scale[axis] / self.scale[chosen], float(left @ left) / self.rows
+        weights = np.linalg.lstsq(table, target, rcond=None)[0]
+        unexplained = target - table @ weights
+        residual = float(unexplained @ unexplained) / self.rows
+        return weights * self.scale[axis] / self.scale[chosen], residual
 
     def residuals(self, shape: _Shape) -> list[float]:
         """Return the part of the increments' variance that a law leaves of each moving axis."""
@@ -389,25 +362,26 @@ class _Regression:
     def most_residual(self, lags: range = _LAGS) -> float:
         """Return what a simple law may leave, to explain as much as the richest one."""
         richest = self.residual((self.order, range(lags[0], self.lags.stop)))
-        return min(_ALIKE * richest, richest + _SPARE * (1 - richest)) + _FLOOR
+        return min(_ALIKE * richest, richest + _SPARE * (1 - richest)) + _EXACT**2
 
-    def coefficients(self, shape: _Shape) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return the weights of past commands (axes, order) and measurements (axes, lags, axes).
+    def no_coefficients(self, shape: _Shape) -> _Coefficients:
+        """Return the coefficients of commands that do not move."""
+        axes, (order, lags) = self.axes, shape
+        taps = np.zeros((axes, len(lags), axes))
+        return np.zeros((axes, order)), taps, np.zeros(axes), np.zeros((axes, axes))
 
-        Then the errors of the sums of both over their lags, (axes,) and (axes, axes).
-        """
+    def coefficients(self, shape: _Shape) -> _Coefficients:
+        """Return the coefficients of a law, zeros where commands do not move."""
         order, lags = shape
-        past, past_error = np.zeros((self.axes, order)), np.zeros(self.axes)
-        taps = np.zeros((self.axes, len(lags), self.axes))
-        sum_error = np.zeros((self.axes, self.axes))
+        past, taps, past_error, sum_error = self.no_coefficients(shape)
         for axis in self.moving:
             chosen = self.columns(axis, shape)
-            weights, left = self.solve(axis, chosen, order)
+            weights, unexplained = self.solve(axis, chosen, order)
             taps[axis] = weights[order:].reshape(len(lags), self.axes)
-            inverse = np.linalg.pinv(self.factor[:, chosen], rcond=_CUTOFF)
+            inverse = np.linalg.pinv(self.factor[:, chosen])
             scale = self.scale[axis] / self.scale[chosen]
             spare = max(self.rows - len(chosen), 1)
-            half = scale[:, None] * inverse * np.sqrt(left * self.rows / spare)
+            half = scale[:, None] * inverse * np.sqrt(unexplained * self.rows / spare)
             sums = half[order:].reshape(len(lags), self.axes, -1).sum(axis=0)
             sum_error[axis] = np.linalg.norm(sums, axis=1)
             if order:
@@ -418,56 +392,33 @@ class _Regression:
         return past, taps, past_error, sum_error
 
 
-def _triangular_factor(table: FloatArray) -> FloatArray:
-    """Return R of the QR factorisation of a tall table, block by block."""
-    whole = len(table) // _BLOCK * _BLOCK
-    parts = [table[whole:]]
-    if whole and table.shape[1] < _BLOCK:
-        blocks = np.asarray(np.linalg.qr(table[:whole].reshape(-1, _BLOCK, table.shape[1]), "r"))
-        parts.append(blocks.reshape(-1, table.shape[1]))
-    elif whole:
-        parts.append(table[:whole])
-    return np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
-
-
-def _simplest_shape(
-    regression: _Regression, lags: range = _LAGS, *, only_short: bool = False
-) -> _Shape | None:
+def _simplest_shape(regression: _Regression, lags: range) -> _Shape:
     """Return the shortest law that explains as much as the richest one.
 
     Of up to three states each order and number of taps is tried, beyond them orders that double.
-    None if only a short law is asked for, and none explains as much.
     """
     most = regression.most_residual(lags)
     tried = [
-        (order, more)
-        for order, more in product(range(_SHORT_ORDER + 1), repeat=2)
-        if order - 1 <= more <= order
+        (order, taps)
+        for order, taps in product(range(SHORT_ORDER + 1), repeat=2)
+        if order - 1 <= taps <= order
     ]
-    order = _SHORT_ORDER
-    while order < regression.order and not only_short:
+    order = SHORT_ORDER
+    while order < regression.order:
         order = min(2 * order, regression.order)
         tried.append((order, order))
-    left, shape = 1.0, (regression.order, range(regression.order + 1))
-    for order, more in tried:
-        shapes = [(order, range(lag, lag + more + 1)) for lag in lags]
-        residuals = [regression.residual(each) for each in shapes]
-        left, shape = min(residuals), shapes[int(np.argmin(residuals))]
-        if left <= most:
+    for order, taps in tried:
+        shapes = [(order, range(lag, lag + taps + 1)) for lag in lags]
+        residuals = [regression.residual(candidate) for candidate in shapes]
+        residual, shape = min(zip(residuals, shapes, strict=True), key=itemgetter(0))
+        if residual <= most:
             break
-    else:
-        return None if only_short else _without_idle_taps(regression, left, shape)
-    shape = _without_idle_taps(regression, left, shape)
-    for order in range(1 + max(_SHORT_ORDER, shape[0] // 2), shape[0]):
-        first, stop = shape[1].start, min(shape[1].start + order + 1, shape[1].stop)
-        if regression.residual((order, range(first, stop))) <= most:
-            return order, range(first, stop)
-    return shape
+    return _without_idle_taps(regression, residual, shape)
 
 
-def _without_idle_taps(regression: _Regression, left: float, shape: _Shape) -> _Shape:
+def _without_idle_taps(regression: _Regression, residual: float, shape: _Shape) -> _Shape:
     """Return the law without the first and last taps that explain nothing."""
-    most = _SAME * left + _FLOOR
+    most = (1 + _TOLERANCE) * residual + _EXACT**2
     for early, late in ((1, 0), (0, -1)):
         while len(shape[1]) > 1:
             shorter = shape[0], range(shape[1].start + early, shape[1].stop + late)
@@ -483,28 +434,19 @@ def _describe(regression: _Regression, shape: _Shape | None) -> ControlLaw:
     coherence, residual = np.zeros(axes), 1.0
     if shape is not None:
         coherence, residual = regression.coherence(shape), regression.residual(shape)
-    rest: dict[str, Any] = {"residual": residual, "axis_coherence": read_only(coherence)}
-    if shape is None or np.max(coherence) < _LEAST_COHERENCE:
-        return ControlLaw(
-            kind="none",
-            lag_frames=0,
-            gain=read_only(np.zeros((axes, axes))),
-            gain_error=read_only(np.zeros((axes, axes))),
-            axes_kind="zero",
-            signs=(0,) * axes,
-            poles=read_only(np.zeros((axes, 0), dtype=np.complex128)),
-            past=read_only(np.zeros((axes, 0))),
-            taps=read_only(np.zeros((axes, 1, axes))),
-            **rest,
-        )
-    past, taps, past_error, sum_error = regression.coefficients(shape)
+    if shape is None or np.max(coherence) < FOLLOWED:
+        shape = 0, range(1)
+        past, taps, past_error, sum_error = regression.no_coefficients(shape)
+        kind: LawKind = "none"
+    else:
+        past, taps, past_error, sum_error = regression.coefficients(shape)
+        kind = _kind(shape[0], _poles(past), past_error)
     poles = _poles(past)
-    kind = _kind(shape[0], poles, past_error)
     # at low frequencies, but for the poles at 1
     others = poles[:, 2 if kind == "double integrator" else 1 :]
     scale = np.prod(abs(1 - others), axis=1)[:, None]
     gain, error = np.sum(taps, axis=1) / scale, sum_error / scale
-    gain[abs(gain) < _ROUNDING * np.max(abs(gain))] = 0.0
+    gain[abs(gain) < _EXACT * np.max(abs(gain))] = 0.0
     axes_kind, signs = classify_matrix(gain, error)
     return ControlLaw(
         kind=kind,
@@ -516,14 +458,15 @@ def _describe(regression: _Regression, shape: _Shape | None) -> ControlLaw:
         poles=read_only(poles),
         past=read_only(past),
         taps=read_only(taps),
-        **rest,
+        residual=residual,
+        axis_coherence=read_only(coherence),
     )
 
 
 def _poles(past: FloatArray) -> ComplexArray:
     """Return the poles of each axis, (axes, order), the one nearest 1 first."""
-    each = [np.roots(np.append(1.0, -row)).astype(np.complex128) for row in past]
-    padded = [np.append(row, np.zeros(past.shape[1] - row.size)) for row in each]
+    roots = [np.roots(np.append(1.0, -row)).astype(np.complex128) for row in past]
+    padded = [np.append(row, np.zeros(past.shape[1] - row.size)) for row in roots]
     return np.array([row[np.argsort(abs(row - 1), kind="stable")] for row in padded])
 
 
@@ -532,11 +475,10 @@ def _kind(order: int, poles: ComplexArray, past_error: FloatArray) -> LawKind:
     if order == 0:
         return "proportional"
     distance = abs(poles - 1)
-    if order == 1 and np.all(distance <= np.maximum(_PURE, 4 * past_error)[:, None]):
-        return "pure integrator"
-    if order == 1 and np.all(poles.real > _LEAKY):
-        return "leaky integrator"
-    if order == 2 and np.all(distance < _NEAR_ONE):
+    if order == 1:
+        is_pure = np.all(distance <= np.maximum(_EXACT, SIGMAS * past_error)[:, None])
+        return "pure integrator" if is_pure else "leaky integrator"
+    if order == 2 and np.all(distance < _ADDS_UP):
         return "double integrator"
     return "higher order"
 
@@ -549,7 +491,7 @@ def classify_matrix(values: ArrayLike, errors: ArrayLike = 0.0) -> tuple[AxisKin
     other.
     """
     g = square(values, "values")
-    doubt = _SIGMAS * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
+    doubt = SIGMAS * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
     small = _TOLERANCE * np.max(np.abs(g), initial=0.0)
     least = np.where(np.isfinite(doubt), np.maximum(doubt, small), np.inf)
     g = np.where(np.abs(g) <= least, 0.0, g)

@@ -12,7 +12,6 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, integer, number, read_only, real_array, set_fields
 
-_SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
 _MOST_SHIFT = 100
 
 
@@ -69,8 +68,8 @@ class CommandRepair:
     def options(self) -> str:
         """The options of the command line that do the same."""
 
-        def values(each: tuple[float, ...]) -> str:
-            return " ".join(f"{value:g}" for value in each)
+        def values(numbers: Sequence[float]) -> str:
+            return " ".join(f"{value:g}" for value in numbers)
 
         words = [
             "--command-increments" if self.increments else "",
@@ -113,25 +112,24 @@ class CommandRepair:
                 "swapped commands need two axes; the record has one. Leave "
                 f"{self.options} out, or choose two columns."
             )
-        if len(self._scales) not in (1, axes):
+        if self.matrix and len(self.matrix) != axes**2:
             raise ProblemError(
-                f"command_scale must be one factor, or {axes}; got {list(self._scales)}."
+                f"command_matrix must have {axes**2} numbers for {axes} axes, row after row; "
+                f"got {len(self.matrix)}."
             )
-        out = np.diag(np.broadcast_to(np.array(self._scales), axes))
+        out = _diagonal(self._scales, "command_scale", axes)
         if self.matrix:
-            if len(self.matrix) != axes**2:
-                raise ProblemError(
-                    f"command_matrix must have {axes**2} numbers for {axes} axes, row after row; "
-                    f"got {len(self.matrix)}."
-                )
             out = out @ np.reshape(self.matrix, (axes, axes))
         if self.sign:
-            if len(self.sign) not in (1, axes):
-                raise ProblemError(
-                    f"command_sign must be one sign, or {axes}; got {list(self.sign)}."
-                )
-            out = out @ np.diag(np.broadcast_to(np.array(self.sign, dtype=float), axes))
-        return out @ _SWAP if self.swap_axes else out
+            out = out @ _diagonal(self.sign, "command_sign", axes)
+        return out @ np.eye(2)[::-1] if self.swap_axes else out
+
+
+def _diagonal(values: Sequence[float], name: str, axes: int) -> FloatArray:
+    """Return a diagonal matrix of one value for all axes, or of one for each."""
+    if len(values) not in (1, axes):
+        raise ProblemError(f"{name} must be one number, or {axes}; got {list(values)}.")
+    return np.diag(np.broadcast_to(np.array(values, dtype=np.float64), axes))
 
 
 def axes_repair(swapped: bool, signs: tuple[int, ...]) -> CommandRepair:

@@ -1,8 +1,8 @@
-"""The verdict on the commands of a record: whether they reach its measurements as given.
+"""The check of a record: whether its commands reach its measurements as given.
 
 The control law says which repairs make it one that somebody runs, and the likelihood of the
-repaired commands decides: first by the coarse spectrum, where that is not enough by the model of
-the fit. The law alone decides on records that are too short for a spectrum.
+repaired commands decides: by the coarse spectrum, and by the model of the fit where the law does
+not ask for the repair. The law alone decides on records that are too short for a spectrum.
 """
 
 from __future__ import annotations
@@ -12,31 +12,26 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
 from lbt_synth.errors import NumericalError, ProblemError, RecordError
 from lbt_synth.identification.commands.coarse_spectrum import (
     CLEAR,
+    MOST_SHIFT_FRAMES,
     SEGMENT_S,
-    CoarseFit,
     CoarseRecord,
     dispersion,
 )
 from lbt_synth.identification.commands.control_law import (
+    FOLLOWED,
+    SHORT_ORDER,
+    SIGMAS,
     ControlLaw,
     classify_matrix,
     fit_control_law,
     law_controller,
-)
-from lbt_synth.identification.commands.doubts import (
-    doubt_axes,
-    doubt_law,
-    doubt_parts,
-    doubt_steps,
-    held_while_moving,
-    moving_axes,
 )
 from lbt_synth.identification.commands.repair import (
     CommandRepair,
@@ -44,7 +39,7 @@ from lbt_synth.identification.commands.repair import (
     repair_commands,
 )
 from lbt_synth.identification.fit.fitting import GAINS, PLAUSIBLE_GAINS, Search, cost
-from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components, find_rivals
+from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
@@ -57,33 +52,19 @@ from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_ins
 AS_GIVEN = "as given"
 _FIND = "find the commands that belong to these measurements"
 _GIVEN = CommandRepair()
-_MOST_SHIFT_FRAMES = 3  # by which commands are tried earlier and later
-_ALIKE = 0.1  # nats within which repairs are as likely
-_CLEAR_FINER = 8.0  # nats that decide by the criterion of the fit
-_UNUSUAL = 10.0  # nats that a law asks for which no one would run
-_CONTRADICTED = 60.0  # nats by which a repair is likelier than all that a law allows
-_GENERAL = 5.0  # nats by which a matrix without a name, or part of a frame, must be likelier
-_RELATED = 60.0  # nats by which commands without a law must be likelier than none
-_ABSURD = 3e4  # scale of commands without a law that are rather of another night
-_NO_UNIT = 1e12  # scale that no two units of a length or an angle have
-_NOT_SHOWN = 3.0  # factor beyond plausible gains
-_WRONG_GAIN = 2.0  # factor between a given gain and what the record shows
-_FIT_ERRORS = 4.0  # of a fitted gain from a plausible one that refute the unit
-_WORST_CONDITION = 100.0  # of the gain of a law that is inverted
+_ODD = 10.0  # nats by which what no law asks for must be likelier, by the model of the fit as well
+_SURPRISING = 3 * CLEAR  # nats by which a repair must be likelier that a law with errors denies
+_ABSURD = 3e4  # scale of commands without a law, which are rather of another night
+_WRONG_GAIN = 2.0  # factor beyond a given or plausible gain, which a coarse one does not reach
+_WORST_CONDITION = 100.0  # of the gain of a law: beyond, it has no inverse
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
-_USUAL_GAIN = 0.7
+_HIDES = 0.01  # part of their changes that commands leave unexplained, which moves a gain by 10 %
+_USUAL_GAIN = 0.7  # of a sensor, by whose distance units are told apart
 _COARSE = 1.5  # factor by which a coarse gain may be wrong
-_APART = 1.6  # between gains of two axes that have scales of their own
-_INSIDE = 8  # gains that are tried of the plausible ones
+_LINES = 10  # at most, of a fit that tells gains apart: more of them take minutes
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
-_STABLE = 1 - 1e-9  # spectral radius below which a loop has run
-_SHORT_LAW = 3  # order of a law that does not couple axes, and whose loop can be judged
-_TRIED = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
-_ALL_GAINS = np.geomspace(1.0, 1e-6, 19)[:, None]  # the same for a loop that may be of no sensor
-_NEARER = 0.2  # of the distance of a gain from the plausible ones, in its logarithm
-_NEAR = 0.4  # such a distance that a coarse gain may have
-_LIKE = 3.0  # factor between a coarse gain and the fitted one of the same record
-_LINES = 10  # at most, of the search for lines
+_RAN = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
+_ANY = np.geomspace(1.0, 1e-6, 19)[:, None]  # gains of a loop that may be of no sensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -157,27 +138,29 @@ class CommandVerdict:
 def explain_commands(
     record: LoopRecord, *, sensor_gain: float | Sequence[float] | None = None
 ) -> CommandVerdict:
-    """Compare explanations of how the commands of a closed-loop record reach its measurements.
+    """Check whether the commands of a closed-loop record reach its measurements as given.
 
-    Each explanation gives another pseudo-open-loop series, and only the right one has the simple
-    spectrum of turbulence, lines and noise: Whittle's likelihood on a coarse model decides between
-    the commands as given, with other signs, exchanged or shifted, increments, other units, and
-    commands that have nothing to do with the measurements. The control law that computed the
-    commands says which of these are likely, and tells a shifted record from a wrong delay. A known
-    gain of the sensor is one number or one per axis; by default 0.2 to 1.25 is plausible.
+    Each repair of the commands gives another pseudo-open-loop series, and only the right one has
+    the simple spectrum of turbulence, lines and noise: Whittle's likelihood on a coarse model
+    decides between the commands as given, with other signs, exchanged or shifted, increments, other
+    units, and commands that have nothing to do with the measurements. The control law that computed
+    the commands says which of these are likely, and tells a shifted record from a wrong delay. A
+    known gain of the sensor is one number or one per axis; by default 0.2 to 1.25 is plausible.
     """
     require_instance(record, LoopRecord)
     delay = record.hardware.delay_frames  # refuses a record without one
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
-    known = None if sensor_gain is None else record.known_gains(sensor_gain)
-    law, moves = record_law(record), moving_axes(record)
+    gains = None if sensor_gain is None else record.known_gains(sensor_gain)
+    law, moves = record_law(record), _moving_axes(record.commands[record.usable])
     if moves.any() and not moves.all():
-        return _explain_moving(record, moves, law, known)
+        one = replace(
+            record, measurements=record.measurements[:, moves], commands=record.commands[:, moves]
+        )
+        return _explain_moving(one, moves, law, gains)
     refuse = partial(CommandVerdict, accepted=False, gain=np.full(record.axes, np.nan), law=law)
     sure = law if law is not None and law.is_sure else None
-    doubt = held_while_moving(record) or (doubt_parts(record) if sure is None else doubt_law(sure))
-    if doubt:
+    if sure is not None and (doubt := _doubt_law(sure)):
         return refuse(explanation=doubt)
     late = 0 if sure is None else sure.lag_frames
     early, lag = max(-late, 0), max(late, 0)
@@ -186,59 +169,88 @@ def explain_commands(
         law = None if sure is None else replace(sure, lag_frames=0)
     coarse = CoarseRecord(record)
     if not coarse.stretches:
-        return _explain_by_law(refuse, law, early)
-    steps = "" if known is not None else doubt_steps(coarse)
-    if law is not None and (doubt := doubt_axes(coarse, law) or (steps if law.is_ordinary else "")):
-        return refuse(explanation=steps or doubt)
+        return _explain_by_law(refuse, record, law, early)
     plausible = PLAUSIBLE_GAINS
-    if known is not None:
-        plausible = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
-    best = _choose(coarse, law, lag)
-    scale = np.ones(record.axes) if best is None else _scale(coarse, law, best, plausible)
-    absurd = _ABSURD if law is None or law.kind == "none" else _NO_UNIT
-    if best is None or np.max(np.abs(np.log(scale))) > np.log(absurd):
-        return refuse(
-            explanation="they have nothing to do with the measurements, as if of another night",
-            gain=np.zeros(record.axes),
-        )
-    repair, gain, nats, *_ = best
-    if repair == _GIVEN and law is not None and (doubt := _doubt_running(record, law, gain)):
+    if gains is not None:
+        plausible = float(np.min(gains)) / _WRONG_GAIN, float(np.max(gains)) * _WRONG_GAIN
+    choice = _choose(coarse, law, lag)
+    scale = np.ones(record.axes)
+    if not choice.unrelated.any():
+        scale = _scale(coarse, law, choice, plausible)
+    if doubt := _doubt_choice(record, law, choice, scale):
         return refuse(explanation=doubt)
+    repair = choice.repair
     off = repair.shift_frames and repair.shift_frames + lag
     repair = replace(repair, shift_frames=early or (-lag if repair.shift_frames else 0))
     words = repair.words()
     if off:
         words.append(f"the total delay is {delay + off:g} frames, not {delay:g}")
     if np.any(scale != 1):
-        words.append(wrong_scale(scale, gain))
-    words = words or [steps] * bool(steps)
-    shown = gain / scale
-    hidden = (shown <= plausible[0] / _NOT_SHOWN) | (shown >= plausible[1] * _NOT_SHOWN)
+        words.append(wrong_scale(scale, choice.gain))
+    shown = choice.gain / scale
+    hidden = (shown <= plausible[0] / _WRONG_GAIN) | (shown >= plausible[1] * _WRONG_GAIN)
     return CommandVerdict(
         explanation=" and ".join(words) or AS_GIVEN,
         accepted=not words,
         repair=replace(repair, scale=tuple(scale)),
         delay_frames=delay + off if off else None,
-        nats=max(nats, 0.0),
+        nats=max(choice.nats, 0.0),
         gain=frozen_copy(np.where(hidden, np.nan, shown)),
         law=law if not early else sure,
-        notes=() if words else _note_lag(delay, lag),
+        notes=() if words else _note_law(delay, lag, _unexplained(law)),
     )
 
 
-def _note_lag(delay_frames: float, lag: int) -> tuple[str, ...]:
-    """Return what to look at in an accepted record whose law has a lag."""
-    words = (
-        f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
-        "real-time computer takes that long, the total delay of a new design is "
-        f"{delay_frames + lag:g} frames"
+def _doubt_choice(
+    record: LoopRecord, law: ControlLaw | None, choice: _Choice, scale: FloatArray
+) -> str:
+    """Return what the best repair and scale leave wrong, in words; empty if there is nothing."""
+    lawless = law is None or law.kind == "none"
+    if choice.unrelated.all() or (lawless and np.max(abs(np.log(scale))) > np.log(_ABSURD)):
+        return "they have nothing to do with the measurements, as if of another night"
+    if choice.unrelated.any():
+        axis = int(np.argmax(choice.unrelated))
+        return f"those of axis {axis} have nothing to do with its measurements"
+    if choice.repair == _GIVEN and (doubt := _doubt_running(record, law, choice.gain)):
+        return doubt
+    if np.any(scale < 1) and (hiding := _unexplained(law)):
+        return (
+            f"{hiding}, which hides the sensor gain. Record more digits, cut the record, or give "
+            "the sensor gain"
+        )
+    return ""
+
+
+def _unexplained(law: ControlLaw | None) -> str:
+    """Return in words that the commands follow their law in part only; empty if they do."""
+    if law is None or law.kind == "none" or law.residual < _HIDES:
+        return ""
+    return (
+        f"their law leaves {100 * law.residual:.2g} % of their changes unexplained: they are "
+        "rounded, disturbed or held, or in part of other frames"
     )
-    return (words,) if lag else ()
+
+
+def _note_law(delay_frames: float, lag: int, hiding: str) -> tuple[str, ...]:
+    """Return what to look at in an accepted record whose law has a lag, or explains too little."""
+    notes = []
+    if lag:
+        notes.append(
+            f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
+            "real-time computer takes that long, the total delay of a new design is "
+            f"{delay_frames + lag:g} frames"
+        )
+    if hiding:
+        notes.append(
+            f"warning: of the commands, {hiding}. The sensor gain may be larger than it looks"
+        )
+    return tuple(notes)
 
 
 def record_law(record: LoopRecord) -> ControlLaw | None:
     """Return the control law of a closed-loop record; None where the frames are too few."""
-    assert record.commands is not None
+    if record.commands is None:
+        return None
     measured = record.usable if record.measured is None else record.measured
     with suppress(ProblemError):
         return fit_control_law(
@@ -250,33 +262,52 @@ def record_law(record: LoopRecord) -> ControlLaw | None:
 def _explain_moving(
     record: LoopRecord, moves: BoolArray, law: ControlLaw | None, known: FloatArray | None
 ) -> CommandVerdict:
-    """Explain the commands of the axis that moves; the loop of the other one was open."""
-    assert record.commands is not None
-    one = replace(
-        record, measurements=record.measurements[:, moves], commands=record.commands[:, moves]
-    )
-    verdict = explain_commands(one, sensor_gain=None if known is None else known[moves].tolist())
-    gain = np.full(record.axes, np.nan)
+    """Explain the commands of the axis that moves, of a record of it; the other loop was open."""
+    verdict = explain_commands(record, sensor_gain=None if known is None else known[moves].tolist())
+    gain = np.full(moves.size, np.nan)
     gain[moves] = verdict.gain
     note = f"the commands of axis {int(np.argmin(moves))} stand still: its loop was open"
     return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
 
 
 def _explain_by_law(
-    refuse: Callable[..., CommandVerdict], law: ControlLaw | None, early: int
+    refuse: Callable[..., CommandVerdict], record: LoopRecord, law: ControlLaw | None, early: int
 ) -> CommandVerdict:
     """Return the verdict on commands whose likelihood no stretch is long enough to tell."""
-    repair = CommandRepair(shift_frames=early)
+    repair = _GIVEN
     if law is not None and law.exact:
-        swapped = law.axes_kind == "swapped"
-        signs = law.signs[::-1] if swapped else law.signs
-        repair = axes_repair(swapped, tuple(sign or 1 for sign in signs))
-        repair = replace(repair, shift_frames=early, increments=law.order == 0)
+        repairs = list_repairs(record.axes, record.hardware.delay_frames)
+        ordinary = [repair for repair in repairs if not _is_unusual(repair, law, 0)]
+        repair = ordinary[0] if ordinary else _GIVEN
+    repair = replace(repair, shift_frames=early)
     if repair.options:
-        words = " and ".join(repair.words())
-        return refuse(explanation=f"by their law {words}", repair=repair)
+        return refuse(explanation=f"by their law {' and '.join(repair.words())}", repair=repair)
     note = "the commands were not tested: no stretch of usable frames is long enough"
     return refuse(explanation=AS_GIVEN, accepted=True, notes=(note,))
+
+
+def _moving_axes(commands: FloatArray) -> BoolArray:
+    """Return the axes whose commands (frames, axes) move, (axes,); all of no frames."""
+    moves = np.ptp(commands, axis=0) > 0 if commands.size else np.ones(commands.shape[1])
+    return np.asarray(moves, dtype=np.bool_)
+
+
+def _doubt_law(law: ControlLaw) -> str:
+    """Return what no repair undoes in a sure law, in words; empty if there is nothing."""
+    followed, lags = law.axis_coherence >= FOLLOWED, law.axis_lags
+    if np.any(followed) and np.ptp(lags[followed]):  # no real-time computer does that
+        late, frames = int(np.argmax(lags)), count_text(int(np.ptp(lags)), "frame")
+        return (
+            f"those of axis {late} follow their measurements {frames} later than those of axis "
+            f"{1 - late}; move one of them"
+        )
+    steady = np.linalg.norm(np.sum(law.taps, axis=1), axis=1)
+    largest = np.sum(np.linalg.norm(law.taps, axis=2), axis=1)
+    if law.order <= 1 and np.all(_WORST_CONDITION * steady < largest):
+        return "they follow from the changes of the measurements, as if both had been exchanged"
+    if np.all(followed) and np.linalg.cond(law.gain / largest[:, None]) > _WORST_CONDITION:
+        return "those of both axes follow the same measurements: one axis was recorded twice"
+    return ""
 
 
 def list_repairs(
@@ -288,91 +319,96 @@ def list_repairs(
     still follow from the past of the measurements; it stands for another delay, too.
     """
     signs = list(product((1, -1), repeat=axes))
-    out = [axes_repair(bool(swapped), each) for swapped in range(axes) for each in signs]
-    near = range(-_MOST_SHIFT_FRAMES, _MOST_SHIFT_FRAMES + 1)
-    shifts = [k for k in near if k and k >= 1 - lag - delay_frames]
-    shifts += [-lag] if lag > _MOST_SHIFT_FRAMES else []
+    out = [axes_repair(bool(swapped), sign) for swapped in range(axes) for sign in signs]
+    short_shifts = range(-MOST_SHIFT_FRAMES, MOST_SHIFT_FRAMES + 1)
+    shifts = [k for k in short_shifts if k and k >= 1 - lag - delay_frames]
+    shifts += [-lag] if lag > MOST_SHIFT_FRAMES else []
     out += [CommandRepair(shift_frames=k) for k in shifts]
     out.append(CommandRepair(increments=True))
     general = law is not None and law.is_sure and law.axes_kind == "general"
     if law is not None and general and np.linalg.cond(law.gain) < _WORST_CONDITION:
         # what undoes the gain of the law: a turn, and all of it
-        one, _, other = np.linalg.svd(law.gain)
+        U, _, Vh = np.linalg.svd(law.gain)
         inverse = np.linalg.inv(law.gain)
-        for whole in ((one @ other).T, inverse / np.sqrt(abs(np.linalg.det(inverse)))):
-            out.append(CommandRepair(matrix=tuple(whole.ravel().tolist())))
+        for undoing in ((U @ Vh).T, inverse / np.sqrt(abs(np.linalg.det(inverse)))):
+            out.append(CommandRepair(matrix=tuple(undoing.ravel().tolist())))
     return out
 
 
-# a repair, the sensor gains (axes,) with it, the nats by which it is likelier than the record as
-# given, its contrast, and the nats that decide about it
-_Choice: TypeAlias = tuple[CommandRepair, FloatArray, float, float, float]
+class _Choice(NamedTuple):
+    """The best repair of the commands, and how clear it is."""
+
+    repair: CommandRepair
+    gain: FloatArray  # (axes,), of the sensor with it
+    nats: float  # by which it is likelier than the record as given
+    contrast: float
+    clear: float  # nats that decide
+    unrelated: BoolArray  # (axes,), of commands that follow no law and do not reach the axis
 
 
-def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice | None:
-    """Return the best repair; None where commands do not reach the measurements."""
+def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
+    """Return the repair that law and likelihood ask for."""
     record = coarse.record
-    assert record.delay_frames is not None
-    repairs = list_repairs(record.axes, record.delay_frames, law, lag)
-    compared = coarse.compare(repairs)
-    contrast, gain, misfit = compared[0].sum(axis=0), compared[1], compared[2]
-    score, surprising = _score(repairs, compared, record, law, lag)
-    best = int(np.argmax(score <= np.min(score) + _ALIKE))  # the simplest comes first
-    # what the law asks for, which the coarse spectrum may miss
-    expected = np.flatnonzero(~surprising)
-    if surprising[[0, best]].all() and expected.size:
-        other = int(expected[np.argmin(score[expected])])
-        if _finer_saving(coarse, repairs[other]) >= _CLEAR_FINER:
-            best, score[0] = other, np.inf
-    clear = CLEAR * dispersion(misfit[best])
-    if law is None or law.kind == "none":
-        saved = np.sum(coarse.unrelated()) - np.min(contrast)
-        if saved < _RELATED * dispersion(misfit[best]):
-            return None
-    nats = float(contrast[0] - contrast[best])
-    if surprising[0] and not surprising[best]:  # the law asks for it
-        shown = nats >= clear / 2 or np.isinf(score[0])
+    repairs = list_repairs(record.axes, record.hardware.delay_frames, law, lag)
+    axis_contrast, gain, misfit = coarse.compare(repairs)
+    contrast = axis_contrast.sum(axis=0)
+    spread = np.array([dispersion(value) for value in misfit])
+    penalty, asked = _penalties(repairs, gain, record, law, lag, spread)
+    best = int(np.argmin(contrast + penalty))
+    clear = CLEAR * float(spread[best])
+    nats = contrast[0] - contrast[best]
+    if asked[best]:
+        is_shown = penalty[0] >= _SURPRISING or nats >= clear / 2
     else:
-        shown = nats >= clear and _finer_saving(coarse, repairs[best]) >= _CLEAR_FINER
-    if not shown:
-        best, nats = 0, 0.0
-    return repairs[best], gain[:, best], nats, float(contrast[best]), clear
+        is_shown = (
+            nats >= clear and _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] >= _ODD
+        )
+    if not is_shown:
+        best = 0
+    saved = coarse.unrelated() - np.min(axis_contrast, axis=1)
+    followed = np.zeros(record.axes) if law is None else law.axis_coherence
+    return _Choice(
+        repairs[best],
+        gain[:, best],
+        float(contrast[0] - contrast[best]),
+        float(contrast[best]),
+        clear,
+        (followed < FOLLOWED) & (saved < CLEAR * spread[best]),
+    )
 
 
-def _score(
+def _penalties(
     repairs: Sequence[CommandRepair],
-    compared: CoarseFit,
+    gains: FloatArray,
     record: LoopRecord,
     law: ControlLaw | None,
     lag: int,
+    spread: FloatArray,
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the contrast of repairs with what their laws cost, and which laws are surprising.
+    """Return the nats that repairs (n,) cost because of the laws they make, and which the law asks.
 
     A loop that would have been unstable has not run. A law that is not exact overrules no clear
     likelihood.
     """
-    axis_contrast, gain, misfit = compared
-    contrast = axis_contrast.sum(axis=0)
     unusual = np.array([_is_unusual(repair, law, lag) for repair in repairs])
-    possible = _possible_repairs(repairs, gain, record, law)
-    surprising = unusual | ~possible
-    best = int(np.argmin(contrast))
-    if law is not None and not law.exact and surprising[best]:
-        expected = contrast[:1] if surprising.all() else contrast[~surprising]
-        if np.min(expected) - contrast[best] > _CONTRADICTED * dispersion(misfit[best]):
-            return _score(repairs, compared, record, None, 0)  # it did not compute the commands
-    assert record.delay_frames is not None
-    delays = [record.delay_frames + repair.shift_frames for repair in repairs]
-    odd = [bool(each.matrix) or delay % 1 > 0 for each, delay in zip(repairs, delays, strict=True)]
-    score = contrast + _UNUSUAL * unusual + _GENERAL * np.array([False, *odd[1:]])
-    score[~possible] = np.inf
-    if surprising[0] and not surprising.all():  # the law says what is wrong
-        score[1:][surprising[1:]] = np.inf
-        away = abs(np.log(gain / np.clip(gain, *PLAUSIBLE_GAINS))).max(axis=0)
-        memoryless = law is not None and law.order == 0  # it would hold nothing
-        if np.min(away[~surprising]) < (_NEAR if memoryless else _NEARER * away[0]):
-            score[0] = np.inf  # and so does the sensor
-    return score, surprising
+    impossible = np.zeros(len(repairs), dtype=np.bool_)
+    if law is not None and law.is_sure:
+        for i, (repair, gain) in enumerate(zip(repairs, gains.T, strict=True)):
+            tried = np.vstack([gain, 0.3 * gain, _RAN * np.ones(record.axes)])
+            impossible[i] = not could_have_run(repair, tried, record, law)
+        impossible &= not impossible.all()
+    odd = unusual | impossible
+    asked = ~odd & odd[0]
+    refuted = np.array(odd if asked.any() else impossible)
+    # a slow computer has a lag, and a matrix may couple axes on purpose: the sensor tells
+    is_plausible = np.all(np.clip(gains[:, 0], *PLAUSIBLE_GAINS) == gains[:, 0])
+    if is_plausible and law is not None and law.order > 0:
+        refuted[0] = False
+    surprise = np.inf if law is not None and law.exact else _SURPRISING * spread
+    cost_of_odd = np.where(refuted, surprise, _ODD * odd)
+    fraction = (record.hardware.delay_frames % 1 > 0) & (np.arange(len(repairs)) > 0)
+    nameless = fraction | [bool(repair.matrix) for repair in repairs]
+    return np.asarray(cost_of_odd + _ODD * nameless), asked
 
 
 def _is_unusual(repair: CommandRepair, law: ControlLaw | None, lag: int) -> bool:
@@ -388,27 +424,7 @@ def _is_unusual(repair: CommandRepair, law: ControlLaw | None, lag: int) -> bool
     if kind == "swapped" or min(signs) < 0:
         return True
     # a long law may couple the axes, as a filter of lines along diagonals does
-    return kind != "diagonal" and law.order <= _SHORT_LAW
-
-
-def _possible_repairs(
-    repairs: Sequence[CommandRepair],
-    gains: FloatArray,
-    record: LoopRecord,
-    law: ControlLaw | None,
-) -> BoolArray:
-    """Return which repairs make loops that have run; all where no law tells."""
-    every = np.ones(len(repairs), dtype=np.bool_)
-    if law is None or not law.is_sure:
-        return every
-    tried = _TRIED * np.ones(record.axes)
-    possible = np.array(
-        [
-            could_have_run(repair, np.vstack([gain, 0.3 * gain, *tried]), record, law)
-            for repair, gain in zip(repairs, gains.T, strict=True)
-        ]
-    )
-    return possible if possible.any() else every
+    return kind != "diagonal" and law.order <= SHORT_ORDER
 
 
 def could_have_run(
@@ -417,17 +433,14 @@ def could_have_run(
     """Return whether the recorded law would have been stable at any gains (n, axes)."""
     if repair.increments:
         return True  # another law computes the positions
-    assert record.delay_frames is not None
     controller = law_controller(law, record.frame_rate_hz)
-    path = LoopHardware(
-        frame_rate_hz=record.frame_rate_hz,
-        delay_frames=max(record.delay_frames + repair.shift_frames, 1.0),
-        modes=record.axes,
+    path = replace(
+        record.hardware,
+        delay_frames=max(record.hardware.delay_frames + repair.shift_frames, 1.0),
         influence_matrix=repair.turn(record.axes),
-        mirror=record.mirror,
     )
-    each = (replace(path, sensor_matrix=np.diag(gain)) for gain in gains)
-    return any(_moving_radius(loop, controller) < _STABLE for loop in each)
+    paths = (replace(path, sensor_matrix=np.diag(gain)) for gain in gains)
+    return any(_moving_radius(path, controller) < 1 for path in paths)
 
 
 def _moving_radius(path: LoopHardware, controller: Controller) -> float:
@@ -438,7 +451,7 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     """
     weaker = replace(path, sensor_matrix=0.8 * path.sensor)
     poles, others = (
-        np.linalg.eigvals(close_loop(each, controller).system.A) for each in (path, weaker)
+        np.linalg.eigvals(close_loop(loop, controller).system.A) for loop in (path, weaker)
     )
     moves = np.min(abs(poles[:, None] - others), axis=1) > _HIDDEN
     return float(np.max(abs(poles[moves]))) if moves.any() else np.inf
@@ -449,9 +462,9 @@ def _doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray
 
     ``gains`` (axes,) are the likeliest ones.
     """
-    if law is None or not law.exact or law.order > _SHORT_LAW:
+    if law is None or not law.exact or law.order > SHORT_ORDER:
         return ""
-    tried = np.vstack([gains, 0.3 * gains, 0.1 * gains, *(_ALL_GAINS * np.ones(record.axes))])
+    tried = np.vstack([gains, 0.3 * gains, 0.1 * gains, *(_ANY * np.ones(record.axes))])
     if could_have_run(_GIVEN, tried, record, law):
         return ""
     return (
@@ -461,18 +474,12 @@ def _doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray
 
 
 def _fit(
-    coarse: CoarseRecord,
-    repair: CommandRepair,
-    gain: float | None = None,
-    *,
-    other_gains: bool = False,
-    begin_at: FloatArray | None = None,
+    coarse: CoarseRecord, repair: CommandRepair, held: FloatArray | None = None
 ) -> tuple[float, FloatArray]:
     """Return the criterion of the fit over all axes, and the gains (axes,), nan where one failed.
 
-    Any gain is looked for from several, or from one for each axis (axes,) where they are given.
-    The model has the lines and the wide resonances that it needs, of which the coarse spectrum has
-    few.
+    Gains (axes,) may be held. The model has the lines and the wide resonances that it needs, of
+    which the coarse spectrum has few.
     """
     record = coarse.record
     length = int(SEGMENT_S * record.frame_rate_hz)
@@ -485,13 +492,10 @@ def _fit(
     series = zip(record.measurements.T, coarse.corrections(repair).T, strict=True)
     for i, (y, c) in enumerate(series):
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
-        search = Search(data=data, gain=gain, most_lines=_LINES)
-        if begin_at is not None:
-            search = replace(search, starting_gain=float(begin_at[i]))
+        gain = None if held is None else float(np.clip(held[i], GAINS["above"], GAINS["below"]))
+        search = Search(data=data, gain=gain, most_lines=_LINES, gain_error=float("inf"))
         try:
             model = find_components(search, rounds=FEW_ROUNDS)
-            if other_gains:
-                model, _ = find_rivals(search, [model], other_gains=True)
         except NumericalError:
             total = np.inf
         else:
@@ -499,36 +503,59 @@ def _fit(
     return total, gains
 
 
-def _finer_saving(coarse: CoarseRecord, repair: CommandRepair) -> float:
-    """Return how much likelier a repair is than the record as given, by the model of the fit.
-
-    Before a saving is clear, the record as given is fitted from other gains as well.
-    """
-    other, _ = _fit(coarse, repair)
-    saving = _fit(coarse, _GIVEN)[0] - other
-    return saving if saving < _CLEAR_FINER else _fit(coarse, _GIVEN, other_gains=True)[0] - other
-
-
-def saving_of_gain(
-    coarse: CoarseRecord, repair: CommandRepair, plausible: tuple[float, float]
-) -> float:
-    """Return how much likelier any gain is than plausible ones, by the model of the fit."""
+def _scale(
+    coarse: CoarseRecord, law: ControlLaw | None, choice: _Choice, plausible: tuple[float, float]
+) -> FloatArray:
+    """Return the factors (axes,) of commands that make implausible gains plausible ones."""
     low, high = plausible
-    free, gains = _fit(coarse, repair)
+    one, inside = np.ones(choice.gain.size), np.geomspace(low, high, 8)
+    if np.all((choice.gain >= low) & (choice.gain <= high)):
+        return one
+    plausible_contrasts = coarse.profile(choice.repair, np.tile(inside, (one.size, 1)))
+    if np.sum(np.min(plausible_contrasts, axis=1)) - choice.contrast < choice.clear:
+        return one
+    # wide resonances that the coarse spectrum lacks move its gains: the fit decides, of commands
+    # that are scaled by these
+    scaled = replace(choice.repair, scale=tuple(choice.gain))
+    free, ratios = _fit(coarse, scaled)
+    gains = np.where(np.isfinite(ratios), ratios, 1.0) * choice.gain
     if np.all((gains >= low) & (gains <= high)):
-        return 0.0
-    return min(_fit(coarse, repair, gain)[0] for gain in (low, _usual_gain(plausible), high)) - free
+        return one
+    scale = likely_factors(gains, plausible)
+    if law is not None and law.is_sure:
+        if not could_have_run(choice.repair, inside[:, None] * one, coarse.record, law):
+            return scale
+        if np.mean(np.log(gains)) < np.log(low):
+            return one  # commands that are too large come from a law that is too strong
+    tried = (low, float(np.clip(_USUAL_GAIN, low, high)), high)
+    held = min(_fit(coarse, scaled, gain / choice.gain)[0] for gain in tried)
+    return scale if held - free >= choice.clear else one
 
 
-def fit_gains(coarse: CoarseRecord, repair: CommandRepair, gains: FloatArray) -> FloatArray:
-    """Return the gains (axes,) of a repair by the model of the fit; the coarse ones where it fails.
+def likely_factors(gains: FloatArray, plausible: tuple[float, float]) -> FloatArray:
+    """Return the likeliest factors of commands with these sensor gains (axes,).
 
-    Wide resonances that the coarse spectrum lacks move its gains.
+    One factor stands for both axes where it makes their gains plausible, and neither is now.
     """
-    if not np.all((gains > GAINS["above"]) & (gains < GAINS["below"])):
-        return gains
-    _, fitted = _fit(coarse, repair, begin_at=gains)
-    return np.where(np.abs(np.log(fitted / gains)) < np.log(_LIKE), fitted, gains)
+    low, high = plausible
+    within = (gains >= low) & (gains <= high)
+    if not within.any():
+        common = _likely_factor(float(np.exp(np.mean(np.log(gains)))), plausible)
+        rest = gains / common
+        if np.all((rest >= low / _COARSE) & (rest <= high * _COARSE)):
+            return np.full(gains.size, common)
+    return np.where(within, 1.0, [_likely_factor(gain, plausible) for gain in gains.tolist()])
+
+
+def _likely_factor(gain: float, plausible: tuple[float, float]) -> float:
+    """Return the factor between units that makes a gain plausible; another one if none does."""
+    low, high = plausible
+    usual = float(np.clip(_USUAL_GAIN, low, high))
+    for margin in (1.0, _COARSE):
+        fits = [f for f in _FACTORS if low / margin <= gain / f <= high * margin]
+        if fits:
+            return float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
+    return float(f"{gain / usual:.2g}")
 
 
 def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
@@ -536,7 +563,7 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
 
     The fit shows gains beyond the plausible ones where the coarse model leaves them open.
     """
-    accepted = not np.all(gains - _FIT_ERRORS * errors > PLAUSIBLE_GAINS[1])
+    accepted = not np.all(gains - SIGMAS * errors > PLAUSIBLE_GAINS[1])
     scale = np.ones(gains.size) if accepted else likely_factors(gains, PLAUSIBLE_GAINS)
     return CommandVerdict(
         explanation=AS_GIVEN if accepted else wrong_scale(scale, gains),
@@ -547,50 +574,6 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
     )
 
 
-def _scale(
-    coarse: CoarseRecord, law: ControlLaw | None, best: _Choice, plausible: tuple[float, float]
-) -> FloatArray:
-    """Return the factors (axes,) of commands that make implausible gains plausible ones."""
-    repair, found, _, contrast, clear = best
-    low, high = plausible
-    one, inside = np.ones(found.size), np.geomspace(low, high, _INSIDE)
-    if np.all((found >= low) & (found <= high)):
-        return one
-    near = coarse.profile(repair, np.tile(inside, (found.size, 1)))
-    if np.sum(np.min(near, axis=1)) - contrast < clear:
-        return one
-    gains = fit_gains(coarse, repair, found)
-    scale = likely_factors(gains, plausible)
-    if law is not None and law.is_sure:
-        if not could_have_run(repair, inside[:, None] * one, coarse.record, law):
-            return scale
-        if np.mean(np.log(gains)) < np.log(low):
-            return one  # commands that are too large come from a law that is too strong
-    return scale if saving_of_gain(coarse, repair, plausible) >= clear else one
-
-
-def _usual_gain(plausible: tuple[float, float]) -> float:
-    """Return the gain that a sensor has most often."""
-    return float(np.clip(_USUAL_GAIN, *plausible))
-
-
-def likely_factors(gains: FloatArray, plausible: tuple[float, float]) -> FloatArray:
-    """Return the likeliest factor of the commands of each axis with these gains, (axes,)."""
-    low, high = plausible
-    usual = _usual_gain(plausible)
-
-    def factor(gain: float) -> float:
-        fits = [f for f in _FACTORS if low <= gain / f <= high]
-        fits = fits or [f for f in _FACTORS if low / _COARSE <= gain / f <= _COARSE * high]
-        if fits:
-            return float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
-        return float(f"{gain / usual:.2g}")
-
-    if np.max(gains) < _APART * np.min(gains):
-        return np.full(gains.size, factor(float(np.exp(np.mean(np.log(gains))))))
-    return np.array([1.0 if low <= gain <= high else factor(gain) for gain in gains.tolist()])
-
-
 def wrong_scale(scale: FloatArray, gain: FloatArray) -> str:
     """Return the words for commands that need a factor on each axis, (axes,)."""
     sizes = [
@@ -599,9 +582,9 @@ def wrong_scale(scale: FloatArray, gain: FloatArray) -> str:
     ]
     words = f"they are {sizes[0]}"
     if np.ptp(scale):
-        each = zip(sizes, scale, strict=True)
+        pairs = zip(sizes, scale, strict=True)
         words = " and ".join(
-            f"those of axis {i} are {size}" for i, (size, factor) in enumerate(each) if factor != 1
+            f"those of axis {i} are {size}" for i, (size, factor) in enumerate(pairs) if factor != 1
         )
     gains = ", ".join(f"{value:.3g}" for value in gain)
     return f"{words} (with them the sensor has a gain of {gains})"

@@ -371,9 +371,8 @@ def _state_sentence(found: Diagnosis) -> str:
 def _faults(found: Diagnosis) -> list[str]:
     """Say which channels are at fault, and how many frames are lost."""
     out = [f"the {row.channel} is {row.state}" for row in found.channels if row.serious]
-    lost = 1 - found.record.health.usable / found.record.frames
-    if lost > _MOST_LOST:
-        out.append(f"{100 * lost:.2g} % of the frames are lost")
+    if found.record.lost > _MOST_LOST:
+        out.append(f"{100 * found.record.lost:.2g} % of the frames are lost")
     return out
 
 

@@ -77,7 +77,7 @@ class Search:
     lowest_line_hz: float = LOWEST_LINE_HZ  # below, a component belongs to the turbulence
     most_lines: int = MOST_LINES
     announced: Sequence[tuple[float, float]] = ()  # (frequency, error) of known lines [Hz]
-    starting_gain: float = TYPICAL_GAIN  # where a fit that finds the gain begins
+    gain_error: float = GAIN_ERROR  # of the logarithm of a gain around the typical one, beforehand
 
     def __post_init__(self) -> None:
         nyquist = self.data.frame_rate_hz / 2
@@ -119,7 +119,7 @@ class Search:
 
     def priors(self, spectrum: SpectrumModel) -> Priors:
         """Return the priors of a fit; lines of two axes stay in the band."""
-        prior = (float(np.log(TYPICAL_GAIN)), GAIN_ERROR)
+        prior = (float(np.log(TYPICAL_GAIN)), self.gain_error)
         gain = prior if self.finds_gain and len(spectrum.axes) == 1 else _FIXED
         corner = (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH)
         rows = list[tuple[float, float]]()
@@ -242,7 +242,7 @@ def total_price(search: Search, spectrum: SpectrumModel) -> float:
 def cost(search: Search, model: FittedModel) -> float:
     """Return the contrast of a model, with the prior of its gain, plus the price of all it has."""
     log_gain = model.spectrum.background.log_gain
-    away = float(log_gain - np.log(TYPICAL_GAIN)) / GAIN_ERROR * search.finds_gain
+    away = float(log_gain - np.log(TYPICAL_GAIN)) / search.gain_error * search.finds_gain
     return model.contrast + total_price(search, model.spectrum) + 0.5 * away**2
 
 

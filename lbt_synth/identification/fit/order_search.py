@@ -17,7 +17,7 @@ import numpy as np
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
-from lbt_synth.identification.fit.fitting import GAINS, Search
+from lbt_synth.identification.fit.fitting import GAINS, TYPICAL_GAIN, Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import SEARCHED
 from lbt_synth.identification.fit.spectrum_model import (
@@ -191,7 +191,7 @@ def _begin(search: Search) -> FittedModel | None:
     The gain is held until the lines and a drift are there: one that is free while these are missing
     runs away to what explains them.
     """
-    gain = search.starting_gain if search.finds_gain else search.gain or 1.0
+    gain = TYPICAL_GAIN if search.finds_gain else search.gain or 1.0
     held = replace(search, gain=gain)
     model = fit_background(held, gain)
     for _ in range(FEW_ROUNDS):

@@ -18,19 +18,19 @@ _MAS = {
     "rad": math.degrees(1.0) * 3600e3,
 }
 UNITS = (*_NM, *_MAS)
-_OTHER_NAMES = {
-    "nm": "nanometer nanometre",
-    "um": "micron micrometer micrometre µm μm",
-    "m": "meter metre",
-    "urad": "µrad μrad microrad",
-    "rad": "radian",
-    "arcsec": 'arcsecond asec "',
-    "mas": "milliarcsec milliarcsecond",
+_ALIASES = {
+    **dict.fromkeys(("nanometer", "nanometre"), "nm"),
+    **dict.fromkeys(("micron", "micrometer", "micrometre", "µm", "μm"), "um"),
+    **dict.fromkeys(("meter", "metre"), "m"),
+    **dict.fromkeys(("µrad", "μrad", "microrad"), "urad"),
+    **dict.fromkeys(("arcsecond", "asec", '"'), "arcsec"),
+    **dict.fromkeys(("milliarcsec", "milliarcsecond"), "mas"),
+    "radian": "rad",
 }
-_ALIASES = {other: unit for unit, names in _OTHER_NAMES.items() for other in names.split()}
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _HERTZ = {"hz": 1.0, "khz": 1e3, "mHz": 1e-3, "MHz": 1e6}  # capitals matter where both exist
 _CLOCK_UNITS = {*_SECONDS, *(word.lower() for word in _HERTZ)}
+_BRACKETS = re.compile(r"(?P<name>[^\[(]*?)\s*[\[(](?P<unit>.*)[\])]")
 _SQUARED = re.compile(r"^(?P<unit>.+?)(?:\^2|\*\*2|²|2)\s*(?:/|_|\s|per)\s*hz$", re.IGNORECASE)
 _ROOT = re.compile(
     r"^(?P<unit>.+?)\s*(?:/|_|per)\s*(?:sqrt\(?hz\)?|rthz|√hz|hz\^?(?:0\.5|\(1/2\)))$",
@@ -41,8 +41,8 @@ _ROOT = re.compile(
 def unit_name(text: str) -> str | None:
     """Return the name that this package has for a unit, None for an unknown one."""
     lower = text.strip().lower()
-    found = _ALIASES.get(lower) or _ALIASES.get(lower.removesuffix("s")) or lower
-    return found if found in UNITS else None
+    unit = _ALIASES.get(lower) or _ALIASES.get(lower.removesuffix("s")) or lower
+    return unit if unit in UNITS else None
 
 
 def is_angle(text: str) -> bool:
@@ -53,7 +53,7 @@ def is_angle(text: str) -> bool:
 def density_unit(text: str) -> tuple[str, int] | None:
     """Split the unit of a spectrum into a unit and its power, 1 or 2; None for others."""
     word = text.strip()
-    for pattern, power in ((_ROOT, 1), (_SQUARED, 2)) if len(word) <= _LONGEST_UNIT else ():
+    for pattern, power in ((_ROOT, 1), (_SQUARED, 2)):
         if match := pattern.match(word):
             unit = unit_name(match["unit"])
             return None if unit is None else (unit, power)
@@ -138,7 +138,6 @@ FACTS = {
 }
 OF_AXES = ("measurements", "open_loop", "commands", "density", "amplitude")
 _AXES = {"0": 0, "1": 1, "2": 2, "tip": 0, "tilt": 1, "x": 0, "y": 1}
-_LONGEST_UNIT = 40  # characters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -188,13 +187,9 @@ def _normalise(name: str) -> str:
 
 
 def _split_unit(name: str) -> tuple[str, str | None]:
-    if name.endswith(("]", ")")):
-        depth = 0
-        for at in range(len(name) - 1, -1, -1):  # to the bracket that the last one closes
-            depth += (name[at] in "])") - (name[at] in "[(")
-            if depth == 0:
-                return name[:at].rstrip(), name[at + 1 : -1].strip() or None
-    first = max(1, len(name) - _LONGEST_UNIT - 1)
-    ends = (at for at in range(first, len(name)) if name[at] == "_")
-    found = next((at for at in ends if is_unit(name[at + 1 :])), None)
-    return (name, None) if found is None else (name[:found], name[found + 1 :])
+    """Split a name and its unit, in brackets or after an underscore."""
+    if match := _BRACKETS.fullmatch(name):
+        return match["name"], match["unit"].strip() or None
+    ends = (at for at, sign in enumerate(name) if sign == "_" and at)
+    end = next((at for at in ends if is_unit(name[at + 1 :])), None)
+    return (name, None) if end is None else (name[:end], name[end + 1 :])

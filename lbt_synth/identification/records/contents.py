@@ -6,7 +6,7 @@ The columns of a file that make a record, by their names or as they were chosen.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,7 +26,7 @@ from lbt_synth.identification.records.columns import (
 from lbt_synth.storage.array_file import error_reason, open_fits, read_numpy
 from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.validation import FloatArray, choice, integer, sequence
+from lbt_synth.validation import choice, integer, sequence
 
 FITS = (".fits", ".fit", ".fts")
 TEXTS = (".csv", ".tsv", ".txt", ".dat")
@@ -38,7 +38,6 @@ _SUFFIXES = {  # of numbers that are texts
 }
 _GAPS = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
 _DELIMITERS = (";", "\t", ",", "|")  # else blanks
-_LOOKED_AT = 20  # rows, to find decimal commas
 _DELAY_CARD = "DELAY"
 _IN_FRAMES = ("[frame]", "[frames]")  # the unit of a card, where the FITS standard has it
 # The roles that give the series of each kind of record, and what is needed beside it.
@@ -147,8 +146,7 @@ def _read_fits(out: Contents, content: bytes) -> None:
             if isinstance(unit, fits.BinTableHDU | fits.TableHDU):
                 _add_table(out, unit)
             elif unit.is_image and unit.data is not None:
-                own = unit.header.get("BUNIT")
-                out.add_array(name, unit.data, None if own is None else str(own))
+                out.add_array(name, unit.data, str(unit.header.get("BUNIT", "")) or None)
 
 
 def _add_card(out: Contents, card: Any, where: str) -> None:
@@ -185,8 +183,8 @@ def _add_named(out: Contents, name: str, array: npt.NDArray[Any]) -> None:
     """Add an array, each field of a structured one, or a number or text as a fact."""
     fact = recognise_fact(name)
     if array.dtype.names:
-        for each in array.dtype.names:
-            out.add_array(each, array[each])
+        for field_name in array.dtype.names:
+            out.add_array(field_name, array[field_name])
     elif array.size == 1 and (array.ndim == 0 or array.dtype.kind in "US" or fact is not None):
         if fact is None:
             out.notes.append(f"not used: {name}, a single value")
@@ -205,8 +203,8 @@ def _read_text(out: Contents, content: bytes) -> None:
     above = ""  # the last comment before the table, which may have the names
     for number, raw in enumerate(text.splitlines(), start=1):
         line = raw.strip("\r\n ")
-        if line.lstrip().startswith("#"):
-            comment = line.lstrip().lstrip("#").strip()
+        if line.startswith("#"):
+            comment = line.lstrip("#").strip()
             above = above if rows else comment
             _add_comment(out, comment)
         elif line:
@@ -215,7 +213,7 @@ def _read_text(out: Contents, content: bytes) -> None:
         raise TelemetryError("it has no rows.")
     sign = next((sign for sign in _DELIMITERS if sign in rows[0][1]), None)
     names = _split_heading(rows[0][1], sign)
-    sample = "".join(line for _, line in rows[1:_LOOKED_AT])
+    sample = "".join(line for _, line in rows[1:20])
     if sign in (";", "\t") and "," in sample and "." not in sample:
         out.notes.append("commas were taken for decimal points")
         rows = [(number, line.replace(",", ".")) for number, line in rows]
@@ -223,21 +221,46 @@ def _read_text(out: Contents, content: bytes) -> None:
         rows = rows[1:]
     else:
         cells = _split_heading(above, sign)
-        numbers = [cell for cell in cells if not cell or _parse_number(cell) is not None]
-        names = [""] * len(names) if numbers or len(cells) != len(names) else cells
+        named = len(cells) == len(names) and all(
+            cell and _parse_number(cell) is None for cell in cells
+        )
+        names = cells if named else [""] * len(names)
     if not rows:
         raise TelemetryError("it has a heading and no rows.")
-    parsed = [parse_column(name, np.empty(0)) for name in names]
-    # a text that no role needs, as a remark or a date
-    spare = [bool(each.name) and each.role is None for each in parsed]
-    table, texts = _parse_rows(rows, sign, spare)
-    if all(texts):
-        raise TelemetryError(f"each cell of a column must be a number; got {rows[0][1].strip()!r}.")
-    for each, column, is_text in zip(parsed, table.T, texts, strict=True):
-        if is_text:
-            out.left_out.append(f"{each.name} holds texts")
+    _add_table_of_text(out, rows, names, sign)
+
+
+def _add_table_of_text(
+    out: Contents, rows: list[tuple[int, str]], names: list[str], sign: str | None
+) -> None:
+    """Add the columns of rows of a text; leave out those of texts that no role needs."""
+    lines, columns = [line for _, line in rows], [parse_column(name, np.empty(0)) for name in names]
+    with suppress(ValueError):  # the quick way, which knows no gaps
+        numbers = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
+        if numbers.shape == (len(rows), len(names)):
+            pairs = zip(columns, numbers.T, strict=True)
+            out.columns += [replace(column, values=values) for column, values in pairs]
+            return
+    table = (
+        [line.split() for line in lines] if sign is None else [*csv.reader(lines, delimiter=sign)]
+    )
+    for (number, _), cells in zip(rows, table, strict=True):
+        if len(cells) != len(names):
+            raise TelemetryError(f"line {number} must have {len(names)} cells; got {len(cells)}.")
+    for at, (column, cells) in enumerate(zip(columns, zip(*table, strict=True), strict=True)):
+        values = [_parse_number(cell) for cell in cells]
+        if None not in values:
+            out.columns.append(replace(column, values=np.array(values, dtype=np.float64)))
+        elif column.name and column.role is None:  # as a remark or a date
+            out.left_out.append(f"{column.name} holds texts")
         else:
-            out.columns.append(replace(each, values=column))
+            bad = values.index(None)
+            raise TelemetryError(
+                f"cell {at + 1} of line {rows[bad][0]} must be a number; got "
+                f"{cells[bad].strip()!r}."
+            )
+    if not out.columns:
+        raise TelemetryError(f"each cell of a column must be a number; got {lines[0]!r}.")
 
 
 def _add_comment(out: Contents, comment: str) -> None:
@@ -251,13 +274,9 @@ def _add_comment(out: Contents, comment: str) -> None:
             out.add_fact(fact, value, f"the comment {key}")
 
 
-def _split_cells(lines: Iterable[str], sign: str | None) -> Iterator[list[str]]:
-    """Yield the cells of each line."""
-    return map(str.split, lines) if sign is None else csv.reader(lines, delimiter=sign)
-
-
 def _split_heading(line: str, sign: str | None) -> list[str]:
-    return [cell.strip().strip('"') for cell in next(_split_cells([line], sign), [])]
+    cells = line.split() if sign is None else next(csv.reader([line], delimiter=sign), [])
+    return [cell.strip().strip('"') for cell in cells]
 
 
 def _parse_number(cell: str) -> float | None:
@@ -265,30 +284,6 @@ def _parse_number(cell: str) -> float | None:
         return float(cell)
     except ValueError:
         return float("nan") if cell.strip().lower() in _GAPS else None
-
-
-def _parse_rows(
-    rows: list[tuple[int, str]], sign: str | None, spare: list[bool]
-) -> tuple[FloatArray, list[bool]]:
-    """Return the numbers of rows, and which columns have texts: only ``spare`` ones may."""
-    lines, out = [line for _, line in rows], np.empty((len(rows), len(spare)))
-    texts = [False] * len(spare)
-    with suppress(ValueError):  # the quick way, which knows no gaps
-        numbers = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
-        if numbers.shape == out.shape:
-            return numbers, texts
-    table = _split_cells(lines, sign)
-    for values, (number, _), cells in zip(out, rows, table, strict=True):
-        if len(cells) != len(spare):
-            raise TelemetryError(f"line {number} must have {len(spare)} cells; got {len(cells)}.")
-        for at, value in enumerate(map(_parse_number, cells)):
-            if value is None and not spare[at]:
-                raise TelemetryError(
-                    f"cell {at + 1} of line {number} must be a number; got {cells[at].strip()!r}."
-                )
-            texts[at] |= value is None
-            values[at] = np.nan if value is None else value
-    return out, texts
 
 
 def select_series(
@@ -307,13 +302,13 @@ def select_series(
     notes += [f"{why}; it was left out" for why in contents.left_out]
     if not there:
         raise ProblemError(f"the file holds no series of numbers{_left_out(contents)}.")
-    found = _assign_roles(there, columns) or _assign_by_kind(there, kind, notes)
-    kind = _find_kind(found, contents) if kind is None else kind
-    if kind == "open_loop" and "open_loop" not in found and "measurements" in found:
-        found["open_loop"] = own = found["measurements"]
+    roles = _assign_roles(there, columns) or _assign_by_kind(there, kind, notes)
+    kind = _find_kind(roles, contents) if kind is None else kind
+    if kind == "open_loop" and "open_loop" not in roles and "measurements" in roles:
+        roles["open_loop"] = own = roles["measurements"]
         if len({each.axis for each in own} - {None}) < len(own) and _are_two_axes(own):
-            found["open_loop"] = number_axes(own)
-    role = _series_role(found, kind)
+            roles["open_loop"] = number_axes(own)
+    role = _series_role(roles, kind)
     if role is None:
         needed = [role for role in (_SERIES[kind][0], _BESIDE.get(kind)) if role is not None]
         raise ProblemError(
@@ -322,24 +317,22 @@ def select_series(
         )
     clocks = () if kind == "spectrum" else CLOCKS
     chosen = {
-        each: _choose_axes(found[each], each, axes)
+        each: _choose_axes(roles[each], each, axes)
         for each in (role, _BESIDE.get(kind), *clocks)
-        if each in found
+        if each in roles
     }
-    if kind == "closed_loop":
-        _require_same_axes(chosen)
     notes += [f"{each.replace('_', ' ')}: {join_names(own)}" for each, own in chosen.items()]
     used = {id(column.values) for own in chosen.values() for column in own}
-    if left := [column for column in there if id(column.values) not in used]:
-        notes.append(f"not used: {join_names(left)}")
-    if kind == "open_loop" and "commands" in found:
+    if unused := [column for column in there if id(column.values) not in used]:
+        notes.append(f"not used: {join_names(unused)}")
+    if kind == "open_loop" and "commands" in roles:
         notes.append("commands were left out: the record is of an open loop")
     return kind, chosen
 
 
 def number_axes(columns: Sequence[Column]) -> list[Column]:
     """Return columns numbered as axes, in their order."""
-    return [replace(each, axis=axis) for axis, each in enumerate(columns)]
+    return [replace(column, axis=axis) for axis, column in enumerate(columns)]
 
 
 def _series_role(found: Roles, kind: str) -> str | None:
@@ -377,10 +370,10 @@ def _find_columns(columns: Sequence[Column], wanted: Any) -> list[Column]:
     """Find the columns of a name, all of an array, or of a number."""
     if isinstance(wanted, str):
         name = wanted.strip().lower()
-        hits = [each for each in columns if each.name.strip().lower() == name]
+        hits = [column for column in columns if column.name.strip().lower() == name]
         if len(hits) > 1:
             raise ProblemError(f"{len(hits)} columns are named {wanted!r}; choose by numbers.")
-        hits = hits or [each for each in columns if each.name.lower().startswith(f"{name}[")]
+        hits = hits or [column for column in columns if column.name.lower().startswith(f"{name}[")]
         if not hits:
             raise ProblemError(f"there is no column {wanted!r}; got {join_names(columns)}.")
         return hits
@@ -402,7 +395,7 @@ def _assign_by_kind(columns: Sequence[Column], kind: str | None, notes: list[str
 
 def _are_two_axes(columns: Sequence[Column]) -> bool:
     """Return whether two columns are the series of two axes: none rises all the time as a clock."""
-    return len(columns) == 2 and not any(np.all(np.diff(each.values) > 0) for each in columns)
+    return len(columns) == 2 and not any(np.all(np.diff(column.values) > 0) for column in columns)
 
 
 def _find_kind(found: Roles, contents: Contents) -> str:
@@ -428,8 +421,8 @@ def _find_kind(found: Roles, contents: Contents) -> str:
 def _choose_axes(found: list[Column], role: str, axes: Sequence[int] | None) -> list[Column]:
     """Return the columns of the axes, in the order that their names tell."""
     of_axes = role in OF_AXES
-    known = {each.axis for each in found if each.axis is not None and of_axes}
-    if len(found) > 1 and len(known) < len(found):
+    named_axes = {column.axis for column in found if column.axis is not None and of_axes}
+    if len(found) > 1 and len(named_axes) < len(found):
         raise ProblemError(
             f"{join_names(found)} are all named as {role}"
             f"{', and not each of an axis of its own' if of_axes else ''}; choose by "
@@ -437,7 +430,7 @@ def _choose_axes(found: list[Column], role: str, axes: Sequence[int] | None) -> 
         )
     if not of_axes:
         return found
-    ordered = sorted(found, key=lambda each: each.axis or 0)
+    ordered = sorted(found, key=lambda column: column.axis or 0)
     return [ordered[i] for i in choose_axes(axes, "axes", len(found), f"columns of {role}")]
 
 
@@ -459,22 +452,9 @@ def choose_axes(given: Any, name: str, count: int, what: str) -> list[int]:
     return axes
 
 
-def _require_same_axes(chosen: Roles) -> None:
-    """Refuse measurements of one axis with commands of another."""
-    y, u = chosen["measurements"], chosen["commands"]
-    mine, theirs = ([each.axis for each in own] for own in (y, u))
-    from_one = sorted([mine, theirs], key=str) == [[0, 1], [1, 2]]  # one of them counts from 1
-    if None not in (*mine, *theirs) and len(y) == len(u) and mine != theirs and not from_one:
-        raise ProblemError(
-            f"measurements and commands must be of the same axes; got {join_names(y)} with "
-            f"{join_names(u)}. Choose by columns={{'measurements': ..., 'commands': ...}} if they "
-            "do belong together."
-        )
-
-
 def join_names(columns: Sequence[Column]) -> str:
     """Return the names of columns in one text."""
-    return ", ".join(each.name or "a column without a name" for each in columns)
+    return ", ".join(column.name or "a column without a name" for column in columns)
 
 
 def _left_out(contents: Contents) -> str:

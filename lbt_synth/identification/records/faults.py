@@ -17,16 +17,13 @@ from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 _SHORTEST_RUN = 5  # equal values, a stuck sensor
 _RARE = 1e-3  # runs of chance allowed in a record
-_QUANTISED = 2**20  # levels at most, where equal neighbours say little
 _MANY_RUNS = 100  # needed to compute a chance
 _SAME_LEVEL = 1e-9  # of the range
-_LEAST_AT_LIMIT = 4  # values at an end of the range
-_LIMIT_RATIO = 4  # over the next values inside
+_LIMIT_RATIO = 4  # of values at an end of the range over those at the next levels
 _LEVELS = 3
 _OUTLIER = 6.5  # standard deviations of the second difference: 1e-4 clean frames in a million
 MAD = 1.482602218505602  # standard deviation of a normal law over its median deviation
 _BLOCK = 256  # frames of a local scale
-_PASSES = 6
 
 
 def runs(flags: BoolArray) -> IntArray:
@@ -61,32 +58,16 @@ def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
     """Find frames of a value that is held for longer than chance or quantisation hold it."""
     if not good.any():
         return np.zeros(len(series), dtype=np.bool_)
-    each = equal_runs(series, good)
-    lengths = each[:, 1] - each[:, 0]
-    repeated = float(np.mean(lengths > 1))  # chance that a value is seen again
-    if _is_quantised(series[good]):
-        # a slow series stays on a level longer than the mean run tells: the largest such chance
-        longer = np.cumsum(np.bincount(lengths)[::-1])[::-1]  # runs of at least that length
-        many = longer[1:] >= _MANY_RUNS
-        chances = longer[2:][many[:-1]] / longer[1:-1][many[:-1]]
-        repeated = max(repeated, float(np.max(chances, initial=0.0)))
-    if repeated >= 1:
-        least = np.inf if len(lengths) > 1 else 0.0
-    elif repeated > 0:
-        least = 1 + np.log(_RARE / len(series)) / np.log(repeated)
-    else:
-        least = 0.0
-    return mark(each[lengths >= max(least, _SHORTEST_RUN)], len(series))
-
-
-def _is_quantised(values: FloatArray) -> bool:
-    """Whether all values are whole multiples of a step that is not tiny."""
-    steps = np.abs(np.diff(values))
-    step = float(np.min(steps[steps > 0], initial=np.inf))
-    if not 0 < float(np.ptp(values)) <= _QUANTISED * step:
-        return False
-    counts = steps / step
-    return bool(np.all(np.abs(counts - np.round(counts)) < 1e-3))
+    stretches = equal_runs(series, good)
+    lengths = stretches[:, 1] - stretches[:, 0]
+    # the chance that a value is held on: a slow series in steps stays on a level longer than its
+    # mean run tells, so the largest one of any length counts
+    longer = np.cumsum(np.bincount(lengths)[::-1])[::-1]  # runs of at least that length
+    many = longer[1:] >= _MANY_RUNS
+    chances = longer[2:][many[:-1]] / longer[1:-1][many[:-1]]
+    chance = max(float(np.max(chances, initial=0.0)), np.finfo(float).tiny)
+    least = np.inf if chance >= 1 else 1 + np.log(_RARE / len(series)) / np.log(chance)
+    return mark(stretches[lengths >= max(least, _SHORTEST_RUN)], len(series))
 
 
 def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
@@ -97,26 +78,27 @@ def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
     """
     out = np.zeros(len(series), dtype=np.bool_)
     values = series[good]
-    span = float(np.ptp(values)) if values.size > _LEAST_AT_LIMIT else 0.0
+    span = float(np.ptp(values)) if values.size else 0.0
     if span == 0:
         return out
     tolerance = _SAME_LEVEL * span
     for sign in (1.0, -1.0):
         end = float(np.max(sign * values))
-        near, ends = _sort_levels(sign * values[sign * values > end - 0.25 * span], tolerance)
+        upper = sign * values[sign * values > end - 0.25 * span]
+        upper, ends = _sort_levels(upper, tolerance)
         if len(ends) <= _LEVELS:  # of coarse numbers there are few
-            near, ends = _sort_levels(sign * values, tolerance)
-        counts = np.diff(np.concatenate([[0], ends, [near.size]]))[: _LEVELS + 1]
+            upper, ends = _sort_levels(sign * values, tolerance)
+        counts = np.diff(np.concatenate([[0], ends, [upper.size]]))[: _LEVELS + 1]
         inside = int(np.max(counts[1:], initial=1))
-        if counts[0] >= max(_LEAST_AT_LIMIT, _LIMIT_RATIO * inside):
+        if counts[0] >= _LIMIT_RATIO * inside:
             out |= good & (sign * series >= end - tolerance)
     return out
 
 
 def _sort_levels(values: FloatArray, tolerance: float) -> tuple[FloatArray, IntArray]:
     """Return the values from the largest down, and where each next level begins."""
-    near = np.sort(values)[::-1]
-    return near, np.flatnonzero(-np.diff(near) > tolerance) + 1
+    sorted_values = np.sort(values)[::-1]
+    return sorted_values, np.flatnonzero(-np.diff(sorted_values) > tolerance) + 1
 
 
 def find_outliers(series: FloatArray, good: BoolArray) -> BoolArray:
@@ -130,24 +112,24 @@ def find_outliers(series: FloatArray, good: BoolArray) -> BoolArray:
     steps = np.abs(np.diff(series))[good[1:] & good[:-1]]
     rising = steps[steps > 0]
     smallest = float(rising.min()) / 2 if rising.size else 0.0
-    for _ in range(_PASSES):
+    while True:
         bend, valid = _second_difference(series, good)
         if not valid.any():
             break
         size = np.abs(bend)
         scale = np.maximum(_local_scale(size, valid), smallest)
-        found = valid & (size > _OUTLIER * scale) & (size >= 0.9 * _neighbours(size))
-        if not found.any():
+        outliers = valid & (size > _OUTLIER * scale) & (size >= 0.9 * _neighbours(size))
+        if not outliers.any():
             break
         # a frame at an edge has no second difference: it may be the one that bends its neighbour
-        found |= good & ~valid & (_neighbours(found) > 0)
-        out |= found
-        good &= ~found
+        outliers |= good & ~valid & (_neighbours(outliers) > 0)
+        out |= outliers
+        good &= ~outliers
     if out.any():  # frames between outliers that are too few to be judged
         beside = _neighbours(out) > 0
-        left = runs(good)
-        few = np.array([b - a < 3 and beside[a:b].any() for a, b in left], dtype=np.bool_)
-        out |= mark(left[few], len(series))
+        stretches = runs(good)
+        few = np.array([b - a < 3 and beside[a:b].any() for a, b in stretches], dtype=np.bool_)
+        out |= mark(stretches[few], len(series))
     return out
 
 
@@ -164,15 +146,15 @@ def _second_difference(series: FloatArray, good: BoolArray) -> tuple[FloatArray,
 def _local_scale(size: FloatArray, valid: BoolArray) -> FloatArray:
     """Return the scale of the second difference at each frame, at least that of the record."""
     frames = len(size)
-    whole = MAD * float(np.median(size[valid]))
+    global_scale = MAD * float(np.median(size[valid]))
     blocks = -(-frames // _BLOCK)
     padded = np.full(blocks * _BLOCK, np.nan)
     padded[:frames] = np.where(valid, size, np.nan)
     table = padded.reshape(blocks, _BLOCK)
     enough = np.sum(np.isfinite(table), axis=1) >= _BLOCK // 4
-    local = np.full(blocks, whole)
+    local = np.full(blocks, global_scale)
     if enough.any():
-        local[enough] = np.maximum(whole, MAD * np.nanmedian(table[enough], axis=1))
+        local[enough] = np.maximum(global_scale, MAD * np.nanmedian(table[enough], axis=1))
     return np.repeat(np.maximum(local, _neighbours(local)), _BLOCK)[:frames]
 
 
@@ -213,7 +195,7 @@ class RecordHealth:
     @property
     def clean(self) -> bool:
         """Whether nothing was found that spoils a frame."""
-        return not any(found.spoils for found in self.findings)
+        return not any(finding.spoils for finding in self.findings)
 
     def summary(self) -> str:
         """Return one line: how many frames are usable, and why the others are not."""

@@ -129,8 +129,8 @@ def load_record(
             return record_from_telemetry(load_telemetry(source), axes=axes, **given)
         contents = read_contents(source)
         if commands is not None:
-            other = Path(commands)
-            join_commands(contents, read_contents(other), other)
+            command_file = Path(commands)
+            join_commands(contents, read_contents(command_file), command_file)
         kind, chosen = select_series(contents, kind=kind, axes=axes, columns=columns)
         return build_record(kind, chosen, contents, averages=averages, **given)
 
@@ -250,8 +250,8 @@ def record_from_telemetry(
 
 def _modal_columns(seen: Telemetry, role: str, chosen: list[int], notes: list[str]) -> list[Column]:
     """Return the measurements or the commands of the chosen modes."""
-    own = seen.measurement_unit if role == "measurements" else seen.command_unit
-    series, unit, said = getattr(seen, role), unit_name(own), f"in {own!r}"
+    recorded_unit = seen.measurement_unit if role == "measurements" else seen.command_unit
+    series, unit, said = getattr(seen, role), unit_name(recorded_unit), f"in {recorded_unit!r}"
     find, word = _MATRICES[role]
     if (matrix := find(seen)) is not None:
         series, said = series @ matrix.T, f"behind {word}"

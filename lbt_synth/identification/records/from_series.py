@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records import faults
 from lbt_synth.identification.records.clock import build_clock
 from lbt_synth.identification.records.columns import (
@@ -48,11 +49,9 @@ _UNITS = {
     "loop": "nm, um, m of wavefront, or mas, arcsec, urad, rad of tilt",
     "spectrum": "nm^2/Hz, or mas^2/Hz of tilt; nm/sqrt(Hz) of an amplitude",
 }
-_LARGEST_NM = 1e100  # a larger number is none: its square would overflow
-_SMALLEST_NM = 1e-30  # squares of less are lost to rounding
+_LARGEST_NM = 1e30  # a larger number is a filler
 _OPEN_FRAMES = 20  # of zero or equal commands
 TREND = 2.0  # ratio of scatters
-_LEAST_QUARTER = 64  # pairs of frames that show a trend
 
 Finders = tuple[tuple[str, Callable[[FloatArray, BoolArray], BoolArray]], ...]
 
@@ -82,7 +81,7 @@ def build_record(
         return _build_spectrum(columns, contents, own_unit, source=source, **facts)
     u, u_unit = columns.get("commands"), None
     if u is not None:
-        u_unit = _find_unit(u, command_unit or unit, contents, kind, "command_unit")
+        u_unit = _find_unit(u, command_unit, contents, kind, "command_unit", default=unit)
     (clock,) = columns.get("times", [None])
     (counter,) = columns.get("frame_numbers", [None])
     times = None if clock is None else seconds_per(clock.unit) * clock.values
@@ -116,13 +115,13 @@ def _require_facts(
 ) -> None:
     """Refuse a loop of which several facts are missing, all of them in one message."""
     of_file = "".join(map(str, contents.facts.get("unit", {}).values()))
-    found = [
+    units_of_columns = [
         (column, column.unit or of_file or unit or "")
         for role, unit in units.items()
         for column in columns.get(role, ())
     ]
-    bare = [column for column, unit in found if not unit]
-    angles = facts["diameter_m"] is None and any(is_angle(unit) for _, unit in found)
+    bare = [column for column, unit in units_of_columns if not unit]
+    angles = facts["diameter_m"] is None and any(is_angle(unit) for _, unit in units_of_columns)
     no_rate = facts["frame_rate_hz"] is None and "times" not in columns
     no_delay = facts["delay_frames"] is None and "commands" in columns
     checks = (
@@ -139,17 +138,17 @@ def _require_facts(
 def _find_fact(contents: Contents, name: str, given: Any) -> Any:
     """Return what was given, or what the source has; refuse two values of a source."""
     places = contents.facts.get(name, {})
-    own = {where: number(value, f"{where} ({name})") for where, value in places.items()}
+    values = {where: number(value, f"{where} ({name})") for where, value in places.items()}
     if given is None:
-        if len(set(own.values())) > 1:
-            found = ", ".join(f"{value:.9g} by {where}" for where, value in own.items())
-            raise ProblemError(f"the file gives {name} twice: {found}. Choose one in the call.")
-        for where, value in own.items():
+        if len(set(values.values())) > 1:
+            listing = ", ".join(f"{value:.9g} by {where}" for where, value in values.items())
+            raise ProblemError(f"the file gives {name} twice: {listing}. Choose one in the call.")
+        for where, value in values.items():
             contents.notes.append(f"{name} {value:.9g}, by {where}")
             return int(value) if name == "averages" else value
         return None
     wanted = number(given, name)
-    for where, value in own.items():
+    for where, value in values.items():
         if abs(value - wanted) > 1e-6 * wanted:
             if name == "frame_rate_hz":
                 raise ProblemError(
@@ -160,39 +159,45 @@ def _find_fact(contents: Contents, name: str, given: Any) -> Any:
 
 
 def _find_unit(
-    chosen: Sequence[Column], given: str | None, contents: Contents, kind: str, option: str = "unit"
+    chosen: Sequence[Column],
+    stated: str | None,
+    contents: Contents,
+    kind: str,
+    option: str = "unit",
+    default: str | None = None,
 ) -> str:
     """Return the unit of some columns by their names or headers, the source, or the call."""
     facts = contents.facts.get(option, contents.facts.get("unit", {}))
     of_file = list(dict.fromkeys(map(str, facts.values())))
-    found = {each.unit or (of_file[0] if of_file else "") for each in chosen}
-    if len(found) > 1 or len(of_file) > 1:
+    units = {column.unit or (of_file[0] if of_file else "") for column in chosen}
+    if len(units) > 1 or len(of_file) > 1:
         raise ProblemError(
             f"{join_names(chosen)} must all have the same unit; got "
-            f"{', '.join(sorted(found.union(of_file)))}."
+            f"{', '.join(sorted(units.union(of_file)))}."
         )
-    (own,) = found
-    if not own and given is None:
+    (unit,) = units
+    if unit and stated is not None and not same_unit(unit, stated):
+        raise ProblemError(
+            f"{option} must be that of the data, {unit!r}; got {stated!r}.",
+            at_terminal="Leave it out; --show-unit is the unit of what is shown.",
+        )
+    unit = unit or stated or default or ""
+    if not unit:
         raise ProblemError(
             f"nothing tells the unit of {join_names(chosen)}; give {option} ({_UNITS[kind]}).",
             **(VOLTS if option == "command_unit" else {}),
         )
-    if own and given is not None and not same_unit(own, given):
-        raise ProblemError(
-            f"{option} must be that of the data, {own!r}; got {given!r}.",
-            at_terminal="Leave it out; --show-unit is the unit of what is shown.",
-        )
-    return own or str(given)
+    return str(unit)
 
 
 def _stack_columns(chosen: Sequence[Column]) -> FloatArray:
-    sizes = {len(each.values) for each in chosen}
+    sizes = {len(column.values) for column in chosen}
     if len(sizes) > 1:
         raise ProblemError(
-            f"{' and '.join(each.name for each in chosen)} must be equally long; got "
+            f"{' and '.join(column.name for column in chosen)} must be equally long; got "
             f"{' and '.join(map(str, sorted(sizes)))} rows."
         )
-    return np.column_stack([each.values for each in chosen])
+    return np.column_stack([column.values for column in chosen])
 
 
 def _build_spectrum(
@@ -234,8 +239,7 @@ def _build_spectrum(
     )
 
 
-_SAME_TIME = 0.25  # of a step
-_LEAST_SHARE = 0.5  # of the measurements, that have a command
+_SAME_TIME = 0.25  # of a step, within which two rows are of one frame
 
 
 def join_commands(contents: Contents, other: Contents, path: Path) -> None:
@@ -244,20 +248,20 @@ def join_commands(contents: Contents, other: Contents, path: Path) -> None:
     Rows are matched by the counters of both files, or else by the times of both (within a
     quarter of a step). Without a common clock both files must have equally many rows.
     """
-    named = [each for each in other.columns if each.role == "commands"] or [
-        each for each in other.columns if each.role in (None, "measurements")
+    named = [column for column in other.columns if column.role == "commands"] or [
+        column for column in other.columns if column.role in (None, "measurements")
     ]
     if not named:
         raise TelemetryError(f"{path} holds no commands.", path=path)
     named = _match_commands(contents, other, named, path)
-    if len(named) > 1 and any(each.axis is None for each in named):
+    if len(named) > 1 and any(column.axis is None for column in named):
         named = number_axes(named)
-    own = [each for each in contents.columns if each.role != "commands"]
-    if not any(each.role in ("measurements", "open_loop") for each in own):
-        plain = number_axes([each for each in own if each.role is None])
-        own = [each for each in own if each.role is not None]
-        own += [replace(each, role="measurements") for each in plain]
-    contents.columns = own + [replace(each, role="commands") for each in named]
+    columns = [column for column in contents.columns if column.role != "commands"]
+    if not any(column.role in ("measurements", "open_loop") for column in columns):
+        plain = number_axes([column for column in columns if column.role is None])
+        columns = [column for column in columns if column.role is not None]
+        columns += [replace(column, role="measurements") for column in plain]
+    contents.columns = columns + [replace(column, role="commands") for column in named]
     for fact, places in other.facts.items():
         if fact != "unit":
             for where, value in places.items():
@@ -268,65 +272,55 @@ def join_commands(contents: Contents, other: Contents, path: Path) -> None:
 
 
 def _match_commands(
-    contents: Contents, other: Contents, named: list[Column], path: Path
+    contents: Contents, other: Contents, commands: list[Column], path: Path
 ) -> list[Column]:
     """Return the commands in the rows of the measurements, NaN where there are none."""
-    rows, counts = ({len(each.values) for each in own} for own in (contents.columns, named))
+    counts = [{len(each.values) for each in columns} for columns in (contents.columns, commands)]
     for role in CLOCKS:
-        mine, theirs = (_find_clock(file, role) for file in (contents, other))
-        if mine is None or theirs is None:
+        clocks = [c for file in (contents, other) for c in file.columns if c.role == role]
+        if len(clocks) != 2 or [{len(clock.values)} for clock in clocks] != counts:
             continue
-        if rows != {len(mine.values)} or counts != {len(theirs.values)}:
-            break  # refused below
-        at = _match_rows(_clock_values(mine), _clock_values(theirs), role, path)
-        if np.array_equal(at, np.arange(len(theirs.values))):
-            return named
+        in_s = [seconds_per(clock.unit) if role == "times" else 1.0 for clock in clocks]
+        at = _match_rows(in_s[0] * clocks[0].values, in_s[1] * clocks[1].values, role, path)
         there = at >= 0
-        contents.notes.append(
-            f"commands were laid beside the measurements by {theirs.name}: {int(np.sum(there))} of "
-            f"{len(at)} rows have one"
-        )
-        return [replace(each, values=np.where(there, each.values[at], np.nan)) for each in named]
-    if len(rows | counts) > 1:
+        if not np.array_equal(at, np.arange(len(clocks[1].values))):
+            contents.notes.append(
+                f"commands were laid beside the measurements by {clocks[1].name}: "
+                f"{int(np.sum(there))} of {len(at)} rows have one"
+            )
+        return [replace(each, values=np.where(there, each.values[at], np.nan)) for each in commands]
+    rows = sorted(set.union(*counts))
+    if len(rows) > 1:
         raise TelemetryError(
             f"{path} must have as many frames as the measurements; got "
-            f"{', '.join(map(str, sorted(rows | counts)))}. Or give both files a counter of "
-            "frames, or times.",
+            f"{', '.join(map(str, rows))}. Or give both files a counter of frames, or times.",
             path=path,
         )
     if any(each.role in CLOCKS for each in (*contents.columns, *other.columns)):
         contents.notes.append(
             "the files have no clock in common: rows of the same number were taken for one frame"
         )
-    return named
-
-
-def _find_clock(file: Contents, role: str) -> Column | None:
-    """Return the clock of a file, if it has one and not more."""
-    found = [each for each in file.columns if each.role == role]
-    return found[0] if len(found) == 1 else None
-
-
-def _clock_values(clock: Column) -> FloatArray:
-    return clock.values * (seconds_per(clock.unit) if clock.role == "times" else 1.0)
+    return commands
 
 
 def _match_rows(one: FloatArray, other: FloatArray, role: str, path: Path) -> IntArray:
     """Return the row of the second clock for each row of the first, -1 where there is none."""
-    if not all(np.all(np.isfinite(each)) and np.all(np.diff(each) >= 0) for each in (one, other)):
+    steps = [np.diff(clock) for clock in (one, other)]
+    if not all(np.all(step >= 0) for step in steps):  # no gap does
         raise TelemetryError(f"the {role} of both files must rise, without gaps.", path=path)
     if np.array_equal(one, other):
         return np.arange(len(one))
-    if np.any(np.diff(other) <= 0):
+    if np.any(steps[1] == 0):
         raise TelemetryError(
             f"the {role} of {path} must rise from row to row to be matched with those of the "
             "measurements; got two rows alike.",
             path=path,
         )
-    near = _SAME_TIME * min(map(_median_step, (one, other))) if role == "times" else 0.0
+    within = _SAME_TIME if role == "times" else 0.0
+    tolerance = within * min(float(np.median(step)) for step in steps)
     at = np.searchsorted((other[1:] + other[:-1]) / 2, one, side="right")
-    at = np.where(np.abs(other[at] - one) <= near, at, -1)
-    if np.mean(at >= 0) < _LEAST_SHARE:
+    at = np.where(np.abs(other[at] - one) <= tolerance, at, -1)
+    if np.mean(at >= 0) < 0.5:
         raise TelemetryError(
             f"only {int(np.sum(at >= 0))} of {len(one)} measurements have a command in {path} by "
             f"their {role}; they go from {one[0]:.12g} to {one[-1]:.12g} and from {other[0]:.12g} "
@@ -335,11 +329,6 @@ def _match_rows(one: FloatArray, other: FloatArray, role: str, path: Path) -> In
             path=path,
         )
     return at
-
-
-def _median_step(clock: FloatArray) -> float:
-    steps = np.diff(clock)
-    return float(np.median(steps[steps > 0])) if np.any(steps > 0) else 0.0
 
 
 def loop_record(
@@ -402,12 +391,10 @@ def loop_record(
 
     Notes
     -----
-    A frame is spoilt where a measurement is missing, not finite, held (a run of equal values
-    longer than chance), at an end of the range that is reached repeatedly, or outlying: a second
-    difference of more than 6.5 standard deviations, by median deviations of the record and of
-    the frames around. A command that is missing, not finite or at a limit spoils the
-    frames whose correction it is part of. Commands that are zero or held, and a scatter that
-    changes by more than 2 between the first quarter and the last, are reported only.
+    A frame is spoilt where a measurement is missing, not finite, held, at an end of the range that
+    is reached repeatedly, or outlying. A command that is missing, not finite or at a limit spoils
+    the frames whose correction it is part of. Commands that are zero or held, and a scatter that
+    changes, are reported only. The page on records has the thresholds.
 
     Examples
     --------
@@ -424,8 +411,8 @@ def loop_record(
     scale = nm_per(unit, diameter_m=diameter_m)
     y, u = _series_in_nm(measurements, "measurements", scale), None
     if commands is not None:
-        own = unit if command_unit is None else command_unit
-        scale = nm_per(own, diameter_m=diameter_m, name="command_unit")
+        unit_of_commands = unit if command_unit is None else command_unit
+        scale = nm_per(unit_of_commands, diameter_m=diameter_m, name="command_unit")
         u = _series_in_nm(commands, "commands", scale)
         if u.shape != y.shape:
             raise DimensionError(f"commands must match measurements {y.shape}; got {u.shape}.")
@@ -479,9 +466,7 @@ def _series_in_nm(value: Any, name: str, scale: float) -> FloatArray:
         raise DimensionError(f"{name} must have one or two axes; got {out.shape}.{turn}")
     with np.errstate(over="ignore", invalid="ignore"):
         scaled = scale * out
-        size = np.abs(scaled)
-        scaled = np.where(size < _LARGEST_NM, scaled, np.nan)
-        return np.where(size < _SMALLEST_NM, 0.0, scaled)
+        return np.where(np.abs(scaled) < _LARGEST_NM, scaled, np.nan)
 
 
 def _lay_on_grid(
@@ -512,9 +497,9 @@ def _judge_series(
         good = there & np.isfinite(column)
         findings += findings_in(there & ~good, "not finite", name, axis)
         for kind, finder in finders:
-            found = finder(np.where(np.isfinite(column), column, 0.0), good)
-            findings += findings_in(found, kind, name, axis)
-            good &= ~found
+            faulty = finder(np.where(np.isfinite(column), column, 0.0), good)
+            findings += findings_in(faulty, kind, name, axis)
+            good &= ~faulty
         out[:, axis] = faults.fill(column, good)
         all_good &= good
     return out, all_good
@@ -565,7 +550,7 @@ def end_scatters(series: FloatArray, good: BoolArray) -> tuple[float, float]:
     """
     steps = np.diff(series)[good[1:] & good[:-1]]
     quarter = steps.size // 4
-    if quarter < _LEAST_QUARTER:
+    if quarter < SHORTEST_SEGMENT:
         return float("nan"), float("nan")
-    first, last = (float(np.sqrt(np.mean(part**2))) for part in (steps[:quarter], steps[-quarter:]))
-    return first, last
+    first, last = (np.sqrt(np.mean(ends**2)) for ends in (steps[:quarter], steps[-quarter:]))
+    return float(first), float(last)

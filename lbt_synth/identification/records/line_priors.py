@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,10 +31,6 @@ _AVERAGES = 32  # segments that a record is cut into
 _FINEST_HZ = 0.25
 _SHORTEST_SEGMENT = 64
 _DIP = 0.5  # of a peak, by which the power must fall before another peak counts
-_ERROR = re.compile(
-    r"((f|freq|frequency)[_ ])?(err|error|sigma|std|uncertainty)(_hz|\s*[\[(]\s*hz.*)?$", re.I
-)
-_HEADINGS = ("frequency", "error")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,14 +97,14 @@ def load_lines(lines: str | os.PathLike[str] | Sequence[Any] | FloatArray) -> tu
     [16.0, 45.5]
     """
     if isinstance(lines, str | os.PathLike):
-        found = _read_lines(Path(lines))
+        priors = _read_lines(Path(lines))
     elif isinstance(lines, list | tuple | np.ndarray):
-        found = [_line_prior(one, "list") for one in lines]
+        priors = [_line_prior(one, "list") for one in lines]
     else:
         raise ProblemError(
             f"lines must be a file or a list of frequencies; got {type(lines).__name__}."
         )
-    return tuple(sorted(found, key=lambda line: line.frequency_hz))
+    return tuple(sorted(priors, key=lambda line: line.frequency_hz))
 
 
 def _line_prior(one: Any, source: str) -> LinePrior:
@@ -136,22 +131,19 @@ def _read_lines(path: Path) -> list[LinePrior]:
 
 def _frequency_rows(columns: list[Column]) -> FloatArray:
     """Return frequencies and, if there are any, errors, (lines, 1 or 2), NaN without an error."""
-    found = {
-        "error" if _ERROR.match(each.name.strip()) else each.role: each.values
-        for each in columns
-        if (each.unit or "hz").lower() == "hz"
-    }
-    if not any(each.name for each in columns):
-        found = dict(zip(_HEADINGS, (each.values for each in columns), strict=False))
-    if "frequency" not in found or len(found) < len(columns) or not found.keys() <= {*_HEADINGS}:
+    fit = len(columns) <= 2
+    if any(column.name for column in columns):  # errors may come first
+        columns = sorted(columns, key=lambda column: column.role != "frequency")
+        fit = [column.role == "frequency" for column in columns] in ([True], [True, False])
+    if not fit or any((column.unit or "hz").lower() != "hz" for column in columns):
         raise ProblemError(
-            "its one or two columns must be frequency_hz, and frequency_error_hz or error_hz if "
-            f"there is one; got {join_names(columns)}."
+            "its one or two columns must be frequency_hz, and error_hz if there is one; got "
+            f"{join_names(columns)}."
         )
-    gaps = np.flatnonzero(np.isnan(found["frequency"]))
+    gaps = np.flatnonzero(np.isnan(columns[0].values))
     if gaps.size:
         raise ProblemError(f"row {gaps[0] + 1} of the numbers has no frequency.")
-    return np.column_stack([found[word] for word in _HEADINGS if word in found])
+    return np.column_stack([column.values for column in columns])
 
 
 def accelerometer_lines(
@@ -269,8 +261,8 @@ def _whole_segments(series: FloatArray, good: BoolArray, length: int) -> FloatAr
     """Return the steps of the segments without a spoilt frame, one after another."""
     steps, fine = np.diff(series, axis=0), good[1:] & good[:-1]
     count = len(steps) // length
-    whole = np.repeat(fine[: count * length].reshape(count, length).all(axis=1), length)
-    return np.asarray(steps[: count * length][whole])
+    complete = np.repeat(fine[: count * length].reshape(count, length).all(axis=1), length)
+    return np.asarray(steps[: count * length][complete])
 
 
 def _find_lines(

@@ -38,8 +38,8 @@ _BRIDGED_FRACTION = 0.01
 NOT_KNOWN = "correction not known"
 _Delay: TypeAlias = Annotated[float, ("at_least", 1), ("at_most", 100)]
 
-_LEAST_FRAMES = 4096  # that show a model
-LEAST_SECONDS = 4.0
+_LEAST_FRAMES = 1024  # half of which, two segments, show a model to be tested on the others
+LEAST_SECONDS = 2.0  # slower turbulence moves no filter by much
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -153,6 +153,17 @@ class LoopRecord:
         return self.frames / self.frame_rate_hz
 
     @property
+    def first_known(self) -> int:
+        """First frame whose correction has no command from before the record."""
+        closed = self.commands is not None and self.delay_frames is not None
+        return len(self.mirror_taps) if closed else 0
+
+    @property
+    def lost(self) -> float:
+        """Part of the frames that is spoilt, of those whose commands the record has."""
+        return float(1 - np.mean(self.usable[min(self.first_known, self.frames - 1) :]))
+
+    @property
     def hardware(self) -> LoopHardware:
         """The loop of a known delay: its mirror, one measurement and one command per axis."""
         if self.delay_frames is None:
@@ -189,15 +200,15 @@ class LoopRecord:
         They are ``y(k)/gain + c(k) = phi_tot(k-1) + w(k)/gain``, with one real gain of the sensor
         or one per axis. A closed loop has to have a known delay.
         """
-        return np.asarray(self.measurements / self._gains(sensor_gain) + self.corrections())
-
-    def _gains(self, sensor_gain: ArrayLike) -> FloatArray:
-        return one_or_each(sensor_gain, "sensor_gain", self.axes, above=0)
+        return np.asarray(self.measurements / self.known_gains(sensor_gain) + self.corrections())
 
     def known_gains(self, sensor_gain: ArrayLike) -> FloatArray:
         """Return the gain of each axis, (axes,), from one for all, alone or in a list, or each."""
-        given = np.atleast_1d(real_array(sensor_gain, "sensor_gain"))
-        return np.broadcast_to(self._gains(given[0] if given.size == 1 else given), (self.axes,))
+        gains = np.atleast_1d(real_array(sensor_gain, "sensor_gain"))
+        gains = one_or_each(
+            gains[0] if gains.size == 1 else gains, "sensor_gain", self.axes, above=0
+        )
+        return np.broadcast_to(gains, (self.axes,))
 
     def stretches(self) -> tuple[tuple[int, int], ...]:
         """Return (start, stop) of each stretch of contiguous usable frames."""
@@ -214,7 +225,7 @@ class LoopRecord:
             frame_rate_hz=self.frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
         )
         measured = self.usable if self.measured is None else self.measured
-        findings = tuple(found for found in self.health.findings if found.kind != NOT_KNOWN)
+        findings = tuple(finding for finding in self.health.findings if finding.kind != NOT_KNOWN)
         usable = measured
         if self.commands is not None:
             spoilt = [False] * self.frames if self.commanded is None else ~self.commanded
@@ -246,14 +257,14 @@ class LoopRecord:
         first: those of at most ``most`` frames, up to ``most_fraction`` of the record.
         """
         longest = integer(most, "most", at_least=1)
-        part = number(most_fraction, "most_fraction", at_least=0, at_most=1)
+        fraction = number(most_fraction, "most_fraction", at_least=0, at_most=1)
         series, usable = self.pseudo_open_loop(sensor_gain), self.usable.copy()
         holes = runs(~self.usable)
         holes = holes[(holes[:, 0] > 0) & (holes[:, 1] < self.frames)]
         lengths = holes[:, 1] - holes[:, 0]
         order = np.argsort(lengths, kind="stable")
         chosen = order[
-            (lengths[order] <= longest) & (np.cumsum(lengths[order]) <= part * self.frames)
+            (lengths[order] <= longest) & (np.cumsum(lengths[order]) <= fraction * self.frames)
         ]
         for start, stop in holes[chosen]:
             series[start:stop] = _interpolate_hole(series, self.usable, int(start), int(stop))
@@ -262,10 +273,10 @@ class LoopRecord:
         if not count:
             return self
         new = (usable & ~self.usable)[:, None]
-        back = self._gains(sensor_gain) * (series - self.corrections())
+        back = self.known_gains(sensor_gain) * (series - self.corrections())
         note = f"{count} frames in {len(chosen)} holes of at most {longest} were interpolated"
-        if left := int(np.sum(lengths <= longest)) - len(chosen):
-            note += f"; {left} more such holes were left, beyond {100 * part:g} %"
+        if unbridged := int(np.sum(lengths <= longest)) - len(chosen):
+            note += f"; {unbridged} more such holes were left, beyond {100 * fraction:g} %"
         health = replace(
             self.health,
             usable=int(np.sum(usable)),
@@ -280,12 +291,12 @@ class LoopRecord:
 
 def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: int) -> FloatArray:
     """Interpolate a hole by the polynomial through two frames on either side, or one."""
-    known = np.array([start - 2, start - 1, stop, stop + 1])
-    if known[0] < 0 or known[-1] >= len(series) or not usable[known].all():
-        known = known[1:3]
-    powers = np.vander(known - start, increasing=True)
-    inside = np.vander(np.arange(stop - start), known.size, increasing=True)
-    return np.asarray(inside @ np.linalg.solve(powers, series[known]))
+    nodes = np.array([start - 2, start - 1, stop, stop + 1])
+    if nodes[0] < 0 or nodes[-1] >= len(series) or not usable[nodes].all():
+        nodes = nodes[1:3]
+    powers = np.vander(nodes - start, increasing=True)
+    inside = np.vander(np.arange(stop - start), nodes.size, increasing=True)
+    return np.asarray(inside @ np.linalg.solve(powers, series[nodes]))
 
 
 def require_length(
@@ -321,13 +332,12 @@ def require_length(
     >>> lbt.identification.require_length(brief)  # doctest: +ELLIPSIS
     Traceback (most recent call last):
         ...
-    lbt_synth.errors.ProblemError: the record needs 4096 usable frames (5.12 s at 800 Hz) ...
+    lbt_synth.errors.ProblemError: the record needs 1600 usable frames (2 s at 800 Hz) in ...
     """
     rate = record.frame_rate_hz
     needed = integer(frames, "frames", at_least=1)
     needed = max(needed, int(np.ceil(rate * number(seconds, "seconds", at_least=0) * (1 - 1e-12))))
-    known = record.commands is None or record.delay_frames is None
-    before = 0 if known else len(record.hardware.mirror_taps)  # commands that no record knows
+    before = record.first_known
     lengths = [stop - (start if start > before else 0) for start, stop in record.stretches()]
     count = sum(length for length in lengths if length >= SHORTEST_SEGMENT)
     longest = max(lengths, default=0)

@@ -64,9 +64,9 @@ def test_repairs_that_are_refused() -> None:
         (lambda: CommandRepair(scale=(1.0, -2.0)), "command_scale must be above 0"),
         (lambda: CommandRepair(shift_frames=101), "command_shift_frames must be at most 100"),
         (lambda: CommandRepair(matrix=(1.0, np.nan, 0.0, 1.0)), "command_matrix"),
-        (lambda: CommandRepair(scale=(5.0, 4.0)).turn(1), "command_scale must be one factor, or 1"),
+        (lambda: CommandRepair(scale=(5.0, 4.0)).turn(1), "command_scale must be one number, or 1"),
         (lambda: repair(one, swap_axes=True), "need two axes"),
-        (lambda: repair(one, sign=(1, -1)), "must be one sign, or 1"),
+        (lambda: repair(one, sign=(1, -1)), "command_sign must be one number, or 1"),
         (lambda: repair(one, matrix=(1.0, 0.0, 0.0, 1.0)), "must have 1 numbers"),
         (lambda: repair(open_loop, sign=(-1,)), "open loop"),
     ):

@@ -63,7 +63,7 @@ def test_a_short_record_has_channels_and_a_law(change, doubt, repair):
     assert found.costs == found.lines == found.residuals == ()
     assert len(found.channels) == 2
     (note,) = found.notes
-    expected = "the given design was not tried" if doubt else "no model: the record needs 4096"
+    expected = "the given design was not tried" if doubt else "no model: the record needs 2000"
     assert note.startswith(expected)
 
 

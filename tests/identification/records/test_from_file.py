@@ -338,7 +338,7 @@ FRAMES = 60
     ("text", "words"),
     [
         ("frequency_hz,error_hz\n20,0.1\n,0.2\n", "row 2 of the numbers has no frequency"),
-        ("frequency_hz,rms_nm\n20,300\n", "must be frequency_hz, and frequency_error_hz.*rms_nm"),
+        ("frequency_hz,rms_nm\n20,300\n", "must be frequency_hz, and error_hz.*rms_nm"),
         ("frequency_khz\n0.02\n", "must be frequency_hz"),
         ("f_hz,frequency_hz\n20,20\n", "must be frequency_hz"),
         ("error_hz\n20\n", "must be frequency_hz.*got error_hz"),
@@ -577,6 +577,11 @@ def test_what_telemetry_does_not_tell_is_given():
     assert seen.delay_frames == 2.5
     assert np.allclose(seen.measurements, lbt.models.nm_per_mas(8.0) * telemetry().measurements)
     assert np.array_equal(seen.commands, telemetry().commands)
+    # a unit of the measurements is none of commands that have their own
+    half = telemetry(measurement_unit="px", command_unit="nm")
+    seen = lbt.identification.record_from_telemetry(half, unit="m")
+    assert np.allclose(seen.measurements, 1e9 * half.measurements)
+    assert np.array_equal(seen.commands, half.commands)
     other = lbt.identification.record_from_telemetry(
         telemetry(diameter_m=8.0), delay_frames=3, diameter_m=6.5
     )

@@ -198,17 +198,18 @@ def test_length():
     y = np.random.default_rng(0).standard_normal(6000)
     y[::200] = np.nan  # stretches of 199
     broken = loop_record(y, frame_rate_hz=RATE, unit="nm")
-    with pytest.raises(
-        ProblemError, match=r"needs 4096 usable frames \(4.1 s at 1000 Hz\).*got 0 "
-    ):
+    with pytest.raises(ProblemError, match=r"needs 2000 usable frames \(2 s at 1000 Hz\).*got 0 "):
         require_length(broken)
     assert require_length(broken.bridged()) == 5999
     whole = broken.bridged()
     with pytest.raises(ProblemError, match=r"needs 7000 usable frames \(7 s at 1000 Hz\)"):
         require_length(whole, seconds=7)
     quick = loop_record(y[1:200], frame_rate_hz=2000, unit="nm")
-    with pytest.raises(ProblemError, match="needs 8000 usable frames"):
+    with pytest.raises(ProblemError, match="needs 4000 usable frames"):
         require_length(quick)
+    few = loop_record(y[1:1000:2], frame_rate_hz=400, unit="nm")
+    with pytest.raises(ProblemError, match="needs 1024 usable frames"):
+        require_length(few)
 
 
 @pytest.mark.parametrize("delay", [1.0, 2.0, 2.5])
@@ -222,3 +223,14 @@ def test_commands_before_a_record_do_not_make_it_shorter(delay):
     late = loop_record(y, np.zeros(5000), **known)
     with pytest.raises(ProblemError, match="needs 5000 usable frames"):
         require_length(late, seconds=5)
+
+
+def test_frames_before_the_first_commands_are_not_lost():
+    """Of 100 frames, 3 % were said to be lost."""
+    y = np.random.default_rng(0).standard_normal((100, 1))
+    seen = loop_record(y, y, frame_rate_hz=RATE, delay_frames=2.5, unit="nm")
+    assert (seen.first_known, seen.lost) == (3, 0.0)
+    y[50] = np.nan
+    seen = loop_record(y, np.zeros((100, 1)), frame_rate_hz=RATE, delay_frames=2.5, unit="nm")
+    assert seen.lost == pytest.approx(1 / 97)
+    assert seen.with_delay(1.0).lost == pytest.approx(1 / 99)

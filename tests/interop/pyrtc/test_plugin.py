@@ -195,7 +195,7 @@ def test_what_does_not_fit_is_refused(gains):
             "predictor.command_limit must be above 0",
         ),
         (lambda: odd.fit(np.zeros((10_000, 2))), "whole frames; that of"),
-        (lambda: lazy.fit(short), "needs 4096 usable frames"),
+        (lambda: lazy.fit(short), "needs 2000 usable frames"),
     ):
         with pytest.raises(lbt.errors.ProblemError, match=words):
             call()
