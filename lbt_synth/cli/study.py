@@ -19,7 +19,7 @@ from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.grid import timed
 from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths
-from lbt_synth.studies.study.summary import worst_table
+from lbt_synth.studies.study.statistics import worst_table
 from lbt_synth.validation import integer
 
 _FAILURE = ("row", "controller", "error")
@@ -56,8 +56,8 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
         page = study_page(
             loaded,
             columns,
+            statistics,
             folder=folder,
-            statistics=statistics,
             failures=run.failures,
             computing_s=run.computing_s,
         )

@@ -16,6 +16,6 @@ from .study.run import replay_row as replay_row
 from .study.run import run_study as run_study
 from .study.sample import evaluate_samples as evaluate_samples
 from .study.statistics import study_statistics as study_statistics
+from .study.statistics import summary_tables as summary_tables
 from .study.study import Study as Study
-from .study.summary import summary_tables as summary_tables
 from .worst_residual import guaranteed_residual as guaranteed_residual

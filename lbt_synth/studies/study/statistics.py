@@ -1,32 +1,31 @@
-"""Statistics of a study: each controller, comparisons of them, and what they depend on."""
+"""Statistics of a study and their tables: percentiles, and what the Strehl ratio depends on."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.storage.display_unit import shown_format, shown_unit
+from lbt_synth.storage.rows import cell_text
+from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array
 
 PERCENTS = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
-LEVELS = (0.3, 0.5, 0.7, 0.8)
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # of the interval of a percentile or a share
 _MOST_WORST = 10  # samples that are listed
-_PARTS = ("turbulence", "vibration", "noise", "within")
-_EQUAL = 1e-6  # difference of Strehl ratios that is rounding: the accuracy of the evaluation
 _FEWEST = 20  # samples for an index
-_CONSTANT = 1e-12  # of the largest result: a smaller scatter is rounding
+_CONSTANT = 1e-12  # scatter of a Strehl ratio that is rounding
 # With more groups than 8 and fewer samples, one parameter of a Sobol sequence inherits up to 9 % of
 # another (benchmarks/study_statistics.py)
 _FEW_GROUPS, _MANY_SAMPLES = 8, 4096
-_GROUPS = ((200, 4), (1600, 8), (20_000, 16))  # of a curve: samples, and groups if there are fewer
-_MOST_GROUPS = 32
 _MOST_VALUES = 32  # a parameter with more distinct values is continuous
+
+_Row = tuple[str | Cell, ...]  # a label and a cell for each controller, or a heading alone
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +49,6 @@ class ControllerSamples:
     residual_nm: FloatArray  # [nm rms]; inf where unstable, nan where the evaluation failed
     evaluated: BoolArray  # where the evaluation did not fail
     unstable: BoolArray
-    parts_nm: dict[str, FloatArray]  # of the residual, by origin [nm rms]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,24 +64,22 @@ class ControllerStatistics:
     mean: float  # mean of the Strehl ratio, and its standard error for independent samples
     mean_error: float
     strehl: dict[float, Interval]  # percentiles of the Strehl ratio
-    above: dict[float, Interval]  # share of the samples whose Strehl ratio is above each level
     residual_nm: dict[float, Interval]  # percentiles of the residual [nm rms]
-    parts_nm: dict[str, float]  # median of each part of the residual over the stable loops [nm rms]
-    best: Interval  # share of the samples on which no controller has a higher Strehl ratio
-    loss: dict[float, Interval]  # percentiles of the highest Strehl ratio of all minus this one
     worst: tuple[int, ...]  # places of the samples on which it does worst, the worst first
-    # for each parameter: index, the part of the variance that it explains by itself, index_error,
-    # and spearman, the rank correlation; nan for a constant
+    # for each parameter: index, the part of the variance that it explains by itself, and
+    # index_error, its standard error; nan for a constant
     sensitivity: dict[str, dict[str, float]]
-    # Strehl ratio in groups of each parameter that varies, (k,) each: the parameter, mean, low, its
-    # 10th percentile, and unstable, the part of the loops
-    curves: dict[str, dict[str, FloatArray]]
 
     @property
     def ranked(self) -> tuple[str, ...]:
         """The parameters that vary, by falling index."""
-        index = {name: row["index"] for name, row in self.sensitivity.items()}
-        return tuple(sorted((n for n in index if np.isfinite(index[n])), key=lambda n: -index[n]))
+        varying = (n for n, row in self.sensitivity.items() if np.isfinite(row["index"]))
+        return tuple(sorted(varying, key=lambda name: -self.sensitivity[name]["index"]))
+
+    def index(self, name: str) -> tuple[float, float]:
+        """Return the index of a parameter and its standard error."""
+        row = self.sensitivity[name]
+        return row["index"], row["index_error"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -93,18 +89,11 @@ class StudyStatistics:
     samples: int  # samples in the study so far
     parameters: tuple[str, ...]  # their names
     controllers: tuple[ControllerStatistics, ...]  # each controller by itself
-    # each controller less each later one on the samples on which neither failed: the parts better
-    # and equal, mean, mean_error and percentiles of the difference of the Strehl ratios
-    comparisons: dict[str, dict[str, float]]
 
     @property
     def ranked(self) -> tuple[str, ...]:
         """The parameters with an index for any controller, by falling greatest index."""
-        pairs = [
-            (each.sensitivity[name]["index"], name)
-            for each in self.controllers
-            for name in each.ranked
-        ]
+        pairs = [(each.index(name)[0], name) for each in self.controllers for name in each.ranked]
         return tuple(dict.fromkeys(name for _, name in sorted(pairs, key=lambda pair: -pair[0])))
 
 
@@ -120,9 +109,7 @@ def study_statistics(
     columns : mapping of str to (n,) array_like
         Results: each parameter under its name and, for each controller, ``NAME.strehl`` (nan
         where unstable or failed), ``NAME.residual_nm`` and ``NAME.stable`` (1, 0; nan where the
-        evaluation failed); ``NAME.turbulence_nm``, ``NAME.vibration_nm``, ``NAME.noise_nm``,
-        ``NAME.within_nm`` and
-        ``row`` (number of the sample) are optional.
+        evaluation failed); ``row`` (number of the sample) is optional.
     parameters : sequence of str
         Names of the parameters.
     controllers : sequence of str
@@ -172,32 +159,19 @@ def study_statistics(
     return StudyStatistics(
         samples=size,
         parameters=tuple(parameters),
-        controllers=tuple(
-            _controller_statistics(each, loss, rows, values, orders)
-            for each, loss in zip(samples, sample_losses(samples), strict=True)
-        ),
-        comparisons={
-            f"{first.controller} less {second.controller}": _compare(first, second)
-            for first, second in combinations(samples, 2)
-        },
+        controllers=tuple(_controller_statistics(each, rows, values, orders) for each in samples),
     )
 
 
 def _controller_statistics(
     samples: ControllerSamples,
-    loss: FloatArray,
     rows: IntArray,
     values: Mapping[str, FloatArray],
     orders: Mapping[str, IntArray],
 ) -> ControllerStatistics:
-    """Return the statistics of one controller, given the order of each parameter's values."""
-    from scipy.stats import rankdata
-
+    """Return the statistics of one controller, with the order of each parameter's values."""
     strehl = samples.strehl[samples.evaluated]
     mean, error = mean_and_error(strehl)
-    ranks = np.asarray(rankdata(samples.strehl, nan_policy="omit"))
-    dependence = {n: _sensitivity(values[n], orders[n], samples, ranks) for n in values}
-    stable = samples.evaluated & ~samples.unstable
     return ControllerStatistics(
         controller=samples.controller,
         samples=len(strehl),
@@ -207,17 +181,9 @@ def _controller_statistics(
         mean=mean,
         mean_error=error,
         strehl=percentiles(strehl, PERCENTS),
-        above={level: share(strehl > level) for level in LEVELS},
         residual_nm=percentiles(samples.residual_nm[samples.evaluated], PERCENTS),
-        parts_nm={
-            part: float(np.median(numbers[stable])) if stable.any() else np.nan
-            for part, numbers in samples.parts_nm.items()
-        },
-        best=share(loss <= _EQUAL),
-        loss=percentiles(loss, (50.0, 95.0, 99.0)),
         worst=_worst(samples, rows),
-        sensitivity={name: row for name, (row, _) in dependence.items()},
-        curves={name: curve for name, (_, curve) in dependence.items() if curve},
+        sensitivity={name: _sensitivity(values[name], orders[name], samples) for name in values},
     )
 
 
@@ -226,30 +192,6 @@ def _worst(samples: ControllerSamples, rows: IntArray) -> tuple[int, ...]:
     places = np.flatnonzero(samples.evaluated)
     order = np.lexsort((rows[places], samples.strehl[places], ~samples.unstable[places]))
     return tuple(places[order[:_MOST_WORST]].tolist())
-
-
-def _compare(first: ControllerSamples, second: ControllerSamples) -> dict[str, float]:
-    """Compare two controllers sample by sample."""
-    both = first.evaluated & second.evaluated
-    difference = first.strehl[both] - second.strehl[both]
-    mean, error = mean_and_error(difference)
-    low, median, high = percentiles(difference, (5.0, 50.0, 95.0)).values()
-    return {
-        "better": share(difference > _EQUAL).value,
-        "equal": share(np.abs(difference) <= _EQUAL).value,
-        "mean": mean,
-        "mean_error": error,
-        "5th percentile": low.value,
-        "median": median.value,
-        "95th percentile": high.value,
-    }
-
-
-def sample_losses(controllers: Sequence[ControllerSamples]) -> tuple[FloatArray, ...]:
-    """Return for each controller the best Strehl ratio minus its own, on every sample (m,)."""
-    whole = np.logical_and.reduce([each.evaluated for each in controllers])
-    best = np.max([each.strehl[whole] for each in controllers], axis=0)
-    return tuple(best - each.strehl[whole] for each in controllers)
 
 
 def read_column(
@@ -293,13 +235,11 @@ def read_controller_samples(
         outside = ~((values >= 0) & (values <= most))
         _refuse_where(stable & outside, values, ProblemError, demand)
         results[name] = np.where(stable, values, np.where(evaluated, lost, np.nan))
-    parts = {part: f"{controller}.{part}_nm" for part in _PARTS}
     return ControllerSamples(
         controller=controller,
         **results,
         evaluated=evaluated,
         unstable=unstable,
-        parts_nm={p: read_column(columns, n, size) for p, n in parts.items() if n in columns},
     )
 
 
@@ -362,18 +302,14 @@ def mean_and_error(values: FloatArray) -> tuple[float, float]:
 
 
 def _sensitivity(
-    values: FloatArray, order: IntArray, samples: ControllerSamples, ranks: FloatArray
-) -> tuple[dict[str, float], dict[str, FloatArray]]:
-    """Return how the Strehl ratio depends on one parameter, and its curve."""
+    values: FloatArray, order: IntArray, samples: ControllerSamples
+) -> dict[str, float]:
+    """Return how much of the variance of the Strehl ratio one parameter explains."""
     order = order[samples.evaluated[order]]
-    ordered, strehl = values[order], samples.strehl[order]
-    if len(ordered) < _FEWEST or ordered[0] == ordered[-1]:
-        return dict.fromkeys(("index", "index_error", "spearman"), np.nan), {}
-    index, error = first_order_index(ordered, strehl)
-    with np.errstate(invalid="ignore"):  # nan if the Strehl ratio is constant
-        spearman = float(np.corrcoef(_ranks(ordered), ranks[order])[0, 1])
-    row = {"index": index, "index_error": error, "spearman": spearman}
-    return row, conditional_curve(ordered, strehl, samples.unstable[order])
+    ordered, index = values[order], (np.nan, np.nan)
+    if len(ordered) >= _FEWEST and ordered[0] < ordered[-1]:
+        index = first_order_index(ordered, samples.strehl[order])
+    return dict(zip(("index", "index_error"), index, strict=True))
 
 
 def first_order_index(ordered: FloatArray, result: FloatArray) -> tuple[float, float]:
@@ -385,9 +321,7 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> tuple[float, f
     value for each of a list.
     """
     n = len(ordered)
-    largest = float(np.max(np.abs(result), initial=0.0))
-    scaled = result / (largest or 1.0)
-    spread = scaled - np.mean(scaled)
+    spread = result - np.mean(result)
     total = float(spread @ spread)
     if total <= n * _CONSTANT**2:
         return np.nan, np.nan
@@ -430,22 +364,6 @@ def _lines(
     return fit, (means - rises)[1:] - (means + rises)[:-1]
 
 
-def conditional_curve(
-    ordered: FloatArray, strehl: FloatArray, unstable: BoolArray
-) -> dict[str, FloatArray]:
-    """Return the Strehl ratio (n,) in groups of a parameter in rising order (n,), by column."""
-    n = len(ordered)
-    groups = next((k for limit, k in _GROUPS if n < limit), _MOST_GROUPS)
-    starts = value_starts(ordered) if is_list(ordered) else group_starts(ordered, groups)
-    rows = []
-    for group in np.split(np.arange(n), starts[1:]):
-        here = strehl[group]
-        middle = 0.5 * (ordered[group[(len(group) - 1) // 2]] + ordered[group[len(group) // 2]])
-        rows.append((middle, np.mean(here), np.percentile(here, 10), np.mean(unstable[group])))
-    names = ("parameter", "mean", "low", "unstable")
-    return dict(zip(names, np.array(rows, dtype=np.float64).T, strict=True))
-
-
 def _ranks(ordered: FloatArray) -> FloatArray:
     """Return the ranks of values that are in order."""
     starts = value_starts(ordered)
@@ -472,3 +390,155 @@ def group_starts(ordered: FloatArray, groups: int) -> IntArray:
     """
     n = len(ordered)
     return np.unique(np.searchsorted(ordered, ordered[np.arange(groups) * n // groups]))
+
+
+def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
+    """Tables of a study: Strehl ratios, residuals, and what they depend on.
+
+    Parameters
+    ----------
+    statistics : StudyStatistics
+        The study.
+
+    Returns
+    -------
+    tuple of Table
+        Those that have rows; :func:`worst_table` lists the worst samples.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> gain = np.linspace(0.5, 1.5, 201)
+    >>> columns = {
+    ...     "gain": gain,
+    ...     "a.stable": np.ones(201),
+    ...     "a.residual_nm": 100 / gain,
+    ...     "a.strehl": 0.5 * gain,
+    ... }
+    >>> first, *others = lbt.studies.summary_tables(
+    ...     lbt.studies.study_statistics(columns, ["gain"], ["a"])
+    ... )
+    >>> first.headings, first.rows[4]
+    (('of the Strehl ratio [%]', 'a'), ('50th percentile', '50.0 (46.5 to 53.5)'))
+    """
+    kinds = (strehl_table, residual_table, sensitivity_table)
+    return tuple(table for kind in kinds if (table := kind(statistics)).rows)
+
+
+def strehl_table(statistics: StudyStatistics) -> Table:
+    """Strehl ratio of each controller: mean, percentiles, and how many loops are unstable."""
+    controllers = statistics.controllers
+    rows: list[_Row] = [
+        ("mean ± standard error", *(_with_error(c.mean, c.mean_error, 2) for c in controllers)),
+        *((_ordinal(p), *(_interval(c.strehl[p]) for c in controllers)) for p in PERCENTS),
+        ("samples",),
+        (
+            "unstable, counted as 0 [%]",
+            *(_bad_if(c.unstable, _interval(c.unstable_share, 2)) for c in controllers),
+        ),
+        ("evaluated", *(str(c.samples) for c in controllers)),
+        ("failed", *(_bad_if(c.failed, str(c.failed)) for c in controllers)),
+    ]
+    caption = "Strehl ratio over the samples, with 95 % intervals for independent samples"
+    return _table_by_controller(caption, "of the Strehl ratio [%]", statistics, rows)
+
+
+def residual_table(statistics: StudyStatistics) -> Table:
+    """Percentiles of the residual of each controller."""
+    unit, factor = shown_unit("nm rms")
+
+    def text(residual_nm: float) -> str:
+        if np.isinf(residual_nm):
+            return "unstable"
+        return cell_text(residual_nm * factor, shown_format(".1f", factor))
+
+    rows: list[_Row] = [
+        (_ordinal(p), *(text(c.residual_nm[p].value) for c in statistics.controllers))
+        for p in PERCENTS
+    ]
+    caption = "Residual of tip and tilt over the samples"
+    return _table_by_controller(caption, f"residual [{unit}]", statistics, rows)
+
+
+def sensitivity_table(statistics: StudyStatistics, names: Mapping[str, str] | None = None) -> Table:
+    """First-order indices of the parameters, one column per controller, and what they lack."""
+    controllers = statistics.controllers
+    rows: list[_Row] = [
+        ((names or {}).get(name, name), *(_with_error(*c.index(name)) for c in controllers))
+        for name in statistics.ranked
+    ]
+    if rows:
+        rest = []
+        for controller in controllers:
+            pairs = np.array([controller.index(name) for name in controller.ranked]).reshape(-1, 2)
+            total = float(np.sum(pairs[:, 0])) if len(pairs) else np.nan
+            rest.append(_with_error(1 - total, float(np.linalg.norm(pairs[:, 1]))))
+        rows.append(("only together (interactions)", *rest))
+    caption = "Variance of the Strehl ratio that one parameter explains by itself [%]"
+    return _table_by_controller(caption, "parameter", statistics, rows)
+
+
+def worst_table(
+    controller: ControllerStatistics,
+    columns: Mapping[str, ArrayLike],
+    parameters: Sequence[str],
+    names: Mapping[str, str] | None = None,
+) -> Table:
+    """List the samples on which a controller does worst, from the columns of the results."""
+    places, name = list(controller.worst), controller.controller
+
+    def at(column: str) -> list[float]:
+        return [float(value) for value in np.asarray(columns[column], dtype=np.float64)[places]]
+
+    rows = [f"{row:.0f}" for row in at("row")] if "row" in columns else [str(i) for i in places]
+    strehls: list[str | Cell] = [
+        percent(strehl) if stable else Cell(text="unstable", tone="bad")
+        for strehl, stable in zip(at(f"{name}.strehl"), at(f"{name}.stable"), strict=True)
+    ]
+    values = [[f"{value:.5g}" for value in at(parameter)] for parameter in parameters]
+    return Table(
+        caption=f"Worst samples of {name}",
+        headings=("row", "Strehl [%]", *((names or {}).get(each, each) for each in parameters)),
+        rows=tuple(zip(rows, strehls, *values, strict=True)),
+    )
+
+
+def percent(value: float, digits: int = 1) -> str:
+    """Return a part as a percentage, a dash if it is nan."""
+    return cell_text(100 * value, f".{digits}f")
+
+
+def _ordinal(percentile: float) -> str:
+    """Return the name of one of the percentiles."""
+    return f"{percentile:g}{'st' if percentile == 1 else 'th'} percentile"
+
+
+def _table_by_controller(
+    caption: str, heading: str, statistics: StudyStatistics, rows: Sequence[_Row]
+) -> Table:
+    """Return a table with a column per controller."""
+    headings = (heading, *(each.controller for each in statistics.controllers))
+    return Table(caption=caption, headings=headings, rows=tuple(rows))
+
+
+def _with_error(value: float, error: float, digits: int = 1) -> str:
+    """Return a part with its standard error as percentages, a dash if it is nan."""
+    text = percent(value, digits)
+    return text if text == "-" or np.isnan(error) else f"{text} ± {percent(error, digits)}"
+
+
+def _interval(interval: Interval, digits: int = 1) -> str:
+    """Return a percentage and the limits of its interval that there are."""
+    numbers = interval.value, interval.low, interval.high
+    text, low, high = (percent(number, digits) for number in numbers)
+    if low == high == "-":
+        return text
+    if "-" in (low, high):
+        return f"{text} (to {high})" if low == "-" else f"{text} (from {low})"
+    return f"{text} ({low} to {high})"
+
+
+def _bad_if(count: int, text: str) -> str | Cell:
+    """Return a text, marked as bad if it counts any."""
+    return Cell(text=text, tone="bad") if count else text
