@@ -36,7 +36,7 @@ def run(arguments: Namespace) -> Report:
     if arguments.pdf:
         require_weasyprint()
     with show_spinner("reading the study, designing", quiet=arguments.json):
-        loaded = studies.load_study(arguments.study, directory=folder)
+        loaded = studies.load_study(arguments.study)
     load_shown(arguments, loaded.config)
     refuse_replacing(output_paths(folder, loaded), loaded.inputs)
     if arguments.dry_run:

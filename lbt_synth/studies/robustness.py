@@ -42,11 +42,12 @@ from lbt_synth.loop.simulation.run import Drop, Segment, run_segments
 from lbt_synth.methods.mixed import METHOD as MIXED
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
-from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
+from lbt_synth.models import LoopHardware, SinusoidalVibration, TipTiltPlant, Truth, Vibration
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.plant.tip_tilt import retuned_plant
+from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
-from lbt_synth.studies.grid import loop_columns, moved_lines, residual_columns
+from lbt_synth.studies.grid import loop_columns, residual_columns
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
@@ -300,6 +301,26 @@ def robustness_map(
         stable=read_only(maps["stable"][..., 0] == 1),
         band_hz=_errors_in_band(design, truth),
     )
+
+
+def moved_lines(
+    truth: Truth, errors_hz: ArrayLike, hardware: LoopHardware, name: str = "errors_hz"
+) -> list[tuple[Vibration | SinusoidalVibration, FloatArray]]:
+    """Return the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
+    errors, nyquist = np.asarray(errors_hz), hardware.frame_rate_hz / 2
+    shares, moved = truth.frequency_shifts_hz(1.0), []
+    for line, moves in zip(stationary_vibrations(truth.vibrations), shares, strict=True):
+        checked_direction(line, hardware)
+        frequencies = line.frequency_hz + moves * errors
+        wrong = ~((frequencies > 0) & (frequencies < nyquist))
+        if np.any(wrong):
+            raise ProblemError(
+                f"{name} must leave each vibration between 0 and {nyquist:.6g} Hz; got an error "
+                f"of {errors[wrong][0]:.6g} Hz, which moves the one at {line.frequency_hz:.6g} Hz "
+                f"to {frequencies[wrong][0]:.6g} Hz."
+            )
+        moved.append((line, frequencies))
+    return moved
 
 
 def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:

@@ -28,7 +28,7 @@ from lbt_synth.loop import ClosedLoop, close_loop, residual_budget
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.evaluator import power_within_frames
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth, Vibration
-from lbt_synth.studies.grid import moved_lines
+from lbt_synth.studies.robustness import moved_lines
 from lbt_synth.validation import FloatArray, number, require_instance
 
 _MOST_BOXES = 120  # halved

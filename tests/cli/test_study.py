@@ -203,7 +203,7 @@ def test_two_in_one_directory(tmp_path, capsys):
         wait_for(lambda: len(part_rows(folder)) >= 1, seconds=120)
         status, _, error = run(capsys, "study", path, "-o", folder)
         assert status == 2
-        assert "another study is running in" in error
+        assert "another computation is running in" in error
     finally:
         first.kill()
         first.communicate()

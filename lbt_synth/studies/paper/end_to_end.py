@@ -23,9 +23,8 @@ from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import SinusoidalVibration, Truth
 from lbt_synth.models.plant.tip_tilt import retuned_plant
-from lbt_synth.storage.atomic_files import exclusive_lock
 from lbt_synth.storage.rows import column, fill_row, table_row
-from lbt_synth.studies.grid import InlineExecutor, Parts, loop_columns
+from lbt_synth.studies.grid import Sweep, loop_columns
 from lbt_synth.studies.paper import parameters as given
 from lbt_synth.studies.paper.parameters import TABLE_II, TABLE_III, VIBRATION_HZ, PublishedRow
 from lbt_synth.validation import FloatArray, choice
@@ -264,28 +263,24 @@ def run_tables(
     calibrate(setup.system, cache=cache)  # once for all processes
     cases = all_cases(rows)
     versions = {"lbt-synth": lbt_synth.__version__, "specula": specula_version()}
-    parts = Parts(
+    waiting = list(cases.values())
+    sweep = Sweep(
         folder=Path(directory),
         columns=_NUMBERS,
         rows=len(cases),
         digest=_digest({"versions": versions, "cases": cases}),
     )
-    waiting = list(cases.values())
-    with exclusive_lock(parts.folder, "computation"):
-        if progress is not None:
-            progress(parts.rows - sum(stop - start for start, stop in parts.missing()))
-        parts.compute_missing(
-            _run_cases,
-            lambda some: (waiting[slice(*some)], cache),
-            part_rows=1,
-            executor=executor or InlineExecutor(),
-            in_flight=1 if executor is None else workers,
-            progress=progress or (lambda count: None),
-        )
-        numbers = np.concatenate([parts.read(path)[0] for path in parts.paths().values()])
+    runs, _ = sweep.run(
+        _run_cases,
+        lambda some: (waiting[slice(*some)], cache),
+        part_rows=1,
+        executor=executor,
+        workers=workers,
+        progress=progress,
+    )
     results = {
         name: dict(zip(_NUMBERS, row, strict=True))
-        for name, row in zip(cases, numbers.tolist(), strict=True)
+        for name, row in zip(cases, runs.results.tolist(), strict=True)
     }
     return make_entries(rows, results, setup)
 

@@ -18,7 +18,6 @@ from lbt_synth.errors import ConfigError, LbtSynthError, name_file, name_key, re
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.methods import method_named
 from lbt_synth.methods.request import DesignRequest, Wording, design_request, fixed_design
-from lbt_synth.studies.study.run import read_designs
 from lbt_synth.studies.study.sample import close_sample_loop, make_sample
 from lbt_synth.studies.study.study import (
     DELAY_ERROR,
@@ -30,9 +29,7 @@ from lbt_synth.studies.study.study import (
 )
 
 
-def load_study(
-    path: str | os.PathLike[str], *, directory: str | os.PathLike[str] | None = None
-) -> Study:
+def load_study(path: str | os.PathLike[str]) -> Study:
     """Read a study file, check it, and design the controllers that are for the whole study.
 
     It checks the file, the configuration and the gain files, that every parameter is a number of
@@ -43,8 +40,6 @@ def load_study(
     ----------
     path : path-like
         The file (YAML).
-    directory : path-like, optional
-        Directory of the study. If it was begun there, its designs are read from it.
 
     Returns
     -------
@@ -59,8 +54,6 @@ def load_study(
         If a gain file cannot be read.
     SynthesisError
         If a design cannot be made.
-    OutputError
-        If the directory belongs to another study, or a design in it was changed.
 
     Examples
     --------
@@ -102,13 +95,10 @@ def load_study(
             "set evaluation: simulation.",
             path="evaluation",
         )
-    fixed = {name: design for name, (design, _) in gains.items()}
-    if directory is not None:
-        fixed |= read_designs(Path(directory), study)
     study = replace(
         study,
         controllers={
-            name: fixed[name] if name in files else _make_controller(study, name, fixed.get(name))
+            name: gains[name][0] if name in files else _make_controller(study, name)
             for name in settings.controllers
         },
     )
@@ -137,7 +127,7 @@ def _require_names(settings: StudySection, source: Path) -> None:
         raise ConfigError(f"{source}: controllers.{name}: {why}.", path=f"controllers.{name}")
 
 
-def _make_controller(study: Study, name: str, stored: Design | None) -> Design | DesignRequest:
+def _make_controller(study: Study, name: str) -> Design | DesignRequest:
     """Return a controller that the study designs, once unless each sample has its own."""
     section, place = study.settings.controllers[name], f"controllers.{name}"
     method = str(section.design)
@@ -149,7 +139,7 @@ def _make_controller(study: Study, name: str, stored: Design | None) -> Design |
     if section.for_ == "sample":
         return request
     try:
-        return stored or study.config.design(request)
+        return study.config.design(request)
     except LbtSynthError as error:
         error.args = (f"{study.source}: {place}: {error}",)
         raise
