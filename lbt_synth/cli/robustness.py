@@ -27,11 +27,9 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.loop import Imaging, stable_sensor_gains
 from lbt_synth.report.designs.report import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
-from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
-from lbt_synth.studies import RobustnessMap, guaranteed_residual, robustness_map
+from lbt_synth.studies import RobustnessMap, robustness_map
 from lbt_synth.studies.robustness import default_methods
-from lbt_synth.studies.worst_residual import GuaranteedResidual, has_guarantee
 from lbt_synth.validation import FloatArray, agree, frozen_copy, number
 
 _MOST_VALUES = 2001  # of frequency errors or sensor gains
@@ -113,14 +111,9 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
     report = Report(data={"maps": {}})
     for name, found in maps.items():
         intervals = _stable_gains(designs[name], found, assumed[name])
-        worst = _guarantee(designs[name], found, assumed[name], config)
-        report.data["maps"][name] = asdict(found) | {
-            "stable_sensor_gains": intervals,
-            "guaranteed": worst and asdict(worst),
-        }
+        report.data["maps"][name] = asdict(found) | {"stable_sensor_gains": intervals}
         report.tables.append(row_table(_map_title(name, found, config.imaging), _map_lines(found)))
         report.notes += _map_notes(name, designs[name], config, found, intervals)
-        report.notes.append(f"{name}: {_guarantee_text(worst, found)}")
     write_outputs(
         report,
         arguments.output,
@@ -221,41 +214,6 @@ def _map_lines(found: RobustnessMap) -> list[Facts]:
                 )
             )
     return lines
-
-
-def _guarantee(
-    design: Design, found: RobustnessMap, assumed: float, config: Config
-) -> GuaranteedResidual | None:
-    """Bound the residual over the frequencies and sensor gains of a map, at the design's delay.
-
-    There is none for a mirror with dynamics or a fractional delay.
-    """
-    hardware = require_hardware(design, "a map")
-    if not has_guarantee(hardware):
-        return None
-    errors, gains = found.errors_hz, found.sensor_gains / assumed
-    return guaranteed_residual(
-        hardware,
-        design,
-        config.truth,
-        error_hz=(float(errors.min()), float(errors.max())),
-        sensor_gains=(float(gains.min()), float(gains.max())),
-    )
-
-
-def _guarantee_text(worst: GuaranteedResidual | None, found: RobustnessMap) -> str:
-    """Return what holds between the points of a map."""
-    if worst is None:
-        return "no guarantee in the image is known but for a settled mirror and a whole delay"
-    low, high = found.sensor_gains.min(), found.sensor_gains.max()
-    delay = "the delay of the design, " if np.any(found.delay_errors_frames) else ""
-    box = (
-        f"{delay}each vibration anywhere in its errors and the sensor gain of each axis anywhere "
-        f"from {low:.4g} to {high:.4g}"
-    )
-    if np.isfinite(worst.upper_nm):
-        return f"at most {nm_text(worst.upper_nm, '.4g')} are left with {box}: guaranteed"
-    return f"nothing is guaranteed with {box}: not all of these loops are stable"
 
 
 def _map_notes(

@@ -18,4 +18,3 @@ from .study.sample import evaluate_samples as evaluate_samples
 from .study.statistics import study_statistics as study_statistics
 from .study.statistics import summary_tables as summary_tables
 from .study.study import Study as Study
-from .worst_residual import guaranteed_residual as guaranteed_residual

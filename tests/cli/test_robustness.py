@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 from support.commands import run
-from support.plants import LBT_YAML, ROOT
+from support.plants import LBT_YAML
 from support.robust_config import robust_writer
 from support.robustness_maps import evaluate_point
 
@@ -237,14 +237,3 @@ def test_one_file_under_two_spellings_is_refused(small, tmp_path, capsys, monkey
     assert main(["design", config, "--method", "robust", "-o", "one.fits"]) == 0
     assert main(["robustness", config, "one.fits", "./one.fits", "-o", "map.png"]) == 2
     assert "must be given once" in capsys.readouterr().err
-
-
-def test_a_moving_mirror_has_a_map_and_no_guarantee(tmp_path, capsys):
-    slow = ROOT / "examples" / "lbt_slow_mirror.yaml"
-    gain = lbt.save_gain(tmp_path / "lqg.fits", lbt.load_config(slow).design("lqg"))
-    few = ("--errors-hz", 0, 1, 2, "--sensor-gains", 0.9, 1, 2)
-    status, text, _ = run(capsys, "robustness", slow, gain, *few)
-    assert status == 0
-    assert "no guarantee in the image is known but for a settled mirror" in " ".join(text.split())
-    data = json.loads(run(capsys, "robustness", slow, gain, *few, "--json")[1])
-    assert data["maps"]["lqg"]["guaranteed"] is None
