@@ -37,12 +37,12 @@ from lbt_synth.storage.rows import (
     row_table,
 )
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies import EndToEndEntry
 from lbt_synth.studies.paper.end_to_end import (
+    EndToEndEntry,
     all_cases,
+    end_to_end_tables,
     plan_tables,
     rms_modal_difference,
-    run_tables,
 )
 from lbt_synth.validation import integer
 
@@ -189,14 +189,12 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
         integer(getattr(arguments, count), option_name(count), at_least=1)
     cases = _named_cases(designs)
     specula_version()
-    rows = plan_tables(
-        setup,
-        cases,
-        seeds=range(setup.seed, setup.seed + arguments.seeds),
-        row_seeds=range(setup.seed, setup.seed + arguments.row_seeds),
-        tables=arguments.tables,
-    )
-    total = len(all_cases(rows))
+    plan: dict[str, Any] = {
+        "seeds": range(setup.seed, setup.seed + arguments.seeds),
+        "row_seeds": range(setup.seed, setup.seed + arguments.row_seeds),
+        "tables": arguments.tables,
+    }
+    total = len(all_cases(plan_tables(setup, cases, **plan)))
     make_directory(folder)
     case_folder = make_directory(folder / "cases")
     calibrate_setup(setup, arguments)
@@ -205,12 +203,13 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
         count_progress(total=total, what="runs", quiet=arguments.json) as advance,
         keep_finished(case_folder),
     ):
-        table = run_tables(
+        table = end_to_end_tables(
             setup,
-            rows,
             case_folder,
+            cases,
+            **plan,
             executor=executor,
-            workers=workers or 1,
+            workers=workers,
             cache=arguments.cache,
             progress=advance,
         )

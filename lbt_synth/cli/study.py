@@ -18,8 +18,9 @@ from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.grid import timed
-from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths
-from lbt_synth.studies.study.statistics import worst_table
+from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths, replay_row
+from lbt_synth.studies.study.sample import evaluate_samples
+from lbt_synth.studies.study.statistics import summary_tables, worst_table
 from lbt_synth.validation import integer
 
 _FAILURE = ("row", "controller", "error")
@@ -83,7 +84,7 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
             "statistics": asdict(statistics),
         },
         tables=[
-            *studies.summary_tables(statistics),
+            *summary_tables(statistics),
             *(replace(table, rows=table.rows[:_WORST]) for table in worst),
         ],
         notes=[
@@ -158,10 +159,10 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
 def _estimate(loaded: studies.Study, at_once: int) -> Facts:
     """Measure parts in this process until one is long enough, and say what the whole will cost."""
     start, size, rows, seconds = 0, _MEASURED_ROWS, 1, 0.0
-    studies.evaluate_samples(loaded, loaded.values(0, 1), 0)  # warms up
+    evaluate_samples(loaded, loaded.values(0, 1), 0)  # warms up
     while seconds < _LONG_ENOUGH_S and start < loaded.samples:
         values = loaded.values(start, min(start + size, loaded.samples))
-        rows, (_, seconds) = len(values), timed(studies.evaluate_samples, loaded, values, start)
+        rows, (_, seconds) = len(values), timed(evaluate_samples, loaded, values, start)
         start, size = start + rows, _MEASURED_ROWS * size
     row_bytes = _NUMBER_BYTES * len(loaded.columns) + _PART_BYTES * len(loaded.result_columns)
     space = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
@@ -177,7 +178,7 @@ def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report
     if 0 <= arguments.row < loaded.samples:  # else it is refused
         make_directory(folder)
     with show_spinner("replaying", quiet=arguments.json):
-        replay = studies.replay_row(loaded, folder, arguments.row)
+        replay = replay_row(loaded, folder, arguments.row)
     stored, fresh, row = replay.stored, replay.fresh, arguments.row
     values = loaded.parameters_by_name(loaded.values(row, row + 1)[0])
     report = Report(

@@ -99,9 +99,9 @@ def study_page(
     --------
     >>> import lbt_synth as lbt
     >>> study = lbt.studies.load_study("examples/study.yaml")
-    >>> values = study.values(0, 2)
-    >>> columns = dict(zip(study.parameter_names, values.T))
-    >>> columns |= lbt.studies.evaluate_samples(study, values, 0)[0]
+    >>> columns = dict(zip(study.parameter_names, study.values(0, 2).T))
+    >>> columns |= {f"kalman.{name}": [1.0, 0.5] for name in ("strehl", "residual_nm")}
+    >>> columns["kalman.stable"] = [1, 1]
     >>> found = lbt.studies.study_statistics(columns, study.parameter_names, ["kalman"])
     >>> lbt.report.study_page(study, columns, found).title
     'Robustness study study.yaml'

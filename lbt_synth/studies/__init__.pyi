@@ -1,9 +1,6 @@
 from .limits import LimitRow as LimitRow
-from .limits import compare_in_truth as compare_in_truth
 from .limits import limits as limits
-from .paper.end_to_end import EndToEndEntry as EndToEndEntry
 from .paper.end_to_end import end_to_end_tables as end_to_end_tables
-from .robustness import MirrorRow as MirrorRow
 from .robustness import RobustnessMap as RobustnessMap
 from .robustness import RobustnessRow as RobustnessRow
 from .robustness import TradeoffPoint as TradeoffPoint
@@ -12,9 +9,6 @@ from .robustness import robustness as robustness
 from .robustness import robustness_map as robustness_map
 from .robustness import tradeoff as tradeoff
 from .study.load import load_study as load_study
-from .study.run import replay_row as replay_row
 from .study.run import run_study as run_study
-from .study.sample import evaluate_samples as evaluate_samples
 from .study.statistics import study_statistics as study_statistics
-from .study.statistics import summary_tables as summary_tables
 from .study.study import Study as Study

@@ -240,38 +240,10 @@ class TruthComparison:
 def compare_in_truth(
     designs: Mapping[str, Design], config: Config, *, without: Collection[str] = ()
 ) -> TruthComparison:
-    """Compare designs in the truth of a configuration with its reference designs.
+    """Compare designs in the stationary truth of a configuration with its reference designs.
 
-    The reference designs are made for the configuration: the integrator of least residual, the
-    Kalman filter and the H-infinity filter.
-
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        Designs by name.
-    config : Config
-        The configuration; its truth must be stationary.
-    without : collection of str, optional
-        Methods whose reference designs are left out, since the designs are those already.
-
-    Returns
-    -------
-    TruthComparison
-        Exact residuals, the limit, and warnings.
-
-    Raises
-    ------
-    ProblemError
-        If a design or a vibration does not fit the loop, or a vibration drifts.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> slow = config.design("integrator", gain=0.2)
-    >>> found = lbt.studies.compare_in_truth({"slow": slow}, config)
-    >>> [row.design for row in found.rows], round(found.limit.rms_nm, 2)
-    (['slow', 'integrator', 'kalman', 'hinf'], 37.78)
+    These are the integrator of least residual, the Kalman filter and the H-infinity filter; some
+    methods are left out if the designs are those already.
     """
     references: dict[str, Design] = {}
     notes = []

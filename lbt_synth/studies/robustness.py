@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -46,7 +45,16 @@ from lbt_synth.models import LoopHardware, SinusoidalVibration, TipTiltPlant, Tr
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
-from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
+from lbt_synth.storage.rows import (
+    Facts,
+    column,
+    fact,
+    facts,
+    fill_row,
+    nm_column,
+    percent_column,
+    table_row,
+)
 from lbt_synth.studies.grid import loop_columns, residual_columns
 from lbt_synth.validation import (
     BoolArray,
@@ -414,31 +422,13 @@ def run_failures(
     return simulation, rows
 
 
-@table_row
-class MirrorRow:
-    """One design on the real mirror; what an unstable loop does not have is nan."""
-
-    design: str = column("design", help="Its name: for ours, what it assumes about the mirror")
-    stable: bool = column(help="Whether its loop is stable")
-    residual_nm: float = nm_column(
-        "residual", format=".2f", missing="unstable", help="Residual under the truth, rms"
-    )
-    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
-    unsettled_nm: float = nm_column(
-        "settled less real position",
-        format=".2f",
-        help="What is left of the assumption that the mirror has settled, for the commands of "
-        "this design: settled less real position, rms",
-    )
-
-
 def mirror(
     plant: TipTiltPlant,
     truth: Truth,
     imaging: Imaging,
     *,
     command_weight: float = 0.0,
-) -> tuple[MirrorRow, ...]:
+) -> tuple[Facts, ...]:
     """Compare designs on a moving mirror: what it costs to ignore its dynamics.
 
     They are the integrator with the best gain on this mirror, the Kalman filter for a mirror
@@ -458,8 +448,10 @@ def mirror(
 
     Returns
     -------
-    tuple of MirrorRow
-        One per design.
+    tuple of Facts
+        One per design: ``design``, ``stable``, ``residual_nm`` [nm rms], ``strehl``, and
+        ``unsettled_nm``, what the settled position of its commands is less the real one [nm rms];
+        nan where the loop is unstable.
 
     Raises
     ------
@@ -497,9 +489,17 @@ def mirror(
     rows = []
     for name, design in designs.items():
         loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-        numbers = loop_columns(loop, truth, imaging) | {"stable": loop.is_stable}
-        numbers["unsettled_nm"] = settling_error(loop, truth).rms_nm if loop.is_stable else np.nan
-        rows.append(fill_row(MirrorRow, SimpleNamespace(**numbers), design=name))
+        numbers = loop_columns(loop, truth, imaging)
+        unsettled_nm = settling_error(loop, truth).rms_nm if loop.is_stable else np.nan
+        rms: dict[str, Any] = {"unit": "nm", "format": ".2f"}
+        row = facts(
+            design=fact(name, "design"),
+            stable=fact(loop.is_stable),
+            residual_nm=fact(numbers["residual_nm"], "residual", missing="unstable", **rms),
+            strehl=fact(numbers["strehl"], "Strehl", unit="%", scale=100, format=".2f"),
+            unsettled_nm=fact(unsettled_nm, "settled less real position", **rms),
+        )
+        rows.append(row)
     return tuple(rows)
 
 

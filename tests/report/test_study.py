@@ -17,6 +17,7 @@ from lbt_synth.report.study import (
     short_names,
 )
 from lbt_synth.storage.tables import Cell, Table
+from lbt_synth.studies.study.sample import evaluate_samples
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +163,7 @@ def study():
 def test_a_page_from_a_study_file(study, tmp_path):
     values = study.values(0, 3)
     columns = dict(zip(study.parameter_names, values.T, strict=True))
-    columns |= lbt.studies.evaluate_samples(study, values, 0)[0]
+    columns |= evaluate_samples(study, values, 0)[0]
     folder = tmp_path / "a folder"
     folder.mkdir()
     statistics = lbt.studies.study_statistics(

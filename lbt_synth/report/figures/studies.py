@@ -16,8 +16,9 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, count_columns, drawing
 from lbt_synth.report.figures.loops import draw_design
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.studies import EndToEndEntry, RobustnessMap, RobustnessRow, TradeoffPoint
+from lbt_synth.studies import RobustnessMap, RobustnessRow, TradeoffPoint
 from lbt_synth.studies.limits import LimitStudy
+from lbt_synth.studies.paper.end_to_end import EndToEndEntry
 from lbt_synth.studies.robustness import FAMILIES
 from lbt_synth.validation import real_array, require_instance
 

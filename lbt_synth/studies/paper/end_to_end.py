@@ -190,7 +190,7 @@ def end_to_end_tables(
     row_seeds: Sequence[int] = (0,),
     tables: Sequence[str] = ("II", "III"),
     executor: Executor | None = None,
-    workers: int = 1,
+    workers: int | None = None,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[EndToEndEntry]:
@@ -214,7 +214,7 @@ def end_to_end_tables(
     executor : concurrent.futures.Executor, optional
         Runs the cases, in processes for example; it is left open. By default they run here.
     workers : int, optional
-        How many cases the executor runs at once.
+        How many cases the executor runs at once, if it does not say so itself.
     cache : path-like, optional
         Directory for calibrations and phase screens.
     progress : callable, optional
@@ -244,31 +244,16 @@ def end_to_end_tables(
     lbt_synth.errors.ProblemError: tables must be one of II, III; got 'IV'.
     """
     rows = plan_tables(setup, designs, seeds=seeds, row_seeds=row_seeds, tables=tables)
-    return run_tables(
-        setup, rows, directory, executor=executor, workers=workers, cache=cache, progress=progress
-    )
-
-
-def run_tables(
-    setup: EndToEndSetup,
-    rows: Sequence[PlannedRow],
-    directory: str | os.PathLike[str],
-    *,
-    executor: Executor | None = None,
-    workers: int = 1,
-    cache: str | os.PathLike[str] | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> list[EndToEndEntry]:
-    """Run what is missing of tables of :func:`plan_tables`; see :func:`end_to_end_tables`."""
     calibrate(setup.system, cache=cache)  # once for all processes
     cases = all_cases(rows)
     versions = {"lbt-synth": lbt_synth.__version__, "specula": specula_version()}
+    content = json.dumps({"versions": versions, "cases": cases}, sort_keys=True, default=_plain)
     waiting = list(cases.values())
     sweep = Sweep(
         folder=Path(directory),
         columns=_NUMBERS,
         rows=len(cases),
-        digest=_digest({"versions": versions, "cases": cases}),
+        digest=hashlib.sha256(content.encode()).hexdigest(),
     )
     runs, _ = sweep.run(
         _run_cases,
@@ -293,15 +278,11 @@ def _run_cases(
     return {name: np.array([run[name] for run in runs]) for name in _NUMBERS}, []
 
 
-def _digest(content: Mapping[str, Any]) -> str:
-    """Return a digest of all that decides the runs: what JSON can hold, arrays and dataclasses."""
-
-    def plain(value: Any) -> Any:
-        if is_dataclass(value):
-            return {each.name: getattr(value, each.name) for each in fields(value)}
-        return value.tolist()
-
-    return hashlib.sha256(json.dumps(content, sort_keys=True, default=plain).encode()).hexdigest()
+def _plain(value: Any) -> Any:
+    """Return an array or a dataclass as what JSON can hold."""
+    if is_dataclass(value):
+        return {entry.name: getattr(value, entry.name) for entry in fields(value)}
+    return value.tolist()
 
 
 def all_cases(rows: Iterable[PlannedRow]) -> dict[str, dict[str, Any]]:

@@ -213,35 +213,6 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
     ``row_N.yaml`` is the configuration of the sample with its real delay and noise, and with the
     seed of its simulation: ``simulate row_N.yaml GAIN`` closes the loop of the sample. Designs
     for each sample, which assume the delay and the noise of ``config``, are ``row_N_NAME.fits``.
-
-    Parameters
-    ----------
-    study : Study
-        The study.
-    directory : path-like
-        Its directory, finished or not.
-    row : int
-        The number of the row.
-
-    Returns
-    -------
-    Replay
-        Parameters, stored and fresh results.
-
-    Raises
-    ------
-    ProblemError
-        If the study has no such row, or the configuration refuses its numbers.
-    OutputError
-        If the directory belongs to another study, or cannot be written.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt, tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     again = lbt.studies.replay_row(lbt.studies.load_study("examples/study.yaml"), folder, 3)
-    >>> [path.name for path in again.files], round(again.fresh["kalman.strehl"], 3)
-    (['row_3.yaml'], 0.824)
     """
     row = integer(row, "row", at_least=0)
     if row >= study.samples:

@@ -35,45 +35,11 @@ Sample = tuple[Config, LoopHardware, Truth]
 def evaluate_samples(
     study: Study, values: FloatArray, start: int, *, together: bool = True
 ) -> Result:
-    """Evaluate consecutive samples.
+    """Evaluate consecutive rows of ``Study.values`` from a start; nan is where there is no result.
 
     Samples whose configurations differ by numbers that its builders take as arrays are evaluated
-    together by :func:`ensemble_residuals`; the equations of Kalman filters for samples are solved
-    together. Other designs, simulations, and samples that the configuration refuses
-    are evaluated one by one. So is one sample of each group that is evaluated together, and the
-    two answers must agree.
-
-    Parameters
-    ----------
-    study : Study
-        The study.
-    values : (b, parameters) ndarray
-        Rows of ``Study.values``.
-    start : int
-        Number of the first sample.
-    together : bool, optional
-        False evaluates all of them one by one.
-
-    Returns
-    -------
-    columns : dict of str to (b,) ndarray
-        Each of ``study.result_columns`` for each sample; a controller without a result has nan,
-        an unstable loop ``stable`` 0 and nan otherwise.
-    failures : list of (int, str, str)
-        The row, the controller without a result on it, and why; in the order of the rows.
-
-    Raises
-    ------
-    CertificateError
-        If a sample that is evaluated both ways has two answers.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> study = lbt.studies.load_study("examples/study.yaml")
-    >>> columns, failures = lbt.studies.evaluate_samples(study, study.values(0, 2), 0)
-    >>> columns["kalman.strehl"].round(3).tolist(), columns["kalman.stable"].tolist(), failures
-    ([0.831, 0.809], [1.0, 1.0], [])
+    together, and so are the equations of their Kalman filters. All others are evaluated one by one,
+    as is one sample of each group, and the two answers must agree.
     """
     columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
     failures: list[Failure] = []

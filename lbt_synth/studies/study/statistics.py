@@ -393,35 +393,7 @@ def group_starts(ordered: FloatArray, groups: int) -> IntArray:
 
 
 def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
-    """Tables of a study: Strehl ratios, residuals, and what they depend on.
-
-    Parameters
-    ----------
-    statistics : StudyStatistics
-        The study.
-
-    Returns
-    -------
-    tuple of Table
-        Those that have rows; :func:`worst_table` lists the worst samples.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> gain = np.linspace(0.5, 1.5, 201)
-    >>> columns = {
-    ...     "gain": gain,
-    ...     "a.stable": np.ones(201),
-    ...     "a.residual_nm": 100 / gain,
-    ...     "a.strehl": 0.5 * gain,
-    ... }
-    >>> first, *others = lbt.studies.summary_tables(
-    ...     lbt.studies.study_statistics(columns, ["gain"], ["a"])
-    ... )
-    >>> first.headings, first.rows[4]
-    (('of the Strehl ratio [%]', 'a'), ('50th percentile', '50.0 (46.5 to 53.5)'))
-    """
+    """Return the tables of a study that have rows: Strehl ratios, residuals, dependence."""
     kinds = (strehl_table, residual_table, sensitivity_table)
     return tuple(table for kind in kinds if (table := kind(statistics)).rows)
 

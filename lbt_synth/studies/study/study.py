@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field, model_validator
-from scipy.special import ndtr, ndtri
 
 from lbt_synth.config import Config
 from lbt_synth.config.samples import Keys, parse_path
@@ -19,7 +18,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.methods.method import Section
 from lbt_synth.methods.request import DesignRequest, fixed_design
 from lbt_synth.studies.grid import RESIDUALS
-from lbt_synth.validation import FloatArray, IntArray, integer
+from lbt_synth.validation import FloatArray, integer
 
 DELAY_ERROR = "error.delay_frames"
 NOISE_FACTOR = "error.noise_factor"
@@ -42,12 +41,6 @@ class NormalSection(Section):
         low, high = self.ends
         if not low < high:
             raise ValueError(f"low must be below high; got {low:g} and {high:g}")
-        start, stop, _ = self._cut
-        if not stop - start > 0:
-            raise ValueError(
-                f"a normal distribution of mean {self.mean:g} and deviation {self.deviation:g} "
-                f"has nothing between {low:g} and {high:g}"
-            )
         return self
 
     @property
@@ -56,26 +49,14 @@ class NormalSection(Section):
         low, high = self.low, self.high
         return -np.inf if low is None else low, np.inf if high is None else high
 
-    @property
-    def _cut(self) -> tuple[float, float, float]:
-        """Probabilities of the ends, and +1, or -1 if both count from above.
-
-        Floating-point numbers resolve 1 - F above the mean, and F below.
-        """
-        low, high = ((end - self.mean) / self.deviation for end in self.ends)
-        if low > 0:
-            return float(ndtr(-high)), float(ndtr(-low)), -1.0
-        return float(ndtr(low)), float(ndtr(high)), 1.0
-
     def quantile(self, level: FloatArray) -> FloatArray:
         """Return the values at levels in [0, 1)."""
-        start, stop, sign = self._cut
-        share = np.clip(level, _EDGE, 1 - _EDGE)
-        share = share if sign > 0 else 1 - share
-        standard = sign * ndtri(start + share * (stop - start))
+        from scipy.stats import truncnorm
+
+        low, high = ((end - self.mean) / self.deviation for end in self.ends)
+        standard = truncnorm.ppf(np.clip(level, _EDGE, 1 - _EDGE), low, high)
         with np.errstate(over="ignore"):  # an infinite value is refused later
-            found = self.mean + self.deviation * standard
-        return np.clip(found, *self.ends)
+            return np.clip(self.mean + self.deviation * standard, *self.ends)
 
 
 class ParameterSection(Section):
@@ -140,14 +121,8 @@ class ParameterSection(Section):
         if self.uniform is not None:
             low, high = self.uniform
             return np.clip(low + level * (high - low), low, high)
-        return self._pick(np.arange(len(self.values)), level)
-
-    def _pick(self, order: IntArray, level: FloatArray) -> FloatArray:
-        """Return the values of a list, in an order, below which each share of the weights lies."""
-        weights = np.array(self.weights or [1.0] * len(self.values))[order]
-        shares = weights / np.max(weights)  # so that their sum cannot overflow
-        bounds = np.cumsum(shares) / np.sum(shares)
-        return np.array(self.values)[order][np.searchsorted(bounds[:-1], level, side="right")]
+        bounds = np.cumsum(self.weights or [1.0] * len(self.values))
+        return np.array(self.values)[np.searchsorted(bounds[:-1] / bounds[-1], level, side="right")]
 
     def extremes(self, samples: int) -> tuple[float, float]:
         """Return the ends, or values beyond which half a sample is expected."""
@@ -160,11 +135,10 @@ class ParameterSection(Section):
         return low, high
 
     def median(self) -> float:
-        """Return the median."""
-        half = np.array([0.5])
+        """Return the median; the middle one of a list."""
         if self.values:
-            return float(self._pick(np.argsort(self.values), half)[0])
-        return float(self.quantile(half)[0])
+            return sorted(self.values)[len(self.values) // 2]
+        return float(self.quantile(np.array([0.5]))[0])
 
 
 class ControllerSection(Section):

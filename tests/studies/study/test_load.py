@@ -85,7 +85,6 @@ ONE: {uniform: [1, 2], weights: [1]} => weights goes with list
 ONE: {list: [1, 2], weights: [1, 0]} => greater than 0
 ONE: {normal: {mean: 1, deviation: 0}} => deviation: input should be gr
 ONE: {normal: {mean: 1, deviation: 1, low: 3, high: 2}} => low must be below high
-ONE: {normal: {mean: 1, deviation: 0.01, low: 3, high: 4}} => has nothing between 3 and 4
 parameters: {'truth.vibration[0].rms_nm': 5} => truth has no vibration; did you mean vibrations
 parameters: {'truth.vibrations[1].rms_nm': 5} => truth\.vibrations has 1 entry, counted from 0; got \[1\]
 parameters: {truth.vibrations.rms_nm: 5} => truth\.vibrations has no keys; it is a list of 1

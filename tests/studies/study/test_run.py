@@ -18,6 +18,8 @@ from support.studies import (
 
 import lbt_synth as lbt
 from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.studies.study.run import replay_row
+from lbt_synth.studies.study.sample import evaluate_samples
 
 
 def part_path(folder, place):
@@ -34,7 +36,7 @@ def test_a_run_and_its_results(tmp_path):
     assert (run.computed, run.failures, run.new) == (50, (), True)
     np.testing.assert_array_equal(run.columns["row"], np.arange(50))
     assert sum(counts) == 50
-    assert_whole(folder, study, lbt.studies.evaluate_samples)
+    assert_whole(folder, study, evaluate_samples)
     assert (folder / "failed.csv").read_text() == "row,controller,error\n"
     assert lbt.load_gain(folder / "a.fits").method == "kalman"
     text = (folder / "results.csv").read_text()
@@ -66,7 +68,7 @@ def test_failures_are_listed_and_their_rows_are_there(tmp_path):
     folder = make_folder(tmp_path)
     run = lbt.studies.run_study(study, folder)
     found = read_table(folder / "results.csv")
-    assert_whole(folder, study, lbt.studies.evaluate_samples)
+    assert_whole(folder, study, evaluate_samples)
     noisy = np.flatnonzero(found["loop.delay_frames"] == 4)
     lines = (folder / "failed.csv").read_text().splitlines()[1:]
     assert [line.split(",")[:2] for line in lines] == [[str(row), "tight"] for row in noisy]
@@ -123,7 +125,7 @@ def test_other_studies_and_damage_are_refused(tmp_path):
         lbt.studies.run_study(study, folder, evaluate=stops)
     other = load_small_study(tmp_path, samples="60", controllers=TWO, seed="8")
     refused("is of another study", lambda: lbt.studies.run_study(other, folder))
-    refused("is of another study", lambda: lbt.studies.replay_row(other, folder, 0))
+    refused("is of another study", lambda: replay_row(other, folder, 0))
     part = part_path(folder, 0)
     content = part.read_bytes()
     for damage in (content[:-30], content[:200] + b"x" + content[201:], b""):
@@ -205,7 +207,7 @@ def test_tables_are_written_from_the_parts(tmp_path):
     (folder / "results.csv").write_bytes(content[:100])
     again = lbt.studies.run_study(study, folder, evaluate=None)
     np.testing.assert_array_equal(again.columns["slow.strehl"], first.columns["slow.strehl"])
-    stored = lbt.studies.replay_row(study, folder, 9).stored
+    stored = replay_row(study, folder, 9).stored
     assert stored["slow.strehl"] == first.columns["slow.strehl"][9]
     assert (folder / "results.csv").read_bytes() == content[:100]
     for name in ("results.csv", "failed.csv"):
@@ -237,7 +239,7 @@ def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
     )
     folder = make_folder(tmp_path)
     lbt.studies.run_study(study, folder)
-    again = lbt.studies.replay_row(study, folder, 2)
+    again = replay_row(study, folder, 2)
     assert [path.name for path in again.files] == ["row_2.yaml", "row_2_own.fits"]
     assert set(again.fresh) == set(again.stored) == set(study.result_columns)
     for name, value in again.stored.items():
@@ -274,7 +276,7 @@ def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
 @pytest.mark.usefixtures("small_parts")
 def test_a_row_of_an_unfinished_study(tmp_path):
     study, folder = load_small_study(tmp_path, samples="60"), make_folder(tmp_path)
-    assert lbt.studies.replay_row(study, folder, 3).stored == {}
+    assert replay_row(study, folder, 3).stored == {}
 
     def stops(study, values, start):
         if start >= 40:
@@ -284,12 +286,12 @@ def test_a_row_of_an_unfinished_study(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         lbt.studies.run_study(study, folder, evaluate=stops)
     last = part_rows(folder)[-1][1] - 1
-    stored = lbt.studies.replay_row(study, folder, last).stored
+    stored = replay_row(study, folder, last).stored
     values = study.values(last, last + 1)
     assert stored["slow.strehl"] == evaluate_quickly(study, values, last)[0]["slow.strehl"][0]
-    assert lbt.studies.replay_row(study, folder, 59).stored == {}
+    assert replay_row(study, folder, 59).stored == {}
     with pytest.raises(ProblemError, match="rows 0 to 59; got row 60"):
-        lbt.studies.replay_row(study, folder, 60)
+        replay_row(study, folder, 60)
 
 
 def test_a_row_whose_design_fails(tmp_path):
@@ -299,7 +301,7 @@ def test_a_row_whose_design_fails(tmp_path):
         controllers="{tight: {design: integrator, gain: 0.7, for: sample}}",
         parameters="{loop.delay_frames: {list: [4, 5]}}",
     )
-    again = lbt.studies.replay_row(study, make_folder(tmp_path), 1)
+    again = replay_row(study, make_folder(tmp_path), 1)
     assert "failed its certificate" in again.failures[0][2]
     assert [path.name for path in again.files] == ["row_1.yaml"]
 
@@ -309,7 +311,7 @@ def test_a_row_without_noise(tmp_path):
         load_small_study(tmp_path, parameters="{error.noise_factor: 0}"),
         make_folder(tmp_path),
     )
-    again = lbt.studies.replay_row(study, folder, 1)
+    again = replay_row(study, folder, 1)
     assert again.fresh["slow.noise_nm"] == 0
     assert again.fresh["slow.strehl"] > 0.1
     assert again.files == ()

@@ -9,12 +9,13 @@ from support.study_results import cell_text, draw_points, make_columns
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.storage.display_unit import own_display_unit, show_in
-from lbt_synth.studies import study_statistics, summary_tables
+from lbt_synth.studies import study_statistics
 from lbt_synth.studies.study.statistics import (
     first_order_index,
     percentiles,
     sensitivity_table,
     share,
+    summary_tables,
     worst_table,
 )
 
