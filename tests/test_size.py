@@ -26,7 +26,7 @@ LINES = {
     "models": 4550,
     "report": 4993,
     "storage": 1049,
-    "studies": 3924,
+    "studies": 3250,
     "errors, validation": 642,
 }
 COUNTS = {

@@ -37,11 +37,11 @@ from lbt_synth.storage.rows import (
     row_table,
 )
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.paper.end_to_end import (
+from lbt_synth.studies.paper import (
     EndToEndEntry,
     all_cases,
     end_to_end_tables,
-    plan_tables,
+    plan_cases,
     rms_modal_difference,
 )
 from lbt_synth.validation import integer
@@ -194,7 +194,7 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
         "row_seeds": range(setup.seed, setup.seed + arguments.row_seeds),
         "tables": arguments.tables,
     }
-    total = len(all_cases(plan_tables(setup, cases, **plan)))
+    total = len(all_cases(plan_cases(setup, cases, **plan)))
     make_directory(folder)
     case_folder = make_directory(folder / "cases")
     calibrate_setup(setup, arguments)

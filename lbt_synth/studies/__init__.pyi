@@ -1,6 +1,6 @@
 from .limits import LimitRow as LimitRow
 from .limits import limits as limits
-from .paper.end_to_end import end_to_end_tables as end_to_end_tables
+from .paper import end_to_end_tables as end_to_end_tables
 from .robustness import RobustnessMap as RobustnessMap
 from .robustness import RobustnessRow as RobustnessRow
 from .robustness import TradeoffPoint as TradeoffPoint

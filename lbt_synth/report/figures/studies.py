@@ -18,7 +18,7 @@ from lbt_synth.report.figures.loops import draw_design
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.studies import RobustnessMap, RobustnessRow, TradeoffPoint
 from lbt_synth.studies.limits import LimitStudy
-from lbt_synth.studies.paper.end_to_end import EndToEndEntry
+from lbt_synth.studies.paper import EndToEndEntry
 from lbt_synth.studies.robustness import FAMILIES
 from lbt_synth.validation import real_array, require_instance
 
