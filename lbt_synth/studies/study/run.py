@@ -30,14 +30,18 @@ from lbt_synth.storage.atomic_files import (
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies.grid import Failure, Result, Sweep, refuse
 from lbt_synth.studies.study.sample import (
-    Sample,
     are_evaluated_together,
-    design_for_sample,
     evaluate_row,
     evaluate_samples,
+)
+from lbt_synth.studies.study.study import (
+    DELAY_ERROR,
+    NOISE_FACTOR,
+    Sample,
+    Study,
+    design_for_sample,
     make_sample,
 )
-from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import FloatArray, integer, require_instance
 
 PARTS, RESULTS, FAILED = "parts", "results.csv", "failed.csv"

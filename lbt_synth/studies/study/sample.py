@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import cast
@@ -11,25 +11,27 @@ import numpy as np
 
 from lbt_synth.config import Config, ensemble
 from lbt_synth.config.ensemble import EXPECTED_ERRORS, Samples
-from lbt_synth.config.load import build_config, validate_sections
-from lbt_synth.config.samples import Reads, set_number
-from lbt_synth.config.schema import FileSection
+from lbt_synth.config.samples import Reads
 from lbt_synth.design import Design
-from lbt_synth.errors import CertificateError, refuse_config
+from lbt_synth.errors import CertificateError
 from lbt_synth.loop import ClosedLoop, simulate
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.methods.request import DesignRequest, fixed_design
-from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.studies.grid import Failure, Result, loop_columns, residual_columns
-from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
+from lbt_synth.studies.study.study import (
+    DELAY_ERROR,
+    NOISE_FACTOR,
+    Sample,
+    Study,
+    close_sample_loop,
+    design_for_sample,
+    make_sample,
+)
 from lbt_synth.validation import FloatArray, IntArray
 
 _AGREEMENT = 1e-5  # relative, of a sample evaluated both ways; below 1 absolute
 _FEWEST = 4  # samples in a group that is worth an ensemble
-
-# of one sample: what designs assume, the real loop, and what that really meets
-Sample = tuple[Config, LoopHardware, Truth]
 
 
 def evaluate_samples(
@@ -148,25 +150,6 @@ def _require_agreement(
             )
 
 
-def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
-    """Make the sample of a row of ``Study.values``."""
-    base, parameters = study.config, study.parameters_by_name(values)
-    full = base.settings.model_dump()
-    content = base.settings.model_dump(exclude_unset=True)
-    for name, places in study.places.items():
-        for keys in places:
-            set_number(content, keys, parameters[name], full=full)
-    config = build_config(validate_sections(FileSection, content, base.source), base.source)
-    delay_error, factor = parameters.get(DELAY_ERROR, 0.0), parameters.get(NOISE_FACTOR, 1.0)
-    hardware, truth = config.hardware, config.truth
-    with refuse_config(f"the real loop, with {DELAY_ERROR} and {NOISE_FACTOR}"):
-        if delay_error != 0:
-            hardware = replace(hardware, delay_frames=hardware.delay_frames + delay_error)
-        if factor != 1:
-            truth = replace(truth, noise_nm=truth.noise_nm * factor)
-    return config, hardware, truth
-
-
 def evaluate_row(
     study: Study, values: FloatArray, row: int
 ) -> tuple[dict[str, float], list[Failure]]:
@@ -204,18 +187,6 @@ def _note_failure(failures: list[Failure], row: int, controllers: Iterable[str])
     except EXPECTED_ERRORS as error:
         text = " ".join(str(error).split()) or type(error).__name__
         failures += [(row, name, text) for name in controllers]
-
-
-def design_for_sample(controller: Design | DesignRequest, sample: Sample) -> Design:
-    """Return a controller's design, made for the sample if it has none for all."""
-    design = fixed_design(controller)
-    return sample[0].design(cast("DesignRequest", controller)) if design is None else design
-
-
-def close_sample_loop(sample: Sample, design: Design) -> ClosedLoop:
-    """Close the real loop of a sample with a design."""
-    _, hardware, truth = sample
-    return design.close(hardware, sensor_gain=truth.sensor_gain)
 
 
 def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:

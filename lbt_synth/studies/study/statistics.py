@@ -170,28 +170,23 @@ def _controller_statistics(
     orders: Mapping[str, IntArray],
 ) -> ControllerStatistics:
     """Return the statistics of one controller, with the order of each parameter's values."""
-    strehl = samples.strehl[samples.evaluated]
+    places = np.flatnonzero(samples.evaluated)
+    strehl, unstable = samples.strehl[places], samples.unstable[places]
     mean, error = mean_and_error(strehl)
+    worst = places[np.lexsort((rows[places], strehl, ~unstable))[:_MOST_WORST]]
     return ControllerStatistics(
         controller=samples.controller,
         samples=len(strehl),
         failed=len(samples.strehl) - len(strehl),
-        unstable=int(np.count_nonzero(samples.unstable)),
-        unstable_share=share(samples.unstable[samples.evaluated]),
+        unstable=int(np.count_nonzero(unstable)),
+        unstable_share=share(unstable),
         mean=mean,
         mean_error=error,
         strehl=percentiles(strehl, PERCENTS),
-        residual_nm=percentiles(samples.residual_nm[samples.evaluated], PERCENTS),
-        worst=_worst(samples, rows),
+        residual_nm=percentiles(samples.residual_nm[places], PERCENTS),
+        worst=tuple(worst.tolist()),
         sensitivity={name: _sensitivity(values[name], orders[name], samples) for name in values},
     )
-
-
-def _worst(samples: ControllerSamples, rows: IntArray) -> tuple[int, ...]:
-    """Return the places of the samples of least Strehl ratio, the unstable ones first."""
-    places = np.flatnonzero(samples.evaluated)
-    order = np.lexsort((rows[places], samples.strehl[places], ~samples.unstable[places]))
-    return tuple(places[order[:_MOST_WORST]].tolist())
 
 
 def read_column(
@@ -207,8 +202,7 @@ def read_column(
     if out.ndim != 1 or (size is not None and len(out) != size):
         demand = "be 1-D" if size is None else f"have {size} rows, as the others"
         raise DimensionError(f"column {name!r} must {demand}; got shape {out.shape}.")
-    if finite:
-        _refuse_where(~np.isfinite(out), out, NonFiniteError, f"column {name!r} must be finite")
+    _refuse_where(finite & ~np.isfinite(out), out, f"column {name!r} must be finite")
     return out
 
 
@@ -216,59 +210,48 @@ def read_controller_samples(
     columns: Mapping[str, Any], controller: str, size: int | None = None
 ) -> ControllerSamples:
     """Read the columns of a controller, (n,) each."""
-    stable_column = read_column(columns, f"{controller}.stable", size)
-    size = len(stable_column)
-    evaluated, unstable = ~np.isnan(stable_column), stable_column == 0
-    stable = stable_column == 1
-    demand = f"column '{controller}.stable' must be 1, 0 or nan"
-    _refuse_where(evaluated & ~unstable & ~stable, stable_column, ProblemError, demand)
+    mark = read_column(columns, f"{controller}.stable", size)
+    evaluated, stable = ~np.isnan(mark), mark == 1
+    wrong = evaluated & ~stable & (mark != 0)
+    _refuse_where(wrong, mark, f"column '{controller}.stable' must be 1, 0 or nan")
     results = {}
-    for name, most, range_, lost in (
+    for name, most, said, lost in (
         ("strehl", 1 + 1e-9, "within [0, 1]", 0.0),
-        ("residual_nm", np.inf, "at least 0", np.inf),
+        ("residual_nm", np.finfo(float).max, "finite and at least 0", np.inf),
     ):
-        values = read_column(columns, f"{controller}.{name}", size)
-        demand = (
-            f"column '{controller}.{name}' must be finite and {range_} where the loop is stable"
-        )
-        _refuse_where(stable & ~np.isfinite(values), values, NonFiniteError, demand)
-        outside = ~((values >= 0) & (values <= most))
-        _refuse_where(stable & outside, values, ProblemError, demand)
+        values = read_column(columns, f"{controller}.{name}", mark.size)
+        demand = f"column '{controller}.{name}' must be {said} where the loop is stable"
+        _refuse_where(stable & ~((values >= 0) & (values <= most)), values, demand)
         results[name] = np.where(stable, values, np.where(evaluated, lost, np.nan))
     return ControllerSamples(
-        controller=controller,
-        **results,
-        evaluated=evaluated,
-        unstable=unstable,
+        controller=controller, **results, evaluated=evaluated, unstable=evaluated & ~stable
     )
 
 
-def _refuse_where(
-    wrong: BoolArray, values: FloatArray, error: type[ProblemError], demand: str
-) -> None:
+def _refuse_where(wrong: BoolArray, values: FloatArray, demand: str) -> None:
     """Refuse a column with wrong values, and show the first."""
     if np.any(wrong):
         row = int(np.argmax(wrong))
-        raise error(f"{demand}; got {values[row]:g} at index {row}. Check the file of the results.")
+        text = f"{demand}; got {values[row]:g} at index {row}. Check the file of the results."
+        raise (ProblemError if np.isfinite(values[row]) else NonFiniteError)(text)
 
 
 def percentiles(values: FloatArray, percents: Sequence[float]) -> dict[float, Interval]:
     """Return percentiles of a sample (n,), with intervals from order statistics."""
     from scipy.stats import binom
 
-    n, tail = len(values), (1 - CONFIDENCE) / 2
+    n, tail, parts = len(values), (1 - CONFIDENCE) / 2, np.array(percents) / 100
     if n == 0:
         return dict.fromkeys(percents, _NONE)
     ordered = np.sort(values)
     limits = np.concatenate(([np.nan], ordered, [np.nan]))  # none before the first, after the last
-    table = {}
-    for percent in percents:
-        first = int(binom.ppf(tail, n, percent / 100))
-        last = int(binom.ppf(1 - tail, n, percent / 100)) + 1
-        low, high = limits[[max(first, 0), last]].tolist()
-        value = _interpolate(ordered, percent / 100)
-        table[percent] = Interval(value=value, low=low, high=high)
-    return table
+    first = np.array(np.maximum(binom.ppf(tail, n, parts), 0), dtype=np.int64)
+    last = np.array(binom.ppf(1 - tail, n, parts), dtype=np.int64) + 1
+    rows = zip(percents, limits[first].tolist(), limits[last].tolist(), strict=True)
+    return {
+        percent: Interval(value=_interpolate(ordered, percent / 100), low=low, high=high)
+        for percent, low, high in rows
+    }
 
 
 def _interpolate(ordered: FloatArray, fraction: float) -> float:
@@ -327,19 +310,18 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> tuple[float, f
         return np.nan, np.nan
     if is_list(ordered):
         starts = value_starts(ordered)
-        coefficients = len(starts)
+        coefficients, jumps = len(starts), np.full(1, np.inf)  # a list has no joints
         counts = np.diff(np.append(starts, n))
         fit = np.repeat(np.add.reduceat(spread, starts) / counts, counts)
-        scatter = float(np.sum((spread - fit) ** 2)) / (n - coefficients)
     else:
         groups = round(n ** (1 / 3))
         starts = group_starts(ordered, groups if n >= _MANY_SAMPLES else min(groups, _FEW_GROUPS))
         coefficients = 2 * len(starts)
         fit, jumps = _lines(spread, _ranks(ordered), starts)
-        scatter = float(np.sum((spread - fit) ** 2)) / (n - coefficients)
-        # a jump between lines of n / B samples has 8 B / n of the variance of their scatter,
-        # which is less for even samples than for independent ones
-        scatter = min(scatter, float(np.mean(jumps**2)) / 8 * n / len(starts))
+    # a jump between lines of n / B samples has 8 B / n of the variance of their scatter, which is
+    # less for even samples than for independent ones
+    scatter = float(np.sum((spread - fit) ** 2)) / (n - coefficients)
+    scatter = min(scatter, float(np.mean(jumps**2)) / 8 * n / len(starts))
     squares = (spread - fit) ** 2
     unexplained = float(np.sum(squares)) / total
     # a fit follows some of the scatter (T. L. Kelley, Proc. Natl. Acad. Sci. 21, 554 (1935))

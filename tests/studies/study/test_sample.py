@@ -14,7 +14,8 @@ from lbt_synth.config.schema import FileSection, SensorSection
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.studies.study import sample as evaluation
-from lbt_synth.studies.study.sample import evaluate_samples, make_sample
+from lbt_synth.studies.study.sample import evaluate_samples
+from lbt_synth.studies.study.study import make_sample
 
 
 def test_a_sample_is_a_configuration(tmp_path):
@@ -432,7 +433,7 @@ def test_a_new_key_takes_the_way_that_its_builder_declares(
     def noise(settings):
         return measurement_noise_nm(settings) * excess(settings.sensor)
 
-    for module in ("config.load", "studies.study.sample"):
+    for module in ("config.load", "studies.study.study"):
         monkeypatch.setattr(f"lbt_synth.{module}.FileSection", NewFile)
     for module in ("config.load", "config.ensemble"):
         monkeypatch.setattr(f"lbt_synth.{module}.measurement_noise_nm", noise)
