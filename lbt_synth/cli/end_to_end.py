@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
 from lbt_synth.design import Design
-from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
+from lbt_synth.errors import GainFileError, UnstableLoopError
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
 from lbt_synth.interop.specula.calibration import Calibration
@@ -187,14 +186,13 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     designs = load_designs(arguments.gains)
     for count in ("seeds", "row_seeds", "jobs"):
         integer(getattr(arguments, count), option_name(count), at_least=1)
-    cases = _named_cases(designs)
     specula_version()
     plan: dict[str, Any] = {
         "seeds": range(setup.seed, setup.seed + arguments.seeds),
         "row_seeds": range(setup.seed, setup.seed + arguments.row_seeds),
         "tables": arguments.tables,
     }
-    total = len(all_cases(plan_cases(setup, cases, **plan)))
+    total = len(all_cases(plan_cases(setup, designs, **plan)))
     make_directory(folder)
     case_folder = make_directory(folder / "cases")
     calibrate_setup(setup, arguments)
@@ -206,7 +204,7 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
         table = end_to_end_tables(
             setup,
             case_folder,
-            cases,
+            designs,
             **plan,
             executor=executor,
             workers=workers,
@@ -238,17 +236,3 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     )
     report.note_files(files)
     return report
-
-
-def _named_cases(designs: Mapping[str, Design]) -> dict[str, Design]:
-    """Return designs by names that files can have."""
-    cases = {
-        "".join(letter if letter.isalnum() else "_" for letter in name): design
-        for name, design in designs.items()
-    }
-    if len(cases) < len(designs):
-        raise ProblemError(
-            "names of gain files must differ in letters or digits, because runs are kept under "
-            f"them; got {', '.join(designs)}."
-        )
-    return cases
