@@ -27,7 +27,7 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact, facts
 from lbt_synth.studies import tradeoff
 from lbt_synth.studies.limits import LimitStudy
-from lbt_synth.studies.robustness import FAMILIES
+from lbt_synth.studies.robustness import FAMILIES, mirror_rows
 from lbt_synth.validation import integer
 
 
@@ -147,7 +147,7 @@ def run_mirror(arguments: Namespace) -> Report:
     hardware = plant.hardware
     step = shell.step_response(arguments.tolerance)
     with show_spinner("designing", quiet=arguments.json):
-        rows = studies.mirror(
+        rows = mirror_rows(
             plant,
             config.truth,
             config.imaging,

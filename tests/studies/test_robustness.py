@@ -407,11 +407,9 @@ def test_the_front_of_the_lbt(plant):
 
 def test_a_front_without_a_loop():
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    points = list(lbt.studies.tradeoff(walk, points=2, families=["central"]))
+    points = list(lbt.studies.tradeoff(walk, points=2))
     assert np.isnan(points[0].gain_low)
     assert len(tradeoff_figure(points).axes) == 1
-    with pytest.raises(lbt.errors.ProblemError, match="families must be"):
-        next(lbt.studies.tradeoff(walk, families=["best"]))
     with pytest.raises(lbt.errors.ProblemError, match="points must be at least 2"):
         next(lbt.studies.tradeoff(walk, points=1))
     with pytest.raises(lbt.errors.ProblemError, match="at least one point"):
