@@ -187,7 +187,6 @@ def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report
         notes=[
             *([] if stored else ["note: the study has no result of this row yet."]),
             *(f"failed: {name}: {error}" for _, name, error in replay.failures),
-            *([f"note: {replay.unwritten}"] if replay.unwritten else []),
         ],
     )
     report.add_table(f"Row {row}", ("parameter", "value"), values.items())

@@ -33,6 +33,7 @@ from lbt_synth.studies.study.sample import (
     are_evaluated_together,
     evaluate_row,
     evaluate_samples,
+    note_failure,
 )
 from lbt_synth.studies.study.study import (
     DELAY_ERROR,
@@ -51,7 +52,6 @@ _PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all 
 # of one sample by itself is a fifth (benchmarks/study_rates.py would be slower with fewer). Where
 # each sample takes milliseconds or seconds, a killed study shall lose few of them.
 _ROWS_TOGETHER, _ROWS_ONE_BY_ONE = 8192, 16
-_NOISELESS = "has no noise, which no configuration takes: there is none to simulate it with."
 
 Evaluate = Callable[[Study, FloatArray, int], Result]
 
@@ -205,10 +205,8 @@ class Replay:
     stored: dict[str, float]  # its results in the study; empty if it has none yet
     # its results computed now, by the reference evaluation; without those that failed
     fresh: dict[str, float]
-    failures: tuple[Failure, ...]  # what failed now
-    # files that were written: the configuration, and the designs for this sample
-    files: tuple[Path, ...]
-    unwritten: str = ""  # why there is no configuration; empty if there is one
+    failures: tuple[Failure, ...]  # what failed now, the configuration among it
+    files: tuple[Path, ...]  # that were written: the configuration, and the designs for this sample
 
 
 def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Replay:
@@ -229,36 +227,21 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
             stored = dict(zip(study.result_columns, numbers.tolist(), strict=True))
     values = study.values(row, row + 1)[0]
     fresh, failures = evaluate_row(study, values, row)
-    sample = _, _, truth = make_sample(study, values)
-    has_noise = bool(np.all(np.asarray(truth.noise_nm) > 0))
-    return Replay(
-        stored=stored,
-        fresh=fresh,
-        failures=tuple(failures),
-        files=_write_files(study, folder, row, sample, with_config=has_noise),
-        unwritten="" if has_noise else f"row {row} {_NOISELESS}",
-    )
-
-
-def _write_files(
-    study: Study, folder: Path, row: int, sample: Sample, *, with_config: bool
-) -> tuple[Path, ...]:
-    """Write the configuration of a sample and its own designs, and return their paths."""
-    path = folder / f"row_{row}.yaml"
-    own = {
+    sample, path = make_sample(study, values), folder / f"row_{row}.yaml"
+    designs = {
         folder / f"row_{row}_{name}.fits": controller
         for name, controller in study.controllers.items()
         if fixed_design(controller) is None
     }
-    refuse_replacing([path, *own], study.inputs)
+    refuse_replacing([path, *designs], study.inputs)
     files = []
-    if with_config:
+    with note_failure(failures, row, ["configuration"]):
         settings, comments = _row_settings(study, row, sample)
         files.append(save_config(path, settings, comments=comments))
-    for gain, controller in own.items():
+    for gain, controller in designs.items():
         with contextlib.suppress(*EXPECTED_ERRORS):  # they are among the failures
             files.append(save_gain(gain, design_for_sample(controller, sample)))
-    return tuple(files)
+    return Replay(stored=stored, fresh=fresh, failures=tuple(failures), files=tuple(files))
 
 
 def _row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, dict[str, str]]:

@@ -157,17 +157,17 @@ def evaluate_row(
     failures: list[Failure] = []
     loops: dict[str, ClosedLoop] = {}
     results: dict[str, float] = {}
-    with _note_failure(failures, row, study.controllers):
+    with note_failure(failures, row, study.controllers):
         sample = config, _, truth = make_sample(study, values)
         for name, controller in study.controllers.items():
-            with _note_failure(failures, row, [name]):
+            with note_failure(failures, row, [name]):
                 loops[name] = close_sample_loop(sample, design_for_sample(controller, sample))
         # frames to drop: the same for all controllers, which meet the same disturbances
         radii = [loop.radius_per_frame for loop in loops.values() if loop.is_stable]
         least = study.config.settings.simulation.settle_frames
         settle = max([least, *map(settling_frames, radii)])
         for name, loop in loops.items():
-            with _note_failure(failures, row, [name]):
+            with note_failure(failures, row, [name]):
                 if not loop.is_stable:
                     columns = {"stable": 0.0}
                 elif study.settings.evaluation == "exact":
@@ -180,7 +180,7 @@ def evaluate_row(
 
 
 @contextmanager
-def _note_failure(failures: list[Failure], row: int, controllers: Iterable[str]) -> Iterator[None]:
+def note_failure(failures: list[Failure], row: int, controllers: Iterable[str]) -> Iterator[None]:
     """Note an error that fails controllers on a sample, and not the study."""
     try:
         yield

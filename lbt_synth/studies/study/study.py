@@ -296,15 +296,14 @@ def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) 
     """Return points ``start`` to ``stop`` of a study's sampling, (., dimensions) in [0, 1).
 
     The seed fixes every point. A longer Sobol sequence begins with the same points, and is
-    balanced where it has 2^k of them. A Latin hypercube is made as a whole, once per process.
+    balanced where it has 2^k of them. A Latin hypercube is made as a whole.
     """
-    from scipy.stats import qmc
-
     if dimensions == 0 or stop == start:
         return np.zeros((stop - start, dimensions))
     if settings.sampling == "latin_hypercube":
-        return _hypercube(settings.samples, dimensions, settings.seed)[start:stop]
-    engine: qmc.Sobol = _sobol(dimensions, settings.seed).reset()
+        points = _sampler("LatinHypercube", dimensions, settings.seed, settings.samples)
+        return np.asarray(points[start:stop])
+    engine = _sampler("Sobol", dimensions, settings.seed).reset()
     if start > 0:
         return np.asarray(engine.fast_forward(start).random(stop - start))
     # a first number of points that is no power of 2 is warned of
@@ -312,19 +311,12 @@ def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) 
 
 
 @lru_cache(maxsize=1)
-def _sobol(dimensions: int, seed: int) -> Any:
-    """Return the sequence, as its scrambling takes longer than a batch."""
+def _sampler(kind: str, dimensions: int, seed: int, points: int = 0) -> Any:
+    """Return a sampler, whose scrambling takes longer than a part, or its first points."""
     from scipy.stats import qmc
 
-    return qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed))
-
-
-@lru_cache(maxsize=1)
-def _hypercube(samples: int, dimensions: int, seed: int) -> FloatArray:
-    from scipy.stats import qmc
-
-    engine = qmc.LatinHypercube(dimensions, seed=np.random.default_rng(seed))
-    return np.asarray(engine.random(samples))
+    sampler = getattr(qmc, kind)(dimensions, seed=np.random.default_rng(seed))
+    return sampler.random(points) if points else sampler
 
 
 def is_error(parameter: str) -> bool:

@@ -315,4 +315,6 @@ def test_a_row_without_noise(tmp_path):
     assert again.fresh["slow.noise_nm"] == 0
     assert again.fresh["slow.strehl"] > 0.1
     assert again.files == ()
-    assert "row 1 has no noise, which no configuration takes" in again.unwritten
+    ((row, name, why),) = again.failures
+    assert (row, name) == (1, "configuration")
+    assert "sensor.noise_nm" in why
