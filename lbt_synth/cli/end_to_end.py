@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lbt_synth.cli.argument_kinds import given_options, option_name
+from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.engine import choose_engine, keep_finished
 from lbt_synth.cli.loop_inputs import choose_wavefront_unit, load_design, load_designs
 from lbt_synth.cli.output import Report, json_value

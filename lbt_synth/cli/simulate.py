@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.argument_kinds import given_options
+from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import load_shown, loop_difference_notes, truth_at_sensor_gain
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_figure, write_telemetry
