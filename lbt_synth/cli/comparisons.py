@@ -40,7 +40,7 @@ from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, default_method
 from lbt_synth.validation import FloatArray, agree, frozen_copy, integer, number
 
 _MOST_VALUES = 2001  # of frequency errors or sensor gains
-_LISTED_GAINS = 8  # of more sensor gains, the table shows about so many
+_SHOWN = 8  # sensor gains of a map, and taps of a mirror, that are printed of more
 
 
 def run_limits(arguments: Namespace) -> Report:
@@ -148,9 +148,6 @@ def run_tradeoff(arguments: Namespace) -> Report:
     return report
 
 
-_SHOWN_TAPS = 8
-
-
 def run_mirror(arguments: Namespace) -> Report:
     """Show how the mirror of a configuration settles, and compare designs on it."""
     require_outputs(arguments.output, inputs=[arguments.config])
@@ -166,7 +163,7 @@ def run_mirror(arguments: Namespace) -> Report:
             command_weight=config.settings.design.command_weight,
         )
     taps = hardware.mirror_taps
-    shown = [f"{tap:.4f}" for tap in taps[:_SHOWN_TAPS]] + ["..."] * (taps.size > _SHOWN_TAPS)
+    shown = [f"{tap:.4f}" for tap in taps[:_SHOWN]] + ["..."] * (taps.size > _SHOWN)
     report = Report(data={"taps": taps})
     limit_nm = limit_or_nan(lambda: least_residual(hardware, config.truth))
     least = "least residual of any linear controller in the truth"
@@ -358,8 +355,8 @@ def _map_points(name: str, found: RobustnessMap) -> list[Facts]:
 def _map_lines(found: RobustnessMap) -> Iterator[Facts]:
     """Yield a row for some sensor gains at each delay error, with its worst frequency error."""
     gains, shown = found.sensor_gains, np.arange(found.sensor_gains.size)
-    if gains.size > _LISTED_GAINS:  # some from end to end, and the one that is nearest to 1
-        some = np.linspace(0, gains.size - 1, _LISTED_GAINS - 1).round().astype(int)
+    if gains.size > _SHOWN:  # some from end to end, and the one that is nearest to 1
+        some = np.linspace(0, gains.size - 1, _SHOWN - 1).round().astype(int)
         shown = np.unique([*some, int(np.argmin(np.abs(gains - 1)))])
     percent = {"unit": "%", "scale": 100, "format": ".2f"}
     for i, delay in enumerate(found.delay_errors_frames):

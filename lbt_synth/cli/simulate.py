@@ -124,13 +124,7 @@ def run(arguments: Namespace) -> Report:
     report.notes += _simulation_notes(config, design, strehls, settle, drifts=truth.drifts)
     if drops:
         report.notes.append("note: the exact answer above is with all sensors.")
-    if arguments.stroke is not None:
-        clipped = np.mean(np.any(np.abs(simulation.commands) >= arguments.stroke, axis=2))
-        report.data["clipped"] = float(clipped)
-        report.notes.append(
-            f"note: the mirror clipped the commands of {clipped:.2%} of the frames; the exact "
-            "answer has no limit of the stroke."
-        )
+    _add_clipped(report, simulation, arguments.stroke)
     if arguments.output is not None:
         if segments:
             places, exact_nm = [s for s, _ in segments], [row.exact_nm for _, row in segments]
@@ -145,6 +139,18 @@ def run(arguments: Namespace) -> Report:
             report, arguments.telemetry, recorded, key="telemetry", what="telemetry of case 0"
         )
     return report
+
+
+def _add_clipped(report: Report, simulation: Simulation, stroke: float | None) -> None:
+    """Say how often the mirror did not reach what was commanded, if it has a stroke."""
+    if stroke is None:
+        return
+    clipped = np.mean(np.any(np.abs(simulation.commands) >= stroke, axis=2))
+    report.data["clipped"] = float(clipped)
+    report.notes.append(
+        f"note: the mirror clipped the commands of {clipped:.2%} of the frames; the exact "
+        "answer has no limit of the stroke."
+    )
 
 
 def _parse_drops(arguments: Namespace, design: Design) -> list[Drop]:

@@ -18,15 +18,13 @@ from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.grid import timed
-from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths, replay_row
+from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths, part_rows, replay_row
 from lbt_synth.studies.study.sample import evaluate_samples
 from lbt_synth.studies.study.statistics import summary_tables, worst_table
 from lbt_synth.validation import integer
 
 _FAILURE = ("row", "controller", "error")
-_MEASURED_ROWS = 4  # of the first batch of an estimate, and the growth of the next ones
-_LONG_ENOUGH_S = 1.0
-_NUMBER_BYTES, _PART_BYTES = 13, 8  # of a result in the table and in a part
+_NUMBER_BYTES = 21  # of a number of a study, in a part and in the table of results
 _WORST = 3  # rows of each controller that are printed; the page has more
 
 
@@ -157,20 +155,17 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
 
 
 def _estimate(loaded: studies.Study, at_once: int) -> Facts:
-    """Measure parts in this process until one is long enough, and say what the whole will cost."""
-    start, size, rows, seconds = 0, _MEASURED_ROWS, 1, 0.0
+    """Measure a part in this process, and say what the whole will cost."""
     evaluate_samples(loaded, loaded.values(0, 1), 0)  # warms up
-    while seconds < _LONG_ENOUGH_S and start < loaded.samples:
-        values = loaded.values(start, min(start + size, loaded.samples))
-        rows, (_, seconds) = len(values), timed(evaluate_samples, loaded, values, start)
-        start, size = start + rows, _MEASURED_ROWS * size
-    row_bytes = _NUMBER_BYTES * len(loaded.columns) + _PART_BYTES * len(loaded.result_columns)
+    rows = min(part_rows(loaded), loaded.samples)
+    _, seconds = timed(evaluate_samples, loaded, loaded.values(0, rows), 0)
     space = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
+    disk_bytes = _NUMBER_BYTES * len(loaded.columns) * loaded.samples
     return facts(
         measured_rows=fact(rows, "samples measured in one process"),
         measured_s=fact(seconds, "  their time", unit="s", format=".3g"),
         seconds=fact(seconds / rows * loaded.samples / at_once),  # said in a note, in words
-        disk_bytes=fact(loaded.samples * row_bytes, "space on the disk, about", **space),
+        disk_bytes=fact(disk_bytes, "space on the disk, about", **space),
     )
 
 

@@ -50,8 +50,7 @@ from lbt_synth.studies.study.statistics import (
 from lbt_synth.validation import FloatArray
 
 _POINTS = 400  # of a cumulative distribution
-_BINS = 30  # of a histogram, at most
-_CELLS = 32  # along either axis of a map, at most
+_BINS = 30  # of a histogram, and along either axis of a map, at most
 _WITHIN = 1, 99  # percentiles at the edges of a map; its outermost cells hold what is beyond
 _PER_CELL = 8  # samples in a cell of a map on average, at least
 _MOST_FAILURES = 10  # that are listed
@@ -430,7 +429,7 @@ def binned_map(
     """
     from scipy.stats import binned_statistic_2d
 
-    cells = int(np.clip(np.sqrt(len(x) / _PER_CELL), 3, _CELLS))
+    cells = int(np.clip(np.sqrt(len(x) / _PER_CELL), 3, _BINS))
     (columns, x_edges), (rows, y_edges) = (_cells(values, cells) for values in (x, y))
     mean = binned_statistic_2d(y, x, result, bins=(y_edges, x_edges)).statistic
     return columns, rows, np.asarray(mean)

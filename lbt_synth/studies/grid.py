@@ -40,7 +40,6 @@ Result = tuple[dict[str, FloatArray], list[Failure]]  # columns of some rows (b,
 RESIDUALS = {"residual_nm": "rms_nm"} | {  # columns, and the attributes of what has them
     name: name for name in ("turbulence_nm", "vibration_nm", "noise_nm", "within_nm")
 }
-_FEWEST_PARTS = 4  # and twice as many as are in flight, so that none waits long for the last
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
 _DELETE = "Delete it, and it is computed again."
 
@@ -160,7 +159,8 @@ class Sweep:
         if executor is not None:
             most = getattr(executor, "_max_workers", None)
             in_flight = 2 * (workers or most or os.cpu_count() or 1)
-        share = -(-self.rows // max(_FEWEST_PARTS, 2 * in_flight))
+        # more parts than are in flight, so that no worker waits long for the last
+        share = -(-self.rows // (2 * in_flight + 2))
         with exclusive_lock(folder, "computation"):
             for path in folder.glob(UNFINISHED):
                 path.unlink()  # what a killed process left

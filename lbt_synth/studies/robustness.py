@@ -68,7 +68,6 @@ from lbt_synth.validation import (
 )
 
 FAMILIES = (MIXED.name, "central")
-_MOST_POINTS = 200  # of a trade-off
 _CROWDING = 1.5  # above 1, points are denser near the least norm
 _GAINS_AT_ONCE = 64  # of a map
 
@@ -497,7 +496,7 @@ def tradeoff(
     problem : EstimationProblem
         The problem; with a plant, each filter's loop is examined.
     points : int, optional
-        Levels of the norm, 2 to 200.
+        Levels of the norm, at least 2.
     taps : int, optional
         Length of the mixed filters' impulse response.
 
@@ -528,7 +527,7 @@ def tradeoff(
     True
     """
     require_problem(problem)
-    count = integer(points, "points", at_least=2, at_most=_MOST_POINTS)
+    count = integer(points, "points", at_least=2)
     length = require_taps(taps)
     least, best = hinf(problem, route="riccati"), kalman(problem)
     spread = max(best.gamma / least.gamma_least, 1.0)

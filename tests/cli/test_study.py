@@ -94,8 +94,8 @@ def test_an_estimate(tmp_path, monkeypatch):
     monkeypatch.setattr("lbt_synth.cli.study.evaluate_samples", slow)
     cost = estimate(loaded, 1)
     assert 4 < cost.seconds < 9
-    assert cost.measured_rows >= 1000
-    assert cost.disk_bytes == 5000 * (13 * 9 + 8 * 7)
+    assert cost.measured_rows == 5000
+    assert cost.disk_bytes == 5000 * 21 * 9
     assert estimate(loaded, 100).seconds < 0.09
 
 

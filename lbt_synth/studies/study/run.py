@@ -142,11 +142,10 @@ def run_study(
             if path.exists():
                 why = "is not of a study in this directory, and would be replaced. Name another"
                 refuse(path, f"{why} directory, or delete it.")
-    together = all(are_evaluated_together(study, each) for each in study.controllers.values())
     outcome, computed = sweep.run(
         evaluate,
         lambda rows: (study, study.values(*rows), rows[0]),
-        part_rows=_ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE,
+        part_rows=part_rows(study),
         executor=executor,
         workers=workers,
         progress=progress,
@@ -162,6 +161,12 @@ def run_study(
         new=_write_outputs(folder, study, table, outcome.failures),
         seconds=time.perf_counter() - began,
     )
+
+
+def part_rows(study: Study) -> int:
+    """Return how many rows a part of a study has, at most."""
+    together = all(are_evaluated_together(study, each) for each in study.controllers.values())
+    return _ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE
 
 
 def study_sweep(folder: Path, study: Study) -> Sweep:

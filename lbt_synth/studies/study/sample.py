@@ -31,7 +31,6 @@ from lbt_synth.studies.study.study import (
 from lbt_synth.validation import FloatArray, IntArray
 
 _AGREEMENT = 1e-5  # relative, of a sample evaluated both ways; below 1 absolute
-_FEWEST = 4  # samples in a group that is worth an ensemble
 
 
 def evaluate_samples(
@@ -116,7 +115,7 @@ def _find_groups(study: Study, values: FloatArray, reads: Reads) -> Iterator[Int
         if not all(map(reads.take_arrays_at, places))
     ]
     _, which, counts = np.unique(values[:, apart], axis=0, return_inverse=True, return_counts=True)
-    for group in np.flatnonzero(counts >= min(_FEWEST, len(values))):
+    for group in np.flatnonzero(counts >= min(2, len(values))):
         yield np.flatnonzero(which.reshape(-1) == group)
 
 
