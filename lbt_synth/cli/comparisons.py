@@ -137,14 +137,17 @@ def run_tradeoff(arguments: Namespace) -> Report:
     )
     least = points[0].design
     report = Report()
-    report.add_rows("points", "Trade-off of variance, norm and sensor gain", points)
+    caption, hidden = "Trade-off of variance, norm and sensor gain", ("design",)
+    report.add_rows("points", caption, points, without=hidden)
     report.data |= {"gamma_least": least.gamma_least, "gamma_infeasible": least.gamma_infeasible}
     report.notes.append(
         f"the least norm of any filter lies between {nm_text(least.gamma_infeasible, '.9g')} and "
         f"{nm_text(least.gamma_least, '.9g')}"
     )
     report.notes += own_sensor_notes(config)
-    write_outputs(report, arguments.output, points, figure=lambda: tradeoff_figure(points))
+    write_outputs(
+        report, arguments.output, points, figure=lambda: tradeoff_figure(points), without=hidden
+    )
     return report
 
 

@@ -37,7 +37,6 @@ from lbt_synth.storage.rows import (
 )
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies.paper import (
-    EndToEndEntry,
     all_cases,
     end_to_end_tables,
     plan_cases,
@@ -221,7 +220,7 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     report = Report(
         data={
             "entries": [json_record(entry) for entry in table],
-            "units": json_units(EndToEndEntry),
+            "units": json_units(table[0]),
             "modal_distance_points": differences,
             "runs": total,
         },

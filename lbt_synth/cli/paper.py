@@ -15,7 +15,7 @@ from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import loop_figure, robustness_figure
 from lbt_synth.storage.atomic_files import make_directory, write_atomically
 from lbt_synth.storage.display_unit import own_display_unit
-from lbt_synth.storage.rows import csv_rows, json_record
+from lbt_synth.storage.rows import Facts, csv_rows, json_record
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies import RobustnessRow
 from lbt_synth.studies.paper import (
@@ -23,7 +23,6 @@ from lbt_synth.studies.paper import (
     TABLE_II,
     TABLE_III,
     PaperRow,
-    TableEntry,
     modal_row,
     paper_filters,
     parameter_rows,
@@ -43,8 +42,9 @@ def run(arguments: Namespace) -> Report:
         (row, modal_row(row))
         for row in track_progress(plan_rows(), total=_ROWS, what="tables", quiet=arguments.json)
     ]
-    entries = [table_entry(*pair) for pair in rows]
-    second, third = ([e for e in entries if e.table == table] for table in ("II", "III"))
+    second, third = (
+        [table_entry(*pair) for pair in rows if pair[0].table == table] for table in ("II", "III")
+    )
     filters = paper_filters()
     files = write_paper(folder, rows, filters)
     ratio = filters[1].gamma_requested / filters[1].gamma_least
@@ -77,7 +77,7 @@ def run(arguments: Namespace) -> Report:
     return report
 
 
-def _add_comparison(report: Report, title: str, entries: list[TableEntry]) -> None:
+def _add_comparison(report: Report, title: str, entries: list[Facts]) -> None:
     """Add a table with the methods side by side."""
     methods = dict.fromkeys(entry.method for entry in entries)
     headings, lines = ["row"], {entry.label: [entry.label] for entry in entries}

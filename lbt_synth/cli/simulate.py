@@ -37,8 +37,9 @@ from lbt_synth.report.figures.records import sensor_failure_figure, simulation_f
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.input_files import file_sha256
+from lbt_synth.storage.rows import Facts
 from lbt_synth.storage.words import count_text
-from lbt_synth.studies.robustness import SegmentRow, run_failures
+from lbt_synth.studies.robustness import run_failures
 from lbt_synth.validation import FloatArray
 
 _DROP = re.compile(
@@ -96,7 +97,7 @@ def run(arguments: Namespace) -> Report:
         why = " ".join([str(error), *loop_difference_notes(config, design)])
         raise UnstableLoopError(why, spectral_radius=loop.radius_per_frame) from error
     settings = config.settings.simulation
-    segments: list[tuple[Segment, SegmentRow]] = []
+    segments: list[tuple[Segment, Facts]] = []
     sizes: dict[str, Any] = _choose_sizes(arguments, config, drops)
     # the same settling for all controllers, so that one seed is one weather
     settle = max(settings.settle_frames, settling_frames(loop.radius_per_frame))

@@ -3,7 +3,6 @@ from .limits import limits as limits
 from .paper import end_to_end_tables as end_to_end_tables
 from .robustness import RobustnessMap as RobustnessMap
 from .robustness import RobustnessRow as RobustnessRow
-from .robustness import TradeoffPoint as TradeoffPoint
 from .robustness import robustness as robustness
 from .robustness import robustness_map as robustness_map
 from .robustness import tradeoff as tradeoff

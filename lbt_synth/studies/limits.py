@@ -11,9 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lbt_synth.config import Config
-from lbt_synth.design import (
-    Design,
-)
+from lbt_synth.design import Design
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.loop import (
     ClosedLoop,
@@ -37,7 +35,6 @@ if TYPE_CHECKING:
     from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
 
 _GRID = 65  # shifts over the range of errors, at least
-_SAME = 1e-6  # relative difference of residuals of one design
 _CLEAR = 0.01  # of the residual's variance by which a reference has to be better
 # Residual in the truth over what the design expects: at least twice the variance. A mirror that is
 # slower than a Kalman filter believes stays below (1.2 in examples/lbt_slow_mirror.yaml).
@@ -258,7 +255,7 @@ def compare_in_truth(
     study = limits({**designs, **references}, config.hardware, config.truth, config.imaging)
     ours, theirs = study.rows[: len(designs)], study.rows[len(designs) :]
     there = np.array([row.residual_nm for row in ours])
-    others = [row for row in theirs if not np.any(np.abs(row.residual_nm - there) <= _SAME * there)]
+    others = [row for row in theirs if not np.isclose(row.residual_nm, there, rtol=1e-6).any()]
     better = {row.design: (references[row.design], row.residual_nm) for row in others}
     return TruthComparison(
         rows=(*ours, *others),
@@ -270,12 +267,6 @@ def compare_in_truth(
     )
 
 
-def _means_nm(design: Design, config: Config) -> float:
-    """Return what a design leaves in means over frames, as it expects it."""
-    loop = design.close(config.hardware, sensor_gain=config.truth.sensor_gain)
-    return float(residual_budget(loop, config.truth, frame_means=True).rms_nm)
-
-
 def _warnings(
     design: Design, row: LimitRow, config: Config, others: Mapping[str, tuple[Design, float]]
 ) -> Iterator[str]:
@@ -284,8 +275,10 @@ def _warnings(
         yield "the loop is unstable in the truth"
         return
     expected_nm = np.inf if design.expected_residual_nm is None else design.expected_residual_nm
-    may_surprise = row.residual_nm > _SURPRISING * expected_nm  # means leave hardly more
-    means_nm = _means_nm(design, config) if may_surprise else 0.0
+    means_nm = 0.0
+    if row.residual_nm > _SURPRISING * expected_nm:  # means leave hardly more
+        loop = design.close(config.hardware, sensor_gain=config.truth.sensor_gain)
+        means_nm = float(residual_budget(loop, config.truth, frame_means=True).rms_nm)
     if surprises := means_nm > _SURPRISING * expected_nm:
         yield (
             f"the truth leaves {nm_text(means_nm)} in means over frames, where the design expects "

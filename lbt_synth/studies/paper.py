@@ -16,7 +16,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,10 +45,10 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.rows import Facts, fact, facts, fill_row
 from lbt_synth.studies.grid import Sweep, loop_columns
 from lbt_synth.studies.robustness import RobustnessRow
-from lbt_synth.validation import FloatArray, choice, set_fields
+from lbt_synth.validation import FloatArray, choice
 
 VIBRATION_HZ = 20.0
 
@@ -303,79 +303,24 @@ def modal_row(
     return fill_row(RobustnessRow, **numbers | given)
 
 
-@table_row
-class TableEntry:
-    """One entry of ``table``, "II" or "III", ours beside the paper's."""
-
-    table: str = field()
-    label: str = column(key="row", help="Its row")
-    method: str = column(help='"classical", or the method of the filter')
-    ours: float = column(key="strehl_percent", help="Strehl ratio [%]")
-    paper: float = column(key="paper_strehl_percent", help="Strehl ratio [%]")
-    difference: float = column(
-        key="difference_points", help="Ours less the paper's [points]", init=False
+def table_entry(row: PaperRow, modal: RobustnessRow) -> Facts:
+    """Put the Strehl ratio of the modal analysis of a row beside the paper's [%]."""
+    ours = 100 * modal.strehl
+    return facts(
+        label=fact(row.label, key="row"),
+        method=fact(row.method),
+        ours=fact(ours, key="strehl_percent"),
+        paper=fact(row.paper, key="paper_strehl_percent"),
+        difference=fact(ours - row.paper, key="difference_points"),
     )
 
-    def __post_init__(self) -> None:
-        set_fields(self, difference=self.ours - self.paper)
 
-
-def table_entry(row: PaperRow, modal: RobustnessRow) -> TableEntry:
-    """Put the modal analysis of a row beside the paper's."""
-    return fill_row(TableEntry, row, ours=100 * modal.strehl)
-
-
-def rms_difference(entries: list[TableEntry]) -> float:
+def rms_difference(entries: Sequence[Facts]) -> float:
     """Root mean square of the differences [points]."""
     return float(np.sqrt(np.mean([entry.difference**2 for entry in entries])))
 
 
 _NUMBERS = ("strehl", "tip_tilt_gain", "tip_rms_nm", "tilt_rms_nm", "other_modes_strehl")
-
-
-@table_row
-class EndToEndEntry:
-    """One row of a table for one controller, simulated; ``strehls`` are those of each seed [%]."""
-
-    table: str = column(help='Table, "II" or "III"')
-    label: str = column("row", key="row", help="Its row")
-    method: str = column("method", help="Its controller")
-    error_hz: float | None = column(
-        unit="Hz", help="Frequency of the vibration less that of the model"
-    )
-    strehls: tuple[float, ...] = field()
-    strehl: float = column(
-        "end to end", key="strehl_percent", format=".1f", help="Mean Strehl ratio over seeds [%]"
-    )
-    scatter: float = column(
-        "scatter",
-        key="scatter_points",
-        format=".1f",
-        help="Standard deviation over seeds [points]; nan for one",
-    )
-    seeds: int = column("seeds", help="How many there are")
-    paper: float = column(
-        "paper", key="paper_strehl_percent", format=".1f", help="The paper's [%], or nan"
-    )
-    modal: float = column(
-        "modal",
-        key="modal_strehl_percent",
-        format=".1f",
-        help="Prediction of the modal analysis with the measured optical gain and the measured "
-        "Strehl ratio of the other modes, mean over seeds [%]; 0 where the loop is unstable",
-    )
-    optical_gain: float = column(
-        "optical gain", format=".3f", help="Optical gain of tip and tilt, mean over seeds"
-    )
-    tip_rms_nm: float = column("tip", unit="nm", format=".0f", help="Residual, rms over seeds")
-    tilt_rms_nm: float = column("tilt", unit="nm", format=".0f", help="Residual, rms over seeds")
-    other_modes: float = column(
-        "other modes",
-        unit="%",
-        key="other_modes_strehl_percent",
-        format=".1f",
-        help="Strehl ratio without tip and tilt, mean over seeds",
-    )
 
 
 def plan_cases(
@@ -424,7 +369,7 @@ def end_to_end_tables(
     workers: int | None = None,
     cache: str | os.PathLike[str] | None = None,
     progress: Callable[[int], None] | None = None,
-) -> list[EndToEndEntry]:
+) -> list[Facts]:
     """Run Tables II and III of Agapito et al. 2008 end to end, or what is missing of them.
 
     Each run has a file of its own: started again in the same directory with the same arguments,
@@ -453,8 +398,10 @@ def end_to_end_tables(
 
     Returns
     -------
-    list of EndToEndEntry
-        One per row and controller, ours beside the paper's and the modal analysis.
+    list of Facts
+        One per row and controller: ``table``, ``label``, ``method``, ``error_hz``, and the mean and
+        the scatter over seeds of the Strehl ratio, ``strehl`` and ``scatter`` [points], beside
+        ``paper`` and ``modal``, the modal analysis with what was measured [%].
 
     Raises
     ------
@@ -526,24 +473,31 @@ def all_cases(planned: Planned) -> dict[str, Mapping[str, Any]]:
 
 def make_entries(
     planned: Planned, results: Mapping[str, Mapping[str, Any]], setup: EndToEndSetup
-) -> list[EndToEndEntry]:
+) -> list[Facts]:
     """Make the entries of the tables from the results of their runs."""
-    entries = []
+    entries, percent, rms = [], {"format": ".1f"}, {"unit": "nm", "format": ".0f"}
     for row, cases in planned:
         runs = [results[name] for name in cases]
         strehls, gain, tip, tilt, others = (np.array([run[n] for run in runs]) for n in _NUMBERS)
-        entry = fill_row(
-            EndToEndEntry,
-            row,
-            strehls=tuple((100 * strehls).tolist()),
-            strehl=100 * float(np.mean(strehls)),
-            scatter=100 * float(np.std(strehls, ddof=1)) if strehls.size > 1 else np.nan,
-            seeds=strehls.size,
-            modal=float(np.mean([_predict_strehl(row, run, setup) for run in runs])),
-            optical_gain=float(np.mean(gain)),
-            tip_rms_nm=float(np.mean(tip**2) ** 0.5),
-            tilt_rms_nm=float(np.mean(tilt**2) ** 0.5),
-            other_modes=100 * float(np.mean(others)),
+        scatter = 100 * float(np.std(strehls, ddof=1)) if strehls.size > 1 else np.nan
+        modal = float(np.mean([_predict_strehl(row, run, setup) for run in runs]))
+        other_modes = {"unit": "%", "key": "other_modes_strehl_percent", **percent}
+        entry = facts(
+            table=fact(row.table),
+            label=fact(row.label, "row", key="row"),
+            method=fact(row.method, "method"),
+            error_hz=fact(row.error_hz, unit="Hz"),
+            strehl=fact(
+                100 * float(np.mean(strehls)), "end to end", key="strehl_percent", **percent
+            ),
+            scatter=fact(scatter, "scatter", key="scatter_points", **percent),
+            seeds=fact(strehls.size, "seeds"),
+            paper=fact(row.paper, "paper", key="paper_strehl_percent", **percent),
+            modal=fact(modal, "modal", key="modal_strehl_percent", **percent),
+            optical_gain=fact(float(np.mean(gain)), "optical gain", format=".3f"),
+            tip_rms_nm=fact(float(np.mean(tip**2) ** 0.5), "tip", **rms),
+            tilt_rms_nm=fact(float(np.mean(tilt**2) ** 0.5), "tilt", **rms),
+            other_modes=fact(100 * float(np.mean(others)), "other modes", **other_modes),
         )
         entries.append(entry)
     return entries
@@ -563,7 +517,7 @@ def _predict_strehl(row: PaperRow, run: Mapping[str, Any], setup: EndToEndSetup)
     return 100 * modal.strehl if modal.stable else 0.0
 
 
-def rms_modal_difference(table: Iterable[EndToEndEntry], method: str) -> float:
+def rms_modal_difference(table: Iterable[Facts], method: str) -> float:
     """Return the rms of end-to-end less modal over Table III, for one controller [points]."""
     differences = [e.strehl - e.modal for e in table if e.table == "III" and e.method == method]
     return float(np.sqrt(np.mean(np.square(differences))))

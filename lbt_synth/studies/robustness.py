@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ from numpy.typing import ArrayLike
 from lbt_synth.config import Config
 from lbt_synth.design import (
     Design,
-    FilterDesign,
     central_filter,
     hinf,
     kalman,
@@ -341,24 +341,6 @@ def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
     return read_only(np.array([number(value, name, **bounds) for value in axis]))
 
 
-@table_row
-class SegmentRow:
-    """The residual between two events."""
-
-    start_s: float = column("from", unit="s", format="g")
-    end_s: float = column("to", unit="s", format="g")
-    sensors: str = column("sensors that fail")
-    residual_nm: float = nm_column("simulated", unit="nm rms", format=".2f")
-    exact_nm: float = nm_column(
-        "exact, once settled",
-        unit="nm rms",
-        format=".2f",
-        help="nan where the loop is unstable, a reading is frozen, or a vibration drifts",
-    )
-    strehl: float = percent_column("Strehl", help="nan where the loop is unstable")
-    stable: bool = column("stable", help="Whether the loop is stable with these sensors")
-
-
 def run_failures(
     design: Design,
     config: Config,
@@ -368,10 +350,11 @@ def run_failures(
     frames: int,
     cases: int,
     seed: int,
-) -> tuple[Simulation, list[tuple[Segment, SegmentRow]]]:
+) -> tuple[Simulation, list[tuple[Segment, Facts]]]:
     """Run the loop of a configuration in which sensors fail, none after the end of the run.
 
-    Between failures and returns there is a segment, with a row that has its exact residual, too.
+    Between failures and returns there is a segment, with a row that has its exact residual, too:
+    nan where the loop is unstable, a reading is frozen, or a vibration drifts.
     """
     filters, rate = design.controllers, config.hardware.frame_rate_hz
     hardware = replace(config.hardware, suite=require_hardware(design, "a run").suite)
@@ -397,14 +380,17 @@ def run_failures(
         exact = loop.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
         first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
         part = simulation.part(first, last)
-        row = SegmentRow(
-            start_s=segment.start_s,
-            end_s=segment.end_s,
-            sensors=segment.text or "none",
-            residual_nm=float(np.sqrt(np.mean(part.rms_nm**2))),
-            exact_nm=residual_budget(loop, truth).rms_nm if exact else np.nan,
-            strehl=float(np.mean(part.strehl(config.imaging))) if loop.is_stable else np.nan,
-            stable=loop.is_stable,
+        exact_nm = residual_budget(loop, truth).rms_nm if exact else np.nan
+        ratio = float(np.mean(part.strehl(config.imaging))) if loop.is_stable else np.nan
+        rms, second = {"unit": "nm rms", "format": ".2f"}, {"unit": "s", "format": "g"}
+        row = facts(
+            start_s=fact(segment.start_s, "from", **second),
+            end_s=fact(segment.end_s, "to", **second),
+            sensors=fact(segment.text or "none", "sensors that fail"),
+            residual_nm=fact(float(np.sqrt(np.mean(part.rms_nm**2))), "simulated", **rms),
+            exact_nm=fact(exact_nm, "exact, once settled", **rms),
+            strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
+            stable=fact(loop.is_stable, "stable"),
         )
         rows.append((segment, row))
     return simulation, rows
@@ -450,42 +436,12 @@ def mirror_rows(
     return tuple(rows)
 
 
-@table_row
-class TradeoffPoint:
-    """One filter of the trade-off, ``design``; a problem without a loop has no margins, but nan."""
-
-    family: str = column(
-        "filter",
-        help='"mixed": least variance of all filters with this norm; "central": the H-infinity '
-        "filter whose norm this is",
-    )
-    gamma: float = nm_column(
-        "norm", format=".2f", help="H-infinity norm of its estimation error, recomputed"
-    )
-    gamma_ratio: float = column(
-        "norm / least", format=".4f", help="The same over the least norm of any filter"
-    )
-    rms: float = nm_column(
-        "rms", format=".2f", help="Standard deviation of its estimation error, recomputed"
-    )
-    gain_low: float = column(
-        "gain from", format=".3f", help="Least stable sensor gain", default=np.nan
-    )
-    gain_high: float = column(
-        "gain to", format=".3f", help="Greatest stable sensor gain", default=np.nan
-    )
-    modulus: float = column(
-        "modulus margin", format=".3f", help="Modulus margin of its loop", default=np.nan
-    )
-    design: FilterDesign = field(compare=False, repr=False)
-
-
 def tradeoff(
     problem: EstimationProblem,
     *,
     points: int = 9,
     taps: int = 16,
-) -> Iterator[TradeoffPoint]:
+) -> Iterator[Facts]:
     """Return filters from the least norm to the least variance, and examine their loops.
 
     The levels run from the least gamma to the norm of the Kalman filter, at which all
@@ -502,8 +458,12 @@ def tradeoff(
 
     Yields
     ------
-    TradeoffPoint
-        In the order of levels, then families; each is designed when it is requested.
+    Facts
+        In the order of levels, then families; each is designed when it is requested. ``design`` is
+        the filter of a ``family``: "mixed", of the least variance of all with this norm, or
+        "central", the H-infinity filter whose norm it is. ``gamma`` and ``rms`` are the norm and
+        the standard deviation of its error, recomputed [nm], ``gamma_ratio`` is the norm over the
+        least; ``gain_low``, ``gain_high`` and ``modulus`` are margins of its loop, nan without one.
 
     Raises
     ------
@@ -540,9 +500,17 @@ def tradeoff(
                 design = mixed(problem, gamma=level, taps=length)
             else:
                 design = central_filter(problem, gamma=level)
-            margins = None
+            margins: Any = SimpleNamespace(gain_low=np.nan, gain_high=np.nan, modulus=np.nan)
             if design.hardware is not None:
                 margins = loop_margins(close_loop(design.hardware, design.controller))
-            ratio = max(design.gamma / least.gamma_least, 1.0)
-            given = {"family": family, "gamma_ratio": ratio, "design": design}
-            yield fill_row(TradeoffPoint, design, margins, **given)
+            size, ratio = {"unit": "nm", "format": ".2f"}, design.gamma / least.gamma_least
+            yield facts(
+                family=fact(family, "filter"),
+                gamma=fact(design.gamma, "norm", **size),
+                gamma_ratio=fact(max(ratio, 1.0), "norm / least", format=".4f"),
+                rms=fact(design.rms, "rms", **size),
+                gain_low=fact(margins.gain_low, "gain from", format=".3f"),
+                gain_high=fact(margins.gain_high, "gain to", format=".3f"),
+                modulus=fact(margins.modulus, "modulus margin", format=".3f"),
+                design=fact(design),
+            )
