@@ -391,6 +391,11 @@ def _map_notes(
         late = f" with a delay error of {delay:+g} frames" if delay != 0 else ""
         ends = "none found" if np.isnan(low) else f"{low:.4g} to {high:.4g}"
         notes.append(f"{name}: stable sensor gains{late}: {ends}")
+    if unstable := np.count_nonzero(~found.stable):
+        notes.append(
+            f"warning: {name} is unstable at {unstable} of {found.stable.size} pairs of a sensor "
+            "gain and a delay error of its map."
+        )
     own = require_hardware(design, "a map")
     if own.delay_frames != config.hardware.delay_frames:
         notes.append(

@@ -398,6 +398,7 @@ def test_another_delay_in_the_configuration_gets_a_note(tmp_path, capsys, files)
     status, text, _ = run(capsys, "robustness", CONFIG, files["hinf"], *short, "--delay-errors", 1)
     assert status == 0
     assert "stable sensor gains with a delay error of +1 frames: none found" in text
+    assert "warning: hinf is unstable at 9 of 9 pairs of a sensor gain and a delay error" in text
 
 
 def test_command_without_gain_files_is_as_before(tmp_path, capsys, settings):
