@@ -35,8 +35,8 @@ from lbt_synth.storage.words import count_text, duration_text, listing_text
 from lbt_synth.studies import Study
 from lbt_synth.studies.grid import Failure
 from lbt_synth.studies.study.statistics import (
-    ControllerSamples,
     ControllerStatistics,
+    Samples,
     StudyStatistics,
     is_list,
     percent,
@@ -65,7 +65,7 @@ def study_page(
     *,
     folder: str | os.PathLike[str] = ".",
     failures: Sequence[Failure] = (),
-    computing_s: float | None = None,
+    computing_s: float = 0.0,
 ) -> Page:
     """Return the page of a study; :func:`write_page` writes it.
 
@@ -105,7 +105,10 @@ def study_page(
     >>> lbt.report.study_page(study, columns, found).title
     'Robustness study study.yaml'
     """
-    samples = [read_controller_samples(columns, each.controller) for each in statistics.controllers]
+    samples = {
+        each.controller: read_controller_samples(columns, each.controller)
+        for each in statistics.controllers
+    }
     values = {
         name: read_column(columns, name, statistics.samples) for name in statistics.parameters
     }
@@ -150,7 +153,7 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def _summary_blocks(
-    study: Study, statistics: StudyStatistics, samples: Sequence[ControllerSamples]
+    study: Study, statistics: StudyStatistics, samples: Mapping[str, Samples]
 ) -> list[Block]:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
     unstable = [each for each in statistics.controllers if each.unstable]
@@ -266,7 +269,7 @@ def _controllers_blocks(
 
 def _dependence_blocks(
     statistics: StudyStatistics,
-    samples: Sequence[ControllerSamples],
+    samples: Mapping[str, Samples],
     values: Mapping[str, FloatArray],
     names: Names,
 ) -> list[Block]:
@@ -302,30 +305,27 @@ def _worst_blocks(
     return [opening, *tables, (caption, "\n".join(dict.fromkeys(commands)))]
 
 
-def _origin_section(
-    study: Study, statistics: StudyStatistics, computing_s: float | None
-) -> Sections:
+def _origin_section(study: Study, statistics: StudyStatistics, computing_s: float) -> Sections:
     """Name the files and programs that the page was made from."""
     rows = [
         ("samples with results", f"{statistics.samples} of {study.samples}"),
         ("digest of the study", study.digest),
+        ("computing time, of all processes together", duration_text(computing_s)),
     ]
-    if computing_s is not None:
-        rows.append(("computing time, of all processes together", duration_text(computing_s)))
     about = Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,))
-    roles, sources, texts = ["study", "configuration"], [], {}
+    sources, texts = [], {}
     for place, path in enumerate(study.inputs):
-        role = roles[place] if place < len(roles) else "gain file"
+        role = ("study", "configuration", "gain file")[min(place, 2)]
         source, content = read_source(path, role)
         sources.append(source)
-        if place < len(roles):
+        if role != "gain file":
             texts[f"{role.capitalize()} {source[0]}"] = content.decode("utf-8-sig", "replace")
     return source_section(sources, texts=texts, about=about)
 
 
-def _distribution_chart(samples: Sequence[ControllerSamples]) -> list[Chart]:
+def _distribution_chart(samples: Mapping[str, Samples]) -> list[Chart]:
     """Cumulative distribution of the Strehl ratio, and its lower tail on a logarithmic scale."""
-    strehls = {each.controller: each.strehl[each.evaluated] for each in samples}
+    strehls = {name: each["strehl"][each["evaluated"]] for name, each in samples.items()}
     if not any(values.size for values in strehls.values()):
         return []
     top = 100 * max(float(np.max(values, initial=0.0)) for values in strehls.values())
@@ -385,19 +385,19 @@ def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]
 
 def _map_charts(
     statistics: StudyStatistics,
-    samples: Sequence[ControllerSamples],
+    samples: Mapping[str, Samples],
     parameters: Mapping[str, FloatArray],
     names: Names,
 ) -> list[Chart]:
     """Mean Strehl ratio over the two most influential parameters, one chart per controller."""
     charts = []
-    for place, (one, each) in enumerate(zip(statistics.controllers, samples, strict=True)):
+    for place, one in enumerate(statistics.controllers):
         if len(one.ranked) < 2:
             continue
         first, second = one.ranked[:2]
-        kept = each.evaluated
+        strehl, kept = (samples[one.controller][name] for name in ("strehl", "evaluated"))
         places = parameters[first][kept], parameters[second][kept]
-        x, y, mean = binned_map(*places, each.strehl[kept])
+        x, y, mean = binned_map(*places, strehl[kept])
         low, high = (100 * float(end(mean)) for end in (np.nanmin, np.nanmax))
         ends = 5 * float(np.floor(low / 5)), 5 * float(np.floor(high / 5)) + 5
         with drawing([2.6]) as (panel,):
@@ -405,7 +405,7 @@ def _map_charts(
             label: dict[str, Any] = {"label": "mean Strehl ratio", "unit": "%"}
             panel.map(x, y, 100 * mean, ends=ends, blank="no sample", **label)
         facts = {"x": names[first], "y": names[second], "x_path": first, "y_path": second}
-        facts["controller"] = each.controller
+        facts["controller"] = one.controller
         charts.append(chart(f"map-{place + 1}", panel.figure, group="study-map", **facts))
     return charts
 

@@ -266,7 +266,7 @@ def robustness_map(
         raise ProblemError(
             "a frequency error needs a vibration in the truth; got a truth without any."
         )
-    lines = moved_lines(truth, errors, hardware)
+    lines = list(_moved_lines(truth, errors, hardware))
     noise_nm = truth.noise_per_measurement(hardware.n_measurements)[None]
     size = delays.size, gains.size, errors.size
     maps = {name: np.empty(size) for name in ("strehl", "residual_nm", "stable")}
@@ -301,24 +301,22 @@ def robustness_map(
     )
 
 
-def moved_lines(
-    truth: Truth, errors_hz: ArrayLike, hardware: LoopHardware, name: str = "errors_hz"
-) -> list[tuple[Vibration | SinusoidalVibration, FloatArray]]:
-    """Return the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
-    errors, nyquist = np.asarray(errors_hz), hardware.frame_rate_hz / 2
-    shares, moved = truth.frequency_shifts_hz(1.0), []
-    for line, moves in zip(stationary_vibrations(truth.vibrations), shares, strict=True):
+def _moved_lines(
+    truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
+) -> Iterator[tuple[Vibration | SinusoidalVibration, FloatArray]]:
+    """Yield the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
+    nyquist_hz, shares = hardware.frame_rate_hz / 2, truth.frequency_shifts_hz(1.0)
+    for line, share in zip(stationary_vibrations(truth.vibrations), shares, strict=True):
         checked_direction(line, hardware)
-        frequencies = line.frequency_hz + moves * errors
-        wrong = ~((frequencies > 0) & (frequencies < nyquist))
+        frequencies = line.frequency_hz + share * errors_hz
+        wrong = ~((frequencies > 0) & (frequencies < nyquist_hz))
         if np.any(wrong):
             raise ProblemError(
-                f"{name} must leave each vibration between 0 and {nyquist:.6g} Hz; got an error "
-                f"of {errors[wrong][0]:.6g} Hz, which moves the one at {line.frequency_hz:.6g} Hz "
-                f"to {frequencies[wrong][0]:.6g} Hz."
+                f"errors_hz must leave each vibration between 0 and {nyquist_hz:.6g} Hz; got an "
+                f"error of {errors_hz[wrong][0]:.6g} Hz, which moves the one at "
+                f"{line.frequency_hz:.6g} Hz to {frequencies[wrong][0]:.6g} Hz."
             )
-        moved.append((line, frequencies))
-    return moved
+        yield line, frequencies
 
 
 def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:

@@ -25,6 +25,7 @@ _CONSTANT = 1e-12  # scatter of a Strehl ratio that is rounding
 _FEW_GROUPS, _MANY_SAMPLES = 8, 4096
 _MOST_VALUES = 32  # a parameter with more distinct values is continuous
 
+Samples = dict[str, Any]  # columns (n,) of one controller
 _Row = tuple[str | Cell, ...]  # a label and a cell for each controller, or a heading alone
 
 
@@ -38,17 +39,6 @@ class Interval:
 
 
 _NONE = Interval(value=np.nan, low=np.nan, high=np.nan)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ControllerSamples:
-    """One controller on n samples; all arrays (n,)."""
-
-    controller: str  # its name
-    strehl: FloatArray  # 0 where unstable, nan where the evaluation failed
-    residual_nm: FloatArray  # [nm rms]; inf where unstable, nan where the evaluation failed
-    evaluated: BoolArray  # where the evaluation did not fail
-    unstable: BoolArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,7 +140,7 @@ def study_statistics(
     size = len(read_column(columns, f"{controllers[0]}.stable"))
     if not size:
         raise ProblemError("the results must have at least one sample; got none.")
-    samples = [read_controller_samples(columns, name, size) for name in controllers]
+    samples = {name: read_controller_samples(columns, name, size) for name in controllers}
     values = {name: read_column(columns, name, size, finite=True) for name in parameters}
     rows = np.arange(size)
     if "row" in columns:
@@ -159,31 +149,35 @@ def study_statistics(
     return StudyStatistics(
         samples=size,
         parameters=tuple(parameters),
-        controllers=tuple(_controller_statistics(each, rows, values, orders) for each in samples),
+        controllers=tuple(
+            _controller_statistics(name, columns, rows, values, orders)
+            for name, columns in samples.items()
+        ),
     )
 
 
 def _controller_statistics(
-    samples: ControllerSamples,
+    controller: str,
+    samples: Samples,
     rows: IntArray,
     values: Mapping[str, FloatArray],
     orders: Mapping[str, IntArray],
 ) -> ControllerStatistics:
     """Return the statistics of one controller, with the order of each parameter's values."""
-    places = np.flatnonzero(samples.evaluated)
-    strehl, unstable = samples.strehl[places], samples.unstable[places]
+    places = np.flatnonzero(samples["evaluated"])
+    strehl, unstable = samples["strehl"][places], samples["unstable"][places]
     mean, error = mean_and_error(strehl)
     worst = places[np.lexsort((rows[places], strehl, ~unstable))[:_MOST_WORST]]
     return ControllerStatistics(
-        controller=samples.controller,
+        controller=controller,
         samples=len(strehl),
-        failed=len(samples.strehl) - len(strehl),
+        failed=len(samples["strehl"]) - len(strehl),
         unstable=int(np.count_nonzero(unstable)),
         unstable_share=share(unstable),
         mean=mean,
         mean_error=error,
         strehl=percentiles(strehl, PERCENTS),
-        residual_nm=percentiles(samples.residual_nm[places], PERCENTS),
+        residual_nm=percentiles(samples["residual_nm"][places], PERCENTS),
         worst=tuple(worst.tolist()),
         sensitivity={name: _sensitivity(values[name], orders[name], samples) for name in values},
     )
@@ -208,13 +202,16 @@ def read_column(
 
 def read_controller_samples(
     columns: Mapping[str, Any], controller: str, size: int | None = None
-) -> ControllerSamples:
-    """Read the columns of a controller, (n,) each."""
+) -> Samples:
+    """Read the columns of a controller, (n,) each: results, and what was evaluated and unstable.
+
+    An unstable loop has a Strehl ratio of 0 and an infinite residual, a failed evaluation has nan.
+    """
     mark = read_column(columns, f"{controller}.stable", size)
     evaluated, stable = ~np.isnan(mark), mark == 1
     wrong = evaluated & ~stable & (mark != 0)
     _refuse_where(wrong, mark, f"column '{controller}.stable' must be 1, 0 or nan")
-    results = {}
+    results: Samples = {}
     for name, most, said, lost in (
         ("strehl", 1 + 1e-9, "within [0, 1]", 0.0),
         ("residual_nm", np.finfo(float).max, "finite and at least 0", np.inf),
@@ -223,9 +220,7 @@ def read_controller_samples(
         demand = f"column '{controller}.{name}' must be {said} where the loop is stable"
         _refuse_where(stable & ~((values >= 0) & (values <= most)), values, demand)
         results[name] = np.where(stable, values, np.where(evaluated, lost, np.nan))
-    return ControllerSamples(
-        controller=controller, **results, evaluated=evaluated, unstable=evaluated & ~stable
-    )
+    return results | {"evaluated": evaluated, "unstable": evaluated & ~stable}
 
 
 def _refuse_where(wrong: BoolArray, values: FloatArray, demand: str) -> None:
@@ -284,14 +279,12 @@ def mean_and_error(values: FloatArray) -> tuple[float, float]:
     return mean, float(np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else np.nan
 
 
-def _sensitivity(
-    values: FloatArray, order: IntArray, samples: ControllerSamples
-) -> dict[str, float]:
+def _sensitivity(values: FloatArray, order: IntArray, samples: Samples) -> dict[str, float]:
     """Return how much of the variance of the Strehl ratio one parameter explains."""
-    order = order[samples.evaluated[order]]
+    order = order[samples["evaluated"][order]]
     ordered, index = values[order], (np.nan, np.nan)
     if len(ordered) >= _FEWEST and ordered[0] < ordered[-1]:
-        index = first_order_index(ordered, samples.strehl[order])
+        index = first_order_index(ordered, samples["strehl"][order])
     return dict(zip(("index", "index_error"), index, strict=True))
 
 
