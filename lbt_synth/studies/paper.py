@@ -148,50 +148,36 @@ def imaging() -> Imaging:
 
 
 # the H-infinity filters' own weights, in units of the measurement noise
-HINF_DAMPING = KALMAN_DAMPING
 HINF_VIBRATION_WEIGHT = 0.2508
 HINF_TURBULENCE_WEIGHT = 2.374
 HINF_GAMMA = 7.324
 
 
-def kalman_plant() -> TipTiltPlant:
-    """Plant of the Kalman filters: von Karman variance, 80 mas rms on either axis."""
-    return _plant(turbulence_model(), VIBRATION_NM, KALMAN_DAMPING)
-
-
-def hinf_plant() -> TipTiltPlant:
-    """Plant of the H-infinity filters: the same dynamics, fitted weights."""
-    turbulence = ARModel(
-        coefficients=turbulence_model().coefficients,
-        driving_rms_nm=HINF_TURBULENCE_WEIGHT * NOISE_NM,
-        frame_rate_hz=FRAME_RATE_HZ,
-    )
-    unit = Vibration(frequency_hz=VIBRATION_HZ, damping=HINF_DAMPING, rms_nm=1.0)
-    driving = unit.ar_model(FRAME_RATE_HZ).driving_rms_nm
-    return _plant(turbulence, HINF_VIBRATION_WEIGHT * NOISE_NM / driving, HINF_DAMPING)
-
-
 def filter_problems() -> dict[str, tuple[TipTiltPlant, dict[str, float]]]:
-    """Plant of each of the paper's two filters, and the bound [nm] that it takes, by method."""
+    """Plant of each of the paper's two filters, and the bound [nm] that it takes, by method.
+
+    That of the Kalman filters has von Karman variance and 80 mas rms on either axis, that of the
+    H-infinity filters the same dynamics with fitted weights.
+    """
+    air = turbulence_model()
+    weighted = replace(air, driving_rms_nm=HINF_TURBULENCE_WEIGHT * NOISE_NM)
+    unit = Vibration(frequency_hz=VIBRATION_HZ, damping=KALMAN_DAMPING, rms_nm=1.0)
+    weight_nm = HINF_VIBRATION_WEIGHT * NOISE_NM / unit.ar_model(FRAME_RATE_HZ).driving_rms_nm
     bound = {"gamma": HINF_GAMMA * NOISE_NM}
-    return {KALMAN.name: (kalman_plant(), {}), HINF.name: (hinf_plant(), bound)}
+    return {
+        KALMAN.name: (_plant(air, VIBRATION_NM), {}),
+        HINF.name: (_plant(weighted, weight_nm), bound),
+    }
 
 
-def _plant(turbulence: ARModel, vibration_nm: float, damping: float) -> TipTiltPlant:
+def _plant(turbulence: ARModel, vibration_nm: float) -> TipTiltPlant:
+    line = Vibration(frequency_hz=VIBRATION_HZ, damping=KALMAN_DAMPING, rms_nm=vibration_nm)
     return tip_tilt_plant(
         frame_rate_hz=FRAME_RATE_HZ,
         delay_frames=DELAY_FRAMES,
         turbulence=turbulence,
         noise_nm=NOISE_NM,
-        vibrations=[
-            Vibration(
-                frequency_hz=VIBRATION_HZ,
-                damping=damping,
-                rms_nm=vibration_nm,
-                direction=direction,
-            )
-            for direction in ((1.0, 0.0), (0.0, 1.0))
-        ],
+        vibrations=[replace(line, direction=along) for along in ((1.0, 0.0), (0.0, 1.0))],
     )
 
 
@@ -224,10 +210,9 @@ def parameter_rows() -> tuple[tuple[str, str, str], ...]:
 
 def paper_filters() -> tuple[FilterDesign, FilterDesign]:
     """Kalman and H-infinity filter at the true frequency, with the weights of Table III."""
-    return (
-        kalman(kalman_plant()),
-        hinf(hinf_plant(), gamma=HINF_GAMMA * NOISE_NM),
-    )
+    problems = filter_problems()
+    plant, bound = problems[HINF.name]
+    return kalman(problems[KALMAN.name][0]), hinf(plant, gamma=bound["gamma"])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

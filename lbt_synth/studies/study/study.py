@@ -145,12 +145,10 @@ class ParameterSection(Section):
 
     def extremes(self, samples: int) -> tuple[float, float]:
         """Return the ends, or values beyond which half a sample is expected."""
-        given = self.normal.ends if self.normal is not None else self.uniform or self.values
-        inside = self.quantile(np.array([0.5 / samples, 1 - 0.5 / samples])).tolist()
-        low, high = (
-            end if np.isfinite(end) else value
-            for end, value in zip((min(given), max(given)), inside, strict=True)
-        )
+        if self.normal is None:
+            return min(self.uniform or self.values), max(self.uniform or self.values)
+        inside, ends = self.quantile(np.array([0.5 / samples, 1 - 0.5 / samples])), self.normal.ends
+        low, high = np.where(np.isfinite(ends), ends, inside).tolist()
         return low, high
 
     def median(self) -> float:
