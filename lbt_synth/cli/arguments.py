@@ -505,9 +505,7 @@ def robustness(parser: ArgumentParser) -> None:
 def tradeoff(parser: ArgumentParser) -> None:
     """Design filters from the least norm to the least variance, and compare their sensor gains."""
     add_shared(parser, "--unit", "config")
-    text = (
-        "levels of the norm, from the least of any filter to that of the Kalman filter, at least 2"
-    )
+    text = "levels of the norm, at least 2, from the least of any filter to the Kalman filter's"
     add_option(parser, "--points", int, text, 9)
     text = "past innovations that the mixed filters (least variance at each norm) weigh, 1 to 64"
     add_option(parser, "--taps", int, text, 16)
