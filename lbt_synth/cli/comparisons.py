@@ -268,7 +268,7 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
     total = len(designs) * errors.size * gains.size * len(delays)
     with count_progress(total=total, what="points", quiet=arguments.json) as count:
         for name, design in designs.items():
-            found = studies.robustness_map(
+            grid = studies.robustness_map(
                 design,
                 config.truth,
                 config.imaging,
@@ -277,19 +277,19 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
                 delay_errors_frames=delays,
                 advance=count,
             )
-            maps[name] = replace(found, sensor_gains=frozen_copy(gains))  # the real ones again
+            maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
     report = Report(data={"maps": {}})
-    for name, found in maps.items():
-        intervals = _stable_gains(designs[name], found, assumed[name])
-        report.data["maps"][name] = asdict(found) | {"stable_sensor_gains": intervals}
-        low, high = np.min(found.errors_hz), np.max(found.errors_hz)
+    for name, grid in maps.items():
+        intervals = _stable_gains(designs[name], grid, assumed[name])
+        report.data["maps"][name] = asdict(grid) | {"stable_sensor_gains": intervals}
+        low, high = np.min(grid.errors_hz), np.max(grid.errors_hz)
         title = f"{name}: {config.imaging.label}, over frequency errors of {low:+g} to {high:+g} Hz"
-        report.tables.append(row_table(title, list(_map_lines(found))))
-        report.notes += _map_notes(name, designs[name], config, found, intervals)
+        report.tables.append(row_table(title, list(_map_lines(grid))))
+        report.notes += _map_notes(name, designs[name], config, grid, intervals)
     write_outputs(
         report,
         arguments.output,
-        [point for name, found in maps.items() for point in _map_points(name, found)],
+        [point for name, grid in maps.items() for point in _map_points(name, grid)],
         figure=lambda: robustness_map_figure(maps),
     )
     return report
@@ -324,49 +324,47 @@ def _assumed_gain(name: str, design: Design, config: Config) -> float:
     return gain
 
 
-def _stable_gains(
-    design: Design, found: RobustnessMap, assumed: float
-) -> list[tuple[float, float]]:
+def _stable_gains(design: Design, grid: RobustnessMap, assumed: float) -> list[tuple[float, float]]:
     """Return the interval of stable real sensor gains at each delay error, or nan for none."""
     hardware, intervals = require_hardware(design, "a map"), []
-    for delay, stable in zip(found.delay_errors_frames, found.stable, strict=True):
+    for delay, stable in zip(grid.delay_errors_frames, grid.stable, strict=True):
         real = replace(hardware, delay_frames=hardware.delay_frames + delay)
         # around the gain that the design assumes, if the loop is stable there
-        starts = [assumed, *found.sensor_gains[stable]]
+        starts = [assumed, *grid.sensor_gains[stable]]
         tried = (stable_sensor_gains(real, design.controller, nominal=s / assumed) for s in starts)
         low, high = next((ends for ends in tried if not np.isnan(ends[0])), (np.nan, np.nan))
         intervals.append((low * assumed, high * assumed))
     return intervals
 
 
-def _map_points(name: str, found: RobustnessMap) -> list[Facts]:
+def _map_points(name: str, grid: RobustnessMap) -> list[Facts]:
     """Return a row for each point of the map of a gain file."""
     return [
         facts(
             file=fact(name),
-            delay_error_frames=fact(float(found.delay_errors_frames[i])),
-            sensor_gain=fact(float(found.sensor_gains[j])),
-            error_hz=fact(float(found.errors_hz[k])),
+            delay_error_frames=fact(float(grid.delay_errors_frames[i])),
+            sensor_gain=fact(float(grid.sensor_gains[j])),
+            error_hz=fact(float(grid.errors_hz[k])),
             strehl=fact(float(strehl)),
-            residual_nm=fact(float(found.residual_nm[i, j, k])),
-            stable=fact(bool(found.stable[i, j])),
+            residual_nm=fact(float(grid.residual_nm[i, j, k])),
+            stable=fact(bool(grid.stable[i, j])),
         )
-        for (i, j, k), strehl in np.ndenumerate(found.strehl)
+        for (i, j, k), strehl in np.ndenumerate(grid.strehl)
     ]
 
 
-def _map_lines(found: RobustnessMap) -> Iterator[Facts]:
+def _map_lines(grid: RobustnessMap) -> Iterator[Facts]:
     """Yield a row for some sensor gains at each delay error, with its worst frequency error."""
-    gains, shown = found.sensor_gains, np.arange(found.sensor_gains.size)
+    gains, shown = grid.sensor_gains, np.arange(grid.sensor_gains.size)
     if gains.size > _SHOWN:  # some from end to end, and the one that is nearest to 1
         some = np.linspace(0, gains.size - 1, _SHOWN - 1).round().astype(int)
         shown = np.unique([*some, int(np.argmin(np.abs(gains - 1)))])
     percent = {"unit": "%", "scale": 100, "format": ".2f"}
-    for i, delay in enumerate(found.delay_errors_frames):
+    for i, delay in enumerate(grid.delay_errors_frames):
         for j in shown:
-            stable, strehls = bool(found.stable[i, j]), found.strehl[i, j]
+            stable, strehls = bool(grid.stable[i, j]), grid.strehl[i, j]
             worst = int(np.argmin(strehls)) if stable else 0
-            centre = strehls[found.errors_hz == 0]
+            centre = strehls[grid.errors_hz == 0]
             yield facts(
                 sensor_gain=fact(gains[j], "sensor gain", format=".3f"),
                 delay_error=fact(delay, "delay error", unit="frames", format="+g"),
@@ -374,7 +372,7 @@ def _map_lines(found: RobustnessMap) -> Iterator[Facts]:
                 centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **percent),
                 worst=fact(strehls[worst], "worst Strehl", **percent),
                 worst_hz=fact(
-                    found.errors_hz[worst] if stable else np.nan, "at", unit="Hz", format="+.2f"
+                    grid.errors_hz[worst] if stable else np.nan, "at", unit="Hz", format="+.2f"
                 ),
             )
 
@@ -383,17 +381,17 @@ def _map_notes(
     name: str,
     design: Design,
     config: Config,
-    found: RobustnessMap,
+    grid: RobustnessMap,
     intervals: list[tuple[float, float]],
 ) -> list[str]:
     notes = []
-    for delay, (low, high) in zip(found.delay_errors_frames, intervals, strict=True):
+    for delay, (low, high) in zip(grid.delay_errors_frames, intervals, strict=True):
         late = f" with a delay error of {delay:+g} frames" if delay != 0 else ""
         ends = "none found" if np.isnan(low) else f"{low:.4g} to {high:.4g}"
         notes.append(f"{name}: stable sensor gains{late}: {ends}")
-    if unstable := np.count_nonzero(~found.stable):
+    if unstable := np.count_nonzero(~grid.stable):
         notes.append(
-            f"warning: {name} is unstable at {unstable} of {found.stable.size} pairs of a sensor "
+            f"warning: {name} is unstable at {unstable} of {grid.stable.size} pairs of a sensor "
             "gain and a delay error of its map."
         )
     own = require_hardware(design, "a map")

@@ -106,8 +106,8 @@ def study_page(
     'Robustness study study.yaml'
     """
     samples = {
-        each.controller: read_controller_samples(columns, each.controller)
-        for each in statistics.controllers
+        controller.controller: read_controller_samples(columns, controller.controller)
+        for controller in statistics.controllers
     }
     values = {
         name: read_column(columns, name, statistics.samples) for name in statistics.parameters
@@ -156,20 +156,20 @@ def _summary_blocks(
     study: Study, statistics: StudyStatistics, samples: Mapping[str, Samples]
 ) -> list[Block]:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
-    unstable = [each for each in statistics.controllers if each.unstable]
-    failed = [each for each in statistics.controllers if each.failed]
+    unstable = [controller for controller in statistics.controllers if controller.unstable]
+    failed = [controller for controller in statistics.controllers if controller.failed]
     warnings = []
     if statistics.samples < study.samples:
         warnings.append(paragraph("incomplete", done=statistics.samples, samples=study.samples))
     if unstable:
         parts = ", ".join(
-            f"{each.controller} in {each.unstable} of {each.samples} "
-            f"({percent(each.unstable_share.value, 2)} %)"
-            for each in unstable
+            f"{controller.controller} in {controller.unstable} of {controller.samples} "
+            f"({percent(controller.unstable_share.value, 2)} %)"
+            for controller in unstable
         )
         warnings.append(f"Unstable loops: {parts}.")
     if failed:
-        parts = ", ".join(f"{each.controller} {each.failed}" for each in failed)
+        parts = ", ".join(f"{controller.controller} {controller.failed}" for controller in failed)
         warnings.append(f"Evaluations that failed, and are in none of the figures: {parts}.")
     blocks: list[Block] = [Notice(text=text, tone="bad") for text in warnings]
     if not unstable and not failed and statistics.samples:
@@ -191,7 +191,7 @@ def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, Loop
     """
     loops = {
         name: close_loop(design.hardware, design)
-        for name in (each.controller for each in statistics.controllers)
+        for name in (controller.controller for controller in statistics.controllers)
         if name in study.controllers
         and (design := fixed_design(study.controllers[name])) is not None
         and design.hardware is not None
@@ -202,7 +202,7 @@ def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, Loop
 
 def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
     """Say which controller leads by each measure; the reader decides which measure counts."""
-    with_data = [each for each in controllers if each.samples]
+    with_data = [controller for controller in controllers if controller.samples]
     if not with_data:
         return "No controller was evaluated on any sample."
 
@@ -212,9 +212,9 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
 
     return paragraph(
         "leaders",
-        mean=leader(lambda each: each.mean),
-        median=leader(lambda each: each.strehl[50].value),
-        low=leader(lambda each: each.strehl[5].value),
+        mean=leader(lambda controller: controller.mean),
+        median=leader(lambda controller: controller.strehl[50].value),
+        low=leader(lambda controller: controller.strehl[5].value),
     )
 
 
@@ -293,9 +293,9 @@ def _worst_blocks(
     """List the worst samples, and the commands that replay them."""
     words = ["lbt-synth", "study", os.fspath(study.source), "-o", folder, "--row"]
     tables = [
-        worst_table(each, columns, (each.ranked or statistics.parameters)[:_PARAMETERS], names)
-        for each in statistics.controllers
-        if each.worst
+        worst_table(one, columns, (one.ranked or statistics.parameters)[:_PARAMETERS], names)
+        for one in statistics.controllers
+        if one.worst
     ]
     if not tables:
         return []
@@ -325,7 +325,7 @@ def _origin_section(study: Study, statistics: StudyStatistics, computing_s: floa
 
 def _distribution_chart(samples: Mapping[str, Samples]) -> list[Chart]:
     """Cumulative distribution of the Strehl ratio, and its lower tail on a logarithmic scale."""
-    strehls = {name: each["strehl"][each["evaluated"]] for name, each in samples.items()}
+    strehls = {name: columns["strehl"][columns["evaluated"]] for name, columns in samples.items()}
     if not any(values.size for values in strehls.values()):
         return []
     top = 100 * max(float(np.max(values, initial=0.0)) for values in strehls.values())

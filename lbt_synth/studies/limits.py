@@ -176,7 +176,8 @@ def limits(
         if loop.is_stable and not loop.reads_others:
             margin_deg = phase_margin_deg(loop)
         limit_nm, band_nm = (  # of the loop's own sensor
-            np.nan if each is None or loop.reads_others else each.rms_nm for each in (limit, band)
+            np.nan if bound is None or loop.reads_others else bound.rms_nm
+            for bound in (limit, band)
         )
         row = {
             "design": name,
@@ -217,7 +218,7 @@ def _residual_curve(
         return np.full(shifts.size, residual_nm)
     still = replace(truth, turbulence=None, noise_nm=0.0)
     moved = [still.with_frequency_error(float(shift)) for shift in (0.0, *shifts)]
-    first, *others = (np.trace(residual_budget(loop, each).total_nm2) for each in moved)
+    first, *others = (np.trace(residual_budget(loop, shaken).total_nm2) for shaken in moved)
     return np.asarray(np.sqrt(residual_nm**2 - first + np.array(others)))
 
 

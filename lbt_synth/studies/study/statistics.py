@@ -83,7 +83,7 @@ class StudyStatistics:
     @property
     def ranked(self) -> tuple[str, ...]:
         """The parameters with an index for any controller, by falling greatest index."""
-        pairs = [(each.index(name)[0], name) for each in self.controllers for name in each.ranked]
+        pairs = [(one.index(name)[0], name) for one in self.controllers for name in one.ranked]
         return tuple(dict.fromkeys(name for _, name in sorted(pairs, key=lambda pair: -pair[0])))
 
 
@@ -433,7 +433,7 @@ def worst_table(
     names: Mapping[str, str] | None = None,
 ) -> Table:
     """List the samples on which a controller does worst, from the columns of the results."""
-    places, name = list(controller.worst), controller.controller
+    places, name, words = list(controller.worst), controller.controller, names or {}
 
     def at(column: str) -> list[float]:
         return [float(value) for value in np.asarray(columns[column], dtype=np.float64)[places]]
@@ -446,7 +446,7 @@ def worst_table(
     values = [[f"{value:.5g}" for value in at(parameter)] for parameter in parameters]
     return Table(
         caption=f"Worst samples of {name}",
-        headings=("row", "Strehl [%]", *((names or {}).get(each, each) for each in parameters)),
+        headings=("row", "Strehl [%]", *(words.get(name, name) for name in parameters)),
         rows=tuple(zip(rows, strehls, *values, strict=True)),
     )
 
@@ -465,7 +465,7 @@ def _table_by_controller(
     caption: str, heading: str, statistics: StudyStatistics, rows: Sequence[_Row]
 ) -> Table:
     """Return a table with a column per controller."""
-    headings = (heading, *(each.controller for each in statistics.controllers))
+    headings = (heading, *(controller.controller for controller in statistics.controllers))
     return Table(caption=caption, headings=headings, rows=tuple(rows))
 
 

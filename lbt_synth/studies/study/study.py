@@ -271,7 +271,7 @@ class Study:
         varying = sum(distribution.varies for distribution in distributions)
         levels = iter(unit_points(self.settings, varying, start, stop).T)
         none = np.zeros(stop - start)
-        columns = [each.quantile(next(levels) if each.varies else none) for each in distributions]
+        columns = [law.quantile(next(levels) if law.varies else none) for law in distributions]
         return np.stack(columns, axis=1)
 
     def simulation_seed(self, row: int) -> int:
