@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 4560,
+    "cli": 4556,
     "config": 2331,
     "design": 8382,
     "files": 1608,
@@ -26,7 +26,7 @@ LINES = {
     "models": 4550,
     "report": 4939,
     "storage": 1049,
-    "studies": 3117,
+    "studies": 3106,
     "errors, validation": 642,
 }
 COUNTS = {

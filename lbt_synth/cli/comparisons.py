@@ -21,7 +21,7 @@ from lbt_synth.cli.loop_inputs import (
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.output_files import require_outputs, write_outputs
 from lbt_synth.cli.parser import command_options
-from lbt_synth.cli.progress import count_progress, show_spinner, track_progress
+from lbt_synth.cli.progress import show_spinner, track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
@@ -265,8 +265,7 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
     designs = load_designs(arguments.gains)
     assumed = {name: _assumed_gain(name, d, config) for name, d in designs.items()}
     maps = {}
-    total = len(designs) * errors.size * gains.size * len(delays)
-    with count_progress(total=total, what="points", quiet=arguments.json) as count:
+    with show_spinner("mapping", quiet=arguments.json):
         for name, design in designs.items():
             grid = studies.robustness_map(
                 design,
@@ -275,7 +274,6 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
                 errors_hz=errors,
                 sensor_gains=gains / assumed[name],
                 delay_errors_frames=delays,
-                advance=count,
             )
             maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
     report = Report(data={"maps": {}})

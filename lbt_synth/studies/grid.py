@@ -59,19 +59,6 @@ def residual_columns(budget: ResidualBudget, imaging: Imaging) -> dict[str, Any]
     return {"stable": budget.stable * 1.0, "strehl": strehl(budget, imaging)} | columns
 
 
-class InlineExecutor(futures.Executor):
-    """Executor that runs each call at once in this process."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> futures.Future[Any]:
-        """Run a call; its error is that of the future."""
-        future: futures.Future[Any] = futures.Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
 class Part(NamedTuple):
     """The results of some rows (b, columns), what failed, and the time that they took [s]."""
 
@@ -176,36 +163,42 @@ class Sweep:
                 for first in range(start, stop, size)
             )
             tasks = ((rows, function, arguments(rows)) for rows in waiting)
-            self._compute(tasks, executor or InlineExecutor(), in_flight, count)
+            for rows, result, seconds in _compute(tasks, executor, in_flight):
+                with _explain_failure(rows):
+                    self.write(rows, result, seconds)
+                count(rows[1] - rows[0])
             parts = [self.read(path) for path in self.paths().values()]
         failures = [failure for part in parts for failure in part.failures]
         results = np.concatenate([part.results for part in parts])
         return Part(results, failures, sum(part.seconds for part in parts)), computed
 
-    def _compute(
-        self,
-        tasks: Iterator[tuple[Rows, Callable[..., Result], tuple[Any, ...]]],
-        executor: futures.Executor,
-        in_flight: int,
-        count: Callable[[int], None],
-    ) -> None:
-        """Write parts as they come; if one fails as a whole, the others are given up."""
-        running: dict[futures.Future[tuple[Result, float]], Rows] = {}
-        try:
-            while True:
-                for rows, function, arguments in islice(tasks, in_flight - len(running)):
-                    with _explain_failure(rows):
-                        running[executor.submit(timed, function, *arguments)] = rows
-                if not running:
-                    return
-                for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
-                    rows = running.pop(future)
-                    with _explain_failure(rows):
-                        self.write(rows, *future.result())
-                    count(rows[1] - rows[0])
-        finally:
-            for future in running:
-                future.cancel()
+
+def _compute(
+    tasks: Iterator[tuple[Rows, Callable[..., Result], tuple[Any, ...]]],
+    executor: futures.Executor | None,
+    in_flight: int,
+) -> Iterator[tuple[Rows, Result, float]]:
+    """Yield results as they come; if one task fails as a whole, the others are given up."""
+    for rows, function, arguments in tasks if executor is None else ():
+        with _explain_failure(rows):
+            result, seconds = timed(function, *arguments)
+        yield rows, result, seconds
+    running: dict[futures.Future[tuple[Result, float]], Rows] = {}
+    try:
+        while executor is not None:
+            for rows, function, arguments in islice(tasks, in_flight - len(running)):
+                with _explain_failure(rows):
+                    running[executor.submit(timed, function, *arguments)] = rows
+            if not running:
+                return
+            for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
+                rows = running.pop(future)
+                with _explain_failure(rows):
+                    result, seconds = future.result()
+                yield rows, result, seconds
+    finally:
+        for future in running:
+            future.cancel()
 
 
 def refuse(path: Path, why: str, cause: Exception | None = None) -> NoReturn:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -193,7 +193,6 @@ def robustness_map(
     sensor_gains: ArrayLike,
     delay_errors_frames: ArrayLike = (0.0,),
     hardware: LoopHardware | None = None,
-    advance: Callable[[int], object] | None = None,
 ) -> RobustnessMap:
     """Evaluate one design exactly over frequency errors, sensor gains and delay errors.
 
@@ -214,8 +213,6 @@ def robustness_map(
         Real delay less that of the design [frames].
     hardware : LoopHardware, optional
         Loop to close; that of the design by default.
-    advance : callable, optional
-        Called with the number of points computed since its last call.
 
     Returns
     -------
@@ -288,8 +285,6 @@ def robustness_map(
             columns = residual_columns(loops, imaging)
             for name, numbers in maps.items():
                 numbers[d, some] = columns[name].reshape(count, errors.size)
-            if advance is not None:
-                advance(count * errors.size)
     return RobustnessMap(
         errors_hz=errors,
         sensor_gains=gains,

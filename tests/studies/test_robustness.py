@@ -279,20 +279,6 @@ def test_the_lines_of_the_model_move_as_the_true_ones_near_them(settings):
     assert row.residual_nm == pytest.approx(budget.rms_nm, rel=1e-9)
 
 
-def test_counts_points_as_they_are_done(kalman, settings):
-    counts = []
-    robustness_map(
-        kalman,
-        settings.truth,
-        settings.imaging,
-        errors_hz=[0, 1],
-        sensor_gains=np.linspace(0.5, 1, 70),
-        delay_errors_frames=[0, 0.1],
-        advance=counts.append,
-    )
-    assert sum(counts) == 2 * 70 * 2
-
-
 WRONG = [
     ({"errors_hz": []}, "at least one number"),
     ({"errors_hz": [[0.0]]}, "at least one number"),
