@@ -18,8 +18,7 @@ from lbt_synth.cli.loop_inputs import (
     say_limit,
     truth_at_sensor_gain,
 )
-from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.cli.output import Report, require_outputs, write_outputs
 from lbt_synth.cli.parser import command_options
 from lbt_synth.cli.progress import show_spinner, track_progress
 from lbt_synth.config import Config

@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lbt_synth.cli.loop_inputs import choose_design_unit, load_designs
-from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.cli.output import Report, require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.design import Design
 from lbt_synth.errors import UnstableLoopError

@@ -11,8 +11,7 @@ import numpy as np
 
 from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import load_shown, loop_difference_notes, truth_at_sensor_gain
-from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import require_figure, write_telemetry
+from lbt_synth.cli.output import Report, require_figure, write_telemetry
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config
 from lbt_synth.design import Design
