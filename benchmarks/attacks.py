@@ -97,20 +97,10 @@ def attack(seed: int) -> None:
         size = max(1.0, float(np.abs(mine).max()))
         check("loop = frames of its definition", np.allclose(own, mine, atol=1e-7 * size), seed)
 
-    def at(gains: np.ndarray, errors: np.ndarray | None = None) -> float:
-        """Return the residual at sensor gains and errors of frequency; inf if unstable."""
+    def is_stable(gains: np.ndarray) -> bool:
+        """Return whether the loop is stable at sensor gains, one a measurement."""
         there = replace(path, sensor_matrix=gains[:, None] * path.sensor)
-        turned = lbt.close_loop(there, design)
-        if not turned.is_stable:
-            return float("inf")
-        moved = errors if errors is not None else np.zeros(len(truth.vibrations))
-        lines = tuple(
-            replace(line, frequency_hz=line.frequency_hz + error)
-            for line, error in zip(truth.vibrations, moved, strict=True)
-        )
-        return lbt.residual_budget(
-            turned, replace(truth, vibrations=lines), frame_means=True
-        ).rms_nm
+        return lbt.close_loop(there, design).is_stable
 
     least = lbt.residual_budget(loop, truth, frame_means=True).rms_nm
     for gain in rng.uniform(0.02, 0.5, 3):
@@ -122,24 +112,12 @@ def attack(seed: int) -> None:
     for _ in range(5):
         part = rng.uniform(-0.499, 0.499, q) * margins.disk
         if np.all(np.abs(part) < 1):
-            held = at((1 + part) / (1 - part)) < np.inf
+            held = is_stable((1 + part) / (1 - part))
             check("stable within the disk margin of each axis", held, seed)
     for factor, stable in ((0.999, True), (1.01, False)):
         if margins.gain_high < 1e3:
-            found = at(np.full(q, factor * margins.gain_high)) < np.inf
+            found = is_stable(np.full(q, factor * margins.gain_high))
             check("gain margin", found == stable, seed)
-    low, high = max(0.6, margins.gain_low + 0.05), min(1.4, (1 + margins.gain_high) / 2)
-    error = 0.05 * min(line.frequency_hz for line in truth.vibrations)
-    bound = lbt.studies.guaranteed_residual(
-        path, design, truth, error_hz=error, sensor_gains=(min(low, 1.0), high)
-    )
-    shares = [truth.frequency_shift_hz(line.frequency_hz, error) for line in truth.vibrations]
-    for _ in range(6):
-        gains = rng.uniform(min(low, 1.0), high, q)
-        if rng.random() < 0.5:
-            gains = rng.choice([min(low, 1.0), high], q)
-        errors = rng.choice([-1, 1, 0.3], len(shares)) * shares
-        check("guaranteed residual", at(gains, errors) <= bound.upper_nm * (1 + 1e-9), seed)
 
 
 def attack_channels(seed: int) -> None:

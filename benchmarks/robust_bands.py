@@ -16,6 +16,7 @@ import numpy as np
 from ruamel.yaml import YAML
 
 import lbt_synth as lbt
+from lbt_synth.studies.limits import compare_in_truth
 
 SHIFTS = np.linspace(-1, 1, 17)  # of a line within its band, in units of the half width
 
@@ -102,7 +103,7 @@ def main() -> None:
                 YAML(typ="safe", pure=True).dump(content, stream)
             config = lbt.load_config(path)
             robust = config.design("robust")
-            found = lbt.studies.compare_in_truth({"robust": robust}, config)
+            found = compare_in_truth({"robust": robust}, config)
             designs = {"robust": robust} | {
                 name: config.design(name) for name in ("integrator", "kalman", "hinf")
             }

@@ -15,8 +15,8 @@ from scipy.optimize import minimize
 
 import lbt_synth as lbt
 from lbt_synth.report.draw import house_style
-from lbt_synth.studies.paper import parameters as paper
-from lbt_synth.studies.paper.parameters import paper_filters
+from lbt_synth.studies import paper as paper
+from lbt_synth.studies.paper import paper_filters
 
 ERRORS = np.arange(-7, 8) / 2
 GAINS = [1.0, 0.7, 0.5, 0.358]

@@ -10,6 +10,7 @@ import numpy as np
 from harness import Row, paired, with_growth
 
 import lbt_synth as lbt
+from lbt_synth.studies.study.sample import evaluate_samples
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 FEW = 16  # loops that the peer does; its time is scaled up
@@ -80,8 +81,8 @@ def told_designs() -> dict[int, Row]:
     for count in (64, 512, 4096):
         values = study.values(0, count)
         row = paired(
-            lambda v=values: lbt.studies.evaluate_samples(study, v, 0),
-            lambda v=values: lbt.studies.evaluate_samples(study, v[:FEW], 0, together=False),
+            lambda v=values: evaluate_samples(study, v, 0),
+            lambda v=values: evaluate_samples(study, v[:FEW], 0, together=False),
             3,
         )
         rows[count] = _scaled(row, count)

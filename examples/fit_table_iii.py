@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 import lbt_synth as lbt
 from lbt_synth.linear.riccati.filtering import gamma_riccati
-from lbt_synth.studies.paper.parameters import (
+from lbt_synth.studies.paper import (
     KALMAN_DAMPING,
     PAPER_TRUTH,
     TABLE_III,

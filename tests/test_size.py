@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 4630,
+    "cli": 4556,
     "config": 2331,
     "design": 8382,
     "files": 1608,
@@ -24,9 +24,9 @@ LINES = {
     "loop": 5350,
     "methods": 1109,
     "models": 4550,
-    "report": 4993,
+    "report": 4939,
     "storage": 1049,
-    "studies": 3924,
+    "studies": 3106,
     "errors, validation": 642,
 }
 COUNTS = {

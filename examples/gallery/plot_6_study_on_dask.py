@@ -38,7 +38,7 @@ parameters:
 # Any executor runs a study. The client of a cluster is one; here the cluster is two threads of
 # this process. What is finished is on disk: a study that is killed goes on where it was.
 
-study = lbt.studies.load_study(folder / "study.yaml", directory=folder)
+study = lbt.studies.load_study(folder / "study.yaml")
 with Client(processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None) as client:
     run = lbt.studies.run_study(study, folder, executor=client.get_executor())
 print(f"{run.computed} samples computed")

@@ -1,34 +1,45 @@
-"""The commands limits, tradeoff and mirror: designs compared in the loop of a configuration."""
+"""The commands limits, tradeoff, mirror and robustness: designs in the loop of a configuration."""
 
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, replace
+
+import numpy as np
 
 from lbt_synth import studies
+from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import (
     load_designs,
     load_shown,
     named_difference_notes,
     own_sensor_notes,
     say_limit,
+    truth_at_sensor_gain,
 )
-from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.cli.output import Report, require_outputs, write_outputs
+from lbt_synth.cli.parser import command_options
 from lbt_synth.cli.progress import show_spinner, track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.errors import ConfigError
-from lbt_synth.loop import least_residual
+from lbt_synth.design.result import require_hardware
+from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.loop import least_residual, stable_sensor_gains
 from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models import PositionLoop
+from lbt_synth.report.designs.report import refine_values, require_compatible
+from lbt_synth.report.figures import robustness_figure, robustness_map_figure
 from lbt_synth.report.figures.studies import limits_figure, mirror_figure, tradeoff_figure
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import fact, facts
-from lbt_synth.studies import tradeoff
+from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.studies.limits import LimitStudy
-from lbt_synth.studies.robustness import FAMILIES
-from lbt_synth.validation import integer
+from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, default_methods, mirror_rows
+from lbt_synth.validation import FloatArray, agree, frozen_copy, integer, number
+
+_MOST_VALUES = 2001  # of frequency errors or sensor gains
+_SHOWN = 8  # sensor gains of a map, and taps of a mirror, that are printed of more
 
 
 def run_limits(arguments: Namespace) -> Report:
@@ -117,7 +128,7 @@ def run_tradeoff(arguments: Namespace) -> Report:
     config = load_shown(arguments)
     points = list(
         track_progress(
-            tradeoff(config.plant.own_sensor_alone(), points=count, taps=taps),
+            studies.tradeoff(config.plant.own_sensor_alone(), points=count, taps=taps),
             total=count * len(FAMILIES),
             what="filters",
             quiet=arguments.json,
@@ -125,18 +136,18 @@ def run_tradeoff(arguments: Namespace) -> Report:
     )
     least = points[0].design
     report = Report()
-    report.add_rows("points", "Trade-off of variance, norm and sensor gain", points)
+    caption, hidden = "Trade-off of variance, norm and sensor gain", ("design",)
+    report.add_rows("points", caption, points, without=hidden)
     report.data |= {"gamma_least": least.gamma_least, "gamma_infeasible": least.gamma_infeasible}
     report.notes.append(
         f"the least norm of any filter lies between {nm_text(least.gamma_infeasible, '.9g')} and "
         f"{nm_text(least.gamma_least, '.9g')}"
     )
     report.notes += own_sensor_notes(config)
-    write_outputs(report, arguments.output, points, figure=lambda: tradeoff_figure(points))
+    write_outputs(
+        report, arguments.output, points, figure=lambda: tradeoff_figure(points), without=hidden
+    )
     return report
-
-
-_SHOWN_TAPS = 8
 
 
 def run_mirror(arguments: Namespace) -> Report:
@@ -147,14 +158,14 @@ def run_mirror(arguments: Namespace) -> Report:
     hardware = plant.hardware
     step = shell.step_response(arguments.tolerance)
     with show_spinner("designing", quiet=arguments.json):
-        rows = studies.mirror(
+        rows = mirror_rows(
             plant,
             config.truth,
             config.imaging,
             command_weight=config.settings.design.command_weight,
         )
     taps = hardware.mirror_taps
-    shown = [f"{tap:.4f}" for tap in taps[:_SHOWN_TAPS]] + ["..."] * (taps.size > _SHOWN_TAPS)
+    shown = [f"{tap:.4f}" for tap in taps[:_SHOWN]] + ["..."] * (taps.size > _SHOWN)
     report = Report(data={"taps": taps})
     limit_nm = limit_or_nan(lambda: least_residual(hardware, config.truth))
     least = "least residual of any linear controller in the truth"
@@ -192,3 +203,203 @@ def _require_local_loop(config: Config) -> PositionLoop:
             path=key,
         )
     return shell
+
+
+def run_robustness(arguments: Namespace) -> Report:
+    """Compute the Strehl ratio over an error of the vibration frequency."""
+    require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
+    _refuse_unused_options(arguments)
+    config = load_shown(arguments)
+    return (_map_designs if arguments.gains else _redesign)(config, arguments)
+
+
+def _refuse_unused_options(arguments: Namespace) -> None:
+    """Refuse the options of redesigning beside gain files, and those of maps without them."""
+    names = {name: words for name, (words, _) in command_options(arguments.command).items()}
+    maps = ("errors_hz", "sensor_gains", "delay_errors_frames")
+    unused = ("sensor_gain", "gamma_ratio") if arguments.gains else maps
+    for name in given_options(arguments, *unused):
+        why = "goes with gain files, whose designs stay as they are; name some"
+        if arguments.gains:
+            why = "is for redesigning, without gain files; the options of these are "
+            why += ", ".join(names[each] for each in maps)
+        raise ProblemError(f"{names[name]} {why}.")
+
+
+def _redesign(config: Config, arguments: Namespace) -> Report:
+    settings = config.settings
+    ratio = arguments.gamma_ratio
+    errors = config.errors_hz
+    rows = list(
+        track_progress(
+            studies.robustness(
+                config.plant.own_sensor_alone(),
+                truth_at_sensor_gain(config, arguments.sensor_gain),
+                config.imaging,
+                errors_hz=errors,
+                gamma_ratio=settings.design.gamma_ratio if ratio is None else ratio,
+                hold=settings.robustness.hold,
+            ),
+            total=len(errors) * len(default_methods()),
+            what="designs",
+            quiet=arguments.json,
+        )
+    )
+    report = Report()
+    caption = f"Robustness to the vibration frequency; {config.imaging.label}"
+    report.add_rows("rows", caption, rows)
+    report.notes += own_sensor_notes(config)
+    write_outputs(report, arguments.output, rows, figure=lambda: robustness_figure(rows))
+    return report
+
+
+def _map_designs(config: Config, arguments: Namespace) -> Report:
+    """Map the Strehl ratio of gain files over frequency error, sensor gain and delay error."""
+    settings = config.settings.robustness
+    errors = _parse_range(arguments.errors_hz, "--errors-hz", refine_values(config.errors_hz))
+    gains = _parse_range(arguments.sensor_gains, "--sensor-gains", settings.sensor_gains)
+    delays = arguments.delay_errors_frames or settings.delay_errors_frames
+    for gain in gains:
+        number(gain, "--sensor-gains", above=0)
+    designs = load_designs(arguments.gains)
+    assumed = {name: _assumed_gain(name, d, config) for name, d in designs.items()}
+    maps = {}
+    with show_spinner("mapping", quiet=arguments.json):
+        for name, design in designs.items():
+            grid = studies.robustness_map(
+                design,
+                config.truth,
+                config.imaging,
+                errors_hz=errors,
+                sensor_gains=gains / assumed[name],
+                delay_errors_frames=delays,
+            )
+            maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
+    report = Report(data={"maps": {}})
+    for name, grid in maps.items():
+        intervals = _stable_gains(designs[name], grid, assumed[name])
+        report.data["maps"][name] = asdict(grid) | {"stable_sensor_gains": intervals}
+        low, high = np.min(grid.errors_hz), np.max(grid.errors_hz)
+        title = f"{name}: {config.imaging.label}, over frequency errors of {low:+g} to {high:+g} Hz"
+        report.tables.append(row_table(title, list(_map_lines(grid))))
+        report.notes += _map_notes(name, designs[name], config, grid, intervals)
+    write_outputs(
+        report,
+        arguments.output,
+        [point for name, grid in maps.items() for point in _map_points(name, grid)],
+        figure=lambda: robustness_map_figure(maps),
+    )
+    return report
+
+
+def _parse_range(
+    given: Sequence[float] | None, option: str, default: Sequence[float] | FloatArray
+) -> FloatArray:
+    """Return the values of LOW HIGH COUNT, or those of the configuration where none are given."""
+    if given is None:
+        return np.array(default)
+    low, high, count = (number(value, option) for value in given)
+    if not (low < high and count.is_integer() and 2 <= count <= _MOST_VALUES):
+        raise ProblemError(
+            f"{option} must be LOW HIGH COUNT with LOW below HIGH and a COUNT of 2 to "
+            f"{_MOST_VALUES}; got {low:g} {high:g} {count:g}."
+        )
+    return np.linspace(low, high, int(count))
+
+
+def _assumed_gain(name: str, design: Design, config: Config) -> float:
+    """Return the sensor gain that a design assumes, relative to ``sensor.matrix``."""
+    require_compatible(name, design, config.hardware)
+    own, here = require_hardware(design, "a map"), config.hardware
+    unit = here.sensor / config.sensor_gain
+    gain = float(np.sum(own.sensor * unit) / np.sum(unit**2))
+    if not (gain > 0 and agree(own.sensor, gain * unit) and agree(own.influence, here.influence)):
+        raise ProblemError(
+            f"{name} must have the configuration's sensor and influence matrices, up to a sensor "
+            "gain; it has others. Design it for this configuration."
+        )
+    return gain
+
+
+def _stable_gains(design: Design, grid: RobustnessMap, assumed: float) -> list[tuple[float, float]]:
+    """Return the interval of stable real sensor gains at each delay error, or nan for none."""
+    hardware, intervals = require_hardware(design, "a map"), []
+    for delay, stable in zip(grid.delay_errors_frames, grid.stable, strict=True):
+        real = replace(hardware, delay_frames=hardware.delay_frames + delay)
+        # around the gain that the design assumes, if the loop is stable there
+        starts = [assumed, *grid.sensor_gains[stable]]
+        tried = (stable_sensor_gains(real, design.controller, nominal=s / assumed) for s in starts)
+        low, high = next((ends for ends in tried if not np.isnan(ends[0])), (np.nan, np.nan))
+        intervals.append((low * assumed, high * assumed))
+    return intervals
+
+
+def _map_points(name: str, grid: RobustnessMap) -> list[Facts]:
+    """Return a row for each point of the map of a gain file."""
+    return [
+        facts(
+            file=fact(name),
+            delay_error_frames=fact(float(grid.delay_errors_frames[i])),
+            sensor_gain=fact(float(grid.sensor_gains[j])),
+            error_hz=fact(float(grid.errors_hz[k])),
+            strehl=fact(float(strehl)),
+            residual_nm=fact(float(grid.residual_nm[i, j, k])),
+            stable=fact(bool(grid.stable[i, j])),
+        )
+        for (i, j, k), strehl in np.ndenumerate(grid.strehl)
+    ]
+
+
+def _map_lines(grid: RobustnessMap) -> Iterator[Facts]:
+    """Yield a row for some sensor gains at each delay error, with its worst frequency error."""
+    gains, shown = grid.sensor_gains, np.arange(grid.sensor_gains.size)
+    if gains.size > _SHOWN:  # some from end to end, and the one that is nearest to 1
+        some = np.linspace(0, gains.size - 1, _SHOWN - 1).round().astype(int)
+        shown = np.unique([*some, int(np.argmin(np.abs(gains - 1)))])
+    percent = {"unit": "%", "scale": 100, "format": ".2f"}
+    for i, delay in enumerate(grid.delay_errors_frames):
+        for j in shown:
+            stable, strehls = bool(grid.stable[i, j]), grid.strehl[i, j]
+            worst = int(np.argmin(strehls)) if stable else 0
+            centre = strehls[grid.errors_hz == 0]
+            yield facts(
+                sensor_gain=fact(gains[j], "sensor gain", format=".3f"),
+                delay_error=fact(delay, "delay error", unit="frames", format="+g"),
+                stable=fact(stable, "stable"),
+                centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **percent),
+                worst=fact(strehls[worst], "worst Strehl", **percent),
+                worst_hz=fact(
+                    grid.errors_hz[worst] if stable else np.nan, "at", unit="Hz", format="+.2f"
+                ),
+            )
+
+
+def _map_notes(
+    name: str,
+    design: Design,
+    config: Config,
+    grid: RobustnessMap,
+    intervals: list[tuple[float, float]],
+) -> list[str]:
+    notes = []
+    for delay, (low, high) in zip(grid.delay_errors_frames, intervals, strict=True):
+        late = f" with a delay error of {delay:+g} frames" if delay != 0 else ""
+        ends = "none found" if np.isnan(low) else f"{low:.4g} to {high:.4g}"
+        notes.append(f"{name}: stable sensor gains{late}: {ends}")
+    if unstable := np.count_nonzero(~grid.stable):
+        notes.append(
+            f"warning: {name} is unstable at {unstable} of {grid.stable.size} pairs of a sensor "
+            "gain and a delay error of its map."
+        )
+    own = require_hardware(design, "a map")
+    if own.delay_frames != config.hardware.delay_frames:
+        notes.append(
+            f"note: {name} was designed for a delay of {own.delay_frames:g} frames, from which "
+            f"its delay errors count; the configuration has {config.hardware.delay_frames:g}."
+        )
+    if own.mirror != config.hardware.mirror:
+        notes.append(
+            f"note: {name} was designed for another mirror than the configuration's, and its map "
+            "is that of its own."
+        )
+    return notes

@@ -1,21 +1,23 @@
-"""The command design: a controller from a configuration, as a gain file, and what it prints."""
+"""The commands design, show and verify: gain files, what they hold, and their certificates."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.argument_kinds import given_options
-from lbt_synth.cli.loop_inputs import add_truth, load_shown
+from lbt_synth.cli.arguments import given_options
+from lbt_synth.cli.loop_inputs import add_truth, choose_design_unit, load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
+from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.design.result import without_units
 from lbt_synth.files import save_gain
-from lbt_synth.files.gain_file.store import require_gain_name
+from lbt_synth.files.gain_file.store import load_with_digest, read_design, require_gain_name
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.registry import design_title, option_names
 from lbt_synth.methods.request import Wording, design_request
@@ -130,3 +132,52 @@ def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) ->
             "commands grow. Reset it whenever the loop opens."
         )
     return notes
+
+
+def run_show(arguments: Namespace) -> Report:
+    """Describe the design in a gain file, what a frame costs, and its matrices if asked for."""
+    design, digest = load_with_digest(arguments.gain)
+    choose_design_unit(arguments, design)
+    report = describe_design(design, matrices=arguments.matrices)
+    add_moving_gain(report, design)
+    report.data |= {"file": arguments.gain, "digest": digest}
+    unproved = ["route and status of the solver"]
+    unproved += ["assumptions"] * bool(design.assumptions)
+    unproved += ["configuration, and so the truth"] * bool(design.configuration)
+    report.data["not_proved"] = unproved
+    report.notes += [
+        f"proved: the certificate, computed again from this file of digest {digest}.",
+        f"not proved, the file's word: {'; '.join(unproved)}.",
+    ]
+    if not design.other_sensors:
+        from lbt_synth.interop import frame_cost  # which a design does not need
+
+        cost = frame_cost(design)
+        report.data["frame_cost"] = json_record(cost)
+        report.tables.append(fact_table("Cost per frame, as exported to C", cost))
+    if design.configuration:
+        with show_spinner("comparing in the truth", quiet=arguments.json):
+            add_truth(report, design, config_from_text(design.configuration, Path(arguments.gain)))
+    return report
+
+
+def run_verify(arguments: Namespace) -> Report:
+    """Recompute the certificate of a gain file."""
+    design, digest = read_design(arguments.gain)
+    certificate = design.certificate
+    report = Report(
+        data={
+            "file": arguments.gain,
+            "digest": digest,
+            "method": design.method,
+            "passed": certificate.passed,
+        },
+        notes=[
+            f"{arguments.gain}: {'verified' if certificate.passed else 'NOT VERIFIED'}",
+            f"digest {digest}",
+        ],
+        passed=certificate.passed,
+    )
+    report.add_rows("checks", "Certificate", certificate.checks)
+    add_moving_gain(report, design)
+    return report

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from lbt_synth.cli import loop_records
-from lbt_synth.cli.argument_kinds import given_options
+from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress

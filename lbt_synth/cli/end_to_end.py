@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lbt_synth.cli.argument_kinds import given_options, option_name
+from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.engine import choose_engine, keep_finished
 from lbt_synth.cli.loop_inputs import choose_wavefront_unit, load_design, load_designs
 from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.config import load_config
 from lbt_synth.design import Design
-from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
+from lbt_synth.errors import GainFileError, UnstableLoopError
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
 from lbt_synth.interop.specula.calibration import Calibration
@@ -37,12 +36,11 @@ from lbt_synth.storage.rows import (
     row_table,
 )
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies import EndToEndEntry
-from lbt_synth.studies.paper.end_to_end import (
+from lbt_synth.studies.paper import (
     all_cases,
-    plan_tables,
+    end_to_end_tables,
+    plan_cases,
     rms_modal_difference,
-    run_tables,
 )
 from lbt_synth.validation import integer
 
@@ -187,16 +185,13 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     designs = load_designs(arguments.gains)
     for count in ("seeds", "row_seeds", "jobs"):
         integer(getattr(arguments, count), option_name(count), at_least=1)
-    cases = _named_cases(designs)
     specula_version()
-    rows = plan_tables(
-        setup,
-        cases,
-        seeds=range(setup.seed, setup.seed + arguments.seeds),
-        row_seeds=range(setup.seed, setup.seed + arguments.row_seeds),
-        tables=arguments.tables,
-    )
-    total = len(all_cases(rows))
+    plan: dict[str, Any] = {
+        "seeds": range(setup.seed, setup.seed + arguments.seeds),
+        "row_seeds": range(setup.seed, setup.seed + arguments.row_seeds),
+        "tables": arguments.tables,
+    }
+    total = len(all_cases(plan_cases(setup, designs, **plan)))
     make_directory(folder)
     case_folder = make_directory(folder / "cases")
     calibrate_setup(setup, arguments)
@@ -205,12 +200,13 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
         count_progress(total=total, what="runs", quiet=arguments.json) as advance,
         keep_finished(case_folder),
     ):
-        table = run_tables(
+        table = end_to_end_tables(
             setup,
-            rows,
             case_folder,
+            designs,
+            **plan,
             executor=executor,
-            workers=workers or 1,
+            workers=workers,
             cache=arguments.cache,
             progress=advance,
         )
@@ -224,7 +220,7 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     report = Report(
         data={
             "entries": [json_record(entry) for entry in table],
-            "units": json_units(EndToEndEntry),
+            "units": json_units(table[0]),
             "modal_distance_points": differences,
             "runs": total,
         },
@@ -239,17 +235,3 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     )
     report.note_files(files)
     return report
-
-
-def _named_cases(designs: Mapping[str, Design]) -> dict[str, Design]:
-    """Return designs by names that files can have."""
-    cases = {
-        "".join(letter if letter.isalnum() else "_" for letter in name): design
-        for name, design in designs.items()
-    }
-    if len(cases) < len(designs):
-        raise ProblemError(
-            "names of gain files must differ in letters or digits, because runs are kept under "
-            f"them; got {', '.join(designs)}."
-        )
-    return cases

@@ -17,7 +17,6 @@ from lbt_synth.storage.thread_limits import limit_threads
 from lbt_synth.storage.worker_processes import WorkerPool
 from lbt_synth.validation import integer
 
-_MOST_JOBS = 64  # or eight per processor
 _TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
 
 
@@ -36,8 +35,7 @@ def choose_engine(
 @contextmanager
 def _start_processes(jobs: int) -> Iterator[tuple[Executor, int]]:
     """Provide processes with one thread each, which end at once if the block fails."""
-    most = max(_MOST_JOBS, 8 * (os.cpu_count() or 1))
-    integer(jobs, "--jobs", at_least=1, at_most=most)
+    integer(jobs, "--jobs", at_least=1, at_most=8 * (os.cpu_count() or 1))
     with limit_threads(), WorkerPool(jobs) as pool:
         yield pool, jobs
 

@@ -21,7 +21,7 @@ from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit, limit_o
 from lbt_synth.models import Truth, nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.display_unit import LENGTHS, UNITS, nm_text, show_in
-from lbt_synth.studies import compare_in_truth
+from lbt_synth.studies.limits import compare_in_truth
 
 _MAS_PER_URAD = np.degrees(1e-6) * 3.6e6
 _WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns

@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lbt_synth.cli.argument_kinds import given_options, option_name
+from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config
 from lbt_synth.config.write import config_text

@@ -11,8 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from lbt_synth import models
 from lbt_synth.cli.loop_inputs import choose_wavefront_unit
-from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.cli.output import Report, require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_residuals

@@ -1,4 +1,4 @@
-"""What a command prints: aligned tables for people, one JSON object for programs."""
+"""What a command prints and writes: tables for people, JSON for programs, figures, telemetry."""
 
 from __future__ import annotations
 
@@ -7,15 +7,29 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lbt_synth.cli.streams import printable
-from lbt_synth.storage.rows import cell_text, fact_table, json_record, json_units, row_table
+from lbt_synth.errors import ProblemError
+from lbt_synth.report.draw import FIGURE_ENDINGS, require_figure_name, save_figure
+from lbt_synth.storage.atomic_files import require_writable, write_atomically
+from lbt_synth.storage.rows import (
+    cell_text,
+    csv_rows,
+    fact_table,
+    json_record,
+    json_units,
+    row_table,
+)
 from lbt_synth.storage.tables import Table, text_lines
+
+if TYPE_CHECKING:  # which few commands need
+    from lbt_synth.files import Telemetry
 
 _WIDTH = 200  # where the output is no terminal
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
@@ -110,3 +124,62 @@ def json_value(value: Any) -> Any:
     if isinstance(value, np.integer | np.bool_):
         return value.item()
     return value
+
+
+def require_figure(output: str, *, inputs: Sequence[str]) -> None:
+    """Refuse an output that cannot become a figure, or would replace an input."""
+    require_writable(require_figure_name(output), inputs=inputs)
+
+
+def require_outputs(outputs: Sequence[str], *, inputs: Sequence[str]) -> None:
+    """Refuse outputs that cannot become a table or a figure, or would replace an input."""
+    for output in outputs:
+        if Path(output).suffix.lower() not in (".csv", *FIGURE_ENDINGS):
+            raise ProblemError(
+                f"an output must end in .csv, {', '.join(FIGURE_ENDINGS)}; got {output!r}."
+            )
+    require_writable(*outputs, inputs=inputs)
+
+
+def write_outputs(
+    report: Report,
+    outputs: Sequence[str],
+    rows: Sequence[Any],
+    *,
+    figure: Callable[[], Any],
+    without: Collection[str] = (),
+) -> None:
+    """Write the rows to outputs in .csv and the figure to all others, and note them in the report.
+
+    ``without`` names the fields of the rows that a .csv leaves out.
+    """
+    report.note_files(
+        write_atomically(output, csv_rows(rows, without=without))
+        if Path(output).suffix.lower() == ".csv"
+        else save_figure(figure(), output)
+        for output in outputs
+    )
+
+
+def write_telemetry(
+    report: Report,
+    output: str,
+    telemetry: Telemetry,
+    *,
+    key: str,
+    what: str = "telemetry",
+    kind: str | None = None,
+    precision: str = "float64",
+) -> None:
+    """Write telemetry, and note in the report the file and what its format leaves out."""
+    from lbt_synth.files import save_telemetry  # which few commands need
+    from lbt_synth.files.telemetry.aot import lost_fields
+    from lbt_synth.files.telemetry.store import require_telemetry_name
+
+    kind = require_telemetry_name(output, kind)
+    path = save_telemetry(output, telemetry, format=kind, precision=precision)
+    lost = lost_fields(telemetry) if kind == "aot" else ()
+    report.data |= {key: str(path), "lost": list(lost)}
+    report.notes.append(f"written: {path} ({what})")
+    if lost:
+        report.notes.append(f"note: the AOT standard has no place for {', '.join(lost)}.")

@@ -15,34 +15,38 @@ from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import loop_figure, robustness_figure
 from lbt_synth.storage.atomic_files import make_directory, write_atomically
 from lbt_synth.storage.display_unit import own_display_unit
-from lbt_synth.storage.rows import csv_rows, json_record
+from lbt_synth.storage.rows import Facts, csv_rows, json_record
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies import RobustnessRow
-from lbt_synth.studies.paper.parameters import (
+from lbt_synth.studies.paper import (
     DIAMETER_M,
+    TABLE_II,
     TABLE_III,
-    TableEntry,
-    compare_with_paper,
+    PaperRow,
+    modal_row,
     paper_filters,
     parameter_rows,
+    plan_rows,
     rms_difference,
-    table_ii,
-    table_iii,
+    table_entry,
 )
+
+_ROWS = 3 * len(TABLE_II) + 2 * len(TABLE_III)  # of both tables and their controllers
 
 
 def run(arguments: Namespace) -> Report:
     """Compute and write the tables and figures of the paper."""
     choose_unit(arguments, DIAMETER_M)
     folder = make_directory(arguments.output)
-    rows = list(
-        track_progress(
-            table_iii(), total=2 * len(TABLE_III), what="Table III", quiet=arguments.json
-        )
+    rows = [
+        (row, modal_row(row))
+        for row in track_progress(plan_rows(), total=_ROWS, what="tables", quiet=arguments.json)
+    ]
+    second, third = (
+        [table_entry(*pair) for pair in rows if pair[0].table == table] for table in ("II", "III")
     )
-    second, third = table_ii(), compare_with_paper(rows)
     filters = paper_filters()
-    files = write_paper(folder, rows, second, third, filters)
+    files = write_paper(folder, rows, filters)
     ratio = filters[1].gamma_requested / filters[1].gamma_least
     columns = {
         method: rms_difference([e for e in third if e.method == method])
@@ -73,7 +77,7 @@ def run(arguments: Namespace) -> Report:
     return report
 
 
-def _add_comparison(report: Report, title: str, entries: list[TableEntry]) -> None:
+def _add_comparison(report: Report, title: str, entries: list[Facts]) -> None:
     """Add a table with the methods side by side."""
     methods = dict.fromkeys(entry.method for entry in entries)
     headings, lines = ["row"], {entry.label: [entry.label] for entry in entries}
@@ -90,16 +94,14 @@ def _add_comparison(report: Report, title: str, entries: list[TableEntry]) -> No
 
 def write_paper(
     folder: Path,
-    rows: list[RobustnessRow],
-    second: list[TableEntry],
-    third: list[TableEntry],
+    rows: list[tuple[PaperRow, RobustnessRow]],
     filters: tuple[FilterDesign, FilterDesign],
 ) -> list[Path]:
     """Write tables, figures and gain files of the comparison."""
-    files = [
-        write_atomically(folder / name, csv_rows(entries))
-        for name, entries in (("table_ii.csv", second), ("table_iii.csv", third))
-    ]
+    files = []
+    for table, name in (("II", "table_ii.csv"), ("III", "table_iii.csv")):
+        content = csv_rows([table_entry(*pair) for pair in rows if pair[0].table == table])
+        files.append(write_atomically(folder / name, content))
     with own_display_unit():  # CSV stays in nm
         parameters = csv_bytes(("parameter", "value", "origin"), parameter_rows())
     files.append(write_atomically(folder / "parameters.csv", parameters))
@@ -109,7 +111,7 @@ def write_paper(
     }
     labelled = {design_label(design.method): design for design in filters}
     for name, figure in (
-        ("robustness", robustness_figure(rows, published)),
+        ("robustness", robustness_figure([m for row, m in rows if row.table == "III"], published)),
         ("sigma", loop_figure(labelled, "sigma", unit_weights=True)),
     ):
         files += [save_figure(figure, folder / f"{name}{ending}") for ending in (".png", ".pdf")]

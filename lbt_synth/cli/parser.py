@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import lbt_synth
 from lbt_synth.cli import arguments
-from lbt_synth.cli.argument_kinds import add_switch
 from lbt_synth.cli.streams import printable
 from lbt_synth.errors import suggest_word
 
@@ -39,8 +38,8 @@ COMMANDS = {
 _SHARED_MODULES = {
     "completion": "parser",
     "end-to-end-table": "end_to_end",
-    "verify": "show",
-    **dict.fromkeys(("limits", "mirror", "tradeoff"), "comparisons"),
+    **dict.fromkeys(("show", "verify"), "design"),
+    **dict.fromkeys(("limits", "mirror", "robustness", "tradeoff"), "comparisons"),
 }
 
 
@@ -87,7 +86,7 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
         command = commands.add_parser(
             name, help=text.splitlines()[0].rstrip("."), description=" ".join(text.split())
         )
-        add_switch(command, "--json", "print one JSON object instead")
+        arguments.add_switch(command, "--json", "print one JSON object instead")
         if name in named:
             add_arguments(command)
     return parser

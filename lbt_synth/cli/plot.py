@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from lbt_synth.cli.loop_inputs import choose_design_unit, load_designs
-from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import require_outputs, write_outputs
+from lbt_synth.cli.output import Report, require_outputs, write_outputs
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.design import Design
 from lbt_synth.errors import UnstableLoopError
@@ -33,48 +31,34 @@ from lbt_synth.validation import FloatArray
 _SETTLING_FRAMES = 8000  # within which loops settle, beyond what is drawn
 
 
-_LOOP = (  # the loop of a design, broken at one measurement
-    ("frequency_hz", Column(heading="frequency", unit="Hz")),
-    ("gain_db", Column(heading="loop gain", unit="dB")),
-    ("phase_deg", Column(heading="phase", unit="deg")),  # without jumps, with the delay
-    ("real", Column(heading="real part")),
-    ("imaginary", Column(heading="imaginary part")),
-)
-_SIGMA = (  # largest singular values; nan for what a design does not have
-    ("frequency_hz", Column(heading="frequency", unit="Hz")),
-    ("error", Column(heading="disturbances to error")),  # nm of a loop
-    ("rejection", Column(heading="phase to residual")),
-    ("noise_transfer", Column(heading="noise to residual")),
-)
-_STEP = (  # after a step of the wavefront, as parts of it
-    ("time_s", Column(heading="time", unit="s")),
-    ("residual", Column(heading="residual")),
-    ("command", Column(heading="command")),
-)
+_UNITS = {"frequency_hz": "Hz", "gain_db": "dB", "phase_deg": "deg", "time_s": "s"}
+_LOOP = ("frequency_hz", "gain_db", "phase_deg", "real", "imaginary")  # phases without jumps
+_SIGMA = ("frequency_hz", "error", "rejection", "noise_transfer")  # of phase and noise to residual
+# named series of numbers, of the loop of a design broken at one measurement, or of a design
+_Curves: TypeAlias = list[tuple[str, dict[str, FloatArray]]]
 
 
 def run(arguments: Namespace) -> Report:
     """Print the margins of designs, and write their figure and their points."""
     view = arguments.kind
-    points = _POINTS.get(view, _loop_points)
     require_outputs(arguments.output, inputs=arguments.gains)
     designs, gain = load_designs(arguments.gains), arguments.gain_factor
     choose_design_unit(arguments, *designs.values())
     report = Report()
     with show_spinner("drawing", quiet=arguments.json):
         _add_margins(report, designs, gain)
-        drawn = points(designs, gain)
+        drawn = _draw(view, designs, gain)
         if not drawn:
             raise UnstableLoopError(
                 f"no loop is stable at {gain:g} times the sensor gain that its design assumes, and "
                 "there is nothing to draw; lbt-synth show prints the factors that are stable."
             )
-        report.data["curves"] = _curves(drawn)
-        report.data["units"] |= json_units(drawn[0])
+        report.data["curves"] = _joined(drawn)
+        report.data["units"] |= {n: unit for n, unit in _UNITS.items() if n in drawn[0][1]}
         write_outputs(
             report,
             arguments.output,
-            drawn,
+            list(_points(drawn)),
             figure=lambda: loop_figure(designs, view, sensor_gain=gain),
         )
     if view == "step":
@@ -82,18 +66,47 @@ def run(arguments: Namespace) -> Report:
     return report
 
 
-def _curves(points: Sequence[Facts]) -> dict[str, dict[str, list[float]]]:
-    """Return lists of the numbers of each design; what it has none of is left out."""
-    curves: dict[str, dict[str, list[float]]] = {}
-    for point in points:
-        record = json_record(point)
-        lists = curves.setdefault(record.pop("design"), {name: [] for name in record})
-        for name, value in record.items():
-            lists[name].append(value)
+def _draw(view: str, designs: Mapping[str, Design], gain_factor: float) -> _Curves:
+    """Return the curves of designs in a view; nan stands for what a design does not have."""
+    if view == "step":
+        return [
+            (name, {"time_s": step.time_s, "residual": step.residual, "command": step.command})
+            for name, step in _named_steps(designs, gain_factor)
+        ]
+    curves: _Curves = []
+    if view == "sigma":
+        loops = closed_loops(designs, gain_factor, needed=False)
+        for name, (f, *parts) in sigma_curves(designs, loops).items():
+            lines = (np.full(f.size, np.nan) if part is None else part for part in parts)
+            curves.append((name, dict(zip(_SIGMA, (f, *lines), strict=True))))
+        return curves
+    for name, _, _, broken in open_loops(closed_loops(designs, gain_factor)):
+        if broken is not None:
+            *series, response = loop_points(broken)
+            named = dict(zip(_LOOP, (*series, response.real, response.imag), strict=True))
+            curves.append((name, named))
+    return curves
+
+
+def _joined(curves: _Curves) -> dict[str, dict[str, FloatArray]]:
+    """Return the series of each design, end to end; what it has none of is left out."""
+    joined: dict[str, dict[str, FloatArray]] = {}
+    for name, series in curves:
+        for key, values in series.items():
+            parts = joined.setdefault(name, {})
+            parts[key] = np.concatenate([parts.get(key, np.zeros(0)), values])
     return {
-        design: {name: values for name, values in lists.items() if not np.isnan(values).all()}
-        for design, lists in curves.items()
+        name: {key: values for key, values in series.items() if not np.isnan(values).all()}
+        for name, series in joined.items()
     }
+
+
+def _points(curves: _Curves) -> Iterator[Facts]:
+    """Yield a row for each point of the curves."""
+    columns = tuple(Column(name=name) for name in ("design", *curves[0][1]))
+    for name, series in curves:
+        for numbers in zip(*(values.tolist() for values in series.values()), strict=True):
+            yield Facts(columns, {"design": name, **dict(zip(series, numbers, strict=True))})
 
 
 def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: float) -> None:
@@ -130,39 +143,6 @@ def _margins(design: Design, gain_factor: float) -> dict[str, Any]:
     return record
 
 
-def _points(kind: _Kind, design: str, *series: FloatArray) -> list[Facts]:
-    """Return rows of a kind, of which the series are the numbers in the order of its columns."""
-    columns = tuple(replace(how, name=name) for name, how in (("design", Column()), *kind))
-    names = [name for name, _ in kind]
-    return [
-        Facts(columns, {"design": design, **dict(zip(names, map(float, numbers), strict=True))})
-        for numbers in zip(*series, strict=True)
-    ]
-
-
-def _loop_points(designs: Mapping[str, Design], gain_factor: float) -> list[Facts]:
-    """Return the points of the loops of designs."""
-    return [
-        point
-        for name, _, _, broken in open_loops(closed_loops(designs, gain_factor))
-        if broken is not None
-        for *curves, response in [loop_points(broken)]
-        for point in _points(_LOOP, name, *curves, response.real, response.imag)
-    ]
-
-
-def _sigma_points(designs: Mapping[str, Design], gain_factor: float) -> list[Facts]:
-    """Return the points of the curves of designs."""
-    loops = closed_loops(designs, gain_factor, needed=False)
-    return [
-        point
-        for name, (f, *parts) in sigma_curves(designs, loops).items()
-        for point in _points(
-            _SIGMA, name, f, *(np.full(f.size, np.nan) if p is None else p for p in parts)
-        )
-    ]
-
-
 def _named_steps(
     designs: Mapping[str, Design], gain_factor: float, frames: int = SHOWN_FRAMES
 ) -> list[tuple[str, LoopStep]]:
@@ -187,20 +167,3 @@ def _add_step_facts(report: Report, designs: Mapping[str, Design], gain_factor: 
         for name, step in _named_steps(designs, gain_factor, frames=_SETTLING_FRAMES)
     ]
     report.add_rows("steps", "After a step of the wavefront", rows)
-
-
-def _step_points(designs: Mapping[str, Design], gain_factor: float) -> list[Facts]:
-    """Return the points of the step responses."""
-    return [
-        point
-        for name, step in _named_steps(designs, gain_factor)
-        for point in _points(_STEP, name, step.time_s, step.residual, step.command)
-    ]
-
-
-_Kind: TypeAlias = Sequence[tuple[str, Column]]
-_Points: TypeAlias = Callable[[Mapping[str, Design], float], list[Facts]]
-_POINTS: Mapping[str, _Points] = {  # of the curves, but for those of broken loops
-    "sigma": _sigma_points,
-    "step": _step_points,
-}

@@ -12,8 +12,7 @@ import numpy as np
 
 from lbt_synth.cli.loop_inputs import choose_unit, load_design, load_shown
 from lbt_synth.cli.loop_records import load_series, record_imaging, require_series
-from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import require_figure
+from lbt_synth.cli.output import Report, require_figure
 from lbt_synth.cli.parser import command_options
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config.load import config_from_text

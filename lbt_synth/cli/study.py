@@ -18,14 +18,13 @@ from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.grid import timed
-from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths
-from lbt_synth.studies.study.summary import worst_table
+from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths, part_rows, replay_row
+from lbt_synth.studies.study.sample import evaluate_samples
+from lbt_synth.studies.study.statistics import summary_tables, worst_table
 from lbt_synth.validation import integer
 
 _FAILURE = ("row", "controller", "error")
-_MEASURED_ROWS = 4  # of the first batch of an estimate, and the growth of the next ones
-_LONG_ENOUGH_S = 1.0
-_NUMBER_BYTES, _PART_BYTES = 13, 8  # of a result in the table and in a part
+_NUMBER_BYTES = 21  # of a number of a study, in a part and in the table of results
 _WORST = 3  # rows of each controller that are printed; the page has more
 
 
@@ -36,7 +35,7 @@ def run(arguments: Namespace) -> Report:
     if arguments.pdf:
         require_weasyprint()
     with show_spinner("reading the study, designing", quiet=arguments.json):
-        loaded = studies.load_study(arguments.study, directory=folder)
+        loaded = studies.load_study(arguments.study)
     load_shown(arguments, loaded.config)
     refuse_replacing(output_paths(folder, loaded), loaded.inputs)
     if arguments.dry_run:
@@ -56,8 +55,8 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
         page = study_page(
             loaded,
             columns,
+            statistics,
             folder=folder,
-            statistics=statistics,
             failures=run.failures,
             computing_s=run.computing_s,
         )
@@ -83,7 +82,7 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
             "statistics": asdict(statistics),
         },
         tables=[
-            *studies.summary_tables(statistics),
+            *summary_tables(statistics),
             *(replace(table, rows=table.rows[:_WORST]) for table in worst),
         ],
         notes=[
@@ -156,20 +155,17 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
 
 
 def _estimate(loaded: studies.Study, at_once: int) -> Facts:
-    """Measure parts in this process until one is long enough, and say what the whole will cost."""
-    start, size, rows, seconds = 0, _MEASURED_ROWS, 1, 0.0
-    studies.evaluate_samples(loaded, loaded.values(0, 1), 0)  # warms up
-    while seconds < _LONG_ENOUGH_S and start < loaded.samples:
-        values = loaded.values(start, min(start + size, loaded.samples))
-        rows, (_, seconds) = len(values), timed(studies.evaluate_samples, loaded, values, start)
-        start, size = start + rows, _MEASURED_ROWS * size
-    row_bytes = _NUMBER_BYTES * len(loaded.columns) + _PART_BYTES * len(loaded.result_columns)
+    """Measure a part in this process, and say what the whole will cost."""
+    evaluate_samples(loaded, loaded.values(0, 1), 0)  # warms up
+    rows = min(part_rows(loaded), loaded.samples)
+    _, seconds = timed(evaluate_samples, loaded, loaded.values(0, rows), 0)
     space = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
+    disk_bytes = _NUMBER_BYTES * len(loaded.columns) * loaded.samples
     return facts(
         measured_rows=fact(rows, "samples measured in one process"),
         measured_s=fact(seconds, "  their time", unit="s", format=".3g"),
         seconds=fact(seconds / rows * loaded.samples / at_once),  # said in a note, in words
-        disk_bytes=fact(loaded.samples * row_bytes, "space on the disk, about", **space),
+        disk_bytes=fact(disk_bytes, "space on the disk, about", **space),
     )
 
 
@@ -177,7 +173,7 @@ def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report
     if 0 <= arguments.row < loaded.samples:  # else it is refused
         make_directory(folder)
     with show_spinner("replaying", quiet=arguments.json):
-        replay = studies.replay_row(loaded, folder, arguments.row)
+        replay = replay_row(loaded, folder, arguments.row)
     stored, fresh, row = replay.stored, replay.fresh, arguments.row
     values = loaded.parameters_by_name(loaded.values(row, row + 1)[0])
     report = Report(
@@ -186,7 +182,6 @@ def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report
         notes=[
             *([] if stored else ["note: the study has no result of this row yet."]),
             *(f"failed: {name}: {error}" for _, name, error in replay.failures),
-            *([f"note: {replay.unwritten}"] if replay.unwritten else []),
         ],
     )
     report.add_table(f"Row {row}", ("parameter", "value"), values.items())

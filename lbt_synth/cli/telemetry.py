@@ -8,8 +8,7 @@ from dataclasses import asdict
 import numpy as np
 
 from lbt_synth.cli.loop_inputs import choose_unit
-from lbt_synth.cli.output import Report
-from lbt_synth.cli.output_files import write_telemetry
+from lbt_synth.cli.output import Report, write_telemetry
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry, load_telemetry
 from lbt_synth.files.telemetry.store import require_telemetry_name

@@ -17,17 +17,20 @@ from concurrent import futures
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from lbt_synth.errors import LbtSynthError, NumericalError, OutputError, ProblemError
+from lbt_synth.errors import LbtSynthError, NumericalError, OutputError
 from lbt_synth.loop import ClosedLoop, Imaging, ResidualBudget, residual_budget, strehl
-from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth, Vibration
-from lbt_synth.models.vibration import checked_direction, stationary_vibrations
+from lbt_synth.models import Truth
 from lbt_synth.storage import array_file
-from lbt_synth.storage.atomic_files import make_directory, write_atomically
+from lbt_synth.storage.atomic_files import (
+    UNFINISHED,
+    exclusive_lock,
+    make_directory,
+    write_atomically,
+)
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import FloatArray
 
@@ -56,49 +59,17 @@ def residual_columns(budget: ResidualBudget, imaging: Imaging) -> dict[str, Any]
     return {"stable": budget.stable * 1.0, "strehl": strehl(budget, imaging)} | columns
 
 
-def moved_lines(
-    truth: Truth, errors_hz: ArrayLike, hardware: LoopHardware, name: str = "errors_hz"
-) -> list[tuple[Vibration | SinusoidalVibration, FloatArray]]:
-    """Return the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
-    errors, nyquist = np.asarray(errors_hz), hardware.frame_rate_hz / 2
-    shares, moved = truth.frequency_shifts_hz(1.0), []
-    for line, moves in zip(stationary_vibrations(truth.vibrations), shares, strict=True):
-        checked_direction(line, hardware)
-        frequencies = line.frequency_hz + moves * errors
-        wrong = ~((frequencies > 0) & (frequencies < nyquist))
-        if np.any(wrong):
-            raise ProblemError(
-                f"{name} must leave each vibration between 0 and {nyquist:.6g} Hz; got an error "
-                f"of {errors[wrong][0]:.6g} Hz, which moves the one at {line.frequency_hz:.6g} Hz "
-                f"to {frequencies[wrong][0]:.6g} Hz."
-            )
-        moved.append((line, frequencies))
-    return moved
+class Part(NamedTuple):
+    """The results of some rows (b, columns), what failed, and the time that they took [s]."""
 
-
-class InlineExecutor(futures.Executor):
-    """Executor that runs each call at once in this process."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> futures.Future[Any]:
-        """Run a call; its error is that of the future."""
-        future: futures.Future[Any] = futures.Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
-def calls_in_flight(executor: futures.Executor, workers: int | None = None) -> int:
-    """Return how many calls an executor has at a time: two a worker, so that none waits."""
-    if isinstance(executor, InlineExecutor):
-        return 1
-    return 2 * (workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
+    results: FloatArray
+    failures: list[Failure]
+    seconds: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Parts:
-    """The parts of a sweep in a directory."""
+class Sweep:
+    """Rows of results in columns, whose parts are files of a directory."""
 
     folder: Path
     columns: tuple[str, ...]  # of the results
@@ -135,8 +106,8 @@ class Parts:
         packed = array_file.npz_bytes({"RESULTS": content}, json.dumps(meta))
         write_atomically(self.folder / name, packed)
 
-    def read(self, path: Path) -> tuple[FloatArray, list[Failure], float]:
-        """Return the results of a file (b, columns), its failures and its seconds."""
+    def read(self, path: Path) -> Part:
+        """Return what a file holds; refuse it where it is damaged, or is of another sweep."""
         try:
             arrays, text = array_file.read_npz(read_bytes(path, OutputError))
             meta = json.loads(text)
@@ -145,50 +116,89 @@ class Parts:
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             refuse(path, f"is damaged. {_DELETE}", error)
         start, stop = map(int, path.stem.split("-"))
+        if whole and sweep != self.digest:
+            refuse(
+                path,
+                "is of another study: other settings, inputs, or another version of lbt_synth. "
+                "Name another directory, or delete it.",
+            )
         if not whole or results.shape != (stop - start, len(self.columns)):
             refuse(path, f"is damaged. {_DELETE}")
-        if sweep != self.digest:
-            refuse(path, "is of another study. Name another directory, or delete it.")
-        return results, [tuple(failure) for failure in meta["failures"]], meta["seconds"]
+        return Part(results, [tuple(failure) for failure in meta["failures"]], meta["seconds"])
 
-    def compute_missing(
+    def run(
         self,
         function: Callable[..., Result],
         arguments: Callable[[Rows], tuple[Any, ...]],
         *,
         part_rows: int,
-        executor: futures.Executor,
-        in_flight: int = 1,
-        progress: Callable[[int], None] = lambda rows: None,
-    ) -> None:
-        """Evaluate what is missing on an executor, a few parts in flight.
+        executor: futures.Executor | None = None,
+        workers: int | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> tuple[Part, int]:
+        """Evaluate what is missing; return all rows, and how many of them were computed now.
 
-        Each part is written as it comes; if one fails as a whole, or its worker dies, the others
-        are given up, and a sentence says how to go on.
+        An executor has two parts a worker in flight, so that none waits; without one the parts run
+        here. Each is written as it comes.
         """
-        if make_directory(self.folder).is_symlink():
-            refuse(self.folder, "is a link; expected a directory.")
-        waiting = iter(
-            (first, min(first + part_rows, stop))
-            for start, stop in self.missing()
-            for first in range(start, stop, part_rows)
-        )
-        running: dict[futures.Future[tuple[Result, float]], Rows] = {}
-        try:
-            while True:
-                for rows in islice(waiting, in_flight - len(running)):
-                    with _explain_failure(rows):
-                        running[executor.submit(timed, function, *arguments(rows))] = rows
-                if not running:
-                    return
-                for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
-                    rows = running.pop(future)
-                    with _explain_failure(rows):
-                        self.write(rows, *future.result())
-                    progress(rows[1] - rows[0])
-        finally:
-            for future in running:
-                future.cancel()
+        folder, count = make_directory(self.folder, parents=False), progress or (lambda rows: None)
+        in_flight = 1
+        if executor is not None:
+            most = getattr(executor, "_max_workers", None)
+            in_flight = 2 * (workers or most or os.cpu_count() or 1)
+        # more parts than are in flight, so that no worker waits long for the last
+        share = -(-self.rows // (2 * in_flight + 2))
+        with exclusive_lock(folder, "computation"):
+            for path in folder.glob(UNFINISHED):
+                path.unlink()  # what a killed process left
+            for path in self.paths().values():
+                self.read(path)  # refuses what is damaged before any work
+            missing, size = self.missing(), min(part_rows, share)
+            computed = sum(stop - start for start, stop in missing)
+            if computed < self.rows:
+                count(self.rows - computed)
+            waiting = (
+                (first, min(first + size, stop))
+                for start, stop in missing
+                for first in range(start, stop, size)
+            )
+            tasks = ((rows, function, arguments(rows)) for rows in waiting)
+            for rows, result, seconds in _compute(tasks, executor, in_flight):
+                with _explain_failure(rows):
+                    self.write(rows, result, seconds)
+                count(rows[1] - rows[0])
+            parts = [self.read(path) for path in self.paths().values()]
+        failures = [failure for part in parts for failure in part.failures]
+        results = np.concatenate([part.results for part in parts])
+        return Part(results, failures, sum(part.seconds for part in parts)), computed
+
+
+def _compute(
+    tasks: Iterator[tuple[Rows, Callable[..., Result], tuple[Any, ...]]],
+    executor: futures.Executor | None,
+    in_flight: int,
+) -> Iterator[tuple[Rows, Result, float]]:
+    """Yield results as they come; if one task fails as a whole, the others are given up."""
+    for rows, function, arguments in tasks if executor is None else ():
+        with _explain_failure(rows):
+            result, seconds = timed(function, *arguments)
+        yield rows, result, seconds
+    running: dict[futures.Future[tuple[Result, float]], Rows] = {}
+    try:
+        while executor is not None:
+            for rows, function, arguments in islice(tasks, in_flight - len(running)):
+                with _explain_failure(rows):
+                    running[executor.submit(timed, function, *arguments)] = rows
+            if not running:
+                return
+            for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
+                rows = running.pop(future)
+                with _explain_failure(rows):
+                    result, seconds = future.result()
+                yield rows, result, seconds
+    finally:
+        for future in running:
+            future.cancel()
 
 
 def refuse(path: Path, why: str, cause: Exception | None = None) -> NoReturn:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 from lbt_synth.config import Config
 from lbt_synth.design import (
     Design,
-    FilterDesign,
     central_filter,
     hinf,
     kalman,
@@ -42,11 +41,21 @@ from lbt_synth.loop.simulation.run import Drop, Segment, run_segments
 from lbt_synth.methods.mixed import METHOD as MIXED
 from lbt_synth.methods.registry import record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
-from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
+from lbt_synth.models import LoopHardware, SinusoidalVibration, TipTiltPlant, Truth, Vibration
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.plant.tip_tilt import retuned_plant
-from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
-from lbt_synth.studies.grid import loop_columns, moved_lines, residual_columns
+from lbt_synth.models.vibration import checked_direction, stationary_vibrations
+from lbt_synth.storage.rows import (
+    Facts,
+    column,
+    fact,
+    facts,
+    fill_row,
+    nm_column,
+    percent_column,
+    table_row,
+)
+from lbt_synth.studies.grid import loop_columns, residual_columns
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
@@ -59,7 +68,6 @@ from lbt_synth.validation import (
 )
 
 FAMILIES = (MIXED.name, "central")
-_MOST_POINTS = 200  # of a trade-off
 _CROWDING = 1.5  # above 1, points are denser near the least norm
 _GAINS_AT_ONCE = 64  # of a map
 
@@ -90,9 +98,7 @@ def robustness(
     errors_hz: Sequence[float],
     methods: Sequence[str] | None = None,
     gamma_ratio: float = 1.2,
-    gamma: float | None = None,
     hold: str = "driving",
-    frame_means: bool = False,
 ) -> Iterator[RobustnessRow]:
     """Design at each frequency error and evaluate exactly against the same truth.
 
@@ -112,12 +118,8 @@ def robustness(
         filter.
     gamma_ratio : float, optional
         H-infinity bound as a multiple of each row's least gamma.
-    gamma : float, optional
-        One H-infinity bound for all rows, instead of the ratio.
     hold : {"driving", "rms"}, optional
         What the model keeps of a vibration when its frequency moves.
-    frame_means : bool, optional
-        As in :func:`residual_budget`.
 
     Yields
     ------
@@ -149,17 +151,14 @@ def robustness(
     names = default_methods() if methods is None else methods
     for name in names:
         choice(name, "method", record_methods())
-    bound = {"gamma_ratio": gamma_ratio} if gamma is None else {"gamma": gamma}
     for error in errors_hz:
         number(error, "errors_hz")
         shifts = [-truth.frequency_shift_hz(line.frequency_hz, error) for line in plant.vibrations]
         moved = retuned_plant(plant, shifts, hold=hold)
         for name in names:
-            design = reference_design(name, moved, bound)
-            hardware = require_hardware(design, "a row")
-            loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-            numbers = loop_columns(loop, truth, imaging, frame_means=frame_means)
-            numbers["stable"] = loop.is_stable
+            design = reference_design(name, moved, {"gamma_ratio": gamma_ratio})
+            loop = design.close(plant.hardware, sensor_gain=truth.sensor_gain)
+            numbers = loop_columns(loop, truth, imaging) | {"stable": loop.is_stable}
             yield fill_row(RobustnessRow, design, error_hz=float(error), **numbers)
 
 
@@ -194,7 +193,6 @@ def robustness_map(
     sensor_gains: ArrayLike,
     delay_errors_frames: ArrayLike = (0.0,),
     hardware: LoopHardware | None = None,
-    advance: Callable[[int], object] | None = None,
 ) -> RobustnessMap:
     """Evaluate one design exactly over frequency errors, sensor gains and delay errors.
 
@@ -215,8 +213,6 @@ def robustness_map(
         Real delay less that of the design [frames].
     hardware : LoopHardware, optional
         Loop to close; that of the design by default.
-    advance : callable, optional
-        Called with the number of points computed since its last call.
 
     Returns
     -------
@@ -267,7 +263,7 @@ def robustness_map(
         raise ProblemError(
             "a frequency error needs a vibration in the truth; got a truth without any."
         )
-    lines = moved_lines(truth, errors, hardware)
+    lines = list(_moved_lines(truth, errors, hardware))
     noise_nm = truth.noise_per_measurement(hardware.n_measurements)[None]
     size = delays.size, gains.size, errors.size
     maps = {name: np.empty(size) for name in ("strehl", "residual_nm", "stable")}
@@ -289,8 +285,6 @@ def robustness_map(
             columns = residual_columns(loops, imaging)
             for name, numbers in maps.items():
                 numbers[d, some] = columns[name].reshape(count, errors.size)
-            if advance is not None:
-                advance(count * errors.size)
     return RobustnessMap(
         errors_hz=errors,
         sensor_gains=gains,
@@ -300,6 +294,24 @@ def robustness_map(
         stable=read_only(maps["stable"][..., 0] == 1),
         band_hz=_errors_in_band(design, truth),
     )
+
+
+def _moved_lines(
+    truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
+) -> Iterator[tuple[Vibration | SinusoidalVibration, FloatArray]]:
+    """Yield the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
+    nyquist_hz, shares = hardware.frame_rate_hz / 2, truth.frequency_shifts_hz(1.0)
+    for line, share in zip(stationary_vibrations(truth.vibrations), shares, strict=True):
+        checked_direction(line, hardware)
+        frequencies = line.frequency_hz + share * errors_hz
+        wrong = ~((frequencies > 0) & (frequencies < nyquist_hz))
+        if np.any(wrong):
+            raise ProblemError(
+                f"errors_hz must leave each vibration between 0 and {nyquist_hz:.6g} Hz; got an "
+                f"error of {errors_hz[wrong][0]:.6g} Hz, which moves the one at "
+                f"{line.frequency_hz:.6g} Hz to {frequencies[wrong][0]:.6g} Hz."
+            )
+        yield line, frequencies
 
 
 def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
@@ -317,29 +329,9 @@ def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
     axis = real_array(values, name)
     if axis.ndim != 1 or axis.size == 0:
         raise DimensionError(f"{name} must be a list of at least one number; got {axis.shape}.")
-    for value in axis:
-        number(value, name, **bounds)
     if np.unique(axis).size != axis.size:
         raise ProblemError(f"{name} must hold each value once; got {axis.tolist()}.")
-    return axis
-
-
-@table_row
-class SegmentRow:
-    """The residual between two events."""
-
-    start_s: float = column("from", unit="s", format="g")
-    end_s: float = column("to", unit="s", format="g")
-    sensors: str = column("sensors that fail")
-    residual_nm: float = nm_column("simulated", unit="nm rms", format=".2f")
-    exact_nm: float = nm_column(
-        "exact, once settled",
-        unit="nm rms",
-        format=".2f",
-        help="nan where the loop is unstable, a reading is frozen, or a vibration drifts",
-    )
-    strehl: float = percent_column("Strehl", help="nan where the loop is unstable")
-    stable: bool = column("stable", help="Whether the loop is stable with these sensors")
+    return read_only(np.array([number(value, name, **bounds) for value in axis]))
 
 
 def run_failures(
@@ -351,10 +343,11 @@ def run_failures(
     frames: int,
     cases: int,
     seed: int,
-) -> tuple[Simulation, list[tuple[Segment, SegmentRow]]]:
+) -> tuple[Simulation, list[tuple[Segment, Facts]]]:
     """Run the loop of a configuration in which sensors fail, none after the end of the run.
 
-    Between failures and returns there is a segment, with a row that has its exact residual, too.
+    Between failures and returns there is a segment, with a row that has its exact residual, too:
+    nan where the loop is unstable, a reading is frozen, or a vibration drifts.
     """
     filters, rate = design.controllers, config.hardware.frame_rate_hz
     hardware = replace(config.hardware, suite=require_hardware(design, "a run").suite)
@@ -380,90 +373,36 @@ def run_failures(
         exact = loop.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
         first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
         part = simulation.part(first, last)
-        row = SegmentRow(
-            start_s=segment.start_s,
-            end_s=segment.end_s,
-            sensors=segment.text or "none",
-            residual_nm=float(np.sqrt(np.mean(part.rms_nm**2))),
-            exact_nm=residual_budget(loop, truth).rms_nm if exact else np.nan,
-            strehl=float(np.mean(part.strehl(config.imaging))) if loop.is_stable else np.nan,
-            stable=loop.is_stable,
+        exact_nm = residual_budget(loop, truth).rms_nm if exact else np.nan
+        ratio = float(np.mean(part.strehl(config.imaging))) if loop.is_stable else np.nan
+        rms, second = {"unit": "nm rms", "format": ".2f"}, {"unit": "s", "format": "g"}
+        row = facts(
+            start_s=fact(segment.start_s, "from", **second),
+            end_s=fact(segment.end_s, "to", **second),
+            sensors=fact(segment.text or "none", "sensors that fail"),
+            residual_nm=fact(float(np.sqrt(np.mean(part.rms_nm**2))), "simulated", **rms),
+            exact_nm=fact(exact_nm, "exact, once settled", **rms),
+            strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
+            stable=fact(loop.is_stable, "stable"),
         )
         rows.append((segment, row))
     return simulation, rows
 
 
-@table_row
-class MirrorRow:
-    """One design on the real mirror; what an unstable loop does not have is nan."""
-
-    design: str = column("design", help="Its name: for ours, what it assumes about the mirror")
-    stable: bool = column(help="Whether its loop is stable")
-    residual_nm: float = nm_column(
-        "residual", format=".2f", missing="unstable", help="Residual under the truth, rms"
-    )
-    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
-    unsettled_nm: float = nm_column(
-        "settled less real position",
-        format=".2f",
-        help="What is left of the assumption that the mirror has settled, for the commands of "
-        "this design: settled less real position, rms",
-    )
-
-
-def mirror(
+def mirror_rows(
     plant: TipTiltPlant,
     truth: Truth,
     imaging: Imaging,
     *,
     command_weight: float = 0.0,
-) -> tuple[MirrorRow, ...]:
-    """Compare designs on a moving mirror: what it costs to ignore its dynamics.
+) -> tuple[Facts, ...]:
+    """Compare designs on a plant's moving mirror: what it costs to ignore its dynamics.
 
     They are the integrator with the best gain on this mirror, the Kalman filter for a mirror
     that settles at once, the same filter with the real positions taken out of its measurements,
-    and the LQG, which also commands for the dynamics. Each runs on the plant's own mirror.
-
-    Parameters
-    ----------
-    plant : TipTiltPlant
-        The plant, with the real mirror in its hardware.
-    truth : Truth
-        What the loop really meets.
-    imaging : Imaging
-        The camera.
-    command_weight : float, optional
-        As for :func:`lqg`.
-
-    Returns
-    -------
-    tuple of MirrorRow
-        One per design.
-
-    Raises
-    ------
-    ProblemError
-        If the plant does not come from :func:`tip_tilt_plant`.
-    SynthesisError
-        If a design fails.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-    >>> shell = lbt.models.PositionLoop.from_bandwidth(
-    ...     natural_frequency_hz=20, damping=0.5, bandwidth_hz=60
-    ... )
-    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5, mirror=shell)
-    >>> rows = lbt.studies.mirror(
-    ...     plant, lbt.Truth(turbulence=slow, noise_nm=15.5), lbt.Imaging(diameter_m=8.22)
-    ... )
-    >>> [(row.design, row.stable) for row in rows][1::2]
-    [('kalman, settled mirror', False), ('lqg', True)]
+    and the LQG, which also commands for the dynamics; nan is where a loop is unstable.
     """
     require_instance(plant, TipTiltPlant, "plant")
-    require_instance(truth, Truth)
-    require_instance(imaging, Imaging)
     hardware = plant.hardware
     settled = replace(plant, hardware=replace(hardware, mirror=None))
     regulated = lqg(plant, command_weight=command_weight)
@@ -476,49 +415,26 @@ def mirror(
     rows = []
     for name, design in designs.items():
         loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-        numbers = loop_columns(loop, truth, imaging) | {"stable": loop.is_stable}
-        numbers["unsettled_nm"] = settling_error(loop, truth).rms_nm if loop.is_stable else np.nan
-        rows.append(fill_row(MirrorRow, SimpleNamespace(**numbers), design=name))
+        numbers = loop_columns(loop, truth, imaging)
+        unsettled_nm = settling_error(loop, truth).rms_nm if loop.is_stable else np.nan
+        rms: dict[str, Any] = {"unit": "nm", "format": ".2f"}
+        row = facts(
+            design=fact(name, "design"),
+            stable=fact(loop.is_stable),
+            residual_nm=fact(numbers["residual_nm"], "residual", missing="unstable", **rms),
+            strehl=fact(numbers["strehl"], "Strehl", unit="%", scale=100, format=".2f"),
+            unsettled_nm=fact(unsettled_nm, "settled less real position", **rms),
+        )
+        rows.append(row)
     return tuple(rows)
-
-
-@table_row
-class TradeoffPoint:
-    """One filter of the trade-off, ``design``; a problem without a loop has no margins, but nan."""
-
-    family: str = column(
-        "filter",
-        help='"mixed": least variance of all filters with this norm; "central": the H-infinity '
-        "filter whose norm this is",
-    )
-    gamma: float = nm_column(
-        "norm", format=".2f", help="H-infinity norm of its estimation error, recomputed"
-    )
-    gamma_ratio: float = column(
-        "norm / least", format=".4f", help="The same over the least norm of any filter"
-    )
-    rms: float = nm_column(
-        "rms", format=".2f", help="Standard deviation of its estimation error, recomputed"
-    )
-    gain_low: float = column(
-        "gain from", format=".3f", help="Least stable sensor gain", default=np.nan
-    )
-    gain_high: float = column(
-        "gain to", format=".3f", help="Greatest stable sensor gain", default=np.nan
-    )
-    modulus: float = column(
-        "modulus margin", format=".3f", help="Modulus margin of its loop", default=np.nan
-    )
-    design: FilterDesign = field(compare=False, repr=False)
 
 
 def tradeoff(
     problem: EstimationProblem,
     *,
     points: int = 9,
-    families: Sequence[str] = FAMILIES,
     taps: int = 16,
-) -> Iterator[TradeoffPoint]:
+) -> Iterator[Facts]:
     """Return filters from the least norm to the least variance, and examine their loops.
 
     The levels run from the least gamma to the norm of the Kalman filter, at which all
@@ -529,16 +445,18 @@ def tradeoff(
     problem : EstimationProblem
         The problem; with a plant, each filter's loop is examined.
     points : int, optional
-        Levels of the norm, 2 to 200.
-    families : sequence of {"mixed", "central"}, optional
-        Which filters to design at each level.
+        Levels of the norm, at least 2.
     taps : int, optional
         Length of the mixed filters' impulse response.
 
     Yields
     ------
-    TradeoffPoint
-        In the order of levels, then families; each is designed when it is requested.
+    Facts
+        In the order of levels, then families; each is designed when it is requested. ``design`` is
+        the filter of a ``family``: "mixed", of the least variance of all with this norm, or
+        "central", the H-infinity filter whose norm it is. ``gamma`` and ``rms`` are the norm and
+        the standard deviation of its error, recomputed [nm], ``gamma_ratio`` is the norm over the
+        least; ``gain_low``, ``gain_high`` and ``modulus`` are margins of its loop, nan without one.
 
     Raises
     ------
@@ -557,31 +475,35 @@ def tradeoff(
     ...     D=[[0.0, 3.0]],
     ...     L=[[1.0, 0.0]],
     ... )
-    >>> points = list(lbt.studies.tradeoff(line, points=3, families=["mixed"]))
+    >>> points = list(lbt.studies.tradeoff(line, points=3))[::2]  # the mixed ones
     >>> points[0].rms > points[1].rms > points[2].rms
     True
     """
     require_problem(problem)
-    count = integer(points, "points", at_least=2, at_most=_MOST_POINTS)
+    count = integer(points, "points", at_least=2)
     length = require_taps(taps)
-    for family in families:
-        choice(family, "families", FAMILIES)
     least, best = hinf(problem, route="riccati"), kalman(problem)
     spread = max(best.gamma / least.gamma_least, 1.0)
     for i, share in enumerate(np.linspace(0, 1, count) ** _CROWDING):
         level = least.gamma_least * float(spread**share)
-        for family in families:
-            if i == 0:
-                design = least
-            elif i == count - 1:
-                design = best
+        for family in FAMILIES:
+            if i in (0, count - 1):
+                design = least if i == 0 else best
             elif family == MIXED.name:
                 design = mixed(problem, gamma=level, taps=length)
             else:
                 design = central_filter(problem, gamma=level)
-            margins = None
+            margins: Any = SimpleNamespace(gain_low=np.nan, gain_high=np.nan, modulus=np.nan)
             if design.hardware is not None:
                 margins = loop_margins(close_loop(design.hardware, design.controller))
-            ratio = max(design.gamma / least.gamma_least, 1.0)
-            given = {"family": family, "gamma_ratio": ratio, "design": design}
-            yield fill_row(TradeoffPoint, design, margins, **given)
+            size, ratio = {"unit": "nm", "format": ".2f"}, design.gamma / least.gamma_least
+            yield facts(
+                family=fact(family, "filter"),
+                gamma=fact(design.gamma, "norm", **size),
+                gamma_ratio=fact(max(ratio, 1.0), "norm / least", format=".4f"),
+                rms=fact(design.rms, "rms", **size),
+                gain_low=fact(margins.gain_low, "gain from", format=".3f"),
+                gain_high=fact(margins.gain_high, "gain to", format=".3f"),
+                modulus=fact(margins.modulus, "modulus margin", format=".3f"),
+                design=fact(design),
+            )

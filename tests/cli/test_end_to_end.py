@@ -135,14 +135,6 @@ def test_bad_input_at_the_command_line(tmp_path, capsys, arguments):
     assert not out.exists()
 
 
-def test_designs_of_one_name_are_not_lost(tmp_path, capsys):
-    slow = lbt.integrator(lbt.load_config(CONFIG).hardware, gain=0.5)
-    gains = [str(lbt.save_gain(tmp_path / name, slow)) for name in ("a-b.fits", "a_b.fits")]
-    assert main(["end-to-end-table", CONFIG, *gains, "-o", str(tmp_path / "table")]) == 2
-    assert "must differ in letters or digits" in capsys.readouterr().err
-    assert not (tmp_path / "table").exists()
-
-
 @needs_specula
 def test_the_command_writes_telemetry_that_is_the_run(tmp_path, cache, capsys):
     config, gain = small_config(tmp_path), tmp_path / "k.fits"

@@ -116,7 +116,7 @@ def test_shells_complete_every_option():
 
 @pytest.mark.parametrize(
     ("command", "text"),
-    [("tradeoff", "2 to 200 (default 9)"), ("identify", "[Hz] (default 0.1)")],
+    [("tradeoff", "the Kalman filter's (default 9)"), ("identify", "[Hz] (default 0.1)")],
 )
 def test_help_says_the_defaults(capsys, command, text):
     status, out, _ = run(capsys, command, "--help")

@@ -8,11 +8,10 @@ from support.commands import run
 
 import lbt_synth as lbt
 from lbt_synth.cli import paper
-from lbt_synth.studies.paper.parameters import (
-    compare_with_paper,
+from lbt_synth.studies.paper import (
+    modal_row,
     paper_filters,
-    table_ii,
-    table_iii,
+    plan_rows,
 )
 
 
@@ -49,9 +48,8 @@ def written(folder):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "robustness_figure", draw)
-        rows = list(table_iii())
-        tables = table_ii(), compare_with_paper(rows)
-        return paper.write_paper(folder, rows, *tables, paper_filters()), drawn
+        rows = [(row, modal_row(row)) for row in plan_rows()]
+        return paper.write_paper(folder, rows, paper_filters()), drawn
 
 
 def test_written_files(folder, written):

@@ -113,7 +113,7 @@ def test_the_run_reaches_beyond_the_last_event(capsys, config_file, sensors_file
     data = json.loads(run(capsys, *arguments)[1])
     assert data["frames"] == 5500
     assert [row["sensors"] for row in data["segments"]] == ["none", "m2"]
-    assert " in the loop: 1 run; " in run(capsys, *arguments[:-1])[1]
+    assert " in the loop: 1 run of 5500 frames; " in run(capsys, *arguments[:-1])[1]
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,9 @@ def test_long_values_are_shortened(tmp_path, capsys):
 
 
 def test_an_interruption_is_one_line(monkeypatch, capsys):
-    monkeypatch.setattr("lbt_synth.cli.show.run", lambda _: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(
+        "lbt_synth.cli.design.run_show", lambda _: signal.raise_signal(signal.SIGINT)
+    )
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # shells may ignore it
     try:
         assert run(capsys, "show", "none.fits") == (130, "", "lbt-synth: interrupted\n")

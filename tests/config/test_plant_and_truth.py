@@ -8,6 +8,7 @@ from support.plants import LBT_YAML, ROOT
 from support.vibration_config import write_vibration
 
 import lbt_synth as lbt
+from lbt_synth.studies.robustness import mirror_rows
 
 
 def test_every_kind_of_turbulence_and_noise(tmp_path):
@@ -159,7 +160,7 @@ def test_the_example_has_a_mirror_for_design_and_loop():
     assert config.hardware.mirror is config.plant.hardware.mirror
     step = config.hardware.mirror.step_response()
     assert 3e-3 < step.settling_s < 6e-3
-    rows = lbt.studies.mirror(config.plant, config.truth, config.imaging)
+    rows = mirror_rows(config.plant, config.truth, config.imaging)
     by_name = {row.design: row for row in rows}
     assert not by_name["kalman, settled mirror"].stable
     assert by_name["lqg"].strehl > 0.8

@@ -18,6 +18,7 @@ from lbt_synth.design.lqg import _pieces, loop_variances, mirror_core
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.report.figures.studies import mirror_figure
+from lbt_synth.studies.robustness import mirror_rows
 
 
 def model_rms(plant, controller):
@@ -296,7 +297,7 @@ def test_wrong_arguments_are_refused():
     with pytest.raises(lbt.errors.DimensionError, match="must have rank 2"):
         lbt.lqg(flat)
     with pytest.raises(lbt.errors.ProblemError, match="plant must be a TipTiltPlant"):
-        lbt.studies.mirror(plant.full(), lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8))
+        mirror_rows(plant.full(), lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8))
     with pytest.raises(lbt.errors.ProblemError, match="settles at once"):
         mirror_figure(lbt.LoopHardware(frame_rate_hz=800))
 

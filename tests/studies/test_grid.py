@@ -23,41 +23,43 @@ from lbt_synth.errors import NumericalError, OutputError
 from lbt_synth.storage import array_file
 from lbt_synth.storage.worker_processes import WorkerPool
 from lbt_synth.studies import run_study
-from lbt_synth.studies.grid import InlineExecutor, Parts
+from lbt_synth.studies.grid import Sweep
 
 
 def test_a_sweep_knows_what_is_missing(tmp_path):
-    parts = Parts(folder=tmp_path / "parts", columns=("a",), rows=12, digest="d" * 64)
-    assert parts.missing() == [(0, 12)]
-    parts.folder.mkdir()
+    sweep = Sweep(folder=tmp_path / "parts", columns=("a",), rows=12, digest="d" * 64)
+    assert sweep.missing() == [(0, 12)]
+    sweep.folder.mkdir()
     for start, stop in [(2, 4), (4, 6), (9, 10)]:
-        parts.write((start, stop), ({"a": np.arange(start, stop)}, [(start, "a", "why")]), 0.5)
-    assert list(parts.paths()) == [(2, 4), (4, 6), (9, 10)]
-    assert parts.missing() == [(0, 2), (6, 9), (10, 12)]
-    results, failures, seconds = parts.read(parts.paths()[4, 6])
+        sweep.write((start, stop), ({"a": np.arange(start, stop)}, [(start, "a", "why")]), 0.5)
+    assert list(sweep.paths()) == [(2, 4), (4, 6), (9, 10)]
+    assert sweep.missing() == [(0, 2), (6, 9), (10, 12)]
+    results, failures, seconds = sweep.read(sweep.paths()[4, 6])
     assert (results.tolist(), failures, seconds) == ([[4], [5]], [(4, "a", "why")], 0.5)
-    seen = []
+    seen, counts = [], []
 
     def evaluate(start, stop):
         seen.append((start, stop))
         return {"a": np.arange(start, stop)}, []
 
-    parts.compute_missing(evaluate, lambda rows: rows, part_rows=2, executor=InlineExecutor())
+    run, computed = sweep.run(evaluate, lambda rows: rows, part_rows=2, progress=counts.append)
     assert seen == [(0, 2), (6, 8), (8, 9), (10, 12)]  # a fixed number, and less at an end
-    whole = np.concatenate([parts.read(path)[0] for path in parts.paths().values()])
-    assert whole.ravel().tolist() == list(range(12))
+    assert run.results.ravel().tolist() == list(range(12))
+    assert run.failures == [(2, "a", "why"), (4, "a", "why"), (9, "a", "why")]
+    assert (computed, counts) == (7, [5, 2, 2, 1, 2])
+    assert sweep.run(None, lambda rows: rows, part_rows=2)[1] == 0
 
 
 def test_a_part_is_believed_by_its_digest_alone(tmp_path):
-    parts = Parts(folder=tmp_path, columns=("a",), rows=2, digest="d" * 64)
-    parts.write((0, 2), ({"a": np.ones(2)}, []), 0.5)
-    (path,) = parts.paths().values()
+    sweep = Sweep(folder=tmp_path, columns=("a",), rows=2, digest="d" * 64)
+    sweep.write((0, 2), ({"a": np.ones(2)}, []), 0.5)
+    (path,) = sweep.paths().values()
     arrays, text = array_file.read_npz(path.read_bytes())
     with pytest.raises(OutputError, match="is of another study"):
-        replace(parts, digest="e" * 64).read(path)
+        replace(sweep, digest="e" * 64).read(path)
     path.write_bytes(array_file.npz_bytes({"RESULTS": 1.001 * arrays["RESULTS"]}, text))
     with pytest.raises(OutputError, match="is damaged. Delete it"):
-        parts.read(path)
+        sweep.read(path)
 
 
 def wrong(study, values, start):

@@ -11,6 +11,7 @@ import lbt_synth as lbt
 from lbt_synth.config import Config
 from lbt_synth.design.result import model_limits
 from lbt_synth.report.figures.studies import limits_figure
+from lbt_synth.studies.limits import compare_in_truth
 
 
 def test_study(config):
@@ -85,9 +86,9 @@ def test_designs_of_the_full_form_have_the_limits_of_their_plant(delay):
 
 def test_a_design_of_another_making_keeps_its_name_beside_the_reference(config):
     slow = config.design("integrator", gain=0.1)
-    found = lbt.studies.compare_in_truth({"kalman": slow, "best": config.design("kalman")}, config)
+    found = compare_in_truth({"kalman": slow, "best": config.design("kalman")}, config)
     assert [row.design for row in found.rows] == ["kalman", "best", "integrator", "hinf"]
-    found = lbt.studies.compare_in_truth({"kalman": slow}, config)
+    found = compare_in_truth({"kalman": slow}, config)
     assert [row.design for row in found.rows][1:] == ["integrator", "kalman (reference)", "hinf"]
     assert found.rows[2].residual_nm == pytest.approx(51.0087, abs=1e-3)
     assert found.limit.rms_nm == pytest.approx(37.7777, abs=1e-4)
@@ -95,7 +96,7 @@ def test_a_design_of_another_making_keeps_its_name_beside_the_reference(config):
 
 def test_an_unstable_loop_is_a_warning(config):
     wild = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, delay_frames=1), gain=1.5)
-    found = lbt.studies.compare_in_truth({"wild": wild}, config)
+    found = compare_in_truth({"wild": wild}, config)
     assert found.warnings == {"wild": ("the loop is unstable in the truth",)}
     assert not found.rows[0].stable
 
@@ -111,7 +112,7 @@ def test_a_reference_that_cannot_be_designed_is_a_note(tmp_path, monkeypatch):
         return design(self, method, **options)
 
     monkeypatch.setattr(Config, "design", refuse)
-    found = lbt.studies.compare_in_truth({"slow": slow}, config)
+    found = compare_in_truth({"slow": slow}, config)
     assert found.notes == ("hinf is left out: no convergence.",)
     assert [row.design for row in found.rows] == ["slow", "integrator", "kalman"]
 
@@ -144,7 +145,7 @@ def test_wind_shake_that_a_robust_design_is_not_told_of(tmp_path):
     """Certified at some 20 nm, and a multiple of that in its truth."""
     config = wind_shake(tmp_path, 0.09)
     design = config.design("robust")
-    found = lbt.studies.compare_in_truth({"robust": design}, config)
+    found = compare_in_truth({"robust": design}, config)
     rows = {row.design: row for row in found.rows}
     robust, kalman = rows["robust"], rows["kalman"]
     promised_nm = max(design.objective_nm) * 2**0.5
@@ -162,7 +163,7 @@ def test_wind_shake_that_a_robust_design_is_not_told_of(tmp_path):
 def test_wind_shake_that_is_wide_is_part_of_a_robust_design(tmp_path):
     config = wind_shake(tmp_path, 0.3)
     design = config.design("robust")
-    found = lbt.studies.compare_in_truth({"robust": design}, config)
+    found = compare_in_truth({"robust": design}, config)
     (robust,) = [row for row in found.rows if row.design == "robust"]
     assert not any("not made for" in text for text in found.warnings["robust"])
     assert robust.residual_nm < max(design.objective_nm) * 2**0.5

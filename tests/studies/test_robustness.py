@@ -279,20 +279,6 @@ def test_the_lines_of_the_model_move_as_the_true_ones_near_them(settings):
     assert row.residual_nm == pytest.approx(budget.rms_nm, rel=1e-9)
 
 
-def test_counts_points_as_they_are_done(kalman, settings):
-    counts = []
-    robustness_map(
-        kalman,
-        settings.truth,
-        settings.imaging,
-        errors_hz=[0, 1],
-        sensor_gains=np.linspace(0.5, 1, 70),
-        delay_errors_frames=[0, 0.1],
-        advance=counts.append,
-    )
-    assert sum(counts) == 2 * 70 * 2
-
-
 WRONG = [
     ({"errors_hz": []}, "at least one number"),
     ({"errors_hz": [[0.0]]}, "at least one number"),
@@ -407,11 +393,9 @@ def test_the_front_of_the_lbt(plant):
 
 def test_a_front_without_a_loop():
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    points = list(lbt.studies.tradeoff(walk, points=2, families=["central"]))
+    points = list(lbt.studies.tradeoff(walk, points=2))
     assert np.isnan(points[0].gain_low)
     assert len(tradeoff_figure(points).axes) == 1
-    with pytest.raises(lbt.errors.ProblemError, match="families must be"):
-        next(lbt.studies.tradeoff(walk, families=["best"]))
     with pytest.raises(lbt.errors.ProblemError, match="points must be at least 2"):
         next(lbt.studies.tradeoff(walk, points=1))
     with pytest.raises(lbt.errors.ProblemError, match="at least one point"):

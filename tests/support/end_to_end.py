@@ -5,10 +5,10 @@ from functools import cache
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.studies.paper.end_to_end import (
+from lbt_synth.studies.paper import (
     all_cases,
     make_entries,
-    plan_tables,
+    plan_cases,
 )
 
 CONFIG = "examples/lbt.yaml"
@@ -56,10 +56,10 @@ def fake_results(rows, gain=0.6, strehl=0.7):
 @cache
 def plan_rows():
     fixed = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5)
-    return plan_tables(load_setup(), {"slow": fixed}, seeds=(0, 1), row_seeds=(0,))
+    return plan_cases(load_setup(), {"slow": fixed}, seeds=(0, 1), row_seeds=(0,))
 
 
 @cache
 def make_table():
-    some = [row for row in plan_rows() if row.error_hz in (None, -3.5, 0.0, 3.5)]
+    some = [pair for pair in plan_rows() if pair[0].error_hz in (None, -3.5, 0.0, 3.5)]
     return make_entries(some, fake_results(some), load_setup())

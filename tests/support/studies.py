@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import textwrap
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import numpy as np
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
-from lbt_synth.studies.grid import Parts
+from lbt_synth.studies.grid import Sweep
 
 # cheap to evaluate: turbulence of the model, one integrator
 BASE = """
@@ -61,7 +60,7 @@ def evaluate_quickly(study, values, start):
 
 def part_rows(folder):
     """The rows of each part in the directory of a study."""
-    return list(Parts(folder=folder / "parts", columns=(), rows=0, digest="").paths())
+    return list(Sweep(folder=folder / "parts", columns=(), rows=0, digest="").paths())
 
 
 def make_folder(tmp_path, name="out"):
@@ -90,4 +89,4 @@ def assert_whole(folder, study, evaluate=evaluate_quickly):
         # which samples are in a batch moves what is below the accuracy of the evaluation
         np.testing.assert_allclose(found[name], expected[name], rtol=1e-6, err_msg=name)
     assert sum(stop - start for start, stop in part_rows(folder)) == study.samples
-    assert set(json.loads((folder / "study.json").read_text())["designs"]) == set(study.designed)
+    assert {path.stem for path in folder.glob("*.fits")} == set(study.designed)

@@ -56,4 +56,4 @@ def night():
 def page_of(columns, controllers=CONTROLLERS, parameters=PARAMETERS, study=None):
     statistics = lbt.studies.study_statistics(columns, parameters, controllers)
     more = {"folder": "out", "failures": FAILURES, "computing_s": 75.0}
-    return study_page(study or night(), columns, statistics=statistics, **more)
+    return study_page(study or night(), columns, statistics, **more)

@@ -54,8 +54,7 @@ from lbt_synth.report.page.html import (
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.words import count_text, listing_text
-from lbt_synth.studies import compare_in_truth
-from lbt_synth.studies.limits import TruthComparison
+from lbt_synth.studies.limits import TruthComparison, compare_in_truth
 from lbt_synth.studies.robustness import run_failures
 
 _PANELS = 6  # of one figure that has a panel per design: they fit a sheet

@@ -52,7 +52,7 @@ from lbt_synth.storage.rows import Facts, columns, fact, facts
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import LimitRow, RobustnessMap, robustness_map
-from lbt_synth.studies.limits import LimitStudy, TruthComparison
+from lbt_synth.studies.limits import LimitStudy, TruthComparison, compare_in_truth
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _CONVEX_ROUTES = ("sdp", "lmi")
@@ -316,7 +316,7 @@ def design_report(
             for design, loop, row in zip(designs.values(), loops, study.rows, strict=True)
         ),
         limits=study,
-        truth=studies.compare_in_truth(designs, config),
+        truth=compare_in_truth(designs, config),
         errors_hz=errors,
         files=tuple(files),
         versions=program_versions(("cvxpy", "clarabel") if solved else ()),

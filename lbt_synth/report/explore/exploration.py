@@ -31,7 +31,8 @@ from lbt_synth.report.figures.records import exact_spectrum
 from lbt_synth.storage.display_unit import nm_text, shown_unit
 from lbt_synth.storage.rows import fact, facts, row_table
 from lbt_synth.storage.tables import Table
-from lbt_synth.studies import compare_in_truth, robustness_map
+from lbt_synth.studies import robustness_map
+from lbt_synth.studies.limits import compare_in_truth
 from lbt_synth.validation import ComplexArray, FloatArray
 
 Content: TypeAlias = dict[str, Any]  # of a configuration file

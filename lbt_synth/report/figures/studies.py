@@ -16,7 +16,8 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, count_columns, drawing
 from lbt_synth.report.figures.loops import draw_design
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.studies import EndToEndEntry, RobustnessMap, RobustnessRow, TradeoffPoint
+from lbt_synth.storage.rows import Facts
+from lbt_synth.studies import RobustnessMap, RobustnessRow
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES
 from lbt_synth.validation import real_array, require_instance
@@ -245,7 +246,7 @@ _NAMES = dict(
 _GAINS = (1e-2, 1e2)  # sensor gains that a trade-off shows
 
 
-def tradeoff_figure(points: Sequence[TradeoffPoint], *, axes: OwnAxes = None) -> Figure:
+def tradeoff_figure(points: Sequence[Facts], *, axes: OwnAxes = None) -> Figure:
     """Draw deviation and stable sensor gains over the norm of the estimation error.
 
     Above, the standard deviation; below, if there are loops, the interval of sensor gains for which
@@ -442,7 +443,7 @@ def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
     return image.figure
 
 
-def end_to_end_table_figure(entries: Sequence[EndToEndEntry]) -> Figure:
+def end_to_end_table_figure(entries: Sequence[Facts]) -> Figure:
     """Strehl ratios of Table III by end-to-end simulation, the modal analysis and the paper."""
     rows = [e for e in entries if e.table == "III" and e.error_hz is not None]
     methods = list(dict.fromkeys(e.method for e in rows))

@@ -3,69 +3,55 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import time
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-import lbt_synth
 from lbt_synth.config import save_config
 from lbt_synth.config.ensemble import EXPECTED_ERRORS
 from lbt_synth.config.load import validate_sections
 from lbt_synth.config.plant_and_truth import turbulence_sections
 from lbt_synth.config.schema import Ar2Section, FileSection
 from lbt_synth.config.write import turbulence_content
-from lbt_synth.design import Design
-from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.methods.request import fixed_design
 from lbt_synth.storage.atomic_files import (
     UNFINISHED,
-    exclusive_lock,
     open_atomically,
     refuse_replacing,
     write_atomically,
 )
-from lbt_synth.storage.input_files import read_json
 from lbt_synth.storage.tables import csv_bytes
-from lbt_synth.studies.grid import (
-    Failure,
-    InlineExecutor,
-    Parts,
-    Result,
-    calls_in_flight,
-    refuse,
-)
+from lbt_synth.studies.grid import Failure, Result, Sweep, refuse
 from lbt_synth.studies.study.sample import (
-    Sample,
     are_evaluated_together,
-    design_for_sample,
     evaluate_row,
     evaluate_samples,
+    note_failure,
+)
+from lbt_synth.studies.study.study import (
+    DELAY_ERROR,
+    NOISE_FACTOR,
+    Sample,
+    Study,
+    design_for_sample,
     make_sample,
 )
-from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
 from lbt_synth.validation import FloatArray, integer, require_instance
 
-MANIFEST, PARTS, RESULTS, FAILED = "study.json", "parts", "results.csv", "failed.csv"
+PARTS, RESULTS, FAILED = "parts", "results.csv", "failed.csv"
 PAGE, PRINT = "summary.html", "summary.pdf"
-_SCHEMA = "lbt_synth study 2"
 _PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all digits
 # Rows of a part whose samples are evaluated together: some tenths of a second, of which the check
 # of one sample by itself is a fifth (benchmarks/study_rates.py would be slower with fewer). Where
 # each sample takes milliseconds or seconds, a killed study shall lose few of them.
 _ROWS_TOGETHER, _ROWS_ONE_BY_ONE = 8192, 16
-_FEWEST_PARTS = 4  # and twice as many as are in flight, so that none waits long for the last
-
-_NOISELESS = "has no noise, which no configuration takes: there is none to simulate it with."
 
 Evaluate = Callable[[Study, FloatArray, int], Result]
 
@@ -98,7 +84,7 @@ def run_study(
     Every part, a fixed number of rows, is a file in ``parts`` as soon as it is computed, written
     completely or not at all: a study that is killed at any moment, or whose worker died, resumes
     where it was. When all rows are computed, ``results.csv`` is written with one row per sample in
-    order, and ``failed.csv`` with the failures.
+    order, ``failed.csv`` with the failures, and a gain file for each design for the whole study.
 
     Parameters
     ----------
@@ -128,7 +114,7 @@ def run_study(
     ------
     OutputError
         If the directory belongs to another study, is in use or cannot be written, files in it
-        would be replaced, or a part or a design in it was changed.
+        would be replaced, or a part in it is damaged.
     NumericalError
         If a worker dies, or an executor breaks; what is finished is kept.
 
@@ -148,129 +134,60 @@ def run_study(
     require_instance(study, Study)
     if workers is not None:
         integer(workers, "workers", at_least=1)
-    executor = executor or InlineExecutor()
-    in_flight = calls_in_flight(executor, workers)
-    folder = Path(directory)
+    folder, began = Path(directory), time.perf_counter()
     refuse_replacing(output_paths(folder, study), study.inputs)
-    began = time.perf_counter()
-    parts, count = study_parts(folder, study), progress or (lambda rows: None)
-    with exclusive_lock(folder, "study"):
-        for path in [*folder.glob(UNFINISHED), *parts.folder.glob(UNFINISHED)]:
-            path.unlink()  # what a killed process left
-        _begin(folder, study)
-        for path in parts.paths().values():
-            parts.read(path)  # refuses what is damaged before any work
-        computed = sum(stop - start for start, stop in parts.missing())
-        if computed < study.samples:
-            count(study.samples - computed)
-        if computed:
-            controllers = study.controllers.values()
-            together = all(are_evaluated_together(study, each) for each in controllers)
-            share = -(-study.samples // max(_FEWEST_PARTS, 2 * in_flight))
-            parts.compute_missing(
-                partial(evaluate, study),
-                lambda rows: (study.values(*rows), rows[0]),
-                part_rows=min(_ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE, share),
-                executor=executor,
-                in_flight=in_flight,
-                progress=count,
-            )
-        contents = [parts.read(path) for path in parts.paths().values()]
-        failures = [failure for _, failed, _ in contents for failure in failed]
-        results = np.concatenate([result for result, _, _ in contents])
-        table = np.column_stack([np.arange(study.samples), study.values(), results])
-        new = _write_tables(folder, study, table, failures)
+    sweep = study_sweep(folder, study)
+    if not sweep.paths():
+        for path in output_paths(folder, study):
+            if path.exists():
+                why = "is not of a study in this directory, and would be replaced. Name another"
+                refuse(path, f"{why} directory, or delete it.")
+    outcome, computed = sweep.run(
+        evaluate,
+        lambda rows: (study, study.values(*rows), rows[0]),
+        part_rows=part_rows(study),
+        executor=executor,
+        workers=workers,
+        progress=progress,
+    )
+    table = np.column_stack([np.arange(study.samples), study.values(), outcome.results])
     return StudyRun(
         results=folder / RESULTS,
         failed=folder / FAILED,
         columns=dict(zip(study.columns, np.ascontiguousarray(table.T), strict=True)),
-        failures=tuple(failures),
+        failures=tuple(outcome.failures),
         computed=computed,
-        computing_s=sum(seconds for _, _, seconds in contents),
+        computing_s=outcome.seconds,
+        new=_write_outputs(folder, study, table, outcome.failures),
         seconds=time.perf_counter() - began,
-        new=new,
     )
 
 
-def study_parts(folder: Path, study: Study) -> Parts:
-    """Return the parts of a study in its directory."""
+def part_rows(study: Study) -> int:
+    """Return how many rows a part of a study has, at most."""
+    together = all(are_evaluated_together(study, each) for each in study.controllers.values())
+    return _ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE
+
+
+def study_sweep(folder: Path, study: Study) -> Sweep:
+    """Return the sweep of a study in its directory."""
     place, columns = folder / PARTS, study.result_columns
-    return Parts(folder=place, columns=columns, rows=study.samples, digest=study.digest)
+    return Sweep(folder=place, columns=columns, rows=study.samples, digest=study.digest)
 
 
 def output_paths(folder: Path, study: Study) -> list[Path]:
     """Return the files that a study writes into its directory, without its parts."""
     designs = [f"{name}.fits" for name in study.designed]
-    return [folder / name for name in (MANIFEST, RESULTS, FAILED, PAGE, PRINT, *designs)]
+    return [folder / name for name in (RESULTS, FAILED, PAGE, PRINT, *designs)]
 
 
-def read_manifest(folder: Path, study: Study) -> dict[str, Any] | None:
-    """Return the manifest of a study in its directory, None if it was not begun there."""
-    path = folder / MANIFEST
-    if not path.exists():
-        return None
-    try:
-        manifest = dict(read_json(path, OutputError))
-        readable = manifest["schema"] == _SCHEMA
-        source, version, _ = manifest["source"], manifest["version"], dict(manifest["designs"])
-    except (ValueError, KeyError, TypeError):
-        readable = False
-    if not readable:
-        refuse(path, "is no manifest of a study that this version reads. Name another directory.")
-    if manifest["digest"] != study.digest:
-        why = (
-            f"was made by lbt_synth {version}; this is {lbt_synth.__version__}"
-            if version != lbt_synth.__version__
-            else f"is of another study: {source} as it was, with its configuration and gain files"
-        )
-        refuse(folder, f"{why}. Name another directory, or delete it.")
-    return manifest
-
-
-def read_designs(folder: Path, study: Study) -> dict[str, Design]:
-    """Return the designs that a study wrote for its controllers, none if it was not begun."""
-    designs = {}
-    digests = (read_manifest(folder, study) or {}).get("designs", {})
-    for name in sorted(digests.keys() & study.settings.controllers.keys()):
-        path = folder / f"{name}.fits"
-        designs[name], digest = load_with_digest(path)
-        if digest != digests[name]:
-            why = "is not the design that the study was begun with. Put that back, or name another"
-            refuse(path, f"{why} directory.")
-    return designs
-
-
-def _begin(folder: Path, study: Study) -> None:
-    """Begin a study with its manifest and its designs, or check that it was begun here."""
-    manifest = read_manifest(folder, study)
-    if manifest is None:
-        for path in output_paths(folder, study):
-            if path.exists():
-                why = "is not of a study in this directory, and would be replaced. Name another"
-                refuse(path, f"{why} directory, or delete it.")
-        manifest = {
-            "schema": _SCHEMA,
-            "digest": study.digest,
-            "version": lbt_synth.__version__,
-            "source": str(study.source),
-            "designs": {},
-        }
-        _write_manifest(folder, manifest)
-    if manifest["designs"].keys() == study.designed.keys():
-        read_designs(folder, study)
-        return
-    # begun now, or killed before they were written
-    saved = {n: save_gain(folder / f"{n}.fits", design) for n, design in study.designed.items()}
-    digests = {name: load_with_digest(path)[1] for name, path in saved.items()}
-    _write_manifest(folder, manifest | {"designs": digests})
-
-
-def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
-    write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1).encode() + b"\n")
-
-
-def _write_tables(folder: Path, study: Study, table: FloatArray, failures: list[Failure]) -> bool:
-    """Write the tables of results and failures that are missing; return whether one was."""
+def _write_outputs(folder: Path, study: Study, table: FloatArray, failures: list[Failure]) -> bool:
+    """Write designs and tables that are missing; return whether one of the tables was."""
+    for path in folder.glob(UNFINISHED):
+        path.unlink()  # what a killed process left
+    for name, design in study.designed.items():
+        if not (folder / f"{name}.fits").exists():
+            save_gain(folder / f"{name}.fits", design)
     results, failed = folder / RESULTS, folder / FAILED
     new = not (results.exists() and failed.exists())
     if not failed.exists():
@@ -293,10 +210,8 @@ class Replay:
     stored: dict[str, float]  # its results in the study; empty if it has none yet
     # its results computed now, by the reference evaluation; without those that failed
     fresh: dict[str, float]
-    failures: tuple[Failure, ...]  # what failed now
-    # files that were written: the configuration, and the designs for this sample
-    files: tuple[Path, ...]
-    unwritten: str = ""  # why there is no configuration; empty if there is one
+    failures: tuple[Failure, ...]  # what failed now, the configuration among it
+    files: tuple[Path, ...]  # that were written: the configuration, and the designs for this sample
 
 
 def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Replay:
@@ -305,79 +220,33 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
     ``row_N.yaml`` is the configuration of the sample with its real delay and noise, and with the
     seed of its simulation: ``simulate row_N.yaml GAIN`` closes the loop of the sample. Designs
     for each sample, which assume the delay and the noise of ``config``, are ``row_N_NAME.fits``.
-
-    Parameters
-    ----------
-    study : Study
-        The study.
-    directory : path-like
-        Its directory, finished or not.
-    row : int
-        The number of the row.
-
-    Returns
-    -------
-    Replay
-        Parameters, stored and fresh results.
-
-    Raises
-    ------
-    ProblemError
-        If the study has no such row, or the configuration refuses its numbers.
-    OutputError
-        If the directory belongs to another study, or cannot be written.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt, tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     again = lbt.studies.replay_row(lbt.studies.load_study("examples/study.yaml"), folder, 3)
-    >>> [path.name for path in again.files], round(again.fresh["kalman.strehl"], 3)
-    (['row_3.yaml'], 0.824)
     """
     row = integer(row, "row", at_least=0)
     if row >= study.samples:
         raise ProblemError(f"the study has rows 0 to {study.samples - 1}; got row {row}.")
     folder = Path(directory)
-    stored = {}
-    if read_manifest(folder, study) is not None:
-        parts = study_parts(folder, study)
-        for (start, stop), path in parts.paths().items():
-            if start <= row < stop:
-                numbers = parts.read(path)[0][row - start]
-                stored = dict(zip(study.result_columns, numbers.tolist(), strict=True))
+    stored, sweep = {}, study_sweep(folder, study)
+    for (start, stop), path in sweep.paths().items():
+        if start <= row < stop:
+            numbers = sweep.read(path).results[row - start]
+            stored = dict(zip(study.result_columns, numbers.tolist(), strict=True))
     values = study.values(row, row + 1)[0]
     fresh, failures = evaluate_row(study, values, row)
-    sample = _, _, truth = make_sample(study, values)
-    has_noise = bool(np.all(np.asarray(truth.noise_nm) > 0))
-    return Replay(
-        stored=stored,
-        fresh=fresh,
-        failures=tuple(failures),
-        files=_write_files(study, folder, row, sample, with_config=has_noise),
-        unwritten="" if has_noise else f"row {row} {_NOISELESS}",
-    )
-
-
-def _write_files(
-    study: Study, folder: Path, row: int, sample: Sample, *, with_config: bool
-) -> tuple[Path, ...]:
-    """Write the configuration of a sample and its own designs, and return their paths."""
-    path = folder / f"row_{row}.yaml"
-    own = {
+    sample, path = make_sample(study, values), folder / f"row_{row}.yaml"
+    designs = {
         folder / f"row_{row}_{name}.fits": controller
         for name, controller in study.controllers.items()
         if fixed_design(controller) is None
     }
-    refuse_replacing([path, *own], study.inputs)
+    refuse_replacing([path, *designs], study.inputs)
     files = []
-    if with_config:
+    with note_failure(failures, row, ["configuration"]):
         settings, comments = _row_settings(study, row, sample)
         files.append(save_config(path, settings, comments=comments))
-    for gain, controller in own.items():
+    for gain, controller in designs.items():
         with contextlib.suppress(*EXPECTED_ERRORS):  # they are among the failures
             files.append(save_gain(gain, design_for_sample(controller, sample)))
-    return tuple(files)
+    return Replay(stored=stored, fresh=fresh, failures=tuple(failures), files=tuple(files))
 
 
 def _row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, dict[str, str]]:

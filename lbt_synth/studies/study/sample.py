@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import cast
@@ -11,69 +11,36 @@ import numpy as np
 
 from lbt_synth.config import Config, ensemble
 from lbt_synth.config.ensemble import EXPECTED_ERRORS, Samples
-from lbt_synth.config.load import build_config, validate_sections
-from lbt_synth.config.samples import Reads, set_number
-from lbt_synth.config.schema import FileSection
+from lbt_synth.config.samples import Reads
 from lbt_synth.design import Design
-from lbt_synth.errors import CertificateError, refuse_config
+from lbt_synth.errors import CertificateError
 from lbt_synth.loop import ClosedLoop, simulate
 from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.methods.request import DesignRequest, fixed_design
-from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.studies.grid import Failure, Result, loop_columns, residual_columns
-from lbt_synth.studies.study.study import DELAY_ERROR, NOISE_FACTOR, Study
+from lbt_synth.studies.study.study import (
+    DELAY_ERROR,
+    NOISE_FACTOR,
+    Sample,
+    Study,
+    close_sample_loop,
+    design_for_sample,
+    make_sample,
+)
 from lbt_synth.validation import FloatArray, IntArray
 
 _AGREEMENT = 1e-5  # relative, of a sample evaluated both ways; below 1 absolute
-_FEWEST = 4  # samples in a group that is worth an ensemble
-
-# of one sample: what designs assume, the real loop, and what that really meets
-Sample = tuple[Config, LoopHardware, Truth]
 
 
 def evaluate_samples(
     study: Study, values: FloatArray, start: int, *, together: bool = True
 ) -> Result:
-    """Evaluate consecutive samples.
+    """Evaluate consecutive rows of ``Study.values`` from a start; nan is where there is no result.
 
     Samples whose configurations differ by numbers that its builders take as arrays are evaluated
-    together by :func:`ensemble_residuals`; the equations of Kalman filters for samples are solved
-    together. Other designs, simulations, and samples that the configuration refuses
-    are evaluated one by one. So is one sample of each group that is evaluated together, and the
-    two answers must agree.
-
-    Parameters
-    ----------
-    study : Study
-        The study.
-    values : (b, parameters) ndarray
-        Rows of ``Study.values``.
-    start : int
-        Number of the first sample.
-    together : bool, optional
-        False evaluates all of them one by one.
-
-    Returns
-    -------
-    columns : dict of str to (b,) ndarray
-        Each of ``study.result_columns`` for each sample; a controller without a result has nan,
-        an unstable loop ``stable`` 0 and nan otherwise.
-    failures : list of (int, str, str)
-        The row, the controller without a result on it, and why; in the order of the rows.
-
-    Raises
-    ------
-    CertificateError
-        If a sample that is evaluated both ways has two answers.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> study = lbt.studies.load_study("examples/study.yaml")
-    >>> columns, failures = lbt.studies.evaluate_samples(study, study.values(0, 2), 0)
-    >>> columns["kalman.strehl"].round(3).tolist(), columns["kalman.stable"].tolist(), failures
-    ([0.831, 0.809], [1.0, 1.0], [])
+    together, and so are the equations of their Kalman filters. All others are evaluated one by one,
+    as is one sample of each group, and the two answers must agree.
     """
     columns = {name: np.full(len(values), np.nan) for name in study.result_columns}
     failures: list[Failure] = []
@@ -148,7 +115,7 @@ def _find_groups(study: Study, values: FloatArray, reads: Reads) -> Iterator[Int
         if not all(map(reads.take_arrays_at, places))
     ]
     _, which, counts = np.unique(values[:, apart], axis=0, return_inverse=True, return_counts=True)
-    for group in np.flatnonzero(counts >= min(_FEWEST, len(values))):
+    for group in np.flatnonzero(counts >= min(2, len(values))):
         yield np.flatnonzero(which.reshape(-1) == group)
 
 
@@ -182,25 +149,6 @@ def _require_agreement(
             )
 
 
-def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
-    """Make the sample of a row of ``Study.values``."""
-    base, parameters = study.config, study.parameters_by_name(values)
-    full = base.settings.model_dump()
-    content = base.settings.model_dump(exclude_unset=True)
-    for name, places in study.places.items():
-        for keys in places:
-            set_number(content, keys, parameters[name], full=full)
-    config = build_config(validate_sections(FileSection, content, base.source), base.source)
-    delay_error, factor = parameters.get(DELAY_ERROR, 0.0), parameters.get(NOISE_FACTOR, 1.0)
-    hardware, truth = config.hardware, config.truth
-    with refuse_config(f"the real loop, with {DELAY_ERROR} and {NOISE_FACTOR}"):
-        if delay_error != 0:
-            hardware = replace(hardware, delay_frames=hardware.delay_frames + delay_error)
-        if factor != 1:
-            truth = replace(truth, noise_nm=truth.noise_nm * factor)
-    return config, hardware, truth
-
-
 def evaluate_row(
     study: Study, values: FloatArray, row: int
 ) -> tuple[dict[str, float], list[Failure]]:
@@ -208,17 +156,17 @@ def evaluate_row(
     failures: list[Failure] = []
     loops: dict[str, ClosedLoop] = {}
     results: dict[str, float] = {}
-    with _note_failure(failures, row, study.controllers):
+    with note_failure(failures, row, study.controllers):
         sample = config, _, truth = make_sample(study, values)
         for name, controller in study.controllers.items():
-            with _note_failure(failures, row, [name]):
+            with note_failure(failures, row, [name]):
                 loops[name] = close_sample_loop(sample, design_for_sample(controller, sample))
         # frames to drop: the same for all controllers, which meet the same disturbances
         radii = [loop.radius_per_frame for loop in loops.values() if loop.is_stable]
         least = study.config.settings.simulation.settle_frames
         settle = max([least, *map(settling_frames, radii)])
         for name, loop in loops.items():
-            with _note_failure(failures, row, [name]):
+            with note_failure(failures, row, [name]):
                 if not loop.is_stable:
                     columns = {"stable": 0.0}
                 elif study.settings.evaluation == "exact":
@@ -231,25 +179,13 @@ def evaluate_row(
 
 
 @contextmanager
-def _note_failure(failures: list[Failure], row: int, controllers: Iterable[str]) -> Iterator[None]:
+def note_failure(failures: list[Failure], row: int, controllers: Iterable[str]) -> Iterator[None]:
     """Note an error that fails controllers on a sample, and not the study."""
     try:
         yield
     except EXPECTED_ERRORS as error:
         text = " ".join(str(error).split()) or type(error).__name__
         failures += [(row, name, text) for name in controllers]
-
-
-def design_for_sample(controller: Design | DesignRequest, sample: Sample) -> Design:
-    """Return a controller's design, made for the sample if it has none for all."""
-    design = fixed_design(controller)
-    return sample[0].design(cast("DesignRequest", controller)) if design is None else design
-
-
-def close_sample_loop(sample: Sample, design: Design) -> ClosedLoop:
-    """Close the real loop of a sample with a design."""
-    _, hardware, truth = sample
-    return design.close(hardware, sensor_gain=truth.sensor_gain)
 
 
 def _simulate(loop: ClosedLoop, sample: Sample, *, seed: int, settle: int) -> dict[str, float]:

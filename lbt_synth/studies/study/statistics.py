@@ -1,32 +1,32 @@
-"""Statistics of a study: each controller, comparisons of them, and what they depend on."""
+"""Statistics of a study and their tables: percentiles, and what the Strehl ratio depends on."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.storage.display_unit import shown_format, shown_unit
+from lbt_synth.storage.rows import cell_text
+from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array
 
 PERCENTS = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
-LEVELS = (0.3, 0.5, 0.7, 0.8)
-CONFIDENCE = 0.95
+CONFIDENCE = 0.95  # of the interval of a percentile or a share
 _MOST_WORST = 10  # samples that are listed
-_PARTS = ("turbulence", "vibration", "noise", "within")
-_EQUAL = 1e-6  # difference of Strehl ratios that is rounding: the accuracy of the evaluation
 _FEWEST = 20  # samples for an index
-_CONSTANT = 1e-12  # of the largest result: a smaller scatter is rounding
+_CONSTANT = 1e-12  # scatter of a Strehl ratio that is rounding
 # With more groups than 8 and fewer samples, one parameter of a Sobol sequence inherits up to 9 % of
 # another (benchmarks/study_statistics.py)
 _FEW_GROUPS, _MANY_SAMPLES = 8, 4096
-_GROUPS = ((200, 4), (1600, 8), (20_000, 16))  # of a curve: samples, and groups if there are fewer
-_MOST_GROUPS = 32
 _MOST_VALUES = 32  # a parameter with more distinct values is continuous
+
+Samples = dict[str, Any]  # columns (n,) of one controller
+_Row = tuple[str | Cell, ...]  # a label and a cell for each controller, or a heading alone
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,18 +42,6 @@ _NONE = Interval(value=np.nan, low=np.nan, high=np.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ControllerSamples:
-    """One controller on n samples; all arrays (n,)."""
-
-    controller: str  # its name
-    strehl: FloatArray  # 0 where unstable, nan where the evaluation failed
-    residual_nm: FloatArray  # [nm rms]; inf where unstable, nan where the evaluation failed
-    evaluated: BoolArray  # where the evaluation did not fail
-    unstable: BoolArray
-    parts_nm: dict[str, FloatArray]  # of the residual, by origin [nm rms]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ControllerStatistics:
     """Statistics of one controller over all samples."""
 
@@ -66,24 +54,22 @@ class ControllerStatistics:
     mean: float  # mean of the Strehl ratio, and its standard error for independent samples
     mean_error: float
     strehl: dict[float, Interval]  # percentiles of the Strehl ratio
-    above: dict[float, Interval]  # share of the samples whose Strehl ratio is above each level
     residual_nm: dict[float, Interval]  # percentiles of the residual [nm rms]
-    parts_nm: dict[str, float]  # median of each part of the residual over the stable loops [nm rms]
-    best: Interval  # share of the samples on which no controller has a higher Strehl ratio
-    loss: dict[float, Interval]  # percentiles of the highest Strehl ratio of all minus this one
     worst: tuple[int, ...]  # places of the samples on which it does worst, the worst first
-    # for each parameter: index, the part of the variance that it explains by itself, index_error,
-    # and spearman, the rank correlation; nan for a constant
+    # for each parameter: index, the part of the variance that it explains by itself, and
+    # index_error, its standard error; nan for a constant
     sensitivity: dict[str, dict[str, float]]
-    # Strehl ratio in groups of each parameter that varies, (k,) each: the parameter, mean, low, its
-    # 10th percentile, and unstable, the part of the loops
-    curves: dict[str, dict[str, FloatArray]]
 
     @property
     def ranked(self) -> tuple[str, ...]:
         """The parameters that vary, by falling index."""
-        index = {name: row["index"] for name, row in self.sensitivity.items()}
-        return tuple(sorted((n for n in index if np.isfinite(index[n])), key=lambda n: -index[n]))
+        varying = (n for n, row in self.sensitivity.items() if np.isfinite(row["index"]))
+        return tuple(sorted(varying, key=lambda name: -self.sensitivity[name]["index"]))
+
+    def index(self, name: str) -> tuple[float, float]:
+        """Return the index of a parameter and its standard error."""
+        row = self.sensitivity[name]
+        return row["index"], row["index_error"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -93,18 +79,11 @@ class StudyStatistics:
     samples: int  # samples in the study so far
     parameters: tuple[str, ...]  # their names
     controllers: tuple[ControllerStatistics, ...]  # each controller by itself
-    # each controller less each later one on the samples on which neither failed: the parts better
-    # and equal, mean, mean_error and percentiles of the difference of the Strehl ratios
-    comparisons: dict[str, dict[str, float]]
 
     @property
     def ranked(self) -> tuple[str, ...]:
         """The parameters with an index for any controller, by falling greatest index."""
-        pairs = [
-            (each.sensitivity[name]["index"], name)
-            for each in self.controllers
-            for name in each.ranked
-        ]
+        pairs = [(one.index(name)[0], name) for one in self.controllers for name in one.ranked]
         return tuple(dict.fromkeys(name for _, name in sorted(pairs, key=lambda pair: -pair[0])))
 
 
@@ -120,9 +99,7 @@ def study_statistics(
     columns : mapping of str to (n,) array_like
         Results: each parameter under its name and, for each controller, ``NAME.strehl`` (nan
         where unstable or failed), ``NAME.residual_nm`` and ``NAME.stable`` (1, 0; nan where the
-        evaluation failed); ``NAME.turbulence_nm``, ``NAME.vibration_nm``, ``NAME.noise_nm``,
-        ``NAME.within_nm`` and
-        ``row`` (number of the sample) are optional.
+        evaluation failed); ``row`` (number of the sample) is optional.
     parameters : sequence of str
         Names of the parameters.
     controllers : sequence of str
@@ -163,7 +140,7 @@ def study_statistics(
     size = len(read_column(columns, f"{controllers[0]}.stable"))
     if not size:
         raise ProblemError("the results must have at least one sample; got none.")
-    samples = [read_controller_samples(columns, name, size) for name in controllers]
+    samples = {name: read_controller_samples(columns, name, size) for name in controllers}
     values = {name: read_column(columns, name, size, finite=True) for name in parameters}
     rows = np.arange(size)
     if "row" in columns:
@@ -173,83 +150,37 @@ def study_statistics(
         samples=size,
         parameters=tuple(parameters),
         controllers=tuple(
-            _controller_statistics(each, loss, rows, values, orders)
-            for each, loss in zip(samples, sample_losses(samples), strict=True)
+            _controller_statistics(name, columns, rows, values, orders)
+            for name, columns in samples.items()
         ),
-        comparisons={
-            f"{first.controller} less {second.controller}": _compare(first, second)
-            for first, second in combinations(samples, 2)
-        },
     )
 
 
 def _controller_statistics(
-    samples: ControllerSamples,
-    loss: FloatArray,
+    controller: str,
+    samples: Samples,
     rows: IntArray,
     values: Mapping[str, FloatArray],
     orders: Mapping[str, IntArray],
 ) -> ControllerStatistics:
-    """Return the statistics of one controller, given the order of each parameter's values."""
-    from scipy.stats import rankdata
-
-    strehl = samples.strehl[samples.evaluated]
+    """Return the statistics of one controller, with the order of each parameter's values."""
+    places = np.flatnonzero(samples["evaluated"])
+    strehl, unstable = samples["strehl"][places], samples["unstable"][places]
     mean, error = mean_and_error(strehl)
-    ranks = np.asarray(rankdata(samples.strehl, nan_policy="omit"))
-    dependence = {n: _sensitivity(values[n], orders[n], samples, ranks) for n in values}
-    stable = samples.evaluated & ~samples.unstable
+    worst = places[np.lexsort((rows[places], strehl, ~unstable))[:_MOST_WORST]]
     return ControllerStatistics(
-        controller=samples.controller,
+        controller=controller,
         samples=len(strehl),
-        failed=len(samples.strehl) - len(strehl),
-        unstable=int(np.count_nonzero(samples.unstable)),
-        unstable_share=share(samples.unstable[samples.evaluated]),
+        failed=len(samples["strehl"]) - len(strehl),
+        unstable=int(np.count_nonzero(unstable)),
+        unstable_share=share(unstable),
         mean=mean,
         mean_error=error,
         strehl=percentiles(strehl, PERCENTS),
-        above={level: share(strehl > level) for level in LEVELS},
-        residual_nm=percentiles(samples.residual_nm[samples.evaluated], PERCENTS),
-        parts_nm={
-            part: float(np.median(numbers[stable])) if stable.any() else np.nan
-            for part, numbers in samples.parts_nm.items()
-        },
-        best=share(loss <= _EQUAL),
-        loss=percentiles(loss, (50.0, 95.0, 99.0)),
-        worst=_worst(samples, rows),
-        sensitivity={name: row for name, (row, _) in dependence.items()},
-        curves={name: curve for name, (_, curve) in dependence.items() if curve},
+        residual_nm=percentiles(samples["residual_nm"][places], PERCENTS),
+        worst=tuple(worst.tolist()),
+        sensitivity={name: _sensitivity(values[name], orders[name], samples) for name in values},
     )
-
-
-def _worst(samples: ControllerSamples, rows: IntArray) -> tuple[int, ...]:
-    """Return the places of the samples of least Strehl ratio, the unstable ones first."""
-    places = np.flatnonzero(samples.evaluated)
-    order = np.lexsort((rows[places], samples.strehl[places], ~samples.unstable[places]))
-    return tuple(places[order[:_MOST_WORST]].tolist())
-
-
-def _compare(first: ControllerSamples, second: ControllerSamples) -> dict[str, float]:
-    """Compare two controllers sample by sample."""
-    both = first.evaluated & second.evaluated
-    difference = first.strehl[both] - second.strehl[both]
-    mean, error = mean_and_error(difference)
-    low, median, high = percentiles(difference, (5.0, 50.0, 95.0)).values()
-    return {
-        "better": share(difference > _EQUAL).value,
-        "equal": share(np.abs(difference) <= _EQUAL).value,
-        "mean": mean,
-        "mean_error": error,
-        "5th percentile": low.value,
-        "median": median.value,
-        "95th percentile": high.value,
-    }
-
-
-def sample_losses(controllers: Sequence[ControllerSamples]) -> tuple[FloatArray, ...]:
-    """Return for each controller the best Strehl ratio minus its own, on every sample (m,)."""
-    whole = np.logical_and.reduce([each.evaluated for each in controllers])
-    best = np.max([each.strehl[whole] for each in controllers], axis=0)
-    return tuple(best - each.strehl[whole] for each in controllers)
 
 
 def read_column(
@@ -265,70 +196,57 @@ def read_column(
     if out.ndim != 1 or (size is not None and len(out) != size):
         demand = "be 1-D" if size is None else f"have {size} rows, as the others"
         raise DimensionError(f"column {name!r} must {demand}; got shape {out.shape}.")
-    if finite:
-        _refuse_where(~np.isfinite(out), out, NonFiniteError, f"column {name!r} must be finite")
+    _refuse_where(finite & ~np.isfinite(out), out, f"column {name!r} must be finite")
     return out
 
 
 def read_controller_samples(
     columns: Mapping[str, Any], controller: str, size: int | None = None
-) -> ControllerSamples:
-    """Read the columns of a controller, (n,) each."""
-    stable_column = read_column(columns, f"{controller}.stable", size)
-    size = len(stable_column)
-    evaluated, unstable = ~np.isnan(stable_column), stable_column == 0
-    stable = stable_column == 1
-    demand = f"column '{controller}.stable' must be 1, 0 or nan"
-    _refuse_where(evaluated & ~unstable & ~stable, stable_column, ProblemError, demand)
-    results = {}
-    for name, most, range_, lost in (
+) -> Samples:
+    """Read the columns of a controller, (n,) each: results, and what was evaluated and unstable.
+
+    An unstable loop has a Strehl ratio of 0 and an infinite residual, a failed evaluation has nan.
+    """
+    mark = read_column(columns, f"{controller}.stable", size)
+    evaluated, stable = ~np.isnan(mark), mark == 1
+    wrong = evaluated & ~stable & (mark != 0)
+    _refuse_where(wrong, mark, f"column '{controller}.stable' must be 1, 0 or nan")
+    results: Samples = {}
+    for name, most, said, lost in (
         ("strehl", 1 + 1e-9, "within [0, 1]", 0.0),
-        ("residual_nm", np.inf, "at least 0", np.inf),
+        ("residual_nm", np.finfo(float).max, "finite and at least 0", np.inf),
     ):
-        values = read_column(columns, f"{controller}.{name}", size)
-        demand = (
-            f"column '{controller}.{name}' must be finite and {range_} where the loop is stable"
-        )
-        _refuse_where(stable & ~np.isfinite(values), values, NonFiniteError, demand)
-        outside = ~((values >= 0) & (values <= most))
-        _refuse_where(stable & outside, values, ProblemError, demand)
+        values = read_column(columns, f"{controller}.{name}", mark.size)
+        demand = f"column '{controller}.{name}' must be {said} where the loop is stable"
+        _refuse_where(stable & ~((values >= 0) & (values <= most)), values, demand)
         results[name] = np.where(stable, values, np.where(evaluated, lost, np.nan))
-    parts = {part: f"{controller}.{part}_nm" for part in _PARTS}
-    return ControllerSamples(
-        controller=controller,
-        **results,
-        evaluated=evaluated,
-        unstable=unstable,
-        parts_nm={p: read_column(columns, n, size) for p, n in parts.items() if n in columns},
-    )
+    return results | {"evaluated": evaluated, "unstable": evaluated & ~stable}
 
 
-def _refuse_where(
-    wrong: BoolArray, values: FloatArray, error: type[ProblemError], demand: str
-) -> None:
+def _refuse_where(wrong: BoolArray, values: FloatArray, demand: str) -> None:
     """Refuse a column with wrong values, and show the first."""
     if np.any(wrong):
         row = int(np.argmax(wrong))
-        raise error(f"{demand}; got {values[row]:g} at index {row}. Check the file of the results.")
+        text = f"{demand}; got {values[row]:g} at index {row}. Check the file of the results."
+        raise (ProblemError if np.isfinite(values[row]) else NonFiniteError)(text)
 
 
 def percentiles(values: FloatArray, percents: Sequence[float]) -> dict[float, Interval]:
     """Return percentiles of a sample (n,), with intervals from order statistics."""
     from scipy.stats import binom
 
-    n, tail = len(values), (1 - CONFIDENCE) / 2
+    n, tail, parts = len(values), (1 - CONFIDENCE) / 2, np.array(percents) / 100
     if n == 0:
         return dict.fromkeys(percents, _NONE)
     ordered = np.sort(values)
     limits = np.concatenate(([np.nan], ordered, [np.nan]))  # none before the first, after the last
-    table = {}
-    for percent in percents:
-        first = int(binom.ppf(tail, n, percent / 100))
-        last = int(binom.ppf(1 - tail, n, percent / 100)) + 1
-        low, high = limits[[max(first, 0), last]].tolist()
-        value = _interpolate(ordered, percent / 100)
-        table[percent] = Interval(value=value, low=low, high=high)
-    return table
+    first = np.array(np.maximum(binom.ppf(tail, n, parts), 0), dtype=np.int64)
+    last = np.array(binom.ppf(1 - tail, n, parts), dtype=np.int64) + 1
+    rows = zip(percents, limits[first].tolist(), limits[last].tolist(), strict=True)
+    return {
+        percent: Interval(value=_interpolate(ordered, percent / 100), low=low, high=high)
+        for percent, low, high in rows
+    }
 
 
 def _interpolate(ordered: FloatArray, fraction: float) -> float:
@@ -361,19 +279,13 @@ def mean_and_error(values: FloatArray) -> tuple[float, float]:
     return mean, float(np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else np.nan
 
 
-def _sensitivity(
-    values: FloatArray, order: IntArray, samples: ControllerSamples, ranks: FloatArray
-) -> tuple[dict[str, float], dict[str, FloatArray]]:
-    """Return how the Strehl ratio depends on one parameter, and its curve."""
-    order = order[samples.evaluated[order]]
-    ordered, strehl = values[order], samples.strehl[order]
-    if len(ordered) < _FEWEST or ordered[0] == ordered[-1]:
-        return dict.fromkeys(("index", "index_error", "spearman"), np.nan), {}
-    index, error = first_order_index(ordered, strehl)
-    with np.errstate(invalid="ignore"):  # nan if the Strehl ratio is constant
-        spearman = float(np.corrcoef(_ranks(ordered), ranks[order])[0, 1])
-    row = {"index": index, "index_error": error, "spearman": spearman}
-    return row, conditional_curve(ordered, strehl, samples.unstable[order])
+def _sensitivity(values: FloatArray, order: IntArray, samples: Samples) -> dict[str, float]:
+    """Return how much of the variance of the Strehl ratio one parameter explains."""
+    order = order[samples["evaluated"][order]]
+    ordered, index = values[order], (np.nan, np.nan)
+    if len(ordered) >= _FEWEST and ordered[0] < ordered[-1]:
+        index = first_order_index(ordered, samples["strehl"][order])
+    return dict(zip(("index", "index_error"), index, strict=True))
 
 
 def first_order_index(ordered: FloatArray, result: FloatArray) -> tuple[float, float]:
@@ -385,27 +297,24 @@ def first_order_index(ordered: FloatArray, result: FloatArray) -> tuple[float, f
     value for each of a list.
     """
     n = len(ordered)
-    largest = float(np.max(np.abs(result), initial=0.0))
-    scaled = result / (largest or 1.0)
-    spread = scaled - np.mean(scaled)
+    spread = result - np.mean(result)
     total = float(spread @ spread)
     if total <= n * _CONSTANT**2:
         return np.nan, np.nan
     if is_list(ordered):
         starts = value_starts(ordered)
-        coefficients = len(starts)
+        coefficients, jumps = len(starts), np.full(1, np.inf)  # a list has no joints
         counts = np.diff(np.append(starts, n))
         fit = np.repeat(np.add.reduceat(spread, starts) / counts, counts)
-        scatter = float(np.sum((spread - fit) ** 2)) / (n - coefficients)
     else:
         groups = round(n ** (1 / 3))
         starts = group_starts(ordered, groups if n >= _MANY_SAMPLES else min(groups, _FEW_GROUPS))
         coefficients = 2 * len(starts)
         fit, jumps = _lines(spread, _ranks(ordered), starts)
-        scatter = float(np.sum((spread - fit) ** 2)) / (n - coefficients)
-        # a jump between lines of n / B samples has 8 B / n of the variance of their scatter,
-        # which is less for even samples than for independent ones
-        scatter = min(scatter, float(np.mean(jumps**2)) / 8 * n / len(starts))
+    # a jump between lines of n / B samples has 8 B / n of the variance of their scatter, which is
+    # less for even samples than for independent ones
+    scatter = float(np.sum((spread - fit) ** 2)) / (n - coefficients)
+    scatter = min(scatter, float(np.mean(jumps**2)) / 8 * n / len(starts))
     squares = (spread - fit) ** 2
     unexplained = float(np.sum(squares)) / total
     # a fit follows some of the scatter (T. L. Kelley, Proc. Natl. Acad. Sci. 21, 554 (1935))
@@ -428,22 +337,6 @@ def _lines(
     rises = slopes * counts / 2
     fit = np.repeat(means, counts) + np.repeat(slopes, counts) * place
     return fit, (means - rises)[1:] - (means + rises)[:-1]
-
-
-def conditional_curve(
-    ordered: FloatArray, strehl: FloatArray, unstable: BoolArray
-) -> dict[str, FloatArray]:
-    """Return the Strehl ratio (n,) in groups of a parameter in rising order (n,), by column."""
-    n = len(ordered)
-    groups = next((k for limit, k in _GROUPS if n < limit), _MOST_GROUPS)
-    starts = value_starts(ordered) if is_list(ordered) else group_starts(ordered, groups)
-    rows = []
-    for group in np.split(np.arange(n), starts[1:]):
-        here = strehl[group]
-        middle = 0.5 * (ordered[group[(len(group) - 1) // 2]] + ordered[group[len(group) // 2]])
-        rows.append((middle, np.mean(here), np.percentile(here, 10), np.mean(unstable[group])))
-    names = ("parameter", "mean", "low", "unstable")
-    return dict(zip(names, np.array(rows, dtype=np.float64).T, strict=True))
 
 
 def _ranks(ordered: FloatArray) -> FloatArray:
@@ -472,3 +365,127 @@ def group_starts(ordered: FloatArray, groups: int) -> IntArray:
     """
     n = len(ordered)
     return np.unique(np.searchsorted(ordered, ordered[np.arange(groups) * n // groups]))
+
+
+def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
+    """Return the tables of a study that have rows: Strehl ratios, residuals, dependence."""
+    kinds = (strehl_table, residual_table, sensitivity_table)
+    return tuple(table for kind in kinds if (table := kind(statistics)).rows)
+
+
+def strehl_table(statistics: StudyStatistics) -> Table:
+    """Strehl ratio of each controller: mean, percentiles, and how many loops are unstable."""
+    controllers = statistics.controllers
+    rows: list[_Row] = [
+        ("mean ± standard error", *(_with_error(c.mean, c.mean_error, 2) for c in controllers)),
+        *((_ordinal(p), *(_interval(c.strehl[p]) for c in controllers)) for p in PERCENTS),
+        ("samples",),
+        (
+            "unstable, counted as 0 [%]",
+            *(_bad_if(c.unstable, _interval(c.unstable_share, 2)) for c in controllers),
+        ),
+        ("evaluated", *(str(c.samples) for c in controllers)),
+        ("failed", *(_bad_if(c.failed, str(c.failed)) for c in controllers)),
+    ]
+    caption = "Strehl ratio over the samples, with 95 % intervals for independent samples"
+    return _table_by_controller(caption, "of the Strehl ratio [%]", statistics, rows)
+
+
+def residual_table(statistics: StudyStatistics) -> Table:
+    """Percentiles of the residual of each controller."""
+    unit, factor = shown_unit("nm rms")
+
+    def text(residual_nm: float) -> str:
+        if np.isinf(residual_nm):
+            return "unstable"
+        return cell_text(residual_nm * factor, shown_format(".1f", factor))
+
+    rows: list[_Row] = [
+        (_ordinal(p), *(text(c.residual_nm[p].value) for c in statistics.controllers))
+        for p in PERCENTS
+    ]
+    caption = "Residual of tip and tilt over the samples"
+    return _table_by_controller(caption, f"residual [{unit}]", statistics, rows)
+
+
+def sensitivity_table(statistics: StudyStatistics, names: Mapping[str, str] | None = None) -> Table:
+    """First-order indices of the parameters, one column per controller, and what they lack."""
+    controllers = statistics.controllers
+    rows: list[_Row] = [
+        ((names or {}).get(name, name), *(_with_error(*c.index(name)) for c in controllers))
+        for name in statistics.ranked
+    ]
+    if rows:
+        rest = []
+        for controller in controllers:
+            pairs = np.array([controller.index(name) for name in controller.ranked]).reshape(-1, 2)
+            total = float(np.sum(pairs[:, 0])) if len(pairs) else np.nan
+            rest.append(_with_error(1 - total, float(np.linalg.norm(pairs[:, 1]))))
+        rows.append(("only together (interactions)", *rest))
+    caption = "Variance of the Strehl ratio that one parameter explains by itself [%]"
+    return _table_by_controller(caption, "parameter", statistics, rows)
+
+
+def worst_table(
+    controller: ControllerStatistics,
+    columns: Mapping[str, ArrayLike],
+    parameters: Sequence[str],
+    names: Mapping[str, str] | None = None,
+) -> Table:
+    """List the samples on which a controller does worst, from the columns of the results."""
+    places, name, words = list(controller.worst), controller.controller, names or {}
+
+    def at(column: str) -> list[float]:
+        return [float(value) for value in np.asarray(columns[column], dtype=np.float64)[places]]
+
+    rows = [f"{row:.0f}" for row in at("row")] if "row" in columns else [str(i) for i in places]
+    strehls: list[str | Cell] = [
+        percent(strehl) if stable else Cell(text="unstable", tone="bad")
+        for strehl, stable in zip(at(f"{name}.strehl"), at(f"{name}.stable"), strict=True)
+    ]
+    values = [[f"{value:.5g}" for value in at(parameter)] for parameter in parameters]
+    return Table(
+        caption=f"Worst samples of {name}",
+        headings=("row", "Strehl [%]", *(words.get(name, name) for name in parameters)),
+        rows=tuple(zip(rows, strehls, *values, strict=True)),
+    )
+
+
+def percent(value: float, digits: int = 1) -> str:
+    """Return a part as a percentage, a dash if it is nan."""
+    return cell_text(100 * value, f".{digits}f")
+
+
+def _ordinal(percentile: float) -> str:
+    """Return the name of one of the percentiles."""
+    return f"{percentile:g}{'st' if percentile == 1 else 'th'} percentile"
+
+
+def _table_by_controller(
+    caption: str, heading: str, statistics: StudyStatistics, rows: Sequence[_Row]
+) -> Table:
+    """Return a table with a column per controller."""
+    headings = (heading, *(controller.controller for controller in statistics.controllers))
+    return Table(caption=caption, headings=headings, rows=tuple(rows))
+
+
+def _with_error(value: float, error: float, digits: int = 1) -> str:
+    """Return a part with its standard error as percentages, a dash if it is nan."""
+    text = percent(value, digits)
+    return text if text == "-" or np.isnan(error) else f"{text} ± {percent(error, digits)}"
+
+
+def _interval(interval: Interval, digits: int = 1) -> str:
+    """Return a percentage and the limits of its interval that there are."""
+    numbers = interval.value, interval.low, interval.high
+    text, low, high = (percent(number, digits) for number in numbers)
+    if low == high == "-":
+        return text
+    if "-" in (low, high):
+        return f"{text} (to {high})" if low == "-" else f"{text} (from {low})"
+    return f"{text} ({low} to {high})"
+
+
+def _bad_if(count: int, text: str) -> str | Cell:
+    """Return a text, marked as bad if it counts any."""
+    return Cell(text=text, tone="bad") if count else text

@@ -1,31 +1,49 @@
-"""A Monte Carlo study: its file, and the rows of its samples."""
+"""A Monte Carlo study: its file, the rows of its samples, and the loop of each."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from pydantic import ConfigDict, Field, model_validator
-from scipy.special import ndtr, ndtri
 
-from lbt_synth.config import Config
-from lbt_synth.config.samples import Keys, parse_path
+import lbt_synth
+from lbt_synth.config import Config, load_config
+from lbt_synth.config.load import build_config, read_mapping, validate_sections
+from lbt_synth.config.samples import Keys, find_number, parse_path, set_number
+from lbt_synth.config.schema import FileSection
 from lbt_synth.design import Design
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import (
+    ConfigError,
+    LbtSynthError,
+    ProblemError,
+    name_file,
+    name_key,
+    refuse_config,
+)
+from lbt_synth.files.gain_file.store import load_with_digest
+from lbt_synth.loop import ClosedLoop
+from lbt_synth.methods import method_named
 from lbt_synth.methods.method import Section
-from lbt_synth.methods.request import DesignRequest, fixed_design
+from lbt_synth.methods.request import DesignRequest, Wording, design_request, fixed_design
+from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.studies.grid import RESIDUALS
-from lbt_synth.validation import FloatArray, IntArray, integer
+from lbt_synth.validation import FloatArray, integer
 
 DELAY_ERROR = "error.delay_frames"
 NOISE_FACTOR = "error.noise_factor"
 EXACT_COLUMNS = ("strehl", *RESIDUALS, "stable")
 SIMULATED_COLUMNS = ("strehl", "residual_nm", "stable")
 _EDGE = 2.0**-32  # levels stay this far from 0 and 1, where a normal quantile is infinite
+# of one sample: what designs assume, the real loop, and what that really meets
+Sample = tuple[Config, LoopHardware, Truth]
 ControllerName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]*$", max_length=100)]
 
 
@@ -42,12 +60,6 @@ class NormalSection(Section):
         low, high = self.ends
         if not low < high:
             raise ValueError(f"low must be below high; got {low:g} and {high:g}")
-        start, stop, _ = self._cut
-        if not stop - start > 0:
-            raise ValueError(
-                f"a normal distribution of mean {self.mean:g} and deviation {self.deviation:g} "
-                f"has nothing between {low:g} and {high:g}"
-            )
         return self
 
     @property
@@ -56,26 +68,14 @@ class NormalSection(Section):
         low, high = self.low, self.high
         return -np.inf if low is None else low, np.inf if high is None else high
 
-    @property
-    def _cut(self) -> tuple[float, float, float]:
-        """Probabilities of the ends, and +1, or -1 if both count from above.
-
-        Floating-point numbers resolve 1 - F above the mean, and F below.
-        """
-        low, high = ((end - self.mean) / self.deviation for end in self.ends)
-        if low > 0:
-            return float(ndtr(-high)), float(ndtr(-low)), -1.0
-        return float(ndtr(low)), float(ndtr(high)), 1.0
-
     def quantile(self, level: FloatArray) -> FloatArray:
         """Return the values at levels in [0, 1)."""
-        start, stop, sign = self._cut
-        share = np.clip(level, _EDGE, 1 - _EDGE)
-        share = share if sign > 0 else 1 - share
-        standard = sign * ndtri(start + share * (stop - start))
+        from scipy.stats import truncnorm
+
+        low, high = ((end - self.mean) / self.deviation for end in self.ends)
+        standard = truncnorm.ppf(np.clip(level, _EDGE, 1 - _EDGE), low, high)
         with np.errstate(over="ignore"):  # an infinite value is refused later
-            found = self.mean + self.deviation * standard
-        return np.clip(found, *self.ends)
+            return np.clip(self.mean + self.deviation * standard, *self.ends)
 
 
 class ParameterSection(Section):
@@ -140,31 +140,22 @@ class ParameterSection(Section):
         if self.uniform is not None:
             low, high = self.uniform
             return np.clip(low + level * (high - low), low, high)
-        return self._pick(np.arange(len(self.values)), level)
-
-    def _pick(self, order: IntArray, level: FloatArray) -> FloatArray:
-        """Return the values of a list, in an order, below which each share of the weights lies."""
-        weights = np.array(self.weights or [1.0] * len(self.values))[order]
-        shares = weights / np.max(weights)  # so that their sum cannot overflow
-        bounds = np.cumsum(shares) / np.sum(shares)
-        return np.array(self.values)[order][np.searchsorted(bounds[:-1], level, side="right")]
+        bounds = np.cumsum(self.weights or [1.0] * len(self.values))
+        return np.array(self.values)[np.searchsorted(bounds[:-1] / bounds[-1], level, side="right")]
 
     def extremes(self, samples: int) -> tuple[float, float]:
         """Return the ends, or values beyond which half a sample is expected."""
-        given = self.normal.ends if self.normal is not None else self.uniform or self.values
-        inside = self.quantile(np.array([0.5 / samples, 1 - 0.5 / samples])).tolist()
-        low, high = (
-            end if np.isfinite(end) else value
-            for end, value in zip((min(given), max(given)), inside, strict=True)
-        )
+        if self.normal is None:
+            return min(self.uniform or self.values), max(self.uniform or self.values)
+        inside, ends = self.quantile(np.array([0.5 / samples, 1 - 0.5 / samples])), self.normal.ends
+        low, high = np.where(np.isfinite(ends), ends, inside).tolist()
         return low, high
 
     def median(self) -> float:
-        """Return the median."""
-        half = np.array([0.5])
+        """Return the median; the middle one of a list."""
         if self.values:
-            return float(self._pick(np.argsort(self.values), half)[0])
-        return float(self.quantile(half)[0])
+            return sorted(self.values)[len(self.values) // 2]
+        return float(self.quantile(np.array([0.5]))[0])
 
 
 class ControllerSection(Section):
@@ -280,7 +271,7 @@ class Study:
         varying = sum(distribution.varies for distribution in distributions)
         levels = iter(unit_points(self.settings, varying, start, stop).T)
         none = np.zeros(stop - start)
-        columns = [each.quantile(next(levels) if each.varies else none) for each in distributions]
+        columns = [law.quantile(next(levels) if law.varies else none) for law in distributions]
         return np.stack(columns, axis=1)
 
     def simulation_seed(self, row: int) -> int:
@@ -303,15 +294,14 @@ def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) 
     """Return points ``start`` to ``stop`` of a study's sampling, (., dimensions) in [0, 1).
 
     The seed fixes every point. A longer Sobol sequence begins with the same points, and is
-    balanced where it has 2^k of them. A Latin hypercube is made as a whole, once per process.
+    balanced where it has 2^k of them. A Latin hypercube is made as a whole.
     """
-    from scipy.stats import qmc
-
     if dimensions == 0 or stop == start:
         return np.zeros((stop - start, dimensions))
     if settings.sampling == "latin_hypercube":
-        return _hypercube(settings.samples, dimensions, settings.seed)[start:stop]
-    engine: qmc.Sobol = _sobol(dimensions, settings.seed).reset()
+        points = _sampler("LatinHypercube", dimensions, settings.seed, settings.samples)
+        return np.asarray(points[start:stop])
+    engine = _sampler("Sobol", dimensions, settings.seed).reset()
     if start > 0:
         return np.asarray(engine.fast_forward(start).random(stop - start))
     # a first number of points that is no power of 2 is warned of
@@ -319,21 +309,208 @@ def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) 
 
 
 @lru_cache(maxsize=1)
-def _sobol(dimensions: int, seed: int) -> Any:
-    """Return the sequence, as its scrambling takes longer than a batch."""
+def _sampler(kind: str, dimensions: int, seed: int, points: int = 0) -> Any:
+    """Return a sampler, whose scrambling takes longer than a part, or its first points."""
     from scipy.stats import qmc
 
-    return qmc.Sobol(dimensions, scramble=True, seed=np.random.default_rng(seed))
-
-
-@lru_cache(maxsize=1)
-def _hypercube(samples: int, dimensions: int, seed: int) -> FloatArray:
-    from scipy.stats import qmc
-
-    engine = qmc.LatinHypercube(dimensions, seed=np.random.default_rng(seed))
-    return np.asarray(engine.random(samples))
+    sampler = getattr(qmc, kind)(dimensions, seed=np.random.default_rng(seed))
+    return sampler.random(points) if points else sampler
 
 
 def is_error(parameter: str) -> bool:
     """Whether a parameter is an error of the loop, which is in no configuration."""
     return parameter.split(".")[0] == "error"
+
+
+def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
+    """Make the sample of a row of ``Study.values``."""
+    base, parameters = study.config, study.parameters_by_name(values)
+    full = base.settings.model_dump()
+    content = base.settings.model_dump(exclude_unset=True)
+    for name, places in study.places.items():
+        for keys in places:
+            set_number(content, keys, parameters[name], full=full)
+    config = build_config(validate_sections(FileSection, content, base.source), base.source)
+    delay_error, factor = parameters.get(DELAY_ERROR, 0.0), parameters.get(NOISE_FACTOR, 1.0)
+    hardware, truth = config.hardware, config.truth
+    with refuse_config(f"the real loop, with {DELAY_ERROR} and {NOISE_FACTOR}"):
+        if delay_error != 0:
+            hardware = replace(hardware, delay_frames=hardware.delay_frames + delay_error)
+        if factor != 1:
+            truth = replace(truth, noise_nm=truth.noise_nm * factor)
+    return config, hardware, truth
+
+
+def design_for_sample(controller: Design | DesignRequest, sample: Sample) -> Design:
+    """Return a controller's design, made for the sample if it has none for all."""
+    design = fixed_design(controller)
+    return sample[0].design(cast("DesignRequest", controller)) if design is None else design
+
+
+def close_sample_loop(sample: Sample, design: Design) -> ClosedLoop:
+    """Close the real loop of a sample with a design."""
+    _, hardware, truth = sample
+    return design.close(hardware, sensor_gain=truth.sensor_gain)
+
+
+def load_study(path: str | os.PathLike[str]) -> Study:
+    """Read a study file, check it, and design the controllers that are for the whole study.
+
+    It checks the file, the configuration and the gain files, that every parameter is a number of
+    the configuration, and that the configuration accepts the ends of each parameter, with the
+    others at their medians.
+
+    Parameters
+    ----------
+    path : path-like
+        The file (YAML).
+
+    Returns
+    -------
+    Study
+        The study.
+
+    Raises
+    ------
+    ConfigError
+        If the file or the configuration is refused; ``path`` on the error is that of the key.
+    GainFileError
+        If a gain file cannot be read.
+    SynthesisError
+        If a design cannot be made.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> study = lbt.studies.load_study("examples/study.yaml")
+    >>> study.samples, study.parameter_names[0]
+    (4096, 'atmosphere.seeing_arcsec')
+    >>> study.values(0, 2).shape[1] == len(study.parameter_names)
+    True
+    """
+    source = Path(path)
+    settings = validate_sections(StudySection, read_mapping(source), source)
+    _require_names(settings, source)
+    config_file = source.parent / settings.config
+    config = load_config(config_file)
+    if config.hardware.modes > 2:  # a Strehl ratio of jitter takes one or two axes
+        raise ConfigError(
+            f"{config_file}: a study is of one or two axes; got a loop of {config.hardware.modes}."
+        )
+    sections = settings.controllers.items()
+    files = {name: source.parent / s.file for name, s in sections if s.file is not None}
+    gains = {name: load_with_digest(file) for name, file in files.items()}
+    _require_places(settings, config, source)
+    study = Study(
+        source=source,
+        settings=settings,
+        config=config,
+        controllers={},
+        digest=_digest(settings, config, {name: digest for name, (_, digest) in gains.items()}),
+        inputs=(source, config_file, *files.values()),
+    )
+    samples = []
+    for where, values in _corners(study):
+        with refuse_config(f"{source}: {where}", where.split(" ")[0]):
+            samples.append((where, make_sample(study, values)))
+    if config.truth.drifts and settings.evaluation == "exact":
+        raise ConfigError(
+            f"{source}: a vibration of the truth drifts, so that there is no exact answer; "
+            "set evaluation: simulation.",
+            path="evaluation",
+        )
+    study = replace(
+        study,
+        controllers={
+            name: gains[name][0] if name in files else _make_controller(study, name)
+            for name in settings.controllers
+        },
+    )
+    for name, controller in study.controllers.items():
+        if (design := fixed_design(controller)) is not None:
+            for where, sample in samples:
+                with refuse_config(f"{source}: controllers.{name}, {where}"):
+                    close_sample_loop(sample, design)
+    return study
+
+
+def _require_names(settings: StudySection, source: Path) -> None:
+    """Refuse names of controllers that are those of other files or columns."""
+    first: dict[str, str] = {}
+    for name in settings.controllers:
+        other = first.setdefault(name.casefold(), name)
+        taken = [p for p in settings.parameters if p in result_columns(name, settings.evaluation)]
+        if other != name:
+            why = f"its files need a name that differs by more than its case from {other}"
+        elif name.casefold().startswith("row_"):
+            why = "names that begin with row_ are those of replayed samples; give another"
+        elif taken:
+            why = f"{taken[0]} is both a parameter and a result; give the controller another name"
+        else:
+            continue
+        raise ConfigError(f"{source}: controllers.{name}: {why}.", path=f"controllers.{name}")
+
+
+def _make_controller(study: Study, name: str) -> Design | DesignRequest:
+    """Return a controller that the study designs, once unless each sample has its own."""
+    section, place = study.settings.controllers[name], f"controllers.{name}"
+    method = str(section.design)
+    with name_file(study.source), name_key(f"{place}.design"):
+        method_named(method)
+    with refuse_config(f"{study.source}", place):
+        words = Wording(method="design: {}", place=place)
+        request = design_request(method, section.options, words)
+    if section.for_ == "sample":
+        return request
+    try:
+        return study.config.design(request)
+    except LbtSynthError as error:
+        error.args = (f"{study.source}: {place}: {error}",)
+        raise
+
+
+def _digest(settings: StudySection, config: Config, gains: dict[str, str]) -> str:
+    """Return the digest of all that decides the results: not the names of files."""
+    study = settings.model_dump(by_alias=True, exclude={"config"})
+    for section in study["controllers"].values():
+        del section["file"]
+    content = {
+        "version": lbt_synth.__version__,
+        "study": study,
+        "config": config.settings.model_dump(),
+        "gains": gains,
+    }
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _require_places(settings: StudySection, config: Config, source: Path) -> None:
+    """Refuse parameters that are no numbers of the configuration, or are given twice."""
+    full = config.settings.model_dump()
+    taken: dict[Keys, str] = {}
+    for name, section in settings.parameters.items():
+        with refuse_config(f"{source}: parameters.{name}", f"parameters.{name}"):
+            if is_error(name) and name not in (DELAY_ERROR, NOISE_FACTOR):
+                errors = f"{DELAY_ERROR} and {NOISE_FACTOR}"
+                raise ConfigError(f"the errors of a loop are {errors}; got {name}.")
+            if is_error(name) and section.also:
+                raise ConfigError("an error of the loop is in no configuration; leave also out.")
+            for place in () if is_error(name) else (name, *section.also):
+                if isinstance(find_number(full, place), int) and not section.values:
+                    raise ConfigError(
+                        "it is an integer, which takes a list of values; got a distribution of all "
+                        "numbers."
+                    )
+                keys = parse_path(place)
+                if keys in taken:
+                    raise ConfigError(f"{place} is given twice, by {taken[keys]} and {name}.")
+                taken[keys] = name
+
+
+def _corners(study: Study) -> Iterator[tuple[str, list[float]]]:
+    """Yield the medians, then the ends of each parameter with the others at their medians."""
+    parameters = study.settings.parameters
+    centre = [section.median() for section in parameters.values()]
+    yield "parameters in the middle", centre
+    for i, (name, section) in enumerate(parameters.items()):
+        for end in section.extremes(study.samples) if section.varies else ():
+            yield f"parameters.{name} at {end:g}", [*centre[:i], end, *centre[i + 1 :]]

@@ -21,7 +21,6 @@ def small():
         "a.stable": np.array([1, 0, 1, NAN, 1]),
         "a.strehl": np.array([0.8, NAN, 0.4, NAN, 0.6]),
         "a.residual_nm": np.array([50, NAN, 90, NAN, 70]),
-        "a.noise_nm": np.array([10, NAN, 30, NAN, 20]),
         "b.stable": np.array([1, 0, 0, 1, 1]),
         "b.strehl": np.array([0.7, NAN, NAN, 0.5, 0.6]),
         "b.residual_nm": np.array([60, NAN, NAN, 80, 70]),

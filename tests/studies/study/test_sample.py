@@ -14,7 +14,8 @@ from lbt_synth.config.schema import FileSection, SensorSection
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.studies.study import sample as evaluation
-from lbt_synth.studies.study.sample import make_sample
+from lbt_synth.studies.study.sample import evaluate_samples
+from lbt_synth.studies.study.study import make_sample
 
 
 def test_a_sample_is_a_configuration(tmp_path):
@@ -69,7 +70,7 @@ def test_a_point_is_what_the_library_says(tmp_path):
         "error.noise_factor: 1.5, truth.sensor_gain: 0.7}",
     )
     values = study.values()
-    columns, failures = lbt.studies.evaluate_samples(study, values[1:], 1)
+    columns, failures = evaluate_samples(study, values[1:], 1)
     assert failures == []
     assert tuple(columns) == study.result_columns
     config = study.config
@@ -111,7 +112,7 @@ def test_unstable_loops_and_samples_that_fail(tmp_path):
         parameters="{truth.sensor_gain: {list: [0.3, 1.4]}, loop.delay_frames: {list: [2, 4]}}",
     )
     values = study.values()
-    columns, failures = lbt.studies.evaluate_samples(study, values, 0)
+    columns, failures = evaluate_samples(study, values, 0)
     unstable = values[:, 0] == 1.4
     stable, strehl = columns["wild.stable"], columns["wild.strehl"]
     assert np.all(stable[unstable] == 0)
@@ -135,7 +136,7 @@ def test_simulated_samples(tmp_path):
         parameters="{truth.sensor_gain: {uniform: [1.2, 1.3]}}",
     )
     assert study.result_columns[:3] == ("a.strehl", "a.residual_nm", "a.stable")
-    columns, _ = lbt.studies.evaluate_samples(study, study.values(3, 5), 3)
+    columns, _ = evaluate_samples(study, study.values(3, 5), 3)
     assert columns["c.stable"].tolist() == [0, 0]
     for i, row in enumerate((3, 4)):
         _, hardware, truth = make_sample(study, study.values(row, row + 1)[0])
@@ -174,8 +175,8 @@ def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
         study_file(tmp_path, base=base, controllers=controllers, parameters=parameters, **more)
     )
     values = study.values(0, count)
-    columns, failures = lbt.studies.evaluate_samples(study, values, 0)
-    single, failed = lbt.studies.evaluate_samples(study, values, 0, together=False)
+    columns, failures = evaluate_samples(study, values, 0)
+    single, failed = evaluate_samples(study, values, 0, together=False)
     assert columns.keys() == single.keys()
     for name, expected in single.items():
         assert columns[name] == pytest.approx(expected, rel=1e-6, nan_ok=True), name
@@ -214,7 +215,7 @@ def test_filters_for_their_own_samples(tmp_path, monkeypatch):
     own = {"base": LBT_TEXT, "controllers": OWN, "parameters": WEATHER}
     study, columns, _ = agree(tmp_path, count=6, **own)
     rows = counted(monkeypatch)
-    lbt.studies.evaluate_samples(study, study.values(0, 6), 0)
+    evaluate_samples(study, study.values(0, 6), 0)
     assert rows == [3]  # all of them at once, and one by itself
     strehl = columns["own.strehl"]
     assert len(np.unique(strehl[~np.isnan(strehl)])) >= 3
@@ -228,7 +229,7 @@ def test_the_sensor_gain_that_designs_assume(tmp_path, monkeypatch):
     }"""
     study, *_ = agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=parameters, count=6)
     rows = counted(monkeypatch)
-    lbt.studies.evaluate_samples(study, study.values(0, 6), 0)
+    evaluate_samples(study, study.values(0, 6), 0)
     assert rows == [3, 3]  # all at once, one by itself for each controller
     one = "{model.sensor_gain: {uniform: [0.6, 1.2]}}"
     agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=one, count=5)
@@ -345,8 +346,8 @@ def test_samples_that_the_configuration_refuses(tmp_path):
     values = study.values(0, COUNT)
     values[2, 0] = -5.0
     values[4, 1] = 0.0
-    columns, failures = lbt.studies.evaluate_samples(study, values, 100)
-    _, failed = lbt.studies.evaluate_samples(study, values, 100, together=False)
+    columns, failures = evaluate_samples(study, values, 100)
+    _, failed = evaluate_samples(study, values, 100, together=False)
     lost = [(row, name) for row in (102, 104) for name in ("slow", "kalman")]
     assert [failure[:2] for failure in failures] == lost
     assert "greater than" in failures[0][2]
@@ -363,7 +364,7 @@ def test_a_filter_that_cannot_be_designed(tmp_path):
     study, *_ = agree(tmp_path, base=BASE, controllers=OWN, parameters=parameters)
     values = study.values(0, COUNT)
     values[3, 1] = 1e170  # its variance overflows
-    columns, failures = lbt.studies.evaluate_samples(study, values, 0)
+    columns, failures = evaluate_samples(study, values, 0)
     assert {row for row, _, _ in failures} == {3}
     assert np.isfinite(columns["own.strehl"]).sum() == COUNT - 1
 
@@ -432,7 +433,7 @@ def test_a_new_key_takes_the_way_that_its_builder_declares(
     def noise(settings):
         return measurement_noise_nm(settings) * excess(settings.sensor)
 
-    for module in ("config.load", "studies.study.sample"):
+    for module in ("config.load", "studies.study.study"):
         monkeypatch.setattr(f"lbt_synth.{module}.FileSection", NewFile)
     for module in ("config.load", "config.ensemble"):
         monkeypatch.setattr(f"lbt_synth.{module}.measurement_noise_nm", noise)
@@ -447,7 +448,7 @@ def test_a_new_key_takes_the_way_that_its_builder_declares(
     if excess(NewSensor(noise_nm=1.0, excess=2.0)) > 1:  # it is read
         assert np.mean(groups[0]) < 0.7 * np.mean(groups[1])
     rows = counted(monkeypatch)
-    lbt.studies.evaluate_samples(study, study.values(0, COUNT), 0)
+    evaluate_samples(study, study.values(0, COUNT), 0)
     assert len(rows) == singles
 
 
@@ -468,4 +469,4 @@ def test_two_answers_stop_a_study(tmp_path, monkeypatch):
 
     monkeypatch.setattr(evaluation, "residuals_from_matrices", wrong)
     with pytest.raises(lbt.errors.CertificateError, match="row 14 has slow.*by itself"):
-        lbt.studies.evaluate_samples(study, study.values(10, 16)[:8], 11)
+        evaluate_samples(study, study.values(10, 16)[:8], 11)

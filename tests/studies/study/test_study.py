@@ -1,4 +1,4 @@
-"""Rows of a study, whichever are requested, and the distributions of its parameters."""
+"""Study files: what they say, what is refused, and the rows of their samples."""
 
 import pickle
 
@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.stats import qmc
-from support.studies import load_small_study
+from support.studies import BASE, load_small_study, study_file
 
 import lbt_synth as lbt
-from lbt_synth.errors import ProblemError
+from lbt_synth.design import optimal_integrator
+from lbt_synth.errors import ConfigError, GainFileError, ProblemError
 from lbt_synth.studies.study.study import ParameterSection, unit_points
 
 ONE = "truth.vibrations[0].rms_nm"
@@ -106,15 +107,170 @@ def test_distributions(tmp_path):
     found, counts = np.unique(values[:, 3], return_counts=True)
     assert found.tolist() == [10, 20, 30]
     assert counts.tolist() == [1024, 1024, 2048]
-    weights = [1e308, 1e308, 1e308]  # their sum is infinite
     cut = {"normal": {"mean": 20, "deviation": 0.5, "low": 20}}
     edge = ParameterSection.model_validate(cut).quantile(np.array([0.0]))
     assert edge.round(6).tolist() == [20.0]
-    huge = ParameterSection.model_validate({"list": [1.0, 2.0, 3.0], "weights": weights})
-    assert huge.quantile(np.array([0.1, 0.5, 0.9])).tolist() == [1, 2, 3]
 
 
 def test_the_median_of_a_list_does_not_depend_on_its_order() -> None:
     read = ParameterSection.model_validate
     assert read({"list": [30.0, 10.0, 20.0]}).median() == 20
-    assert read({"list": [30.0, 10.0, 20.0], "weights": [5.0, 1.0, 1.0]}).median() == 30
+
+
+def test_controllers(tmp_path):
+    folder = tmp_path / "gains"
+    folder.mkdir()
+    made = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.4)
+    lbt.save_gain(folder / "a.fits", made)
+    study = load_small_study(
+        tmp_path,
+        controllers="{a: {file: gains/a.fits}, b: {design: kalman}, c: {design: hinf, gamma_ratio: "
+        "1.5, for: sample}, d: {design: integrator}}",
+    )
+    a, b, c, d = study.controllers.values()
+    assert a.gain == 0.4
+    assert b.certificate.passed
+    assert (c.method.name, c.given) == ("hinf", {"gamma_ratio": 1.5})
+    assert list(study.designed) == ["b", "d"]
+    origins = [section.text for section in study.settings.controllers.values()]
+    assert origins[0] == "gains/a.fits"
+    assert origins[1:3] == [
+        "kalman for the configuration",
+        "hinf (gamma_ratio 1.5) for each sample",
+    ]
+    assert d.gain == optimal_integrator(study.config.hardware, study.config.truth).gain
+    assert study.result_columns[:7] == (
+        "a.strehl",
+        "a.residual_nm",
+        "a.turbulence_nm",
+        "a.vibration_nm",
+        "a.noise_nm",
+        "a.within_nm",
+        "a.stable",
+    )
+    assert study.columns[:2] == ("row", ONE)
+    assert [path.name for path in study.inputs] == ["study.yaml", "base.yaml", "a.fits"]
+
+
+def test_the_digest_is_of_what_decides_the_results(tmp_path):
+    first = load_small_study(tmp_path).digest
+    study_file(tmp_path).write_text("# a comment\n" + (tmp_path / "study.yaml").read_text())
+    assert lbt.studies.load_study(tmp_path / "study.yaml").digest == first
+    assert load_small_study(tmp_path, seed="4").digest != first
+    assert load_small_study(tmp_path, base=BASE.replace("15.0", "15.1")).digest != first
+    digests = set()
+    for gain in (0.4, 0.5):
+        made = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=gain)
+        lbt.save_gain(tmp_path / "a.fits", made)
+        digests.add(load_small_study(tmp_path, controllers="{a: {file: a.fits}}").digest)
+    assert len(digests) == 2
+
+
+# what is written in place of a key, or for the parameter ONE; what is said; the path of the error
+REFUSALS = r"""
+samplse: 5 => unknown key samplse; did you mean samples => samplse
+samples: => the key samples is missing => samples
+samples: 0 => samples: input should be greater than or equal to 1; got 0 => samples
+samples: 1.5 => samples: input should be a valid integer => samples
+sampling: random => sampling: input should be 'sobol' or 'latin_hypercube' => sampling
+evaluation: fast => evaluation: input should be 'exact' or 'simulation' => evaluation
+results: csv => unknown key results; known are config => results
+version: 2 => version: input should be less than or equal to 1 => version
+controllers: {} => controllers => controllers
+parameters: {} => parameters => parameters
+ONE: {unifrom: [1, 2]} => unknown key parameters\.truth\.vibrations\[0\]\.rms_nm\.unifrom; did you mean uniform => parameters.truth.vibrations[0].rms_nm.unifrom
+ONE: {uniform: [2, 1]} => must be \[low, high\]; got \[2, 1\]
+ONE: {uniform: [1]} => uniform
+ONE: {uniform: [1, .inf]} => finite
+ONE: {} => expected a number or exactly one of
+ONE: {fixed: 1, list: [2]} => expected a number or exactly one
+ONE: fast => truth.vibrations\[0].rms_nm
+ONE: {list: []} => list
+ONE: {list: [a]} => valid number; got 'a'
+ONE: {list: [1, 2], weights: [1]} => weights goes with list
+ONE: {uniform: [1, 2], weights: [1]} => weights goes with list
+ONE: {list: [1, 2], weights: [1, 0]} => greater than 0
+ONE: {normal: {mean: 1, deviation: 0}} => deviation: input should be gr
+ONE: {normal: {mean: 1, deviation: 1, low: 3, high: 2}} => low must be below high
+parameters: {'truth.vibration[0].rms_nm': 5} => truth has no vibration; did you mean vibrations
+parameters: {'truth.vibrations[1].rms_nm': 5} => truth\.vibrations has 1 entry, counted from 0; got \[1\]
+parameters: {truth.vibrations.rms_nm: 5} => truth\.vibrations has no keys; it is a list of 1
+parameters: {'truth[0]': 5} => truth is no list
+parameters: {truth.turbulence: 5} => is not set in the configuration
+parameters: {'truth.vibrations[0].kind': 5} => must lead to a number
+parameters: {truth: 5} => must lead to a number of the configuration; it is a section
+parameters: {atmosphere.seeing_arcsec: 5} => atmosphere has no keys; it is not set
+parameters: {'a b': 5} => is no path in a configuration
+parameters: {'': 5} => is no path in a configuration
+parameters: {error.delay: 5} => error.delay_frames and error.noise_factor; got error.delay
+parameters: {error.noise_factor: {fixed: 1, also: ['truth.vibrations[0].rms_nm']}} => leave also out
+ONE: {fixed: 1, also: [sensor.noise_nm]}, sensor.noise_nm: 3 => is given twice
+ONE: {fixed: 1, also: ['truth.vibrations[0].rms_nm']} => is given twice
+ONE: {uniform: [0, 5]} => parameters\.truth.*rms_nm at 0: .*greater than
+parameters: {'truth.vibrations[0].frequency_hz': {list: [20, 30, 401]}} => at 401: .*below the Nyquist
+ONE: {normal: {mean: 10, deviation: 20}} => at -
+parameters: {loop.axes: {list: [1, 1.5]}} => valid integer
+parameters: {error.delay_frames: {uniform: [-1.5, 0]}} => at -1.5: .*the real loop.*at least 1
+parameters: {error.noise_factor: -1} => the real loop.*at least 0
+controllers: {9a: {design: kalman}} => 9a
+controllers: {a b: {design: kalman}} => a b
+controllers: {a: {design: kalman}, A: {design: lqg}} => differs by more than its case => controllers.A
+controllers: {row_3: {design: kalman}} => names that begin with row_ => controllers.row_3
+controllers: {sensor: {design: kalman}} & parameters: {sensor.noise_nm: 4} => both a parameter and a result => controllers.sensor
+controllers: {a: {}} => expected exactly one of design, file => controllers.a
+controllers: {a: {design: kalmn}} => controllers\.a\.design: method must be one of .*Did you mean kalman\? => controllers.a.design
+controllers: {a: {design: kalman, file: a.fits}} => expected exactly one of design, file
+controllers: {a: {file: a.fits, for: sample}} => for goes with design
+controllers: {a: {file: a.fits, gain: 0.5}} => gain goes with design
+controllers: {a: {design: kalman, gain: 0.5}} => gain goes with design: integrator
+controllers: {a: {design: kalman, route: lmi}} => design: kalman takes route riccati or sdp; got route lmi
+controllers: {a: {design: mixed, route: lmi}} => route goes with design: hinf or kalman; got design: mixed
+controllers: {a: {design: lqg, horizon: 2}} => horizon goes with design: hinf or kalman or mixed; got design: lqg
+controllers: {a: {design: hinf, gamma: 5, gamma_ratio: 2}} => at most one of gamma
+controllers: {a: {design: robust}} => controllers.a: .*design.robust is missing => design.robust
+parameters: {loop.frame_rate_hz: {list: [700, 800, 900]}} => controllers.slow, parameters.loop.frame_rate_hz at 700: the controller must run at
+config: none.yaml => cannot read .*none.yaml
+config: "a\0.yaml" => cannot read .*null byte
+parameters: {simulation.frames: {uniform: [200, 400]}} => it is an integer, which takes a list => parameters.simulation.frames
+"""
+
+
+@pytest.mark.parametrize("line", REFUSALS.strip().splitlines())
+def test_refusals(tmp_path, line):
+    written, message, *path = line.split(" => ")
+    changes = {}
+    for entry in written.split(" & "):
+        key, _, value = entry.partition(":")
+        if key == "ONE":
+            key, value = "parameters", f"{{'{ONE}': {value}}}"
+        changes[key] = value.strip() or None
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_small_study(tmp_path, **changes)
+    assert path in ([], [caught.value.path])
+
+
+def test_a_missing_gain_file(tmp_path):
+    with pytest.raises(GainFileError, match="cannot read"):
+        load_small_study(tmp_path, controllers="{a: {file: a.fits}}")
+
+
+def test_three_axes_are_refused(tmp_path):
+    base = BASE.replace("axes: 1, ", "").replace(
+        "noise_nm: 15.0", "noise_nm: 15.0, matrix: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]"
+    )
+    base = base.replace("vibrations: [{frequency_hz: 20.0, damping: 0.01, rms_nm: 500.0}]", "")
+    base = base.replace(
+        "vibrations: [{kind: sinusoid, frequency_hz: 20.0, rms_nm: 500.0}]", "sensor_gain: 1.0"
+    )
+    with pytest.raises(ConfigError, match="one or two axes; got a loop of 3"):
+        load_small_study(tmp_path, base=base, parameters="{truth.sensor_gain: {uniform: [0.5, 1]}}")
+
+
+def test_a_drift_needs_simulation(tmp_path):
+    base = BASE.replace("kind: sinusoid,", "kind: drift, end_hz: 21.0, duration_s: 1.0,")
+    with pytest.raises(ConfigError, match="no exact answer; set evaluation: simulation"):
+        load_small_study(tmp_path, base=base)
+    assert (
+        load_small_study(tmp_path, base=base, evaluation="simulation").settings.evaluation
+        == "simulation"
+    )
