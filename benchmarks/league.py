@@ -282,8 +282,16 @@ ENTRIES: dict[str, Callable[[lbt.identification.ForwardSplit], lbt.Controller | 
     ),
     "Kalman": lambda split: lbt.kalman(split.model.plant()),
     "H-infinity, 1.2 of least": lambda split: lbt.hinf(split.model.plant(), gamma_ratio=1.2),
-    "automatic": lambda split: lbt.design_from_record(split.past).design,
+    "automatic": lambda split: lbt.design_from_record(past(split)).design,
 }
+
+
+def past(split: lbt.identification.ForwardSplit) -> lbt.identification.LoopRecord:
+    """Return the record as it was when the training ended."""
+    stop = split.training[-1][1]
+    names = ("measurements", "commands", "usable", "measured", "commanded")
+    series = {name: getattr(split.record, name) for name in names}
+    return replace(split.record, **{k: x[:stop] for k, x in series.items() if x is not None})
 
 
 def relative_residual(

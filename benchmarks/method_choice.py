@@ -15,7 +15,7 @@ import argparse
 import time
 
 import numpy as np
-from league import CHANGES, simulate_record
+from league import CHANGES, past, simulate_record
 
 import lbt_synth as lbt
 from lbt_synth.errors import LbtSynthError
@@ -29,8 +29,8 @@ def residuals_of_last_quarter(record) -> tuple[lbt.identification.MethodChoice, 
     training, test = lbt.identification.split_halves(
         record.stretches(), record.frames, fit_share=0.75
     )
-    split = forward_split(record, training, test)
-    choice = lbt.design_from_record(split.past, accept_record=True).choice
+    split = forward_split(record, training, test, lbt.identify(record, stretches=training))
+    choice = lbt.design_from_record(past(split), accept_record=True).choice
     left = {}
     for name in record_methods():
         inputs = PlantInputs(plant=split.model.plant(), design_defaults={"gamma_ratio": 1.2})

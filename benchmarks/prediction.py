@@ -70,13 +70,15 @@ def identity() -> None:
 
 def show(table: lbt.identification.PredictionTable) -> None:
     for row in table.entries:
-        tip, tilt = row.model_axis_nm if row.replayed is None else row.replayed.axis_rms_nm
+        tip, tilt = row.model_axis_nm
+        if row.replayed is not None:
+            tip, tilt = np.sqrt(row.replayed.variance_nm2)
         print(
             f"| {row.name} | {tip:.1f}, {tilt:.1f} | {row.replayed_nm:.1f} +- "
             f"{row.replayed_error_nm:.1f} | {row.model_nm:.1f} | {row.ratio:.3f} | "
             f"{row.deviations:+.1f} | {100 * row.strehl:.1f} | {100 * row.model_strehl:.1f} |"
         )
-    print(f"fit {table.fit}, test {table.test}, {table.warm_up_frames} frames to warm up")
+    print(f"fit {table.fit}, test {table.test}")
 
 
 def tables() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise, product
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -103,39 +103,4 @@ def _cut(stretches: Stretches, first: int, last: int) -> Stretches:
         if low < high:
             out.append((start + low, start + high))
         before += stop - start
-    return tuple(out)
-
-
-def split_frames(
-    stretches: StretchesLike | None,
-    fit: StretchesLike | None,
-    test: StretchesLike | None,
-    frames: int,
-) -> tuple[Stretches, Stretches, Stretches]:
-    """Return contiguous frames, and those of them to fit and to test on.
-
-    Fit and test are as given, or the halves of the contiguous frames; without those, fit and test
-    are contiguous where they touch.
-    """
-    usable = checked_stretches(stretches, frames)
-    if fit is None and test is None:
-        return usable, *split_halves(usable, frames)
-    if fit is None or test is None:
-        raise ProblemError("fit and test must both be given, or neither; got one of them.")
-    fitted, tested = checked_stretches(fit, frames), checked_stretches(test, frames)
-    for (a, b), (c, d) in product(fitted, tested):
-        if a < d and c < b:
-            raise ProblemError(
-                f"the test must have frames that the fit has not; got ({a}, {b}) to fit and "
-                f"({c}, {d}) to test."
-            )
-    return usable if stretches is not None else _join((*fitted, *tested)), fitted, tested
-
-
-def _join(parts: Stretches) -> Stretches:
-    """Return the union of stretches that do not overlap."""
-    out: list[tuple[int, int]] = []
-    for start, stop in sorted(parts):
-        begin = out.pop()[0] if out and out[-1][1] == start else start
-        out.append((begin, stop))
     return tuple(out)

@@ -19,7 +19,7 @@ from lbt_synth.models import TipTiltPlant, Vibration
 from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.validation import FloatArray
 
-_NEAR_AXIS_DEG = 6.0
+_ALL = "all"  # parts together
 
 
 @table_row
@@ -35,12 +35,13 @@ class LineRow:
     )
     direction_error_deg: float = column("+-", unit="deg", format=".2g", help="Its error")
     origin: str = column("origin", help="Where it is from")
+    broad: bool = field(default=False)  # too damped for a line
     vibrations: tuple[Vibration, ...] = field(default=())  # of the plant, that it is made of
 
     @property
     def name(self) -> str:
         """What tables of costs call it."""
-        return f"line at {self.frequency_hz:.4g} Hz"
+        return f"{'broad resonance' if self.broad else 'line'} at {self.frequency_hz:.4g} Hz"
 
     @property
     def where(self) -> str:
@@ -70,7 +71,7 @@ def line_origins(model: IdentifiedModel) -> tuple[LineRow, ...]:
 def _are_twins(one: IdentifiedLine, other: IdentifiedLine, model: IdentifiedModel) -> bool:
     """Whether lines are those of two axes, and of one frequency."""
     along = [line.direction or () for line in (one, other)]
-    if along[0] == along[1] or any(np.count_nonzero(each) != 1 for each in along):
+    if along[0] == along[1] or any(np.count_nonzero(axes) != 1 for axes in along):
         return False
     error = float(np.hypot(one.frequency_error_hz, other.frequency_error_hz))
     width = max(one.damping * one.frequency_hz, other.damping * other.frequency_hz)
@@ -84,15 +85,15 @@ def _describe(group: Sequence[IdentifiedLine], axes: int) -> LineRow:
     weights = np.array([1 / max(line.frequency_error_hz, 1e-12) ** 2 for line in group])
     frequency_hz = float(weights @ [line.frequency_hz for line in group] / weights.sum())
     angle, error = first.direction_deg or 0.0, first.direction_error_deg
-    near = _NEAR_AXIS_DEG if error is None else max(_NEAR_AXIS_DEG, DIFFERENT * error)
+    near = DIFFERENT * (error or 0.0)
     origin = "a diagonal"
     if axes == 1:
         angle, origin = np.nan, "one axis"
     elif len(group) > 1:
         angle, error, origin = np.nan, None, "both axes, unrelated"
-    elif abs(angle) < near:
+    elif abs(angle) <= near:
         origin = AXES[0]
-    elif abs(angle) > 90 - near:
+    elif abs(angle) >= 90 - near:
         angle, origin = angle % 180, AXES[1]
     return LineRow(
         frequency_hz=frequency_hz,
@@ -102,6 +103,7 @@ def _describe(group: Sequence[IdentifiedLine], axes: int) -> LineRow:
         direction_deg=angle,
         direction_error_deg=np.nan if error is None else error,
         origin=origin if first.kind == "line" else f"{origin}, broad",
+        broad=first.kind != "line",
         vibrations=tuple(line.vibration() for line in group),
     )
 
@@ -132,21 +134,24 @@ def disturbance_costs(
     """
     tables = [_covariances(plant, lines, controller) for controller in (running, best)]
     names = next((list(table) for table in tables if table), [])
-    losses = [_losses(table, imaging) for table in tables]
     where = {line.name: line.where for line in lines}
-    rows = [
-        CostRow(
-            part=name,
-            running_nm=_rms(tables[0], name),
-            running_strehl=losses[0].get(name, np.nan),
-            best_nm=_rms(tables[1], name),
-            best_strehl=losses[1].get(name, np.nan),
-            where=where.get(name, ""),
+    rows = []
+    for name in names:
+        numbers = [_rms_and_strehl(table, name, imaging) for table in tables]
+        (running_nm, running_strehl), (best_nm, best_strehl) = numbers
+        rows.append(
+            CostRow(
+                part=name,
+                running_nm=running_nm,
+                running_strehl=running_strehl,
+                best_nm=best_nm,
+                best_strehl=best_strehl,
+                where=where.get(name, ""),
+            )
         )
-        for name in names
-    ]
     by = "running_nm" if tables[0] else "best_nm"
-    return tuple(sorted(rows[:-1], key=lambda row: -getattr(row, by))) + tuple(rows[-1:])
+    rows.sort(key=lambda row: (row.part == _ALL, -getattr(row, by)))
+    return tuple(rows)
 
 
 def _covariances(
@@ -166,26 +171,17 @@ def _covariances(
         out[name] = np.sum(parts, axis=0)
     rest = budget.total_nm2 - np.sum(list(out.values()), axis=0)
     out["turbulence"] = out["turbulence"] + rest  # slow resonances are turbulence
-    return out | {"all": budget.total_nm2}
+    return out | {_ALL: budget.total_nm2}
 
 
-def _losses(parts: Mapping[str, FloatArray], imaging: Imaging) -> dict[str, float]:
-    """Return the Strehl ratio that each part costs."""
-    if not parts:
-        return {}
-    whole = parts["all"]
-    strehl = jitter_strehl(whole, imaging=imaging)
-    return {
-        name: jitter_strehl(_without(whole, part), imaging=imaging) - strehl
-        for name, part in parts.items()
-    }
-
-
-def _without(whole: FloatArray, part: FloatArray) -> FloatArray:
-    """Return a covariance without a part of it, positive semidefinite in spite of rounding."""
-    values, vectors = np.linalg.eigh(whole - part)
-    return np.asarray(vectors @ np.diag(np.maximum(values, 0)) @ vectors.T)
-
-
-def _rms(parts: Mapping[str, FloatArray], name: str) -> float:
-    return float(np.sqrt(max(np.trace(parts[name]), 0.0))) if name in parts else np.nan
+def _rms_and_strehl(
+    parts: Mapping[str, FloatArray], name: str, imaging: Imaging
+) -> tuple[float, float]:
+    """Return the rms that a part leaves, and the Strehl ratio that it costs."""
+    if name not in parts:
+        return np.nan, np.nan
+    others = [parts[part] for part in parts if part not in (name, _ALL)]
+    rest = np.sum(others, axis=0) if name != _ALL else 0 * parts[_ALL]
+    strehl = jitter_strehl(parts[_ALL], imaging=imaging)
+    rms_nm = float(np.sqrt(max(np.trace(parts[name]), 0.0)))
+    return rms_nm, jitter_strehl(rest, imaging=imaging) - strehl

@@ -31,12 +31,12 @@ _STABLE_GAINS = "stable sensor gains"
 AXES = ("tip", "tilt")
 _DEAD = 0.5  # of the frames, on one value
 _NOISIER = 3.0  # times the other axis
-_FEW = 0.01  # of the frames, with a fault
+FEW = 0.01  # of the frames, that may have a fault
 DEAD = "dead"
 _WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel
 _WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers", "held": "held"}
 _SAME_RATE = 1e-3
-_AGREES = 0.1  # of the residual that its own model promises
+_AGREES = 0.1  # of the residual that its own model promises: what conditions change
 
 
 def law_facts(law: ControlLaw) -> Facts:
@@ -128,7 +128,7 @@ class ChannelRow:
     @property
     def serious(self) -> bool:
         """Whether something is wrong with it that more than a few frames have."""
-        return self.state == DEAD or self.faulty > _FEW or any(map(self.state.count, _WHOLE))
+        return self.state == DEAD or self.faulty > FEW or any(map(self.state.count, _WHOLE))
 
 
 def judge_channels(record: LoopRecord) -> tuple[ChannelRow, ...]:
@@ -161,27 +161,27 @@ def _judge_series(
     steps = [_step_rms(one, good) for one in values.T]
     rows = []
     for axis, one in enumerate(values.T):
-        found = [
-            each
-            for each in record.health.findings
-            if each.series == series and each.axis == axis and each.kind in _WORDS
+        findings = [
+            finding
+            for finding in record.health.findings
+            if (finding.series, finding.axis) == (series, axis) and finding.kind in _WORDS
         ]
         here = one[good] if good.any() else one
         first, last = end_scatters(one, good)
         change, quarter = last / first if first > 0 else np.nan, len(here) // 4
         drift = float(np.mean(here[-quarter:]) - np.mean(here[:quarter])) if quarter else np.nan
-        held = sum(each.fraction for each in found if each.kind in ("stuck", "held"))
-        words = [f"{_WORDS[each.kind]} ({100 * each.fraction:.2g} %)" for each in found]
+        held = sum(finding.fraction for finding in findings if finding.kind in ("stuck", "held"))
+        words = [f"{_WORDS[each.kind]} ({100 * each.fraction:.2g} %)" for each in findings]
         if np.ptp(here) == 0 or held > _DEAD:
             words = [DEAD]
         elif series == "measurements":
             others = [step for i, step in enumerate(steps) if i != axis]
-            if others and steps[axis] > _NOISIER * max(others):
-                words.append(_WHOLE[0])
-            if closed and abs(drift) > float(np.std(here)):
-                words.append(_WHOLE[1])
-            if not 1 / TREND <= (1.0 if np.isnan(change) else change) <= TREND:
-                words.append(_WHOLE[2])
+            whole = {
+                "noisy": bool(others) and steps[axis] > _NOISIER * max(others),
+                "drifting": closed and abs(drift) > float(np.std(here)),
+                "scatter changes": change > TREND or change < 1 / TREND,
+            }
+            words += [word for word, is_so in whole.items() if is_so]
         rows.append(
             ChannelRow(
                 channel=f"{names[axis]} {series.removesuffix('s')}".strip(),
@@ -190,7 +190,7 @@ def _judge_series(
                 mean_nm=float(np.mean(here)),
                 drift_nm=drift,
                 change=change,
-                faulty=sum(each.fraction for each in found),
+                faulty=sum(finding.fraction for finding in findings),
                 state=", ".join(words) or "good",
             )
         )
@@ -261,10 +261,9 @@ def _agreement(promised_nm: float, replayed: PredictionRow | None) -> str:
         return "not known"
     ratio = replayed.replayed_nm / promised_nm
     # the error of the logarithm, so that a large residual does not excuse itself
-    if abs(np.log(ratio)) <= DIFFERENT * replayed.replayed_error_nm / replayed.replayed_nm:
+    error = replayed.replayed_error_nm / replayed.replayed_nm
+    if abs(np.log(ratio)) <= max(DIFFERENT * error, _AGREES):
         return "yes"
-    if abs(ratio - 1) <= _AGREES:
-        return f"yes, within {100 * _AGREES:.0f} %"
     return f"no: {'more' if ratio > 1 else 'less'} than promised, by a factor {ratio:.2f}"
 
 

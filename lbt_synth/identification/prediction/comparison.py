@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,22 +14,19 @@ from lbt_synth.identification.prediction.predictor import least_squares_predicto
 from lbt_synth.identification.prediction.residual import (
     ResidualEstimate,
     check_series,
-    check_test,
-    choose_warm_up,
-    estimate_replay,
     estimate_residual,
+    gather,
     inverse_sensor,
-    leave_out,
     mode_noise,
     replay,
+    settled_test,
 )
-from lbt_synth.identification.stretches import Stretches, StretchesLike, split_frames
+from lbt_synth.identification.stretches import Stretches, StretchesLike, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, residual_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
@@ -38,7 +35,6 @@ INTEGRATOR = "best integrator"
 PREDICTOR = "least-squares predictor"
 LIMIT = "limit of performance"
 _RESERVED = (RAN, INTEGRATOR, PREDICTOR, LIMIT)
-_START_SHARE = 0.01  # of a measured mean square: what a start adds above that has a note
 _MOST_DEVIATIONS = 4.0  # standard errors between data and model that chance explains
 
 
@@ -83,10 +79,8 @@ class PredictionTable:
     entries : tuple of PredictionRow
         The rows.
     fit, test : tuple of (start, stop)
-        Frames that the predictor was fitted to, and those that all rows are measured on.
-    warm_up_frames : int
-        Frames at the beginning of each contiguous stretch that are not in the test, because the
-        state before them is not known.
+        Frames that the predictor was fitted to, and those that all rows are measured on: the
+        halves of the usable frames, without the first half second of a stretch.
     notes : tuple of str
         What is left out of the table or cannot be, and why.
     """
@@ -94,7 +88,6 @@ class PredictionTable:
     entries: tuple[PredictionRow, ...]
     fit: Stretches
     test: Stretches
-    warm_up_frames: int
     notes: tuple[str, ...]
 
     def __getitem__(self, name: str) -> PredictionRow:
@@ -114,8 +107,6 @@ def prediction_against_data(
     controllers: Mapping[str, Controller | Design],
     *,
     stretches: StretchesLike | None = None,
-    fit: StretchesLike | None = None,
-    test: StretchesLike | None = None,
     measurements: ArrayLike | None = None,
     running: Controller | Design | None = None,
     noise_error_nm: ArrayLike = 0.0,
@@ -138,10 +129,8 @@ def prediction_against_data(
     controllers : mapping of str to Controller or Design
         What is compared, by name.
     stretches : sequence of (start, stop), optional
-        Contiguous usable frames, over which controllers run; by default the whole record, or
-        ``fit`` and ``test``. They are halved by :func:`split_halves`, unless these are given.
-    fit, test : sequence of (start, stop), optional
-        Frames to fit the predictor to and frames to test on; both or neither.
+        Contiguous usable frames, over which controllers run; by default the whole record. The
+        halves of :func:`split_halves` are to fit and to test.
     measurements : (frames, q) array_like, optional
         Measurements y(k) of the loop that ran, for its own row [nm].
     running : Controller or Design, optional
@@ -189,82 +178,59 @@ def prediction_against_data(
     if imaging is not None:
         require_instance(imaging, Imaging)
     hardware = plant.hardware
-    series, _ = check_series(open_loop, hardware.modes, stretches)
-    runs, fitted, tested = split_frames(stretches, fit, test, len(series))
+    series, runs = check_series(open_loop, hardware.modes, stretches)
+    fit, later = split_halves(runs, len(series))
+    test, replayed = settled_test(runs, later, hardware.frame_rate_hz)
     noise = mode_noise(hardware, plant.R, noise_error_nm=noise_error_nm)
     for name in controllers:
         if name in _RESERVED or not isinstance(name, str):
             raise ProblemError(
                 f"a controller may not be called {name!r}; its row is taken. Give another name."
             )
-    predictor, _ = least_squares_predictor(series, hardware, taps=taps, stretches=fitted)
-    chosen = {INTEGRATOR: model_integrator(plant), **controllers, PREDICTOR: predictor}
-    loops = {name: _close_stable_loop(plant, name, one) for name, one in chosen.items()}
-    check_test(runs, tested)
-    replays = {name: replay(loop, series, runs, from_rest=False) for name, loop in loops.items()}
-    warm_up = choose_warm_up(list(replays.values()), tested)
-    kept = leave_out(runs, tested, warm_up)
-    rows = []
+    predictor, _ = least_squares_predictor(series, hardware, taps=taps, stretches=fit)
+    designs = {INTEGRATOR: model_integrator(plant), **controllers, PREDICTOR: predictor}
+    loops = {name: _close_stable_loop(plant, name, thing) for name, thing in designs.items()}
+    measured = {name: replay(loop, series, replayed) for name, loop in loops.items()}
     if measurements is not None:
-        promised = None
-        if running is not None:
-            promised = _model_means(_close_stable_loop(plant, RAN, running), plant)
-        y, _ = check_series(measurements, hardware.n_measurements, tested, "measurements")
+        y, _ = check_series(measurements, hardware.n_measurements, test, "measurements")
         if len(y) != len(series):
             raise ProblemError(
                 f"measurements must have the {len(series)} frames of open_loop; got {len(y)}."
             )
-        residual = y @ inverse_sensor(hardware).T
-        ran = estimate_residual(np.concatenate([residual[a:b] for a, b in kept]), kept, *noise)
-        rows.append(_build_row(RAN, ran, promised, imaging))
-    elif running is not None:
-        raise ProblemError("the controller that ran needs its measurements; got none.")
-    for name, loop in loops.items():
-        replayed = estimate_replay(replays[name], kept, noise)
-        rows.append(_build_row(name, replayed, _model_means(loop, plant), imaging))
-    notes = [*_note_starts(rows, loops), *_note_refuted(rows)]
+        measured = {RAN: y @ inverse_sensor(hardware).T, **measured}
+    if running is not None:
+        if measurements is None:
+            raise ProblemError("the controller that ran needs its measurements; got none.")
+        loops[RAN] = _close_stable_loop(plant, RAN, running)
+    rows = []
+    for name, residual in measured.items():
+        estimate = estimate_residual(gather(residual, test), test, *noise)
+        promised = None
+        if name in loops:  # as a record has it, in means over frames
+            promised = residual_budget(loops[name], plant, frame_means=True).total_nm2
+        rows.append(_build_row(name, estimate, promised, imaging))
+    notes = _note_refuted(rows)
     try:
         limit = least_model_residual(plant, frame_means=True)
     except ProblemError as error:  # modes that do not decouple, or a mirror without a limit
-        notes = [f"no {LIMIT}: {error}", *notes]
+        notes = (f"no {LIMIT}: {error}", *notes)
     else:
         along = limit.directions.T * limit.variance_nm2 @ limit.directions
         rows.append(_build_row(LIMIT, None, along, imaging))
-    return PredictionTable(
-        entries=tuple(rows),
-        fit=fitted,
-        test=kept,
-        warm_up_frames=warm_up,
-        notes=tuple(notes),
-    )
+    return PredictionTable(entries=tuple(rows), fit=fit, test=test, notes=notes)
 
 
-def _note_starts(rows: Sequence[PredictionRow], loops: Mapping[str, ClosedLoop]) -> Iterator[str]:
-    """Yield a note on each row whose start matters."""
-    for row in rows:
-        if row.replayed is None:
-            continue
-        start = float(np.trace(row.replayed.start_nm2))
-        if start > _START_SHARE * float(np.mean(np.sum(row.replayed.measured_nm**2, axis=1))):
-            yield (
-                f"the state of the {row.name} before the record is not known: slow modes (pole "
-                f"{loops[row.name].spectral_radius:.6f}) may contribute up to "
-                f"{nm_text(start**0.5, '.2g')} to its residual on the data, which its error holds. "
-                "A longer record tells more"
-            )
-
-
-def _note_refuted(rows: Sequence[PredictionRow]) -> list[str]:
+def _note_refuted(rows: list[PredictionRow]) -> tuple[str, ...]:
     """Return a note on the rows for which the noise cannot be right."""
     refuted = {row.name: row.replayed for row in rows if row.replayed and row.replayed.refuted}
     if not refuted:
-        return []
+        return ()
     most = max(replayed.errors_below_zero for replayed in refuted.values())
-    return [
+    return (
         f"no residual on the data of {', '.join(refuted)}: its variance is {most:.3g} standard "
         "errors below zero, more than chance; the model has more noise than the data, or another "
-        "sensor gain. Identify the noise again."
-    ]
+        "sensor gain. Identify the noise again.",
+    )
 
 
 def _close_stable_loop(plant: TipTiltPlant, name: str, thing: Controller | Design) -> ClosedLoop:
@@ -278,30 +244,28 @@ def _close_stable_loop(plant: TipTiltPlant, name: str, thing: Controller | Desig
     return loop
 
 
-def _model_means(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
-    """Covariance of what the plant's model leaves, in means over frames as a record has them."""
-    return residual_budget(loop, plant, frame_means=True).total_nm2
-
-
 def _build_row(
-    name: str, found: ResidualEstimate | None, promised: FloatArray | None, imaging: Imaging | None
+    name: str,
+    replayed: ResidualEstimate | None,
+    promised: FloatArray | None,
+    imaging: Imaging | None,
 ) -> PredictionRow:
     """Return a row of a residual on the data and a covariance (n, n) that the model promises."""
-    measured = np.nan if found is None else found.rms_nm
+    measured = np.nan if replayed is None else replayed.rms_nm
     model = np.nan if promised is None else float(np.sqrt(np.trace(promised)))
     strehl = promised_strehl = np.nan
-    if imaging is not None and found is not None:
-        strehl = found.strehl(imaging)
+    if imaging is not None and replayed is not None:
+        strehl = replayed.strehl(imaging)
     if imaging is not None and promised is not None:
         promised_strehl = jitter_strehl(promised, imaging=imaging)
     return PredictionRow(
         name=name,
         replayed_nm=measured,
-        replayed_error_nm=np.nan if found is None else found.rms_error_nm,
+        replayed_error_nm=np.nan if replayed is None else replayed.rms_error_nm,
         model_nm=model,
         ratio=measured / model if model > 0 else np.nan,
         strehl=strehl,
         model_strehl=promised_strehl,
-        replayed=found,
+        replayed=replayed,
         model_axis_nm=None if promised is None else frozen_copy(np.sqrt(np.diag(promised))),
     )

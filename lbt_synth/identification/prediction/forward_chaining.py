@@ -8,7 +8,7 @@ all that compete on a split see the same pseudo-open-loop series and the same fr
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -21,7 +21,9 @@ from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.prediction.residual import (
     ResidualEstimate,
     estimate_residual,
+    gather,
     replay,
+    settled_test,
 )
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, forward_splits
@@ -29,13 +31,9 @@ from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import (
-    FloatArray,
-    require_instance,
-)
+from lbt_synth.validation import FloatArray, require_instance
 
 _LEAST_TEST_S = 1.0
-_START_S = 0.5  # after the beginning of a stretch, where a controller has just started
 
 
 def record_splits(
@@ -73,8 +71,6 @@ class ForwardSplit:
         Identified from the training.
     open_loop : (frames, axes) ndarray
         The pseudo-open-loop series z(k) with the sensor gains of the model [nm].
-    options : mapping
-        Options of :func:`identify` that the model was identified with.
     """
 
     record: LoopRecord
@@ -83,7 +79,6 @@ class ForwardSplit:
     replayed: Stretches
     model: IdentifiedModel
     open_loop: FloatArray
-    options: Mapping[str, Any]
 
     @property
     def hardware(self) -> LoopHardware:
@@ -91,24 +86,9 @@ class ForwardSplit:
         return self.model.hardware
 
     @property
-    def past(self) -> LoopRecord:
-        """The record as it was when the training ended."""
-        stop, record = self.training[-1][1], self.record
-        names = ("measurements", "commands", "usable", "measured", "commanded")
-        series = {name: getattr(record, name) for name in names}
-        return replace(
-            record, **{name: given[:stop] for name, given in series.items() if given is not None}
-        )
-
-    @property
     def noise_nm2(self) -> FloatArray:
         """Covariance of the noise in the series, (axes, axes) [nm^2]."""
         return np.diag([(axis.noise_nm / axis.sensor_gain) ** 2 for axis in self.model.axes])
-
-    def measured(self) -> FloatArray:
-        """Return the residual that the loop measured in the test, (frames, axes) [nm]."""
-        residual = self.record.measurements / np.array(self.model.sensor_gains)
-        return np.concatenate([residual[start:stop] for start, stop in self.test])
 
     def replay(self, controller: Controller) -> FloatArray:
         """Return the measured residual of a controller in the test, (frames, axes) [nm].
@@ -118,48 +98,21 @@ class ForwardSplit:
         """
         loop = close_loop(self.hardware, controller)
         loop.require_stable()
-        run = replay(loop, self.open_loop, self.replayed, from_rest=False)
-        return np.concatenate([run.residual[start:stop] for start, stop in self.test])
+        return gather(replay(loop, self.open_loop, self.replayed), self.test)
 
 
 def forward_split(
-    record: LoopRecord,
-    training: Stretches,
-    test: Stretches,
-    *,
-    model: IdentifiedModel | None = None,
-    **options: Any,
+    record: LoopRecord, training: Stretches, test: Stretches, model: IdentifiedModel
 ) -> ForwardSplit:
-    """Identify the past of a split, and find the frames of its test that count.
-
-    Training and test are a pair of :func:`forward_splits`; the model is that of the training, if it
-    is known. The first half second of each stretch does not count, where a controller has just
-    started.
-    """
-    require_instance(record, LoopRecord)
-    settle = round(_START_S * record.frame_rate_hz)
-    kept, replayed = [], []
-    for start, stop in test:
-        first = max((a for a, _ in record.stretches() if a <= start), default=start)
-        begin = max(start, first + settle)
-        if begin < stop:
-            kept.append((begin, stop))
-            replayed.append((first, stop))
-    if not kept:
-        raise ProblemError(
-            f"a test needs a stretch of more than {settle} frames ({_START_S:g} s); got "
-            f"{max(stop - start for start, stop in test)}. Record more, or split less."
-        )
-    if model is None:
-        model = identify(record, stretches=training, **options)
+    """Return a split with the model of its training, and the frames of its test that count."""
+    kept, replayed = settled_test(record.stretches(), test, record.frame_rate_hz)
     return ForwardSplit(
         record=record,
         training=training,
-        test=tuple(kept),
-        replayed=tuple(replayed),
+        test=kept,
+        replayed=replayed,
         model=model,
         open_loop=record.pseudo_open_loop(model.sensor_gains),
-        options=options,
     )
 
 
@@ -198,7 +151,8 @@ def forward_chain(
     -------
     residuals : dict of str to ResidualEstimate
         What they leave of all tests, one after the other; that of least residual is the first.
-        :meth:`ResidualEstimate.above` compares two.
+        :meth:`ResidualEstimate.above` compares two, and :meth:`ResidualEstimate.within` returns
+        the share of one test.
     failures : dict of str to str
         Why others are not among them.
 
@@ -228,22 +182,20 @@ def forward_chain(
     >>> list(residuals), bool(difference > 2 * error)
     (['filter', 'ran'], True)
     """
-    pairs = record_splits(record, splits, first_share=first_share)
-    model, identified = first_model, identify_past or partial(identify, record, **options)
+    identified = identify_past or partial(identify, record, **options)
     measured: dict[str, list[FloatArray]] = {name: [] for name in designs}
     failures: dict[str, str] = {}
     stretches: Stretches = ()
-    noise, frames = list[FloatArray](), list[int]()
-    for training, test in pairs:
+    model, noise, frames = first_model, list[FloatArray](), list[int]()
+    for training, test in record_splits(record, splits, first_share=first_share):
         if model is None or stretches:
             model = identified(stretches=training, start=model)
-        split = forward_split(record, training, test, model=model, **options)
+        split = forward_split(record, training, test, model)
         for name, build in designs.items():
             if name in failures:
                 continue
             try:
-                made = build(split)
-                measured[name].append(split.replay(as_controller(made)))
+                measured[name].append(split.replay(as_controller(build(split))))
             except LbtSynthError as error:
                 failures[name] = str(error)
         stretches += split.test

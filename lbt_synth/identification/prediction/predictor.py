@@ -39,10 +39,8 @@ def least_squares_predictor(
     taps: int = 32,
     sensor_gain: float = 1.0,
     stretches: StretchesLike | None = None,
-    coupled: bool = False,
-    ridge: float = 0.0,
 ) -> tuple[Controller, FloatArray]:
-    """Fit the FIR predictor of least residual to a record, and make it a controller.
+    """Fit the FIR predictor of least residual of each mode to a record, and make it a controller.
 
     Parameters
     ----------
@@ -56,19 +54,15 @@ def least_squares_predictor(
         Sensor gain g that formed z, relative to the sensor matrix; the controller needs it.
     stretches : sequence of (start, stop), optional
         Contiguous usable frames to fit; by default the whole record.
-    coupled : bool, optional
-        Predict each mode from all modes, instead of from itself.
-    ridge : float, optional
-        Added to the mean squares of the regressors, relative to their mean; 0 is least squares.
-        Regressors that depend on each other get the coefficients of least norm.
 
     Returns
     -------
     controller : Controller
         From y(k) to u(k). The filter is its Youla parameter (:func:`youla_controller`): the loop
         is stable for any coefficients, at the sensor gain of the fit.
-    coefficients : (n, n, taps) ndarray
-        What z_j(k-l) adds to the correction of mode i that u(k) commands.
+    coefficients : (n, taps) ndarray
+        What z_i(k-l) adds to the correction of mode i that u(k) commands. Regressors that depend
+        on each other get the coefficients of least norm.
 
     Raises
     ------
@@ -86,39 +80,32 @@ def least_squares_predictor(
     >>> idle = lbt.Controller(A=0.0, B=0.0, C=0.0, D=0.0, dt_s=1 / 800)
     >>> run = lbt.simulate(idle, lbt.Truth(turbulence=slow), hardware=path, frames=20_000)
     >>> _, taps = lbt.identification.least_squares_predictor(run.total_nm[0], path, taps=1)
-    >>> bool(abs(taps[0, 0, 0] - 0.81) < 0.02)
+    >>> bool(abs(taps[0, 0] - 0.81) < 0.02)
     True
     """
     require_instance(hardware, LoopHardware)
-    count = integer(taps, "taps", at_least=1)
-    if count > _MOST_TAPS:
-        raise ProblemError(f"taps must be at most {_MOST_TAPS}; got {count}.")
+    count = integer(taps, "taps", at_least=1, at_most=_MOST_TAPS)
     gain = number(sensor_gain, "sensor_gain", above=0)
-    share = number(ridge, "ridge", at_least=0)
     back, n = inverse_sensor(hardware) / gain, hardware.modes
     need = "a predictor needs a command for every mode, and an influence matrix"
     to_command = invert(hardware.influence, need)
     series, parts = check_series(open_loop, n, stretches)
     blocks = [_regression(series[a:b], hardware.mirror_taps, count) for a, b in parts]
-    X, Z = (np.concatenate(each) for each in zip(*blocks, strict=True))
-    unknowns = count * (n if coupled else 1)
-    if len(X) < _LEAST_ROWS * unknowns:
+    X, Z = (np.concatenate(block) for block in zip(*blocks, strict=True))
+    if len(X) < _LEAST_ROWS * count:
         raise ProblemError(
-            f"a predictor of {unknowns} coefficients needs at least {_LEAST_ROWS * unknowns} "
-            f"frames to fit, beside {count} and the mirror's at the beginning of each stretch; got "
+            f"a predictor of {count} coefficients needs at least {_LEAST_ROWS * count} frames to "
+            f"fit, beside {count} and the mirror's at the beginning of each stretch; got "
             f"{len(X)}. Record more, or lower taps."
         )
-    coefficients = np.zeros((n, n, count))
-    for i in range(n):
-        seen = slice(None) if coupled else slice(i, i + 1)
-        regressors = X[:, seen].reshape(len(X), unknowns)
-        found = _solve_least_squares(regressors, Z[:, i], share)
-        coefficients[i, seen] = found.reshape(-1, count)
+    tolerance = np.finfo(float).eps * (count + 1)
+    fits = [np.linalg.lstsq(X[:, i], Z[:, i], rcond=tolerance)[0] for i in range(n)]
+    coefficients = np.array(fits)
     # an FIR filter of z from y to u, whose states are the last z
     parameter = Controller(
         A=np.eye(n * count, k=-n),
         B=np.vstack([back, np.zeros((n * (count - 1), n))]),
-        C=to_command @ coefficients.transpose(0, 2, 1).reshape(n, n * count),
+        C=to_command @ np.hstack([np.diag(column) for column in coefficients.T]),
         D=np.zeros((n, n)),
         dt_s=hardware.dt_s,
     )
@@ -138,13 +125,3 @@ def _regression(
     filtered = sliding_window_view(part, m, axis=0) @ mirror_taps[::-1]
     late = sliding_window_view(filtered, count, axis=0)[:rows, :, ::-1]
     return np.asarray(late), part[m - 1 + count :]
-
-
-def _solve_least_squares(X: FloatArray, z: FloatArray, share: float) -> FloatArray:
-    """Return the least-squares coefficients of least norm."""
-    unknowns = X.shape[1]
-    weight = np.sqrt(share * np.mean(np.sum(X**2, axis=0)))
-    left = np.vstack([X, weight * np.eye(unknowns)])
-    right = np.append(z, np.zeros(unknowns))
-    found = np.linalg.lstsq(left, right, rcond=np.finfo(float).eps * (unknowns + 1))[0]
-    return np.asarray(found)

@@ -140,12 +140,10 @@ def test_a_table_of_one_axis():
         z,
         {"Kalman": lbt.kalman(plant)},
         imaging=CAMERA,
-        fit=[(0, 3000)],
-        test=[(3000, 5000), (5100, 9000)],
+        stretches=[(0, 5000), (5100, 9000)],
     )
-    assert table.fit == ((0, 3000),)
-    assert 0 < table.warm_up_frames < 1000
-    assert table.test == ((3000, 5000), (5100 + table.warm_up_frames, 9000))
+    assert table.fit == ((0, 4450),)
+    assert table.test == ((4450, 5000), (5500, 9000))
     row = table["Kalman"]
     assert abs(row.deviations) < 4
     assert row.strehl == pytest.approx(
@@ -248,16 +246,13 @@ def test_more_noise_than_the_data_has_is_a_note():
             {"controllers": {"mine": PATH}},
             "controller must be a Controller, or a design; got LoopHardware",
         ),
-        ({"fit": [(0, 900)]}, "fit and test must both be given"),
-        ({"fit": [(0, 900)], "test": [(800, 2000)]}, "frames that the fit has not"),
-        ({"fit": [(0, 900)], "test": [(900, 2001)]}, "within 2000 frames"),
+        ({"stretches": [(0, 2001)]}, "within 2000 frames"),
         ({"measurements": GOOD[:1999]}, "within 1999 frames"),
         ({"measurements": GOOD[:, :1]}, r"measurements must be \(frames, 2\)"),
         ({"measurements": np.vstack([GOOD, GOOD])}, "must have the 2000 frames of open_loop"),
         ({"measurements": SPOILT[::-1]}, "measurements, frames 1000 to 2000, must be finite"),
         ({"running": lbt.integrator(PATH, gain=0.3)}, "needs its measurements"),
         ({"imaging": 2.2}, "expected an Imaging"),
-        ({"stretches": [(0, 900)], "fit": [(0, 500)], "test": [(800, 950)]}, "within the usable"),
         ({"noise_error_nm": -1.0}, "noise_error_nm must be at least 0"),
         ({"taps": 300}, "at least 1200 frames to fit"),
     ],
