@@ -18,9 +18,9 @@ def run(arguments: Namespace) -> Report:
     record = loop_records.read_record(arguments)
     choose_unit(arguments, record.diameter_m)
     options = loop_records.identification_options(arguments, record)
-    notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     if isinstance(record, LoopRecord):
-        notes = loop_records.judge_record(arguments, record)
+        doubts = loop_records.judge_record(arguments, record)
     if isinstance(record, SpectrumRecord):  # it does not hold the timing of the loop
         options |= {name: getattr(arguments, name) for name in ("frame_rate_hz", "delay_frames")}
     with show_spinner("identifying", quiet=arguments.json):
@@ -34,6 +34,6 @@ def run(arguments: Namespace) -> Report:
         found = accelerometer_transfers(model, record, values, channels=channels)
         loop_records.add_accelerometers(report, found)
         report.notes += [f"note: {note}." for note in notes]
-    report.notes += [loop_records.marked_note(note) for note in notes]
+    report.notes += [loop_records.marked_note(doubt) for doubt in doubts]
     loop_records.write_files(report, places, arguments, record, model, accelerometers=found)
     return report

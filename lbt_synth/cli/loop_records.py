@@ -234,9 +234,13 @@ def add_accelerometers(report: Report, found: AccelerometerTransfers) -> None:
         report.add_rows("accelerometer_lines", "Accelerometers and lines", found.transfers)
     report.add_rows("accelerometers", "Accelerometers", found.channels)
     report.data["accelerometer_shift"] = {
-        name: getattr(found, f"shift_{name}") for name in ("frames", "error_frames", "by_phases")
+        name: getattr(found, f"shift_{name}") for name in ("frames", "error_frames")
     }
     report.notes.append(f"note: {found.shift_text}")
+    if found.used:
+        report.notes.append(f"note: {found.worth_text}.")
+    names = ("alone_nm", "together_nm")
+    report.data["accelerometer_residuals"] = {name: getattr(found, name) for name in names}
 
 
 def find_places(arguments: Namespace, model: str | Path | None, **others: Path) -> dict[str, Path]:

@@ -161,7 +161,6 @@ def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
         channels=tuple(ChannelRow(channel=name, noise_m_s2=2e-4, verdict="") for name in names),
         shift_frames=age - 1,
         shift_error_frames=0.1,
-        shift_by_phases=True,
         age_frames=age,
         rate_hz=1000.0,
     )
