@@ -15,11 +15,10 @@ import argparse
 import time
 
 import numpy as np
-from league import CHANGES, past, simulate_record
+from league import CHANGES, Split, past, simulate_record
 
 import lbt_synth as lbt
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.identification.prediction.forward_chaining import forward_split
 from lbt_synth.methods.registry import default_method, method_named, record_methods
 from lbt_synth.methods.request import PlantInputs, design_request
 
@@ -29,13 +28,13 @@ def residuals_of_last_quarter(record) -> tuple[lbt.identification.MethodChoice, 
     training, test = lbt.identification.split_halves(
         record.stretches(), record.frames, fit_share=0.75
     )
-    split = forward_split(record, training, test, lbt.identify(record, stretches=training))
+    split = Split(record, training, test, lbt.identify(record, stretches=training))
     choice = lbt.design_from_record(past(split), accept_record=True).choice
     left = {}
     for name in record_methods():
         inputs = PlantInputs(plant=split.model.plant(), design_defaults={"gamma_ratio": 1.2})
         design = design_request(name, method_named(name).reference_options).build(inputs)
-        left[name] = float(np.sqrt(np.mean(np.sum(split.replay(design.controller) ** 2, axis=1))))
+        left[name] = float(np.sqrt(split.residual(design.controller).measured_nm2))
     return choice, left
 
 

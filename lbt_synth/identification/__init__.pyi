@@ -12,8 +12,6 @@ from .fit.identify import identify as identify
 from .likeliest_gain import allowed_gains as allowed_gains
 from .prediction.comparison import PredictionTable as PredictionTable
 from .prediction.comparison import prediction_against_data as prediction_against_data
-from .prediction.forward_chaining import ForwardSplit as ForwardSplit
-from .prediction.forward_chaining import forward_chain as forward_chain
 from .prediction.predictor import least_squares_predictor as least_squares_predictor
 from .prediction.residual import ResidualEstimate as ResidualEstimate
 from .prediction.residual import replayed_residual as replayed_residual

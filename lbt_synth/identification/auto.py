@@ -32,16 +32,11 @@ from lbt_synth.identification.prediction.comparison import (
     PredictionTable,
     prediction_against_data,
 )
-from lbt_synth.identification.prediction.forward_chaining import (
-    ForwardSplit,
-    forward_chain,
-    record_splits,
-)
-from lbt_synth.identification.prediction.residual import ResidualEstimate
+from lbt_synth.identification.prediction.residual import ResidualEstimate, replayed_residual
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
-from lbt_synth.identification.stretches import Stretches, split_halves
+from lbt_synth.identification.stretches import forward_splits, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget
 from lbt_synth.methods.registry import (
@@ -410,23 +405,15 @@ def choose_method(
     a method that would replace the default. A method that fails or is unstable is left out; if
     nothing can be compared, a note says why.
     """
-
-    def build(name: str, split: ForwardSplit) -> Design:
-        return design(name, split.model, method_named(name).reference_options)
-
-    tried = {name: partial(build, name) for name in quick_methods()}
+    usual = default_method()
     try:
-        residuals, left_out = forward_chain(
-            record, tried, splits=_SPLITS, first_model=half, identify_past=identify_past
-        )
+        residuals, failures = _replay_methods(record, half, identify_past, design)
     except LbtSynthError as error:
         note = f"the methods were not compared: {error}"
-        return MethodChoice(method=default_method(), rows=(), notes=(note,))
-    usual, failures = default_method(), dict(left_out)
-    tests = [test for _, test in record_splits(record, _SPLITS)]
+        return MethodChoice(method=usual, rows=(), notes=(note,))
     chosen = usual
-    for name, residual in residuals.items():  # the best first
-        if usual in residuals and not _is_better(residual, residuals[usual], tests):
+    for name, parts in residuals.items():  # the best first
+        if usual in residuals and not _is_better(parts, residuals[usual]):
             continue
         if is_safe(design(name, half, method_named(name).reference_options)):
             chosen = name
@@ -435,55 +422,87 @@ def choose_method(
     return _describe_choice(chosen, residuals, failures)
 
 
-def _is_better(
-    residual: ResidualEstimate, usual: ResidualEstimate, tests: Sequence[Stretches]
-) -> bool:
-    """Whether a residual is clearly less than the usual one on every test."""
-    for test in tests:
-        reference = usual.within(test)
-        difference, error = reference.above(residual.within(test))
+def _replay_methods(
+    record: LoopRecord,
+    half: IdentifiedModel,
+    identify_past: Callable[..., IdentifiedModel],
+    design: Callable[[str, IdentifiedModel, Mapping[str, Any]], Design],
+) -> tuple[dict[str, list[ResidualEstimate]], dict[str, str]]:
+    """Return what quick methods leave of each test by models of its past, and why others fail."""
+    residuals: dict[str, list[ResidualEstimate]] = {name: [] for name in quick_methods()}
+    failures: dict[str, str] = {}
+    model, stretches = half, record.stretches()
+    splits = forward_splits(stretches, record.frames, splits=_SPLITS)
+    for training, test in splits:
+        if training != splits[0][0]:
+            model = identify_past(stretches=training, start=model)
+        for name in [name for name in residuals if name not in failures]:
+            try:
+                made = design(name, model, method_named(name).reference_options)
+                residual = replayed_residual(
+                    record.pseudo_open_loop(model.sensor_gains),
+                    made.controller,
+                    model.hardware,
+                    noise_nm=[axis.noise_nm for axis in model.axes],
+                    stretches=stretches,
+                    test=test,
+                )
+                residuals[name].append(residual)
+            except LbtSynthError as error:
+                failures[name] = str(error).rstrip(".")
+    whole = [(name, parts) for name, parts in residuals.items() if name not in failures]
+    return dict(sorted(whole, key=lambda row: _mean_nm2(row[1]))), failures
+
+
+def _mean_nm2(parts: Sequence[ResidualEstimate]) -> float:
+    return float(np.mean([part.total_nm2 for part in parts]))
+
+
+def _is_better(parts: Sequence[ResidualEstimate], usual: Sequence[ResidualEstimate]) -> bool:
+    """Whether residuals are clearly less than the usual ones on every test."""
+    for part, reference in zip(parts, usual, strict=True):
+        difference, error = reference.above(part)
         if difference <= max(_ERRORS * error, _LEAST_SHARE * reference.measured_nm2):
             return False
     return True
 
 
 def _describe_choice(
-    chosen: str, residuals: Mapping[str, ResidualEstimate], failures: Mapping[str, str]
+    chosen: str,
+    residuals: Mapping[str, Sequence[ResidualEstimate]],
+    failures: Mapping[str, str],
 ) -> MethodChoice:
     """Return the choice with its table, and say by how much it is better."""
     title, usual = method_named(chosen).title, default_method()
-    notes = [
-        f"the {method_named(name).title} is left out: {why.rstrip('.')}"
-        for name, why in failures.items()
-    ]
+    notes = [f"the {method_named(name).title} is left out: {why}" for name, why in failures.items()]
     shown = [name for name in residuals if name not in failures]
     if chosen not in shown:
         return MethodChoice(method=chosen, rows=(), notes=tuple(notes))
-    rows = []
+    measured_nm2 = float(np.mean([part.measured_nm2 for part in residuals[chosen]]))
+    rows = {}
     for name in shown:
-        difference, error = residuals[name].above(residuals[chosen])
-        rows.append(
-            MethodRow(
-                name=method_named(name).title,
-                residual_nm=residuals[name].rms_nm,
-                above_nm2=difference,
-                above_error_nm2=error,
-                above=difference / residuals[chosen].measured_nm2,
-            )
+        pairs = zip(residuals[name], residuals[chosen], strict=True)
+        differences, errors = np.transpose([part.above(best) for part, best in pairs])
+        mean_nm2 = _mean_nm2(residuals[name])
+        rows[name] = MethodRow(
+            name=method_named(name).title,
+            residual_nm=float(np.sqrt(mean_nm2)) if mean_nm2 >= 0 else np.nan,
+            above_nm2=float(np.mean(differences)),
+            above_error_nm2=float(np.linalg.norm(errors) / len(errors)),
+            above=float(np.mean(differences)) / measured_nm2,
         )
     if chosen == usual:
         word = (
             f"the {title} stays: no method tried leaves less on each of {_SPLITS} tests, by more "
             f"than {_ERRORS:g} standard errors and {100 * _LEAST_SHARE:g} % of the variance"
         )
-    elif usual in shown:
-        difference, error = residuals[usual].above(residuals[chosen])
-        gained = nm_text(difference, error_nm=error, unit="nm^2")
-        share = 100 * difference / residuals[usual].measured_nm2
+    elif usual in rows:
+        row = rows[usual]
+        gained = nm_text(row.above_nm2, error_nm=row.above_error_nm2, unit="nm^2")
         word = (
             f"the {title} is chosen: on each of {_SPLITS} tests it leaves less than the "
-            f"{method_named(usual).title}, in all by {gained} ({share:.2g} % of the variance)"
+            f"{row.name}, in all by {gained} ({100 * row.above:.2g} % of the measured variance)"
         )
     else:
         word = f"the {title} is chosen: of the methods that are left it leaves least"
-    return MethodChoice(method=chosen, rows=tuple(rows), notes=(word, *notes))
+    return MethodChoice(method=chosen, rows=tuple(rows.values()), notes=(word, *notes))

@@ -133,14 +133,6 @@ class ResidualEstimate:
         error = float(np.sqrt(max(float(np.sum(covariance)), 0.0)))
         return self.total_nm2 - other.total_nm2, error
 
-    def within(self, test: Stretches) -> ResidualEstimate:
-        """Return the residual in those of its stretches that lie in a test."""
-        inside = [any(a <= start and stop <= b for a, b in test) for start, stop in self.stretches]
-        rows = np.repeat(inside, [stop - start for start, stop in self.stretches])
-        kept = tuple(one for one, good in zip(self.stretches, inside, strict=True) if good)
-        noise_error = np.zeros_like(self.noise_nm2)
-        return estimate_residual(self.measured_nm[rows], kept, self.noise_nm2, noise_error)
-
     def strehl(self, imaging: Imaging) -> float:
         """Long-exposure Strehl ratio of a Gaussian residual of this covariance, in [0, 1].
 

@@ -5,10 +5,14 @@ Where replays start, and which frames count.
 
 from __future__ import annotations
 
+import runpy
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.plants import ROOT
 from support.predictions import (
     CAMERA,
     CASES,
@@ -22,6 +26,7 @@ from support.predictions import (
     a_truth,
     pseudo_open_loop,
 )
+from support.short_record import short_record
 
 import lbt_synth as lbt
 from lbt_synth.identification.prediction.residual import (
@@ -339,14 +344,6 @@ def test_replays_that_begin_in_a_record_cover_those_that_know_its_past(pole):
     assert np.mean(np.abs(deviations) < 1) > 2 / 3
 
 
-def test_within_a_test_there_is_its_share():
-    z = np.random.default_rng(0).standard_normal((700, 1))
-    both = estimate_residual(z, ((0, 300), (400, 800)), np.eye(1), np.zeros((1, 1)))
-    later = both.within(((350, 900),))
-    assert later.stretches == ((400, 800),)
-    assert later.total_nm2 == pytest.approx(np.mean(z[300:] ** 2) - 1)
-
-
 def test_a_residual_in_words():
     zero = np.zeros((1, 1))
     z = 10 * np.random.default_rng(0).standard_normal((4000, 1))
@@ -358,3 +355,35 @@ def test_a_residual_in_words():
     assert "more noise than the data" in refuted.text
     assert 0 < hidden.strehl(CAMERA) <= 1
     assert np.isnan(refuted.strehl(CAMERA))
+
+
+def test_the_future_changes_nothing_before_it():
+    """Nor does what a replay begins with: it runs over the frames before the test."""
+    z = np.random.default_rng(0).standard_normal((3000, 2)).cumsum(axis=0)
+    later = z.copy()
+    later[2600:] += 1000.0
+    new = lbt.kalman(a_plant()).controller
+    one, other = (
+        lbt.identification.replayed_residual(
+            series, new, PATH, noise_nm=1.0, stretches=[(10, 3000)], test=[(1500, 3000)]
+        ).measured_nm
+        for series in (z, later)
+    )
+    assert np.array_equal(one[:1100], other[:1100])
+    assert np.max(np.abs(one[1100:] - other[1100:])) > 500
+
+
+def test_the_league_of_designs_and_rivals(monkeypatch, capsys):
+    """The script of the benchmarks ranks a filter of the model above the best integrator."""
+    league = runpy.run_path(str(ROOT / "benchmarks/league.py"))
+    names = ("best integrator", "least squares, 32 taps", "Kalman")
+    entries = {name: league["ENTRIES"][name] for name in names}
+    monkeypatch.setitem(league["play"].__globals__, "ENTRIES", entries)
+    short = replace(short_record(), usable=np.arange(9000) < 600)
+    league["play"]({"night": short_record(), "brief": short}, 2)
+    failure, _, heading, *rows = capsys.readouterr().out.splitlines()
+    assert failure.startswith("brief is not in the table: ")
+    assert heading.split()[-1] == "night"
+    assert [row[:26].strip() for row in rows] == ["Kalman", "least squares, 32 taps", names[0]]
+    assert float(rows[0].split()[-1]) == 0.0
+    assert float(rows[2].split()[-1]) > 20
