@@ -318,9 +318,8 @@ def studied(seed: int, frames: int) -> dict:
     gain = halved.sensor_gains[0]
     predictor, _ = lbt.identification.least_squares_predictor(
         it.record.pseudo_open_loop(gain),
-        it.path,
+        replace(it.path, sensor_matrix=gain * it.path.sensor),
         taps=32,
-        sensor_gain=gain,
         stretches=half,
     )
     half_filter = lbt.kalman(halved.plant()).controller
@@ -329,9 +328,8 @@ def studied(seed: int, frames: int) -> dict:
         lbt.identification.replayed_residual(
             true_open,
             controller,
-            it.path,
+            replace(it.path, sensor_matrix=it.truth.sensor_gain * it.path.sensor),
             noise_nm=it.truth.noise_nm,
-            sensor_gain=it.truth.sensor_gain,
             stretches=it.record.stretches(),
             test=other,
         ).total_nm2
@@ -467,9 +465,8 @@ def drifts() -> None:
             left_nm2 = lbt.identification.replayed_residual(
                 record.pseudo_open_loop(0.8),
                 lbt.kalman(model.plant()).controller,
-                path,
+                replace(path, sensor_matrix=0.8 * path.sensor),
                 noise_nm=5.0,
-                sensor_gain=0.8,
                 stretches=record.stretches(),
                 test=record.stretches(),
             ).total_nm2

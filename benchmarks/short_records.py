@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import time
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 
 import identification as loops
 import numpy as np
@@ -45,9 +46,8 @@ def replayed(
         found = lbt.identification.replayed_residual(
             it.record.pseudo_open_loop(it.truth.sensor_gain),
             controller,
-            it.path,
+            replace(it.path, sensor_matrix=it.truth.sensor_gain * it.path.sensor),
             noise_nm=it.truth.noise_nm,
-            sensor_gain=it.truth.sensor_gain,
             stretches=[run],
             test=[test],
         )

@@ -28,7 +28,6 @@ from lbt_synth.identification.likeliest_gain import (
     unstable_gains,
 )
 from lbt_synth.identification.prediction.comparison import (
-    PredictionRow,
     PredictionTable,
     prediction_against_data,
 )
@@ -96,7 +95,6 @@ def design_from_record(
     assumed_gain: float = 1.0,
     announced: Sequence[LinePrior] = (),
     imaging: Imaging | None = None,
-    taps: int = 32,
     accept_record: bool = False,
     command_scale_known: bool = False,
     progress: Callable[[int], None] | None = None,
@@ -127,8 +125,6 @@ def design_from_record(
         As for :func:`identify`.
     imaging : Imaging, optional
         The camera, for Strehl ratios; 2.2 um by default.
-    taps : int, optional
-        Coefficients of the predictor by least squares.
     accept_record : bool, optional
         Go on although something else explains the record better; the design says so.
     command_scale_known : bool, optional
@@ -207,7 +203,6 @@ def design_from_record(
         measurements=None if record.commands is None else record.measurements,
         noise_error_nm=[axis.noise_error_nm for axis in half.axes],
         imaging=Imaging() if imaging is None else imaging,
-        taps=taps,
     )
     step(1)
     whole, allowed = identify_with_gains(record, start=half, **options)
@@ -231,7 +226,7 @@ def design_from_record(
             *careful,
             *_compare_gains(model, half),
             *note_drift(record, model.plant(), made.controller),
-            *_note_short(usable, model, held_out[name]),
+            *_note_short(usable, model),
         ),
         choice=choice_of_method,
     )
@@ -265,23 +260,14 @@ def _design_robustly(model: IdentifiedModel, gains: tuple[float, float]) -> Desi
     return design_request(gain_robust_method(), {}).build(inputs)
 
 
-def _note_short(seconds: float, model: IdentifiedModel, row: PredictionRow) -> Iterator[str]:
+def _note_short(seconds: float, model: IdentifiedModel) -> Iterator[str]:
     """Yield what a short record leaves open."""
-    if seconds >= _SHORT_SECONDS:
-        return
-    shares = {
-        "the noise": max(axis.noise_error_nm / axis.noise_nm for axis in model.axes),
-        "the residual on unseen data": row.replayed_error_nm / row.replayed_nm,
-    }
-    gains = [(axis.sensor_gain_error, axis.sensor_gain) for axis in model.axes]
-    if all(error is not None for error, _ in gains):
-        shares = {"the sensor gain": max((error or 0.0) / gain for error, gain in gains)} | shares
-    yield (
-        f"the record is short ({seconds:.3g} s): it does not tell lines less than "
-        f"{max(axis.resolution_hz for axis in model.axes):.2g} Hz apart from one, and shows "
-        + " and ".join(f"{what} to {100 * x:.2g} %" for what, x in shares.items() if x == x)
-        + ". Half a minute shows more"
-    )
+    if seconds < _SHORT_SECONDS:
+        resolution_hz = max(axis.resolution_hz for axis in model.axes)
+        yield (
+            f"the record is short ({seconds:.3g} s): it does not tell lines less than "
+            f"{resolution_hz:.2g} Hz apart from one. Half a minute shows more"
+        )
 
 
 def _judge_commands(
@@ -302,9 +288,8 @@ def _judge_commands(
 
 def _judge_gains(model: IdentifiedModel, accept: bool) -> tuple[str, ...]:
     """Return what is assumed of fitted gains; refuse those of commands in another unit."""
-    errors = [axis.sensor_gain_error for axis in model.axes]
-    known = np.array([np.inf if error is None else error for error in errors])
-    verdict = judge_fitted_gains(np.array(model.sensor_gains), known)
+    errors = np.array([axis.sensor_gain_error or np.inf for axis in model.axes])
+    verdict = judge_fitted_gains(np.array(model.sensor_gains), errors)
     if not accept:
         verdict.require_accepted()
     return verdict.overruled

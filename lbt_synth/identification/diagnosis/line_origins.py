@@ -1,4 +1,4 @@
-"""Where the lines of a record come from: one axis, a diagonal, or both axes without relation.
+"""Where the lines of a record come from: one axis, or a diagonal.
 
 What each part of the disturbance costs a loop, in nm and in Strehl ratio.
 """
@@ -24,7 +24,7 @@ _ALL = "all"  # parts together
 
 @table_row
 class LineRow:
-    """A vibration, on all axes."""
+    """A vibration."""
 
     frequency_hz: float = column("f", unit="Hz", format=".3f", help="Frequency")
     frequency_error_hz: float = column("+-", unit="Hz", format=".2g", help="Its standard error")
@@ -35,8 +35,8 @@ class LineRow:
     )
     direction_error_deg: float = column("+-", unit="deg", format=".2g", help="Its error")
     origin: str = column("origin", help="Where it is from")
-    broad: bool = field(default=False)  # too damped for a line
-    vibrations: tuple[Vibration, ...] = field(default=())  # of the plant, that it is made of
+    broad: bool  # too damped for a line
+    vibration: Vibration  # of the plant
 
     @property
     def name(self) -> str:
@@ -52,59 +52,34 @@ class LineRow:
 
 
 def line_origins(model: IdentifiedModel) -> tuple[LineRow, ...]:
-    """Return the lines of a model by frequency; two axes at one frequency are one row.
-
-    The joint likelihood of both axes says which lines go along a direction.
-    """
-    groups: list[list[IdentifiedLine]] = []
-    for line in sorted(model.parts, key=lambda part: part.frequency_hz):
-        if line.kind == "turbulence":
-            continue
-        last = groups[-1] if groups else []
-        if len(last) == 1 and _are_twins(last[0], line, model):
-            last.append(line)
-        else:
-            groups.append([line])
-    return tuple(_describe(group, len(model.axes)) for group in groups)
+    """Return the lines of a model by frequency, each with the direction in which it shakes."""
+    parts = [part for part in model.parts if part.kind != "turbulence"]
+    return tuple(_line_row(part, len(model.axes)) for part in sorted(parts, key=_frequency_hz))
 
 
-def _are_twins(one: IdentifiedLine, other: IdentifiedLine, model: IdentifiedModel) -> bool:
-    """Whether lines are those of two axes, and of one frequency."""
-    along = [line.direction or () for line in (one, other)]
-    if along[0] == along[1] or any(np.count_nonzero(axes) != 1 for axes in along):
-        return False
-    error = float(np.hypot(one.frequency_error_hz, other.frequency_error_hz))
-    width = max(one.damping * one.frequency_hz, other.damping * other.frequency_hz)
-    near = max(DIFFERENT * error, min(width, model.axes[0].resolution_hz * 2))
-    return abs(one.frequency_hz - other.frequency_hz) <= near
+def _frequency_hz(part: IdentifiedLine) -> float:
+    return part.frequency_hz
 
 
-def _describe(group: Sequence[IdentifiedLine], axes: int) -> LineRow:
-    """Return a line along a direction, or those of both axes at one frequency."""
-    first = max(group, key=lambda line: line.rms_nm)
-    weights = np.array([1 / max(line.frequency_error_hz, 1e-12) ** 2 for line in group])
-    frequency_hz = float(weights @ [line.frequency_hz for line in group] / weights.sum())
-    angle, error = first.direction_deg or 0.0, first.direction_error_deg
-    near = DIFFERENT * (error or 0.0)
-    origin = "a diagonal"
+def _line_row(part: IdentifiedLine, axes: int) -> LineRow:
+    angle, error = part.direction_deg or 0.0, part.direction_error_deg
+    near, origin = DIFFERENT * (error or 0.0), "a diagonal"
     if axes == 1:
         angle, origin = np.nan, "one axis"
-    elif len(group) > 1:
-        angle, error, origin = np.nan, None, "both axes, unrelated"
     elif abs(angle) <= near:
         origin = AXES[0]
     elif abs(angle) >= 90 - near:
         angle, origin = angle % 180, AXES[1]
     return LineRow(
-        frequency_hz=frequency_hz,
-        frequency_error_hz=float(1 / np.sqrt(weights.sum())),
-        damping=f"{first.damping:.3g}" if first.resolved else f"< {first.damping:.2g}",
-        rms_nm=float(np.sqrt(sum(line.rms_nm**2 for line in group))),
+        frequency_hz=part.frequency_hz,
+        frequency_error_hz=part.frequency_error_hz,
+        damping=f"{part.damping:.3g}" if part.resolved else f"< {part.damping:.2g}",
+        rms_nm=part.rms_nm,
         direction_deg=angle,
         direction_error_deg=np.nan if error is None else error,
-        origin=origin if first.kind == "line" else f"{origin}, broad",
-        broad=first.kind != "line",
-        vibrations=tuple(line.vibration() for line in group),
+        origin=origin if part.kind == "line" else f"{origin}, broad",
+        broad=part.kind != "line",
+        vibration=part.vibration(),
     )
 
 
@@ -165,10 +140,8 @@ def _covariances(
         return {}
     budget = residual_budget(loop, plant, frame_means=True)
     out = {"turbulence": budget.turbulence_nm2, "measurement noise": budget.noise_nm2}
-    for line in lines:
-        parts = [line_covariance(loop, vibration) for vibration in line.vibrations]
-        name = line.name if line.name not in out else f"{line.name}, another"
-        out[name] = np.sum(parts, axis=0)
+    for line in lines:  # two of one frequency are one part
+        out[line.name] = out.get(line.name, 0.0) + line_covariance(loop, line.vibration)
     rest = budget.total_nm2 - np.sum(list(out.values()), axis=0)
     out["turbulence"] = out["turbulence"] + rest  # slow resonances are turbulence
     return out | {_ALL: budget.total_nm2}

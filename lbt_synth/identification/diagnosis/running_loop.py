@@ -229,28 +229,13 @@ def given_design_facts(
 ) -> Facts:
     """Return what a given design does on the record, replayed where its loop is stable."""
     controller = given_controller(design, model)
-    loop = close_loop(model.hardware, controller)
     promised = design.rms
-    residual = {"unit": "nm", "format": ".2f"}
     return facts(
         design=fact(name, "design"),
         method=fact(design_title(design.method), "method"),
-        stable=fact(loop.is_stable, "stable"),
-        spectral_radius=fact(loop.spectral_radius, "spectral radius", format=".5f"),
+        stable=fact(close_loop(model.hardware, controller).is_stable, "stable"),
         stable_gains=fact(_stable_gains(model, controller), _STABLE_GAINS),
-        sensor_gain=fact(f"{np.mean(model.sensor_gains):.3f}", "identified sensor gain"),
-        replayed_nm=fact(
-            np.nan if replayed is None else replayed.replayed_nm,
-            "residual on the record",
-            **residual,
-        ),
-        replayed_error_nm=fact(
-            np.nan if replayed is None else replayed.replayed_error_nm, "+-", **residual
-        ),
-        own_model_nm=fact(promised, "promised by its own model", **residual),
-        model_nm=fact(
-            np.nan if replayed is None else replayed.model_nm, "by the record's model", **residual
-        ),
+        own_model_nm=fact(promised, "promised by its own model", unit="nm", format=".2f"),
         agreement=fact(_agreement(promised, replayed), "agrees with its model"),
     )
 

@@ -8,8 +8,6 @@ replay measures, for fractional delays and mirrors that move as well.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
@@ -24,7 +22,6 @@ from lbt_synth.validation import (
     FloatArray,
     frozen_copy,
     integer,
-    number,
     require_instance,
 )
 
@@ -37,7 +34,6 @@ def least_squares_predictor(
     hardware: LoopHardware,
     *,
     taps: int = 32,
-    sensor_gain: float = 1.0,
     stretches: StretchesLike | None = None,
 ) -> tuple[Controller, FloatArray]:
     """Fit the FIR predictor of least residual of each mode to a record, and make it a controller.
@@ -45,13 +41,12 @@ def least_squares_predictor(
     Parameters
     ----------
     open_loop : (frames, n) array_like
-        Recorded pseudo-open-loop series ``z(k) = phi_tot(k-1) + w(k) / g`` [nm].
+        Recorded pseudo-open-loop series ``z(k) = phi_tot(k-1) + S^-1 w(k)`` [nm].
     hardware : LoopHardware
-        The loop: delay, mirror, sensor and influence matrix, both square and invertible.
+        The loop: delay, mirror, sensor and influence matrix, both square and invertible. The sensor
+        matrix has the sensor gain that z was formed with.
     taps : int, optional
         Coefficients per mode, at most 1000.
-    sensor_gain : float, optional
-        Sensor gain g that formed z, relative to the sensor matrix; the controller needs it.
     stretches : sequence of (start, stop), optional
         Contiguous usable frames to fit; by default the whole record.
 
@@ -85,8 +80,7 @@ def least_squares_predictor(
     """
     require_instance(hardware, LoopHardware)
     count = integer(taps, "taps", at_least=1, at_most=_MOST_TAPS)
-    gain = number(sensor_gain, "sensor_gain", above=0)
-    back, n = inverse_sensor(hardware) / gain, hardware.modes
+    back, n = inverse_sensor(hardware), hardware.modes
     need = "a predictor needs a command for every mode, and an influence matrix"
     to_command = invert(hardware.influence, need)
     series, parts = check_series(open_loop, n, stretches)
@@ -109,8 +103,7 @@ def least_squares_predictor(
         D=np.zeros((n, n)),
         dt_s=hardware.dt_s,
     )
-    believed = replace(hardware, sensor_matrix=gain * hardware.sensor)
-    return youla_controller(believed, parameter), frozen_copy(coefficients)
+    return youla_controller(hardware, parameter), frozen_copy(coefficients)
 
 
 def _regression(

@@ -25,7 +25,6 @@ from lbt_synth.validation import (
     FloatArray,
     float_array,
     frozen_copy,
-    number,
     one_or_each,
     real_array,
     require_instance,
@@ -175,17 +174,16 @@ def replayed_residual(
     *,
     noise_nm: ArrayLike,
     noise_error_nm: ArrayLike = 0.0,
-    sensor_gain: float = 1.0,
     stretches: StretchesLike | None = None,
     test: StretchesLike | None = None,
     from_rest: bool = False,
 ) -> ResidualEstimate:
     """Residual that a controller would have left of a recorded disturbance.
 
-    The pseudo-open-loop measurement ``z(k) = phi_tot(k-1) + w(k) / g`` does not depend on the
-    controller that ran. From ``y(k) = g S (z(k) - c(k))``, with c(k) its own correction, a
+    The pseudo-open-loop measurement ``z(k) = phi_tot(k-1) + S^-1 w(k)`` does not depend on the
+    controller that ran. From ``y(k) = S (z(k) - c(k))``, with c(k) its own correction, a
     controller computes exactly the commands of that loop under that disturbance and noise. Its
-    measured residual is ``e(k) = z(k) - c(k) = phi_res(k-1) + w(k) / g``. As c(k) depends on the
+    measured residual is ``e(k) = z(k) - c(k) = phi_res(k-1) + S^-1 w(k)``. As c(k) depends on the
     noise up to frame k-1 only, white noise adds exactly its variance, which is subtracted.
 
     The controller runs over each stretch from the equilibrium for its first frames, and the first
@@ -198,13 +196,12 @@ def replayed_residual(
     controller : Controller
         From y(k) to u(k).
     hardware : LoopHardware
-        The loop: delay, mirror, sensor matrix S (square and invertible).
+        The loop: delay, mirror, and the sensor matrix S (square and invertible), with the sensor
+        gain g that z was formed with.
     noise_nm : float or (q,) array_like
         Standard deviation of the white noise w on each measurement, per frame [nm].
     noise_error_nm : float or (q,) array_like, optional
         Standard error of that, the errors of different measurements independent [nm].
-    sensor_gain : float, optional
-        Sensor gain g of the recorded loop relative to the sensor matrix, as used to form z.
     stretches : sequence of (start, stop), optional
         Contiguous usable frames, in order; by default the whole record.
     test : sequence of (start, stop), optional
@@ -244,11 +241,10 @@ def replayed_residual(
     """
     require_instance(hardware, LoopHardware)
     deviation = one_or_each(noise_nm, "noise_nm", hardware.n_measurements, at_least=0)
-    gain = number(sensor_gain, "sensor_gain", above=0)
     series, runs = check_series(open_loop, hardware.modes, stretches)
     noise_nm2 = deviation**2 * np.eye(hardware.n_measurements)
-    noise = mode_noise(hardware, noise_nm2, noise_error_nm=noise_error_nm, sensor_gain=gain)
-    loop = close_loop(hardware, controller, sensor_gain=gain)
+    noise = mode_noise(hardware, noise_nm2, noise_error_nm=noise_error_nm)
+    loop = close_loop(hardware, controller)
     loop.require_stable()
     tested = runs if test is None else checked_stretches(test, len(series))
     kept, replayed = settled_test(runs, tested, 0.0 if from_rest else hardware.frame_rate_hz)
@@ -261,14 +257,13 @@ def mode_noise(
     noise_nm2: FloatArray,
     *,
     noise_error_nm: ArrayLike,
-    sensor_gain: float = 1.0,
 ) -> tuple[FloatArray, FloatArray]:
     """Return noise (q, q) of the measurements in the modes [nm^2], and its error [nm^4], (n, n).
 
     The errors of the standard deviations of measurements are independent: an error of one is
     common to all modes that it measures.
     """
-    back = inverse_sensor(hardware) / sensor_gain
+    back = inverse_sensor(hardware)
     error = one_or_each(noise_error_nm, "noise_error_nm", hardware.n_measurements, at_least=0)
     deviation = np.sqrt(np.diag(noise_nm2))
     # d var_i / d s_j; of white noise without correlations 2 s_j back_ij^2

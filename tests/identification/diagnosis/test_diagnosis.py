@@ -37,7 +37,7 @@ def test_a_good_record():
 def test_a_given_design():
     row = line_diagnosis().given
     assert (row.design, row.method, row.stable) == ("mine", "Kalman filter", True)
-    assert row.replayed_nm == line_diagnosis().row("mine").replayed_nm
+    assert row.own_model_nm == given_design().rms
     low, high = (float(end) for end in row.stable_gains.split(" to "))
     assert low < line_diagnosis().model.sensor_gains[0] < high
     assert row.agreement.startswith("no: more than promised")
