@@ -13,7 +13,6 @@ from lbt_synth.identification import LoopRecord, design_from_record
 from lbt_synth.identification.auto import LEAST_SECONDS, MethodChoice, RecordedDesign
 from lbt_synth.identification.prediction.comparison import RAN
 from lbt_synth.loop import Imaging, close_loop, loop_margins
-from lbt_synth.storage.display_unit import nm_text
 
 
 def run(arguments: Namespace) -> Report:
@@ -79,11 +78,11 @@ def _add_comparison(
     report.data |= {"gain_over_what_ran": None, "wavelength_um": imaging.wavelength_um}
     if record.commands is not None:
         ran = table[RAN]
-        report.notes.append(
-            f"gain over what ran, on unseen data: residual {nm_text(ran.replayed_nm, '.4g')} -> "
-            f"{nm_text(best.replayed_nm, '.4g')}, {imaging.label} (tip and tilt) "
-            f"{ran.strehl:.3f} -> {best.strehl:.3f}."
-        )
+        before, after = (row.replayed.text for row in (ran, best) if row.replayed is not None)
+        strehl = ""
+        if ran.strehl >= 0 and best.strehl >= 0:
+            strehl = f"; {imaging.label} (tip and tilt) {ran.strehl:.3f} -> {best.strehl:.3f}"
+        report.notes.append(f"gain over what ran, on unseen data: {before} -> {after}{strehl}.")
         report.data["gain_over_what_ran"] = {
             "residual_nm": [ran.replayed_nm, best.replayed_nm],
             "strehl": [ran.strehl, best.strehl],
