@@ -136,7 +136,7 @@ def predictors() -> None:
         )
         print(
             f"{taps} taps: {found.rms_nm:.2f} +- {found.rms_error_nm:.2f} nm on the data, "
-            f"{lbt.residual_budget(loop, model).rms_nm:.2f} nm by the model, "
+            f"{lbt.residual_budget(loop, model, frame_means=True).rms_nm:.2f} nm by the model, "
             f"limit {limit:.2f} nm; "
             f"{1e3 * took:.0f} ms"
         )
@@ -145,7 +145,10 @@ def predictors() -> None:
 def errors(nights: int = 200) -> None:
     model = plant()
     path, design = model.hardware, lbt.kalman(model)
-    exact = lbt.residual_budget(lbt.close_loop(path, design.controller), model).rms_nm ** 2
+    exact = (
+        lbt.residual_budget(lbt.close_loop(path, design.controller), model, frame_means=True).rms_nm
+        ** 2
+    )
     seen = []
     for seed in range(nights):
         y, u, _ = night(path, 1000 + seed, 6000)
