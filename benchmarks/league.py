@@ -39,7 +39,7 @@ from lbt_synth.identification.prediction.residual import (
     inverse_sensor,
     invert,
 )
-from lbt_synth.identification.stretches import Stretches, StretchesLike, forward_splits
+from lbt_synth.identification.stretches import Stretches, StretchesLike, cut_stretches
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import youla_controller
@@ -328,7 +328,11 @@ def residuals_of(
 ) -> dict[str, list[lbt.identification.ResidualEstimate]]:
     """Return what each entry leaves of each test, without those that fail."""
     model, residuals, failed = None, {name: [] for name in ENTRIES}, set()
-    for training, test in forward_splits(record.stretches(), record.frames, splits=splits):
+    stretches, usable = record.stretches(), int(np.sum(record.usable))
+    for k in range(splits):
+        share = (1 + k / splits) / 2
+        training, rest = lbt.identification.split_halves(stretches, record.frames, fit_share=share)
+        test = cut_stretches(rest, 0, usable // (2 * splits))
         model = lbt.identify(record, stretches=training, start=model)
         split = Split(record, training, test, model)
         for name in [name for name in ENTRIES if name not in failed]:

@@ -1,9 +1,7 @@
 """A certified controller from a record, tested on data that it has not seen.
 
-The method of synthesis for a record, chosen by what it leaves of the frames after its training.
-
-The Kalman filter is the default. It stays unless another method leaves clearly less on every test:
-one that wins on some tests only has won by what changed between them.
+The Kalman filter is the default. It stays unless another method leaves clearly less on every third
+of the test: one that wins on some parts only has won by what changed between them.
 """
 
 from __future__ import annotations
@@ -17,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.errors import LbtSynthError
 from lbt_synth.identification.commands.verdict import explain_commands, judge_fitted_gains
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.likeliest_gain import (
@@ -28,14 +25,16 @@ from lbt_synth.identification.likeliest_gain import (
     unstable_gains,
 )
 from lbt_synth.identification.prediction.comparison import (
+    PredictionRow,
     PredictionTable,
-    prediction_against_data,
+    compare_on_record,
+    stable_designs,
 )
-from lbt_synth.identification.prediction.residual import ResidualEstimate, replayed_residual
+from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
-from lbt_synth.identification.stretches import forward_splits, split_halves
+from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget
 from lbt_synth.methods.registry import (
@@ -47,14 +46,13 @@ from lbt_synth.methods.registry import (
 from lbt_synth.methods.request import PlantInputs, design_request, option_owners
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import column, nm_column, percent_column, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import choice, require_instance
 
 _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
-_SPLITS = 3  # tests on each of which another method has to win
+_PARTS = 3  # of the test, on each of which another method has to win
 _ERRORS = 2.0  # of the difference by which another method has to leave less than the default
 _LEAST_SHARE = 0.02  # of the measured variance: 1 % of the rms, less than conditions change by
 
@@ -70,7 +68,6 @@ class RecordedDesign(Summarised):
     held_out: PredictionTable
     name: str  # row of the design in held_out, the title of its method
     notes: tuple[str, ...]  # warnings about the design
-    choice: MethodChoice | None = None  # how the method was chosen; None if it was given
 
     @property
     def controller(self) -> Controller:
@@ -107,11 +104,10 @@ def design_from_record(
     the usable frames gives a design, and that is replayed on the second half. The design that is
     returned is made the same way from all frames.
 
-    Without a method, the quick ones that need no more than a plant are compared by forward
-    chaining: designed from the first half, two thirds and five sixths, and replayed on the sixth
-    that follows. The Kalman filter stays unless another one leaves less on each of the three tests,
-    by more than twice the error of the difference and 2 % of the measured variance. Where it does
-    not stay, the test is a little kind to the chosen one.
+    Without a method, the quick ones that need no more than a plant are tested in this way. The
+    Kalman filter stays unless another one leaves less on each third of the test, by more than twice
+    the error of the difference and 2 % of the measured variance. Where it does not stay, the test
+    is a little kind to the chosen one.
 
     Parameters
     ----------
@@ -181,29 +177,24 @@ def design_from_record(
     design = partial(_design, defaults=defaults)
     if allowed is not None:
         assumptions += _judge_gains(half, accept_record)
-    choice_of_method = None
     if method is None:
-        choice_of_method = choose_method(
-            record,
-            half,
-            identify_past=fit_model,
-            design=design,
-            is_safe=lambda made: (
-                allowed is None or unstable_gains(made, possible_gains(allowed, half)) is None
+        tried = {name: method_named(name).reference_options for name in quick_methods()}
+        designs, missing = stable_designs(half.plant(), tried, defaults)
+        notes += missing
+    else:
+        designs = {method_named(method).title: design(method, half)}
+    step(1)
+    held_out = compare_on_record(record, half, designs, imaging=imaging or Imaging())
+    if method is None:
+        gains_of_half = None if allowed is None else possible_gains(allowed, half)
+        method, words = choose_method(
+            {name: row.replayed for name, row in _quick_rows(held_out) if row.replayed},
+            lambda name: (
+                gains_of_half is None
+                or unstable_gains(designs[method_named(name).title], gains_of_half) is None
             ),
         )
-        method = choice_of_method.method
-    step(1)
-    name = method_named(method).title
-    held_out = prediction_against_data(
-        half.plant(),
-        record.pseudo_open_loop(half.sensor_gains),
-        {name: design(method, half)},
-        stretches=record.stretches(),
-        measurements=None if record.commands is None else record.measurements,
-        noise_error_nm=[axis.noise_error_nm for axis in half.axes],
-        imaging=Imaging() if imaging is None else imaging,
-    )
+        notes += words
     step(1)
     whole, allowed = identify_with_gains(record, start=half, **options)
     model, made, careful = design_for_gains(
@@ -220,7 +211,7 @@ def design_from_record(
         design=replace(made, assumptions=(*assumptions, *made.assumptions)),
         half_model=half,
         held_out=held_out,
-        name=name,
+        name=method_named(method).title,
         notes=(
             *notes,
             *careful,
@@ -228,7 +219,6 @@ def design_from_record(
             *note_drift(record, model.plant(), made.controller),
             *_note_short(usable, model),
         ),
-        choice=choice_of_method,
     )
 
 
@@ -331,163 +321,57 @@ def note_drift(record: LoopRecord, plant: TipTiltPlant, controller: Controller) 
             )
 
 
-@table_row
-class MethodRow:
-    """A method of synthesis on the frames after its training."""
-
-    name: str = column("method", help="What it is")
-    residual_nm: float = nm_column(
-        "residual", format=".2f", help="Residual on these frames, all axes"
-    )
-    above_nm2: float = column(
-        "above the chosen", unit="nm^2", format=".4g", help="Its variance above that of the chosen"
-    )
-    above_error_nm2: float = column(
-        "+-", unit="nm^2", format=".2g", help="Standard error of the difference"
-    )
-    above: float = percent_column(
-        "of the measured variance", help="The same over what the loop of the chosen one measures"
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MethodChoice:
-    """The method of synthesis chosen for a record.
-
-    Attributes
-    ----------
-    method : str
-        Its name.
-    rows : tuple of MethodRow
-        The methods, from the least measured residual; empty if they could not be compared.
-    notes : tuple of str
-        By how much the chosen one is better, and why others are left out.
-    """
-
-    method: str
-    rows: tuple[MethodRow, ...]
-    notes: tuple[str, ...]
-
-
 def quick_methods() -> list[str]:
-    """Return the names of the methods that an automatic choice tries."""
-    return [name for name in record_methods() if not method_named(name).slow]
+    """Return the names of the methods that an automatic choice tries, the default first."""
+    names = [name for name in record_methods() if not method_named(name).slow]
+    return sorted(names, key=lambda name: name != default_method())
+
+
+def _quick_rows(table: PredictionTable) -> Iterator[tuple[str, PredictionRow]]:
+    """Yield the rows of quick methods by the names of these."""
+    names = {method_named(name).title: name for name in quick_methods()}
+    yield from ((names[row.name], row) for row in table.entries if row.name in names)
 
 
 def choose_method(
-    record: LoopRecord,
-    half: IdentifiedModel,
-    *,
-    identify_past: Callable[..., IdentifiedModel],
-    design: Callable[[str, IdentifiedModel, Mapping[str, Any]], Design],
-    is_safe: Callable[[Design], bool],
-) -> MethodChoice:
-    """Choose the default method, unless another one leaves clearly less on every test.
+    residuals: Mapping[str, ResidualEstimate], is_safe: Callable[[str], bool]
+) -> tuple[str, list[str]]:
+    """Choose the default method, unless another one leaves clearly less on every third of a test.
 
-    ``half`` is identified from the training of the first of the three splits, half of the usable
-    frames, and ``identify_past`` takes its ``stretches=`` and ``start=``. ``is_safe`` says whether
-    the loop of a design is stable at all sensor gains that the record allows, and is asked only of
-    a method that would replace the default. A method that fails or is unstable is left out; if
-    nothing can be compared, a note says why.
+    ``is_safe`` says whether the loop of a method's design is stable at all sensor gains that the
+    record allows. Return the name of the method, and by how much it is better.
     """
-    usual = default_method()
-    try:
-        residuals, failures = _replay_methods(record, half, identify_past, design)
-    except LbtSynthError as error:
-        note = f"the methods were not compared: {error}"
-        return MethodChoice(method=usual, rows=(), notes=(note,))
-    chosen = usual
-    for name, parts in residuals.items():  # the best first
-        if usual in residuals and not _is_better(parts, residuals[usual]):
+    usual, notes = default_method(), list[str]()
+    for name in sorted(residuals, key=lambda name: residuals[name].total_nm2):
+        residual, title = residuals[name], method_named(name).title
+        if usual not in residuals:
+            words = f"the {title} is chosen: of the methods that are left it leaves least"
+        elif _is_better(residual, residuals[usual]):
+            difference, error = residuals[usual].above(residual)
+            words = (
+                f"the {title} is chosen: on each of {_PARTS} parts of the test it leaves less than "
+                f"the {method_named(usual).title}, in all by "
+                f"{nm_text(difference, error_nm=error, unit='nm^2')}"
+            )
+        else:
             continue
-        if is_safe(design(name, half, method_named(name).reference_options)):
-            chosen = name
-            break
-        failures[name] = "its loop is unstable at a sensor gain that the record allows"
-    return _describe_choice(chosen, residuals, failures)
+        if is_safe(name):
+            return name, [words, *notes]
+        notes.append(
+            f"the {title} is left out: its loop is unstable at a sensor gain that the record allows"
+        )
+    words = (
+        f"the {method_named(usual).title} stays: no method tried leaves less on each of {_PARTS} "
+        f"parts of the test, by more than {_ERRORS:g} standard errors and "
+        f"{100 * _LEAST_SHARE:g} % of the variance"
+    )
+    return usual, [words, *notes]
 
 
-def _replay_methods(
-    record: LoopRecord,
-    half: IdentifiedModel,
-    identify_past: Callable[..., IdentifiedModel],
-    design: Callable[[str, IdentifiedModel, Mapping[str, Any]], Design],
-) -> tuple[dict[str, list[ResidualEstimate]], dict[str, str]]:
-    """Return what quick methods leave of each test by models of its past, and why others fail."""
-    residuals: dict[str, list[ResidualEstimate]] = {name: [] for name in quick_methods()}
-    failures: dict[str, str] = {}
-    model, stretches = half, record.stretches()
-    splits = forward_splits(stretches, record.frames, splits=_SPLITS)
-    for training, test in splits:
-        if training != splits[0][0]:
-            model = identify_past(stretches=training, start=model)
-        for name in [name for name in residuals if name not in failures]:
-            try:
-                made = design(name, model, method_named(name).reference_options)
-                residual = replayed_residual(
-                    record.pseudo_open_loop(model.sensor_gains),
-                    made.controller,
-                    model.hardware,
-                    noise_nm=[axis.noise_nm for axis in model.axes],
-                    stretches=stretches,
-                    test=test,
-                )
-                residuals[name].append(residual)
-            except LbtSynthError as error:
-                failures[name] = str(error).rstrip(".")
-    whole = [(name, parts) for name, parts in residuals.items() if name not in failures]
-    return dict(sorted(whole, key=lambda row: _mean_nm2(row[1]))), failures
-
-
-def _mean_nm2(parts: Sequence[ResidualEstimate]) -> float:
-    return float(np.mean([part.total_nm2 for part in parts]))
-
-
-def _is_better(parts: Sequence[ResidualEstimate], usual: Sequence[ResidualEstimate]) -> bool:
-    """Whether residuals are clearly less than the usual ones on every test."""
-    for part, reference in zip(parts, usual, strict=True):
+def _is_better(residual: ResidualEstimate, usual: ResidualEstimate) -> bool:
+    """Whether a residual is clearly less than the usual one on every part of the test."""
+    for part, reference in zip(residual.parts(_PARTS), usual.parts(_PARTS), strict=True):
         difference, error = reference.above(part)
         if difference <= max(_ERRORS * error, _LEAST_SHARE * reference.measured_nm2):
             return False
     return True
-
-
-def _describe_choice(
-    chosen: str,
-    residuals: Mapping[str, Sequence[ResidualEstimate]],
-    failures: Mapping[str, str],
-) -> MethodChoice:
-    """Return the choice with its table, and say by how much it is better."""
-    title, usual = method_named(chosen).title, default_method()
-    notes = [f"the {method_named(name).title} is left out: {why}" for name, why in failures.items()]
-    shown = [name for name in residuals if name not in failures]
-    if chosen not in shown:
-        return MethodChoice(method=chosen, rows=(), notes=tuple(notes))
-    measured_nm2 = float(np.mean([part.measured_nm2 for part in residuals[chosen]]))
-    rows = {}
-    for name in shown:
-        pairs = zip(residuals[name], residuals[chosen], strict=True)
-        differences, errors = np.transpose([part.above(best) for part, best in pairs])
-        mean_nm2 = _mean_nm2(residuals[name])
-        rows[name] = MethodRow(
-            name=method_named(name).title,
-            residual_nm=float(np.sqrt(mean_nm2)) if mean_nm2 >= 0 else np.nan,
-            above_nm2=float(np.mean(differences)),
-            above_error_nm2=float(np.linalg.norm(errors) / len(errors)),
-            above=float(np.mean(differences)) / measured_nm2,
-        )
-    if chosen == usual:
-        word = (
-            f"the {title} stays: no method tried leaves less on each of {_SPLITS} tests, by more "
-            f"than {_ERRORS:g} standard errors and {100 * _LEAST_SHARE:g} % of the variance"
-        )
-    elif usual in rows:
-        row = rows[usual]
-        gained = nm_text(row.above_nm2, error_nm=row.above_error_nm2, unit="nm^2")
-        word = (
-            f"the {title} is chosen: on each of {_SPLITS} tests it leaves less than the "
-            f"{row.name}, in all by {gained} ({100 * row.above:.2g} % of the measured variance)"
-        )
-    else:
-        word = f"the {title} is chosen: of the methods that are left it leaves least"
-    return MethodChoice(method=chosen, rows=tuple(rows.values()), notes=(word, *notes))

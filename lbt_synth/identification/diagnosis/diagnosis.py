@@ -31,7 +31,8 @@ from lbt_synth.identification.prediction.comparison import (
     INTEGRATOR,
     PredictionRow,
     PredictionTable,
-    prediction_against_data,
+    compare_on_record,
+    stable_designs,
 )
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.record import LoopRecord, require_length
@@ -39,8 +40,6 @@ from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.registry import all_methods, reference_methods
-from lbt_synth.methods.request import PlantInputs, design_request
-from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import Facts
 from lbt_synth.validation import require_instance
 
@@ -251,28 +250,29 @@ def _compare(
     notes: list[str],
 ) -> Diagnosis:
     """Add residuals on the second half, and the best design there for a model of the first."""
-    record, plant = diagnosis.record, half.plant()
-    designs = _stable_designs(plant, notes)
-    stable = {}
-    for name, controller in given.items():
-        if close_loop(plant.hardware, controller).is_stable:
-            stable[name] = controller
-        else:
-            notes.append(f"{name} is unstable in the loop of this record")
-
-    def compare() -> PredictionTable:
-        return prediction_against_data(
-            plant,
-            record.pseudo_open_loop(half.sensor_gains),
+    plant = half.plant()
+    with_bands = [m for m in all_methods().values() if m.plant_section is not None]
+    methods = (*reference_methods(estimators_only=True), *with_bands)
+    designs, missing = stable_designs(plant, {method.name: {} for method in methods})
+    stable = {
+        name: controller
+        for name, controller in given.items()
+        if close_loop(plant.hardware, controller).is_stable
+    }
+    unstable = given.keys() - stable.keys()
+    notes += missing
+    notes += [f"{name} is unstable in the loop of this record" for name in unstable]
+    table = _attempt(
+        lambda: compare_on_record(
+            diagnosis.record,
+            half,
             {**designs, **stable},
-            stretches=record.stretches(),
-            measurements=None if record.commands is None else record.measurements,
             running=running,
-            noise_error_nm=[axis.noise_error_nm for axis in half.axes],
             imaging=diagnosis.imaging,
-        )
-
-    table = _attempt(compare, "comparison on unseen data", notes)
+        ),
+        "comparison on unseen data",
+        notes,
+    )
     if table is None:
         return diagnosis
     notes += table.notes
@@ -280,23 +280,6 @@ def _compare(
     residuals = {row.name: row.replayed.total_nm2 for row in table.entries if row.replayed}
     best = min(designs, key=lambda name: residuals[name])
     return replace(diagnosis, comparison=table, best=best, best_design=designs[best])
-
-
-def _stable_designs(plant: TipTiltPlant, notes: list[str]) -> dict[str, Design]:
-    """Return the designs that hold a plant's loop by their titles; note why others are missing."""
-    inputs, designs = PlantInputs(plant=plant), {}
-    with_bands = [m for m in all_methods().values() if m.plant_section is not None]
-    for method in (*reference_methods(estimators_only=True), *with_bands):
-        try:
-            design = design_request(method.name, {}).build(inputs)
-        except LbtSynthError as error:
-            notes.append(f"no {method.title}: {error}")
-            continue
-        if close_loop(plant.hardware, design.controller).is_stable:
-            designs[method.title] = design
-        else:
-            notes.append(f"no {method.title}: its loop is not stable at the identified sensor gain")
-    return designs
 
 
 def _attempt(compute: Callable[[], Any], what: str, notes: list[str]) -> Any:

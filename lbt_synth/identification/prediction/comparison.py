@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design, model_integrator
-from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.errors import LbtSynthError, ProblemError, UnstableLoopError
+from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.prediction.predictor import least_squares_predictor
 from lbt_synth.identification.prediction.residual import (
     ResidualEstimate,
@@ -21,11 +24,14 @@ from lbt_synth.identification.prediction.residual import (
     replay,
     settled_test,
 )
+from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl, residual_budget
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.methods.registry import method_named
+from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
@@ -218,6 +224,52 @@ def prediction_against_data(
         along = limit.directions.T * limit.variance_nm2 @ limit.directions
         rows.append(_build_row(LIMIT, None, along, imaging))
     return PredictionTable(entries=tuple(rows), fit=fit, test=test, notes=notes)
+
+
+def stable_designs(
+    plant: TipTiltPlant,
+    options: Mapping[str, Mapping[str, Any]],
+    defaults: Mapping[str, Any] = MappingProxyType({}),
+) -> tuple[dict[str, Design], list[str]]:
+    """Return designs that hold a plant's loop, by titles, and why others are missing.
+
+    ``options`` are those of each method, by its name.
+    """
+    inputs = PlantInputs(plant=plant, design_defaults=defaults)
+    designs, notes = dict[str, Design](), list[str]()
+    for name, given in options.items():
+        title = method_named(name).title
+        try:
+            design = design_request(name, given).build(inputs)
+        except LbtSynthError as error:
+            notes.append(f"no {title}: {str(error).rstrip('.')}")
+            continue
+        if close_loop(plant.hardware, design.controller).is_stable:
+            designs[title] = design
+        else:
+            notes.append(f"no {title}: its loop is not stable at the identified sensor gain")
+    return designs, notes
+
+
+def compare_on_record(
+    record: LoopRecord,
+    half: IdentifiedModel,
+    controllers: Mapping[str, Controller | Design],
+    *,
+    running: Controller | None = None,
+    imaging: Imaging | None = None,
+) -> PredictionTable:
+    """Return what controllers leave of the second half of a record, by a model of the first."""
+    return prediction_against_data(
+        half.plant(),
+        record.pseudo_open_loop(half.sensor_gains),
+        controllers,
+        stretches=record.stretches(),
+        measurements=None if record.commands is None else record.measurements,
+        running=running,
+        noise_error_nm=[axis.noise_error_nm for axis in half.axes],
+        imaging=imaging,
+    )
 
 
 def _note_refuted(rows: list[PredictionRow]) -> tuple[str, ...]:

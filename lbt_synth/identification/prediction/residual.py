@@ -8,13 +8,19 @@ second of each stretch does not count.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import rfft
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
+from lbt_synth.identification.stretches import (
+    Stretches,
+    StretchesLike,
+    checked_stretches,
+    cut_stretches,
+)
 from lbt_synth.linear import Controller
 from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl
@@ -131,6 +137,17 @@ class ResidualEstimate:
         covariance = mean_covariance(one - two, one + two, self.stretches)
         error = float(np.sqrt(max(float(np.sum(covariance)), 0.0)))
         return self.total_nm2 - other.total_nm2, error
+
+    def parts(self, count: int) -> list[ResidualEstimate]:
+        """Return the residuals of so many consecutive parts of the frames, of equal length."""
+        edges = (len(self.measured_nm) * np.arange(count + 1) // count).tolist()
+        none = np.zeros_like(self.noise_nm2)
+        return [
+            estimate_residual(
+                self.measured_nm[a:b], cut_stretches(self.stretches, a, b), self.noise_nm2, none
+            )
+            for a, b in pairwise(edges)
+        ]
 
     def strehl(self, imaging: Imaging) -> float:
         """Long-exposure Strehl ratio of a Gaussian residual of this covariance, in [0, 1].
