@@ -14,7 +14,7 @@ from lbt_synth.cli.progress import count_progress
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import Diagnosis, LoopRecord, diagnose
 from lbt_synth.identification.commands.control_law import ControlLaw
-from lbt_synth.identification.diagnosis.running_loop import live_axes
+from lbt_synth.identification.diagnosis.rows import live_axes
 from lbt_synth.identification.diagnosis.verdict import diagnosis_verdict
 from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
 from lbt_synth.report.page.html import require_page_names, write_page

@@ -10,8 +10,8 @@ from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identify import identify as identify
 from .likeliest_gain import allowed_gains as allowed_gains
 from .prediction.comparison import PredictionTable as PredictionTable
+from .prediction.comparison import least_squares_predictor as least_squares_predictor
 from .prediction.comparison import prediction_against_data as prediction_against_data
-from .prediction.predictor import least_squares_predictor as least_squares_predictor
 from .prediction.residual import ResidualEstimate as ResidualEstimate
 from .prediction.residual import replayed_residual as replayed_residual
 from .records.from_file import load_record as load_record

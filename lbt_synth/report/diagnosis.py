@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.identification import Diagnosis
-from lbt_synth.identification.diagnosis.running_loop import law_facts
+from lbt_synth.identification.diagnosis.rows import law_facts
 from lbt_synth.identification.diagnosis.verdict import NARROW, diagnosis_verdict
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing

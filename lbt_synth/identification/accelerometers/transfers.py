@@ -36,8 +36,7 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
 from lbt_synth.models.sensor_suite import LONGEST_DELAY
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import column, nm_column, row_table, table_row
-from lbt_synth.storage.tables import Table
+from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, number
 
 _NM = 1e-9
@@ -159,13 +158,6 @@ class AccelerometerTransfers:
             f"{nm_text(self.alone_nm)}, and with {', '.join(row.channel for row in self.used)} "
             f"{nm_text(self.together_nm)}"
         )
-
-    def tables(self) -> list[Table]:
-        """Return the tables of lines and channels."""
-        return [
-            row_table("Accelerometers and lines", list(self.transfers)),
-            row_table("Accelerometers", list(self.channels)),
-        ]
 
 
 def accelerometer_transfers(

@@ -10,18 +10,16 @@ from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
-from lbt_synth.identification.diagnosis.line_origins import (
+from lbt_synth.identification.diagnosis.rows import (
+    ChannelRow,
     CostRow,
     LineRow,
-    disturbance_costs,
-    line_origins,
-)
-from lbt_synth.identification.diagnosis.running_loop import (
-    ChannelRow,
     design_differences,
+    disturbance_costs,
     given_controller,
     given_design_facts,
     judge_channels,
+    line_origins,
     loop_facts,
     running_controller,
 )

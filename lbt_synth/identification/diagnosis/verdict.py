@@ -10,7 +10,7 @@ import numpy as np
 
 from lbt_synth.design import model_integrator
 from lbt_synth.identification.diagnosis.diagnosis import Diagnosis
-from lbt_synth.identification.diagnosis.running_loop import FEW
+from lbt_synth.identification.diagnosis.rows import FEW
 from lbt_synth.identification.prediction.comparison import INTEGRATOR, RAN
 from lbt_synth.identification.prediction.residual import ResidualEstimate, gather
 from lbt_synth.storage.display_unit import nm_text
