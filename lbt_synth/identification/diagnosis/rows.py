@@ -143,14 +143,14 @@ class ChannelRow:
 
 def judge_channels(record: LoopRecord) -> tuple[ChannelRow, ...]:
     """Return what is known of each channel of a record, the measurements first."""
-    names = AXES if record.axes == len(AXES) else ("",)
     measured = record.usable if record.measured is None else record.measured
-    everything = np.ones(record.frames, dtype=np.bool_)
-    commanded = everything if record.commanded is None else record.commanded
-    closed = record.commands is not None
-    rows = _judge_series(record, "measurements", record.measurements, measured, names, closed)
+    axes = range(record.axes)
+    rows = [_judge_channel(record, axis, record.measurements, measured) for axis in axes]
     if record.commands is not None:
-        rows += _judge_series(record, "commands", record.commands, commanded, names, closed)
+        commanded = record.commanded
+        if commanded is None:
+            commanded = np.ones(record.frames, dtype=np.bool_)
+        rows += [_judge_channel(record, axis, record.commands, commanded) for axis in axes]
     return tuple(rows)
 
 
@@ -160,51 +160,44 @@ def live_axes(record: LoopRecord) -> list[int]:
     return [axis for axis, row in enumerate(rows) if row.state != DEAD]
 
 
-def _judge_series(
-    record: LoopRecord,
-    series: str,
-    values: FloatArray,
-    good: BoolArray,
-    names: tuple[str, ...],
-    closed: bool,
-) -> list[ChannelRow]:
-    steps = [_step_rms(one, good) for one in values.T]
-    rows = []
-    for axis, one in enumerate(values.T):
-        findings = [
-            finding
-            for finding in record.health.findings
-            if (finding.series, finding.axis) == (series, axis) and finding.kind in _WORDS
-        ]
-        here = one[good] if good.any() else one
-        first, last = end_scatters(one, good)
-        change, quarter = last / first if first > 0 else np.nan, len(here) // 4
-        drift = float(np.mean(here[-quarter:]) - np.mean(here[:quarter])) if quarter else np.nan
-        held = sum(finding.fraction for finding in findings if finding.kind in ("stuck", "held"))
-        words = [f"{_WORDS[each.kind]} ({100 * each.fraction:.2g} %)" for each in findings]
-        if np.ptp(here) == 0 or held > _DEAD:
-            words = [DEAD]
-        elif series == "measurements":
-            others = [step for i, step in enumerate(steps) if i != axis]
-            whole = {
-                "noisy": bool(others) and steps[axis] > _NOISIER * max(others),
-                "drifting": closed and abs(drift) > float(np.std(here)),
-                "scatter changes": change > TREND or change < 1 / TREND,
-            }
-            words += [word for word, is_so in whole.items() if is_so]
-        rows.append(
-            ChannelRow(
-                channel=f"{names[axis]} {series.removesuffix('s')}".strip(),
-                rms_nm=float(np.std(here)),
-                step_nm=steps[axis],
-                mean_nm=float(np.mean(here)),
-                drift_nm=drift,
-                change=change,
-                faulty=sum(finding.fraction for finding in findings),
-                state=", ".join(words) or "good",
-            )
+def _judge_channel(
+    record: LoopRecord, axis: int, values: FloatArray, good: BoolArray
+) -> ChannelRow:
+    """Return what is known of one column of the measurements or commands, (frames, axes)."""
+    series = "measurements" if values is record.measurements else "commands"
+    findings = [
+        finding
+        for finding in record.health.findings
+        if (finding.series, finding.axis) == (series, axis) and finding.kind in _WORDS
+    ]
+    channel, steps = values[:, axis], [_step_rms(column, good) for column in values.T]
+    here = channel[good] if good.any() else channel
+    first, last = end_scatters(channel, good)
+    change, quarter = last / first if first > 0 else np.nan, len(here) // 4
+    drift = float(np.mean(here[-quarter:]) - np.mean(here[:quarter])) if quarter else np.nan
+    held = sum(finding.fraction for finding in findings if finding.kind in ("stuck", "held"))
+    words = [f"{_WORDS[finding.kind]} ({100 * finding.fraction:.2g} %)" for finding in findings]
+    if np.ptp(here) == 0 or held > _DEAD:
+        words = [DEAD]
+    elif series == "measurements":
+        others = [step for i, step in enumerate(steps) if i != axis]
+        faults = (
+            bool(others) and steps[axis] > _NOISIER * max(others),
+            record.commands is not None and abs(drift) > float(np.std(here)),
+            change > TREND or change < 1 / TREND,
         )
-    return rows
+        words += [word for word, is_so in zip(_WHOLE, faults, strict=True) if is_so]
+    name = AXES[axis] if record.axes == len(AXES) else ""
+    return ChannelRow(
+        channel=f"{name} {series.removesuffix('s')}".strip(),
+        rms_nm=float(np.std(here)),
+        step_nm=steps[axis],
+        mean_nm=float(np.mean(here)),
+        drift_nm=drift,
+        change=change,
+        faulty=sum(finding.fraction for finding in findings),
+        state=", ".join(words) or "good",
+    )
 
 
 def _step_rms(series: FloatArray, good: BoolArray) -> float:

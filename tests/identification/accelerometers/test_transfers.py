@@ -1,5 +1,7 @@
 """How channels of accelerometers move with lines: factors, clocks, and what is left out."""
 
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -238,3 +240,27 @@ def test_motions_at_the_frequency_of_a_line_that_do_not_go_with_it_are_not_used(
 def test_readings_that_are_refused(given, options, words):
     with pytest.raises(lbt.errors.ProblemError, match=words):
         lbt.identification.accelerometer_transfers(night().model, night().record, given, **options)
+
+
+def test_a_record_of_39_s_and_5_channels_takes_little_memory():
+    """Each second took 50 MB where all shifts of a wide band were tried at once."""
+    code = """
+from pathlib import Path
+import numpy as np
+import lbt_synth as lbt
+rng = np.random.default_rng(0)
+line = lbt.Vibration(frequency_hz=90, damping=0.02, rms_nm=60).ar_model(1000)
+v = np.zeros(39_002)
+for k in range(2, v.size):
+    v[k] = line.coefficients @ v[[k - 1, k - 2]] + line.driving_rms_nm * rng.standard_normal()
+z = v[1:-1] + 5 * rng.standard_normal(39_000)
+a = -1e-9 * (2 * np.pi * 90) ** 2 * v[1:-1, None] + 1e-3 * rng.standard_normal((39_000, 5))
+model = lbt.identify(record := lbt.identification.loop_record(z, frame_rate_hz=1000, unit="nm"))
+used = lbt.identification.accelerometer_transfers(model, record, a).used
+status = Path("/proc/self/status").read_text()  # the peak that getrusage gives is the parent's
+print(len(used), int(status.split("VmHWM:")[1].split()[0]) / 1024)
+"""
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    channels, megabytes = out.stdout.split()
+    assert channels == "5"
+    assert float(megabytes) < 300
