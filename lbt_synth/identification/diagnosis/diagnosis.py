@@ -217,7 +217,9 @@ def _examine_loop(
     facts = loop_facts(model, running)
     diagnosis = replace(diagnosis, model=model, loop=facts, lines=line_origins(model))
     first, _ = split_halves(record.stretches(), record.frames)
-    half = _attempt(lambda: fit(stretches=first, start=model), "model of the first half", notes)
+    # one sensor gain for all that is said: a half shows it less well
+    fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
+    half = _attempt(lambda: fit(**fixed), "model of the first half", notes)
     step(1)
     plant = (model if half is None else half).plant()
     if running is not None and not close_loop(plant.hardware, running).is_stable:

@@ -88,11 +88,10 @@ def _measured_text(diagnosis: Diagnosis, ran: ResidualEstimate) -> str:
     """Say from which measurement the residual of what ran follows, and its Strehl ratio."""
     y = gather(diagnosis.record.measurements, ran.stretches)
     measured_nm = float(np.sqrt(np.mean(np.sum(y**2, axis=1))))
-    gain = measured_nm / np.sqrt(ran.measured_nm2)
     noise_nm = float(np.sqrt(np.trace(ran.noise_nm2)))
     return (
-        f"{nm_text(measured_nm)} were measured; by the first half the sensor gain is {gain:.3g}, "
-        f"and {nm_text(noise_nm)} are noise{_strehl_text(diagnosis, RAN)}"
+        f"{nm_text(measured_nm)} were measured at this sensor gain, and {nm_text(noise_nm)} are "
+        f"noise{_strehl_text(diagnosis, RAN)}"
     )
 
 

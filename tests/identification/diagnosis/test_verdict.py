@@ -44,9 +44,11 @@ def test_of_a_good_record():
     assert residual.startswith(f"It leaves {ran.text} on unseen data (")
     start, stop = ran.stretches[0]
     y = line_record().measurements[start:stop]
-    gain = np.sqrt(np.mean(y**2) / ran.measured_nm2)
-    assert f"({np.sqrt(np.mean(y**2)):.3g} nm were measured; by the first half the" in residual
-    assert f"the sensor gain is {gain:.3g}, and {np.sqrt(ran.noise_nm2[0, 0]):.3g} nm" in residual
+    noise_nm = np.sqrt(ran.noise_nm2[0, 0])
+    measured = f"({np.sqrt(np.mean(y**2)):.3g} nm were measured at this sensor gain, and "
+    assert f"{measured}{noise_nm:.3g} nm are noise; Strehl ratio" in residual
+    gain = np.sqrt(np.mean(y**2) / ran.measured_nm2)  # the same as of the first sentence
+    assert gain == pytest.approx(found.model.sensor_gains[0], rel=1e-9)
     share = (found.costs[0].running_nm / found.costs[-1].running_nm) ** 2
     assert f": by the model {100 * share:.0f} % of the {found.costs[0].part}" in residual
     assert advice.startswith(
