@@ -286,7 +286,13 @@ def write_files(
     if made is not None:
         designs = {made.name: made.design}
         report.note_written(save_gain(places["gain"], made.design))
-    text, comments = _model_text(model, arguments, record, accelerometers)
+    try:
+        text, comments = _model_text(model, arguments, record, accelerometers)
+    except ProblemError as error:
+        if accelerometers is None:
+            raise
+        report.notes.append(f"warning: the model is written without accelerometers: {error}")
+        text, comments = _model_text(model, arguments, record, None)
     report.note_written(write_atomically(places["model"], text), "model")
     report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
     if "figure" in places:
