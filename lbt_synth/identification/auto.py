@@ -6,10 +6,9 @@ of the test: one that wins on some parts only has won by what changed between th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,6 @@ from lbt_synth.identification.likeliest_gain import (
     unstable_gains,
 )
 from lbt_synth.identification.prediction.comparison import (
-    PredictionRow,
     PredictionTable,
     compare_on_record,
     stable_designs,
@@ -177,23 +175,27 @@ def design_from_record(
     design = partial(_design, defaults=defaults)
     if allowed is not None:
         assumptions += _judge_gains(half, accept_record)
+    designs: dict[str, Design] = {}
     if method is None:
         tried = {name: method_named(name).reference_options for name in quick_methods()}
         designs, missing = stable_designs(half.plant(), tried, defaults)
         notes += missing
-    else:
-        designs = {method_named(method).title: design(method, half)}
+    if not designs:
+        name = method or default_method()
+        designs = {method_named(name).title: design(name, half)}
     step(1)
     held_out = compare_on_record(record, half, designs, imaging=imaging or Imaging())
     if method is None:
-        gains_of_half = None if allowed is None else possible_gains(allowed, half)
-        method, words = choose_method(
-            {name: row.replayed for name, row in _quick_rows(held_out) if row.replayed},
-            lambda name: (
-                gains_of_half is None
-                or unstable_gains(designs[method_named(name).title], gains_of_half) is None
-            ),
-        )
+        names = {method_named(name).title: name for name in quick_methods()}
+        rows = [(names[row.name], row.replayed) for row in held_out.entries if row.name in names]
+        residuals = {name: residual for name, residual in rows if residual is not None}
+        unsafe = []
+        if allowed is not None:
+            box = possible_gains(allowed, half)
+            unsafe = [
+                names[t] for t, made in designs.items() if unstable_gains(made, box) is not None
+            ]
+        method, words = choose_method(residuals, unsafe)
         notes += words
     step(1)
     whole, allowed = identify_with_gains(record, start=half, **options)
@@ -222,15 +224,9 @@ def design_from_record(
     )
 
 
-def _design(
-    method: str,
-    model: IdentifiedModel,
-    options: Mapping[str, Any] = MappingProxyType({}),
-    *,
-    defaults: Mapping[str, Any],
-) -> Design:
+def _design(method: str, model: IdentifiedModel, *, defaults: Mapping[str, Any]) -> Design:
     inputs = PlantInputs(plant=model.plant(), design_defaults=defaults)
-    return design_request(method, options).build(inputs)
+    return design_request(method, {}).build(inputs)
 
 
 def _require_able(record: LoopRecord, method: str | None, defaults: Mapping[str, Any]) -> float:
@@ -327,35 +323,30 @@ def quick_methods() -> list[str]:
     return sorted(names, key=lambda name: name != default_method())
 
 
-def _quick_rows(table: PredictionTable) -> Iterator[tuple[str, PredictionRow]]:
-    """Yield the rows of quick methods by the names of these."""
-    names = {method_named(name).title: name for name in quick_methods()}
-    yield from ((names[row.name], row) for row in table.entries if row.name in names)
-
-
 def choose_method(
-    residuals: Mapping[str, ResidualEstimate], is_safe: Callable[[str], bool]
+    residuals: Mapping[str, ResidualEstimate], unsafe: Collection[str] = ()
 ) -> tuple[str, list[str]]:
     """Choose the default method, unless another one leaves clearly less on every third of a test.
 
-    ``is_safe`` says whether the loop of a method's design is stable at all sensor gains that the
-    record allows. Return the name of the method, and by how much it is better.
+    The loops of ``unsafe`` designs are unstable at a sensor gain that the record allows. Return the
+    name of the method, and by how much it is better.
     """
     usual, notes = default_method(), list[str]()
-    for name in sorted(residuals, key=lambda name: residuals[name].total_nm2):
-        residual, title = residuals[name], method_named(name).title
-        if usual not in residuals:
-            words = f"the {title} is chosen: of the methods that are left it leaves least"
-        elif _is_better(residual, residuals[usual]):
-            difference, error = residuals[usual].above(residual)
+    ordered = sorted(residuals, key=lambda name: residuals[name].total_nm2)
+    if usual not in residuals:
+        title = method_named(ordered[0]).title
+        return ordered[0], [f"the {title} is chosen: of the methods that are left it leaves least"]
+    for name in ordered:
+        if not _is_better(residuals[name], residuals[usual]):
+            continue
+        title = method_named(name).title
+        if name not in unsafe:
+            difference, error = residuals[usual].above(residuals[name])
+            gained = nm_text(difference, error_nm=error, unit="nm^2")
             words = (
                 f"the {title} is chosen: on each of {_PARTS} parts of the test it leaves less than "
-                f"the {method_named(usual).title}, in all by "
-                f"{nm_text(difference, error_nm=error, unit='nm^2')}"
+                f"the {method_named(usual).title}, in all by {gained}"
             )
-        else:
-            continue
-        if is_safe(name):
             return name, [words, *notes]
         notes.append(
             f"the {title} is left out: its loop is unstable at a sensor gain that the record allows"
