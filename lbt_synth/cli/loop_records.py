@@ -247,7 +247,7 @@ def add_accelerometers(report: Report, found: AccelerometerTransfers) -> None:
         name: getattr(found, f"shift_{name}") for name in ("frames", "error_frames")
     }
     report.notes.append(f"note: {found.shift_text}")
-    if found.used:
+    if found.worth_text:
         report.notes.append(f"note: {found.worth_text}.")
     names = ("alone_nm", "together_nm")
     report.data["accelerometer_residuals"] = {name: getattr(found, name) for name in names}

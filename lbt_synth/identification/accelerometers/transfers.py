@@ -24,7 +24,7 @@ from scipy.special import gammaincc
 
 from lbt_synth.design import kalman
 from lbt_synth.design.fallbacks import MOST_UNITS
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
 from lbt_synth.identification.accelerometers.readings import fill_missing
 from lbt_synth.identification.fit.identified_model import (
     DIFFERENT,
@@ -150,8 +150,8 @@ class AccelerometerTransfers:
 
     @property
     def worth_text(self) -> str:
-        """What the channels buy, in words; empty where none shows a line."""
-        if not self.used:
+        """What the channels buy, in words; empty where none shows a line, or it is not known."""
+        if not np.isfinite(self.together_nm):
             return ""
         return (
             "by the model, the Kalman filter of the wavefront leaves "
@@ -270,7 +270,12 @@ def accelerometer_transfers(
         age_frames=lag + 1,
         rate_hz=model.frame_rate_hz,
     )
-    return _with_residuals(transfers, model) if best else transfers
+    if not best:
+        return transfers
+    try:
+        return _with_residuals(transfers, model)
+    except LbtSynthError:  # no filter of these sensors: the motions are not lost
+        return transfers
 
 
 def _is_live(readings: FloatArray) -> bool:
