@@ -75,7 +75,7 @@ def _diagnosis_data(found: Diagnosis) -> dict[str, Any]:
         "commands": None if found.commands is None else json_record(found.commands.facts()),
         "control_law": None if found.law is None else _law_data(found.law),
         "loop": None if found.loop is None else json_record(found.loop),
-        "lines": [json_record(line) for line in found.lines],
+        "lines": [asdict(line) for line in found.lines],
         "costs": [json_record(row) for row in found.costs],
         "residuals": [json_record(row) for row in found.residuals],
         "best": found.best or None,

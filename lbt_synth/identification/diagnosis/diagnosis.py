@@ -13,17 +13,16 @@ from lbt_synth.identification.commands.verdict import CommandVerdict, explain_co
 from lbt_synth.identification.diagnosis.rows import (
     ChannelRow,
     CostRow,
-    LineRow,
     design_differences,
     disturbance_costs,
+    disturbance_lines,
     given_controller,
     given_design_facts,
     judge_channels,
-    line_origins,
     loop_facts,
     running_controller,
 )
-from lbt_synth.identification.fit.identified_model import IdentifiedModel
+from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
 from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.prediction.comparison import (
     INTEGRATOR,
@@ -60,8 +59,8 @@ class Diagnosis:
         The model of the whole record, and why there is none in ``notes``.
     loop : Facts or None
         The loop that ran, by law and model.
-    lines : tuple of LineRow
-        Vibrations, and where they come from.
+    lines : tuple of IdentifiedLine
+        Resonances that are no turbulence, by frequency.
     comparison : PredictionTable or None
         Residuals on the second half of the record, by models of the first.
     best : str
@@ -83,7 +82,7 @@ class Diagnosis:
     channels: tuple[ChannelRow, ...] = ()
     model: IdentifiedModel | None = None
     loop: Facts | None = None
-    lines: tuple[LineRow, ...] = ()
+    lines: tuple[IdentifiedLine, ...] = ()
     comparison: PredictionTable | None = None
     best: str = ""
     best_design: Design | None = None
@@ -215,7 +214,7 @@ def _examine_loop(
     controllers = {name: given_controller(design, model) for name, design in given.items()}
     running = running_controller(diagnosis.law, record.frame_rate_hz)
     facts = loop_facts(model, running)
-    diagnosis = replace(diagnosis, model=model, loop=facts, lines=line_origins(model))
+    diagnosis = replace(diagnosis, model=model, loop=facts, lines=disturbance_lines(model))
     first, _ = split_halves(record.stretches(), record.frames)
     # one sensor gain for all that is said: a half shows it less well
     fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
@@ -228,7 +227,7 @@ def _examine_loop(
     if half is not None:
         diagnosis = _compare(diagnosis, half, running, controllers, notes)
     best, imaging = diagnosis.best_design, diagnosis.imaging
-    lines = line_origins(model if half is None else half)
+    lines = disturbance_lines(model if half is None else half)
     chosen = None if best is None else best.controller
     costs = _attempt(
         lambda: disturbance_costs(plant, lines, running, chosen, imaging), "costs", notes

@@ -23,7 +23,7 @@ from lbt_synth.loop import Imaging, close_loop, jitter_strehl, loop_margins, res
 from lbt_synth.loop.budget import line_covariance
 from lbt_synth.loop.stable_range import stable_sensor_gains
 from lbt_synth.methods.registry import design_title
-from lbt_synth.models import TipTiltPlant, Vibration
+from lbt_synth.models import TipTiltPlant
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.rows import (
     Facts,
@@ -274,62 +274,25 @@ def design_differences(design: Design, model: IdentifiedModel) -> list[str]:
     return [*notes, *(f"the gain file was {text}" for text in loop_differences(own, here))]
 
 
-@table_row
-class LineRow:
-    """A vibration."""
-
-    frequency_hz: float = column("f", unit="Hz", format=".3f", help="Frequency")
-    frequency_error_hz: float = column("+-", unit="Hz", format=".2g", help="Its standard error")
-    damping: str = column("damping", help="Damping ratio, a bound where it is not resolved")
-    rms_nm: float = nm_column("rms", help="Rms over all axes")
-    direction_deg: float = column(
-        "direction", unit="deg", format=".1f", help="From tip (0) towards tilt (90)"
-    )
-    direction_error_deg: float = column("+-", unit="deg", format=".2g", help="Its error")
-    origin: str = column("origin", help="Where it is from")
-    broad: bool  # too damped for a line
-    vibration: Vibration  # of the plant
-
-    @property
-    def name(self) -> str:
-        """What tables of costs call it."""
-        return f"{'broad resonance' if self.broad else 'line'} at {self.frequency_hz:.4g} Hz"
-
-    @property
-    def where(self) -> str:
-        """Along what it shakes, to go on in a sentence; empty where that is not known."""
-        if self.origin in AXES:
-            return f" in {self.origin}"
-        return "" if np.isnan(self.direction_deg) else f" along {self.direction_deg:.0f} deg"
-
-
-def line_origins(model: IdentifiedModel) -> tuple[LineRow, ...]:
-    """Return the lines of a model by frequency, each with the direction in which it shakes."""
+def disturbance_lines(model: IdentifiedModel) -> tuple[IdentifiedLine, ...]:
+    """Return the resonances of a model that are no turbulence, by frequency."""
     parts = [part for part in model.parts if part.kind != "turbulence"]
-    parts.sort(key=lambda part: part.frequency_hz)
-    return tuple(_line_row(part, len(model.axes)) for part in parts)
+    return tuple(sorted(parts, key=lambda part: part.frequency_hz))
 
 
-def _line_row(part: IdentifiedLine, axes: int) -> LineRow:
-    angle, error = part.direction_deg or 0.0, part.direction_error_deg
-    near, origin = DIFFERENT * (error or 0.0), "a diagonal"
-    if axes == 1:
-        angle, origin = np.nan, "one axis"
-    elif abs(angle) <= near:
-        origin = AXES[0]
-    elif abs(angle) >= 90 - near:
-        angle, origin = angle % 180, AXES[1]
-    return LineRow(
-        frequency_hz=part.frequency_hz,
-        frequency_error_hz=part.frequency_error_hz,
-        damping=f"{part.damping:.3g}" if part.resolved else f"< {part.damping:.2g}",
-        rms_nm=part.rms_nm,
-        direction_deg=angle,
-        direction_error_deg=np.nan if error is None else error,
-        origin=origin if part.kind == "line" else f"{origin}, broad",
-        broad=part.kind != "line",
-        vibration=part.vibration(),
-    )
+def line_name(line: IdentifiedLine) -> str:
+    """Return what a table of costs calls a resonance."""
+    return f"{'line' if line.kind == 'line' else 'broad resonance'} at {line.frequency_hz:.4g} Hz"
+
+
+def line_place(line: IdentifiedLine) -> str:
+    """Return along what a line shakes, to go on in a sentence; empty of a loop of one axis."""
+    direction = line.direction or (1.0,)
+    if len(direction) == 1:
+        return ""
+    if np.count_nonzero(direction) == 1:
+        return f" in {AXES[int(np.argmax(np.abs(direction)))]}"
+    return f" along {line.direction_deg:.0f} deg"
 
 
 @table_row
@@ -346,7 +309,7 @@ class CostRow:
 
 def disturbance_costs(
     plant: TipTiltPlant,
-    lines: Sequence[LineRow],
+    lines: Sequence[IdentifiedLine],
     running: Controller | None,
     best: Controller | None,
     imaging: Imaging,
@@ -358,7 +321,7 @@ def disturbance_costs(
     """
     tables = [_covariances(plant, lines, controller) for controller in (running, best)]
     names = next((list(table) for table in tables if table), [])
-    where = {line.name: line.where for line in lines}
+    where = {line_name(line): line_place(line) for line in lines}
     rows = []
     for name in names:
         numbers = [_rms_and_strehl(table, name, imaging) for table in tables]
@@ -379,7 +342,7 @@ def disturbance_costs(
 
 
 def _covariances(
-    plant: TipTiltPlant, lines: Sequence[LineRow], controller: Controller | None
+    plant: TipTiltPlant, lines: Sequence[IdentifiedLine], controller: Controller | None
 ) -> dict[str, FloatArray]:
     """Return the covariance (n, n) of the residual by part, and of all; none of no stable loop."""
     if controller is None:
@@ -390,7 +353,8 @@ def _covariances(
     budget = residual_budget(loop, plant, frame_means=True)
     out = {"turbulence": budget.turbulence_nm2, "measurement noise": budget.noise_nm2}
     for line in lines:  # two of one frequency are one part
-        out[line.name] = out.get(line.name, 0.0) + line_covariance(loop, line.vibration)
+        name = line_name(line)
+        out[name] = out.get(name, 0.0) + line_covariance(loop, line.vibration())
     rest = budget.total_nm2 - np.sum(list(out.values()), axis=0)
     out["turbulence"] = out["turbulence"] + rest  # slow resonances are turbulence
     return out | {_ALL: budget.total_nm2}

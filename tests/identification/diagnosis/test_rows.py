@@ -1,14 +1,11 @@
-"""The channels of a record, with one thing wrong at a time; lines, and costs of a disturbance."""
+"""The channels of a record, with one thing wrong at a time, and the costs of a disturbance."""
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 import pytest
-from support.control_laws import PATH, RATE, ordinary_loop
+from support.control_laws import RATE, ordinary_loop
 from support.diagnoses import line_diagnosis
-from support.recorded_loops import slow
 from support.wrong_commands import record
 
 import lbt_synth as lbt
@@ -16,7 +13,6 @@ from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.diagnosis.rows import (
     disturbance_costs,
     judge_channels,
-    line_origins,
     live_axes,
 )
 
@@ -119,53 +115,6 @@ def test_few_outliers_are_not_serious():
     found, rows, _ = states(y, u)
     assert found["tip measurement"].startswith("outliers (0.0")
     assert not any(row.serious for row in rows)
-
-
-ANGLES = {20.0: 0.0, 37.0: 90.0, 61.0: 30.0, 90.0: -40.0}  # by frequency [Hz]
-
-
-def line(frequency, direction, rms=60.0):
-    return lbt.Vibration(frequency_hz=frequency, damping=0.006, rms_nm=rms, direction=direction)
-
-
-def recorded(vibrations, seed, frames=16_384):
-    truth = lbt.Truth(turbulence=slow(), vibrations=vibrations, noise_nm=8.0, sensor_gain=0.7)
-    run = lbt.simulate(
-        lbt.integrator(PATH, gain=0.3).controller, truth, hardware=PATH, frames=frames, seed=seed
-    )
-    return lbt.identification.loop_record(
-        run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
-    )
-
-
-@cache
-def several():
-    lines = tuple(
-        line(f, (np.cos(np.radians(angle)), np.sin(np.radians(angle))))
-        for f, angle in ANGLES.items()
-    )
-    return line_origins(lbt.identify(recorded(lines, seed=2), sensor_gain=0.7))
-
-
-def test_each_line_has_its_direction():
-    rows = {round(each.frequency_hz): each for each in several()}
-    assert sorted(rows) == [20, 37, 61, 90]
-    for frequency, angle in ANGLES.items():
-        row = rows[frequency]
-        apart = (row.direction_deg - angle + 90) % 180 - 90
-        if frequency in (20.0, 37.0):  # of one axis alone
-            assert abs(apart) < 6
-        else:
-            assert abs(apart) < 4 * row.direction_error_deg < 12
-        assert row.rms_nm == pytest.approx(60, rel=0.35)
-    origins = [rows[f].origin for f in sorted(rows)]
-    assert origins == ["tip", "tilt", "a diagonal", "a diagonal"]
-
-
-def test_a_diagonal_is_one_vibration():
-    by_frequency = {round(row.frequency_hz): row for row in several()}
-    assert min(np.abs(by_frequency[61].vibration.direction)) > 0.4
-    assert by_frequency[61].name.startswith("line at 6")
 
 
 @pytest.fixture(scope="module")

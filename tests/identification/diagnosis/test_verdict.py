@@ -8,6 +8,7 @@ from support.control_laws import RATE, SteppedLaw, run_law
 from support.diagnoses import line_diagnosis, line_record, short_record
 
 import lbt_synth as lbt
+from lbt_synth.identification.diagnosis.rows import line_name, line_place
 from lbt_synth.identification.diagnosis.verdict import diagnosis_verdict
 from lbt_synth.identification.prediction.comparison import INTEGRATOR, RAN
 
@@ -161,9 +162,8 @@ def test_of_a_loop_near_its_limit():
 def test_along_what_a_line_shakes():
     found = line_diagnosis()
     (line,) = found.lines
-    assert line.where == ""
-    assert replace(line, origin="a diagonal", direction_deg=30.0).where == " along 30 deg"
-    assert replace(line, origin="tilt", direction_deg=90.0).where == " in tilt"
+    assert line_place(replace(line, direction=(0.866, 0.5))) == " along 30 deg"
+    assert line_place(replace(line, direction=(0.0, 1.0))) == " in tilt"
     costs = tuple(replace(row, where=" in tilt") for row in found.costs)
     (name,) = (row.part for row in costs if row.part.startswith("line"))
     assert f"% of the {name} in tilt" in diagnosis_verdict(replace(found, costs=costs))[1]
@@ -171,5 +171,5 @@ def test_along_what_a_line_shakes():
 
 def test_a_wide_resonance_is_no_line():
     (line,) = line_diagnosis().lines
-    assert line.name.startswith("line at ")
-    assert replace(line, broad=True).name.startswith("broad resonance at ")
+    assert line_name(line).startswith("line at ")
+    assert line_name(replace(line, kind="broad")).startswith("broad resonance at ")
