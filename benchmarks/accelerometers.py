@@ -164,8 +164,7 @@ def examine(seed: int, frames: int) -> dict[str, list[float]]:
         out["motion"].append((row.motion_nm_per_nm - abs(factor)) / row.motion_error_nm_per_nm)
         out["phase"].append(off / row.phase_error_deg)
         out["error"].append(abs(row.motion_nm_per_nm / abs(factor) - 1))
-    out["by phases"] = [float(found.shift_by_phases)]
-    out["shift"] = [(found.shift_frames - it.late)] if found.shift_by_phases else []
+    out["shift"] = [(found.shift_frames - it.late)]
     out["shift errors"] = [x / found.shift_error_frames for x in out["shift"]]
     return out
 
@@ -255,7 +254,7 @@ def main() -> None:
         size = np.abs(every[name])
         return f"{100 * np.mean(size < 1):.0f}, {100 * np.mean(size < 1.96):.0f} %"
 
-    for name in ("useful channels found", "lines found", "by phases"):
+    for name in ("useful channels found", "lines found"):
         print(f"| {name} | {share(name)} |")
     for name in ("dead or unrelated channels used", "false"):
         print(f"| {name} | {int(np.sum(every[name]))} of {len(every[name])} |")

@@ -313,9 +313,8 @@ def studied(seed: int, frames: int) -> dict:
     gain = halved.sensor_gains[0]
     predictor, _ = lbt.identification.least_squares_predictor(
         it.record.pseudo_open_loop(gain),
-        it.path,
+        replace(it.path, sensor_matrix=gain * it.path.sensor),
         taps=32,
-        sensor_gain=gain,
         stretches=half,
     )
     half_filter = lbt.kalman(halved.plant()).controller
@@ -324,9 +323,8 @@ def studied(seed: int, frames: int) -> dict:
         lbt.identification.replayed_residual(
             true_open,
             controller,
-            it.path,
+            replace(it.path, sensor_matrix=it.truth.sensor_gain * it.path.sensor),
             noise_nm=it.truth.noise_nm,
-            sensor_gain=it.truth.sensor_gain,
             stretches=it.record.stretches(),
             test=other,
         ).total_nm2

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,8 +39,9 @@ from lbt_synth.identification.prediction.residual import (
     inverse_sensor,
     invert,
 )
-from lbt_synth.identification.stretches import Stretches, StretchesLike
+from lbt_synth.identification.stretches import Stretches, StretchesLike, cut_stretches
 from lbt_synth.linear import Controller
+from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop import youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray, integer, number, require_instance
@@ -226,20 +227,48 @@ def _dominant_poles(A: FloatArray, coefficients: FloatArray, order: int) -> Comp
     return np.asarray(np.linalg.eigvals(kept.T @ A @ kept), dtype=np.complex128)
 
 
-def best_integrator(split: lbt.identification.ForwardSplit) -> lbt.Controller:
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Frames to learn from, later ones that count, and the model that the first give."""
+
+    record: lbt.identification.LoopRecord
+    training: Stretches
+    test: Stretches
+    model: lbt.identification.IdentifiedModel
+
+    @property
+    def hardware(self) -> LoopHardware:
+        return self.model.hardware
+
+    @property
+    def open_loop(self) -> FloatArray:
+        return self.record.pseudo_open_loop(self.model.sensor_gains)
+
+    def residual(self, controller: Controller) -> lbt.identification.ResidualEstimate:
+        """Return what a controller would have left of the test."""
+        return lbt.identification.replayed_residual(
+            self.open_loop,
+            controller,
+            self.hardware,
+            noise_nm=[axis.noise_nm for axis in self.model.axes],
+            stretches=self.record.stretches(),
+            test=self.test,
+        )
+
+
+def best_integrator(split: Split) -> lbt.Controller:
     """Return the integrators that leave least of the test itself: no integrator leaves less."""
     axes = split.hardware.modes
 
     def left(gain: float, axis: int) -> float:
-        return float(
-            np.mean(split.replay(integrators(split.hardware, [gain] * axes))[:, axis] ** 2)
-        )
+        residual = split.residual(integrators(split.hardware, [gain] * axes))
+        return float(np.mean(residual.measured_nm[:, axis] ** 2))
 
     gains = [best_gain(lambda gain, i=axis: left(gain, i), split.hardware) for axis in range(axes)]
     return integrators(split.hardware, gains)
 
 
-def ar_filter(split: lbt.identification.ForwardSplit) -> lbt.Design:
+def ar_filter(split: Split) -> lbt.Design:
     """Return a Kalman filter for an AR model of each axis by Yule-Walker, as pyRTC's ar_kalman."""
     start, stop = max(split.training, key=lambda stretch: stretch[1] - stretch[0])
     hardware, models = split.hardware, []
@@ -265,14 +294,14 @@ def ar_filter(split: lbt.identification.ForwardSplit) -> lbt.Design:
     return lbt.kalman(plant)
 
 
-def fir_predictor(split: lbt.identification.ForwardSplit, taps: int) -> lbt.Controller:
+def fir_predictor(split: Split, taps: int) -> lbt.Controller:
     """Return the best FIR predictor of the training."""
     return lbt.identification.least_squares_predictor(
         split.open_loop, split.hardware, taps=taps, stretches=split.training
     )[0]
 
 
-ENTRIES: dict[str, Callable[[lbt.identification.ForwardSplit], lbt.Controller | lbt.Design]] = {
+ENTRIES: dict[str, Callable[[Split], lbt.Controller | lbt.Design]] = {
     "best integrator": best_integrator,
     f"AR({AR_ORDER}) filter": ar_filter,
     "least squares, 32 taps": lambda split: fir_predictor(split, 32),
@@ -282,19 +311,48 @@ ENTRIES: dict[str, Callable[[lbt.identification.ForwardSplit], lbt.Controller | 
     ),
     "Kalman": lambda split: lbt.kalman(split.model.plant()),
     "H-infinity, 1.2 of least": lambda split: lbt.hinf(split.model.plant(), gamma_ratio=1.2),
-    "automatic": lambda split: lbt.design_from_record(split.past).design,
+    "automatic": lambda split: lbt.design_from_record(past(split)).design,
 }
 
 
+def past(split: Split) -> lbt.identification.LoopRecord:
+    """Return the record as it was when the training ended."""
+    stop = split.training[-1][1]
+    names = ("measurements", "commands", "usable", "measured", "commanded")
+    series = {name: getattr(split.record, name) for name in names}
+    return replace(split.record, **{k: x[:stop] for k, x in series.items() if x is not None})
+
+
+def residuals_of(
+    record: lbt.identification.LoopRecord, splits: int
+) -> dict[str, list[lbt.identification.ResidualEstimate]]:
+    """Return what each entry leaves of each test, without those that fail."""
+    model, residuals, failed = None, {name: [] for name in ENTRIES}, set()
+    stretches, usable = record.stretches(), int(np.sum(record.usable))
+    for k in range(splits):
+        share = (1 + k / splits) / 2
+        training, rest = lbt.identification.split_halves(stretches, record.frames, fit_share=share)
+        test = cut_stretches(rest, 0, usable // (2 * splits))
+        model = lbt.identify(record, stretches=training, start=model)
+        split = Split(record, training, test, model)
+        for name in [name for name in ENTRIES if name not in failed]:
+            try:
+                residuals[name].append(split.residual(as_controller(ENTRIES[name](split))))
+            except lbt.LbtSynthError as error:
+                print(f"{name} is not in the table: {error}")
+                failed.add(name)
+    return {name: parts for name, parts in residuals.items() if name not in failed}
+
+
 def relative_residual(
-    residuals: dict[str, lbt.identification.ResidualEstimate], name: str
+    parts: Sequence[lbt.identification.ResidualEstimate],
+    best: Sequence[lbt.identification.ResidualEstimate],
 ) -> tuple[float, float]:
     """Return a measured residual over the least one, less 1, and its standard error."""
-    best = next(iter(residuals.values()))
-    least = best.measured_nm2
-    difference, error = residuals[name].above(best)
-    ratio = np.sqrt(1 + difference / least)
-    return ratio - 1, error / (2 * ratio * least)
+    least = np.mean([part.measured_nm2 for part in best])
+    differences, errors = np.transpose([p.above(b) for p, b in zip(parts, best, strict=True)])
+    ratio = np.sqrt(1 + np.mean(differences) / least)
+    return ratio - 1, np.linalg.norm(errors) / len(errors) / (2 * ratio * least)
 
 
 def play(records: dict[str, lbt.identification.LoopRecord], splits: int) -> None:
@@ -302,20 +360,15 @@ def play(records: dict[str, lbt.identification.LoopRecord], splits: int) -> None
     chains = {}
     for name, record in records.items():
         try:
-            chain = lbt.identification.forward_chain(record, ENTRIES, splits=splits)
+            residuals = residuals_of(record, splits)
         except lbt.LbtSynthError as error:
             print(f"{name} is not in the table: {error}")
             continue
-        chains[name], failures = chain
-        for entry, why in failures.items():
-            print(f"{entry} is not in the table of {name}: {why}")
+        best = min(residuals.values(), key=lambda parts: sum(x.measured_nm2 for x in parts))
+        chains[name] = {entry: relative_residual(x, best) for entry, x in residuals.items()}
     rows = []
     for entry in ENTRIES:
-        ratios = {
-            name: relative_residual(residuals, entry)
-            for name, residuals in chains.items()
-            if entry in residuals
-        }
+        ratios = {name: chain[entry] for name, chain in chains.items() if entry in chain}
         if ratios:
             above, errors = np.array(list(ratios.values())).T
             mean = np.expm1(np.mean(np.log1p(above)))

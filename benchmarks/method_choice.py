@@ -15,27 +15,27 @@ import argparse
 import time
 
 import numpy as np
-from league import CHANGES, simulate_record
+from league import CHANGES, Split, past, simulate_record
 
 import lbt_synth as lbt
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.identification.prediction.forward_chaining import forward_split
 from lbt_synth.methods.registry import default_method, method_named, record_methods
 from lbt_synth.methods.request import PlantInputs, design_request
 
 
-def residuals_of_last_quarter(record) -> tuple[lbt.identification.MethodChoice, dict[str, float]]:
+def residuals_of_last_quarter(record) -> tuple[str, dict[str, float]]:
     """Return the choice from three quarters, and what each method measures in the last one [nm]."""
     training, test = lbt.identification.split_halves(
         record.stretches(), record.frames, fit_share=0.75
     )
-    split = forward_split(record, training, test)
-    choice = lbt.design_from_record(split.past, accept_record=True).choice
+    split = Split(record, training, test, lbt.identify(record, stretches=training))
+    title = lbt.design_from_record(past(split), accept_record=True).name
+    choice = next(name for name in record_methods() if method_named(name).title == title)
     left = {}
     for name in record_methods():
         inputs = PlantInputs(plant=split.model.plant(), design_defaults={"gamma_ratio": 1.2})
         design = design_request(name, method_named(name).reference_options).build(inputs)
-        left[name] = float(np.sqrt(np.mean(np.sum(split.replay(design.controller) ** 2, axis=1))))
+        left[name] = float(np.sqrt(split.residual(design.controller).measured_nm2))
     return choice, left
 
 
@@ -95,9 +95,9 @@ def main() -> None:
             print(f"{record:14s} refused: {error}", flush=True)
             continue
         above = {name: 100 * (value / min(left.values()) - 1) for name, value in left.items()}
-        near.append(above[choice.method] <= 1)
+        near.append(above[choice] <= 1)
         cells = (f"{value:8.2f}" for value in above.values())
-        print(f"{record:14s}", *cells, f"  {choice.method}", flush=True)
+        print(f"{record:14s}", *cells, f"  {choice}", flush=True)
     print(f"the choice is within 1 % of the best method on {sum(near)} of {len(near)} records")
 
 

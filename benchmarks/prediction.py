@@ -70,13 +70,15 @@ def identity() -> None:
 
 def show(table: lbt.identification.PredictionTable) -> None:
     for row in table.entries:
-        tip, tilt = row.model_axis_nm if row.replayed is None else row.replayed.axis_rms_nm
+        tip, tilt = row.model_axis_nm
+        if row.replayed is not None:
+            tip, tilt = np.sqrt(row.replayed.variance_nm2)
         print(
             f"| {row.name} | {tip:.1f}, {tilt:.1f} | {row.replayed_nm:.1f} +- "
             f"{row.replayed_error_nm:.1f} | {row.model_nm:.1f} | {row.ratio:.3f} | "
             f"{row.deviations:+.1f} | {100 * row.strehl:.1f} | {100 * row.model_strehl:.1f} |"
         )
-    print(f"fit {table.fit}, test {table.test}, {table.warm_up_frames} frames to warm up")
+    print(f"fit {table.fit}, test {table.test}")
 
 
 def tables() -> None:
@@ -134,7 +136,7 @@ def predictors() -> None:
         )
         print(
             f"{taps} taps: {found.rms_nm:.2f} +- {found.rms_error_nm:.2f} nm on the data, "
-            f"{lbt.residual_budget(loop, model).rms_nm:.2f} nm by the model, "
+            f"{lbt.residual_budget(loop, model, frame_means=True).rms_nm:.2f} nm by the model, "
             f"limit {limit:.2f} nm; "
             f"{1e3 * took:.0f} ms"
         )
@@ -143,7 +145,10 @@ def predictors() -> None:
 def errors(nights: int = 200) -> None:
     model = plant()
     path, design = model.hardware, lbt.kalman(model)
-    exact = lbt.residual_budget(lbt.close_loop(path, design.controller), model).rms_nm ** 2
+    exact = (
+        lbt.residual_budget(lbt.close_loop(path, design.controller), model, frame_means=True).rms_nm
+        ** 2
+    )
     seen = []
     for seed in range(nights):
         y, u, _ = night(path, 1000 + seed, 6000)

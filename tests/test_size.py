@@ -18,7 +18,7 @@ LINES = {
     "config": 2331,
     "design": 8382,
     "files": 1608,
-    "identification": 12758,
+    "identification": 12630,
     "interop": 4663,
     "linear": 6078,
     "loop": 5350,
@@ -30,10 +30,10 @@ LINES = {
     "errors, validation": 642,
 }
 COUNTS = {
-    "files of the package": 306,
-    "public names": 254,
-    "tuned constants": 794,
-    "lines of tests": 42920,
+    "files of the package": 303,
+    "public names": 248,
+    "tuned constants": 832,
+    "lines of tests": 42600,
     "words of docs": 75543,
 }
 

@@ -10,10 +10,9 @@ from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import count_progress
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import LoopRecord, design_from_record
-from lbt_synth.identification.auto import LEAST_SECONDS, MethodChoice, RecordedDesign
+from lbt_synth.identification.auto import LEAST_SECONDS, RecordedDesign
 from lbt_synth.identification.prediction.comparison import RAN
 from lbt_synth.loop import Imaging, close_loop, loop_margins
-from lbt_synth.storage.display_unit import nm_text
 
 
 def run(arguments: Namespace) -> Report:
@@ -40,8 +39,7 @@ def run(arguments: Namespace) -> Report:
     report = Report(data={"source": str(arguments.file)})
     loop_records.add_record(report, record)
     loop_records.add_model(report, found.model)
-    if found.choice is not None:
-        _add_choice(report, found.choice)
+    report.data["method"] = found.design.method
     _add_comparison(report, found, record, imaging)
     loop = close_loop(found.model.hardware, found.design.controller)
     report.data["certificate"] = found.design.certificate.passed
@@ -53,15 +51,6 @@ def run(arguments: Namespace) -> Report:
     report.data["assumptions"] = found.design.assumptions
     loop_records.write_files(report, places, arguments, record, found.model, found)
     return report
-
-
-def _add_choice(report: Report, choice: MethodChoice) -> None:
-    """Add how the method was chosen."""
-    report.data["method"] = choice.method
-    if choice.rows:
-        caption = "Methods, by what they leave of the frames after their training"
-        report.add_rows("methods", caption, choice.rows)
-    report.notes += [f"note: {note}." for note in choice.notes]
 
 
 def _add_comparison(
@@ -79,11 +68,11 @@ def _add_comparison(
     report.data |= {"gain_over_what_ran": None, "wavelength_um": imaging.wavelength_um}
     if record.commands is not None:
         ran = table[RAN]
-        report.notes.append(
-            f"gain over what ran, on unseen data: residual {nm_text(ran.replayed_nm, '.4g')} -> "
-            f"{nm_text(best.replayed_nm, '.4g')}, {imaging.label} (tip and tilt) "
-            f"{ran.strehl:.3f} -> {best.strehl:.3f}."
-        )
+        before, after = (row.replayed.text for row in (ran, best) if row.replayed is not None)
+        strehl = ""
+        if ran.strehl >= 0 and best.strehl >= 0:
+            strehl = f"; {imaging.label} (tip and tilt) {ran.strehl:.3f} -> {best.strehl:.3f}"
+        report.notes.append(f"gain over what ran, on unseen data: {before} -> {after}{strehl}.")
         report.data["gain_over_what_ran"] = {
             "residual_nm": [ran.replayed_nm, best.replayed_nm],
             "strehl": [ran.strehl, best.strehl],

@@ -14,8 +14,8 @@ from lbt_synth.cli.progress import count_progress
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import Diagnosis, LoopRecord, diagnose
 from lbt_synth.identification.commands.control_law import ControlLaw
-from lbt_synth.identification.diagnosis.diagnosis import diagnosis_verdict
-from lbt_synth.identification.diagnosis.running_loop import live_axes
+from lbt_synth.identification.diagnosis.rows import live_axes
+from lbt_synth.identification.diagnosis.verdict import diagnosis_verdict
 from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.rows import json_record
@@ -75,7 +75,7 @@ def _diagnosis_data(found: Diagnosis) -> dict[str, Any]:
         "commands": None if found.commands is None else json_record(found.commands.facts()),
         "control_law": None if found.law is None else _law_data(found.law),
         "loop": None if found.loop is None else json_record(found.loop),
-        "lines": [json_record(line) for line in found.lines],
+        "lines": [asdict(line) for line in found.lines],
         "costs": [json_record(row) for row in found.costs],
         "residuals": [json_record(row) for row in found.residuals],
         "best": found.best or None,

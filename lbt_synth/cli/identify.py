@@ -8,6 +8,7 @@ from lbt_synth.cli import loop_records
 from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
+from lbt_synth.errors import LbtSynthError
 from lbt_synth.identification import LoopRecord, SpectrumRecord, accelerometer_transfers, identify
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 
@@ -18,9 +19,9 @@ def run(arguments: Namespace) -> Report:
     record = loop_records.read_record(arguments)
     choose_unit(arguments, record.diameter_m)
     options = loop_records.identification_options(arguments, record)
-    notes: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     if isinstance(record, LoopRecord):
-        notes = loop_records.judge_record(arguments, record)
+        doubts = loop_records.judge_record(arguments, record)
     if isinstance(record, SpectrumRecord):  # it does not hold the timing of the loop
         options |= {name: getattr(arguments, name) for name in ("frame_rate_hz", "delay_frames")}
     with show_spinner("identifying", quiet=arguments.json):
@@ -31,9 +32,13 @@ def run(arguments: Namespace) -> Report:
     found: AccelerometerTransfers | None = None
     if arguments.accelerometers is not None and isinstance(record, LoopRecord):
         channels, values, notes = loop_records.read_accelerations(arguments, record)
-        found = accelerometer_transfers(model, record, values, channels=channels)
-        loop_records.add_accelerometers(report, found)
         report.notes += [f"note: {note}." for note in notes]
-    report.notes += [loop_records.marked_note(note) for note in notes]
+        try:
+            found = accelerometer_transfers(model, record, values, channels=channels)
+        except LbtSynthError as error:  # the model is not lost
+            report.notes.append(f"warning: the accelerometers were not compared: {error}")
+        else:
+            loop_records.add_accelerometers(report, found)
+    report.notes += [loop_records.marked_note(doubt) for doubt in doubts]
     loop_records.write_files(report, places, arguments, record, model, accelerometers=found)
     return report

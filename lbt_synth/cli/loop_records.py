@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config
+from lbt_synth.config.identified_system import RAISED, require_writable_facts
 from lbt_synth.config.write import config_text
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
@@ -177,6 +178,15 @@ def identification_options(
     obstruction = record.obstruction if isinstance(record, LoopRecord) else arguments.obstruction
     if obstruction is not None and record.diameter_m is None:
         raise ProblemError("--obstruction is a fraction of the diameter; give --diameter-m.")
+    loop = record if isinstance(record, LoopRecord) else arguments
+    require_writable_facts(
+        record.axes,
+        loop.frame_rate_hz,
+        loop.delay_frames,
+        diameter_m=record.diameter_m,
+        obstruction=obstruction,
+        wavelength_um=imaging_wavelength_um(arguments, record),
+    )
     options: dict[str, Any] = {
         "announced": _expected_lines(arguments, record),
         "lowest_line_hz": arguments.lowest_line_hz,
@@ -233,9 +243,13 @@ def add_accelerometers(report: Report, found: AccelerometerTransfers) -> None:
         report.add_rows("accelerometer_lines", "Accelerometers and lines", found.transfers)
     report.add_rows("accelerometers", "Accelerometers", found.channels)
     report.data["accelerometer_shift"] = {
-        name: getattr(found, f"shift_{name}") for name in ("frames", "error_frames", "by_phases")
+        name: getattr(found, f"shift_{name}") for name in ("frames", "error_frames")
     }
     report.notes.append(f"note: {found.shift_text}")
+    if found.worth_text:
+        report.notes.append(f"note: {found.worth_text}.")
+    names = ("alone_nm", "together_nm")
+    report.data["accelerometer_residuals"] = {name: getattr(found, name) for name in names}
 
 
 def find_places(arguments: Namespace, model: str | Path | None, **others: Path) -> dict[str, Path]:
@@ -266,16 +280,22 @@ def write_files(
     made: RecordedDesign | None = None,
     accelerometers: AccelerometerTransfers | None = None,
 ) -> None:
-    """Write gain file, model and figure, once all of them are computed."""
-    text = _model_text(model, arguments, record, accelerometers)
-    figure = None
-    if "figure" in places:
-        designs = None if made is None else {made.name: made.design}
-        figure = identification_figure(model, designs=designs)
+    """Write gain file, model and figure, one after the other: what is ready is not lost."""
+    designs = None
     if made is not None:
+        designs = {made.name: made.design}
         report.note_written(save_gain(places["gain"], made.design))
+    try:
+        text, comments = _model_text(model, arguments, record, accelerometers)
+    except ProblemError as error:
+        if accelerometers is None:
+            raise
+        report.notes.append(f"warning: the model is written without accelerometers: {error}")
+        text, comments = _model_text(model, arguments, record, None)
     report.note_written(write_atomically(places["model"], text), "model")
-    if figure is not None:
+    report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
+    if "figure" in places:
+        figure = identification_figure(model, designs=designs)
         report.note_written(save_figure(figure, places["figure"]), "figure")
 
 
@@ -284,8 +304,8 @@ def _model_text(
     arguments: Namespace,
     record: LoopRecord | SpectrumRecord,
     accelerometers: AccelerometerTransfers | None,
-) -> bytes:
-    """Return the text of a configuration for an identified model."""
+) -> tuple[bytes, dict[str, str]]:
+    """Return the text of a configuration for an identified model, and its comments."""
     obstruction = record.obstruction if isinstance(record, LoopRecord) else arguments.obstruction
     source = ascii(Path(arguments.file).name)[1:-1]
     settings, comments = identified_config(
@@ -296,7 +316,7 @@ def _model_text(
         title=f"Identified from {source} by lbt-synth {arguments.command}.",
         accelerometers=accelerometers,
     )
-    return config_text(settings, comments).encode()
+    return config_text(settings, comments).encode(), comments
 
 
 def add_record(report: Report, record: LoopRecord | SpectrumRecord) -> None:

@@ -20,6 +20,8 @@ from lbt_synth.validation import number
 _AXES = ("tip", "tilt")
 _NAME = "accelerometer"  # of the instrument that all channels make
 _DIRECTIONS = {(1.0, 0.0): "tip", (0.0, 1.0): "tilt"}
+RAISED = "raised to the least that a configuration has"
+_LEAST_NM = 1e-3  # of noise and lines in a configuration
 _KIND_COMMENTS = {"line": "", "broad": "broad; ", "turbulence": "part of the turbulence; "}
 
 
@@ -77,27 +79,17 @@ def identified_config(
     axes = tuple(model.axes)
     if len(axes) not in (1, 2):
         raise ProblemError(f"a configuration has one or two axes; got a model of {len(axes)}.")
-    if obstruction is not None and diameter_m is None:
-        raise ProblemError(
-            "obstruction is a fraction of diameter_m, which is missing. Give both, or neither."
-        )
     comments = {
         "": title,
         "sensor.noise_nm": _error_comment("nm", [axis.noise_error_nm for axis in axes]),
     }
-    content: dict[str, Any] = {"version": 1}
-    if diameter_m is not None:
-        content["telescope"] = {"diameter_m": diameter_m}
-        if obstruction is not None:
-            content["telescope"]["obstruction"] = obstruction
-    content["sensor"] = {"noise_nm": [float(axis.noise_nm) for axis in axes]}
+    content = _known_content(
+        len(axes), model.frame_rate_hz, model.delay_frames, diameter_m, obstruction
+    )
+    noises = [_raised(axis.noise_nm, "sensor.noise_nm", comments) for axis in axes]
+    content["sensor"] = {"noise_nm": noises}
     if model.mirror is not None:
         content["mirror"] = {"local_loop": asdict(model.mirror)}
-    content["loop"] = {"axes": len(axes)} if len(axes) == 1 else {}
-    content["loop"] |= {
-        "frame_rate_hz": number(model.frame_rate_hz, "frame_rate_hz", above=0),
-        "delay_frames": number(model.delay_frames, "delay_frames", at_least=1),
-    }
     vibrations = _vibration_sections(model, comments)
     if accelerometers is not None and accelerometers.used:
         delay = model.delay_frames
@@ -121,13 +113,65 @@ def identified_config(
     content["imaging"] = {"wavelength_um": wavelength_um}
     if other_modes_strehl != 1:
         content["imaging"]["other_modes_strehl"] = other_modes_strehl
+    return _validated(content), {key: text for key, text in comments.items() if text}
+
+
+def require_writable_facts(
+    axes: int,
+    frame_rate_hz: float | None,
+    delay_frames: float | None,
+    *,
+    diameter_m: float | None = None,
+    obstruction: float | None = None,
+    wavelength_um: float = 2.2,
+) -> None:
+    """Refuse facts that no configuration can hold, before a model is identified for it."""
+    rate_hz, delay = frame_rate_hz or 1.0, delay_frames or 1.0  # what is not known is found
+    content = _known_content(axes, rate_hz, delay, diameter_m, obstruction)
+    turbulence = {"kind": "ar", "coefficients": [0.9], "driving_rms_nm": 1.0}
+    content |= {"sensor": {"noise_nm": 1.0}, "model": {"turbulence": turbulence}}
+    _validated(content | {"imaging": {"wavelength_um": wavelength_um}})
+
+
+def _known_content(
+    axes: int,
+    frame_rate_hz: float,
+    delay_frames: float,
+    diameter_m: float | None,
+    obstruction: float | None,
+) -> dict[str, Any]:
+    """Return what a configuration says that is not identified."""
+    if obstruction is not None and diameter_m is None:
+        raise ProblemError(
+            "obstruction is a fraction of diameter_m, which is missing. Give both, or neither."
+        )
+    content: dict[str, Any] = {"version": 1}
+    if diameter_m is not None:
+        content["telescope"] = {"diameter_m": diameter_m}
+        if obstruction is not None:
+            content["telescope"]["obstruction"] = obstruction
+    content["loop"] = {"axes": axes} if axes == 1 else {}
+    content["loop"] |= {
+        "frame_rate_hz": number(frame_rate_hz, "frame_rate_hz", above=0),
+        "delay_frames": number(delay_frames, "delay_frames", at_least=1),
+    }
+    return content
+
+
+def _validated(content: dict[str, Any]) -> FileSection:
     try:
-        settings = FileSection.model_validate(content)
+        return FileSection.model_validate(content)
     except ValidationError as error:
         raise ProblemError(
             f"the model cannot be written as a configuration: {describe_error(error)[0]}"
         ) from error
-    return settings, {key: text for key, text in comments.items() if text}
+
+
+def _raised(value_nm: float, path: str, comments: dict[str, str]) -> float:
+    """Return a size that a configuration can hold, with a comment where it is not as it was."""
+    if 0 <= value_nm < _LEAST_NM:
+        comments[path] = f"{RAISED}, from {value_nm:.2g} nm"
+    return float(max(value_nm, _LEAST_NM)) if value_nm >= 0 else float(value_nm)
 
 
 def _vibration_sections(model: IdentifiedModel, comments: dict[str, str]) -> list[dict[str, Any]]:
@@ -146,8 +190,9 @@ def _vibration_sections(model: IdentifiedModel, comments: dict[str, str]) -> lis
             entry["direction_deg"] = part.direction_deg
             error = _error_comment("degrees", [part.direction_error_deg or 0.0])
             comments[f"{path}.direction_deg"] = error
-        for key in ("frequency_hz", "damping", "rms_nm"):
+        for key in ("frequency_hz", "damping"):
             entry[key] = float(getattr(part, key))
+        entry["rms_nm"] = _raised(part.rms_nm, f"{path}.rms_nm", comments)
         sections.append(entry)
     return sections
 

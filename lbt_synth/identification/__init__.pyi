@@ -1,5 +1,4 @@
 from .accelerometers.transfers import accelerometer_transfers as accelerometer_transfers
-from .auto import MethodChoice as MethodChoice
 from .auto import design_from_record as design_from_record
 from .commands.control_law import fit_control_law as fit_control_law
 from .commands.repair import CommandRepair as CommandRepair
@@ -10,10 +9,8 @@ from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identify import identify as identify
 from .prediction.comparison import PredictionTable as PredictionTable
+from .prediction.comparison import least_squares_predictor as least_squares_predictor
 from .prediction.comparison import prediction_against_data as prediction_against_data
-from .prediction.forward_chaining import ForwardSplit as ForwardSplit
-from .prediction.forward_chaining import forward_chain as forward_chain
-from .prediction.predictor import least_squares_predictor as least_squares_predictor
 from .prediction.residual import ResidualEstimate as ResidualEstimate
 from .prediction.residual import replayed_residual as replayed_residual
 from .records.from_file import load_record as load_record

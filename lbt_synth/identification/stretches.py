@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise, product
 from typing import TypeAlias
-
-import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.validation import integer, number
@@ -66,36 +63,18 @@ def split_halves(
     >>> lbt.identification.split_halves([(0, 400), (500, 900)], 1000, fit_share=0.25)
     (((0, 200),), ((200, 400), (500, 900)))
     """
-    return forward_splits(stretches, frames, splits=1, first_share=fit_share)[0]
-
-
-def forward_splits(
-    stretches: StretchesLike | None, frames: int, *, splits: int = 3, first_share: float = 0.5
-) -> tuple[tuple[Stretches, Stretches], ...]:
-    """Divide a record into pairs of stretches, to train on and later ones to test on.
-
-    Stretches are contiguous usable frames (start, stop), in order; None is the whole record. The
-    first pair trains on ``first_share`` of the usable frames, in (0, 1); the rest is divided into
-    tests of equal length, which begin where their training ends.
-    """
-    pairs = checked_stretches(stretches, integer(frames, "frames", at_least=1))
-    count = integer(splits, "splits", at_least=1)
-    share = number(first_share, "first_share", above=0, below=1)
-    usable = sum(stop - start for start, stop in pairs)
-    first = int(share * usable)  # as of split_halves
-    cuts = first + (usable - first) * np.arange(count + 1) // count
-    if cuts[0] < 1 or np.any(np.diff(cuts) < 1):
+    usable = checked_stretches(stretches, integer(frames, "frames", at_least=1))
+    count = sum(stop - start for start, stop in usable)
+    cut = int(number(fit_share, "fit_share", above=0, below=1) * count)
+    if not 1 <= cut < count:
         raise ProblemError(
-            f"a record must leave frames to train on and to test on; got {usable} usable frames "
-            f"for {count} splits. Record more, or split less."
+            f"a record must leave frames to fit and to test on; got {count} usable frames. Record "
+            "more."
         )
-    return tuple(
-        (_cut(pairs, 0, int(start)), _cut(pairs, int(start), int(stop)))
-        for start, stop in pairwise(cuts)
-    )
+    return cut_stretches(usable, 0, cut), cut_stretches(usable, cut, count)
 
 
-def _cut(stretches: Stretches, first: int, last: int) -> Stretches:
+def cut_stretches(stretches: Stretches, first: int, last: int) -> Stretches:
     """Return the usable frames from one count of them to another."""
     out, before = [], 0
     for start, stop in stretches:
@@ -103,39 +82,4 @@ def _cut(stretches: Stretches, first: int, last: int) -> Stretches:
         if low < high:
             out.append((start + low, start + high))
         before += stop - start
-    return tuple(out)
-
-
-def split_frames(
-    stretches: StretchesLike | None,
-    fit: StretchesLike | None,
-    test: StretchesLike | None,
-    frames: int,
-) -> tuple[Stretches, Stretches, Stretches]:
-    """Return contiguous frames, and those of them to fit and to test on.
-
-    Fit and test are as given, or the halves of the contiguous frames; without those, fit and test
-    are contiguous where they touch.
-    """
-    usable = checked_stretches(stretches, frames)
-    if fit is None and test is None:
-        return usable, *split_halves(usable, frames)
-    if fit is None or test is None:
-        raise ProblemError("fit and test must both be given, or neither; got one of them.")
-    fitted, tested = checked_stretches(fit, frames), checked_stretches(test, frames)
-    for (a, b), (c, d) in product(fitted, tested):
-        if a < d and c < b:
-            raise ProblemError(
-                f"the test must have frames that the fit has not; got ({a}, {b}) to fit and "
-                f"({c}, {d}) to test."
-            )
-    return usable if stretches is not None else _join((*fitted, *tested)), fitted, tested
-
-
-def _join(parts: Stretches) -> Stretches:
-    """Return the union of stretches that do not overlap."""
-    out: list[tuple[int, int]] = []
-    for start, stop in sorted(parts):
-        begin = out.pop()[0] if out and out[-1][1] == start else start
-        out.append((begin, stop))
     return tuple(out)

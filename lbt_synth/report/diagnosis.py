@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.identification import Diagnosis
-from lbt_synth.identification.diagnosis.diagnosis import NARROW, diagnosis_verdict
-from lbt_synth.identification.diagnosis.running_loop import law_facts
+from lbt_synth.identification.diagnosis.rows import law_facts
+from lbt_synth.identification.diagnosis.verdict import NARROW, diagnosis_verdict
+from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing
 from lbt_synth.report.figures import identification_figure
@@ -102,11 +103,11 @@ def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
         f"{unseen}; {found.imaging.label}": found.residuals,
     }
     given = found.given
-    lines = {"Vibrations, and where they come from": found.lines}
+    lines = [] if found.model is None else model_tables(found.model)[1:]
     return {
         "record": channels,
         "loop": [row_table(caption, rows) for caption, rows in loop.items() if rows],
-        "disturbance": [row_table(caption, rows) for caption, rows in lines.items() if rows],
+        "disturbance": lines,
         "verdict": [row_table(caption, rows) for caption, rows in residuals.items() if rows]
         + ([] if given is None else [fact_table("The gain file on this record", given)]),
     }

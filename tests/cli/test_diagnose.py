@@ -35,7 +35,7 @@ def test_a_page_of_text(capsys, night):
     for caption in (
         "Record: 8.188 s at 1000 Hz. 8186 of 8188 frames are usable",
         "Control law in use, from y to u",
-        "Vibrations, and where they come from",
+        "Vibrations",
         "What each part leaves by the model of the first half (best design: ",
         "Residual on the second half of the record",
     ):

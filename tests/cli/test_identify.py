@@ -12,6 +12,7 @@ from support.night import GAIN, LINE_HZ
 from support.recorded_loops import RATE, open_record
 
 import lbt_synth as lbt
+from lbt_synth.cli import identify as identify_command
 from lbt_synth.identification.fit import whittle
 
 FACTS = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm")
@@ -194,6 +195,36 @@ def test_accelerometers_are_compared_with_the_lines_of_the_model(
     status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 500)
     assert status == 2
     assert "at least once a frame, 1000 Hz; got 500 Hz" in error
+
+
+def test_a_model_is_written_whatever_becomes_of_its_accelerometers(
+    tmp_path, capsys, monkeypatch, recorded_loop, tip_night
+):
+    run_, _, _ = recorded_loop
+    np.save(tmp_path / "a.npy", 1e-3 * np.diff(run_.total_nm[0][:, 0], n=2, prepend=[0, 0]))
+    real = identify_command.accelerometer_transfers
+
+    def fails(*_, **__):
+        raise lbt.errors.NumericalError("gone.")
+
+    def is_noiseless(*given, **options):
+        found = real(*given, **options)
+        rows = tuple(replace(row, noise_m_s2=0.0) for row in found.channels)
+        return replace(found, channels=rows)
+
+    for wrong, words in (
+        (fails, "warning: the accelerometers were not compared: gone."),
+        (is_noiseless, "warning: the model is written without accelerometers: "),
+    ):
+        monkeypatch.setattr(identify_command, "accelerometer_transfers", wrong)
+        out = tmp_path / f"{wrong.__name__}.yaml"
+        base = ("identify", tip_night, *FACTS, "-o", out, "--no-figure")
+        status, text, _ = run(capsys, *base, "--accelerometers", tmp_path / "a.npy")
+        assert status == 0
+        assert words in text
+        settings = lbt.load_config(out).settings
+        assert settings.sensors is None
+        assert settings.model.vibrations
 
 
 def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):

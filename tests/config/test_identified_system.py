@@ -7,6 +7,7 @@ import pytest
 from support.identified_models import ONE_AXIS, SHELL, TILT, TIP, TWO, Line, Model, save_identified
 
 import lbt_synth as lbt
+from lbt_synth.config.identified_system import RAISED, require_writable_facts
 from lbt_synth.identification.accelerometers.transfers import (
     AccelerometerTransfers,
     ChannelRow,
@@ -126,7 +127,7 @@ def test_quiet_axes_have_no_vibrations(tmp_path):
         (TWO, {"wavelength_um": float("nan")}, "imaging.wavelength_um"),
         (replace(TWO, delay_frames=float("nan")), {}, "delay_frames"),
         (replace(TWO, delay_frames=None), {}, "delay_frames"),
-        (Model(axes=(replace(TIP, noise_nm=0.0),)), {}, "sensor.noise_nm"),
+        (Model(axes=(replace(TIP, noise_nm=-1.0),)), {}, "sensor.noise_nm"),
         (Model(axes=(replace(TIP, sensor_gain=-1.0),)), {}, "model.sensor_gain"),
         (
             Model(axes=(replace(TIP, parts=(Line(frequency_hz=3, damping=1.0, rms_nm=1),)),)),
@@ -161,7 +162,6 @@ def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
         channels=tuple(ChannelRow(channel=name, noise_m_s2=2e-4, verdict="") for name in names),
         shift_frames=age - 1,
         shift_error_frames=0.1,
-        shift_by_phases=True,
         age_frames=age,
         rate_hz=1000.0,
     )
@@ -178,3 +178,29 @@ def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
     assert ("give the real delay" in path.read_text()) == (age in (-3, 500))
     # readings of the frame itself have not ended when a loop of less than two frames acts
     assert found.loop_age(1.5) == (age if 0 < age < 100 else 1)
+
+
+def test_what_is_less_than_a_configuration_holds_is_raised_to_its_least():
+    parts = (Line(frequency_hz=3, damping=0.1, rms_nm=0.0), *TIP.parts)
+    model = Model(axes=(replace(TIP, noise_nm=2e-4, parts=parts),))
+    settings, comments = lbt.config.identified_config(model)
+    assert settings.sensor.noise_nm == [1e-3]
+    assert settings.model.vibrations[0].rms_nm == 1e-3
+    assert comments["sensor.noise_nm"] == f"{RAISED}, from 0.0002 nm"
+    assert comments["model.vibrations[0].rms_nm"] == f"{RAISED}, from 0 nm"
+
+
+@pytest.mark.parametrize(
+    ("facts", "text"),
+    [
+        ({"obstruction": 0.1}, "diameter_m, which is missing"),
+        ({"diameter_m": 1e9}, "telescope.diameter_m"),
+        ({"delay_frames": 1e9}, "loop.delay_frames"),
+        ({"wavelength_um": -1.0}, "imaging.wavelength_um"),
+    ],
+)
+def test_facts_that_no_configuration_can_hold_are_known_before_a_fit(facts, text):
+    known = {"frame_rate_hz": 500.0, "delay_frames": None}
+    require_writable_facts(1, **known)
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        require_writable_facts(1, **(known | facts))

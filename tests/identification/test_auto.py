@@ -13,20 +13,13 @@ from support.night import GAIN, night_record
 from support.recorded_loops import LINE, RATE, spliced_record
 
 import lbt_synth as lbt
-from lbt_synth.errors import CertificateError
-from lbt_synth.identification import auto
 from lbt_synth.identification.auto import choose_method, note_drift, quick_methods
-from lbt_synth.identification.prediction.forward_chaining import (
-    forward_split,
-    record_splits,
-)
 from lbt_synth.identification.prediction.residual import estimate_residual
 from lbt_synth.methods import method_named, registry
 from lbt_synth.methods.registry import default_method
 
 DRIFT_HZ = 500.0
 SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=DRIFT_HZ)
-KNOWN = {"sensor_gain": GAIN, "most_lines": 1}
 
 
 def test_a_design_is_doubted_where_the_gains_disagree() -> None:
@@ -45,7 +38,7 @@ def test_a_design_is_doubted_where_the_gains_disagree() -> None:
         notes = (str(error),)
     assert any("sensor gain" in note for note in notes)
     given = lbt.design_from_record(first, method="hinf")
-    assert (given.notes, given.choice, given.name) == ((), None, "H-infinity filter")
+    assert (given.notes, given.name) == ((), "H-infinity filter")
 
 
 def test_a_design_needs_a_delay_and_data():
@@ -83,131 +76,90 @@ def test_what_a_filter_leaves_of_a_drift_is_noted():
     plant = lbt.tip_tilt_plant(
         frame_rate_hz=DRIFT_HZ, turbulence=SLOW, noise_nm=5.0, sensor_gain=0.5
     )
-    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
-    left = abs(loop.sensitivity([1e-6])[0, 1, 1])
+    controller = lbt.kalman(plant).controller
+    left = abs(lbt.close_loop(plant.hardware, controller).sensitivity([1e-6])[0, 1, 1])
     assert 0.01 < left < 0.5
-    residual = np.array([10.0, 10.0])
-    assert list(note_drift(drifting_record(10.0, 1.0), loop, residual)) == []
-    (note,) = note_drift(drifting_record(3000.0, -200.0), loop, residual)
+    assert list(note_drift(drifting_record(10.0, 1.0), plant, controller)) == []
+    (note,) = note_drift(drifting_record(3000.0, -200.0), plant, controller)
     assert note.startswith("axis 1 of the record stands 3e+03 nm off zero and drifts by -200 nm/s.")
     said = float(note.split("leaves up to ")[1].split(" nm")[0])
     assert said == pytest.approx(left * (3000 + 5 * 200), rel=0.05)
 
 
-@pytest.fixture(scope="module")
-def record():
-    return night_record()
-
-
-@pytest.fixture(scope="module")
-def models(record):
-    """Models of the first half and of three quarters."""
-    return [
-        lbt.identify(record, stretches=training, **KNOWN)
-        for training, _ in record_splits(record, 2)
-    ]
-
-
-def worse(plant):
-    """An integrator."""
-    return lbt.integrator(plant.hardware, gain=0.3)
-
-
-def choose(record, models, designs, *, is_safe=lambda _: True):
-    """Choose among methods that stand for other designs; return what was identified, too."""
-    asked = []
-
-    def identify_past(**given):
-        asked.append(given)
-        return models[1]
-
-    def design(name, model, _options):
-        if name not in designs:
-            raise CertificateError("it was not asked for.")
-        return designs[name](model.plant())
-
-    found = choose_method(
-        record, models[0], identify_past=identify_past, design=design, is_safe=is_safe
-    )
-    return found, asked
-
-
-def test_a_method_that_leaves_clearly_less_is_chosen(record, models):
-    found, asked = choose(record, models, {"kalman": worse, "hinf": lbt.kalman})
-    assert found.method == "hinf"
-    assert [row.name for row in found.rows] == ["H-infinity filter", "Kalman filter"]
-    # the first half is not identified again
-    pairs = record_splits(record, 2)
-    assert asked == [{"stretches": pairs[1][0], "start": models[0]}]
-    left = []
-    for (training, test), model in zip(pairs, models, strict=True):
-        split = forward_split(record, training, test, model=model)
-        assert split.model is model
-        left += [
-            np.sum(split.replay(make(model.plant()).controller) ** 2, axis=1)
-            for make in (worse, lbt.kalman)
-        ]
-    bad, good = (np.mean(np.concatenate(left[i::2])) for i in range(2))
-    assert found.rows[1].above_nm2 == pytest.approx(bad - good)
-    assert found.rows[1].above == pytest.approx((bad - good) / good)
-    assert found.rows[1].above_nm2 > 2 * found.rows[1].above_error_nm2
-    assert (found.rows[0].above_nm2, found.rows[0].above_error_nm2) == (0, 0)
-    assert "H-infinity filter is chosen" in found.notes[0]
-    assert "less than the Kalman filter, by" in found.notes[0]
-    assert "LQG controller is left out: it was not asked for" in found.notes[1]
-    assert not any(note.endswith(".") for note in found.notes)  # whoever prints one ends it
-
-
-def test_a_method_that_a_possible_gain_makes_unstable_is_not_chosen(record, models):
-    designs = {"kalman": worse, "hinf": lbt.kalman, "lqg": worse}
-    found, _ = choose(record, models, designs, is_safe=lambda _: False)
-    assert found.method == "kalman"
-    assert [row.name for row in found.rows] == ["Kalman filter", "LQG controller"]
-    assert any("H-infinity filter is left out: its loop is unstable" in n for n in found.notes)
-
-
-def test_without_the_default_the_best_is_chosen(record, models):
-    found, _ = choose(record, models, {"lqg": worse, "hinf": lbt.kalman})
-    assert found.method == "hinf"
-    assert "of the methods that are left" in found.notes[0]
-    assert "Kalman filter is left out" in " ".join(found.notes)
-
-
-def test_what_cannot_be_compared_leaves_the_default(record, models):
-    found, _ = choose(record, models, {})
-    assert (found.method, found.rows) == ("kalman", ())
-    assert "were not compared: no design can be compared" in found.notes[0]
+def residuals(*, error, **differences):
+    """Residuals of methods, whose variances are below 1000 by differences on three parts."""
+    parts = {"kalman": [], **{name: [] for name in differences}}
+    for i in range(3):
+        common, own = np.random.default_rng(i).standard_normal((2, 6000))
+        common *= np.sqrt(1000 / np.mean(common**2))
+        own -= common * (common @ own) / (common @ common)
+        # its product with the common part scatters
+        size = 6000 * error**2 / 4000
+        own *= np.sqrt(size / np.mean(own**2))
+        parts["kalman"].append(common)
+        for name, less in differences.items():
+            parts[name].append(np.sqrt(1 - (less[i] + size) / 1000) * common + own)
+    zero = np.zeros((1, 1))
+    return {
+        name: estimate_residual(np.concatenate(series)[:, None], ((5, 18_005),), zero, zero)
+        for name, series in parts.items()
+    }
 
 
 @pytest.mark.parametrize(
-    ("difference", "error", "chosen"),
+    ("differences", "error", "chosen"),
     [
-        (20.0, 1.0, "hinf"),
-        (2.5, 1.0, "hinf"),
-        (1.5, 1.0, "kalman"),  # within two errors
-        (0.4, 0.02, "kalman"),  # sure, but less than a thousandth
-        (-20.0, 1.0, "kalman"),
+        ((40.0, 40.0, 40.0), 4.0, "hinf"),
+        ((400.0, 400.0, 10.0), 1.0, "kalman"),  # less than 2 % of the variance on one part
+        ((400.0, 400.0, -20.0), 1.0, "kalman"),  # more on one
+        ((25.0, 25.0, 25.0), 20.0, "kalman"),  # within two errors
+        ((-20.0, -20.0, -20.0), 1.0, "kalman"),
     ],
 )
-def test_the_default_stays_within_two_errors(
-    record, models, monkeypatch, difference, error, chosen
-):
-    common, own = np.random.default_rng(0).standard_normal((2, 20_000))
-    common *= np.sqrt(1000 / np.mean(common**2))
-    own -= common * (common @ own) / (common @ common)
-    own *= np.sqrt(5 * error**2 / np.mean(own**2))  # its product with the common part scatters
-    share = np.sqrt(1 - (difference + 5 * error**2) / 1000)
-    left = {
-        name: estimate_residual(series[:, None], ((0, 20_000),), *np.zeros((2, 1, 1)))
-        for name, series in {"kalman": common, "hinf": share * common + own}.items()
-    }
-    ordered = dict(sorted(left.items(), key=lambda row: row[1].total_nm2))
-    monkeypatch.setattr(auto, "forward_chain", lambda *_, **__: (ordered, {}))
-    found, _ = choose(record, models, {"hinf": lbt.kalman})
-    assert found.method == chosen
-    row = next(row for row in found.rows if row.above_nm2 != 0)
-    assert abs(row.above_nm2) == pytest.approx(abs(difference))
-    assert row.above_error_nm2 == pytest.approx(error, rel=0.2)
+def test_the_default_stays_unless_another_wins_every_part(differences, error, chosen):
+    compared = residuals(error=error, hinf=differences)
+    pairs = zip(*(compared[name].parts(3) for name in ("kalman", "hinf")), strict=True)
+    for (usual, other), difference in zip(pairs, differences, strict=True):
+        above, its_error = usual.above(other)
+        assert above == pytest.approx(difference)
+        assert its_error == pytest.approx(error, rel=0.3) or difference >= 400
+    method, (note,) = choose_method(compared)
+    assert method == chosen
+    words = "H-infinity filter is chosen" if chosen == "hinf" else "Kalman filter stays"
+    assert f"the {words}" in note
+    assert not note.endswith(".")  # whoever prints it ends it
+
+
+def test_a_method_that_leaves_clearly_less_says_by_how_much():
+    compared = residuals(error=4.0, hinf=(100.0, 200.0, 300.0))
+    difference, error = compared["kalman"].above(compared["hinf"])
+    _, (note,) = choose_method(compared)
+    assert note.endswith(f"less than the Kalman filter, in all by 200 +- {error:.2g} nm^2")
+    assert difference == pytest.approx(200)
+
+
+def test_a_method_that_a_possible_gain_makes_unstable_is_not_chosen():
+    compared = residuals(error=4.0, hinf=(200.0,) * 3, lqg=(100.0,) * 3)
+    method, notes = choose_method(compared, {"hinf"})
+    assert method == "lqg"
+    assert "H-infinity filter is left out: its loop is unstable" in notes[1]
+
+
+def test_without_the_default_the_best_is_chosen():
+    compared = residuals(error=4.0, hinf=(-200.0,) * 3, lqg=(-100.0,) * 3)
+    del compared["kalman"]
+    method, (note,) = choose_method(compared)
+    assert method == "lqg"
+    assert "of the methods that are left" in note
+
+
+def test_all_quick_methods_are_in_the_table_of_unseen_data():
+    record = night_record()
+    made = lbt.design_from_record(record, sensor_gain=GAIN, most_lines=1)
+    names = [row.name for row in made.held_out.entries]
+    assert {method_named(name).title for name in quick_methods()} < set(names)
+    assert (made.name, made.design.method) == ("Kalman filter", "kalman")
+    assert any(note.startswith("the Kalman filter stays") for note in made.notes)
 
 
 def test_slow_methods_are_not_tried(monkeypatch):

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
-from lbt_synth.identification.stretches import forward_splits
+from lbt_synth.identification.stretches import cut_stretches
 
 
 def frames_in(stretches):
@@ -19,7 +19,7 @@ def test_halves_are_apart_and_in_order(lengths, share):
     stretches = [(int(a), int(b)) for a, b in zip(ends[::2], ends[1::2], strict=False)]
     usable = frames_in(stretches)
     if int(share * len(usable)) == 0:
-        with pytest.raises(lbt.errors.ProblemError, match="frames to train on and to test on"):
+        with pytest.raises(lbt.errors.ProblemError, match="frames to fit and to test on"):
             lbt.identification.split_halves(stretches, int(ends[-1]), fit_share=share)
         return
     fit, test = lbt.identification.split_halves(stretches, int(ends[-1]), fit_share=share)
@@ -27,32 +27,12 @@ def test_halves_are_apart_and_in_order(lengths, share):
     np.testing.assert_array_equal(np.concatenate([frames_in(fit), frames_in(test)]), usable)
 
 
-def test_tests_cover_the_rest_once_and_follow_their_training():
-    usable = [(10, 400), (450, 460), (500, 1001)]
-    pairs = forward_splits(usable, 1200, splits=4, first_share=0.4)
+def test_cuts_are_those_of_the_usable_frames():
+    usable = ((10, 400), (450, 460), (500, 1001))
     everything = frames_in(usable)
-    assert len(pairs) == 4
-    for training, test in pairs:
-        both = np.concatenate([frames_in(training), frames_in(test)])
-        assert np.array_equal(both, everything[: len(both)])
-    tests = np.concatenate([frames_in(test) for _, test in pairs])
-    assert np.array_equal(tests, everything[-len(tests) :])
-    assert len(tests) == pytest.approx(0.6 * len(everything), abs=1)
-    lengths = [len(frames_in(test)) for _, test in pairs]
-    assert max(lengths) - min(lengths) <= 1
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"splits": 0}, "splits"),
-        ({"first_share": 1.0}, "first_share"),
-        ({"splits": 7}, "10 usable frames for 7 splits"),
-    ],
-)
-def test_splits_that_a_record_cannot_have(options, words):
-    with pytest.raises(lbt.errors.ProblemError, match=words):
-        forward_splits([(0, 10)], 10, **options)
+    for first, last in ((0, 390), (389, 401), (395, 901)):
+        part = cut_stretches(usable, first, last)
+        assert np.array_equal(frames_in(part), everything[first:last])
 
 
 @pytest.mark.parametrize(
@@ -66,6 +46,7 @@ def test_splits_that_a_record_cannot_have(options, words):
         (([7], 40), "a pair \\(start, stop\\)"),
         (([], 40), "at least one stretch"),
         ((None, 0), "frames must be at least 1"),
+        (([(0, 1)], 1), "frames to fit and to test on; got 1 usable"),
     ],
 )
 def test_stretches_that_are_refused(arguments, message):

@@ -23,12 +23,9 @@ from lbt_synth.storage.display_unit import M_S2
 from lbt_synth.validation import BoolArray, FloatArray, float_array, number
 
 _MISSING = 0.1  # of the frames without a number, from which a channel counts as dead
-_MOST_M_S2 = 1e12
 _NAME = re.compile(r"\w[\w .+-]*$")
 _SPELLINGS = re.compile(r"\s*/\s*s(\^|\*\*)?2$|\s*/\s*s²$|[ .*]s(\^|\*\*)?-2$")
 _SAME = 1e-7  # relative, between rates that are one
-_FEWEST_READINGS = 4  # that a spline needs
-
 
 Readings = tuple[tuple[str, ...], FloatArray, tuple[str, ...]]  # channels, values, notes
 
@@ -48,20 +45,18 @@ def load_readings(
     """
     source = Path(path)
     contents = read_contents(source)
-    found = [each for each in contents.columns if each.role not in CLOCKS]
-    sizes = sorted({each.values.size for each in contents.columns})
-    if not found or len(sizes) != 1:
+    columns = [column for column in contents.columns if column.role not in CLOCKS]
+    sizes = sorted({column.values.size for column in contents.columns})
+    if not columns or len(sizes) != 1:
         raise TelemetryError(
-            f"{source} must hold columns of one length, a sensor each; got {len(found)} of "
+            f"{source} must hold columns of one length, a sensor each; got {len(columns)} of "
             f"{sizes} rows.",
             path=source,
         )
-    names = [each.name.strip() for each in found]
+    names = [column.name.strip() for column in columns]
     if not all(_NAME.match(name) for name in names) or len(set(names)) < len(names):
-        names = [f"channel{c + 1}" for c in range(len(found))]
-    values = as_columns(
-        np.stack([_m_s2(each, unit, source) * each.values for each in found], axis=1)
-    )
+        names = [f"channel{c + 1}" for c in range(len(columns))]
+    values = np.stack([_m_s2(column, unit, source) * column.values for column in columns], axis=1)
     values, own_hz, notes = _on_own_clock(contents, values, rate_hz, frame_rate_hz)
     if own_hz != frame_rate_hz:
         values = resample(values, own_hz, frame_rate_hz)
@@ -169,7 +164,7 @@ def at_places(values: FloatArray, place: FloatArray) -> FloatArray:
     below = np.clip(np.floor(place).astype(int), 0, len(values) - 2)
     for c, series in enumerate(values.T):
         good = np.isfinite(series)
-        if len(series) < _FEWEST_READINGS or not good.any():
+        if not good.any():
             out[:, c] = np.nan
             continue
         filled = np.interp(rows, rows[good], series[good])
@@ -205,10 +200,4 @@ def as_columns(accelerations: ArrayLike) -> FloatArray:
     given = given[:, None] if given.ndim == 1 else given
     if given.ndim != 2 or given.size == 0:
         raise DimensionError(f"accelerations must be (frames, channels); got {given.shape}.")
-    largest = float(np.max(np.abs(given), initial=0.0, where=np.isfinite(given)))
-    if largest > _MOST_M_S2:
-        raise ProblemError(
-            f"accelerations must be at most {_MOST_M_S2:g} m/s^2; got {largest:.3g}. Is the unit "
-            "right?"
-        )
     return given

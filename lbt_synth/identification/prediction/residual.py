@@ -1,52 +1,45 @@
 """The residual that a controller would have left of a recorded disturbance.
 
-Loops replayed on recorded series: where they start, and what the start may still add.
-
 The state of a loop at the beginning of contiguous frames depends on the frames before, which are
-not known. A replay begins in the equilibrium for the mean of the first frames. An error d of that
-state adds ``C A^k d`` to the residual of frame k. Its covariance P is that of the loop's state
-under the record's own sample autocovariance: with s(k) the state on the N frames, less that
-mean, from rest, and then on zeros for ever,
-
-    P = (1 / N) sum over all k of s(k) s(k)'
-
-From frame a to frame b the start then adds ``(1 / (b - a)) sum C A^k P A'^k C'`` to the mean
-square. A loop warms up on the frames before the test, and on as many of its first frames as make
-the error of the residual least.
+not known. A replay begins in the equilibrium for the mean of the first frames, and the first half
+second of each stretch does not count.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import rfft
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
+from lbt_synth.identification.stretches import (
+    Stretches,
+    StretchesLike,
+    checked_stretches,
+    cut_stretches,
+)
 from lbt_synth.linear import Controller
 from lbt_synth.linear.block_filtering import filter_series
-from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl
 from lbt_synth.models import LoopHardware
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
     float_array,
     frozen_copy,
-    number,
     one_or_each,
     real_array,
     require_instance,
 )
 
 _TOO_FAR = 4.0  # standard errors below zero that chance does not explain
-FEWEST = 100  # frames that give a standard error
+_FEWEST = 100  # frames that give a standard error
 _FIRST = 64  # frames whose mean a replay begins with
-_MOST_STATES = 1 << 15  # frames of a stretch that show the spread of the state
-_TINY = 1e-300
+_SETTLE_S = 0.5  # of a stretch, in which loops that reject a hertz forget where they began
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -67,17 +60,14 @@ class ResidualEstimate:
         Covariance of the noise in e [nm^2].
     covariance_nm2 : (n, n) ndarray
         Covariance of the residual: mean of ``e e'`` less that of the noise [nm^2].
-    start_nm2 : (n, n) ndarray
-        Mean square that the unknown state of the loop before the record may add [nm^2].
     error_nm4 : (n, n) ndarray
-        Covariance of the errors of the axes' variances, that of the start included [nm^4].
+        Covariance of the errors of the axes' variances [nm^4].
     """
 
     measured_nm: FloatArray
     stretches: Stretches
     noise_nm2: FloatArray
     covariance_nm2: FloatArray
-    start_nm2: FloatArray
     error_nm4: FloatArray
 
     @property
@@ -104,18 +94,6 @@ class ResidualEstimate:
     def total_error_nm2(self) -> float:
         """Standard error of the variance over all axes [nm^2]."""
         return float(np.sqrt(max(float(np.sum(self.error_nm4)), 0.0)))
-
-    @property
-    def axis_rms_nm(self) -> FloatArray:
-        """Residual of each axis, (n,) [nm rms]; nan where the variance is negative."""
-        variance = self.variance_nm2
-        return frozen_copy(np.sqrt(np.where(variance >= 0, variance, np.nan)))
-
-    @property
-    def axis_rms_error_nm(self) -> FloatArray:
-        """Standard error of each axis' rms, (n,) [nm]; nan where the variance is negative."""
-        with np.errstate(divide="ignore"):
-            return frozen_copy(self.variance_error_nm2 / (2 * self.axis_rms_nm))
 
     @property
     def rms_nm(self) -> float:
@@ -160,41 +138,50 @@ class ResidualEstimate:
         error = float(np.sqrt(max(float(np.sum(covariance)), 0.0)))
         return self.total_nm2 - other.total_nm2, error
 
+    def parts(self, count: int) -> list[ResidualEstimate]:
+        """Return the residuals of so many consecutive parts of the frames, of equal length."""
+        edges = (len(self.measured_nm) * np.arange(count + 1) // count).tolist()
+        none = np.zeros_like(self.noise_nm2)
+        return [
+            estimate_residual(
+                self.measured_nm[a:b], cut_stretches(self.stretches, a, b), self.noise_nm2, none
+            )
+            for a, b in pairwise(edges)
+        ]
+
     def strehl(self, imaging: Imaging) -> float:
         """Long-exposure Strehl ratio of a Gaussian residual of this covariance, in [0, 1].
 
-        It is nan if the covariance is not positive semidefinite: the residual is lost in the noise.
+        A variance below zero counts as zero; where the noise is refuted, the ratio is nan.
         """
-        if np.linalg.eigvalsh(self.covariance_nm2)[0] < 0:
+        if self.refuted:
             return float("nan")
-        return jitter_strehl(self.covariance_nm2, imaging=imaging)
+        values, vectors = np.linalg.eigh(self.covariance_nm2)
+        covariance = vectors * np.maximum(values, 0.0) @ vectors.T
+        return jitter_strehl(covariance, imaging=imaging)
+
+    @property
+    def text(self) -> str:
+        """The residual in words, with its error, or with its bound where the noise hides it."""
+        if self.refuted:
+            return "an unknown residual (the model has more noise than the data)"
+        if self.total_nm2 <= self.total_error_nm2:
+            return f"at most {nm_text(self.upper_nm, '.2g')} (the noise hides it)"
+        return nm_text(self.rms_nm, error_nm=self.rms_error_nm)
 
 
 def estimate_residual(
-    measured: FloatArray,
-    stretches: Stretches,
-    noise_nm2: FloatArray,
-    noise_error_nm4: FloatArray,
-    start_nm2: FloatArray | None = None,
+    measured: FloatArray, stretches: Stretches, noise_nm2: FloatArray, noise_error_nm4: FloatArray
 ) -> ResidualEstimate:
     """Estimate a residual from the measured residual (frames, n) of some stretches."""
-    start = np.zeros_like(noise_nm2) if start_nm2 is None else start_nm2
     error = mean_covariance(measured, measured, stretches) + noise_error_nm4
     return ResidualEstimate(
         measured_nm=frozen_copy(measured),
         stretches=stretches,
         noise_nm2=frozen_copy(noise_nm2),
         covariance_nm2=frozen_copy(measured.T @ measured / len(measured) - noise_nm2),
-        start_nm2=frozen_copy(start),
-        error_nm4=frozen_copy(error + np.outer(np.diag(start), np.diag(start))),
+        error_nm4=frozen_copy(error),
     )
-
-
-def estimate_replay(
-    run: Replay, test: Stretches, noise: tuple[FloatArray, FloatArray]
-) -> ResidualEstimate:
-    """Return the residual of a replay in the frames that count, under the :func:`mode_noise`."""
-    return estimate_residual(run.measured(test), test, *noise, run.left_of_start(test))
 
 
 def replayed_residual(
@@ -204,22 +191,20 @@ def replayed_residual(
     *,
     noise_nm: ArrayLike,
     noise_error_nm: ArrayLike = 0.0,
-    sensor_gain: float = 1.0,
     stretches: StretchesLike | None = None,
     test: StretchesLike | None = None,
     from_rest: bool = False,
 ) -> ResidualEstimate:
     """Residual that a controller would have left of a recorded disturbance.
 
-    The pseudo-open-loop measurement ``z(k) = phi_tot(k-1) + w(k) / g`` does not depend on the
-    controller that ran. From ``y(k) = g S (z(k) - c(k))``, with c(k) its own correction, a
+    The pseudo-open-loop measurement ``z(k) = phi_tot(k-1) + S^-1 w(k)`` does not depend on the
+    controller that ran. From ``y(k) = S (z(k) - c(k))``, with c(k) its own correction, a
     controller computes exactly the commands of that loop under that disturbance and noise. Its
-    measured residual is ``e(k) = z(k) - c(k) = phi_res(k-1) + w(k) / g``. As c(k) depends on the
+    measured residual is ``e(k) = z(k) - c(k) = phi_res(k-1) + S^-1 w(k)``. As c(k) depends on the
     noise up to frame k-1 only, white noise adds exactly its variance, which is subtracted.
 
-    The controller runs over each stretch from the equilibrium for its first frames. What the
-    error of that start can add to the mean square is part of the standard error, and as many
-    frames at the beginning of each stretch are left out of the test as make the whole error least.
+    The controller runs over each stretch from the equilibrium for its first frames, and the first
+    half second of a stretch does not count.
 
     Parameters
     ----------
@@ -228,13 +213,12 @@ def replayed_residual(
     controller : Controller
         From y(k) to u(k).
     hardware : LoopHardware
-        The loop: delay, mirror, sensor matrix S (square and invertible).
+        The loop: delay, mirror, and the sensor matrix S (square and invertible), with the sensor
+        gain g that z was formed with.
     noise_nm : float or (q,) array_like
         Standard deviation of the white noise w on each measurement, per frame [nm].
     noise_error_nm : float or (q,) array_like, optional
         Standard error of that, the errors of different measurements independent [nm].
-    sensor_gain : float, optional
-        Sensor gain g of the recorded loop relative to the sensor matrix, as used to form z.
     stretches : sequence of (start, stop), optional
         Contiguous usable frames, in order; by default the whole record.
     test : sequence of (start, stop), optional
@@ -248,8 +232,7 @@ def replayed_residual(
     -------
     ResidualEstimate
         Measured residual, its variance without the noise, and standard errors. They include the
-        sampling of Gaussian series, the start and the error of ``noise_nm``, not that of the
-        sensor gain.
+        sampling of Gaussian series and the error of ``noise_nm``, not that of the sensor gain.
 
     Raises
     ------
@@ -275,17 +258,15 @@ def replayed_residual(
     """
     require_instance(hardware, LoopHardware)
     deviation = one_or_each(noise_nm, "noise_nm", hardware.n_measurements, at_least=0)
-    gain = number(sensor_gain, "sensor_gain", above=0)
     series, runs = check_series(open_loop, hardware.modes, stretches)
     noise_nm2 = deviation**2 * np.eye(hardware.n_measurements)
-    noise = mode_noise(hardware, noise_nm2, noise_error_nm=noise_error_nm, sensor_gain=gain)
-    loop = close_loop(hardware, controller, sensor_gain=gain)
+    noise = mode_noise(hardware, noise_nm2, noise_error_nm=noise_error_nm)
+    loop = close_loop(hardware, controller)
     loop.require_stable()
     tested = runs if test is None else checked_stretches(test, len(series))
-    check_test(runs, tested)
-    run = replay(loop, series, runs, from_rest=from_rest)
-    warm_up = 0 if from_rest else choose_warm_up([run], tested)
-    return estimate_replay(run, leave_out(runs, tested, warm_up), noise)
+    kept, replayed = settled_test(runs, tested, 0.0 if from_rest else hardware.frame_rate_hz)
+    residual = replay(loop, series, replayed, from_rest=from_rest)
+    return estimate_residual(gather(residual, kept), kept, *noise)
 
 
 def mode_noise(
@@ -293,14 +274,13 @@ def mode_noise(
     noise_nm2: FloatArray,
     *,
     noise_error_nm: ArrayLike,
-    sensor_gain: float = 1.0,
 ) -> tuple[FloatArray, FloatArray]:
     """Return noise (q, q) of the measurements in the modes [nm^2], and its error [nm^4], (n, n).
 
     The errors of the standard deviations of measurements are independent: an error of one is
     common to all modes that it measures.
     """
-    back = inverse_sensor(hardware) / sensor_gain
+    back = inverse_sensor(hardware)
     error = one_or_each(noise_error_nm, "noise_error_nm", hardware.n_measurements, at_least=0)
     deviation = np.sqrt(np.diag(noise_nm2))
     # d var_i / d s_j; of white noise without correlations 2 s_j back_ij^2
@@ -338,131 +318,53 @@ def invert(square: FloatArray, need: str) -> FloatArray:
     return np.asarray(np.linalg.inv(square))
 
 
-def check_test(runs: Stretches, test: Stretches) -> None:
-    """Refuse a test that does not lie in contiguous frames, or has too few."""
+def settled_test(
+    runs: Stretches, test: Stretches, frame_rate_hz: float
+) -> tuple[Stretches, Stretches]:
+    """Return the frames of a test that count, and those that a replay runs over before and in it.
+
+    A replay begins where contiguous frames do, and what it has measured in their first half second
+    does not count; a rate of 0 counts all. Refuse a test outside of the runs, or of few frames.
+    """
+    settle, kept, replayed = round(_SETTLE_S * frame_rate_hz), [], dict[int, int]()
     for start, stop in test:
-        if not any(a <= start and stop <= b for a, b in runs):
+        first = next((a for a, b in runs if a <= start and stop <= b), None)
+        if first is None:
             raise ProblemError(
                 f"the test must lie within the usable stretches; got ({start}, {stop}) in "
                 f"{', '.join(map(str, runs))}."
             )
-    if count_frames(test) < FEWEST:
+        if max(start, first + settle) < stop:
+            kept.append((max(start, first + settle), stop))
+            replayed[first] = stop
+    frames = sum(stop - start for start, stop in kept)
+    if frames < _FEWEST:
         raise ProblemError(
-            f"a residual needs at least {FEWEST} frames; got {count_frames(test)}. Record more."
+            f"a residual needs at least {_FEWEST} frames beyond the first {settle} of each "
+            f"stretch; got {frames}. Record more, or split less."
         )
+    return tuple(kept), tuple(replayed.items())
 
 
-def count_frames(test: Stretches) -> int:
-    """Return the number of frames of stretches."""
-    return sum(stop - start for start, stop in test)
+def gather(series: FloatArray, stretches: Stretches) -> FloatArray:
+    """Return the rows of a series (frames, n) that lie in some stretches."""
+    return np.concatenate([series[start:stop] for start, stop in stretches])
 
 
-def leave_out(runs: Stretches, test: Stretches, frames: int) -> Stretches:
-    """Return a test without the first frames of each run."""
-    kept = [(max(start, _run_start(runs, start) + frames), stop) for start, stop in test]
-    return tuple((a, b) for a, b in kept if a < b)
+def replay(
+    loop: ClosedLoop, series: FloatArray, runs: Stretches, *, from_rest: bool = False
+) -> FloatArray:
+    """Return the measured residual (frames, n) of a stable loop on a series, nan outside of runs.
 
-
-def _run_start(runs: Stretches, frame: int) -> int:
-    """Return where the run of a frame begins."""
-    return max(a for a, _ in runs if a <= frame)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Replay:
-    """What a loop leaves of recorded frames, and what the error of its start adds.
-
-    A loop without states that are unknown, such as one that was measured, has no ``spread``.
+    z(k) stands for phi_tot(k-1), without noise: the residual of frame k-1 is e(k).
     """
-
-    runs: Stretches  # contiguous frames
-    residual: FloatArray  # (frames, n): the measured residual; nan outside the runs
-    output: FloatArray  # (n, s): C
-    powers: tuple[FloatArray, ...] = ()  # (s, s) each: A, A^2, A^4, ...
-    spread: FloatArray | None = None  # (s, s): sum of A^k P A'^k over all k
-
-    def measured(self, test: Stretches) -> FloatArray:
-        """Return the measured residual of the frames that count, (k, n)."""
-        return np.concatenate([self.residual[start:stop] for start, stop in test])
-
-    def scatter(self, test: Stretches) -> float:
-        """Return the standard error of the mean square over all axes, but for the start."""
-        e = self.measured(test)
-        return float(np.sqrt(max(np.sum(mean_covariance(e, e, test)), 0.0)))
-
-    def left_of_start(self, test: Stretches) -> FloatArray:
-        """Return the mean square that the start adds to the test, (n, n)."""
-        n = len(self.output)
-        total = np.zeros((n, n))
-        for start, stop in test:
-            first = _run_start(self.runs, start)
-            total += self._energy_after(start - first) - self._energy_after(stop - first)
-        return total / count_frames(test)
-
-    def _energy_after(self, frames: int) -> FloatArray:
-        """Return the sum of the squares that the start adds from a frame on, (n, n)."""
-        row = self.output
-        for i, power in enumerate(self.powers):
-            if frames >> i & 1:
-                row = row @ power
-        return row @ self.spread @ row.T if self.spread is not None else 0 * row @ row.T
-
-
-def replay(loop: ClosedLoop, series: FloatArray, runs: Stretches, *, from_rest: bool) -> Replay:
-    """Replay a stable loop on a recorded series (frames, n)."""
-    # z(k) for phi_tot(k-1), and no noise: the residual of frame k-1 is e(k)
     path = loop.rejection()
-    s, n = path.B.shape
-    equilibrium = np.linalg.solve(np.eye(s) - path.A, path.B)
-    constant = path.C @ equilibrium + path.D  # what the loop leaves of a constant
-    both = replace(path, C=np.vstack([path.C, np.eye(s)]), D=np.vstack([path.D, np.zeros((s, n))]))
+    constant = path.frequency_response([0.0])[0].real  # what the loop leaves of a constant
     residual = np.full(series.shape, np.nan)
-    moments, count = np.zeros((s, s)), 0
     for start, stop in runs:
-        mean = np.zeros(n) if from_rest else np.mean(series[start : min(stop, start + _FIRST)], 0)
-        away = series[start:stop] - mean
-        residual[start:stop] = filter_series(path, away) + constant @ mean
-        if not from_rest:
-            away = away[:_MOST_STATES]
-            states = filter_series(both, away)[:, n:]
-            last = path.A @ states[-1] + path.B @ away[-1]
-            moments += states.T @ states
-            moments += stationary_covariance(path.A, np.outer(last, last))
-            count += len(away)
-    if from_rest:
-        return Replay(runs=runs, residual=residual, output=path.C)
-    powers = [path.A]
-    for _ in range(len(series).bit_length()):
-        powers.append(powers[-1] @ powers[-1])
-    return Replay(
-        runs=runs,
-        residual=residual,
-        output=path.C,
-        powers=tuple(powers),
-        spread=stationary_covariance(path.A, moments / count),
-    )
-
-
-def choose_warm_up(replays: Sequence[Replay], test: Stretches) -> int:
-    """Return the frames at the beginning of each run that are better left out.
-
-    It is the number for which the variances of the mean squares, by the scatter of the residual
-    and by its start, have the least sum over the replays, in units of the first.
-    """
-    runs = replays[0].runs
-    longest = max(stop - start for start, stop in runs)
-    tried = [0, *np.unique(np.geomspace(1, longest, 60).astype(int)).tolist()]
-    parts = [(w, leave_out(runs, test, w)) for w in tried]
-    kept = [(w, part) for w, part in parts if count_frames(part) >= FEWEST]
-    adds = np.array([[np.trace(one.left_of_start(part)) for one in replays] for _, part in kept])
-    share = np.array([count_frames(test) / count_frames(part) for _, part in kept])
-    best = 0
-    for _ in range(2):  # the first scatter has the start in it
-        scatter = np.array([one.scatter(kept[best][1]) for one in replays])
-        scatter /= np.sqrt(share[best])
-        variances = len(replays) * share + np.sum((adds / np.maximum(scatter, _TINY)) ** 2, axis=1)
-        best = int(np.argmin(variances))
-    return int(kept[best][0])
+        mean = np.mean(series[start : min(stop, start + _FIRST)], axis=0) * (not from_rest)
+        residual[start:stop] = filter_series(path, series[start:stop] - mean) + constant @ mean
+    return residual
 
 
 def mean_covariance(one: FloatArray, other: FloatArray, stretches: Stretches) -> FloatArray:

@@ -1,20 +1,18 @@
 """How channels of accelerometers move with lines: factors, clocks, and what is left out."""
 
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from support.line_bands import make_bands
 from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
-from lbt_synth.identification.accelerometers.transfers import (
-    AccelerometerTransfers,
-    clock_shift,
-    fit_pairs,
-)
+from lbt_synth.identification.accelerometers import transfers
+from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
 
@@ -77,7 +75,7 @@ def test_factors_shift_and_noise_are_those_of_the_channels():
     found = find(reading(2.0, -0.7, 1.3, noise=noise), reading(0.0, 1.1, 0.4, noise=noise, seed=1))
     truth = {"channel1": (2.0, -0.7, 1.3), "channel2": (0.0, 1.1, 0.4)}
     assert found.age_frames == 1
-    assert abs(found.shift_frames) < 4 * found.shift_error_frames < 0.2
+    assert abs(found.shift_frames) < 4 * found.shift_error_frames < 1
     for row in found.transfers:
         factor = truth[row.channel][line_index(row)]
         assert row.useful == (factor != 0)
@@ -110,13 +108,19 @@ def test_errors_count_that_of_the_sensor_gain():
     assert found.shift_error_frames == pytest.approx(exact.shift_error_frames, rel=0.02)
 
 
-@pytest.mark.parametrize("age", [0, 6, 140])
+@pytest.mark.parametrize("age", [0, 6, 140, -4321])
 def test_readings_of_any_age_are_laid_beside_the_wavefront(age):
-    found = find(reading(2.0, -0.7, 1.3, age=age, noise=1e-3))
-    assert found.shift_by_phases
-    assert found.age_frames == age
-    assert abs(found.shift_frames - (age - 1)) < 5 * found.shift_error_frames < 0.3
-    assert "by the phases of lines" in found.shift_text
+    """The phases hold for the age that is found, which the slope within the lines tells."""
+    late = reading(2.0, -0.7, 1.3, age=max(age, 0), noise=1e-3)
+    found = find(late[max(-age, 0) :])
+    assert abs(found.shift_frames - (age - 1)) < 4 * found.shift_error_frames < 2
+    assert found.age_frames == 1 + round(found.shift_frames)
+    assert "by the slope of the phase" in found.shift_text
+    for row in found.transfers:
+        j = line_index(row)
+        phase = 360 * LINES[j][0] / RATE * (found.age_frames - age) + 180 * (j == 1)
+        assert row.useful
+        assert phase_error(row, phase) < 5 * row.phase_error_deg
 
 
 def test_a_fraction_of_a_frame_goes_into_the_phases():
@@ -168,12 +172,12 @@ def test_a_run_gives_the_motions_back(delay_frames):
         assert phase_error(row, phase_deg) < min(4 * row.phase_error_deg, 0.5)
 
 
-def test_one_narrow_line_does_not_tell_the_shift():
-    found = find(reading(0.0, 1.5, age=3, noise=1e-3))
-    assert not found.shift_by_phases
-    assert "do not tell the shift" in found.shift_text
+def test_a_shift_that_is_not_sure_moves_no_readings():
+    found = find(reading(0.0, 1.5, age=3, noise=1e-2))
+    assert found.age_frames == 1
+    assert abs(found.shift_frames - 2) < 3 * found.shift_error_frames
     (row,) = (row for row in found.transfers if row.useful)
-    phase = 360 * LINES[1][0] / RATE * (found.age_frames - 3)
+    phase = 360 * LINES[1][0] / RATE * (1 - 3)
     assert phase_error(row, phase) < 5 * row.phase_error_deg
 
 
@@ -195,10 +199,26 @@ def test_channels_that_fail_are_named_and_left_out():
     assert [row.channel for row in found.used] == ["channel1"]
 
 
-def test_records_that_begin_seconds_apart_are_laid_beside_each_other():
-    found = find(reading(2.0, -0.7, 1.3, noise=1e-3)[4321:])
-    assert found.age_frames == 1 - 4321
-    assert found.shift_by_phases
+def test_what_channels_buy_is_what_filters_leave():
+    found = find(reading(2.0, -0.7, 1.3, noise=1e-4), reading(2.0, noise=1e-3, seed=1))
+    alone = lbt.kalman(night().model.plant()).rms
+    assert found.alone_nm == pytest.approx(alone)
+    quiet, one_line = (row.residual_nm for row in found.channels)
+    assert found.together_nm <= quiet * (1 + 1e-6) < one_line < 0.99 * alone
+    text = f"leaves {alone:.3g} nm, and with channel1, channel2 {found.together_nm:.3g} nm"
+    assert text in found.worth_text
+    assert find(1e-2 * np.random.default_rng(8).standard_normal(FRAMES)).worth_text == ""
+
+
+def test_motions_are_found_where_no_filter_can_be_designed(monkeypatch):
+    def fails(_):
+        raise lbt.errors.NumericalError("no filter.")
+
+    monkeypatch.setattr(transfers, "kalman", fails)
+    found = find(reading(2.0, -0.7, 1.3, noise=1e-3))
+    assert found.used
+    assert np.isnan(found.together_nm)
+    assert found.worth_text == ""
 
 
 def test_no_more_channels_are_used_than_a_design_takes():
@@ -226,7 +246,6 @@ def test_motions_at_the_frequency_of_a_line_that_do_not_go_with_it_are_not_used(
         (np.ones((100, 2, 2)), {}, r"must be \(frames, channels\)"),
         (np.ones((FRAMES, 2)), {"channels": ["a", "a"]}, "2 different names"),
         (np.ones(FRAMES), {"false_alarm": 2}, "false_alarm"),
-        (1e200 * np.ones(FRAMES), {}, "Is the unit right"),
         (np.random.default_rng(0).standard_normal(100), {}, "usable frames in a row"),
     ],
 )
@@ -235,15 +254,25 @@ def test_readings_that_are_refused(given, options, words):
         lbt.identification.accelerometer_transfers(night().model, night().record, given, **options)
 
 
-def test_a_sensor_gain_whose_error_looks_like_a_shift_is_its_error():
-    """Factors that turn in proportion to their frequency are a shift of 0.3 frames per error."""
-    pairs = fit_pairs(make_bands(factors=np.array([3.0, -0.4, 0.7]), noise=0.3))
-    turned = [
-        (band, replace(fit, slopes=fit.factors[:, None] * 0.3j * np.mean(band.angle)), j, channel)
-        for band, fit, j, channel in pairs
-    ]
-    still = [(band, replace(fit, slopes=0 * fit.slopes), j, c) for band, fit, j, c in pairs]
-    exact, found = clock_shift(still, 3), clock_shift(turned, 3)
-    assert exact[1] < 0.1
-    assert exact[2]
-    assert found == (exact[0], pytest.approx(np.hypot(exact[1], 0.3), rel=1e-6), True)
+def test_a_record_of_39_s_and_5_channels_takes_little_memory():
+    """Each second took 50 MB where all shifts of a wide band were tried at once."""
+    code = """
+from pathlib import Path
+import numpy as np
+import lbt_synth as lbt
+rng = np.random.default_rng(0)
+line = lbt.Vibration(frequency_hz=90, damping=0.02, rms_nm=60).ar_model(1000)
+v = np.zeros(39_002)
+for k in range(2, v.size):
+    v[k] = line.coefficients @ v[[k - 1, k - 2]] + line.driving_rms_nm * rng.standard_normal()
+z = v[1:-1] + 5 * rng.standard_normal(39_000)
+a = -1e-9 * (2 * np.pi * 90) ** 2 * v[1:-1, None] + 1e-3 * rng.standard_normal((39_000, 5))
+model = lbt.identify(record := lbt.identification.loop_record(z, frame_rate_hz=1000, unit="nm"))
+used = lbt.identification.accelerometer_transfers(model, record, a).used
+status = Path("/proc/self/status").read_text()  # the peak that getrusage gives is the parent's
+print(len(used), int(status.split("VmHWM:")[1].split()[0]) / 1024)
+"""
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    channels, megabytes = out.stdout.split()
+    assert channels == "5"
+    assert float(megabytes) < 300

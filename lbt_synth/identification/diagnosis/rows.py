@@ -1,42 +1,52 @@
-"""The loop that ran: its commands, its control law, and the identified sensor gain.
-
-The channels of a record, one by one: clipped, stuck, dead, drifting and noisy ones.
-
-A design of a gain file, in the loop of a record: stability, residual, agreement.
-"""
+"""The rows of a diagnosis: channels, the loop that ran, a given design, lines, and their costs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import field, replace
 
 import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
-from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
+from lbt_synth.identification.fit.identified_model import (
+    DIFFERENT,
+    IdentifiedLine,
+    IdentifiedModel,
+)
 from lbt_synth.identification.prediction.comparison import PredictionRow
 from lbt_synth.identification.records.from_series import TREND, end_scatters
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
-from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop import Imaging, close_loop, jitter_strehl, loop_margins, residual_budget
+from lbt_synth.loop.budget import line_covariance
 from lbt_synth.loop.stable_range import stable_sensor_gains
 from lbt_synth.methods.registry import design_title
+from lbt_synth.models import TipTiltPlant
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.storage.rows import Facts, column, fact, facts, nm_column, table_row
+from lbt_synth.storage.rows import (
+    Facts,
+    column,
+    fact,
+    facts,
+    nm_column,
+    percent_column,
+    table_row,
+)
 from lbt_synth.validation import BoolArray, FloatArray
 
 _STABLE_GAINS = "stable sensor gains"
 AXES = ("tip", "tilt")
 _DEAD = 0.5  # of the frames, on one value
 _NOISIER = 3.0  # times the other axis
-_FEW = 0.01  # of the frames, with a fault
+FEW = 0.01  # of the frames, that may have a fault
 DEAD = "dead"
 _WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel
 _WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers", "held": "held"}
 _SAME_RATE = 1e-3
-_AGREES = 0.1  # of the residual that its own model promises
+_AGREES = 0.1  # of the residual that its own model promises: what conditions change
+_ALL = "all"  # parts together
 
 
 def law_facts(law: ControlLaw) -> Facts:
@@ -128,19 +138,19 @@ class ChannelRow:
     @property
     def serious(self) -> bool:
         """Whether something is wrong with it that more than a few frames have."""
-        return self.state == DEAD or self.faulty > _FEW or any(map(self.state.count, _WHOLE))
+        return self.state == DEAD or self.faulty > FEW or any(map(self.state.count, _WHOLE))
 
 
 def judge_channels(record: LoopRecord) -> tuple[ChannelRow, ...]:
     """Return what is known of each channel of a record, the measurements first."""
-    names = AXES if record.axes == len(AXES) else ("",)
     measured = record.usable if record.measured is None else record.measured
-    everything = np.ones(record.frames, dtype=np.bool_)
-    commanded = everything if record.commanded is None else record.commanded
-    closed = record.commands is not None
-    rows = _judge_series(record, "measurements", record.measurements, measured, names, closed)
+    axes = range(record.axes)
+    rows = [_judge_channel(record, axis, record.measurements, measured) for axis in axes]
     if record.commands is not None:
-        rows += _judge_series(record, "commands", record.commands, commanded, names, closed)
+        commanded = record.commanded
+        if commanded is None:
+            commanded = np.ones(record.frames, dtype=np.bool_)
+        rows += [_judge_channel(record, axis, record.commands, commanded) for axis in axes]
     return tuple(rows)
 
 
@@ -150,51 +160,44 @@ def live_axes(record: LoopRecord) -> list[int]:
     return [axis for axis, row in enumerate(rows) if row.state != DEAD]
 
 
-def _judge_series(
-    record: LoopRecord,
-    series: str,
-    values: FloatArray,
-    good: BoolArray,
-    names: tuple[str, ...],
-    closed: bool,
-) -> list[ChannelRow]:
-    steps = [_step_rms(one, good) for one in values.T]
-    rows = []
-    for axis, one in enumerate(values.T):
-        found = [
-            each
-            for each in record.health.findings
-            if each.series == series and each.axis == axis and each.kind in _WORDS
-        ]
-        here = one[good] if good.any() else one
-        first, last = end_scatters(one, good)
-        change, quarter = last / first if first > 0 else np.nan, len(here) // 4
-        drift = float(np.mean(here[-quarter:]) - np.mean(here[:quarter])) if quarter else np.nan
-        held = sum(each.fraction for each in found if each.kind in ("stuck", "held"))
-        words = [f"{_WORDS[each.kind]} ({100 * each.fraction:.2g} %)" for each in found]
-        if np.ptp(here) == 0 or held > _DEAD:
-            words = [DEAD]
-        elif series == "measurements":
-            others = [step for i, step in enumerate(steps) if i != axis]
-            if others and steps[axis] > _NOISIER * max(others):
-                words.append(_WHOLE[0])
-            if closed and abs(drift) > float(np.std(here)):
-                words.append(_WHOLE[1])
-            if not 1 / TREND <= (1.0 if np.isnan(change) else change) <= TREND:
-                words.append(_WHOLE[2])
-        rows.append(
-            ChannelRow(
-                channel=f"{names[axis]} {series.removesuffix('s')}".strip(),
-                rms_nm=float(np.std(here)),
-                step_nm=steps[axis],
-                mean_nm=float(np.mean(here)),
-                drift_nm=drift,
-                change=change,
-                faulty=sum(each.fraction for each in found),
-                state=", ".join(words) or "good",
-            )
+def _judge_channel(
+    record: LoopRecord, axis: int, values: FloatArray, good: BoolArray
+) -> ChannelRow:
+    """Return what is known of one column of the measurements or commands, (frames, axes)."""
+    series = "measurements" if values is record.measurements else "commands"
+    findings = [
+        finding
+        for finding in record.health.findings
+        if (finding.series, finding.axis) == (series, axis) and finding.kind in _WORDS
+    ]
+    channel, steps = values[:, axis], [_step_rms(column, good) for column in values.T]
+    here = channel[good] if good.any() else channel
+    first, last = end_scatters(channel, good)
+    change, quarter = last / first if first > 0 else np.nan, len(here) // 4
+    drift = float(np.mean(here[-quarter:]) - np.mean(here[:quarter])) if quarter else np.nan
+    held = sum(finding.fraction for finding in findings if finding.kind in ("stuck", "held"))
+    words = [f"{_WORDS[finding.kind]} ({100 * finding.fraction:.2g} %)" for finding in findings]
+    if np.ptp(here) == 0 or held > _DEAD:
+        words = [DEAD]
+    elif series == "measurements":
+        others = [step for i, step in enumerate(steps) if i != axis]
+        faults = (
+            bool(others) and steps[axis] > _NOISIER * max(others),
+            record.commands is not None and abs(drift) > float(np.std(here)),
+            change > TREND or change < 1 / TREND,
         )
-    return rows
+        words += [word for word, is_so in zip(_WHOLE, faults, strict=True) if is_so]
+    name = AXES[axis] if record.axes == len(AXES) else ""
+    return ChannelRow(
+        channel=f"{name} {series.removesuffix('s')}".strip(),
+        rms_nm=float(np.std(here)),
+        step_nm=steps[axis],
+        mean_nm=float(np.mean(here)),
+        drift_nm=drift,
+        change=change,
+        faulty=sum(finding.fraction for finding in findings),
+        state=", ".join(words) or "good",
+    )
 
 
 def _step_rms(series: FloatArray, good: BoolArray) -> float:
@@ -229,28 +232,13 @@ def given_design_facts(
 ) -> Facts:
     """Return what a given design does on the record, replayed where its loop is stable."""
     controller = given_controller(design, model)
-    loop = close_loop(model.hardware, controller)
     promised = design.rms
-    residual = {"unit": "nm", "format": ".2f"}
     return facts(
         design=fact(name, "design"),
         method=fact(design_title(design.method), "method"),
-        stable=fact(loop.is_stable, "stable"),
-        spectral_radius=fact(loop.spectral_radius, "spectral radius", format=".5f"),
+        stable=fact(close_loop(model.hardware, controller).is_stable, "stable"),
         stable_gains=fact(_stable_gains(model, controller), _STABLE_GAINS),
-        sensor_gain=fact(f"{np.mean(model.sensor_gains):.3f}", "identified sensor gain"),
-        replayed_nm=fact(
-            np.nan if replayed is None else replayed.replayed_nm,
-            "residual on the record",
-            **residual,
-        ),
-        replayed_error_nm=fact(
-            np.nan if replayed is None else replayed.replayed_error_nm, "+-", **residual
-        ),
-        own_model_nm=fact(promised, "promised by its own model", **residual),
-        model_nm=fact(
-            np.nan if replayed is None else replayed.model_nm, "by the record's model", **residual
-        ),
+        own_model_nm=fact(promised, "promised by its own model", unit="nm", format=".2f"),
         agreement=fact(_agreement(promised, replayed), "agrees with its model"),
     )
 
@@ -261,10 +249,9 @@ def _agreement(promised_nm: float, replayed: PredictionRow | None) -> str:
         return "not known"
     ratio = replayed.replayed_nm / promised_nm
     # the error of the logarithm, so that a large residual does not excuse itself
-    if abs(np.log(ratio)) <= DIFFERENT * replayed.replayed_error_nm / replayed.replayed_nm:
+    error = replayed.replayed_error_nm / replayed.replayed_nm
+    if abs(np.log(ratio)) <= max(DIFFERENT * error, _AGREES):
         return "yes"
-    if abs(ratio - 1) <= _AGREES:
-        return f"yes, within {100 * _AGREES:.0f} %"
     return f"no: {'more' if ratio > 1 else 'less'} than promised, by a factor {ratio:.2f}"
 
 
@@ -285,3 +272,102 @@ def design_differences(design: Design, model: IdentifiedModel) -> list[str]:
                 )
     here = replace(model.hardware, sensor_matrix=own.sensor, influence_matrix=own.influence)
     return [*notes, *(f"the gain file was {text}" for text in loop_differences(own, here))]
+
+
+def disturbance_lines(model: IdentifiedModel) -> tuple[IdentifiedLine, ...]:
+    """Return the resonances of a model that are no turbulence, by frequency."""
+    parts = [part for part in model.parts if part.kind != "turbulence"]
+    return tuple(sorted(parts, key=lambda part: part.frequency_hz))
+
+
+def line_name(line: IdentifiedLine) -> str:
+    """Return what a table of costs calls a resonance."""
+    return f"{'line' if line.kind == 'line' else 'broad resonance'} at {line.frequency_hz:.4g} Hz"
+
+
+def line_place(line: IdentifiedLine) -> str:
+    """Return along what a line shakes, to go on in a sentence; empty of a loop of one axis."""
+    direction = line.direction or (1.0,)
+    if len(direction) == 1:
+        return ""
+    if np.count_nonzero(direction) == 1:
+        return f" in {AXES[int(np.argmax(np.abs(direction)))]}"
+    return f" along {line.direction_deg:.0f} deg"
+
+
+@table_row
+class CostRow:
+    """One part of the disturbance, and what it costs two loops by the model."""
+
+    part: str = column("part", help="Part of the disturbance")
+    running_nm: float = nm_column("running", help="Residual that it leaves in the loop that ran")
+    running_strehl: float = percent_column("Strehl lost", help="Strehl ratio that this costs")
+    best_nm: float = nm_column("best design", help="Residual that it leaves in the best design")
+    best_strehl: float = percent_column("Strehl lost", help="Strehl ratio that this costs")
+    where: str = field(default="")  # along what a line shakes, to go on in a sentence
+
+
+def disturbance_costs(
+    plant: TipTiltPlant,
+    lines: Sequence[IdentifiedLine],
+    running: Controller | None,
+    best: Controller | None,
+    imaging: Imaging,
+) -> tuple[CostRow, ...]:
+    """Return a row per part of the disturbance, the most costly first, and one of all.
+
+    The Strehl ratio that a part costs is that of the residual without it, less that with it: as
+    residuals add up in the exponent, these do not add up to the whole loss.
+    """
+    tables = [_covariances(plant, lines, controller) for controller in (running, best)]
+    names = next((list(table) for table in tables if table), [])
+    where = {line_name(line): line_place(line) for line in lines}
+    rows = []
+    for name in names:
+        numbers = [_rms_and_strehl(table, name, imaging) for table in tables]
+        (running_nm, running_strehl), (best_nm, best_strehl) = numbers
+        rows.append(
+            CostRow(
+                part=name,
+                running_nm=running_nm,
+                running_strehl=running_strehl,
+                best_nm=best_nm,
+                best_strehl=best_strehl,
+                where=where.get(name, ""),
+            )
+        )
+    by = "running_nm" if tables[0] else "best_nm"
+    rows.sort(key=lambda row: (row.part == _ALL, -getattr(row, by)))
+    return tuple(rows)
+
+
+def _covariances(
+    plant: TipTiltPlant, lines: Sequence[IdentifiedLine], controller: Controller | None
+) -> dict[str, FloatArray]:
+    """Return the covariance (n, n) of the residual by part, and of all; none of no stable loop."""
+    if controller is None:
+        return {}
+    loop = close_loop(plant.hardware, controller)
+    if not loop.is_stable:
+        return {}
+    budget = residual_budget(loop, plant, frame_means=True)
+    out = {"turbulence": budget.turbulence_nm2, "measurement noise": budget.noise_nm2}
+    for line in lines:  # two of one frequency are one part
+        name = line_name(line)
+        out[name] = out.get(name, 0.0) + line_covariance(loop, line.vibration())
+    rest = budget.total_nm2 - np.sum(list(out.values()), axis=0)
+    out["turbulence"] = out["turbulence"] + rest  # slow resonances are turbulence
+    return out | {_ALL: budget.total_nm2}
+
+
+def _rms_and_strehl(
+    parts: Mapping[str, FloatArray], name: str, imaging: Imaging
+) -> tuple[float, float]:
+    """Return the rms that a part leaves, and the Strehl ratio that it costs."""
+    if name not in parts:
+        return np.nan, np.nan
+    others = [parts[part] for part in parts if part not in (name, _ALL)]
+    rest = np.sum(others, axis=0) if name != _ALL else 0 * parts[_ALL]
+    strehl = jitter_strehl(parts[_ALL], imaging=imaging)
+    rms_nm = float(np.sqrt(max(np.trace(parts[name]), 0.0)))
+    return rms_nm, jitter_strehl(rest, imaging=imaging) - strehl

@@ -1,18 +1,17 @@
-"""What a diagnosis says of commands that no option repairs.
-
-The channels of a record, with one thing wrong at a time.
-"""
+"""The channels of a record, with one thing wrong at a time, and the costs of a disturbance."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from support.control_laws import RATE, ordinary_loop
+from support.diagnoses import line_diagnosis
 from support.wrong_commands import record
 
 import lbt_synth as lbt
 from lbt_synth.identification.commands.verdict import explain_commands
-from lbt_synth.identification.diagnosis.running_loop import (
+from lbt_synth.identification.diagnosis.rows import (
+    disturbance_costs,
     judge_channels,
     live_axes,
 )
@@ -116,3 +115,51 @@ def test_few_outliers_are_not_serious():
     found, rows, _ = states(y, u)
     assert found["tip measurement"].startswith("outliers (0.0")
     assert not any(row.serious for row in rows)
+
+
+@pytest.fixture(scope="module")
+def diagnosis():
+    return line_diagnosis()
+
+
+def test_squares_add_up_to_the_budget(diagnosis):
+    plant = diagnosis.model.plant()
+    running = lbt.Controller(A=1.0, B=0.2, C=1.0, D=0.0, dt_s=1e-3)
+    best = diagnosis.best_design.controller
+    costs = disturbance_costs(plant, diagnosis.lines, running, best, lbt.Imaging())
+    *parts, total = costs
+    for field, controller in (("running_nm", running), ("best_nm", best)):
+        loop = lbt.close_loop(plant.hardware, controller)
+        exact = lbt.residual_budget(loop, plant, frame_means=True)
+        values = {row.part: getattr(row, field) for row in costs}
+        assert values["all"] == pytest.approx(exact.rms_nm, rel=1e-6)
+        assert values["measurement noise"] == pytest.approx(exact.noise_nm, rel=1e-6)
+        assert np.hypot.reduce([getattr(row, field) for row in parts]) == pytest.approx(
+            values["all"]
+        )
+    ordered = [row.running_nm for row in parts]
+    assert ordered == sorted(ordered, reverse=True)
+    assert total.part == "all"
+
+
+def test_strehl_ratio_that_a_part_costs(diagnosis):
+    total = diagnosis.costs[-1]
+    lost = 1 - lbt.loop.jitter_strehl([[total.running_nm**2]], imaging=lbt.Imaging())
+    assert total.running_strehl == pytest.approx(lost, rel=1e-6)
+    line = diagnosis.costs[0]
+    rest = total.running_nm**2 - line.running_nm**2
+    without = lbt.loop.jitter_strehl([[rest]], imaging=lbt.Imaging())
+    assert line.running_strehl == pytest.approx(without - (1 - lost), rel=1e-6)
+
+
+def test_loops_that_are_not_known_cost_nothing_that_is_known(diagnosis):
+    plant = diagnosis.model.plant()
+    wild = lbt.Controller(A=1.0, B=5.0, C=1.0, D=0.0, dt_s=1e-3)
+    rows = disturbance_costs(
+        plant, diagnosis.lines, wild, diagnosis.best_design.controller, lbt.Imaging()
+    )
+    assert all(np.isnan([row.running_nm, row.running_strehl]).all() for row in rows)
+    assert [row.best_nm for row in rows[:-1]] == sorted(
+        (r.best_nm for r in rows[:-1]), reverse=True
+    )
+    assert disturbance_costs(plant, diagnosis.lines, None, None, lbt.Imaging()) == ()

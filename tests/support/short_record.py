@@ -1,12 +1,10 @@
-"""A short record of one axis and its first split."""
+"""A short record of one axis."""
 
 from __future__ import annotations
 
 from functools import cache
 
 import lbt_synth as lbt
-from lbt_synth.identification.prediction.forward_chaining import forward_split
-from lbt_synth.identification.stretches import forward_splits
 
 RATE, NOISE, GAIN = 500.0, 5.0, 0.8
 PATH = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
@@ -23,11 +21,3 @@ def short_record() -> lbt.identification.LoopRecord:
     return lbt.identification.loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
     )
-
-
-@cache
-def short_split() -> lbt.identification.ForwardSplit:
-    """The first of its two splits, at the true sensor gain."""
-    record = short_record()
-    pairs = forward_splits(record.stretches(), record.frames, splits=2)
-    return forward_split(record, *pairs[0], sensor_gain=GAIN, most_lines=2)
