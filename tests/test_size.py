@@ -18,7 +18,7 @@ LINES = {
     "config": 2331,
     "design": 8382,
     "files": 1608,
-    "identification": 12758,
+    "identification": 12766,
     "interop": 4663,
     "linear": 6078,
     "loop": 5350,
