@@ -34,5 +34,5 @@ def common_lyapunov_rms(plant, gamma):
     output = [[W, CT, DT], [CT.T, J, across], [DT.T, across.T, np.eye(m1)]]
     blocks = [cp.bmat(rows) for rows in (norm, decay, output)]
     programme = cp.Problem(cp.Minimize(cp.trace(W)), [(M + M.T) / 2 >> 0 for M in blocks])
-    programme.solve(solver=cp.CLARABEL, tol_gap_rel=1e-6, tol_gap_abs=1e-6, tol_feas=1e-7)
+    programme.solve(solver=cp.CLARABEL, tol_gap_rel=1e-5, tol_gap_abs=1e-5, tol_feas=1e-6)
     return gamma * float(np.sqrt(programme.value))

@@ -19,8 +19,7 @@ _SHORTEST_RUN = 5  # equal values, a stuck sensor
 _RARE = 1e-3  # runs of chance allowed in a record
 _MANY_RUNS = 100  # needed to compute a chance
 _SAME_LEVEL = 1e-9  # of the range
-_LIMIT_RATIO = 4  # of values at an end of the range over those at the next levels
-_LEVELS = 3
+_LIMIT_RATIO = 4  # of values at an end of the range over those at each of as many next levels
 _OUTLIER = 6.5  # standard deviations of the second difference: 1e-4 clean frames in a million
 MAD = 1.482602218505602  # standard deviation of a normal law over its median deviation
 _BLOCK = 256  # frames of a local scale
@@ -86,9 +85,9 @@ def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
         end = float(np.max(sign * values))
         upper = sign * values[sign * values > end - 0.25 * span]
         upper, ends = _sort_levels(upper, tolerance)
-        if len(ends) <= _LEVELS:  # of coarse numbers there are few
+        if len(ends) <= _LIMIT_RATIO:  # of coarse numbers there are few
             upper, ends = _sort_levels(sign * values, tolerance)
-        counts = np.diff(np.concatenate([[0], ends, [upper.size]]))[: _LEVELS + 1]
+        counts = np.diff(np.concatenate([[0], ends, [upper.size]]))[: _LIMIT_RATIO + 1]
         inside = int(np.max(counts[1:], initial=1))
         if counts[0] >= _LIMIT_RATIO * inside:
             out |= good & (sign * series >= end - tolerance)

@@ -233,7 +233,7 @@ def test_a_slow_line_of_little_damping_is_no_line_without_any(numbers):
     """Its pole is at 1e-8 to 1e-4 inside the circle, further than rounding can move it."""
     plant = slow_line(*numbers)
     found = lbt.linear.kalman_riccati(plant)
-    assert found.P == pytest.approx(doubled(plant), rel=1e-6)  # scipy's is off by up to 4e-5
+    assert found.P == pytest.approx(doubled(plant), rel=5e-6)  # scipy's is off by up to 4e-5
     certificate = lbt.design.certify_filter(plant, found.gain_predictor, least_variance=True)
     assert certificate.passed
 
