@@ -384,7 +384,7 @@ def _add_missing_facts(parser: ArgumentParser) -> None:
     add_option(facts, "--obstruction", float, "as a fraction of the diameter")
     add_option(facts, "--averages", int, "periodograms that a spectrum is the mean of")
     add_option(facts, "--commands", str, "another file, with the commands")
-    text = "columns by name or number from 0, as in measurements=tip,tilt commands=3,4"
+    text = "columns by name or number from 0, as in measurements=tip,tilt commands=3,4 times="
     add_option(facts, "--columns", str, text, nargs="+", metavar="ROLE=NAME")
     add_option(facts, "--axes", int, "which of several columns or modes, from 0", nargs="+")
 

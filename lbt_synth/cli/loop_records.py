@@ -153,18 +153,19 @@ def imaging_wavelength_um(arguments: Namespace, record: LoopRecord | SpectrumRec
 
 
 def _parse_columns(given: Sequence[str] | None) -> dict[str, list[str | int]] | None:
-    """Parse ROLE=NAME[,NAME] pairs."""
+    """Parse ROLE=NAME[,NAME] pairs; a role without a name has no column."""
     if given is None:
         return None
     out: dict[str, list[str | int]] = {}
     for pair in given:
         role, equals, names = pair.partition("=")
-        if not equals or not role or not names:
+        if not equals or not role:
             raise ProblemError(
-                f"--columns takes ROLE=NAME or ROLE=NAME,NAME, as in measurements=tip,tilt or "
-                f"commands=3,4; got {pair!r}."
+                "--columns takes ROLE=NAME or ROLE=NAME,NAME, as in measurements=tip,tilt or "
+                f"density=3,4, and ROLE= for a role that no column has; got {pair!r}."
             )
-        out[role] = [int(name) if name.isdecimal() else name for name in names.split(",")]
+        chosen = names.split(",") if names else []
+        out[role] = [int(name) if name.isdecimal() else name for name in chosen]
     return out
 
 

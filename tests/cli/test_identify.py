@@ -70,12 +70,13 @@ def test_series_of_any_format(tmp_path, capsys, recorded_loop, ending):
     elif ending == "npz":
         np.savez(file, measurements=y, commands=u)
     elif ending == "csv":
+        options += ("--columns", "times=")  # they stand still
         np.savetxt(
             file,
-            np.hstack([y, u]),
+            np.hstack([np.zeros((len(y), 1)), y, u]),
             delimiter=",",
             comments="",
-            header="tip_nm,tilt_nm,command_tip_nm,command_tilt_nm",
+            header="time,tip_nm,tilt_nm,command_tip_nm,command_tilt_nm",
         )
     else:
         from astropy.io import fits
