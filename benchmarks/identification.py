@@ -108,7 +108,13 @@ def case(
         whole = lbt.models.SumSpectrum(parts=[total, own])
         seen = replace(truth, turbulence=whole, noise_nm=1e-3 * noise)
     run = lbt.simulate(
-        ran.controller, seen, hardware=path, frames=frames, seed=seed, settle_frames=2000
+        ran.controller,
+        seen,
+        hardware=path,
+        frames=frames,
+        seed=seed,
+        settle_frames=2000,
+        frame_means=bool(colour),  # noise is a process of means over frames
     )
     record = lbt.identification.loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=rate, delay_frames=2, unit="nm"
