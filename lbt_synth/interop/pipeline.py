@@ -306,7 +306,7 @@ def export(
         reads_others=own.reads_others,
     )
     first = parts[0].design
-    origin = provenance_lines(first, gain_digest)
+    origin = _provenance_lines(first, gain_digest)
     numbers = own.round([part.design for part in parts], **settings)
     whole = own.join(numbers, parts, count)
     pairs = list(zip(parts, numbers, strict=True))
@@ -315,7 +315,8 @@ def export(
     single = settings.get("precision") == "single"
     if single:  # in double precision the figure would depend on this machine's sums
         origin.append(("precision", f"single: commands within {error:.1e} of the largest one"))
-    files = own.write(place, whole, first, origin, gain_digest=gain_digest, **settings)
+    lines = [f"{label:<11}  {comment_text(text)}" for label, text in origin]
+    files = own.write(place, whole, first, lines, gain_digest=gain_digest, **settings)
     again = own.read(files, whole)
     _require_same(again, whole)
     checks = _proved(own, pairs, error)
@@ -488,12 +489,7 @@ def _rehearse_sensors(
     return commands
 
 
-def join_labels(lines: Sequence[tuple[str, str]]) -> list[str]:
-    """Join each label and its text."""
-    return [f"{label}: {text}" if label else text for label, text in lines]
-
-
-def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str, str]]:
+def _provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str, str]]:
     """Return labelled lines on a file: version, method, gain file, loop, units, certificate."""
     if gain_digest is not None and not _DIGEST.fullmatch(str(gain_digest)):
         raise ProblemError(
@@ -520,7 +516,7 @@ def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str,
     checks = design.certificate.checks
     lines.append(("certificate", f"{len(checks)} checks passed"))
     lines += [("", f"{c.name}: {c.value:.6g} (limit {c.limit:.6g})") for c in checks]
-    return [(label, comment_text(text)) for label, text in lines]
+    return lines
 
 
 def comment_text(text: str) -> str:

@@ -23,7 +23,7 @@ from lbt_synth.design.shaping.uncertainty import (
     MovingSensorGain,
 )
 from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.linear import Controller, hinf_norm
+from lbt_synth.linear import Controller, StateSpace, hinf_norm
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import residual_budget
@@ -89,6 +89,18 @@ def sums_variance(
         return np.asarray(roundoff**2 / 3 * np.sum(terms**2 + sums**2, axis=1))
 
     return variance
+
+
+def command_as_state(textbook: StateSpace) -> Controller:
+    """Return the controller of a textbook form, whose command is a further state."""
+    n, (m, q) = textbook.n_states, textbook.D.shape
+    return Controller(
+        A=np.block([[textbook.A, np.zeros((n, m))], [textbook.C, np.zeros((m, m))]]),
+        B=np.vstack([textbook.B, textbook.D]),
+        C=np.eye(m, n + m, k=n),
+        D=np.zeros((m, q)),
+        dt_s=textbook.dt_s,
+    )
 
 
 def require_proved(checks: tuple[Check, ...], arithmetic: str, hint: str) -> None:

@@ -74,7 +74,7 @@ def _write(
     place: Path,
     terms: SourceTerms,
     _: Design,
-    origin: Sequence[tuple[str, str]],
+    origin: Sequence[str],
     *,
     name: str | None,
     gain_digest: str | None,

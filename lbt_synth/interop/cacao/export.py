@@ -24,15 +24,16 @@ from numpy.typing import ArrayLike, NDArray
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.modes import ModeDesign
-from lbt_synth.interop.pipeline import Arithmetic, Target, join_labels
+from lbt_synth.interop.pipeline import Arithmetic, Target
 from lbt_synth.interop.proof import (
     ROUNDOFF,
     Written,
+    command_as_state,
     mode_variances,
     proved_gains,
     scenario_gains,
 )
-from lbt_synth.linear import Controller, StateSpace, hinf_norm
+from lbt_synth.linear import StateSpace, hinf_norm
 from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import open_fits
@@ -244,17 +245,9 @@ class PredictiveFilter:
 
         Products are added in any order.
         """
-        hardware, s = self.hardware, self.system
-        m, n = hardware.modes, s.n_states
-        # the last command is a state
-        parameter = Controller(
-            A=np.block([[s.A, np.zeros((n, m))], [s.C, np.zeros((m, m))]]),
-            B=np.vstack([s.B, s.D]),
-            C=np.eye(m, n + m, k=n),
-            D=np.zeros((m, m)),
-            dt_s=s.dt_s,
-        )
-        controller = youla_controller(replace(hardware, sensor_matrix=None), parameter)
+        m, n = self.hardware.modes, self.system.n_states
+        parameter = command_as_state(self.system)
+        controller = youla_controller(replace(self.hardware, sensor_matrix=None), parameter)
         # noise in the product is part of the command; noise in the history comes as a measurement
         command = np.eye(controller.n_states, m, k=-n)
         entry = replace(controller, B=np.hstack([command, controller.B]), D=np.zeros((m, 2 * m)))
@@ -340,7 +333,7 @@ def _join(numbers: Sequence[_Numbers], parts: Sequence[ModeDesign], count: int) 
 
 
 def _write(
-    place: Path, whole: _Numbers, design: Design, origin: Sequence[tuple[str, str]], **_: Any
+    place: Path, whole: _Numbers, design: Design, origin: Sequence[str], **_: Any
 ) -> dict[Path, bytes]:
     """Return a FITS file with the matrix as its primary image, which milk loads as a stream."""
     from astropy.io import fits
@@ -350,7 +343,7 @@ def _write(
     unit.header["METHOD"] = design.method, "synthesis"
     unit.header["STEPS"] = steps, "frames of history, the newest first"
     unit.header["MODES"] = modes, "modes of a frame"
-    for line in (*join_labels(origin), _SIGN):
+    for line in (*origin, _SIGN):
         unit.header.add_comment(line)
     unit.add_checksum(when="of this unit")
     buffer = io.BytesIO()

@@ -21,7 +21,7 @@ from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.files.telemetry.time_filters import is_significant, transfer_function
 from lbt_synth.interop.dao.refit import DirectFormLoop, make_again, mode_loops
 from lbt_synth.interop.modes import ModeDesign
-from lbt_synth.interop.pipeline import Arithmetic, Target, join_labels
+from lbt_synth.interop.pipeline import Arithmetic, Target
 from lbt_synth.interop.proof import ROUNDOFF, Written, prove_written, sums_variance
 from lbt_synth.linear import Controller
 from lbt_synth.storage.array_file import fits_bytes, open_fits
@@ -182,7 +182,7 @@ def _join(numbers: Sequence[_Matrix], parts: Sequence[ModeDesign], count: int) -
 
 
 def _write(
-    place: Path, matrix: _Matrix, design: Design, origin: Sequence[tuple[str, str]], **_: Any
+    place: Path, matrix: _Matrix, design: Design, origin: Sequence[str], **_: Any
 ) -> dict[Path, bytes]:
     """Return the matrix as FITS or as a file of numpy, by the ending."""
     if place.suffix.lower() == ".fits":
@@ -190,7 +190,7 @@ def _write(
             "METHOD": (design.method, "synthesis"),
             "ORDER": (len(matrix) // 2, "M: rows b_0..b_M, then a_1..a_M"),
         }
-        comments = [*join_labels(origin), _SIGN]
+        comments = [*origin, _SIGN]
         return {place: fits_bytes(cards, {"K_MAT": matrix}, comments=comments)}
     buffer = io.BytesIO()
     np.save(buffer, matrix, allow_pickle=False)

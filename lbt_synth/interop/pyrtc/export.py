@@ -27,7 +27,7 @@ from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.interop.pipeline import CERTIFICATE, Arithmetic, Target, join_labels
+from lbt_synth.interop.pipeline import CERTIFICATE, Arithmetic, Target
 from lbt_synth.interop.proof import ROUNDOFF, Written
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop import close_loop
@@ -210,7 +210,7 @@ def _write(
     folder: Path,
     whole: tuple[PolFilter, ...],
     design: Design,
-    origin: Sequence[tuple[str, str]],
+    origin: Sequence[str],
     *,
     modes: int | None,
     other_gain: float | None,
@@ -220,7 +220,7 @@ def _write(
     first = whole[0]
     count = len(first.response) if modes is None else modes
     config = _SYSTEM.format(
-        origin="\n".join(f"# {line}" for line in join_labels(origin)),
+        origin="\n".join(f"# {line}" for line in origin),
         size=count,
         response=_RESPONSE,
         gain=_GAIN,
