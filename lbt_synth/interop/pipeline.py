@@ -13,7 +13,7 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -26,10 +26,10 @@ from lbt_synth.design import Check, Design
 from lbt_synth.design.modal.per_mode import name_modes
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
-from lbt_synth.interop.proof import Written, prove_written, require_proved
+from lbt_synth.interop.proof import LOSS, NOISE, POLE, Written, prove_written, require_proved
 from lbt_synth.linear.state_space import RunningController
 from lbt_synth.loop.simulation.disturbances import Disturbance
-from lbt_synth.loop.simulation.run import Drop, SteppedController, run_frames, simulate
+from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
 from lbt_synth.storage.rows import column, json_record, table_row
@@ -40,9 +40,6 @@ FRAMES = 2000
 # without *, \ and ? no text ends a comment, splices lines or makes a trigraph
 _UNSAFE = re.compile(r"[^A-Za-z0-9 ._,:;+\-=()<>%'/\[\]|]")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_POLE = 0.99  # of the random phase that disturbs the rehearsed loop
-_LARGEST_ERROR = 0.01  # of the largest command, where the proof knows nothing of rounded sums
-_SINGLE_SUFFICES = 1e-3  # of the largest command
 
 
 @table_row
@@ -312,9 +309,6 @@ def export(
     pairs = list(zip(parts, numbers, strict=True))
     error = max(rehearsal_error(part.design, own.start(held, np.inf)) for part, held in pairs)
     precision = settings.get("precision", own.arithmetic.precision)
-    single = settings.get("precision") == "single"
-    if single:  # in double precision the figure would depend on this machine's sums
-        origin.append(("precision", f"single: commands within {error:.1e} of the largest one"))
     lines = [f"{label:<11}  {comment_text(text)}" for label, text in origin]
     files = own.write(place, whole, first, lines, gain_digest=gain_digest, **settings)
     again = own.read(files, whole)
@@ -322,13 +316,8 @@ def export(
     checks = _proved(own, pairs, error)
     require_proved(checks, f"the arithmetic of {target} ({precision} precision)", own.hint)
     _require_finite(error, precision, own.hint)
-    notes = [own.remark(part.design, held) for part, held in pairs]
-    if single and not error <= _SINGLE_SUFFICES:
-        notes.append(
-            f"in single precision commands are off by {error:.2g} of the largest one. Export with "
-            "precision double"
-        )
-    notes = list(dict.fromkeys(filter(None, notes)))
+    remarks = [own.remark(part.design, held) for part, held in pairs]
+    notes = list(dict.fromkeys(filter(None, remarks)))
     if own.contents:
         make_directory(place, parents=False)
     settings |= {"modes": count, "notes": notes, **own.facts(whole, **settings)}
@@ -388,7 +377,7 @@ def _proved(
         if part.design.other_sensors:
             how = "a run in which each sensor is missing for a while"
             name = "commands in a rehearsal, difference"
-            proof.append(Check(name, error, _LARGEST_ERROR, how))
+            proof.append(Check(name, error, LOSS, how))
         if len(part.modes) < controlled:
             modes = name_modes(np.array(part.modes))
             proof = [replace(check, name=f"{check.name} ({modes})") for check in proof]
@@ -413,11 +402,9 @@ def rehearsal_error(design: Design, other: Any) -> float:
                 commands = _rehearse_sensors(design, other, expected, readings)
         except ProblemError:
             return float("inf")
-        size = float(np.max(np.abs(expected)))
-        error = float(np.max(np.abs(commands - expected)))
-    if not np.isfinite(error):
-        return float("inf")
-    return error / size if size > 0 else error
+        size = float(np.max(np.abs(expected))) or 1.0
+        error = float(np.max(np.abs(commands - expected))) / size
+    return error if np.isfinite(error) else float("inf")
 
 
 @lru_cache(maxsize=8)
@@ -458,20 +445,14 @@ def _absences(design: Design) -> tuple[dict[str, int], int]:
 def _rehearse(design: Design, controller: SteppedController | RunningController) -> FloatArray:
     """Return the commands (frames, m) of a controller that takes the place of a design's own."""
     rng = np.random.default_rng(0)
-    hardware, (m, q) = design.hardware, design.controller.D.shape
+    hardware, q = design.hardware, design.controller.D.shape[1]
     if hardware is None:
-        series, commands = rng.standard_normal((FRAMES, q)), np.empty((FRAMES, m))
-
-        def note(k: int, _: FloatArray, command: FloatArray) -> None:
-            commands[k] = command
-
-        measure = partial(np.take, series, axis=0)
-        run_frames(controller, measure, note, frames=FRAMES, shape=(m,), taps=np.ones(1))
-        return commands
+        controller.reset()
+        return np.array([controller.step(y) for y in rng.standard_normal((FRAMES, q))])
     total = rng.standard_normal((1, FRAMES, hardware.modes))
     for k in range(1, FRAMES):
-        total[0, k] = _POLE * total[0, k - 1] + np.sqrt(1 - _POLE**2) * total[0, k]
-    noise = 0.1 * rng.standard_normal((1, FRAMES, q))
+        total[0, k] = POLE * total[0, k - 1] + np.sqrt(1 - POLE**2) * total[0, k]
+    noise = NOISE * rng.standard_normal((1, FRAMES, q))
     disturbance = Disturbance(phase_nm=total, noise=noise, frame_means=True)
     return np.asarray(simulate(controller, disturbance, hardware=hardware).commands[0])
 

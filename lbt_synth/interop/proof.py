@@ -33,11 +33,11 @@ from lbt_synth.models import ARModel, LoopHardware
 from lbt_synth.validation import BoolArray, FloatArray
 
 ROUNDOFF = {"double": 2.0**-53, "single": 2.0**-24}  # largest relative error of an operation
-_LOSS = 0.01  # of residual and of margins, relative
+LOSS = 0.01  # of residual and of margins, relative
 _SCENARIOS = (1.0, 0.7, 0.5, 0.358)  # sensor gains, where a design names none
 _STEP = 1.01  # ratio of neighbouring sensor gains
 _WIDEST = 10.0  # factor on the sensor gain, to either side
-_POLE, _NOISE = 0.99, 0.1  # of a reference disturbance of unit variance
+POLE, NOISE = 0.99, 0.1  # of a reference disturbance of unit variance
 EIGENVALUES = "eigenvalues of the monodromy, per frame"
 _ASKED = np.array([0.0031, 0.11, 0.37])  # parts of the frame rate
 
@@ -148,7 +148,7 @@ def _prove_sensors(design: Design, hardware: LoopHardware, written: Written) -> 
         name_of_loss = f"residual with {name}, loss"
         checks += [
             Check(f"spectral radius with {name}", max(radii), 1 - STABILITY_MARGIN, EIGENVALUES),
-            Check(name_of_loss, max(losses), _LOSS, "Lyapunov equations"),
+            Check(name_of_loss, max(losses), LOSS, "Lyapunov equations"),
         ]
     return checks
 
@@ -174,7 +174,7 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
     before, after = (hinf_norm(loop.output_sensitivity()).value for loop in (own, other))
     change = written.response_change
     after += change(1.0) if change else 0.0
-    checks.append(Check("modulus margin, loss", float(after / before) - 1, _LOSS, "level sets"))
+    checks.append(Check("modulus margin, loss", float(after / before) - 1, LOSS, "level sets"))
     return checks + _demand_checks(design, other, change)
 
 
@@ -224,7 +224,7 @@ def _residual_check(design: Design, hardware: LoopHardware, written: Written, ga
         share = float(np.sqrt(np.max(rounding_nm2 / before)))
     if written.variance is not None:
         how += f"; rounding at most {share:.1e} of it"
-    return Check(f"residual at sensor gain {gain:g}, loss", loss, _LOSS, how)
+    return Check(f"residual at sensor gain {gain:g}, loss", loss, LOSS, how)
 
 
 def _with_signals(loop: ClosedLoop, signals: FloatArray | None) -> ClosedLoop:
@@ -244,9 +244,9 @@ def mode_variances(design: Design, loop: ClosedLoop, rows: slice) -> FloatArray:
     n, q = loop.hardware.modes, loop.hardware.n_measurements
     if design.mode_specifications:
         return _shaped_variances(design, seen)
-    drive = np.sqrt(1 - _POLE**2)
-    slow = ARModel(coefficients=np.array([_POLE]), driving_rms_nm=drive, frame_rate_hz=rate)
-    sources, noise = [(slow, row) for row in np.eye(n)], _NOISE * np.eye(q)
+    drive = np.sqrt(1 - POLE**2)
+    slow = ARModel(coefficients=np.array([POLE]), driving_rms_nm=drive, frame_rate_hz=rate)
+    sources, noise = [(slow, row) for row in np.eye(n)], NOISE * np.eye(q)
     if design.is_estimator and (plant := design.plant) is not None:
         sources = list(zip(plant.turbulence, np.eye(n), strict=True))
         sources += [(v.ar_model(rate), np.asarray(v.direction)) for v in plant.vibrations]
@@ -337,7 +337,7 @@ def _demand_checks(
             more = _demand_change(demand, change) if change else 0.0
             for check in demand.checks(mode_alone):
                 name, value = f"mode {mode + 1}: {check.name}", check.value + more
-                limit = check.limit + _LOSS * abs(check.limit)
+                limit = check.limit + LOSS * abs(check.limit)
                 checks.append(replace(check, name=name, value=value, limit=limit))
     return checks
 

@@ -26,6 +26,7 @@ from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.modes import ModeDesign
 from lbt_synth.interop.pipeline import Arithmetic, Target
 from lbt_synth.interop.proof import (
+    LOSS,
     ROUNDOFF,
     Written,
     command_as_state,
@@ -44,7 +45,6 @@ _LONGEST = 1 << 17  # steps that are looked for
 _CLOSE = 0.5  # of the least distance that is computed: a bound on all others
 _ROOM = 0.98  # of the loss, for what is rounded
 _MOST_NUMBERS = 100_000_000  # of the matrix: 400 MB
-_MOST_LOSS = 0.01
 _SIGN = "mirror = + PFmat history; the matrix holds the controller with its sign changed"
 _Numbers = tuple[NDArray[np.float32], float]  # command, step, mode of the history; delay [frames]
 
@@ -297,7 +297,7 @@ def _round(
     designs: Sequence[Design], *, steps: int | None, loss: float, **_: Any
 ) -> list[_Numbers]:
     """Return the matrix of each design, all of the same length."""
-    limit = number(loss, "loss", above=0, at_most=_MOST_LOSS)
+    limit = number(loss, "loss", above=0, at_most=LOSS)
     filters = [predictive_filter(design) for design in designs]
     if steps is None:
         count = max(2, *(whole.fewest_steps(limit) for whole in filters))
@@ -372,7 +372,7 @@ TARGET = Target(
         limits="finite impulse response; a mirror that settles, a delay of at most 8 frames",
     ),
     file="matrix of single precision (.fits) and its certificate",
-    options={"steps": None, "loss": _MOST_LOSS, "modes": None, "other_gain": None},
+    options={"steps": None, "loss": LOSS, "modes": None, "other_gain": None},
     round=_round,
     write=_write,
     read=_read,

@@ -543,7 +543,7 @@ def test_a_table_that_is_too_long_is_refused(tmp_path, sensors_design, monkeypat
 
 
 def test_commands_that_are_off_are_refused(tmp_path, sensors_design, monkeypatch):
-    monkeypatch.setattr(pipeline, "_LARGEST_ERROR", 1e-9)
+    monkeypatch.setattr(pipeline, "LOSS", 1e-9)
     lbt.interop.export(tmp_path / "k.c", sensors_design, "c")
     with pytest.raises(NumericalError, match=r"in a rehearsal.*Try double precision"):
         lbt.interop.export(tmp_path / "single.c", sensors_design, "c", precision="single")
