@@ -30,7 +30,7 @@ from lbt_synth.loop.budget import residual_budget
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.loop.stable_range import radii_by_gain
 from lbt_synth.models import ARModel, LoopHardware
-from lbt_synth.validation import BoolArray, FloatArray
+from lbt_synth.validation import FloatArray
 
 ROUNDOFF = {"double": 2.0**-53, "single": 2.0**-24}  # largest relative error of an operation
 LOSS = 0.01  # of residual and of margins, relative
@@ -39,7 +39,6 @@ _STEP = 1.01  # ratio of neighbouring sensor gains
 _WIDEST = 10.0  # factor on the sensor gain, to either side
 POLE, NOISE = 0.99, 0.1  # of a reference disturbance of unit variance
 EIGENVALUES = "eigenvalues of the monodromy, per frame"
-_ASKED = np.array([0.0031, 0.11, 0.37])  # parts of the frame rate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -208,15 +207,11 @@ def _residual_check(design: Design, hardware: LoopHardware, written: Written, ga
     before = mode_variances(design, loops[0], slice(n))
     change, how = written.residual_change_nm, "Lyapunov equations, level sets"
     how += ", and what is left out" if change else ""
+    outputs = mode_variances(design, _with_signals(loops[1], written.signals), slice(None))
+    sizes, after = np.sqrt(np.abs(outputs)), outputs[:n]  # below zero is the size of its rounding
     rounding_nm2 = np.zeros(n)
-    if written.variance is None or written.entry is None:
-        after = mode_variances(design, loops[1], slice(n))
-    else:
-        shown = _with_signals(loops[1], written.signals)
-        outputs = mode_variances(design, shown, slice(None))
-        sizes = np.sqrt(np.abs(outputs))  # where it is below zero, the size of its rounding
+    if written.variance is not None and written.entry is not None:
         variance = written.variance(gain, sizes[n + m :], sizes[n : n + m])
-        after = outputs[:n]
         rounding_nm2 = _rounding_left(hardware, controller, written.entry, variance, gain)
     with np.errstate(invalid="ignore"):  # not a number: no accuracy, and the check fails
         after_nm = np.sqrt(after + rounding_nm2) + (change(gain) if change else 0.0)
@@ -274,18 +269,10 @@ def _shaped_variances(design: Design, loop: ClosedLoop) -> FloatArray:
     variances = np.zeros(len(loop.system.C))
     for mode, spec in enumerate(design.mode_specifications):
         terms = [x for x in leaves(spec.objective) if x.sensor_gain == loop.sensor_gain]
-        for row in np.flatnonzero(_reached(loop, mode)):
+        for row in range(variances.size):
             one = _mode_of(loop, mode, slice(row, row + 1))
             variances[row] += sum(term.measured_nm2(one) for term in terms)
     return variances
-
-
-def _reached(loop: ClosedLoop, mode: int) -> BoolArray:
-    """Return which outputs respond to a mode, (outputs,); most belong to another one."""
-    response = loop.system.frequency_response(_ASKED * loop.hardware.frame_rate_hz)
-    n, sensor = loop.hardware.modes, loop.hardware.sensor
-    own = np.stack([response[:, :, mode], response[:, :, n:] @ sensor[:, mode]])
-    return np.asarray(np.any(own != 0, axis=(0, 1)))
 
 
 def _rounding_left(

@@ -12,6 +12,7 @@ next, which bounds ``1 / |1 / D|`` between two gains.
 from __future__ import annotations
 
 import io
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
@@ -52,15 +53,9 @@ _Numbers = tuple[NDArray[np.float32], float]  # command, step, mode of the histo
 class AppliedFilter:
     """What ``modalfilter`` and ``applyPF`` compute in a frame, in single precision.
 
-    The pseudo-open-loop value of a mode is its measurement less the command that was applied
-    ``latency`` frames ago, interpolated between two frames. The matrix multiplies the values of the
-    last frames, the newest first, all modes of a frame together; products are added one by one.
-    The mirror gets the product itself: a positive command of cacao adds to the measurement, so
-    that :meth:`step` returns its negative.
-
-    The matrix (modes, steps * modes) has a row per mode of the command. The latency of cacao's
-    index arithmetic is one frame more than the total delay. The limit is that of the modulus of a
-    command that is applied; the history holds the applied commands.
+    The matrix (modes, steps * modes) multiplies the pseudo-open-loop values of the last frames, the
+    newest first: measurements less the commands, clipped at the limit, that were applied
+    ``latency`` frames ago, which in cacao's index arithmetic is a frame more than the delay.
     """
 
     def __init__(self, matrix: ArrayLike, delay_frames: float = 2.0, limit: float = np.inf) -> None:
@@ -93,7 +88,7 @@ class AppliedFilter:
         u = np.clip(np.add.accumulate(products, axis=1)[:, -1], -self._limit, self._limit)
         self._applied[1:] = self._applied[:-1].copy()
         self._applied[0] = u
-        return 0.0 - u.astype(np.float64)
+        return 0.0 - u.astype(np.float64)  # a positive command of cacao adds to the measurement
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -186,8 +181,8 @@ class PredictiveFilter:
 
     def fewest_steps(self, loss: float) -> int:
         """Return the steps after which what is cut off costs at most that part of the residual."""
-        high = 1
-        while not self._is_enough(high, loss):
+        enough, high = partial(self._is_enough, loss=loss), 1
+        while not enough(high):
             high *= 2
             if high > _LONGEST:
                 raise NumericalError(
@@ -197,11 +192,7 @@ class PredictiveFilter:
                     status="steps",
                     residual=_LONGEST,
                 )
-        low = high // 2
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (low, middle) if self._is_enough(middle, loss) else (middle, high)
-        return high
+        return bisect_left(range(high), True, lo=high // 2 + 1, key=enough)
 
     def _is_enough(self, steps: int, loss: float) -> bool:
         norm = self.cut_norm(steps)

@@ -87,11 +87,6 @@ class PolFilter:
         return np.linalg.pinv(self.response).astype(np.float32).astype(np.float64)
 
     @property
-    def is_whole(self) -> bool:
-        """Whether the series of pyRTC needs no correction."""
-        return not np.any(self.tap_error)
-
-    @property
     def tap_error(self) -> FloatArray:
         """Return what pyRTC leaves of the last commands in its series, (frames,)."""
         out = self.taps.copy()

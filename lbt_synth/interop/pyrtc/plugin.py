@@ -173,7 +173,7 @@ class GainFilePredictor:
         """
         history = np.asarray(pol_history, dtype=np.float64)[:, : self._own]
         hardware = require_hardware(self._design, "pyRTC")
-        if not self._found.is_whole:
+        if np.any(self._found.tap_error):
             raise ProblemError(
                 "pyRTC's series is the phase for a mirror that settles at once and a delay of "
                 f"whole frames; that of {self._gain_file} is another. Try lbt-synth auto on a "
