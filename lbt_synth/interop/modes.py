@@ -47,10 +47,7 @@ def require_exportable(design: Design, *, reads_others: bool = False) -> None:
 
 
 def require_modal(design: Design) -> int:
-    """Return the number of modes of a design whose measurements and commands are its modes.
-
-    Each measurement may have a sensor gain, which the controller counts with.
-    """
+    """Return the number of modes of a design that measures, with a gain each, and moves modes."""
     hardware = require_hardware(design, "an export of modes")
     sensor, identity = hardware.sensor, np.eye(hardware.modes)
     own = "the RTC reconstructs modes and projects them on actuators itself. Design for the modes."
@@ -72,10 +69,7 @@ def mode_designs(
     mixed: bool,
     reads_others: bool,
 ) -> tuple[list[ModeDesign], int]:
-    """Return the designs of a file, each certified, and the number of its modes.
-
-    ``modal`` requires those of modes, ``mixed`` allows several.
-    """
+    """Return the designs of a file, each certified, and the number of its modes."""
     start = getattr(design, "start", None)  # of a stack of designs
     design = cast("Design | MixedController", design if start is None else start())
     if hardware is not None and getattr(design, "hardware", None) is not None:

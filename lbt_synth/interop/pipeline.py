@@ -1,9 +1,6 @@
 """The one export: a design in the form that another program loads, proved in its arithmetic.
 
-A target says how it rounds the numbers of a design, writes them, and reads them back. Everything
-else stands here: what is refused, the rehearsal beside the controller, the proof of the numbers,
-which must be those that are read from the file, its certificate. A folder of this room whose
-``export`` module has a ``TARGET`` is a target; nothing else lists them.
+A folder of this room whose ``export`` module has a ``TARGET`` is a target; nothing else lists them.
 """
 
 from __future__ import annotations
@@ -26,7 +23,7 @@ from lbt_synth.design import Check, Design
 from lbt_synth.design.modal.per_mode import name_modes
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
-from lbt_synth.interop.proof import LOSS, NOISE, POLE, Written, prove_written, require_proved
+from lbt_synth.interop.proof import LOSS, NOISE, POLE, Written, prove_written
 from lbt_synth.linear.state_space import RunningController
 from lbt_synth.loop.simulation.disturbances import Disturbance
 from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
@@ -61,45 +58,36 @@ def _join_one(numbers: Sequence[Any], parts: Sequence[ModeDesign], count: int) -
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Target:
-    """A program that runs our controllers.
-
-    Its functions hand on the *numbers* that a file holds, in a type of the target's own.
+    """A program that runs our controllers: how it rounds, writes and reads the numbers of a design.
 
     Attributes
     ----------
     arithmetic : Arithmetic
         How it computes.
-    file : str
-        What is written, in words.
+    file, hint : str
+        What is written, in words; what to try where the proof fails.
     options : mapping
         Options of :func:`export` that the target takes, each with its default.
     round : callable
-        ``round(designs, **options)`` returns the numbers of each design, in the precision of the
-        target; it refuses what the target cannot hold.
+        ``round(designs, **options)`` returns the numbers of each design, in a type of the target.
     write, read : callable
         ``write(place, whole, design, origin, gain_digest=..., **options)`` returns the content of
         each file, and ``read(files, whole)`` the numbers in it; ``whole`` has their sizes.
     computed : callable
         ``computed(design, numbers)`` returns the :class:`Written` that is proved.
     start : callable
-        ``start(numbers, limit)`` returns a twin of the program, stepped in its arithmetic. One that
-        knows the limit of a command clips its commands itself.
+        ``start(numbers, limit)`` returns a twin, which clips where the program knows the limit.
     join : callable
         ``join(numbers, parts, count)`` returns the numbers of a file of so many modes.
-    facts : callable
-        ``facts(whole, **options)`` returns what else the certificate names.
-    remark : callable
-        ``remark(design, numbers)`` returns what a user is told of these numbers, or nothing.
-    hint : str
-        What to try where the proof fails.
-    endings, beside : tuple of str
-        Endings that a file may have, and those of what goes beside it other than the certificate.
-    contents : tuple of str
-        Names of the files, where the target writes a folder.
+    facts, remark : callable
+        ``facts(whole, **options)`` returns what else the certificate names, and
+        ``remark(design, numbers)`` what a user is told, or nothing.
+    endings, beside, contents : tuple of str
+        Endings of a file, those of what goes beside it; names in a folder.
     modal : bool or None
         Whether measurements and commands must be the modes; None where it does for several designs.
-    reads_others : bool
-        Whether a design may read further sensors.
+    mixed, reads_others : bool
+        Whether a file may hold several designs, and a design read further sensors.
     """
 
     arithmetic: Arithmetic
@@ -309,13 +297,15 @@ def export(
     pairs = list(zip(parts, numbers, strict=True))
     error = max(rehearsal_error(part.design, own.start(held, np.inf)) for part, held in pairs)
     precision = settings.get("precision", own.arithmetic.precision)
-    lines = [f"{label:<11}  {comment_text(text)}" for label, text in origin]
-    files = own.write(place, whole, first, lines, gain_digest=gain_digest, **settings)
+    files = own.write(place, whole, first, origin, gain_digest=gain_digest, **settings)
     again = own.read(files, whole)
-    _require_same(again, whole)
+    if not _is_same(again, whole):
+        raise NumericalError(
+            "the file must hold the numbers that are proved; what is read from it is another.",
+            status="arithmetic",
+        )
     checks = _proved(own, pairs, error)
-    require_proved(checks, f"the arithmetic of {target} ({precision} precision)", own.hint)
-    _require_finite(error, precision, own.hint)
+    _require_proved(target, precision, checks, error, own.hint)
     remarks = [own.remark(part.design, held) for part, held in pairs]
     notes = list(dict.fromkeys(filter(None, remarks)))
     if own.contents:
@@ -332,24 +322,22 @@ def export(
     )
 
 
-def _require_finite(error: float, precision: str, hint: str) -> None:
-    """Refuse commands that grow beyond all numbers of a precision."""
-    if not np.isfinite(error):
-        raise NumericalError(
-            f"the commands must stay finite in {precision} precision; they grew beyond all "
-            f"numbers within {FRAMES} frames. {hint}",
-            status="arithmetic",
-            residual=error,
-        )
-
-
-def _require_same(read: Any, written: Any) -> None:
-    """Refuse a file that holds other numbers than those that are proved."""
-    if not _is_same(read, written):
-        raise NumericalError(
-            "the file must hold the numbers that are proved; what is read from it is another.",
-            status="arithmetic",
-        )
+def _require_proved(
+    target: str, precision: str, checks: Sequence[Check], error: float, hint: str
+) -> None:
+    """Refuse what fails in the arithmetic of a target, with its value and what to try instead."""
+    failed = next((check for check in checks if not check.passed), None)
+    if failed is None and np.isfinite(error):
+        return
+    what, value = f"the commands grow beyond all numbers within {FRAMES} frames", error
+    if failed is not None:
+        what, value = f"{failed.name} is {failed.value:.6g}, limit {failed.limit:.6g}", failed.value
+    raise NumericalError(
+        f"the loop must keep what its design promises in the arithmetic of {target} ({precision} "
+        f"precision); {what}. {hint}",
+        status="arithmetic",
+        residual=value,
+    )
 
 
 def _is_same(one: Any, other: Any) -> bool:
@@ -388,10 +376,8 @@ def _proved(
 def rehearsal_error(design: Design, other: Any) -> float:
     """Largest difference of commands from the controller's, over the largest command.
 
-    Both close the loop of the design around the same disturbance (a process of the first
-    order) and noise; a controller alone may be unstable, so only its loop can be compared.
-    A design without a loop is fed white noise. One of several sensors is stable by itself: it gets
-    the readings and the commands of its loop, in which each sensor is missing for a while.
+    Both close the loop of the design around the same disturbance; without a loop they get noise.
+    One of several sensors gets the readings and commands of its loop, each missing for a while.
     """
     with np.errstate(all="ignore"):  # what overflows is found to be infinite
         expected, readings = _own_commands(design)
@@ -470,7 +456,7 @@ def _rehearse_sensors(
     return commands
 
 
-def _provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str, str]]:
+def _provenance_lines(design: Design, gain_digest: str | None) -> list[str]:
     """Return labelled lines on a file: version, method, gain file, loop, units, certificate."""
     if gain_digest is not None and not _DIGEST.fullmatch(str(gain_digest)):
         raise ProblemError(
@@ -497,7 +483,7 @@ def _provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str
     checks = design.certificate.checks
     lines.append(("certificate", f"{len(checks)} checks passed"))
     lines += [("", f"{c.name}: {c.value:.6g} (limit {c.limit:.6g})") for c in checks]
-    return lines
+    return [f"{label:<11}  {comment_text(text)}" for label, text in lines]
 
 
 def comment_text(text: str) -> str:

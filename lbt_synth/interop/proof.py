@@ -1,7 +1,6 @@
 """Proof of a controller as another program computes it: the loop closed around what is written.
 
-Rounded coefficients are put back into the loop exactly. The rounding of the arithmetic is white
-noise that enters with the command; its variance bounds that of the target's order of sums.
+The rounding of its sums is white noise that enters with the command.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from lbt_synth.design.shaping.uncertainty import (
     MirrorUncertainty,
     MovingSensorGain,
 )
-from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
@@ -77,8 +76,7 @@ def sums_variance(
 ) -> Callable[[float, FloatArray, FloatArray], FloatArray]:
     """Return the variance of the rounding of each row's products and partial sums, left to right.
 
-    The columns of ``whole`` (r, c) belong to signals of the controller's state, then to commands,
-    then to measurements. A term that is zero rounds nothing.
+    The columns of ``whole`` (r, c) belong to signals of the state, to commands, to measurements.
     """
 
     def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
@@ -102,23 +100,8 @@ def command_as_state(textbook: StateSpace) -> Controller:
     )
 
 
-def require_proved(checks: tuple[Check, ...], arithmetic: str, hint: str) -> None:
-    """Refuse an export with the first check that fails, its value, and what to try instead."""
-    for check in checks:
-        if not check.passed:
-            raise NumericalError(
-                f"the loop must keep what its design promises in {arithmetic}; {check.name} is "
-                f"{check.value:.6g}, limit {check.limit:.6g}. {hint}",
-                status="arithmetic",
-                residual=check.value,
-            )
-
-
 def prove_written(design: Design, written: Written) -> tuple[Check, ...]:
-    """Check the loop around a controller as it is written, against that of its design.
-
-    A design without a loop has no checks of one.
-    """
+    """Check the loop around a controller as it is written; without a loop there is none."""
     if design.hardware is None:
         return written.checks
     prove = _prove_sensors if len(written.controllers) > 1 else _prove_loop
@@ -153,11 +136,7 @@ def _prove_sensors(design: Design, hardware: LoopHardware, written: Written) -> 
 
 
 def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> list[Check]:
-    """Check the loop of one sensor over the sensor gains of its design.
-
-    It is stable; residual, arithmetic included, and modulus margin are within 1 % of the design's,
-    and so is each demand on a shaped design of its limit.
-    """
+    """Check stability, residual, modulus margin and demands of a loop over its sensor gains."""
     (controller,) = written.controllers.values()
     low, high = proved_gains(design, hardware)
     count = 2 + int(np.log(high / low) / np.log(_STEP))

@@ -1,8 +1,4 @@
-"""The target C: source and header in C99, rendered from the templates in this folder.
-
-The source needs no library, allocates nothing, and has no state of its own: it is passed in.
-Coefficients are exact, as hexadecimal numbers.
-"""
+"""The target C: C99 source and header, from the templates in this folder, without a library."""
 
 from __future__ import annotations
 

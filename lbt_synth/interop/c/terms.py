@@ -1,9 +1,7 @@
-"""The terms of exported C source: made of a design, counted, stepped, proved, read from its text.
+"""The terms of exported C source: made of a design, stepped, proved, read from its text.
 
-In each frame the source predicts from its state and from the commands that were applied, and
-corrects by what each new reading differs from its prediction. A controller of one sensor is the
-case of one phase, in which every reading is new: its matrix B is the gain of the readings, whose
-prediction is none.
+A frame predicts from the state and the commands that were applied, and corrects by what is new. A
+controller of one sensor is the case of one phase in which every reading is new and predicted as 0.
 """
 
 from __future__ import annotations
@@ -177,10 +175,7 @@ class RunningSource:
         fresh: Mapping[str, bool] | None = None,
         applied: ArrayLike | None = None,
     ) -> FloatArray:
-        """Take y(k), what is new and the commands u(k-1) that were applied; return u(k).
-
-        By default all that is due is new, and its own commands were applied.
-        """
+        """Take y(k), what is new (all), and the applied u(k-1) (its own); return u(k)."""
         rows, read = self._terms.rows, self._terms.read[self._phase]
         due = frozenset(unit for unit, own in rows.items() if read[own.start])
         new = frozenset(
@@ -241,11 +236,7 @@ def join(numbers: Sequence[SourceTerms], parts: Sequence[ModeDesign], count: int
 
 
 def as_computed(design: Design, terms: SourceTerms) -> Written:
-    """Return the controllers that a source makes, and the rounding of one of one sensor.
-
-    The estimator form must be stable by itself. A rounded command is applied, and known to the
-    next frame: the last commands are further states.
-    """
+    """Return the controllers that a source makes, and the rounding of one of one sensor."""
     (s, _, m), K = terms.sizes, terms.gains[NONE]
     still = terms.transition[:, :, :s].copy()
     still[:, : K.shape[1]] += K @ terms.innovation[:, :, :s]

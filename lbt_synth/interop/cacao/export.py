@@ -1,12 +1,10 @@
 """The target cacao: a controller as a filter of the pseudo-open-loop history, cut after some steps.
 
-In a loop of sensor gain 1, the command is a stable filter Q of the pseudo-open-loop measurement,
-whatever the controller (:func:`lbt_synth.loop.youla_controller`), and every stable Q keeps that
-loop stable. Where the sensor has the gains G, a diagonal matrix that a design knows of or does not,
-the commands are ``Q w / D`` with ``D = 1 - (1 - G) L Q`` and the path L of norm 1. Without a part E
-of Q they change by ``E w / D D'``, where ``D' = D + (1 - G) L E``: no more than a small gain,
-``|1 - G| |E / D| < 1``, allows. D changes by no more than ``|G' - G| |Q|`` from one gain to the
-next, which bounds ``1 / |1 / D|`` between two gains.
+At sensor gain 1 the command is a stable filter Q of the pseudo-open-loop measurement. At the gains
+G, a diagonal matrix, the commands are ``Q w / D`` with ``D = 1 - (1 - G) L Q`` and the path L of
+norm 1. Without a part E of Q they change by ``E w / D D'``, where ``D' = D + (1 - G) L E``: a small
+gain ``|1 - G| |E / D| < 1`` keeps the loop stable. D changes by at most ``|G' - G| |Q|`` between
+two gains, which bounds ``1 / |1 / D|`` there.
 """
 
 from __future__ import annotations
@@ -93,10 +91,7 @@ class AppliedFilter:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PredictiveFilter:
-    """The filter from the pseudo-open-loop measurements to the commands of a design.
-
-    Where it is cut after some steps, ``norm`` bounds what it lacks.
-    """
+    """The filter Q of a design; ``norm`` bounds the part E that it lacks once it is cut."""
 
     design: Design
     hardware: LoopHardware
@@ -135,10 +130,7 @@ class PredictiveFilter:
         return proved_gains(self.design, self.hardware)
 
     def least_distance(self, enough: float) -> float:
-        """Return a lower bound on ``1 / |1 - G| |1 / D|`` over the interval.
-
-        Where one is found that is not above ``enough``, it is returned.
-        """
+        """Bound ``1 / |1 - G| |1 / D|`` over the interval, or return one not above enough."""
         steepness = float(np.max(self.hardware.sensor)) * float(hinf_norm(self.system))
         low, high = self.interval
         intervals, least = [(low, high)], float("inf")
@@ -162,10 +154,7 @@ class PredictiveFilter:
 
     @cached_property
     def sizes_nm(self) -> dict[float, tuple[float, float]]:
-        """The rms of the pseudo-open loop, all modes, and that of the least residual of a mode.
-
-        At each sensor gain of the proof.
-        """
+        """The rms of the pseudo-open loop and the least residual of a mode, by sensor gain."""
         every, sizes = slice(self.hardware.modes), {}
         for gain in scenario_gains(self.design):
             if self.interval[0] <= gain <= self.interval[1]:
@@ -232,10 +221,7 @@ class PredictiveFilter:
         return self._peak(gain, norm) * norm * self.sizes_nm[gain][0]
 
     def as_computed(self, taps: FloatArray) -> Written:
-        """Return the filter of the design as a controller, and the rounding of the taps' sums.
-
-        Products are added in any order.
-        """
+        """Return the filter as a controller, and the rounding of sums of its taps in any order."""
         m, n = self.hardware.modes, self.system.n_states
         parameter = command_as_state(self.system)
         controller = youla_controller(replace(self.hardware, sensor_matrix=None), parameter)

@@ -1,7 +1,6 @@
 """The target dao: the matrix that Durham's dao real-time computers load, one column per mode.
 
-Per mode ``u(k) = b_0 y(k) + .. + b_M y(k-M) + a_1 u(k-1) + .. + a_M u(k-M)`` in single precision;
-rows ``0 .. M`` of a matrix (2 M + 1, modes) are b, rows ``M+1 .. 2M`` are a.
+Per mode ``u(k) = b_0 y(k) + .. + b_M y(k-M) + a_1 u(k-1) + .. + a_M u(k-M)``, in rows b, then a.
 """
 
 from __future__ import annotations
@@ -49,11 +48,7 @@ def direct_form_rows(controller: Controller, order: int) -> FloatArray:
 
 
 def mode_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArray]]:
-    """Return numerator and denominator (k,) of each mode in powers of ``z^-1``.
-
-    States that a mode does not drive, or does not show in its command, are left out. Denominators
-    begin with 1.
-    """
+    """Return numerator and denominator (k,) of each mode in the powers of ``z^-1`` it needs."""
     system, size = controller.to_statespace().balanced(), controller.n_states
     m, q = system.D.shape
     if m != q:
@@ -103,11 +98,7 @@ def direct_form(rows: FloatArray, dt_s: float) -> Controller:
 
 
 class InnerLoop:
-    """Per mode, ``u(k) = sum b_j y(k-j) + sum a_i u(k-i)``, in single precision.
-
-    The products are added one by one, in the order of the matrix's rows. A command beyond the limit
-    is clipped, and the memory holds the commands that were applied.
-    """
+    """The sums of a frame in single precision, product by product, clipped at the limit."""
 
     def __init__(self, matrix: ArrayLike, limit: float = np.inf) -> None:
         self._rows = np.asarray(matrix, dtype=np.float32)

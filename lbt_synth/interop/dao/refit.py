@@ -1,10 +1,8 @@
 """A controller made again for single precision, in direct form: all its coefficients, rounded.
 
-Poles close to z = 1 make both polynomials nearly vanish there, so an error of one coefficient, or
-the rounding of a sum, moves the loop by much. A factor common to both, with roots far from z = 1,
-makes them larger. From there the coefficients move until what the loop leaves, rounding included,
-is least: a nonlinear least-squares problem. Last they are rounded one by one; after each, the
-others are solved again.
+Poles close to z = 1 make both polynomials nearly vanish there, so that each rounding moves the loop
+by much. A common factor with roots far from there makes them larger; from it the coefficients move
+until what the loop leaves, rounding included, is least. Last they are rounded one by one.
 """
 
 from __future__ import annotations
@@ -45,9 +43,8 @@ _ORDERS = 100  # in which the coefficients are rounded; the best one counts
 class DirectFormLoop:
     """One mode, whose controller is ``c = (b_0 .. b_M, a_1 .. a_M)``, in S scenarios.
 
-    With the path of the loop L (sensor gain, delay and mirror) and the polynomials in ``z^-1``
-    ``b = sum b_j z^-j`` and ``a = 1 - sum a_i z^-i``, the loop at the sensor gain g has the
-    polynomial ``p = a + g L b``; it leaves ``a / p`` of the phase and ``L b / p`` of the noise.
+    With the path L and ``b = sum b_j z^-j``, ``a = 1 - sum a_i z^-i``, ``p = a + g L b`` at the
+    sensor gain g, the loop leaves ``a / p`` of the phase and ``L b / p`` of the noise.
     """
 
     powers: ComplexArray  # (F, M + 1), z^-j at each node
@@ -88,11 +85,7 @@ class DirectFormLoop:
         return np.sqrt(variances)
 
     def rounding_matrix(self, c: FloatArray, s: int) -> FloatArray:
-        """Return the matrix V with which ``c' V c`` is the variance of the sums' rounding [nm^2].
-
-        Each product and each partial sum is rounded. Their sizes are those of the measurements and
-        commands that the loop around c remembers.
-        """
+        """Return V: ``c' V c`` is the variance of the rounding of products and sums [nm^2]."""
         gain = self.gains[s]
         a, b, p = self.polynomials(c, gain)
         memory = np.hstack([self.powers * (a / p)[:, None], self.powers[:, 1:] * (b / p)[:, None]])
@@ -105,10 +98,7 @@ class DirectFormLoop:
         return variance
 
     def sums_nm2(self, c: FloatArray, sensor_gain: float) -> float:
-        """Return the variance of the rounding of the sums at a sensor gain of a scenario.
-
-        It is in units of the measurements, which the sensor gain of the path divides.
-        """
+        """Return the variance of the sums' rounding at a sensor gain, in units of measurements."""
         return float(c @ self.rounding_matrix(c, self.gains.index(sensor_gain)) @ c)
 
     def radius(self, c: FloatArray) -> float:
@@ -182,11 +172,7 @@ def mode_loop(
 
 
 def make_again(design: Design, exact: FloatArray) -> NDArray[np.float32]:
-    """Return a matrix made for this arithmetic of that of a shaped design; equal modes once.
-
-    The search takes coefficients in pairs, and begins with b_0: where there is none, or the order
-    is odd, the rounded matrix is returned.
-    """
+    """Return a shaped design's matrix made again; without b_0 or at odd order the rounded one."""
     order, rounded = len(exact) // 2, exact.astype(np.float32)
     if order % 2 or not exact[0].all():
         return rounded
@@ -213,11 +199,7 @@ def refit(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
 
 
 def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float32]:
-    """Round coefficients one by one; those that are left make up for it, where the loop sees it.
-
-    What the loop sees is the relative change of its polynomial p at the nodes. The order decides,
-    and of many at random the best one counts.
-    """
+    """Round coefficients in the best of many orders; the rest makes up for each in p."""
     of_a, of_b = loop.slopes()
     seen = np.concatenate(
         [(of_a + g * of_b) / loop.polynomials(exact, g)[2][:, None] for g in loop.bounded_gains]
@@ -304,11 +286,7 @@ def _search(
 def _rows(
     loop: DirectFormLoop, shares: FloatArray, limits: dict[float, FloatArray], theta: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the errors whose squares are minimised, and their Jacobian.
-
-    ``shares`` (S,) are the weights of a nanometre of residual, and ``limits`` (F,) those of the
-    sensitivity at each sensor gain.
-    """
+    """Return the errors, by the weights of a nanometre and limits of S, and their Jacobian."""
     c, (of_a, of_b) = _coefficients(theta), loop.slopes()
     blocks: list[tuple[FloatArray | ComplexArray, FloatArray | ComplexArray]] = []
 

@@ -1,12 +1,9 @@
 """The target pyRTC: a folder with a configuration that it starts, and all that it refers to.
 
-The gain file goes into the folder; inside pyRTC it is certified again before it runs.
-
 pyRTC measures ``residual(k) = phase - c[0] u(k-1) - c[1] u(k-2) - ..``, in units of its commands,
-and gives the predictor ``residual(k) + u(k-d)``, with the command that it *sent* d frames before.
-The filter that returns the controller's commands is the controller in its own loop: what it knows
-of the phase does not depend on its past commands, so that nothing winds up. Where the mirror's
-answer c is not a delay of d frames, the filter corrects the series by the commands that it sent.
+and gives the predictor ``residual(k) + u(k-d)``, with the command that it sent d frames before. The
+filter of that series is the controller in its own loop, and nothing winds up; where the answer c of
+the mirror is not a delay of d frames, it corrects the series by the commands that it sent.
 """
 
 from __future__ import annotations
@@ -94,11 +91,7 @@ class PolFilter:
         return out
 
     def as_computed(self) -> Written:
-        """Return the controller that pyRTC's loop computes, and what its arithmetic adds.
-
-        The states are those of the filter and the commands sent; noise enters the residual and
-        the command that is sent.
-        """
+        """Return the controller that pyRTC's loop computes, and what its arithmetic adds."""
         s, R, m, d = self.system, self.reconstructor, len(self.response), len(self.taps)
         n = s.n_states
         A = np.zeros((n + d * m, n + d * m))
@@ -129,13 +122,10 @@ class PolFilter:
 
 
 class InnerLoop:
-    """A filter as pyRTC runs it: signals and commands in single precision, the filter in double.
-
-    It starts with a flat mirror. The limit is ``predictor.command_limit`` of the configuration.
-    """
+    """A filter as pyRTC runs it from a flat mirror: signals and commands in single precision."""
 
     def __init__(self, whole: PolFilter, limit: float = np.inf) -> None:
-        self._whole, self._limit, self._tap_error = whole, limit, whole.tap_error
+        self._whole, self._limit, self.tap_error = whole, limit, whole.tap_error
         self._reconstructor = whole.reconstructor.astype(np.float32)
         self.reset()
 
@@ -143,7 +133,7 @@ class InnerLoop:
         """Forget the past."""
         self._state = np.zeros(self._whole.system.n_states)
         # commands that were sent, the last first
-        self._sent = np.zeros((len(self._tap_error), len(self._whole.response)))
+        self._sent = np.zeros((len(self.tap_error), len(self._whole.response)))
 
     def step(self, y: ArrayLike) -> FloatArray:
         """Take y(k), (m,), return u(k), (m,)."""
@@ -152,14 +142,10 @@ class InnerLoop:
         return self.step_pol(pol.astype(np.float64))
 
     def step_pol(self, pol: FloatArray, *, flat: bool = False) -> FloatArray:
-        """Take the series of pyRTC, (m,), return the command u that it sends, (m,).
-
-        Values that are not finite leave the state as it is, and repeat the last command. ``flat``
-        sends zeros.
-        """
+        """Take pyRTC's series, (m,), and send u, or zeros; repeat u for what is not finite."""
         s, u = self._whole.system, self._sent[0]
         if np.isfinite(pol).all():
-            seen = pol + self._tap_error @ self._sent
+            seen = pol + self.tap_error @ self._sent
             u = np.clip(s.C @ self._state + s.D @ seen, -self._limit, self._limit)
             self._state = s.A @ self._state + s.B @ seen
         sent = 0 * u if flat else u.astype(np.float32).astype(np.float64)

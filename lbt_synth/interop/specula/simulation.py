@@ -90,11 +90,7 @@ class EndToEndRun:
 
     @property
     def strehl_error(self) -> float:
-        """Standard error of the Strehl ratio, from eight batches of frames; nan for short runs.
-
-        It holds for this turbulence: what changes more slowly than a batch counts too little, and
-        other seeds scatter more.
-        """
+        """Standard error of the Strehl ratio in this air, of eight batches; nan for short runs."""
         batches = np.array_split(self.strehl_series, _BATCHES)
         if len(self.strehl_series) < 2 * _BATCHES:
             return float("nan")
@@ -116,9 +112,7 @@ class EndToEndRun:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the gain of the sensor in the loop, of each mode or of some together.
 
-        The regression is that of the measurements on the true residual, which does not yet contain
-        the noise of its measurement. Beside the gain are its standard error, for noise that is
-        white, and what it leaves of the measurements [nm rms per mode].
+        Beside it are its standard error for white noise, and what is left of measurements [nm rms].
         """
         axis = None if together else 0
         y, phase = self.measurements[1:, modes], self.residual_nm[:-1, modes]
@@ -187,9 +181,7 @@ def accompany_filter(
 ) -> AccompaniedFilter:
     """Return a filter of tip and tilt with the readings of its accelerometers in a run.
 
-    Its fall-back runs where it has wavefront sensors beside the pyramid. ``shaken`` has the
-    vibrations of the run, and how channels move with them; frames and seed are those of
-    :func:`run_end_to_end`, whose motions the readings follow.
+    Readings follow the motions of :func:`run_end_to_end`; the pyramid is the only wavefront sensor.
     """
     hardware = require_hardware(design, "an end-to-end simulation")
     channels = hardware.suite.channels
