@@ -53,8 +53,8 @@ class Written:
     variance : callable, optional
         From the sensor gain and the rms of measurements (q,) and commands (m,) to that of the
         noise in the sums.
-    signals : (s, n) ndarray, optional
-        Rows that read signals from the controller's state; their rms follow the measurements'.
+    signals : int, optional
+        First states of the controller whose rms follow the measurements'.
     residual_change_nm, response_change : callable, optional
         Bounds on what is left out: from the sensor gain to the change of the residual's rms [nm],
         and to that of the sensitivities.
@@ -65,7 +65,7 @@ class Written:
     controllers: Mapping[frozenset[str], Controller]
     entry: Controller | None = None
     variance: Callable[[float, FloatArray, FloatArray], FloatArray] | None = None
-    signals: FloatArray | None = None
+    signals: int = 0
     residual_change_nm: Callable[[float], float] | None = None
     response_change: Callable[[float], float] | None = None
     checks: tuple[Check, ...] = ()
@@ -201,13 +201,10 @@ def _residual_check(design: Design, hardware: LoopHardware, written: Written, ga
     return Check(f"residual at sensor gain {gain:g}, loss", loss, LOSS, how)
 
 
-def _with_signals(loop: ClosedLoop, signals: FloatArray | None) -> ClosedLoop:
-    """Append signals of the controller, whose states come first, to the outputs of a loop."""
-    if signals is None:
-        return loop
+def _with_signals(loop: ClosedLoop, count: int) -> ClosedLoop:
+    """Append the first states of a loop, which are the controller's, to its outputs."""
     s = loop.system
-    C, D = np.zeros((len(signals), s.n_states)), np.zeros((len(signals), s.D.shape[1]))
-    C[:, : signals.shape[1]] = signals
+    C, D = np.eye(count, s.n_states), np.zeros((count, s.D.shape[1]))
     return replace(loop, system=replace(s, C=np.vstack([s.C, C]), D=np.vstack([s.D, D])))
 
 

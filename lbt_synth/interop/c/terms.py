@@ -248,22 +248,23 @@ def as_computed(design: Design, terms: SourceTerms) -> Written:
     if terms.masked:
         controllers = {missing: terms.controller(missing) for missing in terms.gains}
         return Written(controllers=controllers, checks=checks)
-    controller, rows, whole = terms.controller(), np.eye(s + m), terms.whole
-    entry, signals = replace(controller, B=rows[:s], D=rows[s:]), np.eye(s)
-    if terms.applied:
-        both = np.vstack([rows[:s, :s], controller.C])
-        controller = replace(
-            controller, A=both @ whole[:s, : s + m], B=both @ whole[:s, s + m :], C=rows[s:]
-        )
-        no_feed = np.zeros((m, s + m))
-        entry = replace(controller, B=np.hstack([both, rows[:, s:]]), D=no_feed)
-        signals = rows[:s]
+    # the command is rounded, applied, and known to the next frame: it is a further state
+    controller, rows = terms.controller(), np.eye(s + m)
+    both = np.vstack([rows[:s, :s], controller.C])
+    zeros = np.zeros((m, s + m + controller.B.shape[1]))
+    controller = replace(
+        controller,
+        A=both @ terms.transition[0],
+        B=both @ K[0] + np.vstack([np.zeros_like(K[0]), controller.D]),
+        C=rows[s:],
+        D=zeros[:, s + m :],
+    )
     roundoff = ROUNDOFF["single" if terms.single else "double"]
     return Written(
         controllers={NONE: controller},
-        entry=entry,
-        variance=sums_variance(whole, s, roundoff),
-        signals=signals,
+        entry=replace(controller, B=np.hstack([both, rows[:, s:]]), D=zeros[:, : s + m]),
+        variance=sums_variance(terms.whole, s, roundoff),
+        signals=s,
         checks=checks,
     )
 
