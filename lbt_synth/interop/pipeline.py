@@ -10,7 +10,6 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import lru_cache
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -393,7 +392,6 @@ def rehearsal_error(design: Design, other: Any) -> float:
     return error if np.isfinite(error) else float("inf")
 
 
-@lru_cache(maxsize=8)
 def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
     """Return the commands of the controller itself, and the readings of several sensors."""
     if not design.other_sensors:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lbt_synth.design import Check, Design
-from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModeDesign
 from lbt_synth.interop.pipeline import Arithmetic, Target
 from lbt_synth.interop.proof import (
@@ -58,13 +58,7 @@ class AppliedFilter:
 
     def __init__(self, matrix: ArrayLike, delay_frames: float = 2.0, limit: float = np.inf) -> None:
         self._matrix = np.atleast_2d(np.asarray(matrix, dtype=np.float32))
-        modes, columns = self._matrix.shape
-        if columns % modes or not columns:
-            raise DimensionError(
-                f"the matrix must have steps * {modes} columns, a row per mode; got shape "
-                f"{self._matrix.shape}."
-            )
-        latency = np.float32(1 + number(delay_frames, "delay_frames", at_least=1))
+        latency = np.float32(1 + delay_frames)
         self._whole, self._limit = int(latency), np.float32(limit)
         self._older = np.float32(latency - self._whole)  # weight of the older of two frames
         self.reset()
@@ -185,9 +179,7 @@ class PredictiveFilter:
 
     def _is_enough(self, steps: int, loss: float) -> bool:
         norm = self.cut_norm(steps)
-        if norm > loss or self.small_gain(norm) >= 1:
-            return False
-        return all(
+        return (norm <= loss and self.small_gain(norm) < 1) and all(
             self.residual_nm(gain, norm) <= _ROOM * loss * own
             for gain, (_, own) in self.sizes_nm.items()
         )

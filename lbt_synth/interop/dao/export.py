@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
-from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.files.telemetry.time_filters import is_significant, transfer_function
 from lbt_synth.interop.dao.refit import DirectFormLoop, make_again, mode_loops
 from lbt_synth.interop.modes import ModeDesign
@@ -102,11 +102,6 @@ class InnerLoop:
 
     def __init__(self, matrix: ArrayLike, limit: float = np.inf) -> None:
         self._rows = np.asarray(matrix, dtype=np.float32)
-        if self._rows.ndim != 2 or len(self._rows) % 2 == 0:
-            raise DimensionError(
-                "the matrix must have 2 M + 1 rows and one column per mode; got shape "
-                f"{self._rows.shape}."
-            )
         self._limit, self._past = np.float32(limit), len(self._rows) // 2  # M
         self.reset()
 

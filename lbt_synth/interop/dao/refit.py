@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.signal import sos2tf, tf2sos
 
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
@@ -318,21 +319,14 @@ def _rows(
 
 def _sections(c: FloatArray) -> FloatArray:
     """Return theta: the quadratic sections of a, the factor of b, the sections of b."""
-    M, parts = c.size // 2, []
-    for polynomial in (np.r_[1.0, -c[M + 1 :]], c[: M + 1] / c[0]):
-        roots = np.roots(polynomial)
-        roots = np.concatenate([roots, np.zeros(M - roots.size)])
-        pairs, real = roots[roots.imag > 0], np.sort(roots[roots.imag == 0].real)
-        first = np.concatenate([-2 * pairs.real, -(real[::2] + real[1::2])])
-        second = np.concatenate([np.abs(pairs) ** 2, real[::2] * real[1::2]])
-        parts.append(np.stack([first, second], axis=1).ravel())
-    return np.concatenate([parts[0], c[:1], parts[1]])
+    M = c.size // 2
+    sections = tf2sos(c[: M + 1], np.r_[1.0, -c[M + 1 :]])
+    b = sections[:, 1:3] / sections[:, :1]
+    return np.concatenate([sections[:, 4:].ravel(), c[:1], b.ravel()])
 
 
 def _coefficients(theta: FloatArray) -> FloatArray:
     M = theta.size // 2
-    a, b = np.ones(1), theta[M : M + 1]
-    for k in range(0, M, 2):
-        a = np.convolve(a, [1.0, *theta[k : k + 2]])
-        b = np.convolve(b, [1.0, *theta[M + 1 + k : M + 3 + k]])
-    return np.concatenate([b, -a[1:]])
+    ones, sections_b = np.ones((M // 2, 1)), theta[M + 1 :].reshape(-1, 2)
+    b, a = sos2tf(np.hstack([ones, sections_b, ones, theta[:M].reshape(-1, 2)]))
+    return np.concatenate([theta[M] * b, -a[1:]])

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lbt_synth.design import Design, integrator
 from lbt_synth.design.result import require_hardware
-from lbt_synth.errors import GainFileError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.identification import design_from_record, loop_record
 from lbt_synth.interop.pyrtc.export import InnerLoop, pol_filter
@@ -139,11 +139,7 @@ class GainFilePredictor:
         if command_limit is not None:
             self._limit = number(command_limit, "predictor.command_limit", above=0)
         self._gain_file = gain_file
-        try:
-            design = load_gain(gain_file)
-        except GainFileError as error:
-            raise error from None  # in the log of pyRTC one sentence, without how it was found
-        self._take(design)
+        self._take(load_gain(gain_file))
 
     def _take(self, design: Design) -> None:
         """Run another design, from a state of zero."""
