@@ -103,12 +103,10 @@ def mode_designs(
             f"modes must be at least {controlled}, those of the design; got {count}."
         )
     if other_gain is not None:
-        if modes is None:
-            raise ProblemError("other_gain needs the number of modes of the RTC: give modes.")
         if count == controlled:
             raise ProblemError(
-                f"other_gain must be left out: the design has all {controlled} modes. Or give "
-                "modes, the number of those of the RTC."
+                f"other_gain needs modes, the number of those of the RTC, above the {controlled} "
+                "of the design. Give modes, or leave other_gain out."
             )
         single = require_hardware(parts[0].design, "an export of modes").single_mode()
         others = integrator(single, gain=number(other_gain, "other_gain", above=0))

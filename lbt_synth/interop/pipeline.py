@@ -50,11 +50,6 @@ class Arithmetic:
     limits: str = column("limits")
 
 
-def _join_one(numbers: Sequence[Any], parts: Sequence[ModeDesign], count: int) -> Any:
-    """Return the numbers of the only design."""
-    return numbers[0]
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Target:
     """A program that runs our controllers: how it rounds, writes and reads the numbers of a design.
@@ -97,7 +92,7 @@ class Target:
     computed: Callable[[Design, Any], Written]
     start: Callable[[Any, float], SteppedController]
     options: Mapping[str, Any] = field(default_factory=dict)
-    join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] = _join_one
+    join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] = lambda numbers, *_: numbers[0]
     facts: Callable[..., Mapping[str, Any]] = lambda _, **options: {}
     remark: Callable[[Design, Any], str] = lambda *_: ""
     hint: str

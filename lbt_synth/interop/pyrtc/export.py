@@ -189,7 +189,7 @@ def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> 
 
 def _write(
     folder: Path,
-    whole: tuple[PolFilter, ...],
+    whole: PolFilter,
     design: Design,
     origin: Sequence[str],
     *,
@@ -198,18 +198,17 @@ def _write(
     **_: Any,
 ) -> dict[Path, bytes]:
     """Return configuration, gain file, and interaction matrix as pyRTC writes it."""
-    first = whole[0]
-    count = len(first.response) if modes is None else modes
+    count = len(whole.response) if modes is None else modes
     config = _SYSTEM.format(
         origin="\n".join(f"# {line}" for line in origin),
         size=count,
         response=_RESPONSE,
         gain=_GAIN,
-        delay=first.delay_frames,
-        fit=int(_FIT_SECONDS / first.system.dt_s),
+        delay=whole.delay_frames,
+        fit=int(_FIT_SECONDS / whole.system.dt_s),
         other_gain=float(other_gain or 0.0),
     )
-    matrix = block_diag(first.response, np.eye(count - len(first.response)))
+    matrix = block_diag(whole.response, np.eye(count - len(whole.response)))
     record = {"format": 2, "kind": "interaction_matrix", "image_axes": "yx"}
     buffer = io.BytesIO()
     np.savez(buffer, data=matrix, pyrtc_calibration=np.array(json.dumps(record)))
@@ -219,16 +218,15 @@ def _write(
     return {folder / name: content for name, content in contents.items()}
 
 
-def _read(files: Mapping[Path, bytes], like: tuple[PolFilter, ...]) -> tuple[PolFilter, ...]:
+def _read(files: Mapping[Path, bytes], like: PolFilter) -> PolFilter:
     """Return the filter of the controller and of the interaction matrix in the files."""
     named = {path.name: content for path, content in files.items()}
     with open_fits(named[_GAIN]) as units:
         held = {name: np.array(units[name].data, dtype=np.float64) for name in "ABCD"}
-    m = len(like[0].response)
+    m = len(like.response)
     response = np.load(io.BytesIO(named[_RESPONSE]))["data"][:m, :m]
-    hardware = like[0].hardware
-    controller = Controller(**held, dt_s=hardware.dt_s)
-    return filter_of(hardware, controller, response), *like[1:]
+    controller = Controller(**held, dt_s=like.hardware.dt_s)
+    return filter_of(like.hardware, controller, response)
 
 
 TARGET = Target(
@@ -242,13 +240,12 @@ TARGET = Target(
     ),
     file="folder with the configuration, the gain file and their certificate",
     options={"modes": None, "other_gain": None},
-    round=lambda designs, **_: [(pol_filter(design),) for design in designs],
+    round=lambda designs, **_: [pol_filter(design) for design in designs],
     write=_write,
     read=_read,
-    computed=lambda _, filters: filters[0].as_computed(),
-    start=lambda filters, limit: InnerLoop(filters[0], limit),
-    join=lambda numbers, parts, count: tuple(filters[0] for filters in numbers),
-    facts=lambda whole, **_: {"delay_frames": whole[0].delay_frames},
+    computed=lambda _, numbers: numbers.as_computed(),
+    start=InnerLoop,
+    facts=lambda whole, **_: {"delay_frames": whole.delay_frames},
     hint="Design with less accurate models, or for lower sensor gains.",
     contents=(_CONFIG, _GAIN, _RESPONSE, _CONFIG + CERTIFICATE),
     modal=False,
