@@ -1,4 +1,4 @@
-from .c.terms import frame_cost as frame_cost
+from .c.export import frame_cost as frame_cost
 from .pipeline import Arithmetic as Arithmetic
 from .pipeline import Exported as Exported
 from .pipeline import Target as Target

@@ -47,10 +47,7 @@ def require_exportable(design: Design, *, reads_others: bool = False) -> None:
 
 
 def require_modal(design: Design) -> int:
-    """Return the number of modes of a design whose measurements and commands are its modes.
-
-    Each measurement may have a sensor gain, which the controller counts with.
-    """
+    """Return the number of modes of a design that measures, with a gain each, and moves modes."""
     hardware = require_hardware(design, "an export of modes")
     sensor, identity = hardware.sensor, np.eye(hardware.modes)
     own = "the RTC reconstructs modes and projects them on actuators itself. Design for the modes."
@@ -72,10 +69,7 @@ def mode_designs(
     mixed: bool,
     reads_others: bool,
 ) -> tuple[list[ModeDesign], int]:
-    """Return the designs of a file, each certified, and the number of its modes.
-
-    ``modal`` requires those of modes, ``mixed`` allows several.
-    """
+    """Return the designs of a file, each certified, and the number of its modes."""
     start = getattr(design, "start", None)  # of a stack of designs
     design = cast("Design | MixedController", design if start is None else start())
     if hardware is not None and getattr(design, "hardware", None) is not None:
@@ -109,12 +103,10 @@ def mode_designs(
             f"modes must be at least {controlled}, those of the design; got {count}."
         )
     if other_gain is not None:
-        if modes is None:
-            raise ProblemError("other_gain needs the number of modes of the RTC: give modes.")
         if count == controlled:
             raise ProblemError(
-                f"other_gain must be left out: the design has all {controlled} modes. Or give "
-                "modes, the number of those of the RTC."
+                f"other_gain needs modes, the number of those of the RTC, above the {controlled} "
+                "of the design. Give modes, or leave other_gain out."
             )
         single = require_hardware(parts[0].design, "an export of modes").single_mode()
         others = integrator(single, gain=number(other_gain, "other_gain", above=0))

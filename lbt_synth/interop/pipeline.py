@@ -1,9 +1,6 @@
 """The one export: a design in the form that another program loads, proved in its arithmetic.
 
-A target says how it rounds the numbers of a design, writes them, and reads them back. Everything
-else stands here: what is refused, the rehearsal beside the controller, the proof of the numbers,
-which must be those that are read from the file, its certificate. A folder of this room whose
-``export`` module has a ``TARGET`` is a target; nothing else lists them.
+A folder of this room whose ``export`` module has a ``TARGET`` is a target; nothing else lists them.
 """
 
 from __future__ import annotations
@@ -13,7 +10,6 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import lru_cache, partial
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
@@ -26,10 +22,10 @@ from lbt_synth.design import Check, Design
 from lbt_synth.design.modal.per_mode import name_modes
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
-from lbt_synth.interop.proof import Written, prove_written, require_proved
+from lbt_synth.interop.proof import LOSS, NOISE, POLE, Written, prove_written
 from lbt_synth.linear.state_space import RunningController
 from lbt_synth.loop.simulation.disturbances import Disturbance
-from lbt_synth.loop.simulation.run import Drop, SteppedController, run_frames, simulate
+from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
 from lbt_synth.storage.rows import column, json_record, table_row
@@ -40,9 +36,6 @@ FRAMES = 2000
 # without *, \ and ? no text ends a comment, splices lines or makes a trigraph
 _UNSAFE = re.compile(r"[^A-Za-z0-9 ._,:;+\-=()<>%'/\[\]|]")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-_POLE = 0.99  # of the random phase that disturbs the rehearsed loop
-_LARGEST_ERROR = 0.01  # of the largest command, where the proof knows nothing of rounded sums
-_SINGLE_SUFFICES = 1e-3  # of the largest command
 
 
 @table_row
@@ -57,52 +50,38 @@ class Arithmetic:
     limits: str = column("limits")
 
 
-def _join_one(numbers: Sequence[Any], parts: Sequence[ModeDesign], count: int) -> Any:
-    """Return the numbers of the only design."""
-    return numbers[0]
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Target:
-    """A program that runs our controllers.
-
-    Its functions hand on the *numbers* that a file holds, in a type of the target's own.
+    """A program that runs our controllers: how it rounds, writes and reads the numbers of a design.
 
     Attributes
     ----------
     arithmetic : Arithmetic
         How it computes.
-    file : str
-        What is written, in words.
+    file, hint : str
+        What is written, in words; what to try where the proof fails.
     options : mapping
         Options of :func:`export` that the target takes, each with its default.
     round : callable
-        ``round(designs, **options)`` returns the numbers of each design, in the precision of the
-        target; it refuses what the target cannot hold.
+        ``round(designs, **options)`` returns the numbers of each design, in a type of the target.
     write, read : callable
         ``write(place, whole, design, origin, gain_digest=..., **options)`` returns the content of
         each file, and ``read(files, whole)`` the numbers in it; ``whole`` has their sizes.
     computed : callable
         ``computed(design, numbers)`` returns the :class:`Written` that is proved.
     start : callable
-        ``start(numbers, limit)`` returns a twin of the program, stepped in its arithmetic. One that
-        knows the limit of a command clips its commands itself.
+        ``start(numbers, limit)`` returns a twin, which clips where the program knows the limit.
     join : callable
         ``join(numbers, parts, count)`` returns the numbers of a file of so many modes.
-    facts : callable
-        ``facts(whole, **options)`` returns what else the certificate names.
-    remark : callable
-        ``remark(design, numbers)`` returns what a user is told of these numbers, or nothing.
-    hint : str
-        What to try where the proof fails.
-    endings, beside : tuple of str
-        Endings that a file may have, and those of what goes beside it other than the certificate.
-    contents : tuple of str
-        Names of the files, where the target writes a folder.
+    facts, remark : callable
+        ``facts(whole, **options)`` returns what else the certificate names, and
+        ``remark(design, numbers)`` what a user is told, or nothing.
+    endings, beside, contents : tuple of str
+        Endings of a file, those of what goes beside it; names in a folder.
     modal : bool or None
         Whether measurements and commands must be the modes; None where it does for several designs.
-    reads_others : bool
-        Whether a design may read further sensors.
+    mixed, reads_others : bool
+        Whether a file may hold several designs, and a design read further sensors.
     """
 
     arithmetic: Arithmetic
@@ -113,7 +92,7 @@ class Target:
     computed: Callable[[Design, Any], Written]
     start: Callable[[Any, float], SteppedController]
     options: Mapping[str, Any] = field(default_factory=dict)
-    join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] = _join_one
+    join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] = lambda numbers, *_: numbers[0]
     facts: Callable[..., Mapping[str, Any]] = lambda _, **options: {}
     remark: Callable[[Design, Any], str] = lambda *_: ""
     hint: str
@@ -306,28 +285,23 @@ def export(
         reads_others=own.reads_others,
     )
     first = parts[0].design
-    origin = provenance_lines(first, gain_digest)
+    origin = _provenance_lines(first, gain_digest)
     numbers = own.round([part.design for part in parts], **settings)
     whole = own.join(numbers, parts, count)
     pairs = list(zip(parts, numbers, strict=True))
     error = max(rehearsal_error(part.design, own.start(held, np.inf)) for part, held in pairs)
     precision = settings.get("precision", own.arithmetic.precision)
-    single = settings.get("precision") == "single"
-    if single:  # in double precision the figure would depend on this machine's sums
-        origin.append(("precision", f"single: commands within {error:.1e} of the largest one"))
     files = own.write(place, whole, first, origin, gain_digest=gain_digest, **settings)
     again = own.read(files, whole)
-    _require_same(again, whole)
-    checks = _proved(own, pairs, error)
-    require_proved(checks, f"the arithmetic of {target} ({precision} precision)", own.hint)
-    _require_finite(error, precision, own.hint)
-    notes = [own.remark(part.design, held) for part, held in pairs]
-    if single and not error <= _SINGLE_SUFFICES:
-        notes.append(
-            f"in single precision commands are off by {error:.2g} of the largest one. Export with "
-            "precision double"
+    if not _is_same(again, whole):
+        raise NumericalError(
+            "the file must hold the numbers that are proved; what is read from it is another.",
+            status="arithmetic",
         )
-    notes = list(dict.fromkeys(filter(None, notes)))
+    checks = _proved(own, pairs, error)
+    _require_proved(target, precision, checks, error, own.hint)
+    remarks = [own.remark(part.design, held) for part, held in pairs]
+    notes = list(dict.fromkeys(filter(None, remarks)))
     if own.contents:
         make_directory(place, parents=False)
     settings |= {"modes": count, "notes": notes, **own.facts(whole, **settings)}
@@ -342,24 +316,22 @@ def export(
     )
 
 
-def _require_finite(error: float, precision: str, hint: str) -> None:
-    """Refuse commands that grow beyond all numbers of a precision."""
-    if not np.isfinite(error):
-        raise NumericalError(
-            f"the commands must stay finite in {precision} precision; they grew beyond all "
-            f"numbers within {FRAMES} frames. {hint}",
-            status="arithmetic",
-            residual=error,
-        )
-
-
-def _require_same(read: Any, written: Any) -> None:
-    """Refuse a file that holds other numbers than those that are proved."""
-    if not _is_same(read, written):
-        raise NumericalError(
-            "the file must hold the numbers that are proved; what is read from it is another.",
-            status="arithmetic",
-        )
+def _require_proved(
+    target: str, precision: str, checks: Sequence[Check], error: float, hint: str
+) -> None:
+    """Refuse what fails in the arithmetic of a target, with its value and what to try instead."""
+    failed = next((check for check in checks if not check.passed), None)
+    if failed is None and np.isfinite(error):
+        return
+    what, value = f"the commands grow beyond all numbers within {FRAMES} frames", error
+    if failed is not None:
+        what, value = f"{failed.name} is {failed.value:.6g}, limit {failed.limit:.6g}", failed.value
+    raise NumericalError(
+        f"the loop must keep what its design promises in the arithmetic of {target} ({precision} "
+        f"precision); {what}. {hint}",
+        status="arithmetic",
+        residual=value,
+    )
 
 
 def _is_same(one: Any, other: Any) -> bool:
@@ -387,7 +359,7 @@ def _proved(
         if part.design.other_sensors:
             how = "a run in which each sensor is missing for a while"
             name = "commands in a rehearsal, difference"
-            proof.append(Check(name, error, _LARGEST_ERROR, how))
+            proof.append(Check(name, error, LOSS, how))
         if len(part.modes) < controlled:
             modes = name_modes(np.array(part.modes))
             proof = [replace(check, name=f"{check.name} ({modes})") for check in proof]
@@ -398,10 +370,8 @@ def _proved(
 def rehearsal_error(design: Design, other: Any) -> float:
     """Largest difference of commands from the controller's, over the largest command.
 
-    Both close the loop of the design around the same disturbance (a process of the first
-    order) and noise; a controller alone may be unstable, so only its loop can be compared.
-    A design without a loop is fed white noise. One of several sensors is stable by itself: it gets
-    the readings and the commands of its loop, in which each sensor is missing for a while.
+    Both close the loop of the design around the same disturbance; without a loop they get noise.
+    One of several sensors gets the readings and commands of its loop, each missing for a while.
     """
     with np.errstate(all="ignore"):  # what overflows is found to be infinite
         expected, readings = _own_commands(design)
@@ -412,14 +382,11 @@ def rehearsal_error(design: Design, other: Any) -> float:
                 commands = _rehearse_sensors(design, other, expected, readings)
         except ProblemError:
             return float("inf")
-        size = float(np.max(np.abs(expected)))
-        error = float(np.max(np.abs(commands - expected)))
-    if not np.isfinite(error):
-        return float("inf")
-    return error / size if size > 0 else error
+        size = float(np.max(np.abs(expected))) or 1.0
+        error = float(np.max(np.abs(commands - expected))) / size
+    return error if np.isfinite(error) else float("inf")
 
 
-@lru_cache(maxsize=8)
 def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
     """Return the commands of the controller itself, and the readings of several sensors."""
     if not design.other_sensors:
@@ -457,20 +424,14 @@ def _absences(design: Design) -> tuple[dict[str, int], int]:
 def _rehearse(design: Design, controller: SteppedController | RunningController) -> FloatArray:
     """Return the commands (frames, m) of a controller that takes the place of a design's own."""
     rng = np.random.default_rng(0)
-    hardware, (m, q) = design.hardware, design.controller.D.shape
+    hardware, q = design.hardware, design.controller.D.shape[1]
     if hardware is None:
-        series, commands = rng.standard_normal((FRAMES, q)), np.empty((FRAMES, m))
-
-        def note(k: int, _: FloatArray, command: FloatArray) -> None:
-            commands[k] = command
-
-        measure = partial(np.take, series, axis=0)
-        run_frames(controller, measure, note, frames=FRAMES, shape=(m,), taps=np.ones(1))
-        return commands
+        controller.reset()
+        return np.array([controller.step(y) for y in rng.standard_normal((FRAMES, q))])
     total = rng.standard_normal((1, FRAMES, hardware.modes))
     for k in range(1, FRAMES):
-        total[0, k] = _POLE * total[0, k - 1] + np.sqrt(1 - _POLE**2) * total[0, k]
-    noise = 0.1 * rng.standard_normal((1, FRAMES, q))
+        total[0, k] = POLE * total[0, k - 1] + np.sqrt(1 - POLE**2) * total[0, k]
+    noise = NOISE * rng.standard_normal((1, FRAMES, q))
     disturbance = Disturbance(phase_nm=total, noise=noise, frame_means=True)
     return np.asarray(simulate(controller, disturbance, hardware=hardware).commands[0])
 
@@ -488,12 +449,7 @@ def _rehearse_sensors(
     return commands
 
 
-def join_labels(lines: Sequence[tuple[str, str]]) -> list[str]:
-    """Join each label and its text."""
-    return [f"{label}: {text}" if label else text for label, text in lines]
-
-
-def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str, str]]:
+def _provenance_lines(design: Design, gain_digest: str | None) -> list[str]:
     """Return labelled lines on a file: version, method, gain file, loop, units, certificate."""
     if gain_digest is not None and not _DIGEST.fullmatch(str(gain_digest)):
         raise ProblemError(
@@ -520,7 +476,7 @@ def provenance_lines(design: Design, gain_digest: str | None) -> list[tuple[str,
     checks = design.certificate.checks
     lines.append(("certificate", f"{len(checks)} checks passed"))
     lines += [("", f"{c.name}: {c.value:.6g} (limit {c.limit:.6g})") for c in checks]
-    return [(label, comment_text(text)) for label, text in lines]
+    return [f"{label:<11}  {comment_text(text)}" for label, text in lines]
 
 
 def comment_text(text: str) -> str:

@@ -1,7 +1,6 @@
 """Proof of a controller as another program computes it: the loop closed around what is written.
 
-Rounded coefficients are put back into the loop exactly. The rounding of the arithmetic is white
-noise that enters with the command; its variance bounds that of the target's order of sums.
+The rounding of its sums is white noise that enters with the command.
 """
 
 from __future__ import annotations
@@ -22,24 +21,23 @@ from lbt_synth.design.shaping.uncertainty import (
     MirrorUncertainty,
     MovingSensorGain,
 )
-from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.linear import Controller, hinf_norm
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear import Controller, StateSpace, hinf_norm
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import residual_budget
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.loop.stable_range import radii_by_gain
 from lbt_synth.models import ARModel, LoopHardware
-from lbt_synth.validation import BoolArray, FloatArray
+from lbt_synth.validation import FloatArray
 
 ROUNDOFF = {"double": 2.0**-53, "single": 2.0**-24}  # largest relative error of an operation
-_LOSS = 0.01  # of residual and of margins, relative
+LOSS = 0.01  # of residual and of margins, relative
 _SCENARIOS = (1.0, 0.7, 0.5, 0.358)  # sensor gains, where a design names none
 _STEP = 1.01  # ratio of neighbouring sensor gains
 _WIDEST = 10.0  # factor on the sensor gain, to either side
-_POLE, _NOISE = 0.99, 0.1  # of a reference disturbance of unit variance
+POLE, NOISE = 0.99, 0.1  # of a reference disturbance of unit variance
 EIGENVALUES = "eigenvalues of the monodromy, per frame"
-_ASKED = np.array([0.0031, 0.11, 0.37])  # parts of the frame rate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,8 +53,8 @@ class Written:
     variance : callable, optional
         From the sensor gain and the rms of measurements (q,) and commands (m,) to that of the
         noise in the sums.
-    signals : (s, n) ndarray, optional
-        Rows that read signals from the controller's state; their rms follow the measurements'.
+    signals : int, optional
+        First states of the controller whose rms follow the measurements'.
     residual_change_nm, response_change : callable, optional
         Bounds on what is left out: from the sensor gain to the change of the residual's rms [nm],
         and to that of the sensitivities.
@@ -67,7 +65,7 @@ class Written:
     controllers: Mapping[frozenset[str], Controller]
     entry: Controller | None = None
     variance: Callable[[float, FloatArray, FloatArray], FloatArray] | None = None
-    signals: FloatArray | None = None
+    signals: int = 0
     residual_change_nm: Callable[[float], float] | None = None
     response_change: Callable[[float], float] | None = None
     checks: tuple[Check, ...] = ()
@@ -78,8 +76,7 @@ def sums_variance(
 ) -> Callable[[float, FloatArray, FloatArray], FloatArray]:
     """Return the variance of the rounding of each row's products and partial sums, left to right.
 
-    The columns of ``whole`` (r, c) belong to signals of the controller's state, then to commands,
-    then to measurements. A term that is zero rounds nothing.
+    The columns of ``whole`` (r, c) belong to signals of the state, to commands, to measurements.
     """
 
     def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
@@ -91,23 +88,20 @@ def sums_variance(
     return variance
 
 
-def require_proved(checks: tuple[Check, ...], arithmetic: str, hint: str) -> None:
-    """Refuse an export with the first check that fails, its value, and what to try instead."""
-    for check in checks:
-        if not check.passed:
-            raise NumericalError(
-                f"the loop must keep what its design promises in {arithmetic}; {check.name} is "
-                f"{check.value:.6g}, limit {check.limit:.6g}. {hint}",
-                status="arithmetic",
-                residual=check.value,
-            )
+def command_as_state(textbook: StateSpace) -> Controller:
+    """Return the controller of a textbook form, whose command is a further state."""
+    n, (m, q) = textbook.n_states, textbook.D.shape
+    return Controller(
+        A=np.block([[textbook.A, np.zeros((n, m))], [textbook.C, np.zeros((m, m))]]),
+        B=np.vstack([textbook.B, textbook.D]),
+        C=np.eye(m, n + m, k=n),
+        D=np.zeros((m, q)),
+        dt_s=textbook.dt_s,
+    )
 
 
 def prove_written(design: Design, written: Written) -> tuple[Check, ...]:
-    """Check the loop around a controller as it is written, against that of its design.
-
-    A design without a loop has no checks of one.
-    """
+    """Check the loop around a controller as it is written; without a loop there is none."""
     if design.hardware is None:
         return written.checks
     prove = _prove_sensors if len(written.controllers) > 1 else _prove_loop
@@ -136,17 +130,13 @@ def _prove_sensors(design: Design, hardware: LoopHardware, written: Written) -> 
         name_of_loss = f"residual with {name}, loss"
         checks += [
             Check(f"spectral radius with {name}", max(radii), 1 - STABILITY_MARGIN, EIGENVALUES),
-            Check(name_of_loss, max(losses), _LOSS, "Lyapunov equations"),
+            Check(name_of_loss, max(losses), LOSS, "Lyapunov equations"),
         ]
     return checks
 
 
 def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> list[Check]:
-    """Check the loop of one sensor over the sensor gains of its design.
-
-    It is stable; residual, arithmetic included, and modulus margin are within 1 % of the design's,
-    and so is each demand on a shaped design of its limit.
-    """
+    """Check stability, residual, modulus margin and demands of a loop over its sensor gains."""
     (controller,) = written.controllers.values()
     low, high = proved_gains(design, hardware)
     count = 2 + int(np.log(high / low) / np.log(_STEP))
@@ -162,7 +152,7 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
     before, after = (hinf_norm(loop.output_sensitivity()).value for loop in (own, other))
     change = written.response_change
     after += change(1.0) if change else 0.0
-    checks.append(Check("modulus margin, loss", float(after / before) - 1, _LOSS, "level sets"))
+    checks.append(Check("modulus margin, loss", float(after / before) - 1, LOSS, "level sets"))
     return checks + _demand_checks(design, other, change)
 
 
@@ -196,15 +186,11 @@ def _residual_check(design: Design, hardware: LoopHardware, written: Written, ga
     before = mode_variances(design, loops[0], slice(n))
     change, how = written.residual_change_nm, "Lyapunov equations, level sets"
     how += ", and what is left out" if change else ""
+    outputs = mode_variances(design, _with_signals(loops[1], written.signals), slice(None))
+    sizes, after = np.sqrt(np.abs(outputs)), outputs[:n]  # below zero is the size of its rounding
     rounding_nm2 = np.zeros(n)
-    if written.variance is None or written.entry is None:
-        after = mode_variances(design, loops[1], slice(n))
-    else:
-        shown = _with_signals(loops[1], written.signals)
-        outputs = mode_variances(design, shown, slice(None))
-        sizes = np.sqrt(np.abs(outputs))  # where it is below zero, the size of its rounding
+    if written.variance is not None and written.entry is not None:
         variance = written.variance(gain, sizes[n + m :], sizes[n : n + m])
-        after = outputs[:n]
         rounding_nm2 = _rounding_left(hardware, controller, written.entry, variance, gain)
     with np.errstate(invalid="ignore"):  # not a number: no accuracy, and the check fails
         after_nm = np.sqrt(after + rounding_nm2) + (change(gain) if change else 0.0)
@@ -212,16 +198,13 @@ def _residual_check(design: Design, hardware: LoopHardware, written: Written, ga
         share = float(np.sqrt(np.max(rounding_nm2 / before)))
     if written.variance is not None:
         how += f"; rounding at most {share:.1e} of it"
-    return Check(f"residual at sensor gain {gain:g}, loss", loss, _LOSS, how)
+    return Check(f"residual at sensor gain {gain:g}, loss", loss, LOSS, how)
 
 
-def _with_signals(loop: ClosedLoop, signals: FloatArray | None) -> ClosedLoop:
-    """Append signals of the controller, whose states come first, to the outputs of a loop."""
-    if signals is None:
-        return loop
+def _with_signals(loop: ClosedLoop, count: int) -> ClosedLoop:
+    """Append the first states of a loop, which are the controller's, to its outputs."""
     s = loop.system
-    C, D = np.zeros((len(signals), s.n_states)), np.zeros((len(signals), s.D.shape[1]))
-    C[:, : signals.shape[1]] = signals
+    C, D = np.eye(count, s.n_states), np.zeros((count, s.D.shape[1]))
     return replace(loop, system=replace(s, C=np.vstack([s.C, C]), D=np.vstack([s.D, D])))
 
 
@@ -232,9 +215,9 @@ def mode_variances(design: Design, loop: ClosedLoop, rows: slice) -> FloatArray:
     n, q = loop.hardware.modes, loop.hardware.n_measurements
     if design.mode_specifications:
         return _shaped_variances(design, seen)
-    drive = np.sqrt(1 - _POLE**2)
-    slow = ARModel(coefficients=np.array([_POLE]), driving_rms_nm=drive, frame_rate_hz=rate)
-    sources, noise = [(slow, row) for row in np.eye(n)], _NOISE * np.eye(q)
+    drive = np.sqrt(1 - POLE**2)
+    slow = ARModel(coefficients=np.array([POLE]), driving_rms_nm=drive, frame_rate_hz=rate)
+    sources, noise = [(slow, row) for row in np.eye(n)], NOISE * np.eye(q)
     if design.is_estimator and (plant := design.plant) is not None:
         sources = list(zip(plant.turbulence, np.eye(n), strict=True))
         sources += [(v.ar_model(rate), np.asarray(v.direction)) for v in plant.vibrations]
@@ -262,18 +245,10 @@ def _shaped_variances(design: Design, loop: ClosedLoop) -> FloatArray:
     variances = np.zeros(len(loop.system.C))
     for mode, spec in enumerate(design.mode_specifications):
         terms = [x for x in leaves(spec.objective) if x.sensor_gain == loop.sensor_gain]
-        for row in np.flatnonzero(_reached(loop, mode)):
+        for row in range(variances.size):
             one = _mode_of(loop, mode, slice(row, row + 1))
             variances[row] += sum(term.measured_nm2(one) for term in terms)
     return variances
-
-
-def _reached(loop: ClosedLoop, mode: int) -> BoolArray:
-    """Return which outputs respond to a mode, (outputs,); most belong to another one."""
-    response = loop.system.frequency_response(_ASKED * loop.hardware.frame_rate_hz)
-    n, sensor = loop.hardware.modes, loop.hardware.sensor
-    own = np.stack([response[:, :, mode], response[:, :, n:] @ sensor[:, mode]])
-    return np.asarray(np.any(own != 0, axis=(0, 1)))
 
 
 def _rounding_left(
@@ -325,7 +300,7 @@ def _demand_checks(
             more = _demand_change(demand, change) if change else 0.0
             for check in demand.checks(mode_alone):
                 name, value = f"mode {mode + 1}: {check.name}", check.value + more
-                limit = check.limit + _LOSS * abs(check.limit)
+                limit = check.limit + LOSS * abs(check.limit)
                 checks.append(replace(check, name=name, value=value, limit=limit))
     return checks
 

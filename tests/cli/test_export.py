@@ -2,14 +2,13 @@
 
 import hashlib
 import json
-import re
 
 import numpy as np
 import pytest
 from scipy.io import loadmat
 from support.commands import run
 from support.compiled import Compiled
-from support.exports import lbt_config, lbt_designs, with_controller
+from support.exports import lbt_config, lbt_designs
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
@@ -67,26 +66,6 @@ def test_export_mat_and_dao_at_the_terminal(tmp_path, capsys, designs, gains):
     assert status == 0
     assert "difference from the controller" in text
     assert "note:" not in text
-
-
-def test_c_that_single_precision_breaks_gets_a_note(tmp_path, capsys, monkeypatch):
-    """An integrator beside large states that the command subtracts again."""
-    slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.4)
-    large = lbt.Controller(
-        A=[[1, 0, 0], [0, 0.3, 0], [0, 0, 0.3]],
-        B=[[0.4], [1e5], [1e5]],
-        C=[[1, 1, -1]],
-        D=[[0]],
-        dt_s=1 / 800,
-    )
-    gain = lbt.save_gain(tmp_path / "g.fits", slow)
-    odd = with_controller(slow, large)
-    monkeypatch.setattr("lbt_synth.cli.export.load_gain", lambda path: odd)
-    arguments = ("export", gain, "--for", "c", "-o", tmp_path / "k.c")
-    status, text, _ = run(capsys, *arguments, "--precision", "single")
-    assert status == 0
-    assert re.search(r"note: in single precision commands are off by [\d.]+ of the largest", text)
-    assert "note:" not in run(capsys, *arguments)[1]
 
 
 def test_export_pyrtc_at_the_terminal(tmp_path, capsys, gains):

@@ -21,9 +21,6 @@ def designs():
 def short_rehearsal(monkeypatch):
     """Rehearse few frames, in tests that do not look at what is found there."""
     monkeypatch.setattr(pipeline, "FRAMES", 100)
-    pipeline._own_commands.cache_clear()
-    yield
-    pipeline._own_commands.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -189,7 +189,7 @@ def test_what_makes_no_matrix_is_refused(tmp_path, designs):
     refused(bare, "must be a certified design", **loop)
     refused(designs["kalman"], "hardware must be left out", **loop)
     refused(MixedController(filter=designs["hinf"], gains=GAINS), "left out", **loop)
-    refused(designs["kalman"], "other_gain needs the number of modes", other_gain=0.3)
+    refused(designs["kalman"], "other_gain needs modes, the number", other_gain=0.3)
     refused(designs["kalman"], "above 0", other_gain=-0.3, modes=3)
     refused(MixedController(gains=[0.5]), "other_gain goes with a design", other_gain=0.3)
     assert not list(tmp_path.iterdir())

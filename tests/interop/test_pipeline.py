@@ -197,9 +197,8 @@ def louder(numbers):
         )
     if isinstance(numbers, tuple) and isinstance(numbers[0], np.ndarray):  # cacao
         return 1.2 * numbers[0], numbers[1]
-    if isinstance(numbers, tuple):  # pyrtc
-        first = numbers[0]
-        return (replace(first, response=first.response / 1.2),)
+    if hasattr(numbers, "response"):  # pyrtc
+        return replace(numbers, response=numbers.response / 1.2)
     if hasattr(numbers, "gains"):  # c
         return replace(numbers, gains={some: 1.2 * K for some, K in numbers.gains.items()})
     return replace(numbers, B=1.2 * numbers.B, D=1.2 * numbers.D)

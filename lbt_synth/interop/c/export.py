@@ -1,8 +1,4 @@
-"""The target C: source and header in C99, rendered from the templates in this folder.
-
-The source needs no library, allocates nothing, and has no state of its own: it is passed in.
-Coefficients are exact, as hexadecimal numbers.
-"""
+"""The target C: C99 source and header, from the templates in this folder, without a library."""
 
 from __future__ import annotations
 
@@ -21,14 +17,17 @@ from lbt_synth.interop.c.terms import (
     RunningSource,
     SourceTerms,
     as_computed,
+    controller_terms,
     count_gains,
-    frame_cost,
     join,
     read_source,
     source_terms,
     used_readings,
 )
 from lbt_synth.interop.pipeline import Arithmetic, Target, comment_text
+from lbt_synth.linear import Controller
+from lbt_synth.linear.held_controller import as_controller
+from lbt_synth.storage.rows import column, table_row
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, choice
 
@@ -38,6 +37,60 @@ _IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 _SOURCE = re.compile(r"[A-Za-z0-9._+-]*\.c")
 _LONGEST = 25  # C99 distinguishes identifiers by 31 characters, six of them "_reset"
 _WIDTH = 96
+
+
+@table_row
+class FrameCost:
+    """Arithmetic and memory of one frame of a controller, as exported to C."""
+
+    multiplications: int = column(
+        "multiplications per frame",
+        help="Of the exported source; factors of 1 and -1 are no multiplications",
+    )
+    additions: int = column("additions per frame", help="Of the exported source")
+    coefficients: int = column("coefficients", help="Numbers that the exported source stores")
+    states: int = column(
+        "numbers kept between frames", help="Numbers that it keeps: states and last commands"
+    )
+
+
+def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
+    """Count the arithmetic and the memory of one frame.
+
+    Parameters
+    ----------
+    design : Design or Controller
+        The controller, or a design with one.
+
+    Returns
+    -------
+    FrameCost
+        Counts for the C source that :func:`export` writes.
+
+    Raises
+    ------
+    ProblemError
+        If it is neither.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> lag = lbt.Controller(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
+    >>> cost = lbt.interop.frame_cost(lag)
+    >>> cost.multiplications, cost.additions
+    (1, 1)
+    """
+    terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
+    (s, _, m), out = terms.sizes, _written_out(terms, "")
+    sums = "".join([*out["errors"], *out["states"], *out["commands"]])
+    table = terms.gains[NONE][0].size if terms.masked else 0  # of a frame in which all is read
+    varying = len(terms.read) * len(out["varying"])
+    return FrameCost(
+        multiplications=sums.count(" * ") + table,
+        additions=sums.count(" + ") + sums.count(" - ") + table,
+        coefficients=len(out["constants"]) + varying + count_gains(terms),
+        states=s + m,
+    )
 
 
 def _round(designs: Sequence[Design], *, form: str, precision: str, **_: Any) -> list[SourceTerms]:
@@ -74,7 +127,7 @@ def _write(
     place: Path,
     terms: SourceTerms,
     _: Design,
-    origin: Sequence[tuple[str, str]],
+    origin: Sequence[str],
     *,
     name: str | None,
     gain_digest: str | None,

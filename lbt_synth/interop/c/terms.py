@@ -1,9 +1,7 @@
-"""The terms of exported C source: made of a design, counted, stepped, proved, read from its text.
+"""The terms of exported C source: made of a design, stepped, proved, read from its text.
 
-In each frame the source predicts from its state and from the commands that were applied, and
-corrects by what each new reading differs from its prediction. A controller of one sensor is the
-case of one phase, in which every reading is new: its matrix B is the gain of the readings, whose
-prediction is none.
+A frame predicts from the state and the commands that were applied, and corrects by what is new. A
+controller of one sensor is the case of one phase in which every reading is new and predicted as 0.
 """
 
 from __future__ import annotations
@@ -22,12 +20,10 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.interop.modes import ModeDesign
 from lbt_synth.interop.proof import EIGENVALUES, ROUNDOFF, Written, sums_variance
 from lbt_synth.linear import Controller, StateSpace, estimator_form
-from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import BoolArray, FloatArray
 
-_LARGEST_SINGLE = float(np.finfo(np.float32).max)
+_CONSTANT = ("transition", "innovation", "command")  # matrices that no missing sensor changes
 NONE = frozenset[str]()  # no sensor is missing
 
 
@@ -71,20 +67,16 @@ class SourceTerms:
 
     def rounded(self) -> SourceTerms:
         """Return the terms in single precision; refuse numbers that do not fit."""
-        return replace(
-            self,
-            transition=_to_single(self.transition, "transition"),
-            innovation=_to_single(self.innovation, "innovation"),
-            gains={some: _to_single(K, "gains") for some, K in self.gains.items()},
-            command=_to_single(self.command, "command"),
-            single=True,
-        )
+        matrices: dict[str, Any] = {name: _to_single(getattr(self, name)) for name in _CONSTANT}
+        gains = {some: _to_single(K) for some, K in self.gains.items()}
+        return replace(self, **matrices, gains=gains, single=True)
 
     def controller(self, missing: frozenset[str] = NONE) -> Controller:
         """Return the controller that the terms make where its own commands are applied."""
         (s, *_), K = self.sizes, np.zeros((*self.transition.shape[:2], self.read.shape[1]))
         K[:, : self.gains[missing].shape[1]] = self.gains[missing]
-        whole, (states, through) = self.transition + K @ self.innovation, _halves(self.command, s)
+        whole = self.transition + K @ self.innovation
+        states, through = np.hsplit(self.command, [s])
         return Controller(
             A=whole[:, :, :s] + whole[:, :, s:] @ states,
             B=K,
@@ -94,17 +86,12 @@ class SourceTerms:
         )
 
 
-def _halves(matrix: FloatArray, columns: int) -> tuple[FloatArray, FloatArray]:
-    """Return the first columns of a matrix, and the others."""
-    return matrix[..., :columns], matrix[..., columns:]
-
-
-def _to_single(values: FloatArray, name: str) -> FloatArray:
-    largest = float(np.max(np.abs(values), initial=0.0))
-    if largest > _LARGEST_SINGLE:
+def _to_single(values: FloatArray) -> FloatArray:
+    most, largest = float(np.finfo(np.float32).max), float(np.max(np.abs(values), initial=0.0))
+    if largest > most:
         raise ProblemError(
-            f"the coefficients must be below {_LARGEST_SINGLE:.3g} in single precision; got "
-            f"{largest:.3g} in {name}. Try double precision, or scale the states."
+            f"the coefficients must be below {most:.3g} in single precision; got {largest:.3g}. "
+            "Try double precision, or scale the states."
         )
     return values.astype(np.float32).astype(np.float64)
 
@@ -125,7 +112,7 @@ def source_terms(design: Design, *, form: str = "plain") -> SourceTerms:
 def controller_terms(controller: Controller, applied: int = 0) -> SourceTerms:
     """Return the coefficients of a controller, whose last inputs are the applied commands."""
     m, q = controller.D.shape[0], controller.D.shape[1] - applied
-    B, L = _halves(controller.B, q)
+    B, L = np.hsplit(controller.B, [q])
     L = L if applied else np.zeros((len(B), m))
     return SourceTerms(
         transition=np.hstack([controller.A, L])[None],
@@ -171,8 +158,7 @@ class RunningSource:
 
     def __init__(self, terms: SourceTerms) -> None:
         self._terms, self._dtype = terms, np.float32 if terms.single else np.float64
-        names = ("transition", "innovation", "command")
-        self._matrices = [getattr(terms, name).astype(self._dtype) for name in names]
+        self._matrices = [getattr(terms, name).astype(self._dtype) for name in _CONSTANT]
         self._gains = {some: gains.astype(self._dtype) for some, gains in terms.gains.items()}
         self.reset()
 
@@ -189,10 +175,7 @@ class RunningSource:
         fresh: Mapping[str, bool] | None = None,
         applied: ArrayLike | None = None,
     ) -> FloatArray:
-        """Take y(k), what is new and the commands u(k-1) that were applied; return u(k).
-
-        By default all that is due is new, and its own commands were applied.
-        """
+        """Take y(k), what is new (all), and the applied u(k-1) (its own); return u(k)."""
         rows, read = self._terms.rows, self._terms.read[self._phase]
         due = frozenset(unit for unit, own in rows.items() if read[own.start])
         new = frozenset(
@@ -253,11 +236,7 @@ def join(numbers: Sequence[SourceTerms], parts: Sequence[ModeDesign], count: int
 
 
 def as_computed(design: Design, terms: SourceTerms) -> Written:
-    """Return the controllers that a source makes, and the rounding of one of one sensor.
-
-    The estimator form must be stable by itself. A rounded command is applied, and known to the
-    next frame: the last commands are further states.
-    """
+    """Return the controllers that a source makes, and the rounding of one of one sensor."""
     (s, _, m), K = terms.sizes, terms.gains[NONE]
     still = terms.transition[:, :, :s].copy()
     still[:, : K.shape[1]] += K @ terms.innovation[:, :, :s]
@@ -269,22 +248,23 @@ def as_computed(design: Design, terms: SourceTerms) -> Written:
     if terms.masked:
         controllers = {missing: terms.controller(missing) for missing in terms.gains}
         return Written(controllers=controllers, checks=checks)
-    controller, rows, whole = terms.controller(), np.eye(s + m), terms.whole
-    entry, signals = replace(controller, B=rows[:s], D=rows[s:]), np.eye(s)
-    if terms.applied:
-        both = np.vstack([rows[:s, :s], controller.C])
-        controller = replace(
-            controller, A=both @ whole[:s, : s + m], B=both @ whole[:s, s + m :], C=rows[s:]
-        )
-        no_feed = np.zeros((m, s + m))
-        entry = replace(controller, B=np.hstack([both, rows[:, s:]]), D=no_feed)
-        signals = rows[:s]
+    # the command is rounded, applied, and known to the next frame: it is a further state
+    controller, rows = terms.controller(), np.eye(s + m)
+    both = np.vstack([rows[:s, :s], controller.C])
+    zeros = np.zeros((m, s + m + controller.B.shape[1]))
+    controller = replace(
+        controller,
+        A=both @ terms.transition[0],
+        B=both @ K[0] + np.vstack([np.zeros_like(K[0]), controller.D]),
+        C=rows[s:],
+        D=zeros[:, s + m :],
+    )
     roundoff = ROUNDOFF["single" if terms.single else "double"]
     return Written(
         controllers={NONE: controller},
-        entry=entry,
-        variance=sums_variance(whole, s, roundoff),
-        signals=signals,
+        entry=replace(controller, B=np.hstack([both, rows[:, s:]]), D=zeros[:, : s + m]),
+        variance=sums_variance(terms.whole, s, roundoff),
+        signals=s,
         checks=checks,
     )
 
@@ -356,71 +336,6 @@ def _read_gains(
             gains[phase][:, used] = tables["gains"][start : start + count].reshape(-1, n).T
         out[missing] = gains
     return out, read
-
-
-@table_row
-class FrameCost:
-    """Arithmetic and memory of one frame of a controller, as exported to C."""
-
-    multiplications: int = column(
-        "multiplications per frame",
-        help="Of the exported source; factors of 1 and -1 are no multiplications",
-    )
-    additions: int = column("additions per frame", help="Of the exported source")
-    coefficients: int = column("coefficients", help="Numbers that the exported source stores")
-    states: int = column(
-        "numbers kept between frames", help="Numbers that it keeps: states and last commands"
-    )
-
-
-def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
-    """Count the arithmetic and the memory of one frame.
-
-    Parameters
-    ----------
-    design : Design or Controller
-        The controller, or a design with one.
-
-    Returns
-    -------
-    FrameCost
-        Counts for the C source that :func:`export` writes.
-
-    Raises
-    ------
-    ProblemError
-        If it is neither.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lag = lbt.Controller(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
-    >>> cost = lbt.interop.frame_cost(lag)
-    >>> cost.multiplications, cost.additions
-    (1, 1)
-    """
-    terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
-    s, _, m = terms.sizes
-    sums = [terms.transition, terms.innovation, terms.command[None]]
-    table, period = 0, len(terms.read)  # gains in a table, of a frame in which all is read
-    if terms.masked:
-        table = next(iter(terms.gains.values()))[0].size
-    else:
-        sums[0] = np.concatenate([terms.transition, terms.gains[NONE]], axis=2)
-    written = multiplied = stored = 0
-    for part in sums:
-        same, there = np.all(part == part[0], axis=0), part.any(axis=0)
-        factors = there & ~(same & (np.abs(part[0]) == 1))
-        written += int(np.sum(np.maximum(there.sum(axis=1) - (part is not terms.innovation), 0)))
-        multiplied += int(np.count_nonzero(factors))
-        stored += int(np.count_nonzero(factors & same))
-        stored += period * int(np.count_nonzero(factors & ~same))
-    return FrameCost(
-        multiplications=multiplied + table,
-        additions=written + table,
-        coefficients=stored + count_gains(terms),
-        states=s + m,
-    )
 
 
 def used_readings(terms: SourceTerms, missing: frozenset[str]) -> BoolArray:

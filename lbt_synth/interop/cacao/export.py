@@ -1,17 +1,16 @@
 """The target cacao: a controller as a filter of the pseudo-open-loop history, cut after some steps.
 
-In a loop of sensor gain 1, the command is a stable filter Q of the pseudo-open-loop measurement,
-whatever the controller (:func:`lbt_synth.loop.youla_controller`), and every stable Q keeps that
-loop stable. Where the sensor has the gains G, a diagonal matrix that a design knows of or does not,
-the commands are ``Q w / D`` with ``D = 1 - (1 - G) L Q`` and the path L of norm 1. Without a part E
-of Q they change by ``E w / D D'``, where ``D' = D + (1 - G) L E``: no more than a small gain,
-``|1 - G| |E / D| < 1``, allows. D changes by no more than ``|G' - G| |Q|`` from one gain to the
-next, which bounds ``1 / |1 / D|`` between two gains.
+At sensor gain 1 the command is a stable filter Q of the pseudo-open-loop measurement. At the gains
+G, a diagonal matrix, the commands are ``Q w / D`` with ``D = 1 - (1 - G) L Q`` and the path L of
+norm 1. Without a part E of Q they change by ``E w / D D'``, where ``D' = D + (1 - G) L E``: a small
+gain ``|1 - G| |E / D| < 1`` keeps the loop stable. D changes by at most ``|G' - G| |Q|`` between
+two gains, which bounds ``1 / |1 / D|`` there.
 """
 
 from __future__ import annotations
 
 import io
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache, partial
@@ -22,17 +21,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lbt_synth.design import Check, Design
-from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModeDesign
-from lbt_synth.interop.pipeline import Arithmetic, Target, join_labels
+from lbt_synth.interop.pipeline import Arithmetic, Target
 from lbt_synth.interop.proof import (
+    LOSS,
     ROUNDOFF,
     Written,
+    command_as_state,
     mode_variances,
     proved_gains,
     scenario_gains,
 )
-from lbt_synth.linear import Controller, StateSpace, hinf_norm
+from lbt_synth.linear import StateSpace, hinf_norm
 from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import open_fits
@@ -43,7 +44,6 @@ _LONGEST = 1 << 17  # steps that are looked for
 _CLOSE = 0.5  # of the least distance that is computed: a bound on all others
 _ROOM = 0.98  # of the loss, for what is rounded
 _MOST_NUMBERS = 100_000_000  # of the matrix: 400 MB
-_MOST_LOSS = 0.01
 _SIGN = "mirror = + PFmat history; the matrix holds the controller with its sign changed"
 _Numbers = tuple[NDArray[np.float32], float]  # command, step, mode of the history; delay [frames]
 
@@ -51,26 +51,14 @@ _Numbers = tuple[NDArray[np.float32], float]  # command, step, mode of the histo
 class AppliedFilter:
     """What ``modalfilter`` and ``applyPF`` compute in a frame, in single precision.
 
-    The pseudo-open-loop value of a mode is its measurement less the command that was applied
-    ``latency`` frames ago, interpolated between two frames. The matrix multiplies the values of the
-    last frames, the newest first, all modes of a frame together; products are added one by one.
-    The mirror gets the product itself: a positive command of cacao adds to the measurement, so
-    that :meth:`step` returns its negative.
-
-    The matrix (modes, steps * modes) has a row per mode of the command. The latency of cacao's
-    index arithmetic is one frame more than the total delay. The limit is that of the modulus of a
-    command that is applied; the history holds the applied commands.
+    The matrix (modes, steps * modes) multiplies the pseudo-open-loop values of the last frames, the
+    newest first: measurements less the commands, clipped at the limit, that were applied
+    ``latency`` frames ago, which in cacao's index arithmetic is a frame more than the delay.
     """
 
     def __init__(self, matrix: ArrayLike, delay_frames: float = 2.0, limit: float = np.inf) -> None:
         self._matrix = np.atleast_2d(np.asarray(matrix, dtype=np.float32))
-        modes, columns = self._matrix.shape
-        if columns % modes or not columns:
-            raise DimensionError(
-                f"the matrix must have steps * {modes} columns, a row per mode; got shape "
-                f"{self._matrix.shape}."
-            )
-        latency = np.float32(1 + number(delay_frames, "delay_frames", at_least=1))
+        latency = np.float32(1 + delay_frames)
         self._whole, self._limit = int(latency), np.float32(limit)
         self._older = np.float32(latency - self._whole)  # weight of the older of two frames
         self.reset()
@@ -92,15 +80,12 @@ class AppliedFilter:
         u = np.clip(np.add.accumulate(products, axis=1)[:, -1], -self._limit, self._limit)
         self._applied[1:] = self._applied[:-1].copy()
         self._applied[0] = u
-        return 0.0 - u.astype(np.float64)
+        return 0.0 - u.astype(np.float64)  # a positive command of cacao adds to the measurement
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PredictiveFilter:
-    """The filter from the pseudo-open-loop measurements to the commands of a design.
-
-    Where it is cut after some steps, ``norm`` bounds what it lacks.
-    """
+    """The filter Q of a design; ``norm`` bounds the part E that it lacks once it is cut."""
 
     design: Design
     hardware: LoopHardware
@@ -139,10 +124,7 @@ class PredictiveFilter:
         return proved_gains(self.design, self.hardware)
 
     def least_distance(self, enough: float) -> float:
-        """Return a lower bound on ``1 / |1 - G| |1 / D|`` over the interval.
-
-        Where one is found that is not above ``enough``, it is returned.
-        """
+        """Bound ``1 / |1 - G| |1 / D|`` over the interval, or return one not above enough."""
         steepness = float(np.max(self.hardware.sensor)) * float(hinf_norm(self.system))
         low, high = self.interval
         intervals, least = [(low, high)], float("inf")
@@ -166,10 +148,7 @@ class PredictiveFilter:
 
     @cached_property
     def sizes_nm(self) -> dict[float, tuple[float, float]]:
-        """The rms of the pseudo-open loop, all modes, and that of the least residual of a mode.
-
-        At each sensor gain of the proof.
-        """
+        """The rms of the pseudo-open loop and the least residual of a mode, by sensor gain."""
         every, sizes = slice(self.hardware.modes), {}
         for gain in scenario_gains(self.design):
             if self.interval[0] <= gain <= self.interval[1]:
@@ -185,8 +164,8 @@ class PredictiveFilter:
 
     def fewest_steps(self, loss: float) -> int:
         """Return the steps after which what is cut off costs at most that part of the residual."""
-        high = 1
-        while not self._is_enough(high, loss):
+        enough, high = partial(self._is_enough, loss=loss), 1
+        while not enough(high):
             high *= 2
             if high > _LONGEST:
                 raise NumericalError(
@@ -196,17 +175,11 @@ class PredictiveFilter:
                     status="steps",
                     residual=_LONGEST,
                 )
-        low = high // 2
-        while high - low > 1:
-            middle = (low + high) // 2
-            low, high = (low, middle) if self._is_enough(middle, loss) else (middle, high)
-        return high
+        return bisect_left(range(high), True, lo=high // 2 + 1, key=enough)
 
     def _is_enough(self, steps: int, loss: float) -> bool:
         norm = self.cut_norm(steps)
-        if norm > loss or self.small_gain(norm) >= 1:
-            return False
-        return all(
+        return (norm <= loss and self.small_gain(norm) < 1) and all(
             self.residual_nm(gain, norm) <= _ROOM * loss * own
             for gain, (_, own) in self.sizes_nm.items()
         )
@@ -240,21 +213,10 @@ class PredictiveFilter:
         return self._peak(gain, norm) * norm * self.sizes_nm[gain][0]
 
     def as_computed(self, taps: FloatArray) -> Written:
-        """Return the filter of the design as a controller, and the rounding of the taps' sums.
-
-        Products are added in any order.
-        """
-        hardware, s = self.hardware, self.system
-        m, n = hardware.modes, s.n_states
-        # the last command is a state
-        parameter = Controller(
-            A=np.block([[s.A, np.zeros((n, m))], [s.C, np.zeros((m, m))]]),
-            B=np.vstack([s.B, s.D]),
-            C=np.eye(m, n + m, k=n),
-            D=np.zeros((m, m)),
-            dt_s=s.dt_s,
-        )
-        controller = youla_controller(replace(hardware, sensor_matrix=None), parameter)
+        """Return the filter as a controller, and the rounding of sums of its taps in any order."""
+        m, n = self.hardware.modes, self.system.n_states
+        parameter = command_as_state(self.system)
+        controller = youla_controller(replace(self.hardware, sensor_matrix=None), parameter)
         # noise in the product is part of the command; noise in the history comes as a measurement
         command = np.eye(controller.n_states, m, k=-n)
         entry = replace(controller, B=np.hstack([command, controller.B]), D=np.zeros((m, 2 * m)))
@@ -304,7 +266,7 @@ def _round(
     designs: Sequence[Design], *, steps: int | None, loss: float, **_: Any
 ) -> list[_Numbers]:
     """Return the matrix of each design, all of the same length."""
-    limit = number(loss, "loss", above=0, at_most=_MOST_LOSS)
+    limit = number(loss, "loss", above=0, at_most=LOSS)
     filters = [predictive_filter(design) for design in designs]
     if steps is None:
         count = max(2, *(whole.fewest_steps(limit) for whole in filters))
@@ -340,7 +302,7 @@ def _join(numbers: Sequence[_Numbers], parts: Sequence[ModeDesign], count: int) 
 
 
 def _write(
-    place: Path, whole: _Numbers, design: Design, origin: Sequence[tuple[str, str]], **_: Any
+    place: Path, whole: _Numbers, design: Design, origin: Sequence[str], **_: Any
 ) -> dict[Path, bytes]:
     """Return a FITS file with the matrix as its primary image, which milk loads as a stream."""
     from astropy.io import fits
@@ -350,7 +312,7 @@ def _write(
     unit.header["METHOD"] = design.method, "synthesis"
     unit.header["STEPS"] = steps, "frames of history, the newest first"
     unit.header["MODES"] = modes, "modes of a frame"
-    for line in (*join_labels(origin), _SIGN):
+    for line in (*origin, _SIGN):
         unit.header.add_comment(line)
     unit.add_checksum(when="of this unit")
     buffer = io.BytesIO()
@@ -379,7 +341,7 @@ TARGET = Target(
         limits="finite impulse response; a mirror that settles, a delay of at most 8 frames",
     ),
     file="matrix of single precision (.fits) and its certificate",
-    options={"steps": None, "loss": _MOST_LOSS, "modes": None, "other_gain": None},
+    options={"steps": None, "loss": LOSS, "modes": None, "other_gain": None},
     round=_round,
     write=_write,
     read=_read,

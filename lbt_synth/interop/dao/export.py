@@ -1,7 +1,6 @@
 """The target dao: the matrix that Durham's dao real-time computers load, one column per mode.
 
-Per mode ``u(k) = b_0 y(k) + .. + b_M y(k-M) + a_1 u(k-1) + .. + a_M u(k-M)`` in single precision;
-rows ``0 .. M`` of a matrix (2 M + 1, modes) are b, rows ``M+1 .. 2M`` are a.
+Per mode ``u(k) = b_0 y(k) + .. + b_M y(k-M) + a_1 u(k-1) + .. + a_M u(k-M)``, in rows b, then a.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ from scipy.linalg import block_diag
 
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
-from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.files.telemetry.time_filters import is_significant, transfer_function
 from lbt_synth.interop.dao.refit import DirectFormLoop, make_again, mode_loops
 from lbt_synth.interop.modes import ModeDesign
-from lbt_synth.interop.pipeline import Arithmetic, Target, join_labels
+from lbt_synth.interop.pipeline import Arithmetic, Target
 from lbt_synth.interop.proof import ROUNDOFF, Written, prove_written, sums_variance
 from lbt_synth.linear import Controller
 from lbt_synth.storage.array_file import fits_bytes, open_fits
@@ -49,11 +48,7 @@ def direct_form_rows(controller: Controller, order: int) -> FloatArray:
 
 
 def mode_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArray]]:
-    """Return numerator and denominator (k,) of each mode in powers of ``z^-1``.
-
-    States that a mode does not drive, or does not show in its command, are left out. Denominators
-    begin with 1.
-    """
+    """Return numerator and denominator (k,) of each mode in the powers of ``z^-1`` it needs."""
     system, size = controller.to_statespace().balanced(), controller.n_states
     m, q = system.D.shape
     if m != q:
@@ -103,19 +98,10 @@ def direct_form(rows: FloatArray, dt_s: float) -> Controller:
 
 
 class InnerLoop:
-    """Per mode, ``u(k) = sum b_j y(k-j) + sum a_i u(k-i)``, in single precision.
-
-    The products are added one by one, in the order of the matrix's rows. A command beyond the limit
-    is clipped, and the memory holds the commands that were applied.
-    """
+    """The sums of a frame in single precision, product by product, clipped at the limit."""
 
     def __init__(self, matrix: ArrayLike, limit: float = np.inf) -> None:
         self._rows = np.asarray(matrix, dtype=np.float32)
-        if self._rows.ndim != 2 or len(self._rows) % 2 == 0:
-            raise DimensionError(
-                "the matrix must have 2 M + 1 rows and one column per mode; got shape "
-                f"{self._rows.shape}."
-            )
         self._limit, self._past = np.float32(limit), len(self._rows) // 2  # M
         self.reset()
 
@@ -182,7 +168,7 @@ def _join(numbers: Sequence[_Matrix], parts: Sequence[ModeDesign], count: int) -
 
 
 def _write(
-    place: Path, matrix: _Matrix, design: Design, origin: Sequence[tuple[str, str]], **_: Any
+    place: Path, matrix: _Matrix, design: Design, origin: Sequence[str], **_: Any
 ) -> dict[Path, bytes]:
     """Return the matrix as FITS or as a file of numpy, by the ending."""
     if place.suffix.lower() == ".fits":
@@ -190,7 +176,7 @@ def _write(
             "METHOD": (design.method, "synthesis"),
             "ORDER": (len(matrix) // 2, "M: rows b_0..b_M, then a_1..a_M"),
         }
-        comments = [*join_labels(origin), _SIGN]
+        comments = [*origin, _SIGN]
         return {place: fits_bytes(cards, {"K_MAT": matrix}, comments=comments)}
     buffer = io.BytesIO()
     np.save(buffer, matrix, allow_pickle=False)

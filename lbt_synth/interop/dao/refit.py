@@ -1,10 +1,8 @@
 """A controller made again for single precision, in direct form: all its coefficients, rounded.
 
-Poles close to z = 1 make both polynomials nearly vanish there, so an error of one coefficient, or
-the rounding of a sum, moves the loop by much. A factor common to both, with roots far from z = 1,
-makes them larger. From there the coefficients move until what the loop leaves, rounding included,
-is least: a nonlinear least-squares problem. Last they are rounded one by one; after each, the
-others are solved again.
+Poles close to z = 1 make both polynomials nearly vanish there, so that each rounding moves the loop
+by much. A common factor with roots far from there makes them larger; from it the coefficients move
+until what the loop leaves, rounding included, is least. Last they are rounded one by one.
 """
 
 from __future__ import annotations
@@ -14,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
+from scipy.signal import sos2tf, tf2sos
 
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.design.shaping.channel import Channel, laguerre_basis
 from lbt_synth.design.shaping.objectives import ResidualVariance, leaves, spectrum_of
 from lbt_synth.design.shaping.specification import Specification
-from lbt_synth.interop.proof import ROUNDOFF, demanded_gains
+from lbt_synth.interop.proof import LOSS, ROUNDOFF, demanded_gains
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray
 
@@ -30,27 +29,23 @@ from lbt_synth.validation import ComplexArray, FloatArray
 ROUNDING = 2 / 3 * ROUNDOFF["single"] ** 2 / 3
 _RADIUS = 0.92  # of the roots that are added
 _ROOM = 2e-3  # of each limit, for what lies between the nodes
-_ENOUGH = 1.004  # times what the design leaves; 1.01 is proved
 _SEARCHES = 19  # at most, each with other weights of the scenarios
 _EVALUATIONS = 60  # of one search
 _HASTE = 12  # power of its residual with which a scenario gains weight
 _STEEP = 5.0  # weight of what exceeds a limit
-_FAR = -1.7  # a section with a larger first coefficient is far from z = 1
-_MODULUS = 0.94  # largest squared modulus of its roots, which the loop does not see
+_MODULUS = 0.94  # largest squared modulus of roots, or what the design has
 _UNSTABLE = 1e3  # each error of a loop that is
 _LINE = 0.3  # weight of a vibration's mean power; its largest is a limit
-_DAMPED = 0.5  # of the design's distance from instability, at least
 _GAINS = 25  # sensor gains at which a step must be stable
-_ORDERS = 1000  # in which the coefficients are rounded; the best one counts
+_ORDERS = 100  # in which the coefficients are rounded; the best one counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DirectFormLoop:
     """One mode, whose controller is ``c = (b_0 .. b_M, a_1 .. a_M)``, in S scenarios.
 
-    With the path of the loop L (sensor gain, delay and mirror) and the polynomials in ``z^-1``
-    ``b = sum b_j z^-j`` and ``a = 1 - sum a_i z^-i``, the loop at the sensor gain g has the
-    polynomial ``p = a + g L b``; it leaves ``a / p`` of the phase and ``L b / p`` of the noise.
+    With the path L and ``b = sum b_j z^-j``, ``a = 1 - sum a_i z^-i``, ``p = a + g L b`` at the
+    sensor gain g, the loop leaves ``a / p`` of the phase and ``L b / p`` of the noise.
     """
 
     powers: ComplexArray  # (F, M + 1), z^-j at each node
@@ -91,11 +86,7 @@ class DirectFormLoop:
         return np.sqrt(variances)
 
     def rounding_matrix(self, c: FloatArray, s: int) -> FloatArray:
-        """Return the matrix V with which ``c' V c`` is the variance of the sums' rounding [nm^2].
-
-        Each product and each partial sum is rounded. Their sizes are those of the measurements and
-        commands that the loop around c remembers.
-        """
+        """Return V: ``c' V c`` is the variance of the rounding of products and sums [nm^2]."""
         gain = self.gains[s]
         a, b, p = self.polynomials(c, gain)
         memory = np.hstack([self.powers * (a / p)[:, None], self.powers[:, 1:] * (b / p)[:, None]])
@@ -108,10 +99,7 @@ class DirectFormLoop:
         return variance
 
     def sums_nm2(self, c: FloatArray, sensor_gain: float) -> float:
-        """Return the variance of the rounding of the sums at a sensor gain of a scenario.
-
-        It is in units of the measurements, which the sensor gain of the path divides.
-        """
+        """Return the variance of the sums' rounding at a sensor gain, in units of measurements."""
         return float(c @ self.rounding_matrix(c, self.gains.index(sensor_gain)) @ c)
 
     def radius(self, c: FloatArray) -> float:
@@ -131,14 +119,15 @@ class DirectFormLoop:
 
 
 def mode_loops(design: Design, order: int) -> list[DirectFormLoop]:
-    """Return the loop of each mode of a shaped design, made once for equal ones; none of others."""
+    """Return the loop of each mode of a shaped design, the same for equal ones; none of others."""
     if not design.mode_specifications:
         return []
-    hardware, loops = require_hardware(design, "dao"), dict[tuple[int, float], DirectFormLoop]()
+    hardware = require_hardware(design, "dao")
     keys = list(zip(design.first_equal_modes, np.diag(hardware.sensor).tolist(), strict=True))
-    for mode, sensor in set(keys):
-        specification = design.mode_specifications[mode]
-        loops[mode, sensor] = mode_loop(hardware, specification, order, sensor)
+    loops = {
+        (mode, sensor): mode_loop(hardware, design.mode_specifications[mode], order, sensor)
+        for mode, sensor in set(keys)
+    }
     return [loops[key] for key in keys]
 
 
@@ -184,11 +173,7 @@ def mode_loop(
 
 
 def make_again(design: Design, exact: FloatArray) -> NDArray[np.float32]:
-    """Return a matrix made for this arithmetic of that of a shaped design; equal modes once.
-
-    The search takes coefficients in pairs, and begins with b_0: where there is none, or the order
-    is odd, the rounded matrix is returned.
-    """
+    """Return a shaped design's matrix made again; without b_0 or at odd order the rounded one."""
     order, rounded = len(exact) // 2, exact.astype(np.float32)
     if order % 2 or not exact[0].all():
         return rounded
@@ -203,12 +188,11 @@ def make_again(design: Design, exact: FloatArray) -> NDArray[np.float32]:
 def refit(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
     """Return coefficients (2 M + 1,), M even, whose loop leaves least, rounding included."""
     allowed_nm, limits = loop.residuals_nm(exact), _limits(loop, exact)
-    damped = 1 - _DAMPED * (1 - loop.radius(exact))
     theta, weights = _sections(_widened(exact)), np.ones(len(loop.gains))
     for _ in range(_SEARCHES):
-        theta = _search(loop, theta, damped, np.sqrt(weights) / allowed_nm, limits)
+        theta = _search(loop, theta, np.sqrt(weights) / allowed_nm, limits)
         lost = loop.residuals_nm(_coefficients(theta), rounding=True) / allowed_nm
-        if np.max(lost) < _ENOUGH:
+        if np.max(lost) < 1 + LOSS / 2:  # half of it for the rounded coefficients
             break
         weights *= lost**_HASTE
         weights /= np.mean(weights)
@@ -216,11 +200,7 @@ def refit(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
 
 
 def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float32]:
-    """Round coefficients one by one; those that are left make up for it, where the loop sees it.
-
-    What the loop sees is the relative change of its polynomial p at the nodes. The order decides,
-    and of many at random the best one counts.
-    """
+    """Round coefficients in the best of many orders; the rest makes up for each in p."""
     of_a, of_b = loop.slopes()
     seen = np.concatenate(
         [(of_a + g * of_b) / loop.polynomials(exact, g)[2][:, None] for g in loop.bounded_gains]
@@ -275,99 +255,78 @@ def _limits(loop: DirectFormLoop, exact: FloatArray) -> dict[float, FloatArray]:
 def _search(
     loop: DirectFormLoop,
     theta: FloatArray,
-    largest_radius: float,
     shares: FloatArray,
     limits: dict[float, FloatArray],
 ) -> FloatArray:
-    """Descend from theta; a step to a loop that is unstable at any sensor gain is not taken.
-
-    Roots far from z = 1 stay well inside the circle.
-    """
+    """Descend from theta; a step to a loop that is unstable at any sensor gain is not taken."""
     M, upper = theta.size // 2, np.full(theta.size, np.inf)
-    first = np.concatenate([np.arange(0, M, 2), np.arange(M + 1, 2 * M + 1, 2)])
-    far = first[theta[first] > _FAR] + 1
-    upper[far] = np.maximum(_MODULUS, theta[far] + _ROOM)
+    second = np.r_[1:M:2, M + 2 : 2 * M + 1 : 2]
+    upper[second] = np.maximum(_MODULUS, theta[second] + _ROOM)
 
     def errors(x: FloatArray) -> FloatArray:
-        rows = _rows(loop, shares, limits, x)[0]
-        stable = loop.radius(_coefficients(x)) < largest_radius
-        return rows if stable else np.full_like(rows, _UNSTABLE)
+        stable = loop.radius(_coefficients(x)) < 1
+        return _rows(loop, shares, limits, x)[0] + (0.0 if stable else _UNSTABLE)
 
     def slopes(x: FloatArray) -> FloatArray:
         return _rows(loop, shares, limits, x)[1]
 
-    found = least_squares(
-        errors,
-        theta,
-        jac=slopes,
-        bounds=(-np.inf, upper),
-        x_scale="jac",
-        max_nfev=_EVALUATIONS,
-        ftol=1e-5,
-        xtol=1e-12,
+    return np.asarray(
+        least_squares(
+            errors,
+            theta,
+            jac=slopes,
+            bounds=(-np.inf, upper),
+            x_scale="jac",
+            max_nfev=_EVALUATIONS,
+            ftol=1e-5,
+            xtol=1e-12,
+        ).x
     )
-    return np.asarray(found.x)
 
 
 def _rows(
     loop: DirectFormLoop, shares: FloatArray, limits: dict[float, FloatArray], theta: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the errors whose squares are minimised, and their Jacobian.
-
-    ``shares`` (S,) are the weights of a nanometre of residual, and ``limits`` (F,) those of the
-    sensitivity at each sensor gain.
-    """
+    """Return the errors, by the weights of a nanometre and limits of S, and their Jacobian."""
     c, (of_a, of_b) = _coefficients(theta), loop.slopes()
-    blocks: list[tuple[FloatArray, FloatArray]] = []
+    blocks: list[tuple[FloatArray | ComplexArray, FloatArray | ComplexArray]] = []
 
-    def small(size: ComplexArray, slope: ComplexArray) -> None:
-        blocks.extend([(size.real, slope.real), (size.imag, slope.imag)])
-
-    def below(size: FloatArray, slope: FloatArray, limit: FloatArray | float) -> None:
-        over = np.maximum(size / limit - 1 + _ROOM, 0.0)
-        blocks.append((_STEEP * over, (_STEEP * (over > 0) / limit)[:, None] * slope))
+    def below(size: FloatArray, slope: FloatArray) -> None:
+        over = np.maximum(size - 1 + _ROOM, 0.0)
+        blocks.append((_STEEP * over, _STEEP * (over > 0)[:, None] * slope))
 
     for gain, limit in limits.items():
         a, b, p = loop.polynomials(c, gain)
         S, T, dp = a / p, loop.path * b / p, of_a + gain * of_b
         dS, dT = (of_a - S[:, None] * dp) / p[:, None], (of_b - T[:, None] * dp) / p[:, None]
-        below(np.abs(S), ((S.conj() / np.abs(S))[:, None] * dS).real, limit)
-        if gain == 1 and loop.low < 1:  # the loop at g is stable while Re T is below 1 / (1 - g)
-            below(T.real, dT.real, 1 / (1 - loop.low))
-        if gain == 1 and loop.high > 1:
-            below(-T.real, -dT.real, 1 / (loop.high - 1))
+        below(np.abs(S) / limit, ((S.conj() / np.abs(S) / limit)[:, None] * dS).real)
+        for end in (loop.low, loop.high) if gain == 1 else ():
+            below((1 - end) * T.real, (1 - end) * dT.real)  # or the loop at it is unstable
         for s in (s for s, g in enumerate(loop.gains) if g == gain):
             size = shares[s] * np.sqrt(loop.phase_nm2[s] + _LINE * loop.spread_nm2[s])
-            small(size * S, size[:, None] * dS)
+            blocks.append((size * S, size[:, None] * dS))
             size = shares[s] * np.sqrt(loop.noise_nm2[s])
-            small(size * T, size[:, None] * dT)
+            blocks.append((size * T, size[:, None] * dT))
             V = loop.rounding_matrix(c, s)  # its own slopes are left out
             sums = np.sqrt(c @ V @ c)
             entry = shares[s] * np.sqrt(loop.shares) * loop.path / p
-            small(entry * sums, entry[:, None] * (V @ c / sums - sums * dp / p[:, None]))
+            blocks.append((entry * sums, entry[:, None] * (V @ c / sums - sums * dp / p[:, None])))
     # slopes in theta: each coefficient is linear in each number of theta
     moved = np.array([_coefficients(theta + unit) - c for unit in np.eye(theta.size)]).T
     errors, slopes = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-    return errors, slopes @ moved
+    return np.concatenate([errors.real, errors.imag]), np.vstack([slopes.real, slopes.imag]) @ moved
 
 
 def _sections(c: FloatArray) -> FloatArray:
     """Return theta: the quadratic sections of a, the factor of b, the sections of b."""
-    M, parts = c.size // 2, []
-    for polynomial in (np.r_[1.0, -c[M + 1 :]], c[: M + 1] / c[0]):
-        roots = np.roots(polynomial)
-        roots = np.concatenate([roots, np.zeros(M - roots.size)])
-        pairs, real = roots[roots.imag > 0], np.sort(roots[roots.imag == 0].real)
-        first = np.concatenate([-2 * pairs.real, -(real[::2] + real[1::2])])
-        second = np.concatenate([np.abs(pairs) ** 2, real[::2] * real[1::2]])
-        parts.append(np.stack([first, second], axis=1).ravel())
-    return np.concatenate([parts[0], c[:1], parts[1]])
+    M = c.size // 2
+    sections = tf2sos(c[: M + 1], np.r_[1.0, -c[M + 1 :]])
+    b = sections[:, 1:3] / sections[:, :1]
+    return np.concatenate([sections[:, 4:].ravel(), c[:1], b.ravel()])
 
 
 def _coefficients(theta: FloatArray) -> FloatArray:
     M = theta.size // 2
-    a, b = np.ones(1), theta[M : M + 1]
-    for k in range(0, M, 2):
-        a = np.convolve(a, [1.0, *theta[k : k + 2]])
-        b = np.convolve(b, [1.0, *theta[M + 1 + k : M + 3 + k]])
-    return np.concatenate([b, -a[1:]])
+    ones, sections_b = np.ones((M // 2, 1)), theta[M + 1 :].reshape(-1, 2)
+    b, a = sos2tf(np.hstack([ones, sections_b, ones, theta[:M].reshape(-1, 2)]))
+    return np.concatenate([theta[M] * b, -a[1:]])

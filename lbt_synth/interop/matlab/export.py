@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import lbt_synth
 from lbt_synth.design import Design
-from lbt_synth.interop.pipeline import Arithmetic, Target, join_labels
-from lbt_synth.interop.proof import ROUNDOFF, Written, sums_variance
-from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.interop.c.terms import RunningSource, SourceTerms, as_computed, controller_terms
+from lbt_synth.interop.pipeline import Arithmetic, Target
+from lbt_synth.interop.proof import command_as_state
+from lbt_synth.linear import StateSpace
 
 _TEXT_BYTES = 116  # of the header of a version 5 file; scipy writes the date there
 _CONVENTION = (
@@ -25,27 +23,28 @@ _CONVENTION = (
 )
 
 
-def _round(designs: Sequence[Design]) -> list[StateSpace]:
-    """Return the textbook form of a controller."""
-    return [design.controller.to_statespace() for design in designs]
+def _round(designs: Sequence[Design]) -> list[SourceTerms]:
+    """Return the sums of the textbook form of a controller."""
+    return [_textbook_terms(design.controller.to_statespace()) for design in designs]
+
+
+def _textbook_terms(textbook: StateSpace) -> SourceTerms:
+    return controller_terms(command_as_state(textbook))
 
 
 def _write(
-    place: Path,
-    textbook: StateSpace,
-    design: Design,
-    origin: Sequence[tuple[str, str]],
-    **_: Any,
+    place: Path, _: SourceTerms, design: Design, origin: Sequence[str], **__: Any
 ) -> dict[Path, bytes]:
     """Return a version 5 file without its date: the same design gives the same file."""
     from scipy.io import savemat
 
+    textbook = design.controller.to_statespace()
     content: dict[str, Any] = {
         "textbook": {name: getattr(textbook, name) for name in "ABCD"},
         "new_state": {name: getattr(design.controller, name) for name in "ABCD"},
         "dt_s": design.controller.dt_s,
         "convention": _CONVENTION,
-        "provenance": "\n".join(join_labels(origin)),
+        "provenance": "\n".join(origin),
     }
     if design.hardware is not None:
         content["frame_rate_hz"] = design.hardware.frame_rate_hz
@@ -57,39 +56,13 @@ def _write(
     return {place: header + bytes(buffer.getvalue()[_TEXT_BYTES:])}
 
 
-def _read(files: Mapping[Path, bytes], like: StateSpace) -> StateSpace:
-    """Return the textbook form that a file holds."""
+def _read(files: Mapping[Path, bytes], like: SourceTerms) -> SourceTerms:
+    """Return the sums of the textbook form that a file holds."""
     from scipy.io import loadmat
 
     buffer: Any = io.BytesIO(next(iter(files.values())))  # as for savemat
     form = loadmat(buffer)["textbook"][0, 0]
-    return replace(like, **{name: form[name] for name in "ABCD"})
-
-
-def _with_command(textbook: StateSpace) -> Controller:
-    """Return the controller of a textbook form, whose command is a further state."""
-    n, (m, q) = textbook.n_states, textbook.D.shape
-    return Controller(
-        A=np.block([[textbook.A, np.zeros((n, m))], [textbook.C, np.zeros((m, m))]]),
-        B=np.vstack([textbook.B, textbook.D]),
-        C=np.eye(m, n + m, k=n),
-        D=np.zeros((m, q)),
-        dt_s=textbook.dt_s,
-    )
-
-
-def _as_computed(_: Design, textbook: StateSpace) -> Written:
-    """Return the controller of the textbook form; its products round as sums do."""
-    controller, n = _with_command(textbook), textbook.n_states
-    rows = np.eye(controller.n_states)
-    m = len(textbook.C)
-    whole = np.hstack([controller.A[:, :n], np.zeros((n + m, m)), controller.B])
-    return Written(
-        controllers={frozenset(): controller},
-        entry=replace(controller, B=rows, D=np.zeros((m, n + m))),
-        variance=sums_variance(whole, n, ROUNDOFF["double"]),
-        signals=rows[:n],
-    )
+    return _textbook_terms(StateSpace(**{name: form[name] for name in "ABCD"}, dt_s=like.dt_s))
 
 
 TARGET = Target(
@@ -105,8 +78,8 @@ TARGET = Target(
     round=_round,
     write=_write,
     read=_read,
-    computed=_as_computed,
-    start=lambda textbook, _: _with_command(textbook).start(),
+    computed=as_computed,
+    start=lambda terms, _: RunningSource(terms),
     hint="Design with fewer states.",
     endings=(".mat",),
     modal=False,

@@ -1,12 +1,9 @@
 """The target pyRTC: a folder with a configuration that it starts, and all that it refers to.
 
-The gain file goes into the folder; inside pyRTC it is certified again before it runs.
-
 pyRTC measures ``residual(k) = phase - c[0] u(k-1) - c[1] u(k-2) - ..``, in units of its commands,
-and gives the predictor ``residual(k) + u(k-d)``, with the command that it *sent* d frames before.
-The filter that returns the controller's commands is the controller in its own loop: what it knows
-of the phase does not depend on its past commands, so that nothing winds up. Where the mirror's
-answer c is not a delay of d frames, the filter corrects the series by the commands that it sent.
+and gives the predictor ``residual(k) + u(k-d)``, with the command that it sent d frames before. The
+filter of that series is the controller in its own loop, and nothing winds up; where the answer c of
+the mirror is not a delay of d frames, it corrects the series by the commands that it sent.
 """
 
 from __future__ import annotations
@@ -27,7 +24,7 @@ from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.interop.pipeline import CERTIFICATE, Arithmetic, Target, join_labels
+from lbt_synth.interop.pipeline import CERTIFICATE, Arithmetic, Target
 from lbt_synth.interop.proof import ROUNDOFF, Written
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop import close_loop
@@ -87,11 +84,6 @@ class PolFilter:
         return np.linalg.pinv(self.response).astype(np.float32).astype(np.float64)
 
     @property
-    def is_whole(self) -> bool:
-        """Whether the series of pyRTC needs no correction."""
-        return not np.any(self.tap_error)
-
-    @property
     def tap_error(self) -> FloatArray:
         """Return what pyRTC leaves of the last commands in its series, (frames,)."""
         out = self.taps.copy()
@@ -99,11 +91,7 @@ class PolFilter:
         return out
 
     def as_computed(self) -> Written:
-        """Return the controller that pyRTC's loop computes, and what its arithmetic adds.
-
-        The states are those of the filter and the commands sent; noise enters the residual and
-        the command that is sent.
-        """
+        """Return the controller that pyRTC's loop computes, and what its arithmetic adds."""
         s, R, m, d = self.system, self.reconstructor, len(self.response), len(self.taps)
         n = s.n_states
         A = np.zeros((n + d * m, n + d * m))
@@ -134,13 +122,10 @@ class PolFilter:
 
 
 class InnerLoop:
-    """A filter as pyRTC runs it: signals and commands in single precision, the filter in double.
-
-    It starts with a flat mirror. The limit is ``predictor.command_limit`` of the configuration.
-    """
+    """A filter as pyRTC runs it from a flat mirror: signals and commands in single precision."""
 
     def __init__(self, whole: PolFilter, limit: float = np.inf) -> None:
-        self._whole, self._limit, self._tap_error = whole, limit, whole.tap_error
+        self._whole, self._limit, self.tap_error = whole, limit, whole.tap_error
         self._reconstructor = whole.reconstructor.astype(np.float32)
         self.reset()
 
@@ -148,7 +133,7 @@ class InnerLoop:
         """Forget the past."""
         self._state = np.zeros(self._whole.system.n_states)
         # commands that were sent, the last first
-        self._sent = np.zeros((len(self._tap_error), len(self._whole.response)))
+        self._sent = np.zeros((len(self.tap_error), len(self._whole.response)))
 
     def step(self, y: ArrayLike) -> FloatArray:
         """Take y(k), (m,), return u(k), (m,)."""
@@ -157,14 +142,10 @@ class InnerLoop:
         return self.step_pol(pol.astype(np.float64))
 
     def step_pol(self, pol: FloatArray, *, flat: bool = False) -> FloatArray:
-        """Take the series of pyRTC, (m,), return the command u that it sends, (m,).
-
-        Values that are not finite leave the state as it is, and repeat the last command. ``flat``
-        sends zeros.
-        """
+        """Take pyRTC's series, (m,), and send u, or zeros; repeat u for what is not finite."""
         s, u = self._whole.system, self._sent[0]
         if np.isfinite(pol).all():
-            seen = pol + self._tap_error @ self._sent
+            seen = pol + self.tap_error @ self._sent
             u = np.clip(s.C @ self._state + s.D @ seen, -self._limit, self._limit)
             self._state = s.A @ self._state + s.B @ seen
         sent = 0 * u if flat else u.astype(np.float32).astype(np.float64)
@@ -208,27 +189,26 @@ def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> 
 
 def _write(
     folder: Path,
-    whole: tuple[PolFilter, ...],
+    whole: PolFilter,
     design: Design,
-    origin: Sequence[tuple[str, str]],
+    origin: Sequence[str],
     *,
     modes: int | None,
     other_gain: float | None,
     **_: Any,
 ) -> dict[Path, bytes]:
     """Return configuration, gain file, and interaction matrix as pyRTC writes it."""
-    first = whole[0]
-    count = len(first.response) if modes is None else modes
+    count = len(whole.response) if modes is None else modes
     config = _SYSTEM.format(
-        origin="\n".join(f"# {line}" for line in join_labels(origin)),
+        origin="\n".join(f"# {line}" for line in origin),
         size=count,
         response=_RESPONSE,
         gain=_GAIN,
-        delay=first.delay_frames,
-        fit=int(_FIT_SECONDS / first.system.dt_s),
+        delay=whole.delay_frames,
+        fit=int(_FIT_SECONDS / whole.system.dt_s),
         other_gain=float(other_gain or 0.0),
     )
-    matrix = block_diag(first.response, np.eye(count - len(first.response)))
+    matrix = block_diag(whole.response, np.eye(count - len(whole.response)))
     record = {"format": 2, "kind": "interaction_matrix", "image_axes": "yx"}
     buffer = io.BytesIO()
     np.savez(buffer, data=matrix, pyrtc_calibration=np.array(json.dumps(record)))
@@ -238,16 +218,15 @@ def _write(
     return {folder / name: content for name, content in contents.items()}
 
 
-def _read(files: Mapping[Path, bytes], like: tuple[PolFilter, ...]) -> tuple[PolFilter, ...]:
+def _read(files: Mapping[Path, bytes], like: PolFilter) -> PolFilter:
     """Return the filter of the controller and of the interaction matrix in the files."""
     named = {path.name: content for path, content in files.items()}
     with open_fits(named[_GAIN]) as units:
         held = {name: np.array(units[name].data, dtype=np.float64) for name in "ABCD"}
-    m = len(like[0].response)
+    m = len(like.response)
     response = np.load(io.BytesIO(named[_RESPONSE]))["data"][:m, :m]
-    hardware = like[0].hardware
-    controller = Controller(**held, dt_s=hardware.dt_s)
-    return filter_of(hardware, controller, response), *like[1:]
+    controller = Controller(**held, dt_s=like.hardware.dt_s)
+    return filter_of(like.hardware, controller, response)
 
 
 TARGET = Target(
@@ -261,13 +240,12 @@ TARGET = Target(
     ),
     file="folder with the configuration, the gain file and their certificate",
     options={"modes": None, "other_gain": None},
-    round=lambda designs, **_: [(pol_filter(design),) for design in designs],
+    round=lambda designs, **_: [pol_filter(design) for design in designs],
     write=_write,
     read=_read,
-    computed=lambda _, filters: filters[0].as_computed(),
-    start=lambda filters, limit: InnerLoop(filters[0], limit),
-    join=lambda numbers, parts, count: tuple(filters[0] for filters in numbers),
-    facts=lambda whole, **_: {"delay_frames": whole[0].delay_frames},
+    computed=lambda _, numbers: numbers.as_computed(),
+    start=InnerLoop,
+    facts=lambda whole, **_: {"delay_frames": whole.delay_frames},
     hint="Design with less accurate models, or for lower sensor gains.",
     contents=(_CONFIG, _GAIN, _RESPONSE, _CONFIG + CERTIFICATE),
     modal=False,

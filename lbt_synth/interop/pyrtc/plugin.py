@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lbt_synth.design import Design, integrator
 from lbt_synth.design.result import require_hardware
-from lbt_synth.errors import GainFileError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.identification import design_from_record, loop_record
 from lbt_synth.interop.pyrtc.export import InnerLoop, pol_filter
@@ -139,21 +139,17 @@ class GainFilePredictor:
         if command_limit is not None:
             self._limit = number(command_limit, "predictor.command_limit", above=0)
         self._gain_file = gain_file
-        try:
-            design = load_gain(gain_file)
-        except GainFileError as error:
-            raise error from None  # in the log of pyRTC one sentence, without how it was found
-        self._take(design)
+        self._take(load_gain(gain_file))
 
     def _take(self, design: Design) -> None:
         """Run another design, from a state of zero."""
-        found = pol_filter(design)
-        if found.delay_frames != self.horizon:
+        series = pol_filter(design)
+        if series.delay_frames != self.horizon:
             raise ProblemError(
-                f"predictor.delay_frames must be {found.delay_frames}, that of {self._gain_file}; "
+                f"predictor.delay_frames must be {series.delay_frames}, that of {self._gain_file}; "
                 f"got {self.horizon}. Design for the delay of this loop."
             )
-        self._own = len(found.response)
+        self._own = len(series.response)
         if self._own > self.num_modes:
             raise ProblemError(
                 f"the loop must control at least the {self._own} modes of {self._gain_file}; got "
@@ -162,8 +158,7 @@ class GainFilePredictor:
         if self._other_gain > 0:  # refused where its loop is unstable
             hardware = require_hardware(design, "pyRTC")
             integrator(hardware.single_mode(), gain=self._other_gain)
-        self._design, self._found = design, found
-        self._filter = InnerLoop(found, self._limit)
+        self._design, self._filter = design, InnerLoop(series, self._limit)
         self.reset()
 
     def fit(self, pol_history: ArrayLike) -> GainFilePredictor:
@@ -173,7 +168,7 @@ class GainFilePredictor:
         """
         history = np.asarray(pol_history, dtype=np.float64)[:, : self._own]
         hardware = require_hardware(self._design, "pyRTC")
-        if not self._found.is_whole:
+        if np.any(self._filter.tap_error):
             raise ProblemError(
                 "pyRTC's series is the phase for a mirror that settles at once and a delay of "
                 f"whole frames; that of {self._gain_file} is another. Try lbt-synth auto on a "

@@ -1,9 +1,4 @@
-"""A system and its optics, simulated by SPECULA: air, pupil, mirror, pyramid, detector, camera.
-
-The only module that imports SPECULA (Istituto Nazionale di Astrofisica, MIT licence). Its
-objects are triggered one frame at a time; the controller, the delay and the bookkeeping of
-modes are ours.
-"""
+"""A system and its optics, simulated by SPECULA (MIT licence): the only module that imports it."""
 
 from __future__ import annotations
 
@@ -149,11 +144,7 @@ class EndToEndSystem:
         return float(self.seeing_arcsec * (self.seeing_wavelength_um / _REFERENCE_UM) ** 0.2)
 
     def screen_pixels(self, frames: int) -> int:
-        """Return the side of a square phase screen that does not repeat within some frames.
-
-        It is a power of two, and at least six outer scales, because the screen is periodic and
-        holds nothing slower.
-        """
+        """Return the side of a periodic screen, a power of two, that does not repeat."""
         travelled = frames / self.frame_rate_hz * self.wind_speed_m_s
         length = max(travelled + 2 * self.diameter_m, 6 * self.outer_scale_m)
         return int(2 ** math.ceil(math.log2(length / self.pixel_m)))
@@ -264,8 +255,7 @@ def _discard_damaged(files: Iterable[Path]) -> None:
 class Optics:
     """One optical train, exposed frame after frame.
 
-    ``screens`` is the directory of the phase screens, None for no turbulence; their size
-    depends on the ``frames`` that will be exposed. Without a seed the detector has no noise.
+    Without ``screens``, a directory, there is no turbulence, and without a seed no noise.
     """
 
     def __init__(

@@ -48,20 +48,14 @@ class EndToEndRun:
     ----------
     system : EndToEndSystem
         What was simulated.
-    strehl_series : (frames,) ndarray
-        Intensity in the image's centre over that of a perfect image, frame by frame.
-    other_modes_series : (frames,) ndarray
-        The same for the phase without tip and tilt.
+    strehl_series, other_modes_series : (frames,) ndarray
+        Intensity in the image's centre over that of a perfect image; without tip and tilt.
     measurements, commands, residual_nm : (frames, modes) ndarray
         Modal coefficients [nm rms].
-    psf : (h, h) ndarray
-        Mean image, of sum 1.
-    psf_pixel_mas : float
-        Its pixel [mas].
-    seed : int
-        Seed of turbulence, vibrations and noise.
-    settle_frames : int
-        Frames run before these, and dropped.
+    psf, psf_pixel_mas : (h, h) ndarray, float
+        Mean image, of sum 1, and its pixel [mas].
+    seed, settle_frames : int
+        Seed of turbulence, vibrations and noise; frames run before these, and dropped.
     seconds : float
         Time that the loop took [s].
     """
@@ -90,11 +84,7 @@ class EndToEndRun:
 
     @property
     def strehl_error(self) -> float:
-        """Standard error of the Strehl ratio, from eight batches of frames; nan for short runs.
-
-        It holds for this turbulence: what changes more slowly than a batch counts too little, and
-        other seeds scatter more.
-        """
+        """Standard error of the Strehl ratio in this air, of eight batches; nan for short runs."""
         batches = np.array_split(self.strehl_series, _BATCHES)
         if len(self.strehl_series) < 2 * _BATCHES:
             return float("nan")
@@ -116,9 +106,7 @@ class EndToEndRun:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the gain of the sensor in the loop, of each mode or of some together.
 
-        The regression is that of the measurements on the true residual, which does not yet contain
-        the noise of its measurement. Beside the gain are its standard error, for noise that is
-        white, and what it leaves of the measurements [nm rms per mode].
+        Beside it are its standard error for white noise, and what is left of measurements [nm rms].
         """
         axis = None if together else 0
         y, phase = self.measurements[1:, modes], self.residual_nm[:-1, modes]
@@ -187,9 +175,7 @@ def accompany_filter(
 ) -> AccompaniedFilter:
     """Return a filter of tip and tilt with the readings of its accelerometers in a run.
 
-    Its fall-back runs where it has wavefront sensors beside the pyramid. ``shaken`` has the
-    vibrations of the run, and how channels move with them; frames and seed are those of
-    :func:`run_end_to_end`, whose motions the readings follow.
+    Readings follow the motions of :func:`run_end_to_end`; the pyramid is the only wavefront sensor.
     """
     hardware = require_hardware(design, "an end-to-end simulation")
     channels = hardware.suite.channels
@@ -231,12 +217,9 @@ class EndToEndSetup:
         Length of a run, and its seed.
     gain : float
         Integrator gain of every mode that no filter controls.
-    leak : float
-        Leak of the integrators from mode ``leak_from_mode`` on; those before have none.
-        A pyramid can trap a corner of the mirror at whole turns of the phase; a leak
-        frees it.
-    leak_from_mode : int
-        First mode with a leak, counted from 0.
+    leak, leak_from_mode : float, int
+        Leak of the integrators, and the first mode, counted from 0, that has it: it frees corners
+        of the mirror that a pyramid traps at whole turns of the phase.
 
     Raises
     ------
@@ -292,21 +275,16 @@ class EndToEndSetup:
                 settle_frames=self.settle_frames,
                 seed=self.seed,
             )
-        hardware = getattr(filter, "hardware", None)
-        mine = self.system.hardware
-        if hardware is not None and (hardware.frame_rate_hz, hardware.delay_frames) != (
-            mine.frame_rate_hz,
-            mine.delay_frames,
-        ):
+        expected = self.system.hardware
+        hardware = getattr(filter, "hardware", None) or expected
+        loops = [(h.frame_rate_hz, h.delay_frames, h.mirror) for h in (expected, hardware)]
+        if loops[0] != loops[1]:
+            mirror = "" if hardware.mirror == expected.mirror else ", and for another mirror"
             raise ProblemError(
-                f"the filter must be for the loop of the configuration, {mine.frame_rate_hz:g} Hz "
-                f"and {mine.delay_frames:g} frames; got one for {hardware.frame_rate_hz:g} Hz and "
-                f"{hardware.delay_frames:g} frames. Design it from this configuration."
-            )
-        if hardware is not None and hardware.mirror != mine.mirror:
-            raise ProblemError(
-                "the filter was designed for another mirror than that of the configuration. Design "
-                "for its mirror.local_loop, best with --method lqg."
+                "the filter must be for the loop of the configuration, "
+                f"{expected.frame_rate_hz:g} Hz and {expected.delay_frames:g} frames; got one for "
+                f"{hardware.frame_rate_hz:g} Hz and {hardware.delay_frames:g} frames{mirror}. "
+                "Design it from this configuration."
             )
         gains = np.full(self.system.modes, self.gain)
         if tip_tilt_gain is not None:

@@ -13,7 +13,7 @@ from support.exports import relative
 from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt
-from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.dao.export import (
     InnerLoop,
     _as_computed,
@@ -269,8 +269,3 @@ def test_it_gives_the_commands_bit_for_bit(limit):
     assert np.any(np.abs(expected) > 0.9) != np.isfinite(limit)
     loop.reset()
     assert np.array_equal(loop.step(series[0]), expected[0])
-
-
-def test_what_does_not_fit_is_refused():
-    with pytest.raises(DimensionError):
-        InnerLoop(np.zeros((4, 2)))
