@@ -283,15 +283,15 @@ def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> Fitt
 
 
 def _overlapping(search: Search, spectrum: SpectrumModel, i: int) -> int | None:
-    """Return the nearest line that overlaps line i; None if there is none."""
+    """Return the nearest line that is within two half widths of the narrower one, or None."""
     if spectrum.components[i].kind != "line":
         return None
     centre, half = search.place(spectrum.components[i])
     apart = {}
     for k, other in enumerate(spectrum.components):
-        away = abs(search.place(other)[0] - centre)
-        if k != i and other.kind == "line" and away < half + search.place(other)[1]:
-            apart[k] = away
+        its_centre, its_half = search.place(other)
+        if k != i and other.kind == "line" and abs(its_centre - centre) < 2 * min(half, its_half):
+            apart[k] = abs(its_centre - centre)
     return min(apart, key=apart.__getitem__, default=None)
 
 
