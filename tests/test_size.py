@@ -19,7 +19,7 @@ LINES = {
     "design": 8382,
     "files": 1608,
     "identification": 12630,
-    "interop": 4663,
+    "interop": 4459,
     "linear": 6078,
     "loop": 5350,
     "methods": 1109,

@@ -166,9 +166,8 @@ class Exported:
     files : tuple of Path
         The files; the certificate is the last one.
     error : float
-        Largest difference of the commands from those of the controller, over the largest command,
-        in the arithmetic of the file: in the closed loop where the design is of one, on white noise
-        elsewhere.
+        Largest difference of commands from the controller's in the arithmetic of the file, over the
+        largest command: in the closed loop where the design is of one, on white noise elsewhere.
     start : callable
         ``start(limit)`` returns what was written, stepped in the arithmetic of the target.
     checks : tuple of Check

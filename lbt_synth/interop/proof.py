@@ -47,7 +47,7 @@ class Written:
     Attributes
     ----------
     controllers : mapping of frozenset to Controller
-        With the numbers of the file, for each set of sensors and channels that are not read.
+        With the numbers of the file, for each set of sensors that are not read.
     entry : Controller, optional
         From the noise (r,) of the sums to the command; A and C are those of the controller.
     variance : callable, optional

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -29,12 +30,9 @@ class Rehearsal:
     Attributes
     ----------
     target, design : Simulation
-        In the arithmetic of the target, and in double precision; of one case each. The residual is
-        less noise that was given apart, and commands are those that the mirror got.
-    settle_frames : int
-        Frames at the beginning that are left out.
-    stroke : float
-        Largest modulus of a command; infinite without a limit.
+        In the arithmetic of the target, and in double precision; commands are as they were applied.
+    settle_frames, stroke : int, float
+        Frames at the beginning that are left out; largest modulus of a command, or infinity.
     checks : tuple of Check
         The proof of what the target runs, as in its certificate.
     """
@@ -122,23 +120,15 @@ def rehearse(
     settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * frames))
     with TemporaryDirectory() as folder:
         exported = export(target_named(target).path_in(Path(folder)), design, target)
-    runs = []
-    for running in (exported.start(limit), controller.start()):
-        try:
-            with np.errstate(all="ignore"):  # what overflows is found to be infinite
-                run = simulate(
-                    running, disturbance, hardware=path, settle_frames=settle, stroke=stroke
-                )
-        except ProblemError as error:
-            raise NumericalError(
-                f"in the arithmetic of {target} the loop grows beyond all numbers: {error}",
-                status="arithmetic",
-            ) from error
-        runs.append(run)
+    run = partial(simulate, hardware=path, settle_frames=settle, stroke=stroke)
+    try:
+        with np.errstate(all="ignore"):  # what overflows is found to be infinite
+            runs = [run(c, disturbance) for c in (exported.start(limit), controller.start())]
+    except ProblemError as error:
+        raise NumericalError(
+            f"in the arithmetic of {target} the loop grows beyond all numbers: {error}",
+            status="arithmetic",
+        ) from error
     return Rehearsal(
-        target=runs[0],
-        design=runs[1],
-        settle_frames=settle,
-        stroke=limit,
-        checks=exported.checks,
+        target=runs[0], design=runs[1], settle_frames=settle, stroke=limit, checks=exported.checks
     )

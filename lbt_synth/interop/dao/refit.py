@@ -27,14 +27,12 @@ from lbt_synth.validation import ComplexArray, FloatArray
 # step is 2^-24 to 2^-23 of the number: of normal numbers of any size the mean square is at most
 # 0.544 of what it would be if all steps were the widest, of a sinusoid 0.66.
 ROUNDING = 2 / 3 * ROUNDOFF["single"] ** 2 / 3
-_RADIUS = 0.92  # of the roots that are added
+_RADIUS = 0.92  # of the roots that are added, and largest square of one that the search moves
 _ROOM = 2e-3  # of each limit, for what lies between the nodes
 _SEARCHES = 19  # at most, each with other weights of the scenarios
 _EVALUATIONS = 60  # of one search
 _HASTE = 12  # power of its residual with which a scenario gains weight
 _STEEP = 5.0  # weight of what exceeds a limit
-_MODULUS = 0.94  # largest squared modulus of roots, or what the design has
-_UNSTABLE = 1e3  # each error of a loop that is
 _LINE = 0.3  # weight of a vibration's mean power; its largest is a limit
 _GAINS = 25  # sensor gains at which a step must be stable
 _ORDERS = 100  # in which the coefficients are rounded; the best one counts
@@ -192,7 +190,7 @@ def refit(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
     for _ in range(_SEARCHES):
         theta = _search(loop, theta, np.sqrt(weights) / allowed_nm, limits)
         lost = loop.residuals_nm(_coefficients(theta), rounding=True) / allowed_nm
-        if np.max(lost) < 1 + LOSS / 2:  # half of it for the rounded coefficients
+        if np.max(lost) < 1 + LOSS / 4:  # the rest is for the rounded coefficients
             break
         weights *= lost**_HASTE
         weights /= np.mean(weights)
@@ -261,11 +259,11 @@ def _search(
     """Descend from theta; a step to a loop that is unstable at any sensor gain is not taken."""
     M, upper = theta.size // 2, np.full(theta.size, np.inf)
     second = np.r_[1:M:2, M + 2 : 2 * M + 1 : 2]
-    upper[second] = np.maximum(_MODULUS, theta[second] + _ROOM)
+    upper[second] = np.maximum(_RADIUS, theta[second] + _ROOM)
 
     def errors(x: FloatArray) -> FloatArray:
         stable = loop.radius(_coefficients(x)) < 1
-        return _rows(loop, shares, limits, x)[0] + (0.0 if stable else _UNSTABLE)
+        return _rows(loop, shares, limits, x)[0] + (0.0 if stable else np.inf)
 
     def slopes(x: FloatArray) -> FloatArray:
         return _rows(loop, shares, limits, x)[1]

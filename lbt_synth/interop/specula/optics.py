@@ -29,8 +29,7 @@ from lbt_synth.validation import (
 
 _SUPPORTED = "1.1"
 NO_CLAMP = -1e4  # if negative pixels were set to zero, a fifth of the gain would be lost
-_PUPIL_GAP = 4  # subapertures between the four pupils on the detector
-_MARGIN = 4
+_PUPIL_GAP = 4  # subapertures between the four pupils on the detector, and around them
 _FIELD_ARCSEC = 2.0
 _LARGEST_SCREEN = 16384
 _PSF_SAMPLING = 3
@@ -402,7 +401,7 @@ class Optics:
     def _make_pyramid(self) -> tuple[Any, Any]:
         system = self.system
         across = system.subapertures_across
-        side = 2 * across + _PUPIL_GAP + 2 * _MARGIN
+        side = 2 * across + 3 * _PUPIL_GAP
         natural = system.sensing_wavelength_um * 1e-6 / system.pixel_m * 180 * 3600 / np.pi
         steps = 4 * int(np.ceil(2 * np.pi * system.modulation_lambda_over_d / 4))
         pyramid = _make(
