@@ -26,12 +26,14 @@ from lbt_synth.linear import StateSpace
 from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_rule
+from lbt_synth.models import ARModel, FrozenFlows, ModalTurbulence, Spectrum
 from lbt_synth.models.ar_model import companions, densities
 from lbt_synth.models.mirror.frame_rate_system import Hold
+from lbt_synth.models.spectra import breakpoints_below, spectrum_density
 from lbt_synth.validation import ComplexArray, FloatArray
 
-# of k processes of means over frames: coefficients (k, r) and driving rms (k,), or one for all
-Process: TypeAlias = tuple[FloatArray, FloatArray]
+# one for all modes and loops, or one for each loop
+Turbulence: TypeAlias = Spectrum | FrozenFlows | ModalTurbulence
 # from cycles per frame (f,), the share (f,) of a phase that its means are, and entries (k or 1, n,
 # w), to the rows of a loop, piece by piece
 _Response: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], Iterable[ComplexArray]]
@@ -70,14 +72,14 @@ class Evaluator:
         self,
         density: Callable[[FloatArray], FloatArray],
         entry: FloatArray,
-        edges_hz: Sequence[FloatArray],
+        edges_hz: FloatArray,
     ) -> FloatArray:
         """Return what phases of a density (f, k or 1) leave, one for each column of the entry.
 
         The entries are (k or 1, n, w), the density [nm^2/Hz] that of the phase of all moments.
         """
         nyquist, along = self.frame_rate_hz / 2, np.asarray(entry @ transpose(entry))
-        edges = np.unique(np.concatenate([graded_edges(self.roots) * nyquist, *edges_hz]))
+        edges = np.union1d(graded_edges(self.roots) * nyquist, edges_hz)
         out = np.zeros((len(self.A), 2, self.modes, self.modes))
 
         def still(f_hz: FloatArray) -> FloatArray:
@@ -109,24 +111,48 @@ class Evaluator:
             out[:, 1] = adaptive_integral(still, edges) * along
         return out
 
-    def of_processes(self, processes: Sequence[Process], entry: FloatArray) -> FloatArray:
-        """Return what independent processes leave that enter in one direction, (k or 1, n, 1)."""
+    def of_process(
+        self, coefficients: FloatArray, driving_rms_nm: FloatArray, entry: FloatArray
+    ) -> FloatArray:
+        """Return what processes of means over frames leave, one for each column of the entry.
+
+        There is one for each loop, or one for all: coefficients (k or 1, r), driving rms (k or 1,).
+        """
+        rate = self.frame_rate_hz
         if self.hold is not None:
 
             def density(f_hz: FloatArray) -> FloatArray:
-                parts = (densities(a, b, self.frame_rate_hz, f_hz).T for a, b in processes)
-                return np.asarray(sum(parts) / np.sinc(f_hz / self.frame_rate_hz)[:, None] ** 2)
+                of_means = densities(coefficients, driving_rms_nm, rate, f_hz).T
+                return np.asarray(of_means / np.sinc(f_hz / rate)[:, None] ** 2)
 
-            poles = np.concatenate([process_poles(a).ravel() for a, _ in processes])
-            return self.of_density(density, entry, [graded_edges(poles) * self.frame_rate_hz / 2])
+            poles = process_poles(coefficients).ravel()
+            return self.of_density(density, entry, graded_edges(poles) * rate / 2)
         out = np.zeros((len(self.A), 2, self.modes, self.modes))
-        inputs = np.zeros((len(entry), self.B.shape[-1], 1))
+        first = np.eye(coefficients.shape[1], 1)
+        process = companions(coefficients), driving_rms_nm[:, None, None] * first, first.T[None]
+        inputs = np.zeros((len(entry), self.B.shape[-1], entry.shape[-1]))
         inputs[:, : self.modes] = entry
-        out[:, 0] = self.driven(*_sum_of(processes), inputs).output_covariances()
+        for column in range(entry.shape[-1]):
+            driven = self.driven(*process, inputs[..., [column]])
+            out[:, 0] += driven.output_covariances()
         if self.in_image:
-            power = sum(power_within_frames(a, b, self.frame_rate_hz) for a, b in processes)
-            out[:, 1] = np.asarray(power)[:, None, None] * entry * transpose(entry)
+            power = power_within_frames(coefficients, driving_rms_nm, rate)
+            out[:, 1] = power[:, None, None] * (entry @ transpose(entry))
         return out
+
+    def of_turbulence(self, spectrum: Turbulence, entry: FloatArray) -> FloatArray:
+        """Return what phases of a spectrum leave, or of sampled processes."""
+        if isinstance(spectrum, ARModel | ModalTurbulence):
+            coefficients = np.atleast_2d(spectrum.coefficients)
+            return self.of_process(coefficients, np.atleast_1d(spectrum.driving_rms_nm), entry)
+
+        def density(f_hz: FloatArray) -> FloatArray:
+            if isinstance(spectrum, FrozenFlows):
+                shapes, which, factor = spectrum.factored_psd(f_hz)
+                return np.asarray(shapes.T[:, which] * factor)
+            return spectrum_density(spectrum, f_hz)[:, None]
+
+        return self.of_density(density, entry, breakpoints_below(spectrum, self.frame_rate_hz / 2))
 
     def of_noise(self, factor: FloatArray) -> FloatArray:
         """Return what white noise of covariance ``factor factor'`` leaves, (k or 1, q, p)."""
@@ -267,14 +293,6 @@ def _power(left: ComplexArray) -> FloatArray:
 def process_poles(coefficients: FloatArray) -> ComplexArray:
     """Poles of processes, (k, r)."""
     return np.linalg.eigvals(companions(coefficients)).astype(np.complex128)
-
-
-def _sum_of(processes: Sequence[Process]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return A, B, C (k, ., .) of the sum of processes, each with its own drive."""
-    first = [np.eye(a.shape[1], 1) for a, _ in processes]
-    drives = [b[:, None, None] * one for (_, b), one in zip(processes, first, strict=True)]
-    A = block_diagonal([companions(a) for a, _ in processes])
-    return A, block_diagonal(drives), np.concatenate(first).T[None]
 
 
 def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:

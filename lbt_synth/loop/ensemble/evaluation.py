@@ -20,8 +20,7 @@ from lbt_synth.loop.ensemble.loop_ensemble import (
 )
 from lbt_synth.loop.evaluator import Evaluator
 from lbt_synth.loop.residual import ResidualBudget
-from lbt_synth.models import ARModel, FrozenFlows, LoopHardware, ModalTurbulence
-from lbt_synth.models.spectra import breakpoints_below, spectrum_density
+from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence
 from lbt_synth.models.vibration import sampled_lines
 from lbt_synth.validation import FloatArray, IntArray, read_only, require_instance
 
@@ -211,26 +210,9 @@ def _of_part(
             key = i, *columns.tolist()
             if key not in known and columns.size:
                 entry = np.eye(own.size)[None, :, columns]
-                known[key] = _of_turbulence(loops, spectrum, entry)
+                known[key] = loops.of_turbulence(spectrum, entry)
             of_turbulence[:, :, *at] += known.get(key, 0.0)
     return out
-
-
-def _of_turbulence(loops: Evaluator, spectrum: Turbulence, entry: FloatArray) -> FloatArray:
-    """Covariances (k, 2, n, n) that phases of a spectrum leave, one for each column."""
-    if isinstance(spectrum, ARModel | ModalTurbulence):
-        process = np.atleast_2d(spectrum.coefficients), np.atleast_1d(spectrum.driving_rms_nm)
-        columns = (entry[..., [i]] for i in range(entry.shape[2]))
-        return np.asarray(sum(loops.of_processes([process], column) for column in columns))
-
-    def density(frequency_hz: FloatArray) -> FloatArray:
-        if isinstance(spectrum, FrozenFlows):
-            shapes, which, factor = spectrum.factored_psd(frequency_hz)
-            return np.asarray(shapes.T[:, which] * factor)
-        return spectrum_density(spectrum, frequency_hz)[:, None]
-
-    kinks = breakpoints_below(spectrum, loops.frame_rate_hz / 2)
-    return loops.of_density(density, entry, [kinks])
 
 
 def _of_resonance(
@@ -241,7 +223,7 @@ def _of_resonance(
     if loops.in_image:
         rms_nm = rms_nm * np.sinc(frequency_hz / rate)
     process = sampled_lines(frequency_hz, line.damping[rows], rms_nm, rate)
-    return loops.of_processes([process], along[..., None])
+    return loops.of_process(*process, along[..., None])
 
 
 def _reached(stacks: list[LoopStack], along: FloatArray) -> list[tuple[LoopStack, IntArray]]:

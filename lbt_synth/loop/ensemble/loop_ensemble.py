@@ -46,7 +46,7 @@ class EnsembleVibration:
     direction : (n,) or (p, n) array_like, optional
         Direction over the modes, made a unit vector; along the first of two by default.
     damping : float or (p,) array_like, optional
-        Damping ratio, between 0 and 1; without it the vibration is a sinusoid.
+        Damping ratio, above 0; without it the vibration is a sinusoid.
 
     Raises
     ------
