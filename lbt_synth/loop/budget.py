@@ -10,9 +10,8 @@ import numpy as np
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
-from lbt_synth.loop.evaluator import STILL, Evaluator
-from lbt_synth.loop.loop_errors import append_taps
-from lbt_synth.loop.residual import ResidualBudget
+from lbt_synth.loop.evaluator import STILL, Evaluator, ResidualBudget
+from lbt_synth.loop.stable_range import append_taps
 from lbt_synth.models import (
     ARModel,
     SinusoidalVibration,

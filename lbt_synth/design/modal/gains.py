@@ -23,8 +23,8 @@ from lbt_synth.design.modal.per_mode import Vibrations, lines_per_mode, number_p
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.loop.ensemble.closed_loops import LoopStack, close_loops
-from lbt_synth.loop.ensemble.evaluation import textbook_matrices
+from lbt_synth.loop.ensemble import textbook_matrices
+from lbt_synth.loop.stacks import LoopStack, close_loops
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Spectrum
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number, read_only

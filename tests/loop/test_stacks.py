@@ -5,8 +5,8 @@ import pytest
 from support.ensembles import AIR, LINE, RATE, plant
 
 import lbt_synth as lbt
-from lbt_synth.loop.ensemble.closed_loops import split_into_parts
-from lbt_synth.loop.ensemble.evaluation import textbook_matrices
+from lbt_synth.loop.ensemble import textbook_matrices
+from lbt_synth.loop.stacks import split_into_parts
 
 
 def test_a_loop_is_split_into_parts(kalman, coupled):
