@@ -27,6 +27,7 @@ from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.spectra import spectrum_key
 from lbt_synth.models.vibration import sampled_lines
 from lbt_synth.validation import (
+    BoolArray,
     FloatArray,
     IntArray,
     frozen_copy,
@@ -39,7 +40,6 @@ from lbt_synth.validation import (
 )
 
 Turbulence: TypeAlias = Spectrum | FrozenFlows | ModalTurbulence
-_AT_ONCE = 1024  # loops with vibrations
 _TOGETHER = 2048  # loops with the same frequencies: as many as repay their panels
 
 
@@ -210,21 +210,6 @@ class LoopEnsemble:
                 groups[spectrum_key(part)] = (first, (*modes, mode))
         return list(groups.values())
 
-    def distinct(self, hardware: LoopHardware, *, apart: bool) -> tuple[IntArray, IntArray]:
-        """Return rows that differ by more than their vibrations, and which of them each loop has.
-
-        With ``apart`` all rows differ, as each has its own controller.
-        """
-        rows = np.arange(self.loops)
-        if apart:
-            return rows, rows
-        columns = [self.gains(), self.delays(hardware), *self.noise(hardware).T]
-        for part, _ in self.groups(hardware):
-            columns += _turbulence_values(part)
-        table = np.stack(np.broadcast_arrays(*columns), axis=1)
-        _, first, which = np.unique(table, axis=0, return_index=True, return_inverse=True)
-        return first, which.reshape(-1)
-
     def lines(self, hardware: LoopHardware) -> list[EnsembleVibration]:
         """Return the vibrations with all their arrays (p,), and directions (p, n)."""
         out, p, n, nyquist = [], self.loops, hardware.modes, hardware.frame_rate_hz / 2
@@ -351,47 +336,41 @@ def residuals_from_matrices(
     for spectrum, _ in turbulence:
         if isinstance(spectrum, ARModel | ModalTurbulence):
             require_loop_rate(spectrum.frame_rate_hz, hardware)
-    # loops that differ only in their vibrations are closed once
-    points, which = ensemble.distinct(hardware, apart=len(matrices[0]) > 1)
-    gains, delays = ensemble.gains()[points], ensemble.delays(hardware)[points]
-    stable, groups = close_loops(matrices, hardware, gains, delays)
-    met = [(turbulence_rows(spectrum, points), modes) for spectrum, modes in turbulence]
-    noise_nm, n, here = ensemble.noise(hardware)[points], hardware.modes, stable[which]
-    steady = np.where(stable[:, None, None, None, None], 0.0, np.full((2, 2, n, n), np.nan))
-    shaken = np.where(here[:, None, None, None], 0.0, np.full((2, n, n), np.nan))
+    stable, groups = close_loops(matrices, hardware, ensemble.gains(), ensemble.delays(hardware))
+    noise_nm, n, p = ensemble.noise(hardware), hardware.modes, ensemble.loops
     sinusoids = [line for line in lines if line.damping is None]
-    amplitudes = np.where(here[:, None, None], 0j, np.full((len(sinusoids), n), np.nan))
+    steady, shaken = np.zeros((p, 2, 2, n, n)), np.zeros((p, 2, n, n))
+    amplitudes = np.zeros((p, len(sinusoids), n), dtype=np.complex128)
+    for left in (steady, shaken, amplitudes):
+        left[~stable] = np.nan
     for stacks in groups:
-        place = np.full(stable.size, -1)
-        place[stacks[0].loops] = np.arange(stacks[0].loops.size)
-        for rows in _batches(np.flatnonzero(stable & (place >= 0)), stacks, place):
-            spectra = [(turbulence_rows(spectrum, rows), modes) for spectrum, modes in met]
-            for stack in (stack.take(place[rows]) for stack in stacks):
-                left = _of_part(stack, spectra, noise_nm[rows], hardware, in_image=in_image)
-                steady[rows] += left
-        for rows in _split(np.flatnonzero(here & (place[which] >= 0)), _AT_ONCE):
-            chosen = [stack.take(place[which[rows]]) for stack in stacks]
-            number = 0
+        for batch in _batches(stacks, stable):
+            some = [stack.take(batch) for stack in stacks]
+            rows = some[0].loops
+            spectra = [(turbulence_rows(spectrum, rows), modes) for spectrum, modes in turbulence]
+            for stack in some:
+                steady[rows] += _of_part(
+                    stack, spectra, noise_nm[rows], hardware, in_image=in_image
+                )
             for line in lines:
-                reached = _reached(chosen, line.direction[rows])
-                modes = np.concatenate([own for _, own in reached])
-                loops = stack_evaluator(reached, hardware, in_image=in_image)
+                members = _reached(some, line.direction[rows])
+                modes = np.concatenate([own for _, own in members])
+                loops = stack_evaluator(members, hardware, in_image=in_image)
                 along = line.direction[np.ix_(rows, modes)]
                 if line.damping is not None:
-                    shaken[np.ix_(rows, np.arange(2), modes, modes)] += _of_resonance(
-                        loops, line, rows, along
-                    )
-                    continue
-                entry = np.zeros((rows.size, loops.B.shape[2]), dtype=np.complex128)
-                entry[:, : modes.size] = np.sqrt(2) * line.rms_nm[rows][:, None] * along
-                f = line.frequency_hz[rows] / hardware.frame_rate_hz
-                amplitudes_nm, within = loops.of_sinusoids(f, entry)
-                amplitudes[np.ix_(rows, np.array([number]), modes)] = amplitudes_nm[:, None]
-                shaken[np.ix_(rows, np.array([1]), modes, modes)] += within[:, None]
-                number += 1
-    of_turbulence, of_noise = np.moveaxis(steady[which], 1, 0)
+                    moved = _of_resonance(loops, line, rows, along)
+                else:
+                    entry = np.zeros((rows.size, loops.B.shape[2]), dtype=np.complex128)
+                    entry[:, : modes.size] = np.sqrt(2) * line.rms_nm[rows][:, None] * along
+                    f = line.frequency_hz[rows] / hardware.frame_rate_hz
+                    amplitudes_nm, within = loops.of_sinusoids(f, entry)
+                    place = np.ix_(rows, np.array([sinusoids.index(line)]), modes)
+                    amplitudes[place] = amplitudes_nm[:, None]
+                    moved = np.stack([0 * within, within], axis=1)
+                shaken[np.ix_(rows, np.arange(2), modes, modes)] += moved
+    of_turbulence, of_noise = np.moveaxis(steady, 1, 0)
     return ResidualBudget(
-        stable=read_only(here),
+        stable=read_only(stable),
         turbulence_nm2=of_turbulence[:, 0],
         noise_nm2=of_noise[:, 0],
         random_vibration_nm2=shaken[:, 0],
@@ -410,16 +389,15 @@ def textbook_matrices(controllers: Sequence[Controller]) -> tuple[FloatArray, ..
     return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
 
 
-def _batches(found: IntArray, stacks: list[LoopStack], place: IntArray) -> list[IntArray]:
-    """Split loops into batches; those next to instability, which need short panels, together."""
-    poles = np.concatenate([stack.poles for stack in stacks], axis=1)[place[found]]
-    found = found[np.argsort(np.max(np.abs(poles), axis=1), kind="stable")]
-    return _split(found, _TOGETHER)
+def _batches(stacks: list[LoopStack], stable: BoolArray) -> list[IntArray]:
+    """Split the stable loops of stacks into batches, by how near to instability they are.
 
-
-def _split(rows: IntArray, most: int) -> list[IntArray]:
-    """Split rows into batches of at most so many, none of them empty."""
-    return [rows[i : i + most] for i in range(0, rows.size, most)]
+    Loops next to instability, which need short panels, are then together.
+    """
+    poles = np.concatenate([stack.poles for stack in stacks], axis=1)
+    order = np.argsort(np.max(np.abs(poles), axis=1), kind="stable")
+    order = order[stable[stacks[0].loops[order]]]
+    return [order[i : i + _TOGETHER] for i in range(0, order.size, _TOGETHER)]
 
 
 def _of_part(
@@ -435,12 +413,12 @@ def _of_part(
     ``turbulence`` pairs each spectrum with its modes. All is of the whole loop: the covariances of
     other parts are zero. What reaches equal parts alike is evaluated once.
     """
-    n, part = hardware.modes, stack.part
+    n = hardware.modes
     out = np.zeros((stack.loops.size, 2, 2, n, n))
     of_turbulence, of_noise = out[:, 0], out[:, 1]
-    loops = stack_evaluator([(stack, part.modes[0])], hardware, in_image=in_image)
+    loops = stack_evaluator([(stack, stack.modes[0])], hardware, in_image=in_image)
     known: dict[object, FloatArray] = {}
-    for own, inputs in zip(part.modes, part.measurements, strict=True):
+    for own, inputs in zip(stack.modes, stack.measurements, strict=True):
         at = np.ix_(own, own)
         noise = noise_nm[:, inputs]
         if noise.tobytes() not in known:
@@ -469,5 +447,5 @@ def _of_resonance(
 
 def _reached(stacks: list[LoopStack], along: FloatArray) -> list[tuple[LoopStack, IntArray]]:
     """Return the stacks that directions (k, n) reach, and the modes that each stands for."""
-    pairs = [(stack, modes) for stack in stacks for modes in stack.part.modes]
+    pairs = [(stack, modes) for stack in stacks for modes in stack.modes]
     return [(stack, modes) for stack, modes in pairs if np.any(along[:, modes])]

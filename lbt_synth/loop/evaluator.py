@@ -89,18 +89,8 @@ class Evaluator:
         """
         nyquist, along = self.frame_rate_hz / 2, np.asarray(entry @ transpose(entry))
         edges = np.union1d(graded_edges(self.roots) * nyquist, edges_hz)
-        out = np.zeros((len(self.A), 2, self.modes, self.modes))
 
-        def still(f_hz: FloatArray) -> FloatArray:
-            rest = 1 - np.sinc(f_hz / self.frame_rate_hz) ** 2
-            return np.asarray((density(f_hz) * rest[:, None])[..., None, None])
-
-        def means(f_hz: FloatArray) -> FloatArray:
-            f = f_hz / self.frame_rate_hz
-            ((_, left),) = self._pieces(f, entry)
-            return np.moveaxis(_power(left) * density(f_hz), (2, 3), (0, 1))
-
-        def both(f_hz: FloatArray) -> FloatArray:
+        def left(f_hz: FloatArray) -> FloatArray:
             f = f_hz / self.frame_rate_hz
             mean: ComplexArray = np.zeros(1, dtype=np.complex128)
             squares = np.zeros(1)
@@ -108,17 +98,13 @@ class Evaluator:
                 mean = mean + weight * piece
                 squares = squares + weight * _power(piece)
             of_mean = _power(mean)
-            rest = 1 - np.abs(self._holds.phase_means(f)) ** 2 @ self._holds.weights
-            moving = np.moveaxis(along, 0, -1)[:, :, None] * rest[:, None]
-            left = np.array([of_mean, squares - of_mean + moving]) * density(f_hz)
-            return np.moveaxis(left, (3, 4), (0, 1))
+            within = squares - of_mean
+            if self.in_image:
+                rest = 1 - np.abs(self._holds.phase_means(f)) ** 2 @ self._holds.weights
+                within += np.moveaxis(along, 0, -1)[:, :, None] * rest[:, None]
+            return np.moveaxis(np.array([of_mean, within]) * density(f_hz), (3, 4), (0, 1))
 
-        if self._holds.weights.size > 1:
-            return adaptive_integral(both, edges)
-        out[:, 0] = adaptive_integral(means, edges)
-        if self.in_image:
-            out[:, 1] = adaptive_integral(still, edges) * along
-        return out
+        return adaptive_integral(left, edges)
 
     def of_process(
         self, coefficients: FloatArray, driving_rms_nm: FloatArray, entry: FloatArray
