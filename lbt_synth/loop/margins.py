@@ -145,28 +145,24 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
         return np.asarray(1 / np.diagonal(sensitivity, axis1=1, axis2=2) - 1)
 
     sensitivities = _own_sensitivities(loop)
-    grid, responses = _refine_turns(broken, np.unique(np.concatenate([nodes, uniform])))
-    shared: list[list[int]] = []
-    for index, own in enumerate(responses.T):
-        like = (group for group in shared if _is_same(own, responses[:, group[0]]))
-        group = next(like, None)
-        if group is None:
-            shared.append([index])
-        else:
-            group.append(index)
+    grid, responses = _refine_turns(broken, np.union1d(nodes, uniform))
+    columns = range(responses.shape[1])
+    alike = [
+        next(i for i in columns if _is_same(response, responses[:, i])) for response in responses.T
+    ]
     return tuple(
         BrokenLoop(
-            measurements=tuple(group),
+            measurements=tuple(i for i, first in enumerate(alike) if first == index),
             frequency_hz=grid,
-            response=read_only(responses[:, group[0]].copy()),
-            gain_crossings=tuple(_crossings(sensitivities[group[0]], real_part=0.5)),
+            response=read_only(responses[:, index].copy()),
+            gain_crossings=tuple(_crossings(sensitivities[index], real_part=0.5)),
             phase_crossings=tuple(
                 point
-                for point in _crossings(sensitivities[group[0]])
+                for point in _crossings(sensitivities[index])
                 if 1 / _LARGEST < -point.response.real < _LARGEST
             ),
         )
-        for group in shared
+        for index in sorted(set(alike))
     )
 
 
@@ -223,9 +219,9 @@ def phase_margin_deg(loop: ClosedLoop) -> float:
     return min((point.phase_deg for point in gain_crossings(loop)), default=np.inf)
 
 
-def _is_same(own: ComplexArray, other: ComplexArray) -> bool:
+def _is_same(one: ComplexArray, other: ComplexArray) -> bool:
     """Whether two responses are equal, by their sensitivities."""
-    return bool(np.allclose(1 / (1 + own), 1 / (1 + other), rtol=_SAME, atol=_SAME))
+    return bool(np.allclose(1 / (1 + one), 1 / (1 + other), rtol=_SAME, atol=_SAME))
 
 
 @table_row
