@@ -1,10 +1,9 @@
 """In which range of a gain or a delay a loop is stable: one that stays, or a gain that moves.
 
-Every matrix is affine in the gain and, between two whole delays, in the fraction of a delay. Where
-the change of a part has rank one, as the gain of a measurement has, all crossings of the unit
-circle are found at once: ``A + d b c'`` has an eigenvalue z where ``d T(z) = 1`` with
-``T = c' (z I - A)^-1 b``, and T is real at the angles of the eigenvalues of a symplectic pencil.
-Other parts are followed in steps.
+Every matrix is affine in the gain. Where the change of a part has rank one, as the gain of a
+measurement has, all crossings of the unit circle are found at once: ``A + d b c'`` has an
+eigenvalue z where ``d T(z) = 1`` with ``T = c' (z I - A)^-1 b``, and T is real at the angles of the
+eigenvalues of a symplectic pencil. Other parts, and delays, are followed in steps.
 
 A gain that moves: at the gain c the measurement feeds back through the complementary sensitivity T.
 A gain between ``c (1 - r)`` and ``c (1 + r)`` adds the feedback ``d(k) T`` with ``|d(k)| <= r``, so
@@ -42,8 +41,6 @@ from lbt_synth.loop.closed_loop import (
     ClosedLoop,
     checked_loop_matrices,
     close_loop,
-    last_frame,
-    loop_matrices,
 )
 from lbt_synth.loop.ensemble import textbook_matrices
 from lbt_synth.loop.stacks import close_loops
@@ -62,8 +59,6 @@ _FINER = 8  # parts into which a step is divided, again and again
 _ROUNDS = 13  # for a gain, to its rounding
 _RANK = 1e-12  # of a change, a singular value over the largest that counts as zero
 _REAL = 1e-9  # of a response, an imaginary part that counts as zero
-_EXACT = 3  # frames of delay for which the margin is exact; later ones have too many states
-_INSIDE = 1e-7  # part of an exact margin by which it is less, so that the loop is stable there
 _DIVISION = 64  # of delays in which the delay margin is sought
 _DELAY_ROUNDS = 6
 _LONGEST = 100  # delay up to which it is sought [frames]
@@ -98,22 +93,6 @@ def parts_by_gain(
     A0, A1, *_ = checked_loop_matrices(hardware, plain)
     states = A0.shape[-1]
     return affine_parts(A0.reshape(-1, states, states), A1.reshape(-1, states, states))
-
-
-def parts_by_fraction(loop: ClosedLoop, whole: int) -> list[AffinePart]:
-    """Return the parts of a loop, affine in how far its delay is beyond so many whole frames.
-
-    The mirror settles at once. The change from one whole delay to the next is ``A1``.
-    """
-    k, hardware, ends = loop.controller.to_statespace(), loop.hardware, []
-    readings = last_frame(hardware.sensor)
-    for arrival in (whole - 1, whole):
-        mirror = tapped_mirror(np.eye(whole + 1)[arrival])
-        A0, A1, *_ = loop_matrices(
-            k.A, k.B, k.C, k.D, mirror=mirror, readings=readings, influence=hardware.influence
-        )
-        ends.append(A0 + loop.sensor_gain * A1)
-    return affine_parts(ends[0][None], (ends[1] - ends[0])[None])
 
 
 def affine_parts(A0: FloatArray, A1: FloatArray) -> list[AffinePart]:
@@ -297,23 +276,11 @@ def delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
     """Least change of the delay at which the loop, as it is simulated, is unstable [frames].
 
     It is late with the sign 1, early with -1. A part of a frame is no phase lag: an exposure then
-    sees two commands. So poles decide: exactly for some frames where modes do not mix and the
-    mirror settles at once, in steps else.
+    sees two commands. So the poles of loops decide, whose delays differ by steps.
     """
-    d, reached = loop.hardware.delay_frames, 0.0
+    d = loop.hardware.delay_frames
     longest = _LONGEST - d if sign > 0 else d - 1
-    while loop.hardware.mirror is None and reached < min(_EXACT, longest):
-        at = d + sign * reached
-        whole = int(np.floor(at) if sign > 0 else np.ceil(at) - 1)
-        ranges = [exact_range(part, at - whole) for part in parts_by_fraction(loop, whole)]
-        exact = [one for one in ranges if one is not None]
-        if len(exact) < len(ranges):
-            break
-        end = min(high for _, high in exact) if sign > 0 else max(low for low, _ in exact)
-        if 0 <= end <= 1:
-            return abs(whole + end - d) * (1 - _INSIDE)
-        reached = abs(whole + (sign > 0) - d)
-    if reached >= longest:
+    if longest <= 0:
         return np.inf
     matrices = textbook_matrices([loop.controller])
 
@@ -323,7 +290,7 @@ def delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
 
     # at a whole delay, an exposure sees one command alone, and the loop gain has a peak
     peaks = np.asarray(sign * (np.arange(1, _LONGEST + 1) - d), dtype=np.float64)
-    ends = [reached, min(reached + 1.0, longest)]
+    ends = [0.0, min(1.0, longest)]
     while ends[-1] < longest:
         ends.append(min(2 * ends[-1], longest))
     steps = (

@@ -9,8 +9,6 @@ import pytest
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
-from lbt_synth.linear import StateSpace
-from lbt_synth.loop.margins import channel_norm, channel_scales
 
 RATE = 800.0
 
@@ -267,74 +265,6 @@ def test_phases_of_each_axis_within_the_disk_do_not_change_the_encirclements(cou
     nominal = encirclements((0, 0))
     assert {encirclements((a, b)) for a in (half, -half) for b in (half, -half)} == {nominal}
     assert encirclements((-2.5 * half, -2.5 * half)) != nominal
-
-
-# -- the bound behind the disk margin ------------------------------------------
-def random_system(seed, channels):
-    rng = np.random.default_rng(seed)
-    n = int(rng.integers(2, 12))
-    A = rng.normal(size=(n, n))
-    A *= rng.choice([0.5, 0.9, 0.99, 0.9999]) / abs(np.linalg.eigvals(A)).max()
-    return StateSpace(
-        A=A,
-        B=rng.normal(size=(n, channels)) * 10 ** rng.normal(size=(1, channels)),
-        C=rng.normal(size=(channels, n)),
-        D=rng.normal(size=(channels, channels)),
-    )
-
-
-def attained(system, frequencies, phases):
-    """Return the largest spectral radius of U M(f): mu is attained by a unitary diagonal U."""
-    response = system.frequency_response(frequencies)
-    grid = np.meshgrid(*[phases] * (len(system.C) - 1))
-    best = 0.0
-    for turn in np.reshape(grid, (len(grid), -1)).T:
-        scales = np.concatenate([[1.0], turn])[:, None]
-        best = max(best, float(np.abs(np.linalg.eigvals(scales * response)).max()))
-    return best
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_two_channels_attain_the_bound(seed):
-    system = random_system(seed, 2)
-    upper = channel_norm(system)
-    poles = np.abs(np.angle(system.poles)) / (2 * np.pi)
-    frequencies = np.concatenate([np.linspace(0, 0.5, 2001), poles])
-    best = attained(system, frequencies, np.exp(1j * np.linspace(0, 2 * np.pi, 91)))
-    assert best <= upper * (1 + 1e-9)
-    assert upper <= best * 1.002
-    assert upper <= lbt.hinf_norm(system).upper * (1 + 1e-12)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_three_channels_stay_below_the_bound(seed):
-    system = random_system(100 + seed, 3)
-    best = attained(system, np.linspace(0, 0.5, 101), np.exp(1j * np.linspace(0, 2 * np.pi, 25)))
-    assert best <= channel_norm(system) * (1 + 1e-9)
-
-
-def test_channels_that_do_not_meet_are_as_bad_as_the_worst():
-    lags = StateSpace(A=np.diag([0.5, 0.9]), B=np.eye(2), C=np.eye(2), D=np.zeros((2, 2)))
-    assert channel_norm(lags) == pytest.approx(10, rel=2e-4)
-
-
-def test_one_channel_is_the_norm():
-    lag = StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
-    assert channel_norm(lag) == lbt.hinf_norm(lag).upper
-
-
-def test_nothing_has_no_norm():
-    zero = StateSpace(A=[[0.5]], B=np.zeros((1, 2)), C=np.zeros((2, 1)), D=np.zeros((2, 2)))
-    assert channel_norm(zero) == 0
-
-
-def test_scales_make_rows_and_columns_alike():
-    matrix = np.array([[0, 8.0, 1], [2, 0, 4], [1, 16, 0]])
-    d = channel_scales(matrix)
-    scaled = d[:, None] * matrix / d
-    np.testing.assert_allclose(
-        np.linalg.norm(scaled, axis=0), np.linalg.norm(scaled, axis=1), rtol=1e-6
-    )
 
 
 def test_an_unstable_nominal_has_no_interval():
