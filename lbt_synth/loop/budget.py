@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -126,7 +126,8 @@ def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
     every = _evaluator(loop, loop.system, None, in_image=False)
     parts = [every.shaken(_noise_factor(loop, plant.own_noise_factor))]
     for mode, model in enumerate(plant.turbulence):
-        parts.append(_driven(every, ar_process(model), _entry(loop, [mode])))
+        entry = np.eye(loop.system.B.shape[-1])[:, [mode]]
+        parts.append(_driven(every, ar_process(model), entry))
     for line, motion in zip(plant.vibrations, plant.motions, strict=True):
         parts.append(_driven(every, *_shaken(loop, line, motion)))
     first = -plant.n_measurements
@@ -245,11 +246,6 @@ def _driven(rows: Evaluator, process: StateSpace, entry: FloatArray) -> Evaluato
     """Return a loop from the drives of a process, whose phases are those of the loop."""
     A, B, C, _ = (stack[np.arange(rows.phases) % process.period] for stack in process.stacks())
     return rows.driven(A, B, C, entry[None])
-
-
-def _entry(loop: ClosedLoop, modes: Sequence[int]) -> FloatArray:
-    """Return how the phases of modes enter a loop, (n + q, w)."""
-    return np.eye(loop.system.B.shape[-1])[:, list(modes)]
 
 
 def _motions(loop: ClosedLoop, motions: Motions, lines: int) -> Motions:

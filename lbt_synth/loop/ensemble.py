@@ -12,7 +12,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
 from lbt_synth.loop.closed_loop import require_loop_rate, require_matching_controller
-from lbt_synth.loop.evaluator import Evaluator, ResidualBudget
+from lbt_synth.loop.evaluator import ResidualBudget
 from lbt_synth.loop.stacks import LoopStack, close_loops, stack_evaluator
 from lbt_synth.models import (
     ARModel,
@@ -357,12 +357,19 @@ def residuals_from_matrices(
                 modes = np.concatenate([own for _, own in members])
                 loops = stack_evaluator(members, hardware, in_image=in_image)
                 along = line.direction[np.ix_(rows, modes)]
+                f = line.frequency_hz[rows] / hardware.frame_rate_hz
                 if line.damping is not None:
-                    moved = _of_resonance(loops, line, rows, along)
+                    share = np.sinc(f) if in_image else 1.0
+                    process = sampled_lines(
+                        line.frequency_hz[rows],
+                        line.damping[rows],
+                        share * line.rms_nm[rows],
+                        hardware.frame_rate_hz,
+                    )
+                    moved = loops.of_process(*process, along[..., None])
                 else:
                     entry = np.zeros((rows.size, loops.B.shape[2]), dtype=np.complex128)
                     entry[:, : modes.size] = np.sqrt(2) * line.rms_nm[rows][:, None] * along
-                    f = line.frequency_hz[rows] / hardware.frame_rate_hz
                     amplitudes_nm, within = loops.of_sinusoids(f, entry)
                     place = np.ix_(rows, np.array([sinusoids.index(line)]), modes)
                     amplitudes[place] = amplitudes_nm[:, None]
@@ -432,17 +439,6 @@ def _of_part(
                 known[key] = loops.of_turbulence(spectrum, entry)
             of_turbulence[:, :, *at] += known.get(key, 0.0)
     return out
-
-
-def _of_resonance(
-    loops: Evaluator, line: EnsembleVibration, rows: IntArray, along: FloatArray
-) -> FloatArray:
-    """Covariances (k, 2, n, n) of the residual from a damped vibration, of means and within."""
-    rate, frequency_hz, rms_nm = loops.frame_rate_hz, line.frequency_hz[rows], line.rms_nm[rows]
-    if loops.in_image:
-        rms_nm = rms_nm * np.sinc(frequency_hz / rate)
-    process = sampled_lines(frequency_hz, line.damping[rows], rms_nm, rate)
-    return loops.of_process(*process, along[..., None])
 
 
 def _reached(stacks: list[LoopStack], along: FloatArray) -> list[tuple[LoopStack, IntArray]]:

@@ -168,13 +168,14 @@ def stable_range(parts: list[AffinePart], nominal: float) -> tuple[float, float]
     """
     if not affine_radii(parts, np.array([nominal]))[0] < 1:
         return np.nan, np.nan
-    ranges = np.array([_range_of_part(part, nominal) for part in parts])
+    ranges = np.array(
+        [
+            exact_range(part, nominal) or stepped_range(partial(affine_radii, [part]), nominal)
+            for part in parts
+        ]
+    )
     low, high = float(ranges[:, 0].max()), float(ranges[:, 1].min())
     return low if low > nominal / _WIDEST else 0.0, high if high < nominal * _WIDEST else np.inf
-
-
-def _range_of_part(part: AffinePart, nominal: float) -> tuple[float, float]:
-    return exact_range(part, nominal) or stepped_range(partial(affine_radii, [part]), nominal)
 
 
 def exact_range(part: AffinePart, nominal: float) -> tuple[float, float] | None:
