@@ -15,7 +15,6 @@ from dataclasses import replace
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.loop.margins import channel_norm
 
 FRAMES = 300
 TRIALS, FINDINGS = Counter[str](), Counter[str]()
@@ -120,32 +119,8 @@ def attack(seed: int) -> None:
             check("gain margin", found == stable, seed)
 
 
-def attack_channels(seed: int) -> None:
-    """Try diagonal unitary uncertainties on a random system of 2 to 4 channels."""
-    rng = np.random.default_rng([7, seed])
-    channels, states = int(rng.integers(2, 5)), int(rng.integers(1, 10))
-    A = rng.standard_normal((states, states))
-    A *= rng.choice([0.5, 0.99, 0.9999, 0.999999]) / np.abs(np.linalg.eigvals(A)).max()
-    scale = 10 ** rng.uniform(-4, 4, channels)
-    B, C = rng.standard_normal((2, states, channels)) * scale ** rng.integers(0, 2)
-    C = C.T / scale[:, None] ** (2 * rng.integers(0, 2))
-    D = rng.standard_normal((channels, channels)) * (rng.random((channels, channels)) < 0.6)
-    system = lbt.linear.StateSpace(A=A, B=B, C=C, D=D)
-    bound = channel_norm(system)
-    poles = np.abs(np.angle(np.linalg.eigvals(A))) / (2 * np.pi)
-    places = np.concatenate([rng.uniform(0, 0.5, 60), poles])
-    z = np.exp(2j * np.pi * places)[:, None, None]
-    responses = (
-        C @ np.linalg.solve(z * np.eye(states) - A, np.broadcast_to(B, (len(z), *B.shape))) + D
-    )
-    for turn in np.exp(2j * np.pi * rng.uniform(size=(50, channels))):
-        most = float(np.abs(np.linalg.eigvals(turn[:, None] * responses)).max())
-        check("structured norm", most <= bound * (1 + 1e-7), seed)
-
-
 if __name__ == "__main__":
     for number in range(int(sys.argv[1]) if len(sys.argv) > 1 else 40):
         attack(number)
-        attack_channels(number)
     for name, count in TRIALS.items():
         print(f"{name}: {count} trials, {FINDINGS[name]} findings")

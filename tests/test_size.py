@@ -21,7 +21,7 @@ LINES = {
     "identification": 12630,
     "interop": 4459,
     "linear": 6078,
-    "loop": 5350,
+    "loop": 5150,
     "methods": 1109,
     "models": 4550,
     "report": 4939,

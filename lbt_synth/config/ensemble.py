@@ -25,7 +25,7 @@ from lbt_synth.errors import LbtSynthError
 from lbt_synth.linear import solve_dare
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
-from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
+from lbt_synth.loop.ensemble import ensemble_vibration
 from lbt_synth.models import FrozenFlows, TipTiltPlant, Vibration, tip_tilt_plant
 from lbt_synth.models.plant.readings import known_states
 from lbt_synth.models.turbulence.ar_models import ar1_flows

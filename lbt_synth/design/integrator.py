@@ -16,8 +16,7 @@ from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import LoopEnsemble, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import noise_covariance
-from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
-from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
+from lbt_synth.loop.ensemble import ensemble_vibration, residuals_from_matrices, textbook_matrices
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.validation import ComplexArray, FloatArray, number, require_instance

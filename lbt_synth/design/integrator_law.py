@@ -13,7 +13,7 @@ from lbt_synth.design.claims import Claim, Evidence
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, hinf_norm
 from lbt_synth.loop import ClosedLoop, close_loop
-from lbt_synth.loop.broken_loops import phase_margin_deg
+from lbt_synth.loop.margins import phase_margin_deg
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import Positive, check_fields, frozen_copy
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -10,13 +10,11 @@ import numpy as np
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
-from lbt_synth.loop.evaluator import STILL, Evaluator
-from lbt_synth.loop.loop_errors import append_taps
-from lbt_synth.loop.residual import ResidualBudget
+from lbt_synth.loop.evaluator import STILL, Evaluator, ResidualBudget
+from lbt_synth.loop.stable_range import append_taps
 from lbt_synth.models import (
     ARModel,
     SinusoidalVibration,
-    Spectrum,
     TipTiltPlant,
     Truth,
     Vibration,
@@ -24,7 +22,6 @@ from lbt_synth.models import (
 from lbt_synth.models.mirror.frame_rate_system import Hold, instant_mirror
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.sensor_suite import Motion, Motions, checked_motions
-from lbt_synth.models.spectra import breakpoints_below, spectrum_density
 from lbt_synth.models.vibration import checked_direction
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
 
@@ -96,13 +93,16 @@ def residual_budget(
     rows, n = loop_evaluator(loop, frame_means=frame_means), loop.hardware.modes
     steady = np.zeros((2, n, n))
     for spectrum, modes in turbulence:
-        steady += _of_spectrum(loop, rows, spectrum, np.eye(n)[None, :, list(modes)])
+        if isinstance(spectrum, ARModel):
+            require_loop_rate(spectrum.frame_rate_hz, loop.hardware)
+        steady += rows.of_turbulence(spectrum, np.eye(n)[None, :, list(modes)]).mean(axis=0)
     propagated = rows.of_noise(_noise_factor(loop, noise)[None]).mean(axis=0)
-    resonances = [(line, motion) for line, motion in pairs if isinstance(line, Vibration)]
-    shaken = _of_lines(loop, rows, resonances, of_means=of_means)
+    shaken = np.zeros((2, n, n))
     amplitudes: list[ComplexArray] = []
     for line, motion in pairs:
-        if isinstance(line, SinusoidalVibration):
+        if isinstance(line, Vibration):
+            shaken += _of_resonance(loop, rows, line, motion, of_means=of_means)
+        else:
             f = np.full(len(rows.A), line.frequency_hz / loop.hardware.frame_rate_hz)
             entry = line.amplitude_nm * _sinusoid_entry(loop, line, motion)
             left, within = rows.of_sinusoids(f, entry[None])
@@ -126,7 +126,8 @@ def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
     every = _evaluator(loop, loop.system, None, in_image=False)
     parts = [every.shaken(_noise_factor(loop, plant.own_noise_factor))]
     for mode, model in enumerate(plant.turbulence):
-        parts.append(_driven(every, ar_process(model), _entry(loop, [mode])))
+        entry = np.eye(loop.system.B.shape[-1])[:, [mode]]
+        parts.append(_driven(every, ar_process(model), entry))
     for line, motion in zip(plant.vibrations, plant.motions, strict=True):
         parts.append(_driven(every, *_shaken(loop, line, motion)))
     first = -plant.n_measurements
@@ -135,8 +136,8 @@ def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
 
 def line_covariance(loop: ClosedLoop, line: Vibration) -> FloatArray:
     """Covariance (n, n) of the residual that a line leaves, in means over frames."""
-    left = _of_lines(loop, loop_evaluator(loop, frame_means=True), [(line, {})], of_means=True)
-    return np.asarray(left[0])
+    rows = loop_evaluator(loop, frame_means=True)
+    return np.asarray(_of_resonance(loop, rows, line, {}, of_means=True)[0])
 
 
 def noise_covariance(loop: ClosedLoop, factor: FloatArray) -> FloatArray:
@@ -181,47 +182,24 @@ def _evaluator(
     )
 
 
-def _of_spectrum(
-    loop: ClosedLoop, rows: Evaluator, spectrum: Spectrum, entry: FloatArray
-) -> FloatArray:
-    """Return what phases of a spectrum leave, or of a sampled process, one for each column."""
-    if isinstance(spectrum, ARModel):
-        require_loop_rate(spectrum.frame_rate_hz, loop.hardware)
-        process = spectrum.coefficients[None], np.array([spectrum.driving_rms_nm])
-        columns = (entry[..., [i]] for i in range(entry.shape[2]))
-        left = sum(rows.of_processes([process], column) for column in columns)
-    else:
-        kinks = breakpoints_below(spectrum, loop.hardware.frame_rate_hz / 2)
-        left = rows.of_density(lambda f: spectrum_density(spectrum, f)[:, None], entry, [kinks])
-    return np.asarray(np.mean(left, axis=0))
-
-
-def _of_lines(
+def _of_resonance(
     loop: ClosedLoop,
     rows: Evaluator,
-    lines: Sequence[tuple[Vibration, Mapping[str, Motion]]],
+    line: Vibration,
+    motion: Mapping[str, Motion],
     *,
     of_means: bool,
 ) -> FloatArray:
-    """Return what resonances leave, (2, n, n), whose rms is of means over frames or of all moments.
-
-    Those of one direction that no channel sees are one process.
-    """
-    n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
-    out = np.zeros((2, n, n))
-    alike: dict[bytes, tuple[FloatArray, list[ARModel]]] = {}
-    for line, motion in lines:
-        if _moved_rows(loop, motion):
-            out += _of_seen(loop, rows, line, motion)
-            continue
-        share = 1.0 if of_means else float(np.sinc(line.frequency_hz / rate))
-        along = checked_direction(line, loop.hardware)
-        _, models = alike.setdefault(along.tobytes(), (along, []))
-        models.append(replace(line, rms_nm=share * line.rms_nm).ar_model(rate))
-    for along, models in alike.values():
-        processes = [(one.coefficients[None], np.array([one.driving_rms_nm])) for one in models]
-        out += rows.of_processes(processes, along[None, :, None]).mean(axis=0)
-    return out
+    """Return what a resonance leaves, (2, n, n), whose rms is of means or of all moments."""
+    if _moved_rows(loop, motion):
+        return _of_seen(loop, rows, line, motion)
+    rate = loop.hardware.frame_rate_hz
+    share = 1.0 if of_means else float(np.sinc(line.frequency_hz / rate))
+    model = replace(line, rms_nm=share * line.rms_nm).ar_model(rate)
+    along = checked_direction(line, loop.hardware)
+    driving_rms_nm = np.array([model.driving_rms_nm])
+    left = rows.of_process(model.coefficients[None], driving_rms_nm, along[None, :, None])
+    return np.asarray(left.mean(axis=0))
 
 
 def _of_seen(
@@ -268,11 +246,6 @@ def _driven(rows: Evaluator, process: StateSpace, entry: FloatArray) -> Evaluato
     """Return a loop from the drives of a process, whose phases are those of the loop."""
     A, B, C, _ = (stack[np.arange(rows.phases) % process.period] for stack in process.stacks())
     return rows.driven(A, B, C, entry[None])
-
-
-def _entry(loop: ClosedLoop, modes: Sequence[int]) -> FloatArray:
-    """Return how the phases of modes enter a loop, (n + q, w)."""
-    return np.eye(loop.system.B.shape[-1])[:, list(modes)]
 
 
 def _motions(loop: ClosedLoop, motions: Motions, lines: int) -> Motions:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -26,12 +26,17 @@ from lbt_synth.linear import StateSpace
 from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_rule
+from lbt_synth.models import ARModel, FrozenFlows, ModalTurbulence, Spectrum
 from lbt_synth.models.ar_model import companions, densities
 from lbt_synth.models.mirror.frame_rate_system import Hold
-from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.models.spectra import breakpoints_below, spectrum_density
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import fact, fact_table, facts
+from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
-# of k processes of means over frames: coefficients (k, r) and driving rms (k,), or one for all
-Process: TypeAlias = tuple[FloatArray, FloatArray]
+# one for all modes and loops, or one for each loop
+Turbulence: TypeAlias = Spectrum | FrozenFlows | ModalTurbulence
 # from cycles per frame (f,), the share (f,) of a phase that its means are, and entries (k or 1, n,
 # w), to the rows of a loop, piece by piece
 _Response: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], Iterable[ComplexArray]]
@@ -41,6 +46,12 @@ _RESIDUAL = 1e-9  # of a Lyapunov equation, relative
 _ROUNDING = 1e-8  # of the terms of a variance, the least part that it is computed from
 _WIDENINGS = 16  # panels beside a pole, each four times as long as the one before
 _ORDER = 10  # of the rule on a panel; 6 leaves errors of 3e-6
+_ORIGINS = {
+    "turbulence": "turbulence",
+    "vibration": "vibrations",
+    "noise": "noise",
+    "within": "within frames",
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,26 +81,16 @@ class Evaluator:
         self,
         density: Callable[[FloatArray], FloatArray],
         entry: FloatArray,
-        edges_hz: Sequence[FloatArray],
+        edges_hz: FloatArray,
     ) -> FloatArray:
         """Return what phases of a density (f, k or 1) leave, one for each column of the entry.
 
         The entries are (k or 1, n, w), the density [nm^2/Hz] that of the phase of all moments.
         """
         nyquist, along = self.frame_rate_hz / 2, np.asarray(entry @ transpose(entry))
-        edges = np.unique(np.concatenate([graded_edges(self.roots) * nyquist, *edges_hz]))
-        out = np.zeros((len(self.A), 2, self.modes, self.modes))
+        edges = np.union1d(graded_edges(self.roots) * nyquist, edges_hz)
 
-        def still(f_hz: FloatArray) -> FloatArray:
-            rest = 1 - np.sinc(f_hz / self.frame_rate_hz) ** 2
-            return np.asarray((density(f_hz) * rest[:, None])[..., None, None])
-
-        def means(f_hz: FloatArray) -> FloatArray:
-            f = f_hz / self.frame_rate_hz
-            ((_, left),) = self._pieces(f, entry)
-            return np.moveaxis(_power(left) * density(f_hz), (2, 3), (0, 1))
-
-        def both(f_hz: FloatArray) -> FloatArray:
+        def left(f_hz: FloatArray) -> FloatArray:
             f = f_hz / self.frame_rate_hz
             mean: ComplexArray = np.zeros(1, dtype=np.complex128)
             squares = np.zeros(1)
@@ -97,36 +98,56 @@ class Evaluator:
                 mean = mean + weight * piece
                 squares = squares + weight * _power(piece)
             of_mean = _power(mean)
-            rest = 1 - np.abs(self._holds.phase_means(f)) ** 2 @ self._holds.weights
-            moving = np.moveaxis(along, 0, -1)[:, :, None] * rest[:, None]
-            left = np.array([of_mean, squares - of_mean + moving]) * density(f_hz)
-            return np.moveaxis(left, (3, 4), (0, 1))
+            within = squares - of_mean
+            if self.in_image:
+                rest = 1 - np.abs(self._holds.phase_means(f)) ** 2 @ self._holds.weights
+                within += np.moveaxis(along, 0, -1)[:, :, None] * rest[:, None]
+            return np.moveaxis(np.array([of_mean, within]) * density(f_hz), (3, 4), (0, 1))
 
-        if self._holds.weights.size > 1:
-            return adaptive_integral(both, edges)
-        out[:, 0] = adaptive_integral(means, edges)
-        if self.in_image:
-            out[:, 1] = adaptive_integral(still, edges) * along
-        return out
+        return adaptive_integral(left, edges)
 
-    def of_processes(self, processes: Sequence[Process], entry: FloatArray) -> FloatArray:
-        """Return what independent processes leave that enter in one direction, (k or 1, n, 1)."""
+    def of_process(
+        self, coefficients: FloatArray, driving_rms_nm: FloatArray, entry: FloatArray
+    ) -> FloatArray:
+        """Return what processes of means over frames leave, one for each column of the entry.
+
+        There is one for each loop, or one for all: coefficients (k or 1, r), driving rms (k or 1,).
+        """
+        rate = self.frame_rate_hz
         if self.hold is not None:
 
             def density(f_hz: FloatArray) -> FloatArray:
-                parts = (densities(a, b, self.frame_rate_hz, f_hz).T for a, b in processes)
-                return np.asarray(sum(parts) / np.sinc(f_hz / self.frame_rate_hz)[:, None] ** 2)
+                of_means = densities(coefficients, driving_rms_nm, rate, f_hz).T
+                return np.asarray(of_means / np.sinc(f_hz / rate)[:, None] ** 2)
 
-            poles = np.concatenate([process_poles(a).ravel() for a, _ in processes])
-            return self.of_density(density, entry, [graded_edges(poles) * self.frame_rate_hz / 2])
+            poles = process_poles(coefficients).ravel()
+            return self.of_density(density, entry, graded_edges(poles) * rate / 2)
         out = np.zeros((len(self.A), 2, self.modes, self.modes))
-        inputs = np.zeros((len(entry), self.B.shape[-1], 1))
+        first = np.eye(coefficients.shape[1], 1)
+        process = companions(coefficients), driving_rms_nm[:, None, None] * first, first.T[None]
+        inputs = np.zeros((len(entry), self.B.shape[-1], entry.shape[-1]))
         inputs[:, : self.modes] = entry
-        out[:, 0] = self.driven(*_sum_of(processes), inputs).output_covariances()
+        for column in range(entry.shape[-1]):
+            driven = self.driven(*process, inputs[..., [column]])
+            out[:, 0] += driven.output_covariances()
         if self.in_image:
-            power = sum(power_within_frames(a, b, self.frame_rate_hz) for a, b in processes)
-            out[:, 1] = np.asarray(power)[:, None, None] * entry * transpose(entry)
+            power = power_within_frames(coefficients, driving_rms_nm, rate)
+            out[:, 1] = power[:, None, None] * (entry @ transpose(entry))
         return out
+
+    def of_turbulence(self, spectrum: Turbulence, entry: FloatArray) -> FloatArray:
+        """Return what phases of a spectrum leave, or of sampled processes."""
+        if isinstance(spectrum, ARModel | ModalTurbulence):
+            coefficients = np.atleast_2d(spectrum.coefficients)
+            return self.of_process(coefficients, np.atleast_1d(spectrum.driving_rms_nm), entry)
+
+        def density(f_hz: FloatArray) -> FloatArray:
+            if isinstance(spectrum, FrozenFlows):
+                shapes, which, factor = spectrum.factored_psd(f_hz)
+                return np.asarray(shapes.T[:, which] * factor)
+            return spectrum_density(spectrum, f_hz)[:, None]
+
+        return self.of_density(density, entry, breakpoints_below(spectrum, self.frame_rate_hz / 2))
 
     def of_noise(self, factor: FloatArray) -> FloatArray:
         """Return what white noise of covariance ``factor factor'`` leaves, (k or 1, q, p)."""
@@ -269,14 +290,6 @@ def process_poles(coefficients: FloatArray) -> ComplexArray:
     return np.linalg.eigvals(companions(coefficients)).astype(np.complex128)
 
 
-def _sum_of(processes: Sequence[Process]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return A, B, C (k, ., .) of the sum of processes, each with its own drive."""
-    first = [np.eye(a.shape[1], 1) for a, _ in processes]
-    drives = [b[:, None, None] * one for (_, b), one in zip(processes, first, strict=True)]
-    A = block_diagonal([companions(a) for a, _ in processes])
-    return A, block_diagonal(drives), np.concatenate(first).T[None]
-
-
 def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
     """Return stacks of matrices (..., m, n) along the diagonals of larger ones."""
     stack = np.broadcast_shapes(*(block.shape[:-2] for block in blocks))
@@ -311,3 +324,90 @@ def power_within_frames(
     gain = np.abs(1 - np.einsum("kar,kr->ka", shifts, coefficients)) ** -2
     moving = 1 / np.sinc(angle / (2 * np.pi)) ** 2 - 1
     return np.asarray(np.square(driving_rms_nm) * np.sum(weights * gain * moving, axis=1) / np.pi)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResidualBudget(Summarised):
+    """Stationary residual of a loop, by origin; of p loops, all have a first axis (p,).
+
+    Attributes
+    ----------
+    turbulence_nm2, noise_nm2, random_vibration_nm2 : (n, n) ndarray
+        Covariances over the modes [nm^2], of means over the hold of a command.
+    within_nm2 : (n, n) ndarray
+        Covariance of what moves within the hold of a command [nm^2]; zero in means over frames.
+    line_amplitudes_nm : (s, n) complex ndarray
+        Complex amplitude that each sinusoid leaves on each mode [nm], of such means.
+    stable : bool
+        Whether the loop is stable; what an unstable one leaves is nan.
+    """
+
+    turbulence_nm2: FloatArray
+    noise_nm2: FloatArray
+    random_vibration_nm2: FloatArray
+    within_nm2: FloatArray
+    line_amplitudes_nm: ComplexArray
+    stable: Any = True
+
+    def _brief(self) -> str:
+        modes, loops = self.noise_nm2.shape[-1], self.noise_nm2.shape[:-2]
+        if loops:
+            return f"{loops[0]} loops, {modes} modes"
+        return f"{nm_text(self.rms_nm, '.4g')} rms, {modes} modes"
+
+    def _summarise(self) -> Summary:
+        headings = {"rms_nm": "residual"} | {
+            f"{name}_nm": f"  {heading}" for name, heading in _ORIGINS.items()
+        }
+        nm = {"unit": "nm rms", "format": ".1f"}
+        named = {name: fact(getattr(self, name), text, **nm) for name, text in headings.items()}
+        rows = facts(**named)
+        return Summary(tables=[fact_table("Residual", rows)])
+
+    @property
+    def gaussian_nm2(self) -> FloatArray:
+        """Covariance of all that is Gaussian [nm^2]."""
+        steady = self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2
+        return frozen_copy(steady + self.within_nm2)
+
+    @property
+    def vibration_nm2(self) -> FloatArray:
+        """Covariance of all vibrations, the sinusoids by their mean power [nm^2]."""
+        a = self.line_amplitudes_nm
+        return frozen_copy(self.random_vibration_nm2 + np.real(transpose(a) @ a.conj()) / 2)
+
+    @property
+    def total_nm2(self) -> FloatArray:
+        """Covariance of the residual [nm^2]."""
+        steady = self.turbulence_nm2 + self.noise_nm2 + self.vibration_nm2
+        return frozen_copy(steady + self.within_nm2)
+
+    @property
+    def rms_nm(self) -> Any:
+        """Residual over all modes [nm rms]."""
+        return _rms(self.total_nm2)
+
+    @property
+    def turbulence_nm(self) -> Any:
+        """Residual turbulence over all modes [nm rms]."""
+        return _rms(self.turbulence_nm2)
+
+    @property
+    def vibration_nm(self) -> Any:
+        """Residual vibration over all modes [nm rms]."""
+        return _rms(self.vibration_nm2)
+
+    @property
+    def noise_nm(self) -> Any:
+        """Propagated noise over all modes [nm rms]."""
+        return _rms(self.noise_nm2)
+
+    @property
+    def within_nm(self) -> Any:
+        """What moves within frames over all modes, which no command follows [nm rms]."""
+        return _rms(self.within_nm2)
+
+
+def _rms(covariance: FloatArray) -> Any:
+    root = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
+    return root if root.ndim else float(root)

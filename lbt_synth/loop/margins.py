@@ -1,29 +1,220 @@
-"""Stability margins of a loop."""
+"""Stability margins of a loop, and the broken loops from which they are read."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lbt_synth.errors import NumericalError
 from lbt_synth.linear import StateSpace, hinf_norm
-from lbt_synth.linear.norms import fold_angles, independent_parts, level_angles
-from lbt_synth.linear.state_space import pointwise_response
-from lbt_synth.loop.broken_loops import gain_crossings
+from lbt_synth.linear.norms import independent_parts
+from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
+from lbt_synth.linear.state_space import split_into_parts
+from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop
-from lbt_synth.loop.loop_errors import FRAGILE_DB, FRAGILE_FRAMES, errors_together
-from lbt_synth.loop.stable_range import delay_margin_frames, stable_sensor_gains
+from lbt_synth.loop.stable_range import (
+    FRAGILE_DB,
+    FRAGILE_FRAMES,
+    crossings,
+    delay_margin_frames,
+    errors_together,
+    stable_sensor_gains,
+)
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import FloatArray, require_instance
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, read_only, require_instance
 
-_DISK_TOLERANCE = 1e-4  # of the disk margin, relative
-_GRID = 65  # angles at which the search for the least disk margin begins
-_MOST_INTERVALS = 5000  # of angles; a loop of two axes needs some ten
-_POINT = 1e-12  # rad per sample; a narrower interval is a point
-_MOST_RATIO = 1e8  # of scales, where nothing comes back from a channel; far from overflow
-_SWEEPS = 10  # of the balancing over all channels; two channels need one
+_SAME = 1e-9  # difference of sensitivities of equal axes
+_LARGEST = 1e6  # loop gain beyond which, and below its inverse, much is rounding
+_UNIFORM = 512  # frequencies at equal steps, beside those around resonances
+_TURN, _ROUNDS = 0.15, 6  # a response turns less from one frequency to the next [rad]; halvings
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MarginPoint:
+    """A point of a broken loop from which a margin is read."""
+
+    frequency_hz: float  # where it is [Hz]
+    response: complex  # the broken loop there
+
+    @property
+    def phase_deg(self) -> float:
+        """Further phase lag that takes this point to -1 [deg], where its gain is one."""
+        return float(np.degrees(np.mod(np.angle(self.response) + np.pi, 2 * np.pi)))
+
+    @property
+    def gain(self) -> float:
+        """Factor on the gain that takes this point to -1, where its phase is -180 degrees."""
+        return 1 / abs(self.response)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BrokenLoop:
+    """A loop broken at one measurement, the others closed: ``1 / S_ii - 1`` over frequency."""
+
+    measurements: tuple[int, ...]  # the measurements, from 0, that have this response
+    # (f,): frequencies up to half the frame rate [Hz], more of them around resonances
+    frequency_hz: FloatArray
+    response: ComplexArray  # (f,): the loop gain; the loop is critical where it is -1
+    gain_crossings: tuple[MarginPoint, ...]  # where the gain is one, with increasing frequency
+    phase_crossings: tuple[MarginPoint, ...]  # where the phase is -180 degrees, likewise
+
+    @property
+    def gain_db(self) -> FloatArray:
+        """Gain [dB], (f,)."""
+        return frozen_copy(20 * np.log10(np.maximum(np.abs(self.response), 1e-300)))
+
+    @property
+    def phase_deg(self) -> FloatArray:
+        """Phase without jumps [deg], (f,); between -270 and 90 at the lowest frequency.
+
+        It is nan where the response is zero but for rounding, as at half the frame rate for a
+        delay of half a frame.
+        """
+        phase = np.full(self.response.size, np.nan)
+        known = np.abs(self.response) > 1 / _LARGEST
+        unwrapped = np.degrees(np.unwrap(np.angle(self.response[known])))
+        phase[known] = unwrapped - 360 * np.ceil((unwrapped[:1] - 90) / 360)
+        return frozen_copy(phase)
+
+    @property
+    def phase_margin(self) -> MarginPoint | None:
+        """The gain crossing with the least phase margin; None without a crossing."""
+        return min(self.gain_crossings, key=lambda point: point.phase_deg, default=None)
+
+    @property
+    def gain_margins(self) -> tuple[MarginPoint, ...]:
+        """The phase crossings from which a rise and a fall of the gain reach -1 first."""
+        crossings = self.phase_crossings
+        rise = [point for point in crossings if point.gain > 1]
+        fall = [point for point in crossings if point.gain < 1]
+        return tuple(
+            nearest(points, key=lambda point: point.gain)
+            for nearest, points in ((max, fall), (min, rise))
+            if points
+        )
+
+
+def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
+    """Break a stable loop at each measurement in turn, the others closed.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        The loop.
+
+    Returns
+    -------
+    tuple of BrokenLoop
+        One for each response; measurements whose responses are equal share it.
+
+    Raises
+    ------
+    UnstableLoopError
+        If the loop is not stable.
+
+    Examples
+    --------
+    An integrator of gain 0.5 in a two-frame loop has a phase margin of 90 - 3 asin(0.25) degrees:
+
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> both = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller)
+    >>> (found,) = lbt.loop.broken_loops(both)
+    >>> found.measurements, round(found.phase_margin.phase_deg, 2)
+    ((0, 1), 46.57)
+    """
+    loop.require_stable()
+    system, nyquist = loop.output_sensitivity(), loop.hardware.frame_rate_hz / 2
+    poles = pole_edges(loop.controller.to_statespace().poles)  # resonances of the open loop
+    edges = distinct_edges(np.concatenate([resonance_edges(loop) / nyquist, poles[poles > 1e-6]]))
+    nodes, _ = gauss_panels(edges * nyquist, 12)
+    uniform = np.linspace(0, nyquist, _UNIFORM + 1)[1:]
+
+    def broken(frequency_hz: FloatArray) -> ComplexArray:
+        """Return the response of each broken loop, (f, q); with S, ``1 + l_i = 1 / S_ii``."""
+        sensitivity = system.frequency_response(frequency_hz)
+        return np.asarray(1 / np.diagonal(sensitivity, axis1=1, axis2=2) - 1)
+
+    sensitivities = _own_sensitivities(loop)
+    grid, responses = _refine_turns(broken, np.union1d(nodes, uniform))
+    columns = range(responses.shape[1])
+    alike = [
+        next(i for i in columns if _is_same(response, responses[:, i])) for response in responses.T
+    ]
+    return tuple(
+        BrokenLoop(
+            measurements=tuple(i for i, first in enumerate(alike) if first == index),
+            frequency_hz=grid,
+            response=read_only(responses[:, index].copy()),
+            gain_crossings=tuple(_crossings(sensitivities[index], real_part=0.5)),
+            phase_crossings=tuple(
+                point
+                for point in _crossings(sensitivities[index])
+                if 1 / _LARGEST < -point.response.real < _LARGEST
+            ),
+        )
+        for index in sorted(set(alike))
+    )
+
+
+def gain_crossings(loop: ClosedLoop) -> list[MarginPoint]:
+    """Return where the gain is one of a stable loop, broken at each measurement in turn."""
+    sensitivities = _own_sensitivities(loop).values()
+    return [point for own in sensitivities for point in _crossings(own, real_part=0.5)]
+
+
+def _own_sensitivities(loop: ClosedLoop) -> dict[int, StateSpace]:
+    """Return the sensitivity of each measurement to itself, balanced."""
+    system = loop.output_sensitivity()
+    system.require_one_phase("a broken loop", "output_sensitivity().lifted()")
+    sensitivities = {}
+    for outputs, inputs, part in split_into_parts(system):
+        for measurement in np.intersect1d(outputs, inputs).tolist():
+            i, j = (np.flatnonzero(channels == measurement) for channels in (outputs, inputs))
+            own = replace(part, B=part.B[:, j], C=part.C[i], D=part.D[np.ix_(i, j)])
+            sensitivities[measurement] = own.balanced()
+    return sensitivities
+
+
+def _crossings(sensitivity: StateSpace, *, real_part: float | None = None) -> Iterator[MarginPoint]:
+    """Yield where the response of a broken loop is real, or where its gain is one.
+
+    The gain of ``1 / S - 1`` is one where the real part of S is a half.
+    """
+    angles, values = crossings(sensitivity, real_part=real_part)
+    with np.errstate(divide="ignore", invalid="ignore"):  # that of an integrator is inf
+        responses = 1 / values - 1
+    frequency_hz = angles / (2 * np.pi) / sensitivity.dt_s
+    for f, response in zip(frequency_hz.tolist(), responses.tolist(), strict=True):
+        yield MarginPoint(frequency_hz=f, response=response)
+
+
+def _refine_turns(
+    broken: Callable[[FloatArray], ComplexArray], grid: FloatArray
+) -> tuple[FloatArray, ComplexArray]:
+    """Return a grid that is finer where responses turn, as beside their zeros, and them on it."""
+    responses = broken(grid)
+    for _ in range(_ROUNDS):
+        turns = np.max(np.abs(np.angle(responses[1:] * responses[:-1].conj())), axis=1)
+        (wide,) = np.nonzero(turns > _TURN)
+        if not wide.size:
+            break
+        between = (grid[wide] + grid[wide + 1]) / 2
+        responses = np.insert(responses, wide + 1, broken(between), axis=0)
+        grid = np.insert(grid, wide + 1, between)
+    return read_only(grid), responses
+
+
+def phase_margin_deg(loop: ClosedLoop) -> float:
+    """Return the least phase margin of a stable loop [deg]; inf without a gain crossing."""
+    return min((point.phase_deg for point in gain_crossings(loop)), default=np.inf)
+
+
+def _is_same(one: ComplexArray, other: ComplexArray) -> bool:
+    """Whether two responses are equal, by their sensitivities."""
+    return bool(np.allclose(1 / (1 + one), 1 / (1 + other), rtol=_SAME, atol=_SAME))
 
 
 @table_row
@@ -32,7 +223,7 @@ class LoopMargins(Summarised):
 
     For the phase each measurement is broken in turn, the others closed; gain and delay change in
     all of them at once. The disk margin is of all measurements at once, each with a gain and a
-    phase of its own.
+    phase of its own; where axes are coupled it is proved, but may not be the largest.
     """
 
     def _brief(self) -> str:
@@ -79,7 +270,7 @@ class LoopMargins(Summarised):
     )
     disk: float = column(
         "disk margin, axis by axis",
-        help="Size of the symmetric disks of gains and phases that keep the loop stable",
+        help="Size of symmetric disks of gains and phases that are proved to keep the loop stable",
     )
     disk_gain_low: float = column(
         "stable factors of each axis, from", help="Least factors, each axis with its own"
@@ -193,73 +384,13 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
 
 
 def _disk_margin(loop: ClosedLoop) -> float:
-    """Return the symmetric disk margin of all measurements at once.
+    """Return the symmetric disk margin of all measurements at once, proved by a small gain.
 
     Eq. 32 of P. Seiler, A. Packard, P. Gahinet, IEEE Control Syst. 40(5), 78 (2020),
-    doi:10.1109/MCS.2020.3005277: one over the structured singular value of ``(S - T) / 2``.
+    doi:10.1109/MCS.2020.3005277, with the norm of ``(S - T) / 2`` in place of its structured
+    singular value, which for one measurement is the same.
     """
     S = loop.output_sensitivity()
     centred = replace(S, D=S.D - np.eye(len(S.D)) / 2)
     parts = independent_parts(centred)  # each measurement is an input and an output of its part
-    return 1 / max(channel_norm(part) for part in parts)
-
-
-def channel_norm(system: StateSpace) -> float:
-    """Bound the structured singular value of a stable system with as many outputs as inputs.
-
-    The uncertainty is diagonal. Scales D that suit one angle bound it by the norm of
-    ``D G D^-1`` on an interval, as far as the level sets reach, and intervals cover all angles.
-    """
-    norm = hinf_norm(system).upper
-    if len(system.D) == 1 or norm == 0:
-        return norm
-    balanced = system.balanced()
-    peak = 0.0
-
-    def scaled_system(angle: float) -> StateSpace:
-        """Return the system in the scales that suit an angle, at which the peak may rise."""
-        nonlocal peak
-        response = pointwise_response(system, np.exp(1j * np.array([angle])))[0]
-        scales = channel_scales(np.abs(response))
-        peak = max(peak, float(np.linalg.norm(scales[:, None] * response / scales, 2)))
-        left, right = scales[:, None], 1 / scales
-        B, C, D = balanced.B * right, left * balanced.C, left * balanced.D * right
-        return replace(balanced, B=B, C=C, D=D)
-
-    angles = np.concatenate([np.linspace(0, np.pi, _GRID), np.angle(system.poles)])
-    for angle in fold_angles(angles, 0, np.pi):
-        scaled_system(angle)
-    intervals = [(0.0, np.pi)]
-    for _ in range(_MOST_INTERVALS):
-        if not intervals:
-            return min(peak * (1 + _DISK_TOLERANCE), norm)
-        low, high = intervals.pop()
-        middle = (low + high) / 2
-        scaled = scaled_system(middle)
-        crossings = fold_angles(level_angles(scaled, peak * (1 + _DISK_TOLERANCE)), low, high)
-        below = crossings[crossings < middle].max(initial=low)
-        above = crossings[crossings > middle].min(initial=high)
-        intervals += [(a, b) for a, b in ((low, below), (above, high)) if b - a > _POINT]
-    raise NumericalError(
-        f"the disk margin is at most {1 / peak:.6g}, but its bound does not close with "
-        f"{_MOST_INTERVALS} intervals of frequency. Scale the axes to similar sizes.",
-        status="level sets",
-    )
-
-
-def channel_scales(response: FloatArray) -> FloatArray:
-    """Return one scale per channel that makes rows and columns of moduli (q, q) alike.
-
-    Off the diagonal they minimise the Frobenius norm: E. E. Osborne, J. ACM 7, 338 (1960),
-    doi:10.1145/321043.321048. For two channels, whose determinant no scale changes, they minimise
-    the largest singular value as well.
-    """
-    moduli = response * ~np.eye(len(response), dtype=bool)
-    tiny = max(float(moduli.max()) / _MOST_RATIO, np.finfo(float).tiny)
-    scales = np.ones(len(moduli))
-    for _ in range(_SWEEPS):
-        for i in range(len(moduli)):
-            row = float(np.linalg.norm(scales[i] * moduli[i] / scales))
-            column = float(np.linalg.norm(scales * moduli[:, i] / scales[i]))
-            scales[i] *= np.sqrt(max(column, tiny) / max(row, tiny))
-    return np.asarray(np.clip(scales / scales.max(), 1 / _MOST_RATIO, 1.0))
+    return 1 / max(hinf_norm(part).upper for part in parts)

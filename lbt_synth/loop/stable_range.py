@@ -1,10 +1,9 @@
 """In which range of a gain or a delay a loop is stable: one that stays, or a gain that moves.
 
-Every matrix is affine in the gain and, between two whole delays, in the fraction of a delay. Where
-the change of a part has rank one, as the gain of a measurement has, all crossings of the unit
-circle are found at once: ``A + d b c'`` has an eigenvalue z where ``d T(z) = 1`` with
-``T = c' (z I - A)^-1 b``, and T is real at the angles of the eigenvalues of a symplectic pencil.
-Other parts are followed in steps.
+Every matrix is affine in the gain. Where the change of a part has rank one, as the gain of a
+measurement has, all crossings of the unit circle are found at once: ``A + d b c'`` has an
+eigenvalue z where ``d T(z) = 1`` with ``T = c' (z I - A)^-1 b``, and T is real at the angles of the
+eigenvalues of a symplectic pencil. Other parts, and delays, are followed in steps.
 
 A gain that moves: at the gain c the measurement feeds back through the complementary sensitivity T.
 A gain between ``c (1 - r)`` and ``c (1 + r)`` adds the feedback ``d(k) T`` with ``|d(k)| <= r``, so
@@ -12,6 +11,13 @@ the loop is stable, whatever d does, if it is stable at c and ``r ||T||_inf < 1`
 real lemma one quadratic Lyapunov function then decreases at every gain of the interval; through one
 measurement it exists for no wider interval (P. P. Khargonekar, I. R. Petersen, K. Zhou, IEEE Trans.
 Autom. Control 35, 356 (1990), doi:10.1109/9.50357). The norm is bracketed by level sets.
+
+A gain and a delay that are both wrong: with the mirror's response ``M_d`` at a delay d, a loop that
+is stable at the gain 1 and the delay d is stable at g and ``d'`` while ``I + X`` does not vanish on
+the unit circle, where X is ``z^-1 (g M_d' - M_d)`` times what commands answer to noise, as the
+sensor sees it. It does not while the Hermitian part of X lies above -1. ``M_d'`` is piecewise
+linear in ``d'``, so that a few loops stand for all of a box of gains and delays: X of any other is
+an average of theirs.
 """
 
 from __future__ import annotations
@@ -23,24 +29,23 @@ from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
+from numpy.polynomial.polynomial import polysub
 from scipy.optimize.elementwise import find_root
 
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
 from lbt_synth.linear.held_controller import HasController, as_controller
 from lbt_synth.linear.matrix_functions import component_labels
-from lbt_synth.linear.norms import fold_angles, popov_angles
+from lbt_synth.linear.norms import fold_angles, largest_real_part, popov_angles, square_parts
 from lbt_synth.linear.state_space import schur_form, schur_response
 from lbt_synth.loop.closed_loop import (
     ClosedLoop,
     checked_loop_matrices,
     close_loop,
-    last_frame,
-    loop_matrices,
 )
-from lbt_synth.loop.ensemble.closed_loops import close_loops
-from lbt_synth.loop.ensemble.evaluation import textbook_matrices
+from lbt_synth.loop.ensemble import textbook_matrices
+from lbt_synth.loop.stacks import close_loops
 from lbt_synth.models import LoopHardware
-from lbt_synth.models.mirror.frame_rate_system import tapped_mirror
+from lbt_synth.models.mirror.frame_rate_system import instant_mirror, tapped_mirror
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number, require_instance
@@ -54,8 +59,6 @@ _FINER = 8  # parts into which a step is divided, again and again
 _ROUNDS = 13  # for a gain, to its rounding
 _RANK = 1e-12  # of a change, a singular value over the largest that counts as zero
 _REAL = 1e-9  # of a response, an imaginary part that counts as zero
-_EXACT = 3  # frames of delay for which the margin is exact; later ones have too many states
-_INSIDE = 1e-7  # part of an exact margin by which it is less, so that the loop is stable there
 _DIVISION = 64  # of delays in which the delay margin is sought
 _DELAY_ROUNDS = 6
 _LONGEST = 100  # delay up to which it is sought [frames]
@@ -65,6 +68,14 @@ CIRCLE_LIMIT = 1 - 1e-7
 _WIDEST_MOVING = 100.0  # factor on the loop's gain beyond which no pyramid's optical gain lies
 _BISECTIONS = 10  # of the share of an interval: the ends are then exact to 1 % or better
 _NONE = np.zeros(0)
+# a loop of another gain, over the one assumed, and delay [frames], and taps of
+# ``z^-1 (M_d - g M_d')``, (t,)
+LoopChange: TypeAlias = tuple[float, float, FloatArray]
+FRAGILE_FRAMES = 0.1  # of delay: what a camera's clock or a busy computer adds
+FRAGILE_DB = 2.0  # of the sensor gain: what the seeing changes within minutes
+_MOST = 10.0  # times these errors: one frame, and a factor of 10
+_HALVINGS = 12  # of that range, to 0.03 % of a frame
+_LEVEL = 1 - 1e-6  # of the real part, below which one is proved to stay
 
 
 def radii_by_gain(
@@ -82,22 +93,6 @@ def parts_by_gain(
     A0, A1, *_ = checked_loop_matrices(hardware, plain)
     states = A0.shape[-1]
     return affine_parts(A0.reshape(-1, states, states), A1.reshape(-1, states, states))
-
-
-def parts_by_fraction(loop: ClosedLoop, whole: int) -> list[AffinePart]:
-    """Return the parts of a loop, affine in how far its delay is beyond so many whole frames.
-
-    The mirror settles at once. The change from one whole delay to the next is ``A1``.
-    """
-    k, hardware, ends = loop.controller.to_statespace(), loop.hardware, []
-    readings = last_frame(hardware.sensor)
-    for arrival in (whole - 1, whole):
-        mirror = tapped_mirror(np.eye(whole + 1)[arrival])
-        A0, A1, *_ = loop_matrices(
-            k.A, k.B, k.C, k.D, mirror=mirror, readings=readings, influence=hardware.influence
-        )
-        ends.append(A0 + loop.sensor_gain * A1)
-    return affine_parts(ends[0][None], (ends[1] - ends[0])[None])
 
 
 def affine_parts(A0: FloatArray, A1: FloatArray) -> list[AffinePart]:
@@ -173,13 +168,14 @@ def stable_range(parts: list[AffinePart], nominal: float) -> tuple[float, float]
     """
     if not affine_radii(parts, np.array([nominal]))[0] < 1:
         return np.nan, np.nan
-    ranges = np.array([_range_of_part(part, nominal) for part in parts])
+    ranges = np.array(
+        [
+            exact_range(part, nominal) or stepped_range(partial(affine_radii, [part]), nominal)
+            for part in parts
+        ]
+    )
     low, high = float(ranges[:, 0].max()), float(ranges[:, 1].min())
     return low if low > nominal / _WIDEST else 0.0, high if high < nominal * _WIDEST else np.inf
-
-
-def _range_of_part(part: AffinePart, nominal: float) -> tuple[float, float]:
-    return exact_range(part, nominal) or stepped_range(partial(affine_radii, [part]), nominal)
 
 
 def exact_range(part: AffinePart, nominal: float) -> tuple[float, float] | None:
@@ -281,23 +277,11 @@ def delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
     """Least change of the delay at which the loop, as it is simulated, is unstable [frames].
 
     It is late with the sign 1, early with -1. A part of a frame is no phase lag: an exposure then
-    sees two commands. So poles decide: exactly for some frames where modes do not mix and the
-    mirror settles at once, in steps else.
+    sees two commands. So the poles of loops decide, whose delays differ by steps.
     """
-    d, reached = loop.hardware.delay_frames, 0.0
+    d = loop.hardware.delay_frames
     longest = _LONGEST - d if sign > 0 else d - 1
-    while loop.hardware.mirror is None and reached < min(_EXACT, longest):
-        at = d + sign * reached
-        whole = int(np.floor(at) if sign > 0 else np.ceil(at) - 1)
-        ranges = [exact_range(part, at - whole) for part in parts_by_fraction(loop, whole)]
-        exact = [one for one in ranges if one is not None]
-        if len(exact) < len(ranges):
-            break
-        end = min(high for _, high in exact) if sign > 0 else max(low for low, _ in exact)
-        if 0 <= end <= 1:
-            return abs(whole + end - d) * (1 - _INSIDE)
-        reached = abs(whole + (sign > 0) - d)
-    if reached >= longest:
+    if longest <= 0:
         return np.inf
     matrices = textbook_matrices([loop.controller])
 
@@ -307,7 +291,7 @@ def delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
 
     # at a whole delay, an exposure sees one command alone, and the loop gain has a peak
     peaks = np.asarray(sign * (np.arange(1, _LONGEST + 1) - d), dtype=np.float64)
-    ends = [reached, min(reached + 1.0, longest)]
+    ends = [0.0, min(1.0, longest)]
     while ends[-1] < longest:
         ends.append(min(2 * ends[-1], longest))
     steps = (
@@ -405,4 +389,78 @@ def moving_gain(loop: ClosedLoop) -> MovingGain:
         constant_high=constant[1],
         moving_low=low,
         moving_high=high,
+    )
+
+
+def loop_changes(
+    hardware: LoopHardware, *, low: float, high: float, delay_frames: float
+) -> list[LoopChange]:
+    """Return the loops that stand for all gains of an interval, and delays within an error.
+
+    The mirror settles at once if the delay has an error. A delay below one frame does not occur.
+    """
+    d, own = hardware.delay_frames, hardware.mirror_taps
+    early, late = max(d - delay_frames, 1.0), d + delay_frames
+    whole = np.arange(np.ceil(early), np.floor(late) + 1).tolist()
+    delays = {early, late, *whole} if delay_frames else {d}
+    changes = []
+    for gain in sorted({low, high}):
+        for delay in sorted(delays):
+            if (gain, delay) == (1, d):
+                continue
+            there = own if delay == d else instant_mirror(delay).taps
+            taps = np.concatenate([[0.0], polysub(own, gain * there)])
+            changes.append((gain, delay, taps))
+    return changes
+
+
+def append_taps(system: StateSpace, taps: FloatArray) -> StateSpace:
+    """Return a system whose outputs go through ``taps[0] + taps[1] z^-1 + ...``."""
+    late, p = tapped_mirror(taps), len(system.C)
+    A, entry, output = late.repeated(p)
+    none = np.zeros((system.n_states, len(A)))
+    return StateSpace(
+        A=np.block([[system.A, none], [entry @ system.C, A]]),
+        B=np.vstack([system.B, entry @ system.D]),
+        C=np.hstack([late.D * system.C, output]),
+        D=late.D * system.D,
+        dt_s=system.dt_s,
+    )
+
+
+def errors_together(loop: ClosedLoop) -> float:
+    """Return how many times 0.1 frames and 2 dB, at once, leave a stable loop stable: proved.
+
+    All delays within the error, late or early, and all gains within the factor count, at most 10
+    times. It is nan for a mirror with dynamics, whose response is not linear in the delay.
+    """
+    hardware = loop.hardware
+    if hardware.mirror is not None:
+        return float("nan")
+    parts = square_parts(_answer_to_noise(loop))
+
+    def is_proved(scale: float) -> bool:
+        factor, late = 10 ** (scale * FRAGILE_DB / 20), scale * FRAGILE_FRAMES
+        changes = loop_changes(hardware, low=1 / factor, high=factor, delay_frames=late)
+        systems = (append_taps(part, taps) for *_, taps in changes for part in parts)
+        return all(largest_real_part(system, least=_LEVEL) < 1 for system in systems)
+
+    if is_proved(_MOST):
+        return _MOST
+    low, high = 0.0, _MOST
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if is_proved(middle) else (low, middle)
+    return low
+
+
+def _answer_to_noise(loop: ClosedLoop) -> StateSpace:
+    """Return the system from the noise to what the sensor sees of the commands it causes."""
+    hardware, commanding = loop.hardware, loop.commanding()
+    n, seen = hardware.modes, loop.sensor_gain * hardware.sensor @ hardware.influence
+    return replace(
+        commanding,
+        B=commanding.B[:, n:],
+        C=seen @ commanding.C,
+        D=seen @ commanding.D[:, n:],
     )

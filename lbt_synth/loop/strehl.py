@@ -20,7 +20,7 @@ from scipy.special import j0, j1
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.loop.residual import ResidualBudget
+from lbt_synth.loop.evaluator import ResidualBudget
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -33,9 +33,8 @@ from lbt_synth.validation import (
     semidefinite,
 )
 
-_DIRECTIONS = 64
-_FEWER = np.array([_DIRECTIONS // 2, _DIRECTIONS // 4, _DIRECTIONS // 8])  # directions to try
-_STRIPS = np.linspace(0.2, 4, 20)
+_DIRECTIONS = 64  # of nodes in half a turn, for jitter of at most _TURNS
+_TURNS = 5.0  # of phase over the pupil; beyond them the nodes are made denser
 _POINT_CHUNK = 200_000  # values of the integrand at once
 _MOST_TURNS = 160.0  # of phase over the pupil; the image is gone long before
 
@@ -191,14 +190,19 @@ def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm:
         )
     if count == 0:
         return np.empty(0)
-    rules = _choose_rules(covariance, lines, spread, imaging.cycles_per_nm)
+    turns = np.maximum(spread * imaging.cycles_per_nm / _TURNS, 1.0)
+    fineness = np.ceil(np.log2(turns)).astype(np.int64)
+    directions = np.minimum(
+        _directions(covariance, lines, imaging.cycles_per_nm), _DIRECTIONS << fineness
+    )
     # |f.a|^2 and f'Sf are quadratic forms of f
-    turns = _quadratic_form(np.real(np.einsum("psi,psj->psij", lines, lines.conj())))
+    forms = _quadratic_form(np.real(np.einsum("psi,psj->psij", lines, lines.conj())))
     widths = _quadratic_form(covariance)
     # jitter along the axes is the same in all four quadrants
-    aligned = ~np.any(turns[..., 1], axis=1) & (widths[:, 1] == 0)
+    aligned = ~np.any(forms[..., 1], axis=1) & (widths[:, 1] == 0)
     out = np.empty(count)
-    unique, own = np.unique(np.column_stack([rules, aligned]), axis=0, return_inverse=True)
+    rules = np.column_stack([fineness, directions, aligned])
+    unique, own = np.unique(rules, axis=0, return_inverse=True)
     for i, rule in enumerate(unique.tolist()):
         members = np.flatnonzero(own.reshape(-1) == i)
         squares, weight = _weighted_otf(imaging.obstruction, *rule)
@@ -206,21 +210,13 @@ def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm:
         step = max(1, _POINT_CHUNK // weight.size)
         for start in range(0, len(members), step):
             part = members[start : start + step]
-            factor = _gaussian_transfer(widths[part], squares)
+            factor = np.exp(-2 * np.pi**2 * (widths[part] @ squares))
             for line in range(lines.shape[1]):
-                if np.any(turns[part, line]):
-                    turns_squared = np.maximum(turns[part, line] @ squares, 0)
+                if np.any(forms[part, line]):
+                    turns_squared = np.maximum(forms[part, line] @ squares, 0)
                     factor = factor * j0(2 * np.pi * np.sqrt(turns_squared))
             out[part] = imaging.other_modes * (factor @ weight)
     return out
-
-
-def _gaussian_transfer(forms: FloatArray, squares: FloatArray) -> FloatArray:
-    """Transfer functions (p, nodes) of Gaussian jitters; equal ones are computed once."""
-    if len(forms) > 1 and np.array_equal(forms[0], forms[-1]):
-        unique, which = np.unique(forms, axis=0, return_inverse=True)
-        return np.exp(-2 * np.pi**2 * (unique @ squares))[which.ravel()]
-    return np.exp(-2 * np.pi**2 * (forms @ squares))
 
 
 def jitter_spread_nm(covariance_nm2: FloatArray, line_amplitudes_nm: ComplexArray) -> FloatArray:
@@ -241,28 +237,20 @@ def _quadratic_form(matrices: FloatArray) -> FloatArray:
     return np.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], axis=-1)
 
 
-def _choose_rules(
-    covariance: FloatArray, lines: ComplexArray, spread: FloatArray, cycles_per_nm: float
-) -> IntArray:
-    """Fineness and number of directions of the nodes that each jitter needs, (p, 2).
+def _directions(covariance: FloatArray, lines: ComplexArray, cycles_per_nm: float) -> IntArray:
+    """Return how many directions of half a turn each jitter needs, (p,): a power of two.
 
-    Beyond some 5 turns of phase over the pupil the nodes are made denser. Where the jitter is the
-    same in all directions, or small, fewer directions are enough: the equidistant sum over N
-    directions of half a turn misses only harmonics from 2 N on, which decay faster than ``exp(-2 N
-    t)`` times the largest value of the integrand on a strip of width t.
+    The sum over N of them misses the harmonics from 2 N on: at most ``exp(growth - 4 N)``, where
+    ``exp(growth)`` bounds the integrand at angles with an imaginary part of 2. That is 1e-15 here.
     """
-    turns = np.maximum(spread * cycles_per_nm, 1e-9)
-    fineness = np.maximum(0, np.ceil(np.log2(turns / 5))).astype(np.int64)
     variance, last = covariance[:, 0, 0], covariance[:, -1, -1]
     two = covariance.shape[1] == 2
     unequal = np.hypot(variance - last, 2 * covariance[:, 0, 1]) if two else variance
-    gaussian = (np.pi * cycles_per_nm) ** 2 * unequal
-    sinusoids = 2 * np.pi * cycles_per_nm * np.sum(np.linalg.norm(lines, axis=2), axis=1)
-    growth = np.outer(gaussian, np.cosh(2 * _STRIPS) - 1) + np.outer(sinusoids, np.sinh(_STRIPS))
-    error = np.min(growth[:, None] - 2 * np.outer(_FEWER, _STRIPS), axis=2)
-    halvings = np.sum(error < np.log(1e-15), axis=1)
-    directions = np.where(fineness == 0, _DIRECTIONS >> halvings, _DIRECTIONS << fineness)
-    return np.stack([fineness, directions], axis=1)
+    growth = (np.pi * cycles_per_nm) ** 2 * unequal * (np.cosh(4) - 1)
+    amplitudes = np.sum(np.linalg.norm(lines, axis=2), axis=1)
+    growth += 2 * np.pi * cycles_per_nm * amplitudes * np.sinh(2)
+    exponent = np.ceil(np.log2((growth - np.log(1e-15)) / 4))
+    return np.asarray(2 ** np.minimum(exponent, 30).astype(np.int64))
 
 
 def series_strehl(

@@ -20,8 +20,8 @@ from lbt_synth.loop import (
     least_worst_residual,
     residual_budget,
 )
-from lbt_synth.loop.broken_loops import phase_margin_deg
 from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_or_none
+from lbt_synth.loop.margins import phase_margin_deg
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import stationary_vibrations

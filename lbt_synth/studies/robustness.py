@@ -36,7 +36,7 @@ from lbt_synth.loop import (
     settling_error,
     simulate,
 )
-from lbt_synth.loop.ensemble.loop_ensemble import ensemble_vibration
+from lbt_synth.loop.ensemble import ensemble_vibration
 from lbt_synth.loop.simulation.run import Drop, Segment, run_segments
 from lbt_synth.methods.mixed import METHOD as MIXED
 from lbt_synth.methods.registry import record_methods, reference_methods

@@ -23,8 +23,8 @@ from lbt_synth.design.modal.per_mode import Vibrations, lines_per_mode, number_p
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.loop.ensemble.closed_loops import LoopStack, close_loops
-from lbt_synth.loop.ensemble.evaluation import textbook_matrices
+from lbt_synth.loop.ensemble import textbook_matrices
+from lbt_synth.loop.stacks import close_loops, stack_evaluator
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Spectrum
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number, read_only
@@ -199,18 +199,6 @@ def _checked_spectra(
     return spectra
 
 
-def _transfers(
-    stack: LoopStack, frequency_hz: FloatArray, frame_rate_hz: float, *, differenced: bool
-) -> list[FloatArray]:
-    """Powers (gains, f) that spectra of means, and noise over sensor gain, leave in the image."""
-    f = frequency_hz / frame_rate_hz
-    phase, noise = stack.image_powers(np.exp(2j * np.pi * f))
-    spectrum = np.sinc(f) ** 2  # of unit phases, as means over frames
-    if differenced:
-        spectrum *= 4 * np.sin(np.pi * f) ** 2
-    return [(phase / spectrum[:, None]).T, (noise * stack.sensor_gains**2).T]
-
-
 def find_gains(
     path: LoopHardware,
     density: Density,
@@ -241,6 +229,9 @@ def find_gains(
     unit = textbook_matrices([PURE.controller(path, 1.0)])
     delays = np.full(loop_gains.size, path.delay_frames)
     _, ((stack,),) = close_loops(unit, path, loop_gains, delays)
+    loops = stack_evaluator([(stack, stack.modes[0])], path, in_image=True)
+    # of unit noise over the sensor gain
+    propagated = loops.of_noise(np.ones((1, 1, 1))).sum(axis=(1, 2, 3)) * loop_gains**2
     # the poles of a loop are the roots of 1 - z^-1 + h z^-1 M, in powers of z^-1
     path_taps = np.append(0.0, path.mirror_taps)
     poles = [np.roots(polyadd([1.0, -1.0], part * limit * path_taps)) for part in _RESONANT]
@@ -249,8 +240,10 @@ def find_gains(
     last = np.full((2, gain.size), np.inf)  # gains and variances
     for _ in range(_HALVINGS):
         nodes, weights = gauss_panels(edges * rate / 2, _NODES)
-        rejection, propagation = _transfers(stack, nodes, rate, differenced=differenced)
-        propagated = propagation @ weights * 2 / rate
+        rejection = stack.image_powers(nodes / rate).T
+        rejection /= np.sinc(nodes / rate) ** 2  # the spectra are of means over frames
+        if differenced:
+            rejection /= 4 * np.sin(np.pi * nodes / rate) ** 2
         spectra = _checked_spectra(density, nodes, differenced=differenced)
         variances = (spectra * weights) @ rejection.T
         variances += np.outer(noise_nm2, propagated)

@@ -21,8 +21,7 @@ from lbt_synth.design.modal.stack import ModalFilters
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices
-from lbt_synth.loop.ensemble.loop_ensemble import turbulence_rows
+from lbt_synth.loop.ensemble import residuals_from_matrices, turbulence_rows
 from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, Vibration
 from lbt_synth.validation import BoolArray, FloatArray, read_only, require_instance
 

@@ -13,8 +13,13 @@ from lbt_synth.design.shaping.frequencies import LEVEL_SETS, ROOM, Band, Checked
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import Constraint, HalfPlanes
 from lbt_synth.linear.norms import largest_real_part
-from lbt_synth.loop.loop_errors import LoopChange, append_taps, loop_changes
-from lbt_synth.loop.stable_range import CIRCLE_LIMIT, circle_norm
+from lbt_synth.loop.stable_range import (
+    CIRCLE_LIMIT,
+    LoopChange,
+    append_taps,
+    circle_norm,
+    loop_changes,
+)
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import Positive
 

@@ -18,8 +18,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum
-from lbt_synth.loop.least_residuals.prediction import Prediction
+from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum, Prediction
 from lbt_synth.loop.least_residuals.residual_limit import mode_limit, truth_modes
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import checked_direction

@@ -11,8 +11,12 @@ from scipy.linalg import block_diag
 
 from lbt_synth.errors import CoupledModesError, LbtSynthError, ProblemError
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum, decoupled_modes
-from lbt_synth.loop.least_residuals.prediction import InnerFactor, Prediction
+from lbt_synth.loop.least_residuals.mode_spectra import (
+    InnerFactor,
+    ModeSpectrum,
+    Prediction,
+    decoupled_modes,
+)
 from lbt_synth.models import (
     LoopHardware,
     TipTiltPlant,

@@ -363,40 +363,26 @@ def _step(
     stroke: float,
     events: Mapping[int, Segment],
 ) -> FloatArray:
-    """Run the loop frame by frame; return ``phi_res, u, y``, (cases, frames, n + m + q)."""
-    phase, noise = disturbance.phase_nm, disturbance.noise_of(hardware.n_readings)
-    together = isinstance(controller, RunningController)
-    batches = [slice(None)] if together else [slice(i, i + 1) for i in range(len(phase))]
-    gain, runs = disturbance.sensor_gain, []
-    for some in batches:
-        series = phase[some], noise[some]
-        runs.append(_step_cases(controller, gain, hardware, *series, stroke, events))
-    return np.concatenate(runs)
+    """Run the loop frame by frame; return ``phi_res, u, y``, (cases, frames, n + m + q).
 
-
-def _step_cases(
-    controller: SteppedController | RunningController,
-    sensor_gain: float,
-    hardware: LoopHardware,
-    total: FloatArray,
-    noise: FloatArray,
-    stroke: float,
-    events: Mapping[int, Segment],
-) -> FloatArray:
-    """Run cases side by side, as written in :class:`LoopHardware`.
-
-    The mirror clips commands at the stroke, which then are those applied.
+    Cases run side by side in a controller of ours, one after the other in others.
     """
+    total, noise = disturbance.phase_nm, disturbance.noise_of(hardware.n_readings)
+    together = isinstance(controller, RunningController)
+    if len(total) > 1 and not together:
+        pairs = zip(total, noise, strict=True)
+        cases = (replace(disturbance, phase_nm=phase, noise=white) for phase, white in pairs)
+        runs = [_step(controller, case, hardware, stroke, events) for case in cases]
+        return np.concatenate(runs)
     (cases, frames, n), m, suite = total.shape, hardware.n_commands, hardware.suite
     rows, read = suite.rows(hardware), suite.read(hardware)
     held = memory([own_exposure(hardware), *other_exposures(hardware)], n, len(read))
     seen = held.C.copy()
-    seen[:, : hardware.n_measurements] *= sensor_gain
+    seen[:, : hardware.n_measurements] *= disturbance.sensor_gain
     wavefront = read[:, : seen.shape[1]]
     state, y = np.zeros((held.n_states, cases)), np.zeros((noise.shape[2], cases))
     out = np.zeros((cases, frames, n + m + len(y)))
     wrong: Mapping[str, str] = {}
-    together = isinstance(controller, RunningController)  # others have a single case
 
     def measure(k: int) -> FloatArray:
         nonlocal wrong

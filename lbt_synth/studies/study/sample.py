@@ -15,7 +15,7 @@ from lbt_synth.config.samples import Reads
 from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError
 from lbt_synth.loop import ClosedLoop, simulate
-from lbt_synth.loop.ensemble.evaluation import residuals_from_matrices, textbook_matrices
+from lbt_synth.loop.ensemble import residuals_from_matrices, textbook_matrices
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.methods.request import DesignRequest, fixed_design
 from lbt_synth.studies.grid import Failure, Result, loop_columns, residual_columns

@@ -1,4 +1,4 @@
-"""An ensemble of loops: gains, delays, noise, turbulence, vibrations, one entry per loop."""
+"""An ensemble of loops, and exact residuals by origin of controllers in it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.linear import Controller
+from lbt_synth.linear.held_controller import as_controller
+from lbt_synth.loop.closed_loop import require_loop_rate, require_matching_controller
+from lbt_synth.loop.evaluator import ResidualBudget
+from lbt_synth.loop.stacks import LoopStack, close_loops, stack_evaluator
 from lbt_synth.models import (
+    ARModel,
     FrozenFlows,
     LoopHardware,
     ModalTurbulence,
@@ -19,11 +25,14 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.spectra import spectrum_key
+from lbt_synth.models.vibration import sampled_lines
 from lbt_synth.validation import (
+    BoolArray,
     FloatArray,
     IntArray,
     frozen_copy,
     positive,
+    read_only,
     real_array,
     require_instance,
     sequence,
@@ -31,6 +40,7 @@ from lbt_synth.validation import (
 )
 
 Turbulence: TypeAlias = Spectrum | FrozenFlows | ModalTurbulence
+_TOGETHER = 2048  # loops with the same frequencies: as many as repay their panels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,7 +56,7 @@ class EnsembleVibration:
     direction : (n,) or (p, n) array_like, optional
         Direction over the modes, made a unit vector; along the first of two by default.
     damping : float or (p,) array_like, optional
-        Damping ratio, between 0 and 1; without it the vibration is a sinusoid.
+        Damping ratio, above 0; without it the vibration is a sinusoid.
 
     Raises
     ------
@@ -200,21 +210,6 @@ class LoopEnsemble:
                 groups[spectrum_key(part)] = (first, (*modes, mode))
         return list(groups.values())
 
-    def distinct(self, hardware: LoopHardware, *, apart: bool) -> tuple[IntArray, IntArray]:
-        """Return rows that differ by more than their vibrations, and which of them each loop has.
-
-        With ``apart`` all rows differ, as each has its own controller.
-        """
-        rows = np.arange(self.loops)
-        if apart:
-            return rows, rows
-        columns = [self.gains(), self.delays(hardware), *self.noise(hardware).T]
-        for part, _ in self.groups(hardware):
-            columns += _turbulence_values(part)
-        table = np.stack(np.broadcast_arrays(*columns), axis=1)
-        _, first, which = np.unique(table, axis=0, return_index=True, return_inverse=True)
-        return first, which.reshape(-1)
-
     def lines(self, hardware: LoopHardware) -> list[EnsembleVibration]:
         """Return the vibrations with all their arrays (p,), and directions (p, n)."""
         out, p, n, nyquist = [], self.loops, hardware.modes, hardware.frame_rate_hz / 2
@@ -257,3 +252,196 @@ def turbulence_rows(turbulence: Turbulence, rows: IntArray) -> Turbulence:
         a, driving = turbulence.coefficients[rows], turbulence.driving_rms_nm[rows]
         return replace(turbulence, coefficients=a, driving_rms_nm=driving)
     return turbulence
+
+
+def ensemble_residuals(
+    controller: Any,
+    hardware: LoopHardware,
+    ensemble: LoopEnsemble,
+    *,
+    frame_means: bool = False,
+) -> ResidualBudget:
+    """Evaluate a controller exactly in many loops, or many controllers in one loop each.
+
+    The answers are those of :func:`residual_budget`, loop by loop: stability by eigenvalues,
+    spectra and noise by adaptive quadrature, auto-regressive processes by Lyapunov equations,
+    sinusoids by the closed loops' response. Independent tip and tilt are evaluated separately.
+
+    Parameters
+    ----------
+    controller : Controller, Design, or sequence of these
+        One controller for all loops, or one per loop, all with as many states.
+    hardware : LoopHardware
+        Sensor and mirror of all loops; the ensemble may have other delays.
+    ensemble : LoopEnsemble
+        What the loops meet, p of them.
+    frame_means : bool, optional
+        As in :func:`residual_budget`.
+
+    Returns
+    -------
+    ResidualBudget
+        Stability and covariances by origin.
+
+    Raises
+    ------
+    ProblemError
+        If the controller, a vibration, the turbulence or the noise does not fit the loop.
+    NumericalError
+        If an equation was not solved.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=797)
+    >>> plant = lbt.tip_tilt_plant(
+    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
+    ... )
+    >>> ensemble = lbt.loop.LoopEnsemble(
+    ...     sensor_gain=[0.8, 1.0, 4.0],
+    ...     turbulence=slow,
+    ...     noise_nm=15.5,
+    ...     vibrations=[lbt.loop.EnsembleVibration(frequency_hz=[19.0, 20.0, 20.0], rms_nm=797)],
+    ... )
+    >>> found = lbt.loop.ensemble_residuals(lbt.kalman(plant).controller, plant.hardware, ensemble)
+    >>> found.rms_nm.round(1).tolist()
+    [204.2, 191.7, nan]
+    """
+    require_instance(hardware, LoopHardware)
+    require_instance(ensemble, LoopEnsemble)
+    given = controller if isinstance(controller, list | tuple) else [controller]
+    each = [as_controller(one) for one in given]
+    for one in each:
+        require_matching_controller(hardware.own_sensor_alone(), one)
+    sizes, count = sorted({one.n_states for one in each}), ensemble.loops
+    if len(each) not in (1, count) or len(sizes) != 1:
+        raise DimensionError(
+            f"give one controller, or one per loop ({count}) with as many states each; got "
+            f"{len(each)} with {sizes} states."
+        )
+    matrices = textbook_matrices(each)
+    return residuals_from_matrices(matrices, hardware, ensemble, in_image=not frame_means)
+
+
+def residuals_from_matrices(
+    matrices: tuple[FloatArray, ...],
+    hardware: LoopHardware,
+    ensemble: LoopEnsemble,
+    *,
+    in_image: bool,
+) -> ResidualBudget:
+    """Evaluate controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
+    turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
+    for spectrum, _ in turbulence:
+        if isinstance(spectrum, ARModel | ModalTurbulence):
+            require_loop_rate(spectrum.frame_rate_hz, hardware)
+    stable, groups = close_loops(matrices, hardware, ensemble.gains(), ensemble.delays(hardware))
+    noise_nm, n, p = ensemble.noise(hardware), hardware.modes, ensemble.loops
+    sinusoids = [line for line in lines if line.damping is None]
+    steady, shaken = np.zeros((p, 2, 2, n, n)), np.zeros((p, 2, n, n))
+    amplitudes = np.zeros((p, len(sinusoids), n), dtype=np.complex128)
+    for left in (steady, shaken, amplitudes):
+        left[~stable] = np.nan
+    for stacks in groups:
+        for batch in _batches(stacks, stable):
+            some = [stack.take(batch) for stack in stacks]
+            rows = some[0].loops
+            spectra = [(turbulence_rows(spectrum, rows), modes) for spectrum, modes in turbulence]
+            for stack in some:
+                steady[rows] += _of_part(
+                    stack, spectra, noise_nm[rows], hardware, in_image=in_image
+                )
+            for line in lines:
+                members = _reached(some, line.direction[rows])
+                modes = np.concatenate([own for _, own in members])
+                loops = stack_evaluator(members, hardware, in_image=in_image)
+                along = line.direction[np.ix_(rows, modes)]
+                f = line.frequency_hz[rows] / hardware.frame_rate_hz
+                if line.damping is not None:
+                    share = np.sinc(f) if in_image else 1.0
+                    process = sampled_lines(
+                        line.frequency_hz[rows],
+                        line.damping[rows],
+                        share * line.rms_nm[rows],
+                        hardware.frame_rate_hz,
+                    )
+                    moved = loops.of_process(*process, along[..., None])
+                else:
+                    entry = np.zeros((rows.size, loops.B.shape[2]), dtype=np.complex128)
+                    entry[:, : modes.size] = np.sqrt(2) * line.rms_nm[rows][:, None] * along
+                    amplitudes_nm, within = loops.of_sinusoids(f, entry)
+                    place = np.ix_(rows, np.array([sinusoids.index(line)]), modes)
+                    amplitudes[place] = amplitudes_nm[:, None]
+                    moved = np.stack([0 * within, within], axis=1)
+                shaken[np.ix_(rows, np.arange(2), modes, modes)] += moved
+    of_turbulence, of_noise = np.moveaxis(steady, 1, 0)
+    return ResidualBudget(
+        stable=read_only(stable),
+        turbulence_nm2=of_turbulence[:, 0],
+        noise_nm2=of_noise[:, 0],
+        random_vibration_nm2=shaken[:, 0],
+        within_nm2=of_turbulence[:, 1] + of_noise[:, 1] + shaken[:, 1],
+        line_amplitudes_nm=amplitudes,
+    )
+
+
+def textbook_matrices(controllers: Sequence[Controller]) -> tuple[FloatArray, ...]:
+    """Return controllers with equal numbers of states as balanced ``A, B, C, D``, textbook form.
+
+    Only in states of comparable units does an entry that is tiny beside the others do nothing.
+    """
+    systems = [controller.to_statespace() for controller in controllers]
+    systems = [system.balanced() if system.n_states else system for system in systems]
+    return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
+
+
+def _batches(stacks: list[LoopStack], stable: BoolArray) -> list[IntArray]:
+    """Split the stable loops of stacks into batches, by how near to instability they are.
+
+    Loops next to instability, which need short panels, are then together.
+    """
+    poles = np.concatenate([stack.poles for stack in stacks], axis=1)
+    order = np.argsort(np.max(np.abs(poles), axis=1), kind="stable")
+    order = order[stable[stacks[0].loops[order]]]
+    return [order[i : i + _TOGETHER] for i in range(0, order.size, _TOGETHER)]
+
+
+def _of_part(
+    stack: LoopStack,
+    turbulence: list[tuple[Turbulence, tuple[int, ...]]],
+    noise_nm: FloatArray,
+    hardware: LoopHardware,
+    *,
+    in_image: bool,
+) -> FloatArray:
+    """Covariances (k, 2, 2, n, n) from turbulence and from noise (k, q): of means, and within.
+
+    ``turbulence`` pairs each spectrum with its modes. All is of the whole loop: the covariances of
+    other parts are zero. What reaches equal parts alike is evaluated once.
+    """
+    n = hardware.modes
+    out = np.zeros((stack.loops.size, 2, 2, n, n))
+    of_turbulence, of_noise = out[:, 0], out[:, 1]
+    loops = stack_evaluator([(stack, stack.modes[0])], hardware, in_image=in_image)
+    known: dict[object, FloatArray] = {}
+    for own, inputs in zip(stack.modes, stack.measurements, strict=True):
+        at = np.ix_(own, own)
+        noise = noise_nm[:, inputs]
+        if noise.tobytes() not in known:
+            known[noise.tobytes()] = loops.of_noise(noise[..., None] * np.eye(inputs.size))
+        of_noise[:, :, *at] += known[noise.tobytes()]
+        for i, (spectrum, modes) in enumerate(turbulence):
+            columns = np.flatnonzero(np.isin(own, modes))
+            key = i, *columns.tolist()
+            if key not in known and columns.size:
+                entry = np.eye(own.size)[None, :, columns]
+                known[key] = loops.of_turbulence(spectrum, entry)
+            of_turbulence[:, :, *at] += known.get(key, 0.0)
+    return out
+
+
+def _reached(stacks: list[LoopStack], along: FloatArray) -> list[tuple[LoopStack, IntArray]]:
+    """Return the stacks that directions (k, n) reach, and the modes that each stands for."""
+    pairs = [(stack, modes) for stack in stacks for modes in stack.modes]
+    return [(stack, modes) for stack, modes in pairs if np.any(along[:, modes])]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -24,37 +25,25 @@ from lbt_synth.models.mirror.frame_rate_system import (
 )
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
+# some modes of a loop, (c, n) of c equal parts, and their measurements, (c, q); the matrices of
+# their controllers; the sensor (q, n) and the influence (n, m)
+Part: TypeAlias = tuple[IntArray, IntArray, tuple[FloatArray, ...], FloatArray, FloatArray]
 _ROUNDING = 1e-13  # smaller entries, relative to the largest of their matrix, count as zero
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class LoopPart:
-    """Some modes of a loop, and all that depends on them; c of them that are equal are one part.
-
-    The controllers ``A, B, C, D`` are in textbook form, (N, ., .) each: one for all loops, or one
-    per loop.
-    """
-
-    modes: IntArray  # indices in the whole loop, (c, n)
-    measurements: IntArray  # (c, q)
-    matrices: tuple[FloatArray, ...]  # of the controllers
-    sensor: FloatArray  # (q, n)
-    influence: FloatArray  # (n, m)
-
-    def controllers(self, rows: IntArray) -> tuple[FloatArray, ...]:
-        """Return the controllers ``A, B, C, D`` of some loops, or the one that serves all."""
-        one = len(self.matrices[0]) == 1
-        return self.matrices if one else tuple(matrix[rows] for matrix in self.matrices)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopStack:
-    """k loops of one part, from ``[phi_tot (n), noise (q)]`` to ``phi_res (n)``.
+    """k loops of some modes, from ``[phi_tot (n), noise (q)]`` to ``[phi_res (n), u (m), y (q)]``.
 
-    Their mirrors are ``(1 - fraction) first + fraction second``.
+    Parts of a loop that are equal, c of them, have one stack. The mirrors are ``(1 - fraction)
+    first + fraction second``.
     """
 
-    part: LoopPart
+    modes: IntArray  # indices in the whole loop, (c, n)
+    measurements: IntArray  # (c, q)
+    controllers: tuple[FloatArray, ...]  # A, B, C, D in textbook form, (1 or k, ., .) each
+    sensor: FloatArray  # (q, n)
+    influence: FloatArray  # (n, m)
     mirrors: tuple[Response, Response]  # first and second, with the same states
     hold: Hold | None  # where a mirror with dynamics is within a frame; a settled one stays
     start: FloatArray  # of the hold of u(k) after the begin of exposure k [frames], (k,)
@@ -65,33 +54,31 @@ class LoopStack:
     B: FloatArray
     C: FloatArray
     D: FloatArray
-    command_C: FloatArray  # (k, m, s): from the states to the commands
-    command_D: FloatArray
     poles: ComplexArray  # (k, s)
 
     def take(self, which: IntArray) -> LoopStack:
         """Return some of the loops."""
         names = ["loops", "start", "fraction", "sensor_gains", *"ABCD", "poles"]
-        names += ["command_C", "command_D"]
-        return replace(self, **{name: getattr(self, name)[which] for name in names})
+        values = {name: getattr(self, name)[which] for name in names}
+        controllers = _of_loops(self.controllers, which)
+        return replace(self, controllers=controllers, **values)
 
     @property
     def holds_are_frames(self) -> bool:
         """Whether each command holds for one whole exposure in all of these loops."""
         return self.hold is None and not np.any(self.fraction)
 
-    def image_powers(self, z: ComplexArray) -> tuple[FloatArray, FloatArray]:
-        """Powers (f, k) that a unit phase of all moments and unit noise leave, for one mode."""
-        f, hold = np.angle(z) / (2 * np.pi), self.hold or STILL
+    def image_powers(self, f: FloatArray) -> FloatArray:
+        """Powers (f, k) that a unit phase of all moments leaves, for one mode."""
+        hold, z = self.hold or STILL, np.exp(2j * np.pi * f)
         path, rejection, denominator = self._parts(z)
-        seen = (rejection * path)[0, 0] * (self.sensor_gains / denominator)
+        mirrored = np.sinc(f)[:, None] * (rejection * path)[0, 0]
+        mirrored = mirrored * (self.sensor_gains / denominator)
         positions, means = self._positions(z), hold.phase_means(f)
-        late = np.exp(2j * np.pi * f[:, None] * (self.start - hold.start - 0.5))
-        mirrored = np.sinc(f)[:, None] * seen
+        late = np.exp(-2j * np.pi * f[:, None] * (self.start - hold.start - 0.5))
+        crossed = (positions * means.conj() @ hold.weights)[:, None] * late
         squares = (np.abs(positions) ** 2 @ hold.weights)[:, None]
-        crossed = (positions * means.conj() @ hold.weights)[:, None] * late.conj()
-        of_phase = 1 - 2 * np.real(crossed * mirrored) + squares * np.abs(mirrored) ** 2
-        return of_phase, squares * np.abs(seen / (self.part.sensor[0, 0] * self.sensor_gains)) ** 2
+        return np.asarray(1 - 2 * np.real(crossed * mirrored) + squares * np.abs(mirrored) ** 2)
 
     def responses(self, f: FloatArray, share: FloatArray, *, held: bool) -> Iterator[ComplexArray]:
         """Yield what phases leave of the means over frames, which are a share (f,) of them.
@@ -111,20 +98,20 @@ class LoopStack:
 
     def rows(self, *, held: bool) -> tuple[FloatArray, FloatArray]:
         """Return C (k, g, n, s) and D (k, g, n, n + q) of what :meth:`responses` are of."""
+        n, m = self.influence.shape
         if not held:
-            return self.C[:, None], self.D[:, None]
-        first = self.part.matrices[0].shape[-1]  # the states of the mirror follow
-        commands = self.command_C, self.command_D
-        return (self.hold or STILL).positions(self.part.influence, commands, first)
+            return self.C[:, None, :n], self.D[:, None, :n]
+        first = self.controllers[0].shape[-1]  # the states of the mirror follow
+        commands = self.C[:, n : n + m], self.D[:, n : n + m]
+        return (self.hold or STILL).positions(self.influence, commands, first)
 
     def _parts(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
         """Return the path of phases, and the rejection over its denominator, (n, n, f, k).
 
         The path is to what commands do to the modes, at a gain of 1 and without the mirror.
         """
-        part = self.part
-        controller = np.moveaxis(stacked_response(part.controllers(self.loops), z), (2, 3), (0, 1))
-        path = np.einsum("nm,mq...,qr->nr...", part.influence, controller, part.sensor)
+        controller = np.moveaxis(stacked_response(self.controllers, z), (2, 3), (0, 1))
+        path = np.einsum("nm,mq...,qr->nr...", self.influence, controller, self.sensor)
         path = path / z[:, None]
         first, second = (_mirror_response(mirror, z)[:, None] for mirror in self.mirrors)
         loop = self.sensor_gains * (first * path)
@@ -147,7 +134,7 @@ def stack_evaluator(
     """Return the evaluator of loops, of independent parts of them with the modes of each."""
     first, _ = members[0]
     held = in_image and not first.holds_are_frames
-    sizes = [len(stack.part.influence) for stack, _ in members]
+    sizes = [len(stack.influence) for stack, _ in members]
     rows = [stack.rows(held=held) for stack, _ in members]
     C = block_diagonal([one for one, _ in rows])
     D = _join_inputs([one for _, one in rows], sizes)
@@ -221,7 +208,7 @@ def close_loops(
 
 def split_into_parts(
     matrices: tuple[FloatArray, ...], hardware: LoopHardware
-) -> tuple[list[LoopPart], list[FloatArray]]:
+) -> tuple[list[Part], list[FloatArray]]:
     """Split a loop into independent parts, equal ones once, and what reaches no mode."""
     A, B, C, D = matrices
     sensor, influence = hardware.sensor, hardware.influence
@@ -232,7 +219,7 @@ def split_into_parts(
     for rows, columns, entries in (*controller, (y, r, sensor[None]), (r, u, influence[None])):
         links[np.ix_(rows, columns)] = _nonzero_entries(entries)
     label = component_labels(links)
-    parts: dict[tuple[bytes, ...], LoopPart] = {}
+    parts: dict[tuple[bytes, ...], Part] = {}
     rest = []
     for i in range(np.max(label) + 1):
         states, inputs, commands, modes = (np.flatnonzero(label[k] == i) for k in (x, y, u, r))
@@ -241,10 +228,10 @@ def split_into_parts(
         path = sensor[np.ix_(inputs, modes)], influence[np.ix_(modes, commands)]
         key = tuple(matrix.tobytes() for matrix in (*own, *path))
         if modes.size and key in parts:
-            modes = np.vstack([parts[key].modes, modes])
-            inputs = np.vstack([parts[key].measurements, inputs])
+            modes = np.vstack([parts[key][0], modes])
+            inputs = np.vstack([parts[key][1], inputs])
         if modes.size:
-            parts[key] = LoopPart(np.atleast_2d(modes), np.atleast_2d(inputs), own, *path)
+            parts[key] = np.atleast_2d(modes), np.atleast_2d(inputs), own, *path
         elif states.size:
             rest.append(own[0])
     return list(parts.values()), rest
@@ -258,7 +245,7 @@ def _nonzero_entries(entries: FloatArray) -> BoolArray:
 
 
 def _close_part(
-    part: LoopPart,
+    part: Part,
     rows: IntArray,
     fraction: FloatArray,
     gains: FloatArray,
@@ -267,17 +254,21 @@ def _close_part(
     start: FloatArray,
 ) -> LoopStack:
     """Close the loops of a part at one whole delay."""
-    k, readings = part.controllers(rows), last_frame(part.sensor)
+    modes, measurements, matrices, sensor, influence = part
+    controllers, readings = _of_loops(matrices, rows), last_frame(sensor)
     ends = [
-        loop_matrices(*k, mirror=mirror, readings=readings, influence=part.influence)
+        loop_matrices(*controllers, mirror=mirror, readings=readings, influence=influence)
         for mirror in mirrors
     ]
-    share, gain, n = fraction[:, None, None], gains[:, None, None], len(part.influence)
+    share, gain = fraction[:, None, None], gains[:, None, None]
     A0, A1, B, C0, C1, D = (one + share * (two - one) for one, two in zip(*ends, strict=True))
-    A, C = A0 + gain * A1, C0 + gain * C1
-    command = slice(n, n + part.influence.shape[1])
+    A = A0 + gain * A1
     return LoopStack(
-        part=part,
+        modes=modes,
+        measurements=measurements,
+        controllers=controllers,
+        sensor=sensor,
+        influence=influence,
         mirrors=mirrors,
         hold=hold,
         start=start,
@@ -286,12 +277,16 @@ def _close_part(
         sensor_gains=gains,
         A=A,
         B=B,
-        C=C[:, :n],
-        D=D[:, :n],
-        command_C=C[:, command],
-        command_D=D[:, command],
+        C=C0 + gain * C1,
+        D=D,
         poles=np.linalg.eigvals(A).astype(np.complex128),
     )
+
+
+def _of_loops(controllers: tuple[FloatArray, ...], rows: IntArray) -> tuple[FloatArray, ...]:
+    """Return the controllers of some loops, or the one that serves all."""
+    one = len(controllers[0]) == 1
+    return controllers if one else tuple(matrix[rows] for matrix in controllers)
 
 
 def _mirrors_by_delay(

@@ -1,1 +1,0 @@
-"""Exact residuals of many loops at once."""
