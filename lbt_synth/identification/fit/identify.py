@@ -27,7 +27,12 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedModel,
 )
 from lbt_synth.identification.fit.jumps import cut_at_jumps, find_correction_jumps, find_jumps
-from lbt_synth.identification.fit.order_search import find_components, find_models, find_rivals
+from lbt_synth.identification.fit.order_search import (
+    OVERDAMPED,
+    find_components,
+    find_models,
+    find_rivals,
+)
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
@@ -425,8 +430,8 @@ def _gain_error(model: FittedModel) -> float:
 def _is_clear(model: FittedModel, start: IdentifiedAxis | None) -> bool:
     """Whether nothing could explain another gain than that of a model.
 
-    A plausible gain is clear that is well known beside narrow lines and white noise, or was found
-    in earlier data with an error like that of its fit.
+    A plausible gain is clear that is well known beside narrow lines, white noise and turbulence
+    that is not overdamped, or was found in earlier data with an error like that of its fit.
     """
     background, error = model.spectrum.background, _gain_error(model)
     earlier = None if start is None else start.sensor_gain_error
@@ -435,7 +440,8 @@ def _is_clear(model: FittedModel, start: IdentifiedAxis | None) -> bool:
         and earlier is not None
         and earlier < _AMBIGUOUS * error * start.sensor_gain
     )
-    plain = all(line.is_narrow for line in model.spectrum.lines) and not background.colour
+    turbulence, narrow = model.spectrum.components[0], [c.is_narrow for c in model.spectrum.lines]
+    plain = all(narrow) and not background.colour and turbulence.damping_ratio < OVERDAMPED
     low, high = PLAUSIBLE_GAINS
     return low <= background.gain <= high and (compared or (plain and error < _ROUGH_GAIN))
 

@@ -37,7 +37,7 @@ _COLOUR = 0.3  # of the noise, where a fit begins
 _MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz] and damping: starts of a fit
 _CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a drift beside turbulence may meet the noise
-_OVERDAMPED = 3.0  # damping ratio of turbulence that may stand for a drift
+OVERDAMPED = 3.0  # damping ratio of turbulence that may stand for a drift
 _SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
 _WIDEST_LINE = 0.98  # damping ratio
 _BANDS = 80  # of the background
@@ -218,7 +218,7 @@ def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
     drifts = [
         search.drift(search.place(c)[0] / (2 * c.damping_ratio), float(np.exp(c.log_power)))
         for c in slow
-        if c.damping_ratio > _OVERDAMPED
+        if c.damping_ratio > OVERDAMPED
     ]
     noise = 2 / search.data.frame_rate_hz * float(np.exp(background.log_noise))
     # the density of a drift of variance P above its corner is 2 P corner / (pi f^2)
