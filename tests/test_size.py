@@ -14,26 +14,26 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 4556,
+    "cli": 4480,
     "config": 2331,
-    "design": 8382,
+    "design": 8220,
     "files": 1608,
-    "identification": 12630,
-    "interop": 4459,
+    "identification": 11270,
+    "interop": 4375,
     "linear": 6078,
-    "loop": 5150,
+    "loop": 5050,
     "methods": 1109,
     "models": 4550,
-    "report": 4939,
+    "report": 4850,
     "storage": 1049,
-    "studies": 3106,
+    "studies": 3050,
     "errors, validation": 642,
 }
 COUNTS = {
-    "files of the package": 303,
-    "public names": 248,
-    "tuned constants": 832,
-    "lines of tests": 42600,
+    "files of the package": 284,
+    "public names": 237,
+    "tuned constants": 696,
+    "lines of tests": 41320,
     "words of docs": 75543,
 }
 

@@ -247,11 +247,7 @@ def find_gains(
         spectra = _checked_spectra(density, nodes, differenced=differenced)
         variances = (spectra * weights) @ rejection.T
         variances += np.outer(noise_nm2, propagated)
-        if np.any(variances[:, 0] == 0):
-            raise ProblemError(
-                "every mode must have turbulence, vibration or noise; got none in mode "
-                f"{int(np.argmin(variances[:, 0]))}."
-            )
+        _require_disturbances(variances[:, 0])
         best, variance = _minimise(loop_gains, variances, limit, highest)
         if differenced:
             floor = noise_nm2 * np.interp(best, loop_gains, propagated)
@@ -278,6 +274,15 @@ def find_gains(
         noise_nm=noise_nm,
         hardware=path,
     )
+
+
+def _require_disturbances(variances: FloatArray) -> None:
+    """Refuse a mode (m,) that nothing disturbs."""
+    if np.any(variances == 0):
+        raise ProblemError(
+            "every mode must have turbulence, vibration or noise; got none in mode "
+            f"{int(np.argmin(variances))}."
+        )
 
 
 def _minimise(
