@@ -527,9 +527,12 @@ def _scale(
             return scale
         if np.mean(np.log(gains)) < np.log(low):
             return one  # commands that are too large come from a law that is too strong
+    fitted = float(np.mean(np.log(gains)))
     tried = (low, float(np.clip(_USUAL_GAIN, low, high)), high)
-    held = min(_fit(coarse, scaled, gain / choice.gain)[0] for gain in tried)
-    return scale if held - free >= choice.clear else one
+    for gain in sorted(tried, key=lambda gain: abs(np.log(gain) - fitted)):
+        if _fit(coarse, scaled, gain / choice.gain)[0] - free < choice.clear:
+            return one  # a plausible gain is nearly as likely
+    return scale
 
 
 def likely_factors(gains: FloatArray, plausible: tuple[float, float]) -> FloatArray:
