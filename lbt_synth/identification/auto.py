@@ -169,7 +169,6 @@ def design_from_record(
     first, _ = split_halves(record.stretches(), record.frames)
     half = identify(record, stretches=first, **options)
     finds_gain = record.commands is not None and sensor_gain is None
-    allowed = allowed_gains(record, half) if finds_gain else None
     design = partial(_design, defaults=defaults)
     if finds_gain:
         assumptions += _judge_gains(half, accept_record)
@@ -188,8 +187,8 @@ def design_from_record(
         rows = [(names[row.name], row.replayed) for row in held_out.entries if row.name in names]
         residuals = {name: residual for name, residual in rows if residual is not None}
         unsafe = []
-        if allowed is not None:
-            path = half.hardware
+        if finds_gain:
+            path, allowed = half.hardware, allowed_gains(record, half)
             unsafe = [
                 names[title]
                 for title, tried_design in designs.items()

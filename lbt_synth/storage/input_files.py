@@ -5,12 +5,10 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
-import json
 import os
 from collections.abc import Iterator
 from io import BufferedReader
 from pathlib import Path
-from typing import Any
 
 from lbt_synth.errors import FileError
 
@@ -49,14 +47,6 @@ def file_sha256(path: str | os.PathLike[str], error: type[FileError]) -> str:
     """Return the SHA-256 of a regular file, as ``sha256sum`` prints it."""
     with open_input(path, error) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def read_json(path: str | os.PathLike[str], error: type[FileError]) -> Any:
-    """Return what a JSON file holds; ValueError where it is none."""
-    try:
-        return json.loads(read_bytes(path, error, most=LARGEST_TEXT_BYTES))
-    except RecursionError as why:
-        raise ValueError("its brackets are nested too deep") from why
 
 
 def error_text(error: Exception) -> object:

@@ -6,7 +6,7 @@ import pytest
 
 import lbt_synth as lbt
 from lbt_synth.errors import FileError
-from lbt_synth.storage.input_files import read_bytes, read_json
+from lbt_synth.storage.input_files import read_bytes
 
 READERS = {
     ".fits": [lbt.load_gain, lbt.files.load_telemetry, lbt.load_record],
@@ -50,10 +50,3 @@ def test_a_link_may_be_read(tmp_path):
     assert read_bytes(tmp_path / "b", FileError, most=2) == b"12"
     with pytest.raises(FileError, match="larger than 0 kB"):
         read_bytes(tmp_path / "b", FileError, most=1)
-    assert read_json(tmp_path / "b", FileError) == 12
-
-
-def test_brackets_without_end(tmp_path):
-    (tmp_path / "a").write_bytes(b"[" * 100_000)
-    with pytest.raises(ValueError, match="nested too deep"):
-        read_json(tmp_path / "a", FileError)
