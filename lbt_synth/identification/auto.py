@@ -6,37 +6,31 @@ of the test: one that wins on some parts only has won by what changed between th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.design import Design
+from lbt_synth.errors import NumericalError
 from lbt_synth.identification.commands.verdict import explain_commands, judge_fitted_gains
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.prediction.comparison import (
     PredictionTable,
-    compare_on_record,
-    stable_designs,
+    compare_designs,
 )
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
-from lbt_synth.identification.sensor_gains import (
-    allowed_gains,
-    design_for_gains,
-    unstable_gains,
-)
+from lbt_synth.identification.sensor_gains import allowed_gains, design_for_gains
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget
 from lbt_synth.methods.registry import (
     default_method,
-    gain_robust_method,
     method_named,
     record_methods,
 )
@@ -50,8 +44,6 @@ _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 _PARTS = 3  # of the test, on each of which another method has to win
-_ERRORS = 2.0  # of the difference by which another method has to leave less than the default
-_LEAST_SHARE = 0.02  # of the measured variance: 1 % of the rms, less than conditions change by
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,9 +93,9 @@ def design_from_record(
     returned is made the same way from all frames.
 
     Without a method, the quick ones that need no more than a plant are tested in this way. The
-    Kalman filter stays unless another one leaves less on each third of the test, by more than twice
-    the error of the difference and 2 % of the measured variance. Where it does not stay, the test
-    is a little kind to the chosen one.
+    Kalman filter stays unless another one leaves less on each third of the test, by more than 2 %
+    of the measured variance and than twice the error of the difference, or by 25 % of the rms.
+    Where it does not stay, the test is a little kind to the chosen one.
 
     Parameters
     ----------
@@ -162,46 +154,33 @@ def design_from_record(
     True
     """
     defaults = {} if gamma_ratio is None else {"gamma_ratio": gamma_ratio}
-    usable = _require_able(record, method, defaults)
+    seconds = _require_able(record, method, defaults)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     options |= {"sensor_gain": sensor_gain, "announced": announced}
     first, _ = split_halves(record.stretches(), record.frames)
     half = identify(record, stretches=first, **options)
     finds_gain = record.commands is not None and sensor_gain is None
-    design = partial(_design, defaults=defaults)
     if finds_gain:
         assumptions += _judge_gains(half, accept_record)
-    designs: dict[str, Design] = {}
-    if method is None:
-        tried = {name: method_named(name).reference_options for name in quick_methods()}
-        designs, missing = stable_designs(half.plant(), tried, defaults)
-        notes += missing
-    if not designs:
-        name = method or default_method()
-        designs = {method_named(name).title: design(name, half)}
     step(1)
-    held_out = compare_on_record(record, half, designs, imaging=imaging or Imaging())
+    names = quick_methods() if method is None else [method]
+    requests = {name: {} if method else method_named(name).reference_options for name in names}
+    held_out, designs = compare_designs(
+        record, half, requests, defaults=defaults, imaging=imaging or Imaging()
+    )
+    if not designs:
+        raise NumericalError(f"no design holds the loop: {'; '.join(held_out.notes)}.")
     if method is None:
-        names = {method_named(name).title: name for name in quick_methods()}
-        rows = [(names[row.name], row.replayed) for row in held_out.entries if row.name in names]
-        residuals = {name: residual for name, residual in rows if residual is not None}
-        unsafe = []
-        if finds_gain:
-            path, allowed = half.hardware, allowed_gains(record, half)
-            unsafe = [
-                names[title]
-                for title, tried_design in designs.items()
-                if unstable_gains(path, tried_design.controller, allowed) is not None
-            ]
-        method, words = choose_method(residuals, unsafe)
-        notes += words
+        rows = [(row.name, row.replayed) for row in held_out.entries if row.name in designs]
+        title, note = choose_method({name: data for name, data in rows if data is not None})
+        method = next(name for name in names if method_named(name).title == title)
+        notes.append(note)
     step(1)
     model = identify(record, start=half, **options)
-    made, careful = design_for_gains(
+    made, price = design_for_gains(
         model,
-        partial(design, method),
-        _design_robustly,
+        lambda known: _design(method, known, defaults=defaults),
         allowed_gains(record, model) if finds_gain else None,
         command_scale_known=command_scale_known,
     )
@@ -214,15 +193,16 @@ def design_from_record(
         name=method_named(method).title,
         notes=(
             *notes,
-            *careful,
+            *price,
             *_compare_gains(model, half),
             *note_drift(record, model.plant(), made.controller),
-            *_note_short(usable, model),
+            *_note_short(seconds, model),
         ),
     )
 
 
 def _design(method: str, model: IdentifiedModel, *, defaults: Mapping[str, Any]) -> Design:
+    """Return the design of a method for a model."""
     inputs = PlantInputs(plant=model.plant(), design_defaults=defaults)
     return design_request(method, {}).build(inputs)
 
@@ -238,22 +218,6 @@ def _require_able(record: LoopRecord, method: str | None, defaults: Mapping[str,
     return require_length(record, seconds=LEAST_SECONDS) / record.frame_rate_hz
 
 
-def _design_robustly(model: IdentifiedModel, gains: tuple[float, float]) -> Design:
-    """Design for an interval of gains, relative to the model's, by a method that can."""
-    inputs = PlantInputs(plant=model.plant(), sensor_gains=gains)
-    return design_request(gain_robust_method(), {}).build(inputs)
-
-
-def _note_short(seconds: float, model: IdentifiedModel) -> Iterator[str]:
-    """Yield what a short record leaves open."""
-    if seconds < _SHORT_SECONDS:
-        resolution_hz = max(axis.resolution_hz for axis in model.axes)
-        yield (
-            f"the record is short ({seconds:.3g} s): it does not tell lines less than "
-            f"{resolution_hz:.2g} Hz apart from one. Half a minute shows more"
-        )
-
-
 def _judge_commands(
     record: LoopRecord, sensor_gain: float | Sequence[float] | None, accept: bool
 ) -> tuple[list[str], list[str]]:
@@ -263,11 +227,11 @@ def _judge_commands(
     verdict = explain_commands(record, sensor_gain=sensor_gain)
     if not accept:
         verdict.require_accepted()
-    given = []
+    assumptions = list(verdict.overruled)
     if sensor_gain is not None:
         gains = " and ".join(f"{gain:g}" for gain in np.ravel(sensor_gain))
-        given = [f"the sensor gain is {gains}, as it was given"]
-    return list(verdict.notes), [*verdict.overruled, *given]
+        assumptions.append(f"the sensor gain is {gains}, as it was given")
+    return list(verdict.notes), assumptions
 
 
 def _judge_gains(model: IdentifiedModel, accept: bool) -> tuple[str, ...]:
@@ -280,15 +244,13 @@ def _judge_gains(model: IdentifiedModel, accept: bool) -> tuple[str, ...]:
 
 
 def _compare_gains(model: IdentifiedModel, half: IdentifiedModel) -> Iterator[str]:
-    """Warn of sensor gains that disagree."""
-    for i, (whole, first) in enumerate(zip(model.axes, half.axes, strict=True)):
-        if whole.sensor_gain_error is None or first.sensor_gain_error is None:
-            continue
-        apart = abs(whole.sensor_gain - first.sensor_gain)
-        if apart > DIFFERENT * float(np.hypot(whole.sensor_gain_error, first.sensor_gain_error)):
+    """Warn of sensor gains that changed after the first half of a record."""
+    for i, (axis, first) in enumerate(zip(model.axes, half.axes, strict=True)):
+        error = np.hypot(axis.sensor_gain_error or np.inf, first.sensor_gain_error or np.inf)
+        if abs(axis.sensor_gain - first.sensor_gain) > DIFFERENT * error:
             yield (
                 f"warning: axis {i} has a sensor gain of {first.sensor_gain:.3f} in the first half "
-                f"of the record, and of {whole.sensor_gain:.3f} in all of it"
+                f"of the record, and of {axis.sensor_gain:.3f} in all of it"
             )
 
 
@@ -315,52 +277,40 @@ def note_drift(record: LoopRecord, plant: TipTiltPlant, controller: Controller) 
             )
 
 
+def _note_short(seconds: float, model: IdentifiedModel) -> Iterator[str]:
+    """Yield what a short record leaves open."""
+    if seconds < _SHORT_SECONDS:
+        resolution_hz = max(axis.resolution_hz for axis in model.axes)
+        yield (
+            f"the record is short ({seconds:.3g} s): it does not tell lines less than "
+            f"{resolution_hz:.2g} Hz apart from one. Half a minute shows more"
+        )
+
+
 def quick_methods() -> list[str]:
     """Return the names of the methods that an automatic choice tries, the default first."""
     names = [name for name in record_methods() if not method_named(name).slow]
     return sorted(names, key=lambda name: name != default_method())
 
 
-def choose_method(
-    residuals: Mapping[str, ResidualEstimate], unsafe: Collection[str] = ()
-) -> tuple[str, list[str]]:
+def choose_method(residuals: Mapping[str, ResidualEstimate]) -> tuple[str, str]:
     """Choose the default method, unless another one leaves clearly less on every third of a test.
 
-    The loops of ``unsafe`` designs are unstable at a sensor gain that the record allows. Return the
-    name of the method, and by how much it is better.
+    The residuals are by the titles of methods; return one of these, and why it is chosen.
     """
-    usual, notes = default_method(), list[str]()
-    ordered = sorted(residuals, key=lambda name: residuals[name].total_nm2)
+    usual = method_named(default_method()).title
+    ordered = sorted(residuals, key=lambda title: residuals[title].total_nm2)
     if usual not in residuals:
-        title = method_named(ordered[0]).title
-        return ordered[0], [f"the {title} is chosen: of the methods that are left it leaves least"]
-    for name in ordered:
-        if not _is_better(residuals[name], residuals[usual]):
-            continue
-        title = method_named(name).title
-        if name not in unsafe:
-            difference, error = residuals[usual].above(residuals[name])
+        title = ordered[0]
+        return title, f"the {title} is chosen: of the methods that are left it leaves least"
+    thirds = residuals[usual].parts(_PARTS)
+    for title in ordered:
+        others = residuals[title].parts(_PARTS)
+        if all(third.is_clearly_above(other) for third, other in zip(thirds, others, strict=True)):
+            difference, error = residuals[usual].above(residuals[title])
             gained = nm_text(difference, error_nm=error, unit="nm^2")
-            words = (
+            return title, (
                 f"the {title} is chosen: on each of {_PARTS} parts of the test it leaves less than "
-                f"the {method_named(usual).title}, in all by {gained}"
+                f"the {usual}, in all by {gained}"
             )
-            return name, [words, *notes]
-        notes.append(
-            f"the {title} is left out: its loop is unstable at a sensor gain that the record allows"
-        )
-    words = (
-        f"the {method_named(usual).title} stays: no method tried leaves less on each of {_PARTS} "
-        f"parts of the test, by more than {_ERRORS:g} standard errors and "
-        f"{100 * _LEAST_SHARE:g} % of the variance"
-    )
-    return usual, [words, *notes]
-
-
-def _is_better(residual: ResidualEstimate, usual: ResidualEstimate) -> bool:
-    """Whether a residual is clearly less than the usual one on every part of the test."""
-    for part, reference in zip(residual.parts(_PARTS), usual.parts(_PARTS), strict=True):
-        difference, error = reference.above(part)
-        if difference <= max(_ERRORS * error, _LEAST_SHARE * reference.measured_nm2):
-            return False
-    return True
+    return usual, f"the {usual} stays: no method leaves clearly less on each third of the test"

@@ -19,16 +19,14 @@ from lbt_synth.identification.fit.identify import OPEN_GAIN
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop, residual_budget, stable_sensor_gains
+from lbt_synth.methods.registry import gain_robust_method
+from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import FloatArray
 
-_STEPS = 33  # gains between the possible ones at which the law that ran is tried
 _MISFIT = 1.5  # factor by which a gain may be off where the model leaves something out
-_STEP = 0.05  # of the logarithm of a gain that a design may assume in place of the fitted one
-_HALF = 0.5  # of the gains are left of commands recorded at half their size
-_UNEVEN = 1.3  # ratio of the gains of two axes that one sensor hardly has
-_WORTH_ASKING = 1.05  # ratio of residuals from which knowing the gain is worth a question
+_STEP = 0.05  # of the logarithm of a gain, between gains that are tried: a loop hardly changes
 
 
 def allowed_gains(record: LoopRecord, model: IdentifiedModel) -> FloatArray:
@@ -74,13 +72,11 @@ def allowed_gains(record: LoopRecord, model: IdentifiedModel) -> FloatArray:
     for axis in model.axes:
         gain, error = axis.sensor_gain, axis.sensor_gain_error or 0.0
         factor = np.exp(DIFFERENT * error / gain) * (1.0 if axis.whiteness.white else _MISFIT)
-        limits = [running]
-        if PLAUSIBLE_GAINS[0] <= gain <= PLAUSIBLE_GAINS[1]:
-            limits.append(PLAUSIBLE_GAINS)
-        low, high = gain / factor, gain * factor
-        for least, most in limits:
-            low, high = min(max(low, least), most), max(min(high, most), least)
-        rows.append((low, high))
+        is_plausible = PLAUSIBLE_GAINS[0] <= gain <= PLAUSIBLE_GAINS[1]
+        ends = np.array([gain / factor, gain * factor])
+        for limits in (running, PLAUSIBLE_GAINS if is_plausible else POSSIBLE_GAINS):
+            ends = np.clip(ends, *limits)
+        rows.append(ends)
     return np.array(rows)
 
 
@@ -89,14 +85,17 @@ def _running_gains(record: LoopRecord) -> tuple[float, float]:
     law = record_law(record)
     if law is None or law.kind == "none" or law.lag_frames < 0:
         return POSSIBLE_GAINS
-    gains, one = np.geomspace(*POSSIBLE_GAINS, _STEPS), np.ones((1, record.axes))
-    running = np.flatnonzero(
-        [could_have_run(CommandRepair(), gain * one, record, law) for gain in gains]
-    )
-    if not running.size:
+    gains, one = _gains_between(*POSSIBLE_GAINS), np.ones((1, record.axes))
+    ran = [could_have_run(CommandRepair(), gain * one, record, law) for gain in gains]
+    if not any(ran):
         return POSSIBLE_GAINS
-    beyond = max(running[0] - 1, 0), min(running[-1] + 1, _STEPS - 1)
-    return float(gains[beyond[0]]), float(gains[beyond[1]])
+    beside = np.convolve(ran, [1, 1, 1], "same") > 0  # the limit is between two gains
+    return float(gains[beside][0]), float(gains[beside][-1])
+
+
+def _gains_between(start: float, end: float) -> FloatArray:
+    """Return gains from one to another, both of them included."""
+    return np.geomspace(start, end, int(np.ceil(abs(np.log(end / start)) / _STEP)) + 1)
 
 
 def unstable_gains(
@@ -123,7 +122,6 @@ def unstable_gains(
 def design_for_gains(
     model: IdentifiedModel,
     design: Callable[[IdentifiedModel], Design],
-    design_robustly: Callable[[IdentifiedModel, tuple[float, float]], Design],
     allowed: FloatArray | None,
     *,
     command_scale_known: bool,
@@ -131,11 +129,10 @@ def design_for_gains(
     """Return a design that is stable at all sensor gains that a record allows, and notes.
 
     Its first assumption says which gains these are. Commands that were recorded at half their size
-    look like twice the sensor gain, and no record can tell; so half of the gains are possible,
-    unless the scale of the commands is known. Where the axes have different gains, the commands of
-    either may have another size than was recorded, and each axis may have the gains of both. Where
-    the design for the fitted gain is unstable at one of them, the best of the designs that assume
-    another gain takes its place, or a robust one.
+    look like twice the sensor gain, and no record can tell; so unless the scale of the commands is
+    known, half of the gains are possible, and each axis may have those of both. Where the design
+    for the fitted gain is unstable at one of them, the best of the designs that assume another gain
+    takes its place, or a robust one.
     """
     usual = design(model)
     if allowed is None:
@@ -148,19 +145,34 @@ def design_for_gains(
     if command_scale_known:
         assumed += ". The commands were recorded at the size that was applied, as was stated"
     else:
-        intervals = allowed * [_HALF, 1.0]
+        intervals = np.tile([allowed.min() / 2, allowed.max()], (len(allowed), 1))
         assumed += " and at half of them, should the commands be recorded at half their size"
-        if max(model.sensor_gains) > _UNEVEN * min(model.sensor_gains):
-            low = np.minimum(intervals[:, 0], allowed.min())
-            intervals = np.column_stack([low, np.full(len(low), allowed.max())])
+        if np.ptp(allowed, axis=0).any():
             assumed += ", and each axis at those of both, because they differ"
     bad = unstable_gains(model.hardware, usual.controller, intervals)
     if bad is None:
         return replace(usual, assumptions=(assumed, *usual.assumptions)), ()
-    safe = _assume_another(model, design, intervals)
+    safe = _assume_another(model, design, intervals) or _robust(model, intervals)
     if safe is None:
-        safe = _robust(model, bad, intervals, design_robustly, command_scale_known)
-    note = _price(model, usual, safe, allowed, intervals, command_scale_known)
+        gain = ", ".join(f"{value:.3g}" for value in bad)
+        advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
+        raise CertificateError(
+            f"the loop of the design is unstable at the sensor gain {gain}, and the record allows "
+            f"{_in_words(intervals)}. Record with a higher loop gain, look for jumps in the "
+            f"record, give the sensor gain{advice}."
+        )
+    note = (
+        f"to be stable at sensor gains of {_in_words(intervals)}, the design leaves "
+        f"{nm_text(_residual_nm(safe, model))} in the model; without that it would leave "
+        f"{nm_text(_residual_nm(usual, model))}"
+    )
+    wanted = list[str]()
+    if not command_scale_known:
+        wanted.append("--command-scale 1 if the commands were recorded at the size applied")
+    if any((axis.sensor_gain_error or 0.0) > OPEN_GAIN * axis.sensor_gain for axis in model.axes):
+        wanted.append("--sensor-gain, which the record leaves open")
+    if wanted:
+        note = f"warning: {note}. Give {' or '.join(wanted)}"
     return replace(safe, assumptions=(assumed, *safe.assumptions)), (note,)
 
 
@@ -170,20 +182,14 @@ def _assume_another(
     """Return the better of the designs for the nearest gains, below and above, stable at all."""
     fitted, stable = float(np.exp(np.mean(np.log(model.sensor_gains)))), []
     for end in (float(np.min(intervals)), float(np.max(intervals))):
-        count = int(np.ceil(abs(np.log(end / fitted)) / _STEP))
-        for gain in np.geomspace(fitted, end, count + 1)[1:].tolist():
-            with suppress(CertificateError, SynthesisError):
-                careful = design(_with_gain(model, gain))
+        for gain in _gains_between(fitted, end)[1:].tolist():
+            axes = tuple(replace(axis, sensor_gain=gain) for axis in model.axes)
+            with suppress(SynthesisError):
+                careful = design(replace(model, axes=axes))
                 if unstable_gains(model.hardware, careful.controller, intervals) is None:
                     stable.append(careful)
                     break
-    return min(stable, key=lambda one: _residual_nm(one, model), default=None)
-
-
-def _with_gain(model: IdentifiedModel, gain: float) -> IdentifiedModel:
-    """Return a model whose sensor has another gain on all axes, beside the same disturbance."""
-    axes = tuple(replace(axis, sensor_gain=gain) for axis in model.axes)
-    return replace(model, axes=axes)
+    return min(stable, key=lambda careful: _residual_nm(careful, model), default=None)
 
 
 def _residual_nm(design: Design, model: IdentifiedModel) -> float:
@@ -192,54 +198,18 @@ def _residual_nm(design: Design, model: IdentifiedModel) -> float:
     return residual_budget(loop, model.truth()).rms_nm if loop.is_stable else float("inf")
 
 
-def _price(
-    model: IdentifiedModel,
-    usual: Design,
-    safe: Design,
-    allowed: FloatArray,
-    intervals: FloatArray,
-    command_scale_known: bool,
-) -> str:
-    """Say what stability at all gains costs, and ask for what would buy it back."""
-    paid, least = _residual_nm(safe, model), _residual_nm(usual, model)
-    note = (
-        f"to be stable at sensor gains of {_in_words(intervals)}, the design leaves "
-        f"{nm_text(paid)} in the model; without that it would leave {nm_text(least)}"
-    )
-    wanted = list[str]()
-    if (
-        not command_scale_known
-        and unstable_gains(model.hardware, usual.controller, allowed) is None
-    ):
-        wanted.append("--command-scale 1 if the commands were recorded at the size applied")
-    if any((axis.sensor_gain_error or 0.0) > OPEN_GAIN * axis.sensor_gain for axis in model.axes):
-        wanted.append("--sensor-gain, which the record leaves open")
-    if wanted and paid > _WORTH_ASKING * least:
-        return f"warning: {note}. Give {' or '.join(wanted)}"
-    return note
-
-
-def _robust(
-    model: IdentifiedModel,
-    bad: FloatArray,
-    intervals: FloatArray,
-    design_robustly: Callable[[IdentifiedModel, tuple[float, float]], Design],
-    command_scale_known: bool,
-) -> Design:
-    """Return a design by robust synthesis, or refuse with the gains that are bad for another."""
+def _robust(model: IdentifiedModel, intervals: FloatArray) -> Design | None:
+    """Return a design by robust synthesis over the gains; None where there is none."""
     factors = intervals / np.array(model.sensor_gains)[:, None]
+    gains = float(np.min(factors)), float(np.max(factors))
+    inputs = PlantInputs(plant=model.plant(), sensor_gains=gains)
     with suppress(SynthesisError, ProblemError):  # a plant without lines has no such design
-        design = design_robustly(model, (float(np.min(factors)), float(np.max(factors))))
+        design = design_request(gain_robust_method(), {}).build(inputs)
         if unstable_gains(model.hardware, design.controller, intervals) is None:
             return design
-    gain = ", ".join(f"{value:.3g}" for value in bad)
-    advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
-    raise CertificateError(
-        f"the loop of the design is unstable at the sensor gain {gain}, and the record allows "
-        f"{_in_words(intervals)}. Record with a higher loop gain, look for jumps in the record, "
-        f"give the sensor gain{advice}."
-    )
+    return None
 
 
 def _in_words(intervals: FloatArray) -> str:
+    """Return intervals of gains as text, equal ones once."""
     return " and ".join(dict.fromkeys(f"{low:.3g} to {high:.3g}" for low, high in intervals))

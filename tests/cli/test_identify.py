@@ -195,7 +195,7 @@ def test_accelerometers_are_compared_with_the_lines_of_the_model(
     assert "check the rate of the readings" in text
     status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 500)
     assert status == 2
-    assert "at least once a frame, 1000 Hz; got 500 Hz" in error
+    assert "at least once a frame, 1000 Hz, and last a frame; got 24000 readings at 500 Hz" in error
 
 
 def test_a_model_is_written_whatever_becomes_of_its_accelerometers(

@@ -12,13 +12,13 @@ from support.recorded_loops import LINE, drifting_record, resonant_record, splic
 from support.wrong_commands import record
 
 import lbt_synth as lbt
+from lbt_synth.identification import sensor_gains
 from lbt_synth.identification.sensor_gains import (
     allowed_gains,
     design_for_gains,
     unstable_gains,
 )
 from lbt_synth.methods.registry import gain_robust_method
-from lbt_synth.methods.request import PlantInputs, design_request
 
 
 @pytest.fixture(scope="module")
@@ -104,25 +104,26 @@ def hinf(model: lbt.identification.IdentifiedModel) -> lbt.Design:
     )  # its controller alone is unstable
 
 
-def robust(model: lbt.identification.IdentifiedModel, gains: tuple[float, float]) -> lbt.Design:
-    inputs = PlantInputs(plant=model.plant(), sensor_gains=gains)
-    return design_request(gain_robust_method(), {}).build(inputs)
+@pytest.fixture
+def no_robust(monkeypatch) -> None:
+    """Let robust synthesis find nothing."""
 
+    def fail() -> str:
+        raise lbt.errors.InfeasibleError("too much")
 
-def fail(model: lbt.identification.IdentifiedModel, gains: tuple[float, float]) -> lbt.Design:
-    raise lbt.errors.InfeasibleError("too much")
+    monkeypatch.setattr(sensor_gains, "gain_robust_method", fail)
 
 
 def test_gains_that_the_fit_shows_keep_the_design(loop) -> None:
     _, model = loop
     allowed = np.array([[0.6, 1.2]])
-    design, notes = design_for_gains(model, kalman, fail, allowed, command_scale_known=True)
+    design, notes = design_for_gains(model, kalman, allowed, command_scale_known=True)
     assert design.method == "kalman"
     (text,) = design.assumptions
     assert "the loop is stable at all of these" in text
     assert "at the size that was applied, as was stated" in text
     assert notes == ()
-    free, _ = design_for_gains(model, kalman, fail, None, command_scale_known=False)
+    free, _ = design_for_gains(model, kalman, None, command_scale_known=False)
     assert free.assumptions == ()
 
 
@@ -138,7 +139,7 @@ def test_another_gain_is_assumed_where_the_fitted_one_is_unstable() -> None:
     line = ((60.0, 0.004, 100.0),)
     model = lbt.identify(spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9))
     allowed = beyond_its_margin(model)
-    design, (note,) = design_for_gains(model, kalman, fail, allowed, command_scale_known=True)
+    design, (note,) = design_for_gains(model, kalman, allowed, command_scale_known=True)
     assert design.method == "kalman"
     assert unstable_gains(model.hardware, design.controller, allowed) is None
     assert note.startswith(f"to be stable at sensor gains of {allowed[0, 0]:.3g} to")
@@ -152,17 +153,15 @@ def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain() -> None:
     model = lbt.identify(spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9))
     allowed = np.array([[0.8, 1.0]])
     make = partial(design_for_gains, model, hinf, allowed=allowed)
-    best, notes = make(design_robustly=fail, command_scale_known=True)
+    best, notes = make(command_scale_known=True)
     halves = allowed * [0.5, 1.0]
     assert best.method == "hinf"
     assert notes == ()
     assert unstable_gains(model.hardware, best.controller, halves) is not None
-    safe, (note,) = make(design_robustly=robust, command_scale_known=False)
+    safe, (note,) = make(command_scale_known=False)
     assert unstable_gains(model.hardware, safe.controller, halves) is None
     assert "at half of them" in safe.assumptions[0]
     assert "--command-scale 1" in note or "without that it would leave" in note
-    with pytest.raises(lbt.errors.CertificateError, match="or say --command-scale 1"):
-        design_for_gains(model, lambda _: best, fail, allowed, command_scale_known=False)
 
 
 def test_a_gain_that_the_record_leaves_open_is_asked_for() -> None:
@@ -170,7 +169,7 @@ def test_a_gain_that_the_record_leaves_open_is_asked_for() -> None:
     model = lbt.identify(spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9))
     open_gain = with_gain(model, model.sensor_gains[0], 0.4)
     allowed = beyond_its_margin(model, 1.5)
-    _, (note,) = design_for_gains(open_gain, kalman, fail, allowed, command_scale_known=True)
+    _, (note,) = design_for_gains(open_gain, kalman, allowed, command_scale_known=True)
     assert note.startswith("warning: to be stable")
     assert "Give --sensor-gain, which the record leaves open" in note
 
@@ -188,19 +187,22 @@ def test_axes_of_different_gains_may_have_those_of_both(size: float) -> None:
     assert any("recorded at another size" in note for note in made.model.notes)
 
 
-def test_gains_that_are_too_far_apart_take_robust_synthesis_or_no_design(loop) -> None:
+def test_gains_that_are_too_far_apart_take_robust_synthesis(loop) -> None:
     _, model = loop
     wide = np.array([[0.02, 0.9]])
-    make = partial(design_for_gains, model, hinf, allowed=wide, command_scale_known=True)
-    with pytest.raises(lbt.errors.CertificateError, match="the record allows 0.02 to 0.9"):
-        make(design_robustly=fail)
-
-    def refuse(*_: object) -> lbt.Design:
-        raise lbt.errors.ProblemError("a robust controller is for vibrations; the plant has none.")
-
-    with pytest.raises(lbt.errors.CertificateError, match="the record allows 0.02 to 0.9"):
-        make(design_robustly=refuse)
-    safe, _ = make(design_robustly=robust)
+    safe, _ = design_for_gains(model, hinf, wide, command_scale_known=True)
     assert safe.method == gain_robust_method()
     assert unstable_gains(model.hardware, safe.controller, wide) is None
     assert "lies within 0.02 to 0.9" in safe.assumptions[0]
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.usefixtures("no_robust")
+def test_gains_that_no_design_holds_are_refused(loop, known: bool) -> None:
+    _, model = loop
+    wide = np.array([[0.02, 0.9]])
+    with pytest.raises(
+        lbt.errors.CertificateError, match=r"the record allows 0.0\d to 0.9"
+    ) as caught:
+        design_for_gains(model, hinf, wide, command_scale_known=known)
+    assert ("or say --command-scale 1" in str(caught.value)) is not known

@@ -14,40 +14,33 @@ beside the wavefront. What is left of a shift is in the phases of the lines.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.signal.windows import tukey
 from scipy.special import gammaincc
 
-from lbt_synth.design import kalman
 from lbt_synth.design.fallbacks import MOST_UNITS
-from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.accelerometers.readings import fill_missing
 from lbt_synth.identification.fit.identified_model import (
     DIFFERENT,
     IdentifiedLine,
     IdentifiedModel,
 )
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT, TAPER
 from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.models import Accelerometer, Motion, SensorSuite
 from lbt_synth.models.sensor_suite import LONGEST_DELAY
-from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import column, nm_column, table_row
+from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, number
 
-_NM = 1e-9
 _TINY = np.finfo(np.float64).tiny
-_EXTRA = f"left out, because others show more and a design takes {MOST_UNITS - 1} channels"
-_FEWEST_VALUES = 4  # a series of no more different numbers is rounding
 _DEAD_M_S2 = 1e-9  # rms, a thousandth of what a quiet accelerometer resolves
 _BLOCK_S = 100.0  # that is transformed at once, which bounds the memory for a long record
-_TAPERED = 0.2  # of a block, at both ends together, against leakage of the turbulence
-_INDEPENDENT = (1 - 5 * _TAPERED / 8) ** 2 / (1 - 93 * _TAPERED / 128)  # of tapered values
-_SHORTEST = 256  # frames of a stretch that shows a line
+_INDEPENDENT = (1 - 5 * TAPER / 8) ** 2 / (1 - 93 * TAPER / 128)  # of tapered values
 _REACH = 20.0  # half widths of a line, or bins, from its centre to the edge of its band
 _ROUNDS = 20  # of factors and noise, of which each brings them nearer by a factor of two or more
 _DOUBT = 0.01  # chance below which a channel moves at a line more than its noise explains
@@ -98,12 +91,6 @@ class ChannelRow:
         help="Noise of a reading, near the lines it is used for",
     )
     verdict: str = column("verdict", help="What it is used for, or what is wrong with it")
-    residual_nm: float = nm_column(
-        "with the wavefront",
-        format=".2f",
-        default=float("nan"),
-        help="Residual by the model of a Kalman filter of both",
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -120,8 +107,6 @@ class AccelerometerTransfers:
     # age of a reading for which the phases hold; 1 is the wavefront's of the same frame
     age_frames: int
     rate_hz: float  # readings per second, after averaging
-    alone_nm: float = float("nan")  # residual by the model of a Kalman filter of the wavefront
-    together_nm: float = float("nan")  # and of one that reads all used channels, too
 
     @property
     def used(self) -> tuple[ChannelRow, ...]:
@@ -146,17 +131,6 @@ class AccelerometerTransfers:
             f"the accelerometers lag behind the wavefront by {self.shift_frames:.3g} +- "
             f"{self.shift_error_frames:.2g} frames, by the slope of the phase within lines. Phases "
             f"hold for a shift of {self.age_frames - 1}."
-        )
-
-    @property
-    def worth_text(self) -> str:
-        """What the channels buy, in words; empty where none shows a line, or it is not known."""
-        if not np.isfinite(self.together_nm):
-            return ""
-        return (
-            "by the model, the Kalman filter of the wavefront leaves "
-            f"{nm_text(self.alone_nm)}, and with {', '.join(row.channel for row in self.used)} "
-            f"{nm_text(self.together_nm)}"
         )
 
 
@@ -225,65 +199,52 @@ def accelerometer_transfers(
     (2.0, 'used for 31 Hz')
     """
     readings, good = fill_missing(accelerations)
-    names = _names(channels, readings.shape[1])
+    names = _check_names(channels, readings.shape[1])
     if len(model.axes) != record.axes:
         raise DimensionError(
             f"model and record must have the same axes; got {len(model.axes)} and {record.axes}."
         )
     alarm = number(false_alarm, "false_alarm", above=0, below=1)
-    largest = int(number(largest_shift_s, "largest_shift_s", at_least=0) * model.frame_rate_hz)
-    live = [c for c, series in enumerate(readings.T) if _is_live(series[good])]
+    largest_s = number(largest_shift_s, "largest_shift_s", at_least=0)
+    live = [c for c, series in enumerate(readings.T) if np.std(series[good]) > _DEAD_M_S2]
     places = [i for i, part in enumerate(model.parts) if part.kind == "line"]
-    fits: list[_ChannelFit] = []
-    shift, error, lag, limit = 0.0, float("inf"), 0, 0.0
-    if live and places:
-        lines = [model.parts[i] for i in places]
-        widest = max(line.damping * line.frequency_hz for line in lines)
-        shifts = 1 + np.ceil(4 * widest * largest / model.frame_rate_hz)  # that differ
+    places.sort(key=lambda i: model.parts[i].frequency_hz)
+    lines = [model.parts[i] for i in places]
+    lag, fits, shift, error, limit = 0, list[_ChannelFit](), 0.0, float("inf"), 0.0
+    if live and lines:
+        widest_hz = max(line.damping * line.frequency_hz for line in lines)
+        shifts = 1 + np.ceil(4 * widest_hz * largest_s)  # that differ
         limit = alarm / (len(live) * len(lines) * shifts)
-        lag, fits, (shift, error) = _lay_and_fit(
+        largest = int(largest_s * model.frame_rate_hz)
+        lag, fits, shift, error = _lay_and_fit(
             model, record, lines, readings[:, live], good, largest, limit
         )
-    rows = [
-        _transfer_row(fit, j, names[c], places[j], model, limit)
-        for c, fit in zip(live, fits, strict=False)
-        for j in np.argsort([model.parts[place].frequency_hz for place in places]).tolist()
-    ]
-    noises = {
-        names[c]: fit.noise_m_s2(model.frame_rate_hz, limit)
-        for c, fit in zip(live, fits, strict=False)
-    }
-    shown = [row for row in rows if row.useful]
-    best = _best_channels(shown, noises, model)
-    transfers = AccelerometerTransfers(
-        transfers=tuple(replace(row, useful=row.useful and row.channel in best) for row in rows),
-        channels=tuple(
-            ChannelRow(
-                channel=name,
-                noise_m_s2=noises.get(name, np.nan),
-                verdict=_verdict(name, shown, name in best) if c in live else "dead",
-            )
-            for c, name in enumerate(names)
-        ),
+    fit_of = {names[c]: fit for c, fit in zip(live, fits, strict=False)}
+    used = _best_channels(fit_of, lines, limit)
+    transfers, rows = list[TransferRow](), list[ChannelRow]()
+    for c, name in enumerate(names):
+        noise, shown, fit = np.nan, list[int](), fit_of.get(name)
+        if fit is not None:
+            noise = fit.noise_m_s2(model.frame_rate_hz, limit)
+            shown = np.flatnonzero(fit.chances < limit).tolist()
+            transfers += [
+                _transfer_row(fit, j, name, places[j], line, name in used and j in shown)
+                for j, line in enumerate(lines)
+            ]
+        verdict = _verdict([lines[j] for j in shown], name in used) if c in live else "dead"
+        rows.append(ChannelRow(channel=name, noise_m_s2=noise, verdict=verdict))
+    return AccelerometerTransfers(
+        transfers=tuple(transfers),
+        channels=tuple(rows),
         shift_frames=shift,
         shift_error_frames=error,
         age_frames=lag + 1,
         rate_hz=model.frame_rate_hz,
     )
-    if not best:
-        return transfers
-    try:
-        return _with_residuals(transfers, model)
-    except LbtSynthError:  # no filter of these sensors: the motions are not lost
-        return transfers
 
 
-def _is_live(readings: FloatArray) -> bool:
-    """Return whether the readings (frames,) of a channel are more than rounding."""
-    return np.unique(readings).size > _FEWEST_VALUES and float(np.std(readings)) > _DEAD_M_S2
-
-
-def _names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
+def _check_names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
+    """Return the names of channels; refuse two of one name, or too few."""
     names = tuple(channels or (f"channel{c + 1}" for c in range(count)))
     if len(names) != count or len(set(names)) < count:
         raise ProblemError(
@@ -292,75 +253,43 @@ def _names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
     return names
 
 
-def _verdict(name: str, shown: Sequence[TransferRow], best: bool) -> str:
-    """Return what a channel is used for, in words."""
-    lines = [f"{row.frequency_hz:.3g}" for row in shown if row.channel == name]
-    if not lines:
+def _verdict(shown: Sequence[IdentifiedLine], is_used: bool) -> str:
+    """Return what a channel is used for that shows some lines, in words."""
+    if not shown:
         return "adds nothing"
-    use = f"{'used for' if best else 'shows'} {', '.join(lines)} Hz"
-    return use if best else f"{_EXTRA}; {use}"
+    use = f"{', '.join(f'{line.frequency_hz:.3g}' for line in shown)} Hz"
+    if is_used:
+        return f"used for {use}"
+    return f"left out, because a design takes {MOST_UNITS - 1} channels; shows {use}"
 
 
 def _transfer_row(
-    fit: _ChannelFit, j: int, name: str, place: int, model: IdentifiedModel, limit: float
+    fit: _ChannelFit, j: int, name: str, place: int, line: IdentifiedLine, useful: bool
 ) -> TransferRow:
     """Return what the fit of a channel says of one line."""
     factor, (error, across) = fit.factors[j], fit.errors(j)
     return TransferRow(
         channel=name,
         line=place,
-        frequency_hz=model.parts[place].frequency_hz,
+        frequency_hz=line.frequency_hz,
         motion_nm_per_nm=float(abs(factor)),
         motion_error_nm_per_nm=error,
         phase_deg=float(np.degrees(np.angle(factor))),
         phase_error_deg=float(min(np.degrees(across / max(abs(factor), _TINY)), 180.0)),
         coherence=float(fit.coherences[j]),
         chance=float(fit.chances[j]),
-        useful=bool(fit.chances[j] < limit),
+        useful=useful,
     )
 
 
 def _best_channels(
-    shown: Sequence[TransferRow], noises: Mapping[str, float], model: IdentifiedModel
+    fits: Mapping[str, _ChannelFit], lines: Sequence[IdentifiedLine], limit: float
 ) -> list[str]:
-    """Return the channels that tell most of the lines' power, as many as a design takes."""
-    worth = dict.fromkeys((row.channel for row in shown), 0.0)
-    for row in shown:
-        line = model.parts[row.line]
-        size = _NM * (2 * np.pi * line.frequency_hz) ** 2 * line.rms_nm * row.motion_nm_per_nm
-        signal = (size / max(noises[row.channel], _TINY)) ** 2
-        worth[row.channel] += line.rms_nm**2 * float(np.log1p(signal))
-    return sorted(worth, key=lambda name: -worth[name])[: MOST_UNITS - 1]
-
-
-def _with_residuals(
-    transfers: AccelerometerTransfers, model: IdentifiedModel
-) -> AccelerometerTransfers:
-    """Add what a Kalman filter leaves by the model without channels, with each, and with all."""
-    plant, age = model.plant(), transfers.loop_age(model.delay_frames)
-
-    def residual_nm(channels: Sequence[ChannelRow]) -> float:
-        instrument = Accelerometer(
-            name="accelerometer",
-            rate_hz=transfers.rate_hz,
-            delay_frames=age + model.delay_frames - 1,
-            channels=tuple(row.channel for row in channels),
-            noise_m_s2=np.array([row.noise_m_s2 for row in channels]),
-        )
-        motions: list[dict[str, Motion]] = [{} for _ in model.parts]
-        for row in transfers.transfers:
-            if row.useful and row.channel in instrument.channels:
-                motion = Motion(size=row.motion_nm_per_nm, phase_deg=row.phase_deg)
-                motions[row.line][row.channel] = motion
-        return kalman(plant.with_sensors(SensorSuite(sensors=(instrument,)), tuple(motions))).rms
-
-    rows = [
-        replace(row, residual_nm=residual_nm([row])) if row in transfers.used else row
-        for row in transfers.channels
-    ]
-    together_nm = residual_nm(transfers.used)
-    alone_nm = kalman(plant).rms
-    return replace(transfers, channels=tuple(rows), alone_nm=alone_nm, together_nm=together_nm)
+    """Return the channels that show most of the lines' power, as many as a design takes."""
+    power = np.array([line.rms_nm**2 for line in lines])
+    shown = {name: power @ (fit.coherences * (fit.chances < limit)) for name, fit in fits.items()}
+    best = sorted((name for name in shown if shown[name] > 0), key=lambda name: -shown[name])
+    return best[: MOST_UNITS - 1]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -386,7 +315,7 @@ def _transform(series: FloatArray, rate: float) -> ComplexArray:
     """Return tapered transforms (f, n), whose squares are densities, without mean and slope."""
     time = np.linspace(-1, 1, len(series))
     level = series - series.mean(axis=0) - np.outer(time, time @ series / (time @ time))
-    taper = tukey(len(series), _TAPERED)
+    taper = tukey(len(series), TAPER)
     scale = np.sqrt(2 / (rate * np.sum(taper**2)))
     return np.asarray(scale * np.fft.rfft(taper[:, None] * level, axis=0))
 
@@ -420,7 +349,7 @@ def _make_bands(
     z, moved = np.split(_transform(wavefront, rate)[inside], 2, axis=1)
     along = np.array([(line.direction or (1.0,))[:axes] for line in lines])
     # the mean acceleration over a frame, of the mean position in it
-    swing = -_NM * (2 * np.pi * f) ** 2
+    swing = -1e-9 * (2 * np.pi * f) ** 2  # in m/s^2 a nm
     shapes = np.stack([_density(line, f, bin_hz) for line in lines], axis=1)
     background = [np.interp(f, a.frequency_hz, a.background_nm2_hz) for a in model.axes]
     total = np.einsum("fj,ja,jb->fab", shapes, along, along)
@@ -449,7 +378,7 @@ def _lay_and_fit(
     good: BoolArray,
     largest: int,
     limit: float,
-) -> tuple[int, list[_ChannelFit], tuple[float, float]]:
+) -> tuple[int, list[_ChannelFit], float, float]:
     """Lay readings beside the wavefront: with the likeliest shift, or as given if that is not sure.
 
     Return by how many frames they were moved, the fits, and the shift with its standard error.
@@ -465,32 +394,31 @@ def _lay_and_fit(
         usable = record.usable & (frames == rows) & good[rows]
         blocks = []
         for start, stop in runs(usable).tolist():
-            if stop - start >= _SHORTEST:
+            if stop - start >= SHORTEST_SEGMENT:
                 count = int(np.ceil((stop - start) / (_BLOCK_S * model.frame_rate_hz)))
                 edges = np.linspace(start, stop, count + 1).astype(int).tolist()
                 blocks += [slice(a, b) for a, b in pairwise(edges)]
         if not blocks:
             raise ProblemError(
-                f"record and accelerations must have {_SHORTEST} usable frames in a row side by "
-                f"side; they have {record.frames} and {len(readings)} frames."
+                f"record and accelerations must have {SHORTEST_SEGMENT} usable frames in a row "
+                f"side by side; they have {record.frames} and {len(readings)} frames."
             )
         return [_make_bands(model, lines, wavefront[x], readings[rows[x]]) for x in blocks]
 
-    def fit(bands: Sequence[_Bands], lag: int) -> tuple[list[_ChannelFit], float, float]:
-        fits = [_fit_channel(bands, channel) for channel in range(readings.shape[1])]
-        slope, error = _slope_shift(fits, limit)
-        return fits, lag + slope, error
+    def fit(bands: Sequence[_Bands]) -> list[_ChannelFit]:
+        return [_fit_channel(bands, channel) for channel in range(readings.shape[1])]
 
     bands = beside(0)
-    likeliest = _likeliest_lag(bands, largest)
-    fits, shift, error = fit(beside(likeliest), likeliest)
-    if abs(shift) > DIFFERENT * error:
-        lag = round(shift)
-        fits, shift, error = fit(beside(lag), lag)
-        return lag, fits, (shift, error)
-    if likeliest:
-        fits, *_ = fit(bands, 0)
-    return 0, fits, (shift if np.isfinite(error) else 0.0, error)
+    lag = _likeliest_lag(bands, largest)
+    fits = fit(beside(lag))
+    late, error = _slope_shift(fits, limit)
+    if not abs(lag + late) > DIFFERENT * error:
+        return 0, fit(bands), lag + late if np.isfinite(error) else 0.0, error
+    if round(late):
+        lag += round(late)
+        fits = fit(beside(lag))
+        late, error = _slope_shift(fits, limit)
+    return lag, fits, lag + late, error
 
 
 def _likeliest_lag(bands: Sequence[_Bands], largest: int) -> int:
@@ -499,14 +427,12 @@ def _likeliest_lag(bands: Sequence[_Bands], largest: int) -> int:
     total = np.zeros(lags.size)
     for band in bands:
         near = np.abs(lags) <= band.frames // 2
-        for expected in band.expected.T:
-            for reading in band.readings.T:
-                product = expected.conj() * reading
-                spectrum = np.zeros(band.frames, dtype=np.complex128)
-                spectrum[band.bins] = product
-                agreement = np.abs(band.frames * np.fft.ifft(spectrum)) ** 2
-                power = max(float(np.sum(np.abs(product) ** 2)), _TINY)
-                total[near] += agreement[lags[near] % band.frames] / power
+        for expected, reading in product(band.expected.T, band.readings.T):
+            spectrum = np.zeros(band.frames, dtype=np.complex128)
+            spectrum[band.bins] = expected.conj() * reading
+            agreement = np.abs(band.frames * np.fft.ifft(spectrum)) ** 2
+            power = max(float(np.sum(np.abs(spectrum) ** 2)), _TINY)
+            total[near] += agreement[lags[near] % band.frames] / power
     return int(lags[np.argmax(total)])
 
 
@@ -555,32 +481,32 @@ def _fit_channel(bands: Sequence[_Bands], channel: int) -> _ChannelFit:
         opened = np.concatenate([band.open_power(factors) for band in bands])
     error = a - x @ factors
     slopes = -bread @ (x.conj().T @ (weights[:, None] * np.einsum("fja,j->fa", moved, factors)))
-    shares = np.abs(x) ** 2 * weights[:, None]
+    size = np.abs(x) ** 2
+    shares = size * weights[:, None]
     shares /= np.maximum(shares.sum(axis=0), _TINY)
     values = np.maximum(_INDEPENDENT / np.sum(shares**2, axis=0), 1.0)  # at each line
     degrees = np.maximum(values - 1, 0.5)
     excess = (np.abs(error) ** 2 * weights) @ shares
+    more = np.maximum(excess * values / degrees, 1.0)
+    # a channel with a motion of its own there
     doubtful = gammaincc(degrees, excess * values) < _DOUBT
-    more = np.maximum(excess * values / degrees, 1.0)  # a channel with a motion of its own there
+    raised, degrees = np.where(doubtful, more, 1.0), np.where(doubtful, degrees, len(a))
     variances = np.diag(bread).real / _INDEPENDENT
-    ratios = np.abs(factors) ** 2 / np.maximum(variances, _TINY)
-    ratios, degrees = np.where(
-        doubtful, [ratios / more, degrees], [ratios, np.full_like(more, len(a))]
-    )
+    ratios = np.abs(factors) ** 2 / np.maximum(raised * variances, _TINY)
     left = np.abs(error) ** 2 @ shares
-    shown = np.abs(factors) ** 2 * np.sum(np.abs(x) ** 2 * shares, axis=0)
+    shown = np.abs(factors) ** 2 * np.sum(size * shares, axis=0)
     # a small shift turns the phase in proportion to the distance from the middle of the line
     turn = -1j * (angle[:, None] - angle @ shares) * factors * x
-    size = np.maximum(np.sum(np.abs(turn) ** 2 * weights[:, None], axis=0), _TINY)
+    turned = np.maximum(np.sum(np.abs(turn) ** 2 * weights[:, None], axis=0), _TINY)
     return _ChannelFit(
         factors=factors,
         variances=variances * more,
         slopes=slopes,
         chances=np.exp(-degrees * np.log1p(ratios / degrees)),
         coherences=shown / np.maximum(shown + left, _TINY),
-        noise=noise * np.where(doubtful, more, 1.0),
-        shifts=np.real((weights * error) @ turn.conj()) / size,
-        shift_weights=2 * _INDEPENDENT * size / more,
+        noise=noise * raised,
+        shifts=np.real((weights * error) @ turn.conj()) / turned,
+        shift_weights=2 * _INDEPENDENT * turned / more,
     )
 
 

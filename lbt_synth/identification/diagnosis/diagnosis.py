@@ -4,41 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.identification.commands.control_law import ControlLaw
+from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
 from lbt_synth.identification.diagnosis.rows import (
     ChannelRow,
     CostRow,
-    design_differences,
     disturbance_costs,
     disturbance_lines,
     given_controller,
-    given_design_facts,
+    given_design_notes,
     judge_channels,
     loop_facts,
-    running_controller,
 )
-from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
+from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.prediction.comparison import (
     INTEGRATOR,
     PredictionRow,
     PredictionTable,
-    compare_on_record,
-    stable_designs,
+    compare_designs,
 )
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, close_loop
+from lbt_synth.loop import Imaging
 from lbt_synth.methods.registry import all_methods, reference_methods
 from lbt_synth.storage.rows import Facts
 from lbt_synth.validation import require_instance
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -59,8 +58,6 @@ class Diagnosis:
         The model of the whole record, and why there is none in ``notes``.
     loop : Facts or None
         The loop that ran, by law and model.
-    lines : tuple of IdentifiedLine
-        Resonances that are no turbulence, by frequency.
     comparison : PredictionTable or None
         Residuals on the second half of the record, by models of the first.
     best : str
@@ -70,8 +67,6 @@ class Diagnosis:
     costs : tuple of CostRow
         What each part of the disturbance costs by the model of the first half (of the whole record
         where there is no comparison), the most costly first; the last row is all.
-    given : Facts or None
-        A given design on this record.
     notes : tuple of str
         What could not be said and why, and what else should be known.
     """
@@ -82,12 +77,10 @@ class Diagnosis:
     channels: tuple[ChannelRow, ...] = ()
     model: IdentifiedModel | None = None
     loop: Facts | None = None
-    lines: tuple[IdentifiedLine, ...] = ()
     comparison: PredictionTable | None = None
     best: str = ""
     best_design: Design | None = None
     costs: tuple[CostRow, ...] = ()
-    given: Facts | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -131,7 +124,7 @@ def diagnose(
     record : LoopRecord
         What the loop recorded; the delay of a closed loop must be known.
     given : mapping of str to Design, optional
-        One design to try on the record, by its name.
+        Designs to try on the record, by their names.
     whole : LoopRecord, optional
         The record with those axes, too, that are left out of ``record`` because they are dead.
     imaging : Imaging, optional
@@ -170,37 +163,23 @@ def diagnose(
     ('pure integrator', ['turbulence', 'measurement noise', 'all'])
     """
     require_instance(record, LoopRecord)
-    step = progress or (lambda _: None)
-    notes: list[str] = []
+    step, designs, notes = progress or (lambda _: None), dict(given or {}), list[str]()
     commands = None
     if record.commands is not None:
         commands = explain_commands(record, sensor_gain=options.get("sensor_gain"))
         notes += commands.notes
     diagnosis = Diagnosis(
         record=record,
-        imaging=Imaging() if imaging is None else imaging,
+        imaging=imaging or Imaging(),
         commands=commands,
         channels=judge_channels(record if whole is None else whole),
     )
     step(1)
     if whole is not None and whole.axes > record.axes:
         notes.append("the rest is of the axis that lives: the other one is dead")
-    if not diagnosis.doubt:
-        diagnosis = _examine_loop(diagnosis, dict(given or {}), options, notes, step)
-    elif given:
-        notes.append("the given design was not tried: the commands are not right")
-    return replace(diagnosis, notes=tuple(notes))
-
-
-def _examine_loop(
-    diagnosis: Diagnosis,
-    given: dict[str, Design],
-    options: dict[str, Any],
-    notes: list[str],
-    step: Callable[[int], object],
-) -> Diagnosis:
-    """Add what models of the record tell: of all of it, and of its first half on the second."""
-    record = diagnosis.record
+    if diagnosis.doubt:
+        notes += ["the given design was not tried: the commands are not right"] * bool(designs)
+        return replace(diagnosis, notes=tuple(notes))
 
     def fit(**more: Any) -> IdentifiedModel:
         require_length(record)
@@ -208,36 +187,44 @@ def _examine_loop(
 
     model = _attempt(fit, "model", notes)
     step(1)
-    if model is None:
-        return diagnosis
-    notes += model.notes
+    if model is not None:
+        notes += model.notes
+        diagnosis = replace(diagnosis, model=model)
+        first, _ = split_halves(record.stretches(), record.frames)
+        # one sensor gain for all that is said: a half shows it less well
+        fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
+        half = _attempt(lambda: fit(**fixed), "model of the first half", notes)
+        step(1)
+        diagnosis = _examine_loop(diagnosis, model, half, designs, notes)
+        step(1)
+    return replace(diagnosis, notes=tuple(notes))
+
+
+def _examine_loop(
+    diagnosis: Diagnosis,
+    model: IdentifiedModel,
+    half: IdentifiedModel | None,
+    given: Mapping[str, Design],
+    notes: list[str],
+) -> Diagnosis:
+    """Add what models tell: of all of the record, and of its first half on the second."""
+    law, running = diagnosis.law, None
+    if law is not None and law.is_sure and law.lag_frames >= 0:
+        running = law_controller(law, model.frame_rate_hz)
     controllers = {name: given_controller(design, model) for name, design in given.items()}
-    running = running_controller(diagnosis.law, record.frame_rate_hz)
-    facts = loop_facts(model, running)
-    diagnosis = replace(diagnosis, model=model, loop=facts, lines=disturbance_lines(model))
-    first, _ = split_halves(record.stretches(), record.frames)
-    # one sensor gain for all that is said: a half shows it less well
-    fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
-    half = _attempt(lambda: fit(**fixed), "model of the first half", notes)
-    step(1)
-    plant = (model if half is None else half).plant()
-    if running is not None and not close_loop(plant.hardware, running).is_stable:
-        notes.append("the law of the commands is unstable at the sensor gain of the model")
-        running = None
+    diagnosis = replace(diagnosis, loop=loop_facts(model, running))
     if half is not None:
         diagnosis = _compare(diagnosis, half, running, controllers, notes)
-    best, imaging = diagnosis.best_design, diagnosis.imaging
-    lines = disturbance_lines(model if half is None else half)
-    chosen = None if best is None else best.controller
-    costs = _attempt(
-        lambda: disturbance_costs(plant, lines, running, chosen, imaging), "costs", notes
-    )
-    step(1)
-    diagnosis = replace(diagnosis, costs=costs or ())
+    best = None if diagnosis.best_design is None else diagnosis.best_design.controller
+    basis = model if half is None else half
+
+    def compute_costs() -> tuple[CostRow, ...]:
+        lines = disturbance_lines(basis)
+        return disturbance_costs(basis.plant(), lines, running, best, diagnosis.imaging)
+
+    diagnosis = replace(diagnosis, costs=_attempt(compute_costs, "costs", notes) or ())
     for name, design in given.items():
-        notes += design_differences(design, model)
-        row = diagnosis.row(name)
-        diagnosis = replace(diagnosis, given=given_design_facts(name, design, model, row))
+        notes += given_design_notes(name, design, model)
     return diagnosis
 
 
@@ -249,39 +236,31 @@ def _compare(
     notes: list[str],
 ) -> Diagnosis:
     """Add residuals on the second half, and the best design there for a model of the first."""
-    plant = half.plant()
-    with_bands = [m for m in all_methods().values() if m.plant_section is not None]
-    methods = (*reference_methods(estimators_only=True), *with_bands)
-    designs, missing = stable_designs(plant, {method.name: {} for method in methods})
-    stable = {
-        name: controller
-        for name, controller in given.items()
-        if close_loop(plant.hardware, controller).is_stable
-    }
-    unstable = given.keys() - stable.keys()
-    notes += missing
-    notes += [f"{name} is unstable in the loop of this record" for name in unstable]
-    table = _attempt(
-        lambda: compare_on_record(
+    robust = [m for m in all_methods().values() if m.plant_section is not None]
+    methods = [*reference_methods(estimators_only=True), *robust]
+    compared = _attempt(
+        lambda: compare_designs(
             diagnosis.record,
             half,
-            {**designs, **stable},
+            {method.name: {} for method in methods},
+            others=given,
             running=running,
             imaging=diagnosis.imaging,
         ),
         "comparison on unseen data",
         notes,
     )
-    if table is None:
+    if compared is None:
         return diagnosis
+    table, designs = compared
     notes += table.notes
-    designs[INTEGRATOR] = model_integrator(plant)  # the comparison has it
+    designs = designs | {INTEGRATOR: model_integrator(half.plant())}  # the comparison has it
     residuals = {row.name: row.replayed.total_nm2 for row in table.entries if row.replayed}
     best = min(designs, key=lambda name: residuals[name])
     return replace(diagnosis, comparison=table, best=best, best_design=designs[best])
 
 
-def _attempt(compute: Callable[[], Any], what: str, notes: list[str]) -> Any:
+def _attempt(compute: Callable[[], T], what: str, notes: list[str]) -> T | None:
     """Return what is computed; None, and a note, where it cannot be."""
     try:
         return compute()

@@ -1,4 +1,4 @@
-"""The verdict on a record in three sentences: its state, its residual, and what to change first.
+"""The verdict on a record: its state, its residual, and what to change first.
 
 Residuals are those on the second half of the record, with errors. The model says only how the
 variance of one divides among the parts of the disturbance.
@@ -6,91 +6,107 @@ variance of one divides among the parts of the disturbance.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
 import numpy as np
 
 from lbt_synth.design import model_integrator
 from lbt_synth.identification.diagnosis.diagnosis import Diagnosis
 from lbt_synth.identification.diagnosis.rows import FEW
 from lbt_synth.identification.prediction.comparison import INTEGRATOR, RAN
-from lbt_synth.identification.prediction.residual import ResidualEstimate, gather
+from lbt_synth.identification.prediction.residual import MUCH, gather
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.words import listing_text
 
-NARROW = 0.3  # modulus margin: less is a gain margin below 1.4
-_GOOD_ENOUGH = 1.03  # times the least residual, that no change is worth
-_MUCH = 1.25  # times a residual: lines that beat for long have errors that would excuse it
-_SIGMAS = 2.0  # of a difference that is no chance
+_NARROW = 0.3  # modulus margin: less is a gain margin below 1.4
 _LEAST_SHARE = 0.05  # of the residual variance, of a part that is named
 _DELAY_WARNING = "warning: a delay of"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One thing that a record tells, and what it asks for."""
+
+    tone: Literal["good", "note", "bad"] = "bad"
+    sentence: str
+    advice: str = ""
+
+
+def diagnosis_findings(diagnosis: Diagnosis) -> tuple[Finding, ...]:
+    """Return what a record tells, the most urgent first; the last one is about its residual."""
+    faults = list(_find_faults(diagnosis)) or [_judge_loop(diagnosis)]
+    return (*faults, Finding(sentence=_residual_text(diagnosis), advice=_advice_text(diagnosis)))
+
+
 def diagnosis_verdict(diagnosis: Diagnosis) -> tuple[str, str, str]:
     """Return three sentences: the record, what its residual is made of, what to change first."""
-    return _state_sentence(diagnosis), _residual_sentence(diagnosis), _advice_sentence(diagnosis)
+    *state, residual = diagnosis_findings(diagnosis)
+    advice = next(finding.advice for finding in (*state, residual) if finding.advice)
+    return " ".join(finding.sentence for finding in state), residual.sentence, advice
 
 
-def _state_sentence(diagnosis: Diagnosis) -> str:
-    """Say whether the record can be used, and what ran."""
-    faults = "; ".join(_faults(diagnosis))
-    if diagnosis.doubt:
-        other = f" The record has faults, too: {faults}." if faults else ""
-        return f"The commands are not those that the mirror followed: {diagnosis.doubt}.{other}"
+def _find_faults(diagnosis: Diagnosis) -> Iterator[Finding]:
+    """Yield what must be changed before anything else can be said."""
+    bad = [row for row in diagnosis.channels if row.serious]
+    faults = [f"the {row.channel} is {row.state}" for row in bad]
+    if diagnosis.record.lost > FEW:
+        faults.append(f"{100 * diagnosis.record.lost:.2g} % of the frames are lost")
     if faults:
-        return f"The record has faults: {faults}."
-    if warnings := _delay_warnings(diagnosis):
-        return f"The delay of the record is doubtful: {warnings[0].removeprefix('warning: ')}."
+        advice = f"First look at the {bad[0].channel}, which is {bad[0].state}." if bad else ""
+        yield Finding(sentence=f"The record has faults: {'; '.join(faults)}.", advice=advice)
+    if diagnosis.commands is not None and diagnosis.doubt:
+        yield Finding(
+            sentence=f"The commands are not those that the mirror followed: {diagnosis.doubt}.",
+            advice=f"First {diagnosis.commands.advice}.",
+        )
+    for note in diagnosis.notes:
+        if note.startswith(_DELAY_WARNING):
+            warning = note.removeprefix("warning: ")
+            yield Finding(
+                tone="note",
+                sentence=f"The delay of the record is doubtful: {warning}.",
+                advice="First check the delay, on which sensor gain and designs depend.",
+            )
+
+
+def _judge_loop(diagnosis: Diagnosis) -> Finding:
+    """Say what ran, and whether it was stable."""
     law, loop = "an open loop ran", diagnosis.loop
     if diagnosis.law is not None:
         law = f"{diagnosis.law.name} ran{diagnosis.law.lag_text}"
     if loop is None:
-        return f"The record shows no fault, and {law}."
+        return Finding(tone="note", sentence=f"The record shows no fault, and {law}.")
     gain = f"at the sensor gain of {loop.sensor_gain}"
     if loop.spectral_radius >= 1:
-        return f"The record shows no fault, but {law}, which is UNSTABLE {gain}."
+        sentence = f"The record shows no fault, but {law}, which is UNSTABLE {gain}."
+        return Finding(sentence=sentence)
     stable = f", stable {gain}" if loop.stable_gains else ""
-    if loop.modulus < NARROW:
+    narrow = bool(loop.modulus < _NARROW)
+    if narrow:
         stable += f" but with a modulus margin of {loop.modulus:.2g} only"
-    return f"The record is sound: {law}{stable}."
+    tone: Literal["good", "note"] = "note" if narrow else "good"
+    return Finding(tone=tone, sentence=f"The record is sound: {law}{stable}.")
 
 
-def _faults(diagnosis: Diagnosis) -> list[str]:
-    """Say which channels are at fault, and how many frames are lost."""
-    faults = [f"the {row.channel} is {row.state}" for row in diagnosis.channels if row.serious]
-    if diagnosis.record.lost > FEW:
-        faults.append(f"{100 * diagnosis.record.lost:.2g} % of the frames are lost")
-    return faults
-
-
-def _delay_warnings(diagnosis: Diagnosis) -> list[str]:
-    return [note for note in diagnosis.notes if note.startswith(_DELAY_WARNING)]
-
-
-def _residual_sentence(diagnosis: Diagnosis) -> str:
-    """Say what the loop that ran leaves, and of what."""
-    ran = diagnosis.residual(RAN)
-    running = "running_nm" if ran is not None else "best_nm"
-    parts = _parts_text(diagnosis, running)
-    if ran is None:
+def _residual_text(diagnosis: Diagnosis) -> str:
+    """Say what the loop that ran leaves, from which measurement that follows, and of what it is."""
+    row, ran = diagnosis.row(RAN), diagnosis.residual(RAN)
+    parts = _parts_text(diagnosis, "best_nm" if ran is None else "running_nm")
+    if row is None or ran is None:
         if not parts:
             return "Nothing can be said of its residual."
         return f"What the {diagnosis.best} would leave is by the model {parts}."
-    row = diagnosis.row(RAN)
-    doubt = ""
-    if row is not None and row.contradicts_model:
-        doubt = f"; the data contradict the model, which expects {nm_text(row.model_nm)}"
-    by_model = f": by the model {parts}" if parts else ""
-    measured = _measured_text(diagnosis, ran)
-    return f"It leaves {ran.text} on unseen data ({measured}){by_model}{doubt}."
-
-
-def _measured_text(diagnosis: Diagnosis, ran: ResidualEstimate) -> str:
-    """Say from which measurement the residual of what ran follows, and its Strehl ratio."""
     y = gather(diagnosis.record.measurements, ran.stretches)
     measured_nm = float(np.sqrt(np.mean(np.sum(y**2, axis=1))))
     noise_nm = float(np.sqrt(np.trace(ran.noise_nm2)))
+    by_model = f": by the model {parts}" if parts else ""
+    if row.contradicts_model:
+        by_model += f"; the data contradict the model, which expects {nm_text(row.model_nm)}"
     return (
-        f"{nm_text(measured_nm)} were measured at this sensor gain, and {nm_text(noise_nm)} are "
-        f"noise{_strehl_text(diagnosis, RAN)}"
+        f"It leaves {ran.text} on unseen data ({nm_text(measured_nm)} were measured at this sensor "
+        f"gain, and {nm_text(noise_nm)} are noise{_strehl_text(diagnosis, RAN)}){by_model}."
     )
 
 
@@ -106,43 +122,31 @@ def _parts_text(diagnosis: Diagnosis, field: str) -> str:
     for row in diagnosis.costs[:-1]:
         share = (getattr(row, field) / getattr(diagnosis.costs[-1], field)) ** 2
         if share >= _LEAST_SHARE:  # not of a residual that is not known
-            named.append(f"{100 * share:.0f} % of the {row.part}{row.where}")
+            named.append(f"{100 * share:.0f} % of the {row.part}")
     return listing_text(named)
 
 
-def _advice_sentence(diagnosis: Diagnosis) -> str:
-    """Say what to change first."""
-    bad = next((row for row in diagnosis.channels if row.serious), None)
-    if bad is not None:
-        return f"First look at the {bad.channel}, which is {bad.state}."
-    if diagnosis.doubt and diagnosis.commands is not None:
-        return f"First {diagnosis.commands.advice}."
-    if _delay_warnings(diagnosis):
-        return "First check the delay, on which sensor gain and designs depend."
+def _advice_text(diagnosis: Diagnosis) -> str:
+    """Say what to change first in a loop whose record has no fault."""
     name = diagnosis.best
-    ran, best = diagnosis.residual(RAN), diagnosis.residual(name)
-    slow = diagnosis.residual(INTEGRATOR)
+    ran, best, slow = (diagnosis.residual(row) for row in (RAN, name, INTEGRATOR))
     if best is None or slow is None:
         return "Record longer before anything is changed."
     strehl = _strehl_text(diagnosis, name)
     if ran is None:
         return f"The {name} leaves least on unseen data: {best.text}{strehl}."
-    if not _leaves_more(ran, best):
+    if not ran.is_clearly_above(best):
         return f"Change nothing: of all that was tried the {name} leaves least, {best.text}."
-    leaves = f"the {name} leaves {best.text} on unseen data{strehl}"
-    if name == INTEGRATOR:
-        return f"First change the gain{_gain_text(diagnosis)}: {leaves}."
-    if _leaves_more(ran, slow) and slow.total_nm2 < _MUCH**2 * best.total_nm2:
-        other = f"the {INTEGRATOR} leaves {slow.text} on unseen data, the {name} {best.text}"
-        return f"First change the gain{_gain_text(diagnosis)}: {other}."
-    return f"First change the controller: {leaves}. The {INTEGRATOR} leaves {slow.text}."
-
-
-def _leaves_more(residual: ResidualEstimate, other: ResidualEstimate) -> bool:
-    """Whether a residual is above another one by more than chance, or by much."""
-    difference, error = residual.above(other)
-    ratio = 1 + difference / max(other.total_nm2, other.total_error_nm2)  # of variances
-    return ratio > (_GOOD_ENOUGH if difference > _SIGMAS * error else _MUCH) ** 2
+    if ran.is_clearly_above(slow) and slow.total_nm2 < MUCH**2 * best.total_nm2:
+        other = f"{strehl}" if name == INTEGRATOR else f", the {name} {best.text}"
+        return (
+            f"First change the gain{_gain_text(diagnosis)}: the {INTEGRATOR} leaves {slow.text} on "
+            f"unseen data{other}."
+        )
+    return (
+        f"First change the controller: the {name} leaves {best.text} on unseen data{strehl}. The "
+        f"{INTEGRATOR} leaves {slow.text}."
+    )
 
 
 def _gain_text(diagnosis: Diagnosis) -> str:

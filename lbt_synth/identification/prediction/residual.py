@@ -1,8 +1,8 @@
 """The residual that a controller would have left of a recorded disturbance.
 
 The state of a loop at the beginning of contiguous frames depends on the frames before, which are
-not known. A replay begins in the equilibrium for the mean of the first frames, and the first half
-second of each stretch does not count.
+not known. A replay begins in the equilibrium for the mean of the first half second of a stretch,
+which does not count.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ from lbt_synth.validation import (
     require_instance,
 )
 
-_TOO_FAR = 4.0  # standard errors below zero that chance does not explain
-_FEWEST = 100  # frames that give a standard error
-_FIRST = 64  # frames whose mean a replay begins with
+SURPRISING = 4.0  # standard errors of a residual that chance does not explain
+MUCH = 1.25  # ratio of residuals that no error excuses: that of a line that beats is too large
+_ERRORS = 2.0  # standard errors by which one residual is clearly above another
+_LEAST_SHARE = 0.02  # of the measured variance: 1 % of the rms, less than conditions change by
 _SETTLE_S = 0.5  # of a stretch, in which loops that reject a hertz forget where they began
 
 
@@ -48,7 +49,7 @@ class ResidualEstimate:
 
     The variance of the noise is subtracted: an estimate may be negative within its error. Its rms
     is then nan, and :attr:`upper_nm` an upper bound. One that is negative by more refutes the
-    noise that was subtracted (:attr:`refuted`).
+    noise (:attr:`refuted`).
 
     Attributes
     ----------
@@ -106,17 +107,11 @@ class ResidualEstimate:
         return self.total_error_nm2 / (2 * self.rms_nm) if self.total_nm2 > 0 else float("nan")
 
     @property
-    def errors_below_zero(self) -> float:
-        """Standard errors by which the variance, over all axes or of one, is below zero."""
-        below = -np.append(self.variance_nm2, self.total_nm2)
-        error = np.append(self.variance_error_nm2, self.total_error_nm2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return float(np.max(np.where(below > 0, below / error, 0.0)))
-
-    @property
     def refuted(self) -> bool:
-        """Whether more noise was subtracted than there is, by more than four standard errors."""
-        return self.errors_below_zero > _TOO_FAR
+        """Whether the variance, over all axes or of one, is four standard errors below zero."""
+        variance = np.append(self.variance_nm2, self.total_nm2)
+        error = np.append(self.variance_error_nm2, self.total_error_nm2)
+        return bool(np.any(variance < -SURPRISING * error))
 
     @property
     def upper_nm(self) -> float:
@@ -137,6 +132,15 @@ class ResidualEstimate:
         covariance = mean_covariance(one - two, one + two, self.stretches)
         error = float(np.sqrt(max(float(np.sum(covariance)), 0.0)))
         return self.total_nm2 - other.total_nm2, error
+
+    def is_clearly_above(self, other: ResidualEstimate) -> bool:
+        """Whether it is above another residual by more than chance and changing conditions do.
+
+        Two standard errors of the difference are chance, if they are no more than 25 % of the rms.
+        """
+        difference, error = self.above(other)
+        excused = (MUCH**2 - 1) * max(other.total_nm2, other.total_error_nm2)
+        return difference > max(_LEAST_SHARE * self.measured_nm2, min(_ERRORS * error, excused))
 
     def parts(self, count: int) -> list[ResidualEstimate]:
         """Return the residuals of so many consecutive parts of the frames, of equal length."""
@@ -193,7 +197,6 @@ def replayed_residual(
     noise_error_nm: ArrayLike = 0.0,
     stretches: StretchesLike | None = None,
     test: StretchesLike | None = None,
-    from_rest: bool = False,
 ) -> ResidualEstimate:
     """Residual that a controller would have left of a recorded disturbance.
 
@@ -224,9 +227,6 @@ def replayed_residual(
     test : sequence of (start, stop), optional
         Frames of them that count; by default all. The frames before are for the controller to
         warm up.
-    from_rest : bool, optional
-        Start the controller, the delay and the mirror from rest, and count all frames: the
-        replay is then what such a run would have measured, frame by frame.
 
     Returns
     -------
@@ -259,21 +259,16 @@ def replayed_residual(
     require_instance(hardware, LoopHardware)
     deviation = one_or_each(noise_nm, "noise_nm", hardware.n_measurements, at_least=0)
     series, runs = check_series(open_loop, hardware.modes, stretches)
-    noise_nm2 = deviation**2 * np.eye(hardware.n_measurements)
-    noise = mode_noise(hardware, noise_nm2, noise_error_nm=noise_error_nm)
+    noise = mode_noise(hardware, deviation**2 * np.eye(hardware.n_measurements), noise_error_nm)
     loop = close_loop(hardware, controller)
     loop.require_stable()
     tested = runs if test is None else checked_stretches(test, len(series))
-    kept, replayed = settled_test(runs, tested, 0.0 if from_rest else hardware.frame_rate_hz)
-    residual = replay(loop, series, replayed, from_rest=from_rest)
-    return estimate_residual(gather(residual, kept), kept, *noise)
+    kept, replayed = settled_test(runs, tested, hardware)
+    return estimate_residual(gather(replay(loop, series, replayed), kept), kept, *noise)
 
 
 def mode_noise(
-    hardware: LoopHardware,
-    noise_nm2: FloatArray,
-    *,
-    noise_error_nm: ArrayLike,
+    hardware: LoopHardware, noise_nm2: FloatArray, noise_error_nm: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
     """Return noise (q, q) of the measurements in the modes [nm^2], and its error [nm^4], (n, n).
 
@@ -319,14 +314,14 @@ def invert(square: FloatArray, need: str) -> FloatArray:
 
 
 def settled_test(
-    runs: Stretches, test: Stretches, frame_rate_hz: float
+    runs: Stretches, test: Stretches, hardware: LoopHardware
 ) -> tuple[Stretches, Stretches]:
     """Return the frames of a test that count, and those that a replay runs over before and in it.
 
     A replay begins where contiguous frames do, and what it has measured in their first half second
-    does not count; a rate of 0 counts all. Refuse a test outside of the runs, or of few frames.
+    does not count. Refuse a test outside of the runs, or one that is shorter than that.
     """
-    settle, kept, replayed = round(_SETTLE_S * frame_rate_hz), [], dict[int, int]()
+    settle, kept, replayed = _settle_frames(hardware), [], dict[int, int]()
     for start, stop in test:
         first = next((a for a, b in runs if a <= start and stop <= b), None)
         if first is None:
@@ -338,12 +333,17 @@ def settled_test(
             kept.append((max(start, first + settle), stop))
             replayed[first] = stop
     frames = sum(stop - start for start, stop in kept)
-    if frames < _FEWEST:
+    if frames < settle:
         raise ProblemError(
-            f"a residual needs at least {_FEWEST} frames beyond the first {settle} of each "
-            f"stretch; got {frames}. Record more, or split less."
+            f"a residual needs at least {settle} frames beyond the first {settle} of each stretch; "
+            f"got {frames}. Record more, or split less."
         )
     return tuple(kept), tuple(replayed.items())
+
+
+def _settle_frames(hardware: LoopHardware) -> int:
+    """Return the frames in which a loop forgets where it began."""
+    return max(round(_SETTLE_S * hardware.frame_rate_hz), 1)
 
 
 def gather(series: FloatArray, stretches: Stretches) -> FloatArray:
@@ -351,18 +351,16 @@ def gather(series: FloatArray, stretches: Stretches) -> FloatArray:
     return np.concatenate([series[start:stop] for start, stop in stretches])
 
 
-def replay(
-    loop: ClosedLoop, series: FloatArray, runs: Stretches, *, from_rest: bool = False
-) -> FloatArray:
+def replay(loop: ClosedLoop, series: FloatArray, runs: Stretches) -> FloatArray:
     """Return the measured residual (frames, n) of a stable loop on a series, nan outside of runs.
 
     z(k) stands for phi_tot(k-1), without noise: the residual of frame k-1 is e(k).
     """
-    path = loop.rejection()
+    path, first = loop.rejection(), _settle_frames(loop.hardware)
     constant = path.frequency_response([0.0])[0].real  # what the loop leaves of a constant
     residual = np.full(series.shape, np.nan)
     for start, stop in runs:
-        mean = np.mean(series[start : min(stop, start + _FIRST)], axis=0) * (not from_rest)
+        mean = np.mean(series[start : min(stop, start + first)], axis=0)
         residual[start:stop] = filter_series(path, series[start:stop] - mean) + constant @ mean
     return residual
 

@@ -8,8 +8,8 @@ from support.control_laws import RATE, SteppedLaw, run_law
 from support.diagnoses import line_diagnosis, line_record, short_record
 
 import lbt_synth as lbt
-from lbt_synth.identification.diagnosis.rows import line_name, line_place
-from lbt_synth.identification.diagnosis.verdict import diagnosis_verdict
+from lbt_synth.identification.diagnosis.rows import disturbance_lines, line_name
+from lbt_synth.identification.diagnosis.verdict import diagnosis_findings, diagnosis_verdict
 from lbt_synth.identification.prediction.comparison import INTEGRATOR, RAN
 
 
@@ -87,7 +87,7 @@ def test_a_fault_of_a_channel_may_be_what_is_wrong_with_the_commands():
     found = lbt.identification.diagnose(short_record(-1.0))
     channel = replace(found.channels[0], state="noisy")
     state, _, advice = diagnosis_verdict(replace(found, channels=(channel,)))
-    assert state.endswith("The record has faults, too: the measurement is noisy.")
+    assert state.startswith("The record has faults: the measurement is noisy. The commands are ")
     assert advice == "First look at the measurement, which is noisy."
 
 
@@ -157,19 +157,21 @@ def test_of_a_loop_near_its_limit():
         found, loop=replace(found.loop, values={**found.loop.values, "spectral_radius": 1.02})
     )
     assert "which is UNSTABLE at the sensor gain of" in diagnosis_verdict(wild)[0]
+    tones = [diagnosis_findings(each)[0].tone for each in (found, near, wild)]
+    assert tones == ["good", "note", "bad"]
 
 
 def test_along_what_a_line_shakes():
     found = line_diagnosis()
-    (line,) = found.lines
-    assert line_place(replace(line, direction=(0.866, 0.5))) == " along 30 deg"
-    assert line_place(replace(line, direction=(0.0, 1.0))) == " in tilt"
-    costs = tuple(replace(row, where=" in tilt") for row in found.costs)
-    (name,) = (row.part for row in costs if row.part.startswith("line"))
-    assert f"% of the {name} in tilt" in diagnosis_verdict(replace(found, costs=costs))[1]
+    (line,) = disturbance_lines(found.model)
+    assert line_name(line).endswith(" Hz")
+    assert line_name(replace(line, direction=(0.866, 0.5))).endswith(" Hz along 30 deg")
+    assert line_name(replace(line, direction=(0.0, 1.0))).endswith(" Hz in tilt")
+    (part,) = (row.part for row in found.costs if row.part.startswith("line"))
+    assert f"% of the {part}" in diagnosis_verdict(found)[1]
 
 
 def test_a_wide_resonance_is_no_line():
-    (line,) = line_diagnosis().lines
+    (line,) = disturbance_lines(line_diagnosis().model)
     assert line_name(line).startswith("line at ")
     assert line_name(replace(line, kind="broad")).startswith("broad resonance at ")
