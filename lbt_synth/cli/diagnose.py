@@ -15,7 +15,6 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import Diagnosis, LoopRecord, diagnose
 from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.diagnosis.rows import disturbance_lines, live_axes
-from lbt_synth.identification.diagnosis.verdict import diagnosis_verdict
 from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.rows import json_record
@@ -44,10 +43,9 @@ def run(arguments: Namespace) -> Report:
             progress=count,
             **loop_records.identification_options(arguments, record),
         )
-    verdict = diagnosis_verdict(found)
     report = Report(
-        data={"source": str(arguments.file), "verdict": verdict, **_diagnosis_data(found)},
-        opening=list(verdict),
+        data={"source": str(arguments.file), "verdict": found.verdict, **_diagnosis_data(found)},
+        opening=list(found.verdict),
         tables=[table for own in diagnosis_tables(found).values() for table in own],
         notes=[loop_records.marked_note(note) for note in found.notes],
     )

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.identification import Diagnosis
 from lbt_synth.identification.diagnosis.rows import law_facts
-from lbt_synth.identification.diagnosis.verdict import diagnosis_findings, diagnosis_verdict
 from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing
@@ -138,9 +137,9 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
 
 
 def _verdict_blocks(found: Diagnosis, tables: Sequence[Table]) -> list[Block]:
-    state, *rest = diagnosis_verdict(found)
+    state, *rest = found.verdict
     return [
-        Notice(text=state, tone=diagnosis_findings(found)[0].tone),
+        Notice(text=state, tone=found.findings[0].tone),
         " ".join(rest),
         *tables,
         *_residual_charts(found),

@@ -3,22 +3,20 @@
 One regression: around each line, a Wiener filter with the spectra of the model estimates the line's
 motion from the wavefront. Given the wavefront, the readings of a channel are normal with the mean
 ``expected F`` and the variance ``noise + open``: what the wavefront leaves open of the lines moves
-the channel, too, and does not bias it. The factors F of all lines are found together with these
-weights, in turn with the noise, whose median is robust against lines of the channel's own.
-
-Readings may lag behind by some frames, which turns the phase of every frequency in proportion. They
-are moved by whole frames if the slope of the phase within the lines is surely not that of readings
-beside the wavefront. What is left of a shift is in the phases of the lines.
+the channel, too. The factors F of all lines are found together with these weights, in turn with the
+noise, whose median is robust against lines of the channel's own. Readings are moved by whole frames
+if the slope of the phase within the lines surely says so; the rest of a shift is in the phases.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.signal import detrend
 from scipy.signal.windows import tukey
 from scipy.special import gammaincc
 
@@ -39,7 +37,6 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, 
 
 _TINY = np.finfo(np.float64).tiny
 _DEAD_M_S2 = 1e-9  # rms, a thousandth of what a quiet accelerometer resolves
-_BLOCK_S = 100.0  # that is transformed at once, which bounds the memory for a long record
 _INDEPENDENT = (1 - 5 * TAPER / 8) ** 2 / (1 - 93 * TAPER / 128)  # of tapered values
 _REACH = 20.0  # half widths of a line, or bins, from its centre to the edge of its band
 _ROUNDS = 20  # of factors and noise, of which each brings them nearer by a factor of two or more
@@ -149,12 +146,9 @@ def accelerometer_transfers(
 
     ``a_c(k) = 1e-9 sum_j F_cj a_j(k-g) + noise``
 
-    with a_j(k) the mean acceleration of the line j [nm/s^2 of wavefront] over frame k, which is
-    ``-(2 pi f)^2`` times the mean position in it, g the age of the reading, and F_cj a complex
-    factor, whose size is the motion and whose angle the phase. In bands around the lines, the
-    factors are those of a weighted regression of the channel on the lines as the wavefront shows
-    them by the spectra of the model. What the wavefront leaves open of the lines is a second noise
-    that grows with the factors. Standard errors count those of the model's sensor gains.
+    with a_j(k) the mean acceleration of the line j [nm/s^2 of wavefront] over frame k, g the age of
+    the reading, and F_cj a complex factor, whose size is the motion and whose angle the phase.
+    Standard errors count those of the model's sensor gains.
 
     Parameters
     ----------
@@ -294,9 +288,9 @@ def _best_channels(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Bands:
-    """Frequencies of a block of a record around all lines; densities per Hz."""
+    """Frequencies of a stretch of a record around all lines; densities per Hz."""
 
-    frames: int  # of the block
+    frames: int  # of the stretch
     bins: IntArray  # (f,): of its transform
     angle: FloatArray  # (f,) [rad per frame]
     readings: ComplexArray  # (f, channels) [m/s^2]
@@ -311,13 +305,12 @@ class _Bands:
         return np.asarray(np.maximum(self.shapes @ np.abs(factors) ** 2 - seen, 0.0))
 
 
-def _transform(series: FloatArray, rate: float) -> ComplexArray:
-    """Return tapered transforms (f, n), whose squares are densities, without mean and slope."""
-    time = np.linspace(-1, 1, len(series))
-    level = series - series.mean(axis=0) - np.outer(time, time @ series / (time @ time))
+def _transform(series: FloatArray, rate: float, inside: BoolArray) -> ComplexArray:
+    """Return tapered transforms in bands (f, n), whose squares are densities, without a slope."""
     taper = tukey(len(series), TAPER)
     scale = np.sqrt(2 / (rate * np.sum(taper**2)))
-    return np.asarray(scale * np.fft.rfft(taper[:, None] * level, axis=0))
+    transforms = [scale * np.fft.rfft(taper * detrend(column))[inside] for column in series.T]
+    return np.stack(transforms, axis=1)
 
 
 def _density(line: IdentifiedLine, frequency_hz: FloatArray, bin_hz: float) -> FloatArray:
@@ -337,7 +330,7 @@ def _make_bands(
     wavefront: FloatArray,
     readings: FloatArray,
 ) -> _Bands:
-    """Return the bands of a block of readings and of the wavefront beside its changes by gains."""
+    """Return the bands of a stretch: readings, wavefront and its changes by gains."""
     rate, count = model.frame_rate_hz, len(readings)
     bin_hz = rate / count
     frequency = np.asarray(bin_hz * np.arange(count // 2 + 1), dtype=np.float64)
@@ -346,7 +339,7 @@ def _make_bands(
         reach = _REACH * max(line.damping * line.frequency_hz, bin_hz)
         inside |= np.abs(frequency - line.frequency_hz) <= min(reach, line.frequency_hz / 4)
     f, axes = frequency[inside], len(model.axes)
-    z, moved = np.split(_transform(wavefront, rate)[inside], 2, axis=1)
+    z, moved = np.split(_transform(wavefront, rate, inside), 2, axis=1)
     along = np.array([(line.direction or (1.0,))[:axes] for line in lines])
     # the mean acceleration over a frame, of the mean position in it
     swing = -1e-9 * (2 * np.pi * f) ** 2  # in m/s^2 a nm
@@ -362,7 +355,7 @@ def _make_bands(
         frames=count,
         bins=np.flatnonzero(inside),
         angle=2 * np.pi * f / rate,
-        readings=_transform(readings, rate)[inside],
+        readings=_transform(readings, rate, inside),
         expected=np.einsum("faj,fa->fj", gain, z),
         moved=np.transpose(gain, (0, 2, 1)) * moved[:, None],
         seen=half,
@@ -392,18 +385,17 @@ def _lay_and_fit(
         frames = np.arange(record.frames) + lag
         rows = np.clip(frames, 0, len(readings) - 1)
         usable = record.usable & (frames == rows) & good[rows]
-        blocks = []
-        for start, stop in runs(usable).tolist():
-            if stop - start >= SHORTEST_SEGMENT:
-                count = int(np.ceil((stop - start) / (_BLOCK_S * model.frame_rate_hz)))
-                edges = np.linspace(start, stop, count + 1).astype(int).tolist()
-                blocks += [slice(a, b) for a, b in pairwise(edges)]
-        if not blocks:
+        bands = [
+            _make_bands(model, lines, wavefront[start:stop], readings[rows[start:stop]])
+            for start, stop in runs(usable).tolist()
+            if stop - start >= SHORTEST_SEGMENT
+        ]
+        if not bands:
             raise ProblemError(
                 f"record and accelerations must have {SHORTEST_SEGMENT} usable frames in a row "
                 f"side by side; they have {record.frames} and {len(readings)} frames."
             )
-        return [_make_bands(model, lines, wavefront[x], readings[rows[x]]) for x in blocks]
+        return bands
 
     def fit(bands: Sequence[_Bands]) -> list[_ChannelFit]:
         return [_fit_channel(bands, channel) for channel in range(readings.shape[1])]

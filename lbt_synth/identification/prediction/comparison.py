@@ -35,13 +35,7 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
-from lbt_synth.loop import (
-    Imaging,
-    close_loop,
-    jitter_strehl,
-    residual_budget,
-    youla_controller,
-)
+from lbt_synth.loop import Imaging, close_loop, jitter_strehl, residual_budget, youla_controller
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import PlantInputs, design_request
@@ -53,7 +47,6 @@ RAN = "what ran"
 INTEGRATOR = "best integrator"
 PREDICTOR = "least-squares predictor"
 LIMIT = "limit of performance"
-_LEAST_ROWS = 4  # frames per coefficient of a predictor, so that it does not fit their noise
 
 
 @table_row
@@ -113,10 +106,8 @@ class PredictionTable:
         for entry in self.entries:
             if entry.name == name:
                 return entry
-        raise ProblemError(
-            f"the table has the rows {', '.join(entry.name for entry in self.entries)}; got "
-            f"{name!r}."
-        )
+        names = ", ".join(entry.name for entry in self.entries)
+        raise ProblemError(f"the table has the rows {names}; got {name!r}.")
 
 
 def least_squares_predictor(
@@ -133,8 +124,7 @@ def least_squares_predictor(
     open_loop : (frames, n) array_like
         Recorded pseudo-open-loop series ``z(k) = phi_tot(k-1) + S^-1 w(k)`` [nm].
     hardware : LoopHardware
-        The loop: delay, mirror, sensor and influence matrix, both square and invertible. The sensor
-        matrix has the sensor gain that z was formed with.
+        The loop; its sensor matrix has the sensor gain that z was formed with.
     taps : int, optional
         Coefficients per mode.
     stretches : sequence of (start, stop), optional
@@ -146,14 +136,13 @@ def least_squares_predictor(
         From y(k) to u(k). The filter is its Youla parameter (:func:`youla_controller`): the loop
         is stable for any coefficients, at the sensor gain of the fit.
     coefficients : (n, taps) ndarray
-        What z_i(k-l) adds to the correction of mode i that u(k) commands. Regressors that depend
-        on each other get the coefficients of least norm.
+        What z_i(k-l) adds to the correction of mode i that u(k) commands; of least norm where
+        regressors depend on each other.
 
     Raises
     ------
     ProblemError
-        If a value is out of range, sizes clash, or there are fewer than four frames per
-        coefficient.
+        If a value is out of range, sizes clash, or there are fewer frames than coefficients.
 
     Examples
     --------
@@ -176,11 +165,10 @@ def least_squares_predictor(
     series, parts = check_series(open_loop, n, stretches)
     blocks = [_regression(series[a:b], hardware.mirror_taps, count) for a, b in parts]
     X, Z = (np.concatenate(block) for block in zip(*blocks, strict=True))
-    if len(X) < _LEAST_ROWS * count:
+    if len(X) < count:
         raise ProblemError(
-            f"a predictor of {count} coefficients needs at least {_LEAST_ROWS * count} frames to "
-            f"fit, beside {count} and the mirror's at the beginning of each stretch; got "
-            f"{len(X)}. Record more, or lower taps."
+            f"a predictor needs a frame to fit for each of {count} coefficients, beside {count} at "
+            f"the beginning of each stretch; got {len(X)}. Record more, or lower taps."
         )
     tolerance = np.finfo(float).eps * (count + 1)
     fits = [np.linalg.lstsq(X[:, i], Z[:, i], rcond=tolerance)[0] for i in range(n)]
@@ -287,7 +275,7 @@ def prediction_against_data(
     hardware = plant.hardware
     series, runs = check_series(open_loop, hardware.modes, stretches)
     fit, later = split_halves(runs, len(series))
-    test, replayed = settled_test(runs, later, hardware)
+    test = settled_test(runs, later, hardware)
     noise = mode_noise(hardware, plant.R, noise_error_nm)
     predictor, _ = least_squares_predictor(series, hardware, taps=taps, stretches=fit)
     designs = {INTEGRATOR: model_integrator(plant), **controllers, PREDICTOR: predictor}
@@ -305,7 +293,7 @@ def prediction_against_data(
         for name in loops
         if name not in stable
     ]
-    measured = {name: replay(stable[name], series, replayed) for name in stable if name != RAN}
+    measured = {name: replay(stable[name], series, runs) for name in stable if name != RAN}
     if measurements is not None:
         y, _ = check_series(measurements, hardware.n_measurements, test, "measurements")
         if len(y) != len(series):

@@ -77,11 +77,6 @@ class ResidualEstimate:
         return frozen_copy(np.diag(self.covariance_nm2))
 
     @property
-    def variance_error_nm2(self) -> FloatArray:
-        """Standard error of each axis' variance, (n,) [nm^2]."""
-        return frozen_copy(np.sqrt(np.diag(self.error_nm4)))
-
-    @property
     def total_nm2(self) -> float:
         """Residual variance over all axes [nm^2]."""
         return float(np.sum(self.variance_nm2))
@@ -110,15 +105,14 @@ class ResidualEstimate:
     def refuted(self) -> bool:
         """Whether the variance, over all axes or of one, is four standard errors below zero."""
         variance = np.append(self.variance_nm2, self.total_nm2)
-        error = np.append(self.variance_error_nm2, self.total_error_nm2)
+        error = np.append(np.sqrt(np.diag(self.error_nm4)), self.total_error_nm2)
         return bool(np.any(variance < -SURPRISING * error))
 
     @property
     def upper_nm(self) -> float:
         """Root of the variance plus two standard errors, at least 0 [nm rms]; nan if refuted."""
-        if self.refuted:
-            return float("nan")
-        return float(np.sqrt(max(self.total_nm2 + 2 * self.total_error_nm2, 0.0)))
+        upper = max(self.total_nm2 + 2 * self.total_error_nm2, 0.0)
+        return float("nan") if self.refuted else float(np.sqrt(upper))
 
     def above(self, other: ResidualEstimate) -> tuple[float, float]:
         """Return how far the variance is above another residual's, and the standard error [nm^2].
@@ -202,12 +196,9 @@ def replayed_residual(
 
     The pseudo-open-loop measurement ``z(k) = phi_tot(k-1) + S^-1 w(k)`` does not depend on the
     controller that ran. From ``y(k) = S (z(k) - c(k))``, with c(k) its own correction, a
-    controller computes exactly the commands of that loop under that disturbance and noise. Its
-    measured residual is ``e(k) = z(k) - c(k) = phi_res(k-1) + S^-1 w(k)``. As c(k) depends on the
-    noise up to frame k-1 only, white noise adds exactly its variance, which is subtracted.
-
-    The controller runs over each stretch from the equilibrium for its first frames, and the first
-    half second of a stretch does not count.
+    controller computes exactly the commands of that loop. Its measured residual is ``e(k) = z(k) -
+    c(k) = phi_res(k-1) + S^-1 w(k)``; c(k) depends on the noise up to frame k-1 only, so white
+    noise adds exactly its variance, which is subtracted.
 
     Parameters
     ----------
@@ -225,14 +216,13 @@ def replayed_residual(
     stretches : sequence of (start, stop), optional
         Contiguous usable frames, in order; by default the whole record.
     test : sequence of (start, stop), optional
-        Frames of them that count; by default all. The frames before are for the controller to
-        warm up.
+        Frames of them that count; by default all, without the first half second of a stretch.
 
     Returns
     -------
     ResidualEstimate
-        Measured residual, its variance without the noise, and standard errors. They include the
-        sampling of Gaussian series and the error of ``noise_nm``, not that of the sensor gain.
+        Measured residual, its variance without the noise, and standard errors: of Gaussian series
+        and of ``noise_nm``, not of the sensor gain.
 
     Raises
     ------
@@ -263,8 +253,8 @@ def replayed_residual(
     loop = close_loop(hardware, controller)
     loop.require_stable()
     tested = runs if test is None else checked_stretches(test, len(series))
-    kept, replayed = settled_test(runs, tested, hardware)
-    return estimate_residual(gather(replay(loop, series, replayed), kept), kept, *noise)
+    kept = settled_test(runs, tested, hardware)
+    return estimate_residual(gather(replay(loop, series, runs), kept), kept, *noise)
 
 
 def mode_noise(
@@ -272,8 +262,7 @@ def mode_noise(
 ) -> tuple[FloatArray, FloatArray]:
     """Return noise (q, q) of the measurements in the modes [nm^2], and its error [nm^4], (n, n).
 
-    The errors of the standard deviations of measurements are independent: an error of one is
-    common to all modes that it measures.
+    The error of a measurement's noise is common to all modes that it measures.
     """
     back = inverse_sensor(hardware)
     error = one_or_each(noise_error_nm, "noise_error_nm", hardware.n_measurements, at_least=0)
@@ -293,10 +282,10 @@ def check_series(
             f"{name} must be (frames, {modes}), a row per frame and a column per mode; got "
             f"{series.shape}."
         )
-    parts = checked_stretches(stretches, len(series))
-    for start, stop in parts:
+    runs = checked_stretches(stretches, len(series))
+    for start, stop in runs:
         real_array(series[start:stop], f"{name}, frames {start} to {stop},")
-    return series, parts
+    return series, runs
 
 
 def inverse_sensor(hardware: LoopHardware) -> FloatArray:
@@ -313,15 +302,12 @@ def invert(square: FloatArray, need: str) -> FloatArray:
     return np.asarray(np.linalg.inv(square))
 
 
-def settled_test(
-    runs: Stretches, test: Stretches, hardware: LoopHardware
-) -> tuple[Stretches, Stretches]:
-    """Return the frames of a test that count, and those that a replay runs over before and in it.
+def settled_test(runs: Stretches, test: Stretches, hardware: LoopHardware) -> Stretches:
+    """Return the frames of a test that count: not those of the first half second of a run.
 
-    A replay begins where contiguous frames do, and what it has measured in their first half second
-    does not count. Refuse a test outside of the runs, or one that is shorter than that.
+    Refuse a test outside of the runs, or one of less than half a second.
     """
-    settle, kept, replayed = _settle_frames(hardware), [], dict[int, int]()
+    settle, kept = _settle_frames(hardware), []
     for start, stop in test:
         first = next((a for a, b in runs if a <= start and stop <= b), None)
         if first is None:
@@ -329,16 +315,14 @@ def settled_test(
                 f"the test must lie within the usable stretches; got ({start}, {stop}) in "
                 f"{', '.join(map(str, runs))}."
             )
-        if max(start, first + settle) < stop:
+        if first + settle < stop:
             kept.append((max(start, first + settle), stop))
-            replayed[first] = stop
-    frames = sum(stop - start for start, stop in kept)
-    if frames < settle:
+    if (frames := sum(stop - start for start, stop in kept)) < settle:
         raise ProblemError(
             f"a residual needs at least {settle} frames beyond the first {settle} of each stretch; "
             f"got {frames}. Record more, or split less."
         )
-    return tuple(kept), tuple(replayed.items())
+    return tuple(kept)
 
 
 def _settle_frames(hardware: LoopHardware) -> int:
@@ -369,32 +353,29 @@ def mean_covariance(one: FloatArray, other: FloatArray, stretches: Stretches) ->
     """Return the covariance over the axes of mean products of two Gaussian series, (n, n).
 
     Over K frames it is ``2 / K`` times the sum of the squared cross-covariances over all lags
-    (M. S. Bartlett, J. Roy. Stat. Soc. Suppl. 8, 27 (1946), doi:10.2307/2983611). A periodogram I
-    has ``E I^2 = 2 S^2``: no spectrum needs to be smoothed.
-
-    ``cov(x_i y_i, x_j y_j)`` over all lags is the mean over the frequencies of ``S(x_i, x_j)
-    conj S(y_i, y_j) + S(x_i, y_j) conj S(y_i, x_j)``. On the diagonal the product of the two
-    periodograms has that mean for x = y, and at least that otherwise; off it, the two factors
-    are taken at neighbouring frequencies, which are independent.
+    (M. S. Bartlett, J. Roy. Stat. Soc. Suppl. 8, 27 (1946), doi:10.2307/2983611), the mean over the
+    frequencies of ``S(x_i, x_j) conj S(y_i, y_j) + S(x_i, y_j) conj S(y_i, x_j)``. A periodogram I
+    has ``E I^2 = 2 S^2``, so on the diagonal the product of the two has that mean without smoothing
+    for x = y, and at least that otherwise; off it, the factors are of neighbouring frequencies.
     """
-    frames, n = one.shape
-    total, start = np.zeros((n, n)), 0
-    for begin, end in stretches:
-        length = end - begin
+    n, start = one.shape[1], 0
+    total = np.zeros((n, n))
+    for length in (stop - begin for begin, stop in stretches):
         x, y = (rfft(series[start : start + length], axis=0) for series in (one, other))
-        weight = np.full(len(x), 2.0)  # a frequency and its negative
-        weight[0] = 1.0
-        weight[-1] = 2.0 if length % 2 else 1.0
-        weight /= length**2
-        part = _products(x, x) * np.roll(_products(y, y).conj(), 1, axis=0)
-        part += _products(x, y) * np.roll(_products(y, x).conj(), 1, axis=0)
-        lower = np.tril(np.tensordot(weight, part.real, 1), -1)
-        total += lower + lower.T + np.diag(weight @ (np.abs(x) ** 2 * np.abs(y) ** 2))
         start += length
-    total /= frames**2
+        weight = np.full(len(x), 2.0 / length**2)  # a frequency and its negative
+        weight[0] /= 2
+        if length % 2 == 0:
+            weight[-1] /= 2
+        product = _products(x, x) * np.roll(_products(y, y).conj(), 1, axis=0)
+        product += _products(x, y) * np.roll(_products(y, x).conj(), 1, axis=0)
+        product[:, range(n), range(n)] = np.abs(x) ** 2 * np.abs(y) ** 2
+        total += np.tensordot(weight, product.real, 1)
+    covariance = np.tril(total) + np.tril(total, -1).T
+    covariance /= len(one) ** 2
     # a covariance is at most the product of the deviations
-    most = np.sqrt(np.outer(np.diag(total), np.diag(total)))
-    return np.asarray(np.clip(total, -most, most))
+    most = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    return np.asarray(np.clip(covariance, -most, most))
 
 
 def _products(x: ComplexArray, y: ComplexArray) -> ComplexArray:

@@ -263,7 +263,7 @@ def test_more_noise_than_the_data_has_is_a_note():
         ({"running": lbt.integrator(PATH, gain=0.3)}, "needs its measurements"),
         ({"imaging": 2.2}, "expected an Imaging"),
         ({"noise_error_nm": -1.0}, "noise_error_nm must be at least 0"),
-        ({"taps": 300}, "at least 1200 frames to fit"),
+        ({"taps": 600}, "each of 600 coefficients.* got 399"),
     ],
 )
 def test_tables_that_are_refused(more, message):
@@ -395,8 +395,8 @@ def test_regressors_that_depend_on_each_other():
     [
         (PATH, {"taps": 0}, "taps must be at least 1"),
         (PATH, {"taps": 2.0}, "taps must be an integer"),
-        (PATH, {"taps": 500}, "500 coefficients needs at least 2000 frames"),
-        (PATH, {"stretches": [(0, 20), (30, 50)]}, "at least 128 frames to fit.* got 0"),
+        (PATH, {"taps": 1200}, "for each of 1200 coefficients.*; got 799"),
+        (PATH, {"stretches": [(0, 20), (30, 50)]}, "each of 32 coefficients.* got 0"),
         (FLAT, {}, "sensor matrix that can be inverted"),
         (STUCK, {}, "influence matrix that can be inverted; got \\(2, 2\\) of rank 1"),
         (a_plant(), {}, "expected a LoopHardware"),
