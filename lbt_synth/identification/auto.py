@@ -17,10 +17,7 @@ from lbt_synth.errors import NumericalError
 from lbt_synth.identification.commands.verdict import explain_commands, judge_fitted_gains
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.fit.identify import identify
-from lbt_synth.identification.prediction.comparison import (
-    PredictionTable,
-    compare_designs,
-)
+from lbt_synth.identification.prediction.comparison import PredictionTable, compare_designs
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
@@ -29,11 +26,7 @@ from lbt_synth.identification.sensor_gains import allowed_gains, design_for_gain
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget
-from lbt_synth.methods.registry import (
-    default_method,
-    method_named,
-    record_methods,
-)
+from lbt_synth.methods.registry import default_method, method_named, record_methods
 from lbt_synth.methods.request import PlantInputs, design_request, option_owners
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
@@ -43,7 +36,6 @@ from lbt_synth.validation import choice, require_instance
 _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
-_PARTS = 3  # of the test, on each of which another method has to win
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,15 +79,13 @@ def design_from_record(
 ) -> RecordedDesign:
     """Identify a loop from its record, design a controller, and test it on unseen data.
 
-    Before anything is fitted, the commands must explain the measurements as they are given
-    (``explain_commands``). The test is honest and conservative: a model of the first half of
-    the usable frames gives a design, and that is replayed on the second half. The design that is
-    returned is made the same way from all frames.
+    Before anything is fitted, the commands must explain the measurements as they are given. The
+    test is honest and conservative: designs for a model of the first half of the usable frames are
+    replayed on the second half. The design that is returned is made the same way from all frames.
 
-    Without a method, the quick ones that need no more than a plant are tested in this way. The
-    Kalman filter stays unless another one leaves less on each third of the test, by more than 2 %
-    of the measured variance and than twice the error of the difference, or by 25 % of the rms.
-    Where it does not stay, the test is a little kind to the chosen one.
+    Without a method, the quick ones that need no more than a plant are tested. The Kalman filter
+    stays unless another one leaves less on each third of the test, by more than 2 % of the measured
+    variance and than twice the error of the difference, or by 25 % of the rms.
 
     Parameters
     ----------
@@ -112,8 +102,8 @@ def design_from_record(
     accept_record : bool, optional
         Go on although something else explains the record better; the design says so.
     command_scale_known : bool, optional
-        The commands were recorded at the size that was applied. No record can tell this from
-        half that size, so by default a design is also stable at half the sensor gain.
+        The commands were recorded at the size that was applied. No record can tell; by default a
+        design is also stable at half the sensor gain.
     progress : callable, optional
         Called with 1 after each of 3 steps.
     **options
@@ -180,7 +170,7 @@ def design_from_record(
     model = identify(record, start=half, **options)
     made, price = design_for_gains(
         model,
-        lambda known: _design(method, known, defaults=defaults),
+        lambda known: _design(method, known, defaults),
         allowed_gains(record, model) if finds_gain else None,
         command_scale_known=command_scale_known,
     )
@@ -201,7 +191,7 @@ def design_from_record(
     )
 
 
-def _design(method: str, model: IdentifiedModel, *, defaults: Mapping[str, Any]) -> Design:
+def _design(method: str, model: IdentifiedModel, defaults: Mapping[str, Any]) -> Design:
     """Return the design of a method for a model."""
     inputs = PlantInputs(plant=model.plant(), design_defaults=defaults)
     return design_request(method, {}).build(inputs)
@@ -298,19 +288,15 @@ def choose_method(residuals: Mapping[str, ResidualEstimate]) -> tuple[str, str]:
 
     The residuals are by the titles of methods; return one of these, and why it is chosen.
     """
-    usual = method_named(default_method()).title
     ordered = sorted(residuals, key=lambda title: residuals[title].total_nm2)
-    if usual not in residuals:
-        title = ordered[0]
-        return title, f"the {title} is chosen: of the methods that are left it leaves least"
-    thirds = residuals[usual].parts(_PARTS)
+    usual = method_named(default_method()).title
+    usual = usual if usual in residuals else ordered[0]
     for title in ordered:
-        others = residuals[title].parts(_PARTS)
-        if all(third.is_clearly_above(other) for third, other in zip(thirds, others, strict=True)):
+        thirds = zip(residuals[usual].parts(3), residuals[title].parts(3), strict=True)
+        if all(third.is_clearly_above(other) for third, other in thirds):
             difference, error = residuals[usual].above(residuals[title])
-            gained = nm_text(difference, error_nm=error, unit="nm^2")
             return title, (
-                f"the {title} is chosen: on each of {_PARTS} parts of the test it leaves less than "
-                f"the {usual}, in all by {gained}"
+                f"the {title} is chosen: on each third of the test it leaves less than the "
+                f"{usual}, in all by {nm_text(difference, error_nm=error, unit='nm^2')}"
             )
     return usual, f"the {usual} stays: no method leaves clearly less on each third of the test"

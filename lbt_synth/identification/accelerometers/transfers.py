@@ -10,9 +10,10 @@ if the slope of the phase within the lines surely says so; the rest of a shift i
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -204,7 +205,10 @@ def accelerometer_transfers(
     places = [i for i, part in enumerate(model.parts) if part.kind == "line"]
     places.sort(key=lambda i: model.parts[i].frequency_hz)
     lines = [model.parts[i] for i in places]
-    lag, fits, shift, error, limit = 0, list[_ChannelFit](), 0.0, float("inf"), 0.0
+    lag, shift, error, transfers = 0, 0.0, float("inf"), list[TransferRow]()
+    noise, verdicts = np.full(len(names), np.nan), ["dead"] * len(names)
+    for c in live:
+        verdicts[c] = "adds nothing"
     if live and lines:
         widest_hz = max(line.damping * line.frequency_hz for line in lines)
         shifts = 1 + np.ceil(4 * widest_hz * largest_s)  # that differ
@@ -213,23 +217,22 @@ def accelerometer_transfers(
         lag, fits, shift, error = _lay_and_fit(
             model, record, lines, readings[:, live], good, largest, limit
         )
-    fit_of = {names[c]: fit for c, fit in zip(live, fits, strict=False)}
-    used = _best_channels(fit_of, lines, limit)
-    transfers, rows = list[TransferRow](), list[ChannelRow]()
-    for c, name in enumerate(names):
-        noise, shown, fit = np.nan, list[int](), fit_of.get(name)
-        if fit is not None:
-            noise = fit.noise_m_s2(model.frame_rate_hz, limit)
-            shown = np.flatnonzero(fit.chances < limit).tolist()
-            transfers += [
-                _transfer_row(fit, j, name, places[j], line, name in used and j in shown)
-                for j, line in enumerate(lines)
-            ]
-        verdict = _verdict([lines[j] for j in shown], name in used) if c in live else "dead"
-        rows.append(ChannelRow(channel=name, noise_m_s2=noise, verdict=verdict))
+        shown = fits.chances < limit
+        # the channels that show most of the lines' power, as many as a design takes
+        power = (fits.coherences * shown) @ np.array([line.rms_nm**2 for line in lines])
+        used = shown & (power >= np.sort(power)[-(MOST_UNITS - 1) :][0])[:, None]
+        for k, c in enumerate(live):
+            near = fits.noise[k][shown[k] if shown[k].any() else ...]
+            noise[c] = np.sqrt(np.mean(near) * model.frame_rate_hz / 2)
+            transfers += _transfer_rows(names[c], places, lines, fits, k, used[k])
+            if shown[k].any():
+                verdicts[c] = _verdict(shown[k], used[k], lines)
     return AccelerometerTransfers(
         transfers=tuple(transfers),
-        channels=tuple(rows),
+        channels=tuple(
+            ChannelRow(channel=name, noise_m_s2=float(noise[c]), verdict=verdicts[c])
+            for c, name in enumerate(names)
+        ),
         shift_frames=shift,
         shift_error_frames=error,
         age_frames=lag + 1,
@@ -247,43 +250,40 @@ def _check_names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
     return names
 
 
-def _verdict(shown: Sequence[IdentifiedLine], is_used: bool) -> str:
+def _verdict(shown: BoolArray, used: BoolArray, lines: Sequence[IdentifiedLine]) -> str:
     """Return what a channel is used for that shows some lines, in words."""
-    if not shown:
-        return "adds nothing"
-    use = f"{', '.join(f'{line.frequency_hz:.3g}' for line in shown)} Hz"
-    if is_used:
-        return f"used for {use}"
-    return f"left out, because a design takes {MOST_UNITS - 1} channels; shows {use}"
+    each = [f"{line.frequency_hz:.3g}" for line, is_so in zip(lines, shown, strict=True) if is_so]
+    if used.any():
+        return f"used for {', '.join(each)} Hz"
+    return f"left out, because a design takes {MOST_UNITS - 1} channels; shows {', '.join(each)} Hz"
 
 
-def _transfer_row(
-    fit: _ChannelFit, j: int, name: str, place: int, line: IdentifiedLine, useful: bool
-) -> TransferRow:
-    """Return what the fit of a channel says of one line."""
-    factor, (error, across) = fit.factors[j], fit.errors(j)
-    return TransferRow(
-        channel=name,
-        line=place,
-        frequency_hz=line.frequency_hz,
-        motion_nm_per_nm=float(abs(factor)),
-        motion_error_nm_per_nm=error,
-        phase_deg=float(np.degrees(np.angle(factor))),
-        phase_error_deg=float(min(np.degrees(across / max(abs(factor), _TINY)), 180.0)),
-        coherence=float(fit.coherences[j]),
-        chance=float(fit.chances[j]),
-        useful=useful,
-    )
-
-
-def _best_channels(
-    fits: Mapping[str, _ChannelFit], lines: Sequence[IdentifiedLine], limit: float
-) -> list[str]:
-    """Return the channels that show most of the lines' power, as many as a design takes."""
-    power = np.array([line.rms_nm**2 for line in lines])
-    shown = {name: power @ (fit.coherences * (fit.chances < limit)) for name, fit in fits.items()}
-    best = sorted((name for name in shown if shown[name] > 0), key=lambda name: -shown[name])
-    return best[: MOST_UNITS - 1]
+def _transfer_rows(
+    name: str,
+    places: Sequence[int],
+    lines: Sequence[IdentifiedLine],
+    fits: _Fits,
+    k: int,
+    used: BoolArray,
+) -> list[TransferRow]:
+    """Return what the fit of a channel says of each line."""
+    size = np.abs(fits.factors[k])
+    turned = np.minimum(np.degrees(fits.across[k] / np.maximum(size, _TINY)), 180.0)
+    return [
+        TransferRow(
+            channel=name,
+            line=place,
+            frequency_hz=line.frequency_hz,
+            motion_nm_per_nm=float(size[j]),
+            motion_error_nm_per_nm=float(fits.along[k, j]),
+            phase_deg=float(np.angle(fits.factors[k, j], deg=True)),
+            phase_error_deg=float(turned[j]),
+            coherence=float(fits.coherences[k, j]),
+            chance=float(fits.chances[k, j]),
+            useful=bool(used[j]),
+        )
+        for j, (place, line) in enumerate(zip(places, lines, strict=True))
+    ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -371,7 +371,7 @@ def _lay_and_fit(
     good: BoolArray,
     largest: int,
     limit: float,
-) -> tuple[int, list[_ChannelFit], float, float]:
+) -> tuple[int, _Fits, float, float]:
     """Lay readings beside the wavefront: with the likeliest shift, or as given if that is not sure.
 
     Return by how many frames they were moved, the fits, and the shift with its standard error.
@@ -397,18 +397,15 @@ def _lay_and_fit(
             )
         return bands
 
-    def fit(bands: Sequence[_Bands]) -> list[_ChannelFit]:
-        return [_fit_channel(bands, channel) for channel in range(readings.shape[1])]
-
     bands = beside(0)
     lag = _likeliest_lag(bands, largest)
-    fits = fit(beside(lag))
+    fits = _fit_channels(beside(lag))
     late, error = _slope_shift(fits, limit)
     if not abs(lag + late) > DIFFERENT * error:
-        return 0, fit(bands), lag + late if np.isfinite(error) else 0.0, error
+        return 0, _fit_channels(bands), lag + late if np.isfinite(error) else 0.0, error
     if round(late):
         lag += round(late)
-        fits = fit(beside(lag))
+        fits = _fit_channels(beside(lag))
         late, error = _slope_shift(fits, limit)
     return lag, fits, lag + late, error
 
@@ -428,33 +425,26 @@ def _likeliest_lag(bands: Sequence[_Bands], largest: int) -> int:
     return int(lags[np.argmax(total)])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _ChannelFit:
-    """Factors of one channel for all lines."""
+class _Fits(NamedTuple):
+    """Factors of channels for lines, (channels, lines) each; of one channel, (lines,)."""
 
-    factors: ComplexArray  # (lines,)
-    variances: FloatArray  # (lines,): of the complex factors, for the gains of the model
-    slopes: ComplexArray  # (lines, axes): of the factors, for a standard error of each sensor gain
-    chances: FloatArray  # (lines,): that a channel without a line would show as much
-    coherences: FloatArray  # (lines,)
-    noise: FloatArray  # (lines,): density near each line [(m/s^2)^2/Hz]
-    shifts: FloatArray  # (lines,): lag by the slope of the phase within each line [frames]
-    shift_weights: FloatArray  # (lines,): their inverse variances
-
-    def errors(self, j: int) -> tuple[float, float]:
-        """Return the standard errors of a factor along itself, and across: of size and phase."""
-        turned = self.slopes[j] * np.exp(-1j * np.angle(self.factors[j]))
-        scatter = self.variances[j] / 2
-        along, across = (np.sqrt(scatter + np.sum(x**2)) for x in (turned.real, turned.imag))
-        return float(along), float(across)
-
-    def noise_m_s2(self, rate: float, limit: float) -> float:
-        """Return the noise of a reading near the lines that the channel shows, or near all."""
-        shown = self.chances < limit
-        return float(np.sqrt(np.mean(self.noise[shown if shown.any() else ...]) * rate / 2))
+    factors: ComplexArray
+    along: FloatArray  # standard errors of them, along themselves: of the size
+    across: FloatArray  # and across: of the phase, times the size
+    chances: FloatArray  # that a channel without a line would show as much
+    coherences: FloatArray
+    noise: FloatArray  # density near each line [(m/s^2)^2/Hz]
+    shifts: FloatArray  # lag by the slope of the phase within each line [frames]
+    shift_weights: FloatArray  # their inverse variances
 
 
-def _fit_channel(bands: Sequence[_Bands], channel: int) -> _ChannelFit:
+def _fit_channels(bands: Sequence[_Bands]) -> _Fits:
+    """Fit the factors of all channels for all lines."""
+    channels = range(bands[0].readings.shape[1])
+    return _Fits(*map(np.array, zip(*(_fit_channel(bands, c) for c in channels), strict=True)))
+
+
+def _fit_channel(bands: Sequence[_Bands], channel: int) -> _Fits:
     """Fit the factors of a channel for all lines, and test each of them."""
     x, moved, angle = (
         np.concatenate([getattr(band, name) for band in bands])
@@ -487,13 +477,15 @@ def _fit_channel(bands: Sequence[_Bands], channel: int) -> _ChannelFit:
     ratios = np.abs(factors) ** 2 / np.maximum(raised * variances, _TINY)
     left = np.abs(error) ** 2 @ shares
     shown = np.abs(factors) ** 2 * np.sum(size * shares, axis=0)
+    scatter = variances * more / 2
+    moves = slopes * np.exp(-1j * np.angle(factors))[:, None]
     # a small shift turns the phase in proportion to the distance from the middle of the line
     turn = -1j * (angle[:, None] - angle @ shares) * factors * x
     turned = np.maximum(np.sum(np.abs(turn) ** 2 * weights[:, None], axis=0), _TINY)
-    return _ChannelFit(
+    return _Fits(
         factors=factors,
-        variances=variances * more,
-        slopes=slopes,
+        along=np.sqrt(scatter + np.sum(moves.real**2, axis=1)),
+        across=np.sqrt(scatter + np.sum(moves.imag**2, axis=1)),
         chances=np.exp(-degrees * np.log1p(ratios / degrees)),
         coherences=shown / np.maximum(shown + left, _TINY),
         noise=noise * raised,
@@ -502,11 +494,11 @@ def _fit_channel(bands: Sequence[_Bands], channel: int) -> _ChannelFit:
     )
 
 
-def _slope_shift(fits: Sequence[_ChannelFit], limit: float) -> tuple[float, float]:
+def _slope_shift(fits: _Fits, limit: float) -> tuple[float, float]:
     """Return by how many frames readings are late beyond the lag, and its standard error."""
-    shown = [fit.chances < limit for fit in fits]
-    weights = np.concatenate([fit.shift_weights[s] for fit, s in zip(fits, shown, strict=True)])
-    shifts = np.concatenate([fit.shifts[s] for fit, s in zip(fits, shown, strict=True)])
+    shown = fits.chances < limit
+    weights = fits.shift_weights[shown]
     if not weights.sum() > 0:
         return 0.0, float("inf")
-    return float(weights @ shifts / weights.sum()), float(1 / np.sqrt(weights.sum()))
+    shift = float(weights @ fits.shifts[shown] / weights.sum())
+    return shift, float(1 / np.sqrt(weights.sum()))

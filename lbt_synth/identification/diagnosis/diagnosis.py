@@ -36,7 +36,7 @@ from lbt_synth.identification.prediction.comparison import (
     PredictionTable,
     compare_designs,
 )
-from lbt_synth.identification.prediction.residual import MUCH, ResidualEstimate, gather
+from lbt_synth.identification.prediction.residual import MUCH, gather
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
@@ -65,46 +65,22 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Diagnosis:
-    """What a record tells of its loop.
-
-    Attributes
-    ----------
-    record : LoopRecord
-        The record.
-    imaging : Imaging
-        The camera of Strehl ratios.
-    commands : CommandVerdict or None
-        How the commands reach the measurements; None of an open loop.
-    channels : tuple of ChannelRow
-        Measurements and commands, one by one.
-    model : IdentifiedModel or None
-        The model of the whole record, and why there is none in ``notes``.
-    loop : Facts or None
-        The loop that ran, by law and model.
-    comparison : PredictionTable or None
-        Residuals on the second half of the record, by models of the first.
-    best : str
-        Row of the comparison that leaves least, of the designs.
-    best_design : Design or None
-        The same design, for the model of the first half.
-    costs : tuple of CostRow
-        What each part of the disturbance costs by the model of the first half (of the whole record
-        where there is no comparison), the most costly first; the last row is all.
-    notes : tuple of str
-        What could not be said and why, and what else should be known.
-    """
+    """What a record tells of its loop."""
 
     record: LoopRecord
-    imaging: Imaging
-    commands: CommandVerdict | None = None
-    channels: tuple[ChannelRow, ...] = ()
-    model: IdentifiedModel | None = None
-    loop: Facts | None = None
+    imaging: Imaging  # the camera of Strehl ratios
+    commands: CommandVerdict | None = None  # how they reach the measurements; None of an open loop
+    channels: tuple[ChannelRow, ...] = ()  # measurements and commands, one by one
+    model: IdentifiedModel | None = None  # of the whole record
+    loop: Facts | None = None  # the loop that ran, by law and model
+    # residuals on the second half of the record, by models of the first
     comparison: PredictionTable | None = None
-    best: str = ""
-    best_design: Design | None = None
+    best: str = ""  # row of the comparison that leaves least, of the designs
+    best_design: Design | None = None  # the same design, for the model of the first half
+    # what each part of the disturbance costs by the model of the first half (of the whole record
+    # where there is no comparison), the most costly first; the last row is all
     costs: tuple[CostRow, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what could not be said and why, and what else should be known
 
     @property
     def law(self) -> ControlLaw | None:
@@ -137,11 +113,6 @@ class Diagnosis:
     def row(self, name: str) -> PredictionRow | None:
         """Return a row of the comparison, None where there is none."""
         return next((row for row in self.residuals if row.name == name), None)
-
-    def residual(self, name: str) -> ResidualEstimate | None:
-        """Return the residual on unseen data of a row, None where there is none."""
-        row = self.row(name)
-        return None if row is None else row.replayed
 
 
 def diagnose(
@@ -350,7 +321,8 @@ def _judge_loop(diagnosis: Diagnosis) -> Finding:
 
 def _residual_text(diagnosis: Diagnosis) -> str:
     """Say what the loop that ran leaves, from which measurement that follows, and of what it is."""
-    row, ran = diagnosis.row(RAN), diagnosis.residual(RAN)
+    row = diagnosis.row(RAN)
+    ran = None if row is None else row.replayed
     parts = _parts_text(diagnosis, "best_nm" if ran is None else "running_nm")
     if row is None or ran is None:
         if not parts:
@@ -386,8 +358,8 @@ def _parts_text(diagnosis: Diagnosis, field: str) -> str:
 
 def _advice_text(diagnosis: Diagnosis) -> str:
     """Say what to change first in a loop whose record has no fault."""
-    name = diagnosis.best
-    ran, best, slow = (diagnosis.residual(row) for row in (RAN, name, INTEGRATOR))
+    name, residuals = diagnosis.best, {row.name: row.replayed for row in diagnosis.residuals}
+    ran, best, slow = (residuals.get(row) for row in (RAN, name, INTEGRATOR))
     if best is None or slow is None:
         return "Record longer before anything is changed."
     strehl = _strehl_text(diagnosis, name)
