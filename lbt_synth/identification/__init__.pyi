@@ -1,4 +1,5 @@
 from .accelerometers.transfers import accelerometer_transfers as accelerometer_transfers
+from .auto import allowed_gains as allowed_gains
 from .auto import design_from_record as design_from_record
 from .commands.control_law import fit_control_law as fit_control_law
 from .commands.repair import CommandRepair as CommandRepair
@@ -22,6 +23,5 @@ from .records.line_priors import load_lines as load_lines
 from .records.record import LoopRecord as LoopRecord
 from .records.record import SpectrumRecord as SpectrumRecord
 from .records.record import require_length as require_length
-from .sensor_gains import allowed_gains as allowed_gains
 from .stretches import split_halves as split_halves
 from .tracking import TrackingController as TrackingController

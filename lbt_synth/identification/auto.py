@@ -1,41 +1,57 @@
 """A certified controller from a record, tested on data that it has not seen.
 
 The Kalman filter is the default. It stays unless another method leaves clearly less on every third
-of the test: one that wins on some parts only has won by what changed between them.
+of the test: one that wins on some parts only has won by what changed between them. A design is
+stable at all sensor gains that the record allows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.errors import NumericalError
-from lbt_synth.identification.commands.verdict import explain_commands, judge_fitted_gains
+from lbt_synth.errors import CertificateError, NumericalError, ProblemError, SynthesisError
+from lbt_synth.identification.commands.repair import CommandRepair
+from lbt_synth.identification.commands.verdict import (
+    could_have_run,
+    explain_commands,
+    judge_fitted_gains,
+    record_law,
+)
+from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, POSSIBLE_GAINS
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
-from lbt_synth.identification.fit.identify import identify
+from lbt_synth.identification.fit.identify import OPEN_GAIN, identify
 from lbt_synth.identification.prediction.comparison import PredictionTable, compare_designs
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
-from lbt_synth.identification.sensor_gains import allowed_gains, design_for_gains
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, close_loop, residual_budget
-from lbt_synth.methods.registry import default_method, method_named, record_methods
+from lbt_synth.loop import Imaging, close_loop, residual_budget, stable_sensor_gains
+from lbt_synth.methods.registry import (
+    default_method,
+    gain_robust_method,
+    method_named,
+    record_methods,
+)
 from lbt_synth.methods.request import PlantInputs, design_request, option_owners
-from lbt_synth.models import TipTiltPlant
+from lbt_synth.models import LoopHardware, TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import choice, require_instance
+from lbt_synth.validation import FloatArray, choice, require_instance
 
 _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
+_MISFIT = 1.5  # factor by which a gain may be off where the model leaves something out
+_STEP = 0.05  # of the logarithm of a gain, between gains that are tried: a loop hardly changes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -300,3 +316,189 @@ def choose_method(residuals: Mapping[str, ResidualEstimate]) -> tuple[str, str]:
                 f"{usual}, in all by {nm_text(difference, error_nm=error, unit='nm^2')}"
             )
     return usual, f"the {usual} stays: no method leaves clearly less on each third of the test"
+
+
+def allowed_gains(record: LoopRecord, model: IdentifiedModel) -> FloatArray:
+    """Return the interval of sensor gains of each axis that a closed-loop record allows.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        A closed-loop record with its delay.
+    model : IdentifiedModel
+        Its model.
+
+    Returns
+    -------
+    (axes, 2) ndarray
+        Least and largest gain within three standard errors of the model's, and a factor of 1.5
+        where its innovations are not white. Of these, only gains at which the law that ran was
+        stable, and from 0.2 to 1.25, as sensors have them, if the model's is among these.
+
+    Raises
+    ------
+    ProblemError
+        If the record has no delay.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=20.0, frame_rate_hz=500)
+    >>> truth = lbt.Truth(turbulence=slow, noise_nm=5.0, sensor_gain=0.6)
+    >>> path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
+    >>> run = lbt.simulate(
+    ...     lbt.integrator(path, gain=0.4).controller, truth, hardware=path, frames=10_000
+    ... )
+    >>> record = lbt.identification.loop_record(
+    ...     run.measurements[0], run.commands[0], frame_rate_hz=500, delay_frames=2, unit="nm"
+    ... )
+    >>> low, high = lbt.identification.allowed_gains(record, lbt.identify(record))[0]
+    >>> bool(low < 0.6 < high < 1)
+    True
+    """
+    running = _running_gains(record)
+    rows = []
+    for axis in model.axes:
+        gain, error = axis.sensor_gain, axis.sensor_gain_error or 0.0
+        factor = np.exp(DIFFERENT * error / gain) * (1.0 if axis.whiteness.white else _MISFIT)
+        is_plausible = PLAUSIBLE_GAINS[0] <= gain <= PLAUSIBLE_GAINS[1]
+        ends = np.array([gain / factor, gain * factor])
+        for limits in (running, PLAUSIBLE_GAINS if is_plausible else POSSIBLE_GAINS):
+            ends = np.clip(ends, *limits)
+        rows.append(ends)
+    return np.array(rows)
+
+
+def _running_gains(record: LoopRecord) -> tuple[float, float]:
+    """Return the ends of the possible gains beyond which the law that ran was unstable."""
+    law = record_law(record)
+    if law is None or law.kind == "none" or law.lag_frames < 0:
+        return POSSIBLE_GAINS
+    gains, one = _gains_between(*POSSIBLE_GAINS), np.ones((1, record.axes))
+    ran = [could_have_run(CommandRepair(), gain * one, record, law) for gain in gains]
+    if not any(ran):
+        return POSSIBLE_GAINS
+    beside = np.convolve(ran, [1, 1, 1], "same") > 0  # the limit is between two gains
+    return float(gains[beside][0]), float(gains[beside][-1])
+
+
+def _gains_between(start: float, end: float) -> FloatArray:
+    """Return gains from one to another, both of them included."""
+    return np.geomspace(start, end, int(np.ceil(abs(np.log(end / start)) / _STEP)) + 1)
+
+
+def unstable_gains(
+    hardware: LoopHardware, controller: Controller, gains: FloatArray
+) -> FloatArray | None:
+    """Return sensor gains within intervals (axes, 2) at which a loop is unstable.
+
+    Each corner of the box is tried, and all common factors on the gains of the hardware that its
+    sides allow: exact for axes that decouple. None if the loop is stable at all of them.
+    """
+    for corner in product(*gains):
+        path = replace(hardware, sensor_matrix=np.diag(corner))
+        if not close_loop(path, controller).is_stable:
+            return np.array(corner)
+    assumed = np.diag(hardware.sensor)
+    factors = gains / assumed[:, None]
+    low, high = stable_sensor_gains(hardware, controller)
+    for factor in (np.min(factors), np.max(factors)):
+        if not low < factor < high:
+            return np.asarray(factor * assumed)
+    return None
+
+
+def design_for_gains(
+    model: IdentifiedModel,
+    design: Callable[[IdentifiedModel], Design],
+    allowed: FloatArray | None,
+    *,
+    command_scale_known: bool,
+) -> tuple[Design, tuple[str, ...]]:
+    """Return a design that is stable at all sensor gains that a record allows, and notes.
+
+    Its first assumption says which gains these are. Commands that were recorded at half their size
+    look like twice the sensor gain, and no record can tell; so unless the scale of the commands is
+    known, half of the gains are possible, and each axis may have those of both. Where the design
+    for the fitted gain is unstable at one of them, the best of the designs that assume another gain
+    takes its place, or a robust one.
+    """
+    usual = design(model)
+    if allowed is None:
+        return usual, ()
+    intervals = allowed
+    assumed = (
+        f"the sensor gain lies within {_in_words(allowed)}, as the record and its model allow; "
+        "the loop is stable at all of these"
+    )
+    if command_scale_known:
+        assumed += ". The commands were recorded at the size that was applied, as was stated"
+    else:
+        intervals = np.tile([allowed.min() / 2, allowed.max()], (len(allowed), 1))
+        assumed += " and at half of them, should the commands be recorded at half their size"
+        if np.ptp(allowed, axis=0).any():
+            assumed += ", and each axis at those of both, because they differ"
+    bad = unstable_gains(model.hardware, usual.controller, intervals)
+    if bad is None:
+        return replace(usual, assumptions=(assumed, *usual.assumptions)), ()
+    safe = _assume_another(model, design, intervals) or _robust(model, intervals)
+    if safe is None:
+        gain = ", ".join(f"{value:.3g}" for value in bad)
+        advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
+        raise CertificateError(
+            f"the loop of the design is unstable at the sensor gain {gain}, and the record allows "
+            f"{_in_words(intervals)}. Record with a higher loop gain, look for jumps in the "
+            f"record, give the sensor gain{advice}."
+        )
+    note = (
+        f"to be stable at sensor gains of {_in_words(intervals)}, the design leaves "
+        f"{nm_text(_residual_nm(safe, model))} in the model; without that it would leave "
+        f"{nm_text(_residual_nm(usual, model))}"
+    )
+    wanted = list[str]()
+    if not command_scale_known:
+        wanted.append("--command-scale 1 if the commands were recorded at the size applied")
+    if any((axis.sensor_gain_error or 0.0) > OPEN_GAIN * axis.sensor_gain for axis in model.axes):
+        wanted.append("--sensor-gain, which the record leaves open")
+    if wanted:
+        note = f"warning: {note}. Give {' or '.join(wanted)}"
+    return replace(safe, assumptions=(assumed, *safe.assumptions)), (note,)
+
+
+def _assume_another(
+    model: IdentifiedModel, design: Callable[[IdentifiedModel], Design], intervals: FloatArray
+) -> Design | None:
+    """Return the better of the designs for the nearest gains, below and above, stable at all."""
+    fitted, stable = float(np.exp(np.mean(np.log(model.sensor_gains)))), []
+    for end in (float(np.min(intervals)), float(np.max(intervals))):
+        for gain in _gains_between(fitted, end)[1:].tolist():
+            axes = tuple(replace(axis, sensor_gain=gain) for axis in model.axes)
+            with suppress(SynthesisError):
+                careful = design(replace(model, axes=axes))
+                if unstable_gains(model.hardware, careful.controller, intervals) is None:
+                    stable.append(careful)
+                    break
+    return min(stable, key=lambda careful: _residual_nm(careful, model), default=None)
+
+
+def _residual_nm(design: Design, model: IdentifiedModel) -> float:
+    """Return what a design leaves in a model; infinite where its loop is unstable."""
+    loop = close_loop(model.hardware, design.controller)
+    return residual_budget(loop, model.truth()).rms_nm if loop.is_stable else float("inf")
+
+
+def _robust(model: IdentifiedModel, intervals: FloatArray) -> Design | None:
+    """Return a design by robust synthesis over the gains; None where there is none."""
+    factors = intervals / np.array(model.sensor_gains)[:, None]
+    gains = float(np.min(factors)), float(np.max(factors))
+    inputs = PlantInputs(plant=model.plant(), sensor_gains=gains)
+    with suppress(SynthesisError, ProblemError):  # a plant without lines has no such design
+        design = design_request(gain_robust_method(), {}).build(inputs)
+        if unstable_gains(model.hardware, design.controller, intervals) is None:
+            return design
+    return None
+
+
+def _in_words(intervals: FloatArray) -> str:
+    """Return intervals of gains as text, equal ones once."""
+    return " and ".join(dict.fromkeys(f"{low:.3g} to {high:.3g}" for low, high in intervals))
