@@ -19,7 +19,7 @@ from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.rows import json_record
 
-_STEPS = 4
+_STEPS = 3
 
 
 def run(arguments: Namespace) -> Report:

@@ -28,7 +28,6 @@ from lbt_synth.validation import FloatArray, float_array, number, require_instan
 
 _LEAST_FRAMES = 2 * SHORTEST_SEGMENT  # in a window: fewer are no spectrum
 _MOST_SPOILT = 0.01  # of the frames of a window; with more there is no fit
-_WINDOWS = 2  # lengths of the window that are recorded, for the state of a new filter
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,10 +48,9 @@ class TrackingController:
     each axis in the last ``window_s`` seconds; the sensor gain stays that of the plant. The filter
     for them runs over the record, and takes over between two frames.
 
-    No update can stop the loop: if more than 1 % of the window's frames have no measurement, the
-    fit fails, the design does not pass its certificate, or its loop would be unstable, the running
-    filter stays, and :attr:`history` says why. In a frame whose measurement is not finite, the
-    command is held and the estimate goes on by the model alone.
+    No update can stop the loop: if more than 1 % of the window's frames have no finite measurement,
+    the fit fails, the design does not pass its certificate, or its loop would be unstable, the
+    running filter stays, and :attr:`history` says why.
 
     Parameters
     ----------
@@ -101,17 +99,12 @@ class TrackingController:
         if not np.array_equal(hardware.sensor, np.diag(gains)) or np.any(gains <= 0):
             raise ProblemError(
                 "each measurement must be of one axis, with a gain above 0; got a sensor matrix "
-                f"{hardware.sensor.tolist()}. Recombine the measurements into axes before the "
-                "controller."
+                f"{hardware.sensor.tolist()}. Recombine the measurements into axes first."
             )
-        window_s = number(window_s, "window_s", at_least=_LEAST_FRAMES / rate)
-        self._window = round(window_s * rate)
+        self._window = round(number(window_s, "window_s", at_least=_LEAST_FRAMES / rate) * rate)
         self._every = round(number(update_s, "update_s", at_least=1 / rate) * rate)
         self._hardware, self._gains = hardware, gains.tolist()
-        lines = np.zeros((hardware.modes, 0))
-        if plant.vibrations:
-            lines = np.transpose([line.direction for line in plant.vibrations])
-        self._most_lines = 1 + int(np.max(np.count_nonzero(lines, axis=1)))  # a new one may appear
+        self._most_lines = 1 + len(plant.vibrations)  # a new one may appear
         self._design_filter, self._first = design, design(plant)
         self.reset()
 
@@ -129,7 +122,7 @@ class TrackingController:
         """Return to the first filter, with zero states, and forget everything."""
         hw, self._mirror = self._hardware, self._hardware.mirror_system.whole
         # measurements, corrections, and whether they are spoilt, of the last frames
-        self._past: deque[FloatArray] = deque(maxlen=_WINDOWS * self._window)
+        self._past: deque[FloatArray] = deque(maxlen=self._window)
         self._frames = 0
         self._position = np.zeros((self._mirror.n_states, hw.n_commands))
         self._command = np.zeros(hw.n_commands)
@@ -185,7 +178,7 @@ class TrackingController:
 
     def _identify(self) -> TipTiltPlant:
         """Return the plant of the last window."""
-        hw, window = self._hardware, np.array(self._past)[-self._window :]
+        hw, window = self._hardware, np.array(self._past)
         share = float(np.mean(window[:, -1]))
         if share > _MOST_SPOILT:
             raise ProblemError(

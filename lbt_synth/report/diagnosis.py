@@ -95,10 +95,9 @@ def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
         "Loop": found.loop and [found.loop],
     }
     best = f" (best design: {found.best})" if found.best else ""
-    half = "whole record" if found.comparison is None else "first half"
     unseen = "Residual on the second half of the record, by models of the first"
     residuals = {
-        f"What each part leaves by the model of the {half}{best}": found.costs,
+        f"What each part leaves by the model of the first half{best}": found.costs,
         f"{unseen}; {found.imaging.label}": found.residuals,
     }
     lines = [] if found.model is None else model_tables(found.model)[1:]

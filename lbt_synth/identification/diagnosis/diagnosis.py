@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 
@@ -47,8 +47,6 @@ from lbt_synth.storage.rows import Facts
 from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import require_instance
 
-T = TypeVar("T")
-
 _NARROW = 0.3  # modulus margin: less is a gain margin below 1.4
 _LEAST_SHARE = 0.05  # of the residual variance, of a part that is named
 _DELAY_WARNING = "warning: a delay of"
@@ -77,8 +75,7 @@ class Diagnosis:
     comparison: PredictionTable | None = None
     best: str = ""  # row of the comparison that leaves least, of the designs
     best_design: Design | None = None  # the same design, for the model of the first half
-    # what each part of the disturbance costs by the model of the first half (of the whole record
-    # where there is no comparison), the most costly first; the last row is all
+    # what each part of the disturbance costs by that model, most costly first; the last row is all
     costs: tuple[CostRow, ...] = ()
     notes: tuple[str, ...] = ()  # what could not be said and why, and what else should be known
 
@@ -137,7 +134,7 @@ def diagnose(
     imaging : Imaging, optional
         The camera, for Strehl ratios; 2.2 um by default.
     progress : callable, optional
-        Called with 1 after each of 4 steps.
+        Called with 1 after each of 3 steps.
     **options
         As :func:`identify` takes them.
 
@@ -170,11 +167,13 @@ def diagnose(
     ('pure integrator', ['turbulence', 'measurement noise', 'all'])
     """
     require_instance(record, LoopRecord)
-    step, designs, notes = progress or (lambda _: None), dict(given or {}), list[str]()
+    step, designs, notes = progress or (lambda _: None), given or {}, list[str]()
     commands = None
     if record.commands is not None:
         commands = explain_commands(record, sensor_gain=options.get("sensor_gain"))
         notes += commands.notes
+    if whole is not None and whole.axes > record.axes:
+        notes.append("the rest is of the axis that lives: the other one is dead")
     diagnosis = Diagnosis(
         record=record,
         imaging=imaging or Imaging(),
@@ -182,98 +181,58 @@ def diagnose(
         channels=judge_channels(record if whole is None else whole),
     )
     step(1)
-    if whole is not None and whole.axes > record.axes:
-        notes.append("the rest is of the axis that lives: the other one is dead")
     if diagnosis.doubt:
         notes += ["the given design was not tried: the commands are not right"] * bool(designs)
         return replace(diagnosis, notes=tuple(notes))
-
-    def fit(**more: Any) -> IdentifiedModel:
+    try:
         require_length(record)
-        return identify(record, **options | more)
-
-    model = _attempt(fit, "model", notes)
+        model = identify(record, **options)
+    except LbtSynthError as error:
+        return replace(diagnosis, notes=(*notes, f"no model: {error}"))
     step(1)
-    if model is not None:
-        notes += model.notes
-        diagnosis = replace(diagnosis, model=model)
-        first, _ = split_halves(record.stretches(), record.frames)
-        # one sensor gain for all that is said: a half shows it less well
-        fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
-        half = _attempt(lambda: fit(**fixed), "model of the first half", notes)
-        step(1)
-        diagnosis = _examine_loop(diagnosis, model, half, designs, notes)
-        step(1)
-    return replace(diagnosis, notes=tuple(notes))
-
-
-def _examine_loop(
-    diagnosis: Diagnosis,
-    model: IdentifiedModel,
-    half: IdentifiedModel | None,
-    given: Mapping[str, Design],
-    notes: list[str],
-) -> Diagnosis:
-    """Add what models tell: of all of the record, and of its first half on the second."""
     law, running = diagnosis.law, None
     if law is not None and law.is_sure and law.lag_frames >= 0:
         running = law_controller(law, model.frame_rate_hz)
-    controllers = {name: given_controller(design, model) for name, design in given.items()}
-    diagnosis = replace(diagnosis, loop=loop_facts(model, running))
-    if half is not None:
-        diagnosis = _compare(diagnosis, half, running, controllers, notes)
-    best = None if diagnosis.best_design is None else diagnosis.best_design.controller
-    basis = model if half is None else half
-
-    def compute_costs() -> tuple[CostRow, ...]:
-        lines = disturbance_lines(basis)
-        return disturbance_costs(basis.plant(), lines, running, best, diagnosis.imaging)
-
-    diagnosis = replace(diagnosis, costs=_attempt(compute_costs, "costs", notes) or ())
-    for name, design in given.items():
+    controllers = {name: given_controller(design, model) for name, design in designs.items()}
+    notes += model.notes
+    for name, design in designs.items():
         notes += given_design_notes(name, design, model)
-    return diagnosis
+    diagnosis = replace(diagnosis, model=model, loop=loop_facts(model, running))
+    try:
+        diagnosis = _compare(diagnosis, model, running, controllers, options)
+    except LbtSynthError as error:
+        notes.append(f"no comparison on unseen data: {error}")
+    step(1)
+    notes += [] if diagnosis.comparison is None else diagnosis.comparison.notes
+    return replace(diagnosis, notes=tuple(notes))
 
 
 def _compare(
     diagnosis: Diagnosis,
-    half: IdentifiedModel,
+    model: IdentifiedModel,
     running: Controller | None,
     given: Mapping[str, Controller],
-    notes: list[str],
+    options: Mapping[str, Any],
 ) -> Diagnosis:
-    """Add residuals on the second half, and the best design there for a model of the first."""
+    """Add residuals on the second half, the best design there, and costs, by a model of the first.
+
+    Its sensor gain is that of the whole record, because a half shows it less well.
+    """
+    record, imaging = diagnosis.record, diagnosis.imaging
+    first, _ = split_halves(record.stretches(), record.frames)
+    fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
+    half = identify(record, **{**options, **fixed})
     robust = [m for m in all_methods().values() if m.plant_section is not None]
-    methods = [*reference_methods(estimators_only=True), *robust]
-    compared = _attempt(
-        lambda: compare_designs(
-            diagnosis.record,
-            half,
-            {method.name: {} for method in methods},
-            others=given,
-            running=running,
-            imaging=diagnosis.imaging,
-        ),
-        "comparison on unseen data",
-        notes,
+    names = [m.name for m in (*reference_methods(estimators_only=True), *robust)]
+    table, designs = compare_designs(
+        record, half, {name: {} for name in names}, others=given, running=running, imaging=imaging
     )
-    if compared is None:
-        return diagnosis
-    table, designs = compared
-    notes += table.notes
-    designs = designs | {INTEGRATOR: model_integrator(half.plant())}  # the comparison has it
+    designs[INTEGRATOR] = model_integrator(half.plant())  # the comparison has it
     residuals = {row.name: row.replayed.total_nm2 for row in table.entries if row.replayed}
     best = min(designs, key=lambda name: residuals[name])
-    return replace(diagnosis, comparison=table, best=best, best_design=designs[best])
-
-
-def _attempt(compute: Callable[[], T], what: str, notes: list[str]) -> T | None:
-    """Return what is computed; None, and a note, where it cannot be."""
-    try:
-        return compute()
-    except LbtSynthError as error:
-        notes.append(f"no {what}: {error}")
-        return None
+    chosen, lines = designs[best], disturbance_lines(half)
+    costs = disturbance_costs(half.plant(), lines, running, chosen.controller, imaging)
+    return replace(diagnosis, comparison=table, best=best, best_design=chosen, costs=costs)
 
 
 def _find_faults(diagnosis: Diagnosis) -> Iterator[Finding]:
