@@ -25,7 +25,6 @@ from lbt_synth.validation import BoolArray, FloatArray, float_array, number
 _MISSING = 0.1  # of the frames without a number, from which a channel counts as dead
 _NAME = re.compile(r"\w[\w .+-]*$")
 _SPELLINGS = re.compile(r"\s*/\s*s(\^|\*\*)?2$|\s*/\s*s²$|[ .*]s(\^|\*\*)?-2$")
-_SAME = 1e-7  # relative, between rates that are one
 
 Readings = tuple[tuple[str, ...], FloatArray, tuple[str, ...]]  # channels, values, notes
 
@@ -85,20 +84,15 @@ def _is_offset(series: FloatArray) -> bool:
 def _m_s2(column: Column, unit: str | None, source: Path) -> float:
     """Return the m/s^2 of one unit of a column: as given, as its heading says, or one."""
     said = _SPELLINGS.sub("/s2", (column.unit or "").strip()).replace("µ", "u").lower()
-    if said and said not in M_S2:
-        if unit is None:
-            raise TelemetryError(
-                f"accelerations must be in one of {', '.join(M_S2)}; {column.name} of {source} is "
-                f"in {column.unit!r}. Scale them, or give acceleration_unit.",
-                path=source,
-            )
-    elif said and unit is not None and M_S2[said] != M_S2[unit]:
+    factor = M_S2.get(said or "m/s2") if unit is None else M_S2[unit]
+    if factor is None or M_S2.get(said, factor) != factor:
         raise TelemetryError(
-            f"{column.name} of {source} is in {column.unit}, and acceleration_unit says {unit}: "
-            "which is right? Leave the option away, or correct the heading.",
+            f"accelerations must be in one of {', '.join(M_S2)}; {column.name} of {source} is in "
+            f"{column.unit!r}, and acceleration_unit says {unit}. Scale them, or correct which is "
+            "wrong.",
             path=source,
         )
-    return M_S2[unit or said or "m/s2"]
+    return factor
 
 
 def _on_own_clock(
@@ -136,16 +130,16 @@ def resample(values: FloatArray, rate_hz: float, frame_rate_hz: float) -> FloatA
     periods, whose differences are the means over frames.
     """
     ratio = rate_hz / frame_rate_hz
-    frames = int(np.floor(len(values) / ratio * (1 + _SAME)))
-    if ratio < 1 - _SAME or frames < 1:
+    frames = int(len(values) / ratio)
+    if round(ratio, 6) < 1 or frames < 1:
         raise ProblemError(
             f"accelerations must come at least once a frame, {frame_rate_hz:g} Hz, and last a "
             f"frame; got {len(values)} readings at {rate_hz:g} Hz. Is the rate right? If so, "
             "record them faster; else give accelerometer_rate_hz."
         )
     edges, places = np.arange(len(values) + 1), np.arange(frames + 1) * ratio
-    first = np.floor(places[:-1] * (1 + _SAME)).astype(int)
-    last = np.minimum(np.ceil(places[1:] * (1 - _SAME)).astype(int), len(values))
+    first = np.floor(places[:-1]).astype(int)
+    last = np.minimum(np.ceil(places[1:]).astype(int), len(values))
     out = np.full((frames, values.shape[1]), np.nan)
     for c, series in enumerate(values.T):
         good = np.isfinite(series)

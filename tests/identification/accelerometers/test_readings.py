@@ -88,10 +88,12 @@ def test_units_of_headings_count(tmp_path):
     for unit, factor in (("g", 9.80665), ("m/s^2", 1.0), ("m s-2", 1.0), ("mm/s2", 1e-3)):
         path = write(tmp_path / "a.csv", f"m1 [{unit}],m2 [{unit}]", *series.T)
         np.testing.assert_allclose(load_readings(path, RATE)[1], factor * series, rtol=1e-9)
-    with pytest.raises(lbt.errors.TelemetryError, match="which is right"):
+    with pytest.raises(lbt.errors.TelemetryError, match="acceleration_unit says g"):
         load_readings(path, RATE, unit="g")
     path = write(tmp_path / "a.csv", "m1 [mV],m2 [mV]", *series.T)
-    with pytest.raises(lbt.errors.TelemetryError, match="'mV'. Scale them"):
+    with pytest.raises(
+        lbt.errors.TelemetryError, match="'mV', and acceleration_unit says None. Scale them"
+    ):
         load_readings(path, RATE)
     np.testing.assert_allclose(load_readings(path, RATE, unit="mg")[1], 9.80665e-3 * series)
 

@@ -219,19 +219,6 @@ def test_a_replay_is_the_run_that_there_would_have_been(delay, gain, mirror, sen
     )
 
 
-def test_without_noise_the_residual_itself_is_found():
-    path = a_plant().hardware
-    new = lbt.kalman(a_plant()).controller
-    truth = a_truth(noise_nm=0.0)
-    size = {"hardware": path, "frames": 3000, "seed": 1, "settle_frames": 0}
-    night = lbt.simulate(lbt.integrator(path, gain=0.1).controller, truth, **size)
-    z = pseudo_open_loop(night.measurements[0], night.commands[0], path)
-    np.testing.assert_allclose(z[1:], night.total_nm[0, :-1], rtol=0, atol=1e-8)
-    found = lbt.identification.replayed_residual(z, new, path, noise_nm=0.0, test=[(2000, 3000)])
-    would = lbt.simulate(new, truth, **size).residual_nm[0, 1999:-1]
-    np.testing.assert_allclose(found.covariance_nm2, would.T @ would / len(would), rtol=1e-9)
-
-
 @settings(max_examples=15)
 @given(
     st.integers(0, 2**31),
