@@ -1,5 +1,4 @@
 from .accelerometers.transfers import accelerometer_transfers as accelerometer_transfers
-from .auto import allowed_gains as allowed_gains
 from .auto import design_from_record as design_from_record
 from .commands.control_law import fit_control_law as fit_control_law
 from .commands.repair import CommandRepair as CommandRepair

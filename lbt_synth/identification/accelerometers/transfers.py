@@ -37,6 +37,8 @@ from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, number
 
 _TINY = np.finfo(np.float64).tiny
+_NOTHING = "adds nothing"
+_EXTRA = f"left out, because a design takes {MOST_UNITS - 1} channels"
 _DEAD_M_S2 = 1e-9  # rms, a thousandth of what a quiet accelerometer resolves
 _INDEPENDENT = (1 - 5 * TAPER / 8) ** 2 / (1 - 93 * TAPER / 128)  # of tapered values
 _REACH = 20.0  # half widths of a line, or bins, from its centre to the edge of its band
@@ -88,7 +90,7 @@ class ChannelRow:
         format=".3g",
         help="Noise of a reading, near the lines it is used for",
     )
-    verdict: str = column("verdict", help="What it is used for, or what is wrong with it")
+    verdict: str = column("verdict", help="Whether it is used, or why not")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -191,7 +193,7 @@ def accelerometer_transfers(
     >>> record = lbt.identification.loop_record(z, frame_rate_hz=1000, unit="nm")
     >>> found = lbt.identification.accelerometer_transfers(lbt.identify(record), record, a)
     >>> round(found.transfers[0].motion_nm_per_nm, 1), found.channels[0].verdict
-    (2.0, 'used for 31 Hz')
+    (2.0, 'used')
     """
     readings, good = fill_missing(accelerations)
     names = _check_names(channels, readings.shape[1])
@@ -201,18 +203,16 @@ def accelerometer_transfers(
         )
     alarm = number(false_alarm, "false_alarm", above=0, below=1)
     largest_s = number(largest_shift_s, "largest_shift_s", at_least=0)
-    live = [c for c, series in enumerate(readings.T) if np.std(series[good]) > _DEAD_M_S2]
+    live = np.std(readings[good], axis=0) > _DEAD_M_S2
     places = [i for i, part in enumerate(model.parts) if part.kind == "line"]
     places.sort(key=lambda i: model.parts[i].frequency_hz)
     lines = [model.parts[i] for i in places]
-    lag, shift, error, transfers = 0, 0.0, float("inf"), list[TransferRow]()
-    noise, verdicts = np.full(len(names), np.nan), ["dead"] * len(names)
-    for c in live:
-        verdicts[c] = "adds nothing"
-    if live and lines:
+    lag, shift, error, transfers = 0, 0.0, float("inf"), tuple[TransferRow, ...]()
+    noise, verdicts = np.full(len(names), np.nan), np.where(live, _NOTHING, "dead").astype(object)
+    if live.any() and lines:
         widest_hz = max(line.damping * line.frequency_hz for line in lines)
         shifts = 1 + np.ceil(4 * widest_hz * largest_s)  # that differ
-        limit = alarm / (len(live) * len(lines) * shifts)
+        limit = alarm / (np.sum(live) * len(lines) * shifts)
         largest = int(largest_s * model.frame_rate_hz)
         lag, fits, shift, error = _lay_and_fit(
             model, record, lines, readings[:, live], good, largest, limit
@@ -221,16 +221,16 @@ def accelerometer_transfers(
         # the channels that show most of the lines' power, as many as a design takes
         power = (fits.coherences * shown) @ np.array([line.rms_nm**2 for line in lines])
         used = shown & (power >= np.sort(power)[-(MOST_UNITS - 1) :][0])[:, None]
-        for k, c in enumerate(live):
-            near = fits.noise[k][shown[k] if shown[k].any() else ...]
-            noise[c] = np.sqrt(np.mean(near) * model.frame_rate_hz / 2)
-            transfers += _transfer_rows(names[c], places, lines, fits, k, used[k])
-            if shown[k].any():
-                verdicts[c] = _verdict(shown[k], used[k], lines)
+        near = shown | ~shown.any(axis=1, keepdims=True)  # the lines it shows, or all
+        level = np.sum(fits.noise * near, axis=1) / np.sum(near, axis=1)
+        noise[live] = np.sqrt(level * model.frame_rate_hz / 2)
+        verdicts[live] = np.select([used.any(1), shown.any(1)], ["used", _EXTRA], _NOTHING)
+        channels = [name for name, is_live in zip(names, live, strict=True) if is_live]
+        transfers = _transfer_rows(channels, places, lines, fits, used)
     return AccelerometerTransfers(
-        transfers=tuple(transfers),
+        transfers=transfers,
         channels=tuple(
-            ChannelRow(channel=name, noise_m_s2=float(noise[c]), verdict=verdicts[c])
+            ChannelRow(channel=name, noise_m_s2=float(noise[c]), verdict=str(verdicts[c]))
             for c, name in enumerate(names)
         ),
         shift_frames=shift,
@@ -250,40 +250,32 @@ def _check_names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
     return names
 
 
-def _verdict(shown: BoolArray, used: BoolArray, lines: Sequence[IdentifiedLine]) -> str:
-    """Return what a channel is used for that shows some lines, in words."""
-    each = [f"{line.frequency_hz:.3g}" for line, is_so in zip(lines, shown, strict=True) if is_so]
-    if used.any():
-        return f"used for {', '.join(each)} Hz"
-    return f"left out, because a design takes {MOST_UNITS - 1} channels; shows {', '.join(each)} Hz"
-
-
 def _transfer_rows(
-    name: str,
+    channels: Sequence[str],
     places: Sequence[int],
     lines: Sequence[IdentifiedLine],
     fits: _Fits,
-    k: int,
     used: BoolArray,
-) -> list[TransferRow]:
-    """Return what the fit of a channel says of each line."""
-    size = np.abs(fits.factors[k])
-    turned = np.minimum(np.degrees(fits.across[k] / np.maximum(size, _TINY)), 180.0)
-    return [
+) -> tuple[TransferRow, ...]:
+    """Return what the fits of channels say of lines."""
+    size = np.abs(fits.factors)
+    turned = np.minimum(np.degrees(fits.across / np.maximum(size, _TINY)), 180.0)
+    return tuple(
         TransferRow(
             channel=name,
-            line=place,
+            line=places[j],
             frequency_hz=line.frequency_hz,
-            motion_nm_per_nm=float(size[j]),
-            motion_error_nm_per_nm=float(fits.along[k, j]),
-            phase_deg=float(np.angle(fits.factors[k, j], deg=True)),
-            phase_error_deg=float(turned[j]),
-            coherence=float(fits.coherences[k, j]),
-            chance=float(fits.chances[k, j]),
-            useful=bool(used[j]),
+            motion_nm_per_nm=float(size[c, j]),
+            motion_error_nm_per_nm=float(fits.along[c, j]),
+            phase_deg=float(np.angle(fits.factors[c, j], deg=True)),
+            phase_error_deg=float(turned[c, j]),
+            coherence=float(fits.coherences[c, j]),
+            chance=float(fits.chances[c, j]),
+            useful=bool(used[c, j]),
         )
-        for j, (place, line) in enumerate(zip(places, lines, strict=True))
-    ]
+        for c, name in enumerate(channels)
+        for j, line in enumerate(lines)
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

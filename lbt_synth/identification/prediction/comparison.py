@@ -121,14 +121,10 @@ def least_squares_predictor(
 
     Parameters
     ----------
-    open_loop : (frames, n) array_like
-        Recorded pseudo-open-loop series ``z(k) = phi_tot(k-1) + S^-1 w(k)`` [nm].
-    hardware : LoopHardware
-        The loop; its sensor matrix has the sensor gain that z was formed with.
+    open_loop, hardware, stretches
+        As for :func:`replayed_residual`.
     taps : int, optional
         Coefficients per mode.
-    stretches : sequence of (start, stop), optional
-        Contiguous usable frames to fit; by default the whole record.
 
     Returns
     -------
@@ -185,17 +181,17 @@ def least_squares_predictor(
 
 
 def _regression(
-    part: FloatArray, mirror_taps: FloatArray, count: int
+    series: FloatArray, mirror_taps: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return regressors ``zf(k-1), zf(k-2), ...`` (rows, n, taps) and targets z(k) (rows, n)."""
-    frames, n = part.shape
+    frames, n = series.shape
     m = len(mirror_taps)
     rows = frames - (m - 1) - count  # the first needs zf(k-taps), which needs m values of z
     if rows < 1:
         return np.zeros((0, n, count)), np.zeros((0, n))
-    filtered = sliding_window_view(part, m, axis=0) @ mirror_taps[::-1]
+    filtered = sliding_window_view(series, m, axis=0) @ mirror_taps[::-1]
     late = sliding_window_view(filtered, count, axis=0)[:rows, :, ::-1]
-    return np.asarray(late), part[m - 1 + count :]
+    return np.asarray(late), series[m - 1 + count :]
 
 
 def prediction_against_data(
@@ -212,28 +208,22 @@ def prediction_against_data(
 ) -> PredictionTable:
     """Replay controllers on frames that nothing was fitted to, and compare with the model.
 
-    Other rows are the integrator of least residual by the model, a least-squares predictor from
-    the first half of the frames (:func:`least_squares_predictor`), and the least residual of any
-    linear controller if the model is the truth.
+    Other rows are the best integrator by the model, a :func:`least_squares_predictor` from the
+    first half of the frames, and the least residual of any linear controller if the model is true.
 
     Parameters
     ----------
     plant : TipTiltPlant
         The model, with its sensor gain in the sensor matrix. For an honest comparison it was not
         identified from the frames of the test.
-    open_loop : (frames, n) array_like
-        Recorded pseudo-open-loop series ``z(k) = phi_tot(k-1) + w(k) / g`` [nm].
+    open_loop, stretches, noise_error_nm
+        As for :func:`replayed_residual`; the halves of :func:`split_halves` are to fit and to test.
     controllers : mapping of str to Controller or Design
         What is compared, by name; one whose loop is unstable is left out, with a note.
-    stretches : sequence of (start, stop), optional
-        Contiguous usable frames, over which controllers run; by default the whole record. The
-        halves of :func:`split_halves` are to fit and to test.
     measurements : (frames, q) array_like, optional
         Measurements y(k) of the loop that ran, for its own row [nm].
     running : Controller or Design, optional
         The controller that ran, if it is known, for what the model says of it.
-    noise_error_nm : float or (q,) array_like, optional
-        Standard error of the plant's noise [nm].
     imaging : Imaging, optional
         The camera, for Strehl ratios on at most two axes.
     taps : int, optional
@@ -286,20 +276,16 @@ def prediction_against_data(
         )
     if running is not None:
         designs[RAN] = running
-    loops = {name: close_loop(hardware, as_controller(each)) for name, each in designs.items()}
+    loops = {name: close_loop(hardware, as_controller(x)) for name, x in designs.items()}
     stable = {name: loop for name, loop in loops.items() if loop.is_stable}
-    notes = [
-        f"{name} is unstable at the sensor gain of the model"
-        for name in loops
-        if name not in stable
-    ]
+    unstable = loops.keys() - stable.keys()
+    notes = [f"{name} is unstable at the sensor gain of the model" for name in sorted(unstable)]
     measured = {name: replay(stable[name], series, runs) for name in stable if name != RAN}
     if measurements is not None:
         y, _ = check_series(measurements, hardware.n_measurements, test, "measurements")
         if len(y) != len(series):
-            raise ProblemError(
-                f"measurements must have the {len(series)} frames of open_loop; got {len(y)}."
-            )
+            frames = f"the {len(series)} frames of open_loop"
+            raise ProblemError(f"measurements must have {frames}; got {len(y)}.")
         measured = {RAN: y @ inverse_sensor(hardware).T, **measured}
     elif running is not None:
         raise ProblemError("the controller that ran needs its measurements; got none.")
