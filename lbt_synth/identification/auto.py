@@ -186,7 +186,7 @@ def design_from_record(
     model = identify(record, start=half, **options)
     made, price = design_for_gains(
         model,
-        lambda known: _design(method, known, defaults),
+        lambda assumed: _design(method, assumed, defaults),
         allowed_gains(record, model) if finds_gain else None,
         command_scale_known=command_scale_known,
     )

@@ -83,9 +83,9 @@ def _is_offset(series: FloatArray) -> bool:
 
 def _m_s2(column: Column, unit: str | None, source: Path) -> float:
     """Return the m/s^2 of one unit of a column: as given, as its heading says, or one."""
-    said = _SPELLINGS.sub("/s2", (column.unit or "").strip()).replace("µ", "u").lower()
-    factor = M_S2.get(said or "m/s2") if unit is None else M_S2[unit]
-    if factor is None or M_S2.get(said, factor) != factor:
+    heading = _SPELLINGS.sub("/s2", (column.unit or "").strip()).replace("µ", "u").lower()
+    factor = M_S2.get(heading or "m/s2") if unit is None else M_S2[unit]
+    if factor is None or M_S2.get(heading, factor) != factor:
         raise TelemetryError(
             f"accelerations must be in one of {', '.join(M_S2)}; {column.name} of {source} is in "
             f"{column.unit!r}, and acceleration_unit says {unit}. Scale them, or correct which is "

@@ -116,8 +116,8 @@ class AccelerometerTransfers:
 
     def loop_age(self, delay_frames: float) -> int:
         """Return the age of a reading in a loop of some delay: 1 where the clocks hide it."""
-        known = self.age_frames >= 0 and 1 <= self.age_frames + delay_frames - 1 <= LONGEST_DELAY
-        return self.age_frames if known else 1
+        delay = self.age_frames + delay_frames - 1
+        return self.age_frames if self.age_frames >= 0 and 1 <= delay <= LONGEST_DELAY else 1
 
     @property
     def shift_text(self) -> str:
@@ -467,7 +467,7 @@ def _fit_channel(bands: Sequence[_Bands], channel: int) -> _Fits:
     raised, degrees = np.where(doubtful, more, 1.0), np.where(doubtful, degrees, len(a))
     variances = np.diag(bread).real / _INDEPENDENT
     ratios = np.abs(factors) ** 2 / np.maximum(raised * variances, _TINY)
-    left = np.abs(error) ** 2 @ shares
+    rest = np.abs(error) ** 2 @ shares
     shown = np.abs(factors) ** 2 * np.sum(size * shares, axis=0)
     scatter = variances * more / 2
     moves = slopes * np.exp(-1j * np.angle(factors))[:, None]
@@ -479,7 +479,7 @@ def _fit_channel(bands: Sequence[_Bands], channel: int) -> _Fits:
         along=np.sqrt(scatter + np.sum(moves.real**2, axis=1)),
         across=np.sqrt(scatter + np.sum(moves.imag**2, axis=1)),
         chances=np.exp(-degrees * np.log1p(ratios / degrees)),
-        coherences=shown / np.maximum(shown + left, _TINY),
+        coherences=shown / np.maximum(shown + rest, _TINY),
         noise=noise * raised,
         shifts=np.real((weights * error) @ turn.conj()) / turned,
         shift_weights=2 * _INDEPENDENT * turned / more,

@@ -211,18 +211,18 @@ def given_design_notes(name: str, design: Design, model: IdentifiedModel) -> lis
         f"{name} promises {nm_text(design.rms)} by its own model, and its loop is "
         f"{f'stable at sensor gains of {stable}' if stable else 'unstable'}"
     ]
-    if (own := design.hardware) is None:
+    if (path := design.hardware) is None:
         return notes
-    if own.sensor.shape == (own.modes, own.modes):
-        for i, (axis, assumed) in enumerate(zip(model.axes, np.diag(own.sensor), strict=True)):
+    if path.sensor.shape == (path.modes, path.modes):
+        for i, (axis, assumed) in enumerate(zip(model.axes, np.diag(path.sensor), strict=True)):
             error = axis.sensor_gain_error
             if error is not None and abs(assumed - axis.sensor_gain) > DIFFERENT * error:
                 notes.append(
                     f"{name} assumes a sensor gain of {assumed:.3f} on axis {i}; the record has "
                     f"{axis.sensor_gain:.3f} +- {error:.3f}"
                 )
-    here = replace(model.hardware, sensor_matrix=own.sensor, influence_matrix=own.influence)
-    return [*notes, *(f"{name} was {text}" for text in loop_differences(own, here))]
+    here = replace(model.hardware, sensor_matrix=path.sensor, influence_matrix=path.influence)
+    return [*notes, *(f"{name} was {text}" for text in loop_differences(path, here))]
 
 
 def disturbance_lines(model: IdentifiedModel) -> tuple[IdentifiedLine, ...]:
@@ -266,8 +266,8 @@ def disturbance_costs(
     residuals add up in the exponent, these do not add up to the whole loss.
     """
     ran, designed = (_costs(plant, lines, controller, imaging) for controller in (running, best))
-    known = ran or designed
-    order = sorted(known, key=lambda name: (name == _ALL, -known[name][0]))
+    costs = ran or designed
+    order = sorted(costs, key=lambda name: (name == _ALL, -costs[name][0]))
     unknown = np.nan, np.nan
     return tuple(
         CostRow(
