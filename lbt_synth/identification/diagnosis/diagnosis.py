@@ -63,21 +63,39 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Diagnosis:
-    """What a record tells of its loop."""
+    """What a record tells of its loop.
+
+    Attributes
+    ----------
+    record, imaging, commands : LoopRecord, Imaging, CommandVerdict or None
+        The record, the camera of Strehl ratios, and how commands reach the measurements (None of an
+        open loop).
+    channels : tuple of ChannelRow
+        Measurements and commands, one by one.
+    model, loop : IdentifiedModel or None, Facts or None
+        The model of the whole record, and the loop that ran, by law and model.
+    comparison : PredictionTable or None
+        Residuals on the second half of the record, by models of the first.
+    best, best_design : str, Design or None
+        Row of the comparison that leaves least, of the designs, and that design.
+    costs : tuple of CostRow
+        What each part of the disturbance costs by the model of the first half, the most costly
+        first; the last row is all.
+    notes : tuple of str
+        What could not be said and why, and what else should be known.
+    """
 
     record: LoopRecord
-    imaging: Imaging  # the camera of Strehl ratios
-    commands: CommandVerdict | None = None  # how they reach the measurements; None of an open loop
-    channels: tuple[ChannelRow, ...] = ()  # measurements and commands, one by one
-    model: IdentifiedModel | None = None  # of the whole record
-    loop: Facts | None = None  # the loop that ran, by law and model
-    # residuals on the second half of the record, by models of the first
+    imaging: Imaging
+    commands: CommandVerdict | None = None
+    channels: tuple[ChannelRow, ...] = ()
+    model: IdentifiedModel | None = None
+    loop: Facts | None = None
     comparison: PredictionTable | None = None
-    best: str = ""  # row of the comparison that leaves least, of the designs
-    best_design: Design | None = None  # the same design, for the model of the first half
-    # what each part of the disturbance costs by that model, most costly first; the last row is all
+    best: str = ""
+    best_design: Design | None = None
     costs: tuple[CostRow, ...] = ()
-    notes: tuple[str, ...] = ()  # what could not be said and why, and what else should be known
+    notes: tuple[str, ...] = ()
 
     @property
     def law(self) -> ControlLaw | None:
