@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.identification import Diagnosis
 from lbt_synth.identification.diagnosis.rows import law_facts
-from lbt_synth.identification.diagnosis.verdict import NARROW, diagnosis_verdict
 from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing
@@ -28,7 +27,7 @@ from lbt_synth.report.page.html import (
     source_section,
     time_text,
 )
-from lbt_synth.storage.rows import fact_table, row_table
+from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
 
@@ -96,20 +95,17 @@ def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
         "Loop": found.loop and [found.loop],
     }
     best = f" (best design: {found.best})" if found.best else ""
-    half = "whole record" if found.comparison is None else "first half"
     unseen = "Residual on the second half of the record, by models of the first"
     residuals = {
-        f"What each part leaves by the model of the {half}{best}": found.costs,
+        f"What each part leaves by the model of the first half{best}": found.costs,
         f"{unseen}; {found.imaging.label}": found.residuals,
     }
-    given = found.given
     lines = [] if found.model is None else model_tables(found.model)[1:]
     return {
         "record": channels,
         "loop": [row_table(caption, rows) for caption, rows in loop.items() if rows],
         "disturbance": lines,
-        "verdict": [row_table(caption, rows) for caption, rows in residuals.items() if rows]
-        + ([] if given is None else [fact_table("The gain file on this record", given)]),
+        "verdict": [row_table(caption, rows) for caption, rows in residuals.items() if rows],
     }
 
 
@@ -140,11 +136,9 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
 
 
 def _verdict_blocks(found: Diagnosis, tables: Sequence[Table]) -> list[Block]:
-    state, *rest = diagnosis_verdict(found)
-    wrong = found.doubt or any(row.serious for row in found.channels)
-    doubtful = found.loop is None or found.loop.modulus < NARROW
+    state, *rest = found.verdict
     return [
-        Notice(text=state, tone="bad" if wrong else "note" if doubtful else "good"),
+        Notice(text=state, tone=found.findings[0].tone),
         " ".join(rest),
         *tables,
         *_residual_charts(found),
