@@ -81,9 +81,7 @@ def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
     return np.stack([poles, -(decay**2)], axis=-1)
 
 
-def unit_density(
-    frequency: float, damping: float, s: FloatArray, sections: int = 1
-) -> FloatArray:
+def unit_density(frequency: float, damping: float, s: FloatArray, sections: int = 1) -> FloatArray:
     """Spectrum of unit variance of a resonance, or of some in series, (f,) as s is."""
     b, p, _ = recursion(frequency, damping)
     size = s * ((p - 2) / 2)
@@ -121,7 +119,7 @@ def section_drives(frequency: float, damping: float, sections: int) -> FloatArra
     """Return the driving deviations of processes of 1, 2, ... sections of unit variance, (m,)."""
     drive = coefficients(frequency, damping)[2]
     variances = [series_variance(frequency, damping, m)[0] for m in range(1, sections + 1)]
-    return np.sqrt(drive ** np.arange(1, sections + 1) / np.array(variances))
+    return np.asarray(np.sqrt(drive ** np.arange(1, sections + 1) / np.array(variances)))
 
 
 def resonance_densities(

@@ -605,6 +605,22 @@ def test_a_spectrum_takes_no_options_of_series(option, model):
         lbt.identify(plain, frame_rate_hz=1000, **given)
 
 
+def test_the_noise_of_a_spectrum_without_any_is_stated():
+    """A spectrum of wind shake has none, and no filter is designed for that."""
+    f = np.arange(0.5, 400, 0.5)
+    shake = 3000 / (1 + (f / 1.5) ** 2) ** 2 + 16 / np.pi / ((f - 18) ** 2 + 0.16)
+    spectrum = lbt.identification.SpectrumRecord(frequency_hz=f, density_nm2_hz=shake[:, None])
+    stated = lbt.identify(spectrum, frame_rate_hz=1000, noise_nm=5.0)
+    assert stated.axes[0].noise_nm == 5.0
+    design = lbt.kalman(stated.plant())
+    assert design.certificate.passed
+    assert stated.truth().noise_nm.tolist() == [5.0]
+    with pytest.raises(lbt.errors.ProblemError, match="noise_nm must be above 0"):
+        lbt.identify(spectrum, frame_rate_hz=1000, noise_nm=0.0)
+    with pytest.raises(lbt.errors.ProblemError, match="noise_nm is for spectra"):
+        lbt.identify(spliced_record((0,), frames=4096), noise_nm=5.0)
+
+
 def test_known_lines_are_found(model):
     for axis, known in zip(
         model.axes,
