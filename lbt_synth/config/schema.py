@@ -2,22 +2,88 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_origin
 
-from pydantic import Discriminator, Field, Tag, create_model, model_validator
-
-from lbt_synth.config.section import Section
-from lbt_synth.config.sensor_sections import (
-    MotionSection,
-    OtherSensorSection,
-    SensorSection,
-    with_own_sensor,
+from pydantic import (
+    BaseModel,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    create_model,
+    model_validator,
 )
+
+from lbt_synth.errors import suggest_word
 from lbt_synth.methods import quantities as q
+from lbt_synth.methods.method import Section
 from lbt_synth.methods.registry import all_methods
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
+from lbt_synth.models.sensor_suite import OWN_SENSOR
+
+_LOOP_KEYS = {"rate_hz": "frame_rate_hz", "delay_frames": "delay_frames"}  # of the own sensor
+_TAGS = (q.ONE, q.EACH)  # in the places of mistakes
 
 
+# --------------------------------------------------------------------------
+# Rules over several keys of a section.
+# --------------------------------------------------------------------------
+def _rule(mistake: Callable[[Any], str]) -> Any:
+    """Return a rule of a section, from a function that says what is wrong, or nothing."""
+
+    def check(section: Any) -> Any:
+        if text := mistake(section):
+            raise ValueError(text)
+        return section
+
+    return model_validator(mode="after")(check)
+
+
+def _count_given(section: Any, names: Iterable[str]) -> int:
+    return sum(getattr(section, name) is not None for name in names)
+
+
+def exactly_one(*names: str) -> Any:
+    """Return the rule that a section has exactly one of some keys."""
+    text = f"expected exactly one of {', '.join(names)}"
+    return _rule(lambda section: "" if _count_given(section, names) == 1 else text)
+
+
+def at_most_one(*names: str) -> Any:
+    """Return the rule that a section has at most one of some keys."""
+    text = f"expected at most one of {', '.join(names)}"
+    return _rule(lambda section: "" if _count_given(section, names) < 2 else text)
+
+
+def goes_with(name: str, other: str) -> Any:
+    """Return the rule that a key makes sense beside another one alone."""
+    text = f"{other} goes with {name}, and only with it"
+    return _rule(lambda s: text if _count_given(s, [name]) < _count_given(s, [other]) else "")
+
+
+def by_kind(**keys: tuple[str, ...]) -> Any:
+    """Return the rule which keys each kind has; those that end in a question mark may be absent."""
+    kinds: dict[str, list[str]] = {}
+    for kind, names in keys.items():
+        for name in names:
+            kinds.setdefault(name.rstrip("?"), []).append(kind)
+
+    def mistake(section: Any) -> str:
+        for name, having in kinds.items():
+            given = getattr(section, name) is not None
+            if given and section.kind not in having:
+                return f"{name} goes with kind: {' or '.join(having)}, and only with it"
+            if not given and name in keys[section.kind]:
+                return f"{name} is missing, which goes with kind: {section.kind}"
+        return ""
+
+    return _rule(mistake)
+
+
+# --------------------------------------------------------------------------
+# The sections.
+# --------------------------------------------------------------------------
 class TelescopeSection(Section):
     """The pupil."""
 
@@ -39,6 +105,79 @@ class AtmosphereSection(Section):
     seeing_wavelength_um: q.Micrometres = Field(
         default=0.5, description="wavelength of the seeing [um]"
     )
+
+
+class PyramidSection(Section):
+    """Pyramid sensor, from which the noise is computed."""
+
+    wavelength_um: q.Micrometres = Field(description="sensing wavelength [um]")
+    modulation_lambda_over_d: q.Gain = Field(description="modulation radius [lambda/D]")
+    subapertures_across: q.Count = Field(le=1000, description="subapertures over the diameter")
+    photons: q.Ratio = Field(description="photons per subaperture and frame")
+    read_noise_electrons: q.RatioFromZero = Field(description="read noise per pixel [electrons]")
+
+
+class SensorSection(Section):
+    """Measurement noise: given, or from a pyramid."""
+
+    noise_nm: q.NanometresOrEach | None = Field(
+        default=None,
+        description="noise per frame [nm rms], or one per measurement",
+    )
+    noise_mas: q.Milliarcseconds | None = Field(default=None, description="noise per frame [mas]")
+    pyramid: PyramidSection | None = Field(
+        default=None, description="a pyramid, whose noise is computed"
+    )
+    matrix: list[list[q.Entry]] | None = Field(
+        default=None, description="rows: measurements by modes (default: identity)"
+    )
+    _rules = exactly_one("noise_nm", "noise_mas", "pyramid")
+
+
+class MotionSection(Section):
+    """How a channel of an accelerometer moves with a vibration, at its frequency."""
+
+    motion_nm_per_nm: q.Ratio = Field(
+        description="motion at the channel per motion of the wavefront [nm per nm rms]"
+    )
+    phase_deg: float = Field(
+        default=0.0, ge=-360, le=360, description="phase of it against the wavefront's [deg]"
+    )
+
+
+class OtherSensorSection(Section):
+    """A sensor beside the loop's own: a wavefront sensor of another rate, or an accelerometer."""
+
+    kind: Literal["wavefront", "accelerometer"] = Field(
+        default="wavefront", description="wavefront or accelerometer"
+    )
+    rate_hz: q.Hertz = Field(description="readings per second, a fraction of the frame rate [Hz]")
+    delay_frames: float = Field(
+        ge=1, le=100, description="total delay, in periods of the sensor [frames]"
+    )
+    noise_nm: q.NanometresOrEach | None = Field(
+        default=None, description="noise of a reading of a wavefront sensor [nm rms]"
+    )
+    matrix: list[list[q.Entry]] | None = Field(
+        default=None, description="rows: measurements by modes (default: identity)"
+    )
+    channels: list[str] | None = Field(
+        default=None, min_length=1, description="names of the channels of an accelerometer"
+    )
+    noise_m_s2: q.AccelerationOrEach | None = Field(
+        default=None, description="noise of a reading of an accelerometer [m/s^2]"
+    )
+    highpass_hz: q.Hertz | None = Field(
+        default=None, description="corner of an accelerometer's high pass [Hz]"
+    )
+    covariance: list[list[q.Entry]] | None = Field(
+        default=None, description="covariance of the noise, in place of its size [nm^2, (m/s^2)^2]"
+    )
+    _rules = by_kind(
+        wavefront=("noise_nm?", "matrix?", "covariance?"),
+        accelerometer=("channels", "noise_m_s2?", "highpass_hz?", "covariance?"),
+    )
+    _one_noise = exactly_one("noise_nm", "noise_m_s2", "covariance")
 
 
 class LocalLoopSection(Section):
@@ -66,18 +205,9 @@ class LocalLoopSection(Section):
         default=1, description="computing delay of the local loop [samples]"
     )
     ramp_samples: q.Count = Field(default=1, description="samples over which a command is ramped")
-
-    @model_validator(mode="after")
-    def _require_one_kind_of_gains(self) -> LocalLoopSection:
-        gains = (self.proportional_per_s2 is not None, self.derivative_per_s is not None)
-        if gains[0] != gains[1] or gains[0] == (self.bandwidth_hz is not None):
-            raise ValueError(
-                "expected either bandwidth_hz (and bandwidth_damping), or both of "
-                "proportional_per_s2 and derivative_per_s"
-            )
-        if self.bandwidth_damping is not None and self.bandwidth_hz is None:
-            raise ValueError("bandwidth_damping goes with bandwidth_hz, and only with it")
-        return self
+    _one_position_gain = exactly_one("bandwidth_hz", "proportional_per_s2")
+    _one_velocity_gain = exactly_one("bandwidth_hz", "derivative_per_s")
+    _of_bandwidth = goes_with("bandwidth_hz", "bandwidth_damping")
 
 
 class MirrorSection(Section):
@@ -122,16 +252,9 @@ class _LineSection(Section):
     accelerometers: dict[str, MotionSection] | None = Field(
         default=None, description="accelerometer channels that move with it"
     )
-
-    @model_validator(mode="after")
-    def _require_one_size_and_direction(self) -> _LineSection:
-        if (self.rms_nm is None) == (self.rms_mas is None):
-            raise ValueError("expected exactly one of rms_nm, rms_mas")
-        if self.axis is not None and self.direction_deg is not None:
-            raise ValueError("expected exactly one of axis, direction_deg")
-        if None not in (self.frequency_error_hz, self.frequency_error_percent):
-            raise ValueError("expected one of frequency_error_hz, frequency_error_percent")
-        return self
+    _one_size = exactly_one("rms_nm", "rms_mas")
+    _one_direction = at_most_one("axis", "direction_deg")
+    _one_error = at_most_one("frequency_error_hz", "frequency_error_percent")
 
     @property
     def largest_error_hz(self) -> float | None:
@@ -149,12 +272,7 @@ class VibrationSection(_LineSection):
     lines: int | None = Field(
         default=None, ge=1, le=64, description="how many lines cover it (default 5)"
     )
-
-    @model_validator(mode="after")
-    def _require_spread_of_lines(self) -> VibrationSection:
-        if self.lines is not None and self.spread_hz is None:
-            raise ValueError("lines goes with spread_hz, and only with it")
-        return self
+    _of_spread = goes_with("spread_hz", "lines")
 
 
 class TrueVibrationSection(_LineSection):
@@ -168,40 +286,24 @@ class TrueVibrationSection(_LineSection):
     )
     end_hz: q.Hertz | None = Field(default=None, description="frequency at the end of a drift [Hz]")
     duration_s: q.Seconds | None = Field(default=None, description="duration of a drift [s]")
-
-    @model_validator(mode="after")
-    def _require_what_the_kind_needs(self) -> TrueVibrationSection:
-        if self.kind != "drift" and (self.kind == "resonance") != (self.damping is not None):
-            raise ValueError(
-                "damping goes with kind: resonance, and only with it or with kind: drift"
-            )
-        for given in (self.end_hz, self.duration_s):
-            if (self.kind == "drift") != (given is not None):
-                raise ValueError("end_hz and duration_s go with kind: drift, and only with it")
-        return self
+    _rules = by_kind(
+        sinusoid=(), resonance=("damping",), drift=("damping?", "end_hz", "duration_s")
+    )
 
 
-class Ar1Section(Section):
-    """AR1 turbulence, from the atmosphere."""
+class TurbulenceSection(Section):
+    """Auto-regressive turbulence: from the atmosphere, or by its coefficients."""
 
-    kind: Literal["ar1"] = Field(description="first order, from the atmosphere")
-
-
-class Ar2Section(Section):
-    """AR2 turbulence, fitted to the atmosphere's spectrum above the noise."""
-
-    kind: Literal["ar2"] = Field(description="second order, from the atmosphere")
-
-
-class ArSection(Section):
-    """Auto-regressive turbulence by its coefficients."""
-
-    kind: Literal["ar"] = Field(description="any order, by its coefficients")
-    coefficients: list[q.Entry] = Field(min_length=1, description="of past values, newest first")
-    driving_rms_nm: float = Field(ge=1e-6, le=1e6, description="rms of the driving noise [nm]")
-
-
-TurbulenceSection = Annotated[Ar1Section | Ar2Section | ArSection, Field(discriminator="kind")]
+    kind: Literal["ar1", "ar2", "ar"] = Field(
+        description="first or second order from the atmosphere, or any by its coefficients"
+    )
+    coefficients: list[q.Entry] | None = Field(
+        default=None, min_length=1, description="of past values, newest first"
+    )
+    driving_rms_nm: Annotated[float, Field(ge=1e-6, le=1e6)] | None = Field(
+        default=None, description="rms of the driving noise [nm]"
+    )
+    _rules = by_kind(ar1=(), ar2=(), ar=("coefficients", "driving_rms_nm"))
 
 
 class ModelSection(Section):
@@ -355,7 +457,7 @@ class FileSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _move_own_sensor(cls, raw: Any) -> Any:
-        return with_own_sensor(raw)
+        return _with_own_sensor(raw)
 
     @property
     def usual_turbulence(self) -> str:
@@ -388,3 +490,84 @@ def config_schema() -> dict[str, Any]:
     """
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {"$schema": dialect, **FileSection.model_json_schema(), "title": "lbt-synth"}
+
+
+def _with_own_sensor(raw: Any) -> Any:
+    """Return a file in which ``sensors.wavefront``, the loop's own sensor, is loop and sensor."""
+    sensors = raw.get("sensors") if isinstance(raw, Mapping) else None
+    if not isinstance(sensors, Mapping) or not isinstance(sensors.get(OWN_SENSOR), Mapping):
+        return raw
+    own = sensors[OWN_SENSOR]
+    loop, sensor = dict(raw.get("loop") or {}), dict(raw.get("sensor") or {})
+    for name, value in own.items():
+        section, key = (loop, _LOOP_KEYS[name]) if name in _LOOP_KEYS else (sensor, name)
+        if name != "kind" and section.setdefault(key, value) != value:
+            where = "loop" if section is loop else "sensor"
+            raise ValueError(
+                f"sensors.{OWN_SENSOR}.{name} is {value!r}, and {where}.{key} {section[key]!r}"
+            )
+    others = {name: value for name, value in sensors.items() if name != OWN_SENSOR}
+    return {**raw, "loop": loop, "sensor": sensor, "sensors": others or None}
+
+
+# --------------------------------------------------------------------------
+# What is wrong, in one sentence.
+# --------------------------------------------------------------------------
+def describe_error(
+    error: ValidationError, schema: type[BaseModel] = FileSection
+) -> tuple[str, str]:
+    """Return one sentence on the first mistake, and the path of its key."""
+    details = error.errors()
+    missing = [_key_path(d["loc"]) for d in details if d["type"] == "missing"]
+    # an unknown key says more than the missing one that it was meant to be
+    first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
+    kind, key, got, mentioned = first["type"], _key_path(first["loc"]), first["input"], 1
+    if kind == "extra_forbidden":
+        *sections, word = first["loc"]
+        text = f"unknown key {key}; {suggest_word(str(word), _list_keys(schema, sections))}"
+    elif kind == "missing":
+        mentioned = len(missing)
+        one = mentioned == 1
+        text = f"the key{'' if one else 's'} {', '.join(missing)} {'is' if one else 'are'} missing."
+    elif kind == "value_error":
+        text = f"{key}: {first['ctx']['error']}."
+    elif kind == "too_short" and key.endswith("vibrations"):
+        text = f"{key} is empty; leave the key out for a model without vibrations."
+    elif kind == "model_type":
+        text = f"{key} must be a mapping of keys; got {got!r}."
+    else:
+        text = f"{key}: {first['msg'][0].lower()}{first['msg'][1:]}; got {got!r}."
+    rest = len(details) - mentioned
+    after = "this one" if mentioned == 1 else "these"
+    return text + (f" ({rest} more after {after}.)" if rest else ""), key
+
+
+def _key_path(location: Iterable[int | str]) -> str:
+    """Return the path of a key, without the tags of what may stand there."""
+    words = [f"[{p}]" if isinstance(p, int) else f".{p}" for p in location if p not in _TAGS]
+    return "".join(words).removeprefix(".")
+
+
+def _list_keys(model: type[BaseModel], location: Iterable[int | str]) -> list[str]:
+    """Return the keys that the schema knows at a location."""
+    sections: list[type[BaseModel]] = [model]
+    named_by_file = False  # the next word is a name that the file chooses, a key of a mapping
+    for word in location:
+        if isinstance(word, int) or word in _TAGS or named_by_file:
+            named_by_file = False
+            continue
+        fields = [
+            field
+            for section in sections
+            for name, field in section.model_fields.items()
+            if word == (field.alias or name)
+        ]
+        named_by_file = any(get_origin(field.annotation) is dict for field in fields)
+        sections = [inner for field in fields for inner in _list_sections(field.annotation)]
+    return sorted({f.alias or name for s in sections for name, f in s.model_fields.items()})
+
+
+def _list_sections(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for arg in getattr(annotation, "__args__", ()) for m in _list_sections(arg)]
