@@ -42,7 +42,7 @@ from lbt_synth.models import (
     pyramid_tilt_noise_nm,
     tip_tilt_plant,
 )
-from lbt_synth.models.plant.frequency_prior import line_frequencies, spread_lines
+from lbt_synth.models.plant.tip_tilt import line_frequencies, spread_lines
 from lbt_synth.models.sensor_suite import Motions, Sensor, checked_motions
 from lbt_synth.models.vibration import TrueVibration
 from lbt_synth.validation import FloatArray, frozen_copy

@@ -46,7 +46,7 @@ from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
-from lbt_synth.models.plant.parts import held_frames
+from lbt_synth.models.plant.assembly import held_frames
 from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.storage.rows import Column
 from lbt_synth.validation import (

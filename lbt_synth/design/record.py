@@ -20,7 +20,7 @@ from lbt_synth.models import (
     TipTiltPlant,
     Vibration,
 )
-from lbt_synth.models.plant.parts import PlantParts
+from lbt_synth.models.plant.assembly import PlantParts
 from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.models.sensor_suite import (
     Accelerometer,

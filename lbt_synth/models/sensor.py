@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.models.turbulence.atmosphere import ARCSEC_RAD
-from lbt_synth.models.turbulence.zernike import noll_orders
 from lbt_synth.validation import FloatArray, frozen_copy, number, one_or_each
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.ar_model import ARModel, variance_ratios
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.resonance_spectrum import coefficient_rows
+from lbt_synth.models.spectra import ARModel, variance_ratios
 from lbt_synth.validation import FloatArray, Positive, check_fields, choice, number, real_array
 
 _UNIT = 1e-15  # rounding of a length of one

@@ -16,6 +16,12 @@ import lbt_synth as lbt
 from lbt_synth.errors import ConfigError
 from lbt_synth.studies.robustness import mirror_rows
 
+SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
+LINES = [
+    {"kind": "sinusoid", "frequency_hz": 0.3, "rms_nm": 400, "axis": "both"},
+    {"kind": "sinusoid", "frequency_hz": 40.0, "rms_nm": 50, "axis": "tip"},
+]
+
 
 def test_every_kind_of_turbulence_and_noise(tmp_path):
     ar2 = lbt.load_config(
@@ -157,9 +163,6 @@ def test_priors_of_a_configuration(tmp_path):
             lbt.load_config(write_vibration(tmp_path, **keys))
 
 
-SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
-
-
 # Configuration and command line
 def test_the_example_has_a_mirror_for_design_and_loop():
     config = lbt.load_config(SLOW_YAML)
@@ -211,12 +214,6 @@ def test_gains_of_a_configuration(tmp_path):
     )
     mirror = lbt.load_config(path).hardware.mirror
     assert (mirror.proportional_per_s2, mirror.derivative_per_s) == (4.0e5, 800.0)
-
-
-LINES = [
-    {"kind": "sinusoid", "frequency_hz": 0.3, "rms_nm": 400, "axis": "both"},
-    {"kind": "sinusoid", "frequency_hz": 40.0, "rms_nm": 50, "axis": "tip"},
-]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,8 @@ from support.plants import ROOT
 import lbt_synth as lbt
 from lbt_synth.config.load import example_files, telescope_names, telescope_template
 
+NAMES = ("elt", "gemini", "generic", "keck", "lbt", "vlt")
+
 
 def test_the_example_is_the_papers_table_i(config):
     s = config.settings
@@ -291,9 +293,6 @@ def test_what_is_no_configuration_by_far_is_refused(tmp_path):
         with pytest.raises(lbt.errors.ConfigError, match=why) as caught:
             lbt.load_config(path)
         assert len(str(caught.value)) < 300
-
-
-NAMES = ("elt", "gemini", "generic", "keck", "lbt", "vlt")
 
 
 def test_there_is_a_template_of_each_telescope():

@@ -12,11 +12,170 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lbt_synth.models.ar_model import padded_coefficients
-from lbt_synth.models.plant.parts import PlantParts, held_frames
-from lbt_synth.models.plant.readings import memory, other_exposures
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.plant.seen_vibration import seen_vibration
-from lbt_synth.validation import FloatArray
+from lbt_synth.models.sensor_suite import Motions, checked_motions, period_frames
+from lbt_synth.models.spectra import ARModel, padded_coefficients
+from lbt_synth.models.vibration import Vibration, checked_direction
+from lbt_synth.validation import FloatArray, set_fields
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlantParts:
+    """Loop, turbulence, vibrations and noise, which fit each other."""
+
+    hardware: LoopHardware  # with the sensor gain that the design assumes in its sensor matrix
+    turbulence: tuple[ARModel, ...]  # one per mode
+    vibrations: tuple[Vibration, ...]
+    noise_factor: FloatArray  # (q, q): square root of the noise covariance of the loop's own sensor
+    motions: Motions = ()  # of the channels that each vibration moves; of none by default
+
+    def __post_init__(self) -> None:
+        n, rate = self.hardware.modes, self.hardware.frame_rate_hz
+        if len(self.turbulence) != n:
+            raise DimensionError(
+                f"turbulence must be one ARModel, or one per mode ({n}); got "
+                f"{len(self.turbulence)}."
+            )
+        for model in self.turbulence:
+            if not np.isclose(model.frame_rate_hz, rate, rtol=1e-9):
+                raise ProblemError(
+                    f"the turbulence model must be sampled at the frame rate {rate:.6g} Hz; got "
+                    f"{model.frame_rate_hz:.6g} Hz."
+                )
+        for line in self.vibrations:
+            checked_direction(line, self.hardware)
+        lines = len(self.vibrations)
+        motions = self.motions if any(self.motions) else ({},) * lines
+        set_fields(self, motions=checked_motions(motions, self.hardware.suite, lines))
+
+    @property
+    def order(self) -> int:
+        """Largest order of a turbulence model."""
+        return max(model.order for model in self.turbulence)
+
+    @property
+    def size(self) -> int:
+        """Number of states of the plant of the loop's own sensor."""
+        blocks = self.order + held_frames(self.hardware)
+        return 2 * len(self.vibrations) + blocks * self.hardware.modes
+
+
+def held_frames(hardware: LoopHardware) -> int:
+    """Return how many frames of the total phase the state of a plant holds."""
+    return max(int(np.ceil(hardware.delay_frames)), 2) - 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Exposure:
+    """Readings of a sensor: the mean of a signal over a period, some frames ago."""
+
+    response: FloatArray  # (q, n)
+    age_frames: float  # of the oldest frame that a reading averages
+    period: int  # frames from one reading to the next; readings are in frames 0, period, ...
+
+
+def own_exposure(hardware: LoopHardware) -> Exposure:
+    """Return the readings of the loop's own sensor: the residual of the last frame."""
+    return Exposure(response=hardware.sensor, age_frames=1.0, period=1)
+
+
+def other_exposures(hardware: LoopHardware) -> list[Exposure]:
+    """Return the readings of the other wavefront sensors of a loop."""
+    return [
+        Exposure(
+            response=sensor.response(hardware.modes),
+            age_frames=sensor.age_frames(hardware),
+            period=period_frames(sensor, hardware),
+        )
+        for sensor in hardware.suite.wavefront
+    ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Memory:
+    """System from a signal to the readings of sensors, of samples before, at each phase."""
+
+    A: FloatArray  # (N, h, h); nothing is remembered where there is no sensor, h = 0
+    B: FloatArray  # (N, h, n)
+    C: FloatArray  # (N, q, h)
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[2])
+
+
+def memory(exposures: list[Exposure], modes: int, period: int) -> Memory:
+    """Return the system from a signal s(k) (n,) to the readings in frame k, of s before k.
+
+    An exposure ends in frame e with the mean of the frames since the last end; the sum of a period
+    that has begun and the readings that wait are its states. Where an exposure ends within a frame,
+    that frame counts for both exposures, in part.
+    """
+    blocks = [_exposure_memory(each, modes, period) for each in exposures]
+    states = [block[0].shape[1] for block in blocks]
+    rows = [block[2].shape[1] for block in blocks]
+    A, B = np.zeros((period, sum(states), sum(states))), np.zeros((period, sum(states), modes))
+    C = np.zeros((period, sum(rows), sum(states)))
+    x = y = 0
+    for (a, b, c), n, q in zip(blocks, states, rows, strict=True):
+        A[:, x : x + n, x : x + n], B[:, x : x + n], C[:, y : y + q, x : x + n] = a, b, c
+        x, y = x + n, y + q
+    return Memory(A=A, B=B, C=C)
+
+
+def _exposure_memory(
+    exposure: Exposure, modes: int, period: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return A, B, C of the memory of one sensor, with states [sum, newest reading, older...]."""
+    own, whole = exposure.period, int(np.floor(exposure.age_frames + 1e-9))
+    late = exposure.age_frames - whole  # by which the exposure ends before its last frame does
+    late = 0.0 if late < 1e-9 else late
+    held = 1 + (whole - own) // own  # readings that wait when one is taken
+    sums = int(own > 1 or late > 0)  # states before the readings
+    size = sums + held
+    ends = (own - whole - 1) % own  # frame of the period in which an exposure ends
+    A, B = np.zeros((period, size, size)), np.zeros((period, size))
+    for t in range(period):
+        if t % own == ends:
+            B[t, sums] = (1 - late) / own
+            A[t, sums + 1 :, sums:-1] = np.eye(held - 1)
+            if sums:
+                A[t, 1, 0], B[t, 0] = 1.0, late / own
+        else:
+            A[t], B[t, :sums] = np.eye(size), 1 / own
+    C = np.zeros((len(exposure.response), size * modes))
+    C[:, -modes:] = exposure.response
+    each = np.eye(modes)
+    stack = np.broadcast_to(C, (period, *C.shape))
+    return np.asarray(np.kron(A, each)), np.asarray(np.kron(B[:, :, None], each)), stack
+
+
+def known_states(hardware: LoopHardware) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return A, B, C, D of what commands make: the mirror's states, and corrections that wait.
+
+    They are stacks (N, ...). In frame k they are driven by u(k-1), so that the corrections
+    remembered are those before k - 1, and the reading adds the one of k - 1. The measurements are
+    those of all sensors.
+    """
+    waiting = memory(other_exposures(hardware), hardware.modes, hardware.period)
+    mirror = hardware.mirror_system.whole
+    A_m, B_m, C_m = mirror.repeated(hardware.n_commands)
+    position, direct = hardware.influence @ C_m, mirror.D * hardware.influence
+    period, v, w = len(waiting.A), len(A_m), waiting.n_states
+    last = np.roll(np.arange(period), 1)  # the phase before
+    A, B = np.zeros((period, v + w, v + w)), np.zeros((period, v + w, hardware.n_commands))
+    A[:, :v, :v], B[:, :v] = A_m, B_m
+    A[:, v:, v:], A[:, v:, :v] = waiting.A[last], waiting.B[last] @ position
+    B[:, v:] = waiting.B[last] @ direct
+    q0, q1 = hardware.n_measurements, waiting.C.shape[1]
+    C = np.zeros((period, hardware.n_readings, v + w))
+    D = np.zeros((period, hardware.n_readings, hardware.n_commands))
+    C[:, :q0, :v], C[:, q0 : q0 + q1] = -hardware.sensor @ position, -waiting.C @ A[:, v:]
+    D[:, :q0], D[:, q0 : q0 + q1] = -hardware.sensor @ direct, -waiting.C @ B[:, v:]
+    return A, B, C, D
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -80,42 +80,8 @@ def seen_vibration(
 ) -> SeenVibration:
     """Return a line and what each channel that it moves reads of it, in the channels' order.
 
-    Parameters
-    ----------
-    line : Vibration
-        The line, whose rms is that of the oscillator's position.
-    motion : mapping
-        :class:`Motion` of each channel that the line moves.
-    accelerometers : sequence of Accelerometer
-        The instruments.
-    hardware : LoopHardware
-        The loop.
-    ahead : int, optional
-        Frames by which the newest frame of the state comes after that of the readings.
-
-    Returns
-    -------
-    SeenVibration
-        The process, of the common period of the accelerometers that see the line.
-
-    Raises
-    ------
-    ProblemError
-        If the line is not below the Nyquist frequency, or a delay is too short.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.models.plant.seen_vibration import seen_vibration
-    >>> line = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=500)
-    >>> mirror = lbt.models.Accelerometer(
-    ...     name="mirror", rate_hz=800, delay_frames=1, channels=("m1",), noise_m_s2=1e-3
-    ... )
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> seen = seen_vibration(line, {"m1": lbt.models.Motion(size=1)}, (mirror,), path)
-    >>> position_nm, reading_m_s2 = np.sqrt(np.diag(seen.output_covariances()[0]))
-    >>> round(float(position_nm), 2), round(float(reading_m_s2), 4)
-    (495.43, 0.083)
+    The newest frame of the state comes ``ahead`` frames after that of the readings; the period is
+    the common one of the accelerometers that see the line.
     """
     require_below_nyquist(line.frequency_hz, hardware.frame_rate_hz)
     exposures = [

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,16 +23,12 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem
 from lbt_synth.linear.estimation_problem import LONGEST_HORIZON
-from lbt_synth.models.ar_model import ARModel
-from lbt_synth.models.disturbance_facts import disturbance_facts
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.mirror.position_loop import PositionLoop
-from lbt_synth.models.plant.assembly import plant_matrices
-from lbt_synth.models.plant.full_state import FullStatePlant
-from lbt_synth.models.plant.parts import PlantParts
-from lbt_synth.models.plant.readings import known_states
+from lbt_synth.models.plant.assembly import PlantParts, known_states, plant_matrices
 from lbt_synth.models.sensor_suite import Motions, SensorSuite, noise_factor
-from lbt_synth.models.truth import Entering
+from lbt_synth.models.spectra import ARModel
+from lbt_synth.models.truth import Entering, disturbance_facts
 from lbt_synth.models.vibration import Vibration
 from lbt_synth.storage.rows import fact_table
 from lbt_synth.storage.summaries import Summary
@@ -41,9 +37,108 @@ from lbt_synth.validation import (
     FloatArray,
     frozen_copy,
     integer,
+    number,
     one_or_each,
+    real_array,
     require_instance,
 )
+
+_MOST_LINES = 64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FullStatePlant(EstimationProblem):
+    """The plant with its past commands as states (the paper's full form).
+
+    ``x(k+1) = A x(k) + B_known u(k-1) + B w(k)``,
+    ``y(k) = C x(k) + D_known u(k-1) + D w(k)``; ``D_known`` is zero from a
+    delay of two frames up. ``L`` is the paper's F.
+
+    Parameters
+    ----------
+    B_known : (n, m) array_like
+        Known input to state.
+    D_known : (q, m) array_like
+        Known input to measurement.
+    reduced : TipTiltPlant
+        The same plant without its past commands.
+    """
+
+    B_known: FloatArray
+    D_known: FloatArray
+    reduced: TipTiltPlant
+
+    @property
+    def hardware(self) -> LoopHardware:
+        """The loop."""
+        return self.reduced.hardware
+
+    def controller(self, gain_predictor: FloatArray) -> Controller:
+        """Return the controller from y(k) to u(k), the known input included, in new-state form.
+
+        ``u(k) = N^+ L x_hat(k+1 | k)``; the past command u(k-1) is therefore
+        ``N^+ L x_hat(k | k-1)`` and needs no state of its own. The predictor gain is over the full
+        state, (n, q).
+        """
+        gain = self.checked_gain(gain_predictor)
+        to_command = self.hardware.projector @ self.L
+        applied = self.B_known - gain @ self.D_known
+        A = self.A - gain @ self.C + applied @ to_command
+        D = np.zeros((to_command.shape[0], gain.shape[-1]))
+        return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s, applied=applied)
+
+    def estimator(self, gain_predictor: FloatArray) -> Controller:
+        """Estimator of z from ``[y(k), u(k-1)]``, whatever gave that command, in new-state form.
+
+        The predictor gain is over the full state, (n, q).
+        """
+        gain = self.checked_gain(gain_predictor)
+        B = np.concatenate([gain, self.B_known - gain @ self.D_known], axis=-1)
+        D = np.zeros((self.L.shape[0], B.shape[-1]))
+        return Controller(A=self.A - gain @ self.C, B=B, C=self.L, D=D, dt_s=self.dt_s)
+
+    def ahead(self, frames: int) -> EstimationProblem:
+        """Refuse any horizon but one; the reduced plant has the others."""
+        if frames != 1:
+            raise ProblemError(
+                f"a plant with its commands as states has a horizon of 1; got {frames!r}. "
+                "Try plant.ahead(frames).full() on the reduced plant."
+            )
+        return self
+
+    def with_memory(self, taps: FloatArray) -> EstimationProblem:
+        """Return the plant with past innovations as states, which no command reaches.
+
+        The taps (l, T q) weight the innovations, the newest first.
+        """
+        bare = EstimationProblem(A=self.A, B=self.B, C=self.C, D=self.D, L=self.L)
+        longer = bare.with_memory(taps)
+        more = longer.n_states - self.n_states
+        return replace(
+            self,
+            **{name: getattr(longer, name) for name in "ABCL"},
+            reduced=self.reduced.with_memory(taps),
+            B_known=np.vstack([self.B_known, np.zeros((more, self.B_known.shape[1]))]),
+        )
+
+    def generalised(self) -> tuple[FloatArray, FloatArray]:
+        """Matrices of the H-infinity filter's generalised plant (eq. 8, errata 2 and 7).
+
+        The first (n + l + q, n + p + l) maps ``[x(k), w(k), z_hat(k)]`` to
+        ``[x(k+1), z_hat(k) - z(k), y(k)]``; the second holds the columns of the known input u(k-1).
+        """
+        self.require_one_phase("the generalised plant", "that of a phase")
+        n, p = self.B.shape
+        outputs, q = self.L.shape[0], self.C.shape[0]
+        plant = np.block(
+            [
+                [self.A, self.B, np.zeros((n, outputs))],
+                [-self.L, np.zeros((outputs, p)), np.eye(outputs)],
+                [self.C, self.D, np.zeros((q, outputs))],
+            ]
+        )
+        known = np.vstack([self.B_known, np.zeros((outputs, self.B_known.shape[1])), self.D_known])
+        return plant, known
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -403,3 +498,116 @@ def retuned_plant(
 def with_vibrations(plant: TipTiltPlant, vibrations: Sequence[Vibration]) -> TipTiltPlant:
     """Return a plant with other vibrations, all else being the same."""
     return assemble(replace(plant.parts(), vibrations=tuple(vibrations)))
+
+
+def spread_plant(
+    plant: TipTiltPlant,
+    *,
+    half_width_hz: float | None = None,
+    lines: int = 5,
+    frequencies_hz: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
+) -> TipTiltPlant:
+    """Return a plant whose vibrations have a distribution of frequencies.
+
+    Each vibration becomes several of the same direction and decay rate, its variance shared
+    among them by the weights. Their sum has the mean spectrum of the plants with one of
+    these frequencies each, so :func:`kalman` of the result has the least variance on
+    average over the distribution.
+
+    Parameters
+    ----------
+    plant : TipTiltPlant
+        The plant.
+    half_width_hz : float, optional
+        The frequencies are the mid-points of equal parts of [f - h, f + h], for each f [Hz].
+    lines : int, optional
+        Number of parts, at most 64; with ``half_width_hz``.
+    frequencies_hz : (lines,) array_like, optional
+        The frequencies themselves [Hz], instead of a half width; for a plant whose
+        vibrations share one frequency.
+    weights : (lines,) array_like, optional
+        Probabilities of the frequencies, in proportion; equal by default.
+
+    Returns
+    -------
+    TipTiltPlant
+        The plant, with as many vibrations for each one.
+
+    Raises
+    ------
+    ProblemError
+        If there is no vibration, neither or both of half width and frequencies are given, or
+        a frequency leaves (0, Nyquist).
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
+    >>> plant = lbt.tip_tilt_plant(
+    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
+    ... )
+    >>> spread = lbt.models.spread_plant(plant, half_width_hz=1.0, lines=4)
+    >>> [line.frequency_hz for line in spread.vibrations]
+    [19.25, 19.75, 20.25, 20.75]
+    """
+    parts = plant.parts()  # refuses the memory of a mixed filter
+    if not plant.vibrations:
+        raise ProblemError(
+            "a frequency prior needs a plant with a vibration; got one without any. Try "
+            "tip_tilt_plant(..., vibrations=[Vibration(...)])."
+        )
+    if (half_width_hz is None) == (frequencies_hz is None):
+        raise ProblemError(
+            "give one of half_width_hz and frequencies_hz; "
+            f"got half_width_hz={half_width_hz!r} and frequencies_hz={frequencies_hz!r}."
+        )
+    first = plant.vibrations[0].frequency_hz
+    made: list[Vibration] = []
+    motions: Motions = ()
+    for line, motion in zip(plant.vibrations, plant.motions, strict=True):
+        if frequencies_hz is None:
+            given = line_frequencies(line.frequency_hz, half_width_hz, lines)
+        else:
+            given = np.atleast_1d(real_array(frequencies_hz, "frequencies_hz"))
+            if line.frequency_hz != first:
+                raise ProblemError(
+                    "frequencies_hz is for vibrations of one frequency; got vibrations at "
+                    f"{first:.6g} and {line.frequency_hz:.6g} Hz. Try half_width_hz."
+                )
+        made += spread_lines(line, given, weights)
+        motions += (motion,) * (len(made) - len(motions))
+    return assemble(replace(parts, vibrations=tuple(made), motions=motions))
+
+
+def line_frequencies(
+    frequency_hz: float, half_width_hz: float | None, lines: int, *, name: str = "half_width_hz"
+) -> FloatArray:
+    """Mid-points of equal parts of an interval of frequencies."""
+    half = number(
+        half_width_hz,
+        name,
+        above=0,
+        below=frequency_hz,
+        hint="All frequencies must stay above 0 Hz.",
+    )
+    count = integer(lines, "lines", at_least=1, at_most=_MOST_LINES)
+    return frequency_hz + half * ((2 * np.arange(count) + 1) / count - 1)
+
+
+def spread_lines(
+    line: Vibration, frequencies_hz: Sequence[float] | FloatArray, weights: Any = None
+) -> list[Vibration]:
+    """Split a vibration into several of its direction, decay rate and total variance."""
+    count = len(frequencies_hz)
+    share = np.ones(count) if weights is None else np.atleast_1d(real_array(weights, "weights"))
+    if share.shape != (count,) or not np.all(share > 0):
+        raise ProblemError(
+            f"weights must be {count} positive numbers, one for each frequency; got {weights!r}."
+        )
+    parts = np.sqrt(share / share.sum())
+    return [
+        replace(line.at_frequency(float(f)), rms_nm=line.rms_nm * float(part))
+        for f, part in zip(frequencies_hz, parts, strict=True)
+    ]
