@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+from lbt_synth import models
 from lbt_synth.config.schema import (
     AtmosphereSection,
     FileSection,
@@ -20,43 +21,16 @@ from lbt_synth.config.schema import (
 )
 from lbt_synth.errors import ConfigError, name_key
 from lbt_synth.interop import EndToEndSetup, EndToEndSystem
-from lbt_synth.models import (
-    Accelerometer,
-    ARModel,
-    Atmosphere,
-    DriftingVibration,
-    LoopHardware,
-    Motion,
-    PositionLoop,
-    SensorSuite,
-    SinusoidalVibration,
-    Spectrum,
-    TipTiltPlant,
-    Truth,
-    Vibration,
-    WavefrontSensor,
-    ar1_turbulence,
-    ar2_turbulence,
-    illuminated_subapertures,
-    nm_per_mas,
-    pyramid_tilt_noise_nm,
-    tip_tilt_plant,
-)
-from lbt_synth.models.plant.tip_tilt import line_frequencies, spread_lines
 from lbt_synth.models.sensor_suite import Motions, Sensor, checked_motions
-from lbt_synth.models.vibration import TrueVibration
-from lbt_synth.validation import FloatArray, frozen_copy
+from lbt_synth.models.vibration import TrueVibration, line_frequencies, spread_lines
+from lbt_synth.validation import FloatArray, agree, frozen_copy
 
 T = TypeVar("T")
 _AXES = {"tip": [(1.0, 0.0)], "tilt": [(0.0, 1.0)], "both": [(1.0, 0.0), (0.0, 1.0)]}
 _USUAL_LINES = 5  # of a spread vibration, unless the file says
-_SAME_RATIO = 1e-9  # relative; ratios of sensor gains that differ by less are one factor
 _OF_SYSTEM = {"pixels", "actuators_across", "wind_direction_deg", "calibration_nm"}
 
 
-# --------------------------------------------------------------------------
-# Sections that must be there, and lists that must have a length.
-# --------------------------------------------------------------------------
 def require_telescope(settings: FileSection, reason: str) -> TelescopeSection:
     """Return the section ``telescope``; raise ConfigError with the reason if it is missing."""
     if settings.telescope is None:
@@ -106,23 +80,22 @@ def _require_length(values: list[T], count: int, key: str, what: str) -> list[T]
     return values
 
 
-# --------------------------------------------------------------------------
-# Noise and gains of the loop's own sensor; numbers may be arrays (b,) of samples.
-# --------------------------------------------------------------------------
-def build_atmosphere(settings: FileSection) -> Atmosphere | None:
+def build_atmosphere(settings: FileSection) -> models.Atmosphere | None:
     """Build the atmosphere of a configuration, None if it has none."""
     air = settings.atmosphere
     if air is None:
         return None
     reason = "the turbulence of atmosphere is that over its diameter"
-    return Atmosphere(diameter_m=require_telescope(settings, reason).diameter_m, **air.model_dump())
+    return models.Atmosphere(
+        diameter_m=require_telescope(settings, reason).diameter_m, **air.model_dump()
+    )
 
 
 def _convert_mas_to_nm(settings: FileSection, mas: float, key: str) -> float:
     """Convert an angle of the file [mas] to a wavefront [nm rms]."""
     reason = f"{key} is in mas, and a wavefront in nm needs telescope.diameter_m"
     telescope = require_telescope(settings, f"{reason}. Give it, or the value in nm")
-    return mas * nm_per_mas(telescope.diameter_m)
+    return mas * models.nm_per_mas(telescope.diameter_m)
 
 
 def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
@@ -142,8 +115,8 @@ def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
     )
     numbers = dict(pyramid)
     across = numbers.pop("subapertures_across")
-    return pyramid_tilt_noise_nm(
-        subapertures=illuminated_subapertures(across, telescope.obstruction),
+    return models.pyramid_tilt_noise_nm(
+        subapertures=models.illuminated_subapertures(across, telescope.obstruction),
         diameter_m=telescope.diameter_m,
         **numbers,
     )
@@ -175,7 +148,7 @@ def relative_gain(settings: FileSection, reference: float) -> Any:
         return real / reference
     assumed = _gains_per_measurement(settings)
     ratios = np.array(_require_length(real, assumed.size, key, "measurement")) / assumed
-    if np.ptp(ratios) > _SAME_RATIO * ratios[0]:
+    if not agree(ratios, np.full_like(ratios, ratios[0])):
         text = ", ".join(f"{ratio:.4g}" for ratio in ratios)
         raise ConfigError(
             f"{key}: must be model.sensor_gain times one factor, for the loop has one optical gain "
@@ -186,9 +159,6 @@ def relative_gain(settings: FileSection, reference: float) -> Any:
     return float(ratios[0])
 
 
-# --------------------------------------------------------------------------
-# Vibrations.
-# --------------------------------------------------------------------------
 def true_vibrations_owner(settings: FileSection) -> Literal["model", "truth"]:
     """Return which section has the vibrations that the real loop meets."""
     return "truth" if isinstance(settings.truth.vibrations, list) else "model"
@@ -250,11 +220,11 @@ def _require_below_nyquist(frequency_hz: Any, frame_rate_hz: float, key: str) ->
         )
 
 
-def model_lines(settings: FileSection) -> list[tuple[Any, str, list[Vibration]]]:
+def model_lines(settings: FileSection) -> list[tuple[Any, str, list[models.Vibration]]]:
     """Return each vibration of the model, with its lines: several if it is spread."""
     rate, lines = settings.loop.frame_rate_hz, []
     for section, key, numbers in vibration_numbers(settings, "model"):
-        line = Vibration(**numbers)
+        line = models.Vibration(**numbers)
         spread = [line]
         if section.spread_hz is not None:
             with name_key(f"{key}.spread_hz"):
@@ -270,7 +240,9 @@ def model_lines(settings: FileSection) -> list[tuple[Any, str, list[Vibration]]]
     return lines
 
 
-def _build_true_vibrations(settings: FileSection, plant: TipTiltPlant) -> tuple[TrueVibration, ...]:
+def _build_true_vibrations(
+    settings: FileSection, plant: models.TipTiltPlant
+) -> tuple[TrueVibration, ...]:
     if true_vibrations_owner(settings) == "model":
         return plant.vibrations
     rate, lines = settings.loop.frame_rate_hz, list[TrueVibration]()
@@ -280,12 +252,14 @@ def _build_true_vibrations(settings: FileSection, plant: TipTiltPlant) -> tuple[
             _require_below_nyquist(section.end_hz, rate, f"{key}.end_hz")
             with name_key(key):
                 ends = {"start_hz": start_hz, "end_hz": section.end_hz}
-                lines.append(DriftingVibration(**numbers, **ends, duration_s=section.duration_s))
+                lines.append(
+                    models.DriftingVibration(**numbers, **ends, duration_s=section.duration_s)
+                )
         elif section.kind == "resonance":
-            lines.append(Vibration(**numbers))
+            lines.append(models.Vibration(**numbers))
         else:
             del numbers["damping"]
-            lines.append(SinusoidalVibration(**numbers))
+            lines.append(models.SinusoidalVibration(**numbers))
     return tuple(lines)
 
 
@@ -298,22 +272,19 @@ def _frequency_errors(
         return None
     places = np.array([section.frequency_hz for section in sections])
     starts = [
-        line.start_hz if isinstance(line, DriftingVibration) else line.frequency_hz
+        line.start_hz if isinstance(line, models.DriftingVibration) else line.frequency_hz
         for line in vibrations
     ]
     nearest = [sections[int(np.argmin(np.abs(places - start)))] for start in starts]
     return tuple(section.largest_error_hz or 0.0 for section in nearest)
 
 
-# --------------------------------------------------------------------------
-# The plant.
-# --------------------------------------------------------------------------
 def build_plant(
-    settings: FileSection, atmosphere: Atmosphere | None, noise_nm: float | FloatArray
-) -> TipTiltPlant:
+    settings: FileSection, atmosphere: models.Atmosphere | None, noise_nm: float | FloatArray
+) -> models.TipTiltPlant:
     """Build the plant of the design, with all its sensors."""
     lines = model_lines(settings)
-    plant = tip_tilt_plant(
+    plant = models.tip_tilt_plant(
         frame_rate_hz=settings.loop.frame_rate_hz,
         delay_frames=settings.loop.delay_frames,
         turbulence=_build_turbulence(settings, atmosphere, noise_nm),
@@ -329,7 +300,7 @@ def build_plant(
         return plant
     with name_key("sensors"):
         sensors = tuple(_build_sensor(*entry) for entry in settings.sensors.items())
-        suite = SensorSuite(sensors=sensors)
+        suite = models.SensorSuite(sensors=sensors)
         motions = [(s, key, len(spread)) for s, key, spread in lines]
         return plant.with_sensors(suite, _build_motions(motions, suite))
 
@@ -343,8 +314,8 @@ def turbulence_sections(settings: FileSection) -> list[TurbulenceSection]:
 
 
 def _build_turbulence(
-    settings: FileSection, atmosphere: Atmosphere | None, noise_nm: float | FloatArray
-) -> ARModel | list[ARModel]:
+    settings: FileSection, atmosphere: models.Atmosphere | None, noise_nm: float | FloatArray
+) -> models.ARModel | list[models.ARModel]:
     """Return one model for all axes, or one per axis where sections or noise differ."""
     axes, key = count_axes(settings), "model.turbulence"
     sections, listed = turbulence_sections(settings), isinstance(settings.model.turbulence, list)
@@ -369,29 +340,31 @@ def _build_turbulence(
 def _build_turbulence_model(
     section: TurbulenceSection,
     settings: FileSection,
-    atmosphere: Atmosphere | None,
+    atmosphere: models.Atmosphere | None,
     noise_nm: float,
     key: str,
-) -> ARModel:
+) -> models.ARModel:
     rate = settings.loop.frame_rate_hz
     if section.kind == "ar":
         with name_key(f"{key}.coefficients"):
             numbers = section.model_dump(exclude={"kind"})
-            return ARModel(**numbers, frame_rate_hz=rate)
+            return models.ARModel(**numbers, frame_rate_hz=rate)
     if atmosphere is None:
         reason = f"{key} of kind {section.kind} is computed from it. Give it, or kind ar"
         raise ConfigError(f"the key atmosphere is missing: {reason}.", path="atmosphere")
     if section.kind == "ar1":
-        return ar1_turbulence(atmosphere, frame_rate_hz=rate)
-    return ar2_turbulence(atmosphere, frame_rate_hz=rate, noise_nm=noise_nm)
+        return models.ar1_turbulence(atmosphere, frame_rate_hz=rate)
+    return models.ar2_turbulence(atmosphere, frame_rate_hz=rate, noise_nm=noise_nm)
 
 
-def _build_mirror(section: LocalLoopSection | None) -> PositionLoop | None:
+def _build_mirror(section: LocalLoopSection | None) -> models.PositionLoop | None:
     """Build the mirror's local loop, None for a mirror that settles at once."""
     if section is None:
         return None
     numbers: dict[str, Any] = section.model_dump(exclude_none=True)
-    make = PositionLoop if section.bandwidth_hz is None else PositionLoop.from_bandwidth
+    make = (
+        models.PositionLoop if section.bandwidth_hz is None else models.PositionLoop.from_bandwidth
+    )
     with name_key("mirror.local_loop"):
         return make(**numbers)
 
@@ -404,8 +377,8 @@ def _build_sensor(name: str, section: OtherSensorSection) -> Sensor:
         noise = float(size) if size.ndim == 0 else size
         if section.kind == "wavefront":
             matrix = None if section.matrix is None else np.array(section.matrix)
-            return WavefrontSensor(name=name, **timing, noise_nm=noise, sensor_matrix=matrix)
-        return Accelerometer(
+            return models.WavefrontSensor(name=name, **timing, noise_nm=noise, sensor_matrix=matrix)
+        return models.Accelerometer(
             name=name,
             **timing,
             channels=tuple(section.channels or ()),
@@ -414,13 +387,13 @@ def _build_sensor(name: str, section: OtherSensorSection) -> Sensor:
         )
 
 
-def _build_motions(lines: list[tuple[Any, str, int]], suite: SensorSuite) -> Motions:
+def _build_motions(lines: list[tuple[Any, str, int]], suite: models.SensorSuite) -> Motions:
     """Return the motions of each line, from sections with their keys and numbers of lines."""
-    motions: list[dict[str, Motion]] = []
+    motions: list[dict[str, models.Motion]] = []
     for section, key, count in lines:
         with name_key(f"{key}.accelerometers"):
             moving = {
-                name: Motion(size=motion.motion_nm_per_nm, phase_deg=motion.phase_deg)
+                name: models.Motion(size=motion.motion_nm_per_nm, phase_deg=motion.phase_deg)
                 for name, motion in (section.accelerometers or {}).items()
             }
             checked_motions((moving,), suite, 1)
@@ -428,15 +401,12 @@ def _build_motions(lines: list[tuple[Any, str, int]], suite: SensorSuite) -> Mot
     return tuple(motions)
 
 
-# --------------------------------------------------------------------------
-# The truth.
-# --------------------------------------------------------------------------
 def build_truth(
     settings: FileSection,
-    atmosphere: Atmosphere | None,
+    atmosphere: models.Atmosphere | None,
     noise_nm: float | FloatArray,
-    plant: TipTiltPlant,
-) -> Truth:
+    plant: models.TipTiltPlant,
+) -> models.Truth:
     """Build the truth: turbulence, vibrations, noise and gain of the real loop."""
     kind, suite, motions = settings.true_turbulence, plant.hardware.suite, plant.motions
     if kind == "frozen_flow":
@@ -446,7 +416,7 @@ def build_truth(
         )
     one = plant.turbulence[0]
     same = all(model is one for model in plant.turbulence)
-    spectra: dict[str, Spectrum | tuple[ARModel, ...] | None] = {
+    spectra: dict[str, models.Spectrum | tuple[models.ARModel, ...] | None] = {
         "frozen_flow": atmosphere,
         "model": one if same else plant.turbulence,
         "none": None,
@@ -455,7 +425,7 @@ def build_truth(
     if suite.sensors and true_vibrations_owner(settings) == "truth":
         lines = [(section, key, 1) for section, key, _ in vibration_numbers(settings, "truth")]
         motions = _build_motions(lines, suite)
-    return Truth(
+    return models.Truth(
         turbulence=spectra[kind],
         vibrations=vibrations,
         motions=motions if suite.sensors else (),
@@ -465,11 +435,8 @@ def build_truth(
     )
 
 
-# --------------------------------------------------------------------------
-# The end-to-end simulation.
-# --------------------------------------------------------------------------
 def build_end_to_end_setup(
-    settings: FileSection, hardware: LoopHardware, truth: Truth
+    settings: FileSection, hardware: models.LoopHardware, truth: models.Truth
 ) -> EndToEndSetup:
     """Build the simulation that a configuration describes; refuse one that describes none."""
     hint = "an end-to-end simulation needs it"

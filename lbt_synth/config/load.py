@@ -96,9 +96,9 @@ class Config(Summarised):
     @property
     def errors_hz(self) -> list[float]:
         """Frequency errors of studies: those of the file, or of what it says of its vibrations."""
-        given = self.settings.robustness.errors_hz
-        if given is not None:
-            return given
+        errors_hz = self.settings.robustness.errors_hz
+        if errors_hz is not None:
+            return errors_hz
         lines = self.truth.lines_hz
         if not lines:
             return [0.0]

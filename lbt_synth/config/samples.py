@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, cast
 
@@ -24,7 +24,7 @@ from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ConfigError, suggest_word
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
 from lbt_synth.loop.ensemble import ensemble_vibration
-from lbt_synth.models import FrozenFlows
+from lbt_synth.models import Atmosphere, FrozenFlows
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
@@ -35,9 +35,6 @@ _LINE = ("frequency_hz", "damping", "rms_nm", "rms_mas")
 _PYRAMID = ("photons", "read_noise_electrons", "modulation_lambda_over_d")
 
 
-# --------------------------------------------------------------------------
-# Paths.
-# --------------------------------------------------------------------------
 @lru_cache(maxsize=256)
 def parse_path(path: str) -> Keys:
     """Parse a path into its keys."""
@@ -113,30 +110,11 @@ def _with_value(section: Any, keys: Keys, value: Any) -> Any:
     return section.model_copy(update={first: _with_value(getattr(section, first), rest, value)})
 
 
-# --------------------------------------------------------------------------
-# Samples.
-# --------------------------------------------------------------------------
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Samples:
-    """b samples whose configurations differ by numbers that :func:`array_keys` names."""
-
-    config: Config  # of one of them
-    values: dict[Keys, FloatArray]  # the numbers that differ, (b,) each
-    delay_error_frames: FloatArray  # real delay less that of the configuration, (b,)
-    noise_factor: FloatArray  # real noise over that of the configuration, (b,)
-
-    @property
-    def count(self) -> int:
-        """Their number b."""
-        return len(self.noise_factor)
-
-    @property
-    def settings(self) -> FileSection:
-        """Their settings, with arrays for the numbers that differ."""
-        settings = self.config.settings
-        for keys, values in self.values.items():
-            settings = _with_value(settings, keys, values)
-        return settings
+def with_arrays(settings: FileSection, values: Mapping[Keys, FloatArray]) -> FileSection:
+    """Return settings with arrays (b,) for the numbers of samples that differ, unchecked."""
+    for keys, numbers in values.items():
+        settings = _with_value(settings, keys, numbers)
+    return settings
 
 
 def array_keys(settings: FileSection) -> set[Keys]:
@@ -167,34 +145,45 @@ def array_keys(settings: FileSection) -> set[Keys]:
     return keys
 
 
-def build_ensemble(samples: Samples) -> LoopEnsemble:
-    """Build the ensemble of the real loops."""
-    config, settings = samples.config, samples.settings
-    delay = settings.loop.delay_frames + samples.delay_error_frames
+def build_ensemble(
+    config: Config,
+    values: Mapping[Keys, FloatArray],
+    *,
+    delay_error_frames: FloatArray,
+    noise_factor: FloatArray,
+) -> LoopEnsemble:
+    """Build the real loops of b samples, which differ by some numbers of :func:`array_keys`.
+
+    The configuration is that of one of them. Their real delays less those of the configuration, and
+    their real noise over it, are (b,).
+    """
+    settings, flows = with_arrays(config.settings, values), None
+    delay = settings.loop.delay_frames + delay_error_frames
     for extreme in (np.min(delay), np.max(delay)):
         replace(config.hardware, delay_frames=float(extreme))  # refuses what no loop has
-    flows = _frozen_flows(samples) if settings.true_turbulence == "frozen_flow" else None
+    if settings.true_turbulence == "frozen_flow":
+        flows = _frozen_flows(settings, config.atmosphere)
     noise = np.asarray(measurement_noise_nm(settings))
     if not isinstance(settings.sensor.noise_nm, list):
         noise = noise[..., None]
     return LoopEnsemble(
         sensor_gain=relative_gain(settings, config.sensor_gain),
         delay_frames=delay,
-        noise_nm=noise * samples.noise_factor[:, None],
+        noise_nm=noise * noise_factor[:, None],
         turbulence=config.truth.turbulence if flows is None else flows,
-        vibrations=tuple(_ensemble_vibrations(samples)),
-        loops=samples.count,
+        vibrations=tuple(_ensemble_vibrations(config, settings)),
+        loops=len(noise_factor),
     )
 
 
-def _ensemble_vibrations(samples: Samples) -> list[EnsembleVibration]:
-    settings, base = samples.settings, samples.config.settings
+def _ensemble_vibrations(config: Config, settings: FileSection) -> list[EnsembleVibration]:
+    """Return the vibrations of the samples; the lines of a spread one are the same for all."""
     if true_vibrations_owner(settings) == "truth":
         rows = vibration_numbers(settings, "truth")
         return [EnsembleVibration(**numbers) for _, _, numbers in rows]
     vibrations: list[EnsembleVibration] = []
-    lines = [spread for *_, spread in model_lines(base)]
-    for (section, _, numbers), spread in zip(
+    lines = model_lines(config.settings)
+    for (*_, numbers), (section, _, spread) in zip(
         vibration_numbers(settings, "model"), lines, strict=True
     ):
         one = section.spread_hz is None
@@ -202,9 +191,9 @@ def _ensemble_vibrations(samples: Samples) -> list[EnsembleVibration]:
     return vibrations
 
 
-def _frozen_flows(samples: Samples) -> FrozenFlows | None:
+def _frozen_flows(settings: FileSection, atmosphere: Atmosphere | None) -> FrozenFlows | None:
     """Return the frozen flows of the samples, None if the weather does not differ."""
-    air, atmosphere = samples.settings.atmosphere, samples.config.atmosphere
+    air = settings.atmosphere
     if air is None or atmosphere is None:
         return None
     weather = {name: getattr(air, name) for name in _WEATHER}

@@ -37,15 +37,15 @@ def config_text(settings: FileSection, comments: Mapping[str, str] | None = None
     """Return the YAML of a configuration; see :func:`save_config`."""
     require_instance(settings, FileSection)
     content = settings.model_dump(exclude_unset=True)
-    left = dict(comments or {})
-    head = left.pop("", "")
-    for key, comment in left.items():
+    unused = dict(comments or {})
+    head = unused.pop("", "")
+    for key, comment in unused.items():
         if comment.splitlines() not in ([comment], []):
             raise ProblemError(f"the comment on {key} must be one line; got {comment!r}.")
-    document = _commented(content, "", left)
-    if left:
+    document = _commented(content, "", unused)
+    if unused:
         raise ProblemError(
-            f"comments must be on keys that are written; got one on {next(iter(left))}, which is "
+            f"comments must be on keys that are written; got one on {next(iter(unused))}, which is "
             "not. Keys are paths such as model.vibrations[0].rms_nm."
         )
     text = _dump(document, head)
@@ -123,18 +123,18 @@ def _commented(value: Any, path: str, comments: dict[str, str]) -> Any:
     if isinstance(value, dict):
         section = CommentedMap()
         for key, inner in value.items():
-            own = f"{path}.{key}" if path else key
-            section[key] = _commented(inner, own, comments)
-            if comment := comments.pop(own, ""):
+            place = f"{path}.{key}" if path else key
+            section[key] = _commented(inner, place, comments)
+            if comment := comments.pop(place, ""):
                 section.yaml_add_eol_comment(comment, key, column=_COLUMN)
         return section
     if not isinstance(value, list):
         return value
     entries = CommentedSeq()
     for i, inner in enumerate(value):
-        own = f"{path}[{i}]"
-        entries.append(_commented(inner, own, comments))
-        if comment := comments.pop(own, ""):
+        place = f"{path}[{i}]"
+        entries.append(_commented(inner, place, comments))
+        if comment := comments.pop(place, ""):
             depth = path.count(".") + 1
             entries.yaml_set_comment_before_after_key(i, before=comment, indent=2 * depth)
     if not (value and isinstance(value[0], dict)):
@@ -307,49 +307,49 @@ def _raised(value_nm: float, path: str, comments: dict[str, str]) -> float:
 def _vibration_sections(model: IdentifiedModel, comments: dict[str, str]) -> list[dict[str, Any]]:
     """Return all vibrations, tip first, and add their errors to ``comments``."""
     sections: list[dict[str, Any]] = []
-    for part in model.parts:
+    for line in model.parts:
         path = f"model.vibrations[{len(sections)}]"
-        frequency_error = _error_comment("Hz", [part.frequency_error_hz])
-        comments[f"{path}.frequency_hz"] = _KIND_COMMENTS[part.kind] + frequency_error
-        comments[f"{path}.damping"] = _error_comment("", [part.damping_error])
-        comments[f"{path}.rms_nm"] = _error_comment("nm", [part.rms_error_nm])
+        frequency_error = _error_comment("Hz", [line.frequency_error_hz])
+        comments[f"{path}.frequency_hz"] = _KIND_COMMENTS[line.kind] + frequency_error
+        comments[f"{path}.damping"] = _error_comment("", [line.damping_error])
+        comments[f"{path}.rms_nm"] = _error_comment("nm", [line.rms_error_nm])
         entry: dict[str, Any] = {}
-        if len(model.axes) > 1 and part.direction in _DIRECTIONS:
-            entry["axis"] = _DIRECTIONS[part.direction]
+        if len(model.axes) > 1 and line.direction in _DIRECTIONS:
+            entry["axis"] = _DIRECTIONS[line.direction]
         elif len(model.axes) > 1:
-            entry["direction_deg"] = part.direction_deg
-            error = _error_comment("degrees", [part.direction_error_deg or 0.0])
+            entry["direction_deg"] = line.direction_deg
+            error = _error_comment("degrees", [line.direction_error_deg or 0.0])
             comments[f"{path}.direction_deg"] = error
         for key in ("frequency_hz", "damping"):
-            entry[key] = float(getattr(part, key))
-        entry["rms_nm"] = _raised(part.rms_nm, f"{path}.rms_nm", comments)
+            entry[key] = float(getattr(line, key))
+        entry["rms_nm"] = _raised(line.rms_nm, f"{path}.rms_nm", comments)
         sections.append(entry)
     return sections
 
 
 def _accelerometer_section(
-    found: AccelerometerTransfers, delay_frames: float, comments: dict[str, str]
+    transfers: AccelerometerTransfers, delay_frames: float, comments: dict[str, str]
 ) -> dict[str, Any]:
     """Return the section of the channels that are used, and comment on their delay."""
-    age, path = found.loop_age(delay_frames), f"sensors.{_NAME}.delay_frames"
+    age, path = transfers.loop_age(delay_frames), f"sensors.{_NAME}.delay_frames"
     comments[path] = f"readings come {age - 1} frames after the wavefront's"
-    if age != found.age_frames:
-        apart = found.age_frames - 1
+    if age != transfers.age_frames:
+        apart = transfers.age_frames - 1
         comments[path] = f"not known: the clocks were {apart} frames apart; give the real delay"
     return {
         "kind": "accelerometer",
-        "rate_hz": float(found.rate_hz),
+        "rate_hz": float(transfers.rate_hz),
         "delay_frames": float(age + delay_frames - 1),
-        "channels": [row.channel for row in found.used],
-        "noise_m_s2": [float(row.noise_m_s2) for row in found.used],
+        "channels": [row.channel for row in transfers.used],
+        "noise_m_s2": [float(row.noise_m_s2) for row in transfers.used],
     }
 
 
 def _add_motions(
-    vibrations: list[dict[str, Any]], found: AccelerometerTransfers, comments: dict[str, str]
+    vibrations: list[dict[str, Any]], transfers: AccelerometerTransfers, comments: dict[str, str]
 ) -> None:
     """Add to each vibration how the channels that show it move with it, with errors."""
-    for row in found.transfers:
+    for row in transfers.transfers:
         if not row.useful:
             continue
         moving = vibrations[row.line].setdefault("accelerometers", {})
@@ -362,8 +362,8 @@ def _add_motions(
 
 def _error_comment(unit: str, errors: Sequence[float]) -> str:
     """Return standard errors as a comment, empty if none is known."""
-    known = [math.isfinite(error) and error > 0 for error in errors]
-    if not any(known):
+    is_known = [math.isfinite(error) and error > 0 for error in errors]
+    if not any(is_known):
         return ""
-    texts = [f"{e:.2g}" if ok else "not known" for e, ok in zip(errors, known, strict=True)]
+    texts = [f"{e:.2g}" if ok else "not known" for e, ok in zip(errors, is_known, strict=True)]
     return f"standard error {', '.join(texts)} {unit}".rstrip()

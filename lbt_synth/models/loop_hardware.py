@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, cast
 
 import numpy as np
 
@@ -121,14 +121,12 @@ class LoopHardware(Summarised):
     @property
     def sensor(self) -> FloatArray:
         """Sensor matrix (q, n)."""
-        assert self.sensor_matrix is not None  # set by __post_init__
-        return self.sensor_matrix
+        return cast("FloatArray", self.sensor_matrix)  # set by __post_init__
 
     @property
     def influence(self) -> FloatArray:
         """Influence matrix N (n, m)."""
-        assert self.influence_matrix is not None  # set by __post_init__
-        return self.influence_matrix
+        return cast("FloatArray", self.influence_matrix)
 
     @property
     def projector(self) -> FloatArray:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 OWN_SENSOR = "wavefront"
 LONGEST_PERIOD = 1000  # frames of the loop per reading
 LONGEST_DELAY = 100  # of a sensor [its periods]
-_WHOLE = 1e-9
+WHOLE = 1e-9  # relative amount by which a ratio of rates may miss a whole number
 
 
 def noise_factor(noise_nm: Any, q: int) -> FloatArray:
@@ -238,7 +238,7 @@ def period_frames(sensor: Sensor, hardware: LoopHardware) -> int:
     """Return the frames of the loop from one reading of a sensor to the next."""
     ratio = hardware.frame_rate_hz / sensor.rate_hz
     period = round(ratio)
-    if not 1 <= period <= LONGEST_PERIOD or abs(ratio - period) > _WHOLE * ratio:
+    if not 1 <= period <= LONGEST_PERIOD or abs(ratio - period) > WHOLE * ratio:
         raise ProblemError(
             f"the frame rate {hardware.frame_rate_hz:.6g} Hz must be a whole multiple (up to "
             f"{LONGEST_PERIOD}) of the rate of sensor {sensor.name}; got {sensor.rate_hz:.6g} Hz. "
@@ -251,13 +251,13 @@ def _age(sensor: Sensor, hardware: LoopHardware, *, least: int) -> float:
     """Return the age of the oldest frame that a reading averages; the newest is at least so old."""
     period, late = period_frames(sensor, hardware), hardware.delay_frames - 1
     age = sensor.delay_frames * period - late
-    if age - period + 1 < least - _WHOLE:
+    if age - period + 1 < least - WHOLE:
         raise ProblemError(
             f"the delay of sensor {sensor.name} must be at least "
             f"{(period + late + least - 1) / period:.4g} of its frames, so that its exposure has "
             f"ended when it is read; got {sensor.delay_frames:g}."
         )
-    return float(round(age)) if abs(age - round(age)) < _WHOLE * period else age
+    return float(round(age)) if abs(age - round(age)) < WHOLE * period else age
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -5,22 +5,23 @@ import pytest
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
-from lbt_synth.config.samples import Samples, array_keys, build_ensemble, parse_path
+from lbt_synth.config.samples import array_keys, build_ensemble, parse_path, with_arrays
 
 COUNT = 4
 
 
-def samples(values, **errors):
+def ensemble_of(values, **errors):
     numbers = {"delay_error_frames": np.zeros(COUNT), "noise_factor": np.ones(COUNT)} | errors
-    return Samples(config=lbt.load_config(LBT_YAML), values=values, **numbers)
+    return build_ensemble(lbt.load_config(LBT_YAML), values, **numbers)
 
 
-def test_a_view_of_samples_leaves_the_configuration_as_it_is():
+def test_arrays_leave_the_settings_as_they_are():
     keys, values = parse_path("model.vibrations[0].rms_mas"), np.array([1.0, 2.0, 3.0, 4.0])
-    some = samples({keys: values})
-    assert some.settings.model.vibrations[0].rms_mas is values
-    assert some.config.settings.model.vibrations[0].rms_mas == 80
-    assert some.settings.truth is some.config.settings.truth
+    settings = lbt.load_config(LBT_YAML).settings
+    changed = with_arrays(settings, {keys: values})
+    assert changed.model.vibrations[0].rms_mas is values
+    assert settings.model.vibrations[0].rms_mas == 80
+    assert changed.truth is settings.truth
 
 
 def test_which_numbers_are_taken_as_arrays(tmp_path):
@@ -55,9 +56,9 @@ def test_which_numbers_are_taken_as_arrays(tmp_path):
 
 
 def test_what_designs_assume_does_not_change_the_loops():
-    expected = build_ensemble(samples({}))
+    expected = ensemble_of({})
     for path in ("model.vibrations[0].rms_mas", "model.sensor_gain"):
-        ensemble = build_ensemble(samples({parse_path(path): np.linspace(1.0, 2.0, COUNT)}))
+        ensemble = ensemble_of({parse_path(path): np.linspace(1.0, 2.0, COUNT)})
         assert ensemble.sensor_gain == expected.sensor_gain
         assert [line.rms_nm for line in ensemble.vibrations] == [
             line.rms_nm for line in expected.vibrations
@@ -75,4 +76,4 @@ def test_what_designs_assume_does_not_change_the_loops():
 )
 def test_real_delays_and_noises_that_no_loop_has(errors):
     with pytest.raises(lbt.errors.ProblemError):
-        build_ensemble(samples({}, **errors))
+        ensemble_of({}, **errors)

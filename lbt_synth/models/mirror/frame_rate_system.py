@@ -19,9 +19,9 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.state_space import balancing_scales
 from lbt_synth.models.mirror.position_loop import PositionLoop
+from lbt_synth.models.sensor_suite import WHOLE
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, set_fields
 
-_WHOLE = 1e-9  # relative amount by which the ratio of the rates may miss an integer
 _NOTHING = 1e-14  # a leading tap of at most this counts as zero
 _TAIL = 1e-15  # the taps end where at most this is left of the step response
 _MOST_TAPS = 4000
@@ -203,7 +203,7 @@ def samples_per_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
             "loop at all."
         )
     samples = round(ratio)
-    if samples < 1 or abs(ratio - samples) > _WHOLE * ratio:
+    if samples < 1 or abs(ratio - samples) > WHOLE * ratio:
         counts = [n for n in (int(ratio) + 1, int(ratio)) if n > 0]
         fitting = " and ".join(f"{loop.sampling_hz / n:.9g}" for n in counts)
         raise ProblemError(

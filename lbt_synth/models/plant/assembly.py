@@ -15,7 +15,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.plant.seen_vibration import seen_vibration
-from lbt_synth.models.sensor_suite import Motions, checked_motions, period_frames
+from lbt_synth.models.sensor_suite import WHOLE, Motions, checked_motions, period_frames
 from lbt_synth.models.spectra import ARModel, padded_coefficients
 from lbt_synth.models.vibration import Vibration, checked_direction
 from lbt_synth.validation import FloatArray, set_fields
@@ -130,9 +130,9 @@ def _exposure_memory(
     exposure: Exposure, modes: int, period: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return A, B, C of the memory of one sensor, with states [sum, newest reading, older...]."""
-    own, whole = exposure.period, int(np.floor(exposure.age_frames + 1e-9))
+    own, whole = exposure.period, int(np.floor(exposure.age_frames + WHOLE))
     late = exposure.age_frames - whole  # by which the exposure ends before its last frame does
-    late = 0.0 if late < 1e-9 else late
+    late = 0.0 if late < WHOLE else late
     held = 1 + (whole - own) // own  # readings that wait when one is taken
     sums = int(own > 1 or late > 0)  # states before the readings
     size = sums + held

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, cast
+from typing import ClassVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,7 +29,7 @@ from lbt_synth.models.plant.assembly import PlantParts, known_states, plant_matr
 from lbt_synth.models.sensor_suite import Motions, SensorSuite, noise_factor
 from lbt_synth.models.spectra import ARModel
 from lbt_synth.models.truth import Entering, disturbance_facts
-from lbt_synth.models.vibration import Vibration
+from lbt_synth.models.vibration import Vibration, line_frequencies, spread_lines
 from lbt_synth.storage.rows import fact_table
 from lbt_synth.storage.summaries import Summary
 from lbt_synth.storage.words import count_text
@@ -37,13 +37,10 @@ from lbt_synth.validation import (
     FloatArray,
     frozen_copy,
     integer,
-    number,
     one_or_each,
     real_array,
     require_instance,
 )
-
-_MOST_LINES = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -579,35 +576,3 @@ def spread_plant(
         made += spread_lines(line, given, weights)
         motions += (motion,) * (len(made) - len(motions))
     return assemble(replace(parts, vibrations=tuple(made), motions=motions))
-
-
-def line_frequencies(
-    frequency_hz: float, half_width_hz: float | None, lines: int, *, name: str = "half_width_hz"
-) -> FloatArray:
-    """Mid-points of equal parts of an interval of frequencies."""
-    half = number(
-        half_width_hz,
-        name,
-        above=0,
-        below=frequency_hz,
-        hint="All frequencies must stay above 0 Hz.",
-    )
-    count = integer(lines, "lines", at_least=1, at_most=_MOST_LINES)
-    return frequency_hz + half * ((2 * np.arange(count) + 1) / count - 1)
-
-
-def spread_lines(
-    line: Vibration, frequencies_hz: Sequence[float] | FloatArray, weights: Any = None
-) -> list[Vibration]:
-    """Split a vibration into several of its direction, decay rate and total variance."""
-    count = len(frequencies_hz)
-    share = np.ones(count) if weights is None else np.atleast_1d(real_array(weights, "weights"))
-    if share.shape != (count,) or not np.all(share > 0):
-        raise ProblemError(
-            f"weights must be {count} positive numbers, one for each frequency; got {weights!r}."
-        )
-    parts = np.sqrt(share / share.sum())
-    return [
-        replace(line.at_frequency(float(f)), rms_nm=line.rms_nm * float(part))
-        for f, part in zip(frequencies_hz, parts, strict=True)
-    ]

@@ -9,8 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from lbt_synth.config import Config
-from lbt_synth.config.samples import Keys, Samples, array_keys, build_ensemble
+from lbt_synth.config.samples import Keys, array_keys, build_ensemble
 from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, LbtSynthError
 from lbt_synth.linear import solve_dare
@@ -104,12 +103,19 @@ def _evaluate_group(
 ) -> dict[str, FloatArray]:
     """Return the columns of samples that differ by numbers of some keys only."""
     config, hardware, _ = make_sample(study, values[0])
+    by_name = dict(zip(study.parameter_names, values.T, strict=True))
+    places = [(place, by_name[name]) for name, each in study.places.items() for place in each]
     with np.errstate(over="raise", divide="raise", invalid="raise"):
         if design is None:
             matrices = _kalman_matrices([make_sample(study, row)[0].plant for row in values])
         else:
             matrices = textbook_matrices([design.controller])
-        loops = build_ensemble(_stack_samples(study, config, values, keys))
+        loops = build_ensemble(
+            config,
+            {place: numbers for place, numbers in places if place in keys},
+            delay_error_frames=by_name.get(DELAY_ERROR, np.zeros(len(values))),
+            noise_factor=by_name.get(NOISE_FACTOR, np.ones(len(values))),
+        )
         residuals = residuals_from_matrices(matrices, hardware, loops, in_image=True)
     return residual_columns(residuals, config.imaging)
 
@@ -140,18 +146,6 @@ def _find_groups(study: Study, values: FloatArray, keys: set[Keys]) -> Iterator[
     _, which, counts = np.unique(values[:, apart], axis=0, return_inverse=True, return_counts=True)
     for group in np.flatnonzero(counts >= min(2, len(values))):
         yield np.flatnonzero(which.reshape(-1) == group)
-
-
-def _stack_samples(study: Study, config: Config, values: FloatArray, keys: set[Keys]) -> Samples:
-    """Return the samples of a group of rows of ``Study.values``; one configuration is given."""
-    by_name = dict(zip(study.parameter_names, values.T, strict=True))
-    places = [(place, by_name[name]) for name, each in study.places.items() for place in each]
-    return Samples(
-        config=config,
-        values={place: numbers for place, numbers in places if place in keys},
-        delay_error_frames=by_name.get(DELAY_ERROR, np.zeros(len(values))),
-        noise_factor=by_name.get(NOISE_FACTOR, np.ones(len(values))),
-    )
 
 
 def _require_agreement(
