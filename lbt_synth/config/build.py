@@ -22,7 +22,7 @@ from lbt_synth.config.schema import (
 from lbt_synth.errors import ConfigError, name_key
 from lbt_synth.interop import EndToEndSetup, EndToEndSystem
 from lbt_synth.models.sensor_suite import Motions, Sensor, checked_motions
-from lbt_synth.models.vibration import TrueVibration, line_frequencies, spread_lines
+from lbt_synth.models.vibration import TrueVibration, spread_lines
 from lbt_synth.validation import FloatArray, agree, frozen_copy
 
 T = TypeVar("T")
@@ -228,13 +228,8 @@ def model_lines(settings: FileSection) -> list[tuple[Any, str, list[models.Vibra
         spread = [line]
         if section.spread_hz is not None:
             with name_key(f"{key}.spread_hz"):
-                frequencies = line_frequencies(
-                    line.frequency_hz,
-                    section.spread_hz,
-                    section.lines or _USUAL_LINES,
-                    name="the half width",
-                )
-                spread = spread_lines(line, frequencies)
+                count = section.lines or _USUAL_LINES
+                spread = spread_lines(line, section.spread_hz, count, name="the half width")
                 spread[-1].ar_model(rate)  # the highest must lie below the Nyquist frequency
         lines.append((section, key, spread))
     return lines

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_origin
 
 from pydantic import (
@@ -20,9 +20,7 @@ from lbt_synth.methods import quantities as q
 from lbt_synth.methods.method import Section
 from lbt_synth.methods.registry import all_methods
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
-from lbt_synth.models.sensor_suite import OWN_SENSOR
 
-_LOOP_KEYS = {"rate_hz": "frame_rate_hz", "delay_frames": "delay_frames"}  # of the own sensor
 Matrix: TypeAlias = list[list[q.Entry]]
 _TAGS = (q.ONE, q.EACH)  # in the places of mistakes
 
@@ -374,11 +372,6 @@ class FileSection(Section):
     robustness: RobustnessSection = key("errors that studies try", RobustnessSection())
     end_to_end: EndToEndSection = key("the end-to-end simulation", EndToEndSection())
 
-    @model_validator(mode="before")
-    @classmethod
-    def _move_own_sensor(cls, raw: Any) -> Any:
-        return _with_own_sensor(raw)
-
     @property
     def usual_turbulence(self) -> str:
         """Turbulence of a truth that names none: frozen_flow if there is an atmosphere."""
@@ -410,24 +403,6 @@ def config_schema() -> dict[str, Any]:
     """
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {"$schema": dialect, **FileSection.model_json_schema(), "title": "lbt-synth"}
-
-
-def _with_own_sensor(raw: Any) -> Any:
-    """Return a file in which ``sensors.wavefront``, the loop's own sensor, is loop and sensor."""
-    sensors = raw.get("sensors") if isinstance(raw, Mapping) else None
-    if not isinstance(sensors, Mapping) or not isinstance(sensors.get(OWN_SENSOR), Mapping):
-        return raw
-    wavefront = sensors[OWN_SENSOR]
-    loop, sensor = dict(raw.get("loop") or {}), dict(raw.get("sensor") or {})
-    for name, value in wavefront.items():
-        section, key = (loop, _LOOP_KEYS[name]) if name in _LOOP_KEYS else (sensor, name)
-        if name != "kind" and section.setdefault(key, value) != value:
-            where = "loop" if section is loop else "sensor"
-            raise ValueError(
-                f"sensors.{OWN_SENSOR}.{name} is {value!r}, and {where}.{key} {section[key]!r}"
-            )
-    others = {name: value for name, value in sensors.items() if name != OWN_SENSOR}
-    return {**raw, "loop": loop, "sensor": sensor, "sensors": others or None}
 
 
 def describe_error(

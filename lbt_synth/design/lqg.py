@@ -251,12 +251,11 @@ def lqg_controller(
     """Make the controller from y(k) to u(k): the filter, and the states of mirror and delay."""
     hardware = plant.hardware
     full = replace(estimation_plant(plant), hardware=hardware).full()
-    n, (states, q) = full.n_states, gain_predictor.shape
-    law, gain = np.zeros((hardware.modes, n)), np.zeros((n, q))
-    law[:, :states], gain[:states] = gain_state, gain_predictor
+    states, law = len(gain_predictor), np.zeros((hardware.modes, full.n_states))
+    law[:, :states] = gain_state
     end = states + gain_mirror.size * hardware.n_commands
     law[:, states:end] = -np.kron(gain_mirror, hardware.influence)
-    return replace(full, L=law).controller(gain)
+    return full.controller(gain_predictor, hardware.projector @ law)
 
 
 def estimation_plant(plant: TipTiltPlant) -> TipTiltPlant:

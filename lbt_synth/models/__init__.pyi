@@ -1,6 +1,5 @@
 from .loop_hardware import LoopHardware as LoopHardware
 from .mirror.position_loop import PositionLoop as PositionLoop
-from .plant.tip_tilt import FullStatePlant as FullStatePlant
 from .plant.tip_tilt import TipTiltPlant as TipTiltPlant
 from .plant.tip_tilt import spread_plant as spread_plant
 from .plant.tip_tilt import tip_tilt_plant as tip_tilt_plant

@@ -5,7 +5,7 @@ G. Agapito et al., 2008, equation 4, with the errata 1 and 7.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, TypeAlias
 
@@ -161,36 +161,24 @@ def sampled_lines(
     return a, np.asarray(rms_nm / np.sqrt(variance_ratios(a)))
 
 
-def line_frequencies(
-    frequency_hz: float, half_width_hz: float | None, lines: int, *, name: str = "half_width_hz"
-) -> FloatArray:
-    """Mid-points of equal parts of an interval of frequencies."""
+def spread_lines(
+    line: Vibration, half_width_hz: float, lines: int, *, name: str = "half_width_hz"
+) -> list[Vibration]:
+    """Split a vibration into lines at the mid-points of equal parts of an interval.
+
+    They have its direction and decay rate, and together its variance.
+    """
     half = number(
         half_width_hz,
         name,
         above=0,
-        below=frequency_hz,
+        below=line.frequency_hz,
         hint="All frequencies must stay above 0 Hz.",
     )
     count = integer(lines, "lines", at_least=1, at_most=_MOST_LINES)
-    return frequency_hz + half * ((2 * np.arange(count) + 1) / count - 1)
-
-
-def spread_lines(
-    line: Vibration, frequencies_hz: Sequence[float] | FloatArray, weights: Any = None
-) -> list[Vibration]:
-    """Split a vibration into several of its direction, decay rate and total variance."""
-    count = len(frequencies_hz)
-    share = np.ones(count) if weights is None else np.atleast_1d(real_array(weights, "weights"))
-    if share.shape != (count,) or not np.all(share > 0):
-        raise ProblemError(
-            f"weights must be {count} positive numbers, one for each frequency; got {weights!r}."
-        )
-    parts = np.sqrt(share / share.sum())
-    return [
-        replace(line.at_frequency(float(f)), rms_nm=line.rms_nm * float(part))
-        for f, part in zip(frequencies_hz, parts, strict=True)
-    ]
+    places = line.frequency_hz + half * ((2 * np.arange(count) + 1) / count - 1)
+    rms_nm = line.rms_nm / float(np.sqrt(count))
+    return [replace(line.at_frequency(f), rms_nm=rms_nm) for f in places.tolist()]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -267,26 +267,6 @@ def test_a_file_describes_its_sensors(sensors_config):
     assert sensors_config.truth.motions == plant.motions
 
 
-def test_the_own_sensor_among_the_others(tmp_path, sensors_config):
-    own = "  wavefront: {rate_hz: 1000, delay_frames: 2, noise_nm: 75}\n"
-    written = load_sensors(
-        tmp_path,
-        ("loop: {frame_rate_hz: 1000, delay_frames: 2, axes: 2}\nsensor: {noise_nm: 75}\n", ""),
-        ("sensors:\n", f"sensors:\n{own}"),
-    )
-    assert written.plant.hardware.suite.units == sensors_config.plant.hardware.suite.units
-    assert np.array_equal(written.plant.A, sensors_config.plant.A)
-    assert np.array_equal(written.plant.C, sensors_config.plant.C)
-
-
-def test_the_own_sensor_alone_is_the_loop(tmp_path):
-    text = SENSORS[: SENSORS.index("loop:")] + "sensors: {wavefront: {rate_hz: 500, noise_nm: 9}}\n"
-    text += "model: {turbulence: {kind: ar, coefficients: [0.9], driving_rms_nm: 5}}\n"
-    config = lbt.load_config(write_sensors(tmp_path, text))
-    assert config.plant.hardware.suite.units == ("wavefront",)
-    assert config.hardware.frame_rate_hz == 500
-
-
 def test_lines_of_the_truth_name_their_channels(tmp_path):
     line = "{axis: tip, kind: sinusoid, frequency_hz: 21, rms_nm: 400, accelerometers: {m1: {motion_nm_per_nm: 3}}}"
     config = load_sensors(
@@ -327,7 +307,7 @@ def test_correlated_noise(tmp_path):
         (", noise_nm: 20}", "}", "exactly one of noise_nm, noise_m_s2, covariance"),
         ("channels: [m1, m2], ", "", "channels is missing"),
         ("{rate_hz: 500, delay", "{rate: 500, delay", "unknown key sensors.slow.rate"),
-        ("  slow: {rate_hz: 500,", "  wavefront: {rate_hz: 500,", "frame_rate_hz 1000"),
+        ("  slow: {rate_hz: 500,", "  wavefront: {rate_hz: 500,", "none of them 'wavefront'"),
     ],
 )
 def test_mistakes_are_named(tmp_path, old, new, said):

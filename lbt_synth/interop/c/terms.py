@@ -131,11 +131,10 @@ def _filter_terms(design: Any) -> SourceTerms:
     plant = design.problem
     full = plant.full()
     n, s, m = plant.n_states, full.n_states, plant.hardware.n_commands
-    A, _, C, _ = full.stacks()
     transition = np.zeros((plant.period, s, s + m))
-    transition[:, :, :s], transition[:, :, s:] = A, full.B_known
+    transition[:, :, :s], transition[:, :, s:] = full.A, full.B_known
     predicted = np.zeros((plant.period, plant.n_measurements, s + m))
-    predicted[:, :, :s], predicted[:, :, s:] = C, full.D_known
+    predicted[:, :, :s], predicted[:, :, s:] = full.C, full.D_known
     filters = {(): design.gain_predictor} | {f.missing: f.gains for f in design.fallbacks}
     states = design.controller.stacks()[2][0]
     return SourceTerms(

@@ -29,113 +29,64 @@ from lbt_synth.models.plant.assembly import PlantParts, known_states, plant_matr
 from lbt_synth.models.sensor_suite import Motions, SensorSuite, noise_factor
 from lbt_synth.models.spectra import ARModel
 from lbt_synth.models.truth import Entering, disturbance_facts
-from lbt_synth.models.vibration import Vibration, line_frequencies, spread_lines
+from lbt_synth.models.vibration import Vibration, spread_lines
 from lbt_synth.storage.rows import fact_table
 from lbt_synth.storage.summaries import Summary
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     FloatArray,
-    frozen_copy,
     integer,
     one_or_each,
-    real_array,
     require_instance,
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FullStatePlant(EstimationProblem):
-    """The plant with its past commands as states (the paper's full form).
+class FullForm:
+    """The paper's full form of a plant: with the mirror's states, past commands if it settles.
 
-    ``x(k+1) = A x(k) + B_known u(k-1) + B w(k)``,
-    ``y(k) = C x(k) + D_known u(k-1) + D w(k)``; ``D_known`` is zero from a
-    delay of two frames up. ``L`` is the paper's F.
-
-    Parameters
-    ----------
-    B_known : (n, m) array_like
-        Known input to state.
-    D_known : (q, m) array_like
-        Known input to measurement.
-    reduced : TipTiltPlant
-        The same plant without its past commands.
+    ``x(k+1) = A x(k) + B_known u(k-1) + B w(k)``, ``y(k) = C x(k) + D_known u(k-1) + D w(k)``;
+    ``L`` is the paper's F. Where sensors have a longer period, all but D and L are stacks of a
+    matrix for each phase.
     """
 
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    L: FloatArray
     B_known: FloatArray
-    D_known: FloatArray
-    reduced: TipTiltPlant
+    D_known: FloatArray  # zero from a delay of two frames up
+    dt_s: float
 
     @property
-    def hardware(self) -> LoopHardware:
-        """The loop."""
-        return self.reduced.hardware
+    def n_states(self) -> int:
+        """Number of states n."""
+        return int(self.L.shape[1])
 
-    def controller(self, gain_predictor: FloatArray) -> Controller:
-        """Return the controller from y(k) to u(k), the known input included, in new-state form.
+    def controller(self, gain_predictor: FloatArray, to_command: FloatArray) -> Controller:
+        """Return the controller ``u(k) = to_command x_hat(k+1 | k)``, in new-state form.
 
-        ``u(k) = N^+ L x_hat(k+1 | k)``; the past command u(k-1) is therefore
-        ``N^+ L x_hat(k | k-1)`` and needs no state of its own. The predictor gain is over the full
-        state, (n, q).
+        The past command u(k-1) is ``to_command x_hat(k | k-1)`` and needs no state of its own. The
+        known input has no error, so that the gain is over the reduced state, (r, q).
         """
-        gain = self.checked_gain(gain_predictor)
-        to_command = self.hardware.projector @ self.L
+        gain = self._padded(gain_predictor)
         applied = self.B_known - gain @ self.D_known
         A = self.A - gain @ self.C + applied @ to_command
-        D = np.zeros((to_command.shape[0], gain.shape[-1]))
+        D = np.zeros((len(to_command), gain.shape[-1]))
         return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s, applied=applied)
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Estimator of z from ``[y(k), u(k-1)]``, whatever gave that command, in new-state form.
-
-        The predictor gain is over the full state, (n, q).
-        """
-        gain = self.checked_gain(gain_predictor)
+        """Return the estimator of z from ``[y(k), u(k-1)]``, in new-state form."""
+        gain = self._padded(gain_predictor)
         B = np.concatenate([gain, self.B_known - gain @ self.D_known], axis=-1)
-        D = np.zeros((self.L.shape[0], B.shape[-1]))
+        D = np.zeros((len(self.L), B.shape[-1]))
         return Controller(A=self.A - gain @ self.C, B=B, C=self.L, D=D, dt_s=self.dt_s)
 
-    def ahead(self, frames: int) -> EstimationProblem:
-        """Refuse any horizon but one; the reduced plant has the others."""
-        if frames != 1:
-            raise ProblemError(
-                f"a plant with its commands as states has a horizon of 1; got {frames!r}. "
-                "Try plant.ahead(frames).full() on the reduced plant."
-            )
-        return self
-
-    def with_memory(self, taps: FloatArray) -> EstimationProblem:
-        """Return the plant with past innovations as states, which no command reaches.
-
-        The taps (l, T q) weight the innovations, the newest first.
-        """
-        bare = EstimationProblem(A=self.A, B=self.B, C=self.C, D=self.D, L=self.L)
-        longer = bare.with_memory(taps)
-        more = longer.n_states - self.n_states
-        return replace(
-            self,
-            **{name: getattr(longer, name) for name in "ABCL"},
-            reduced=self.reduced.with_memory(taps),
-            B_known=np.vstack([self.B_known, np.zeros((more, self.B_known.shape[1]))]),
-        )
-
-    def generalised(self) -> tuple[FloatArray, FloatArray]:
-        """Matrices of the H-infinity filter's generalised plant (eq. 8, errata 2 and 7).
-
-        The first (n + l + q, n + p + l) maps ``[x(k), w(k), z_hat(k)]`` to
-        ``[x(k+1), z_hat(k) - z(k), y(k)]``; the second holds the columns of the known input u(k-1).
-        """
-        self.require_one_phase("the generalised plant", "that of a phase")
-        n, p = self.B.shape
-        outputs, q = self.L.shape[0], self.C.shape[0]
-        plant = np.block(
-            [
-                [self.A, self.B, np.zeros((n, outputs))],
-                [-self.L, np.zeros((outputs, p)), np.eye(outputs)],
-                [self.C, self.D, np.zeros((q, outputs))],
-            ]
-        )
-        known = np.vstack([self.B_known, np.zeros((outputs, self.B_known.shape[1])), self.D_known])
-        return plant, known
+    def _padded(self, gain: FloatArray) -> FloatArray:
+        """Return a gain over the reduced state as one over all states."""
+        shape = (*gain.shape[:-2], self.n_states - gain.shape[-2], gain.shape[-1])
+        return np.concatenate([gain, np.zeros(shape)], axis=-2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -177,7 +128,7 @@ class TipTiltPlant(EstimationProblem):
         facts = disturbance_facts(self.turbulence, self.vibrations, deviations)
         return Summary(tables=[fact_table("Plant", self.hardware.facts(), facts)])
 
-    def full(self) -> FullStatePlant:
+    def full(self) -> FullForm:
         """Return the same plant with the mirror's states, which are past commands if it settles.
 
         Examples
@@ -196,33 +147,28 @@ class TipTiltPlant(EstimationProblem):
         whole = np.zeros((self.period, n + past, n + past))
         whole[:, :n, :n], whole[:, n:, n:] = A, A_known
         entry = np.concatenate([np.zeros((self.period, n, B_known.shape[-1])), B_known], axis=1)
-        single = self.period == 1
-        return FullStatePlant(
-            A=whole,
-            B=np.concatenate([B, np.zeros((self.period, past, B.shape[-1]))], axis=1),
-            C=np.concatenate([C, C_known], axis=2),
+        stacks = {
+            "A": whole,
+            "B": np.concatenate([B, np.zeros((self.period, past, B.shape[-1]))], axis=1),
+            "C": np.concatenate([C, C_known], axis=2),
+            "B_known": entry,  # u(k-1) is the input
+            "D_known": D_known,
+        }
+        return FullForm(
+            **{name: stack[0] if self.period == 1 else stack for name, stack in stacks.items()},
             D=self.D,
             L=np.hstack([self.L, np.zeros((len(self.L), past))]),
-            read=self.read,
-            B_known=frozen_copy(entry[0] if single else entry),  # u(k-1) is the input
-            D_known=frozen_copy(D_known[0] if single else D_known),
-            reduced=self,
             dt_s=self.dt_s,
         )
-
-    @property
-    def reduced(self) -> TipTiltPlant:
-        """The plant itself: a full form has its reduced form by this name."""
-        return self
 
     def controller(self, gain_predictor: FloatArray) -> Controller:
         """Return the controller from y(k) to u(k), the known input included, in new-state form.
 
         Its states are those of the reduced estimator, to which the gain (n, q) belongs, and the
-        mirror's.
+        mirror's; ``u(k) = N^+ L x_hat(k+1 | k)``.
         """
         full = self.full()
-        return full.controller(self._padded(gain_predictor, full))
+        return full.controller(self.checked_gain(gain_predictor), self.hardware.projector @ full.L)
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:
         """Estimator of z from ``[y(k), u(k-1)]``, whatever gave that command, in new-state form.
@@ -230,8 +176,7 @@ class TipTiltPlant(EstimationProblem):
         The known input is removed exactly, so the estimation error does not depend on it. The
         predictor gain is over the reduced state, (n, q).
         """
-        full = self.full()
-        return full.estimator(self._padded(gain_predictor, full))
+        return self.full().estimator(self.checked_gain(gain_predictor))
 
     def ahead(self, frames: int) -> TipTiltPlant:
         """Plant of the estimate of ``z(k + frames)`` from y up to k: a loop of another delay.
@@ -359,12 +304,6 @@ class TipTiltPlant(EstimationProblem):
         require_instance(suite, SensorSuite, "suite")
         hardware = replace(self.hardware, suite=suite)
         return assemble(replace(self.parts(), hardware=hardware, motions=motions))
-
-    def _padded(self, gain_predictor: FloatArray, full: FullStatePlant) -> FloatArray:
-        """Gain over the full state; the known input has no error and needs no gain."""
-        gain = self.checked_gain(gain_predictor)
-        shape = (*gain.shape[:-2], full.n_states - self.n_states, gain.shape[-1])
-        return np.concatenate([gain, np.zeros(shape)], axis=-2)
 
 
 def tip_tilt_plant(
@@ -497,34 +436,21 @@ def with_vibrations(plant: TipTiltPlant, vibrations: Sequence[Vibration]) -> Tip
     return assemble(replace(plant.parts(), vibrations=tuple(vibrations)))
 
 
-def spread_plant(
-    plant: TipTiltPlant,
-    *,
-    half_width_hz: float | None = None,
-    lines: int = 5,
-    frequencies_hz: ArrayLike | None = None,
-    weights: ArrayLike | None = None,
-) -> TipTiltPlant:
+def spread_plant(plant: TipTiltPlant, *, half_width_hz: float, lines: int = 5) -> TipTiltPlant:
     """Return a plant whose vibrations have a distribution of frequencies.
 
-    Each vibration becomes several of the same direction and decay rate, its variance shared
-    among them by the weights. Their sum has the mean spectrum of the plants with one of
-    these frequencies each, so :func:`kalman` of the result has the least variance on
-    average over the distribution.
+    Each vibration becomes several of the same direction, decay rate and rms. Their sum has the mean
+    spectrum of the plants with one of these frequencies each, so :func:`kalman` of the result has
+    the least variance on average over the distribution.
 
     Parameters
     ----------
     plant : TipTiltPlant
         The plant.
-    half_width_hz : float, optional
+    half_width_hz : float
         The frequencies are the mid-points of equal parts of [f - h, f + h], for each f [Hz].
     lines : int, optional
-        Number of parts, at most 64; with ``half_width_hz``.
-    frequencies_hz : (lines,) array_like, optional
-        The frequencies themselves [Hz], instead of a half width; for a plant whose
-        vibrations share one frequency.
-    weights : (lines,) array_like, optional
-        Probabilities of the frequencies, in proportion; equal by default.
+        Number of parts, at most 64.
 
     Returns
     -------
@@ -534,8 +460,7 @@ def spread_plant(
     Raises
     ------
     ProblemError
-        If there is no vibration, neither or both of half width and frequencies are given, or
-        a frequency leaves (0, Nyquist).
+        If there is no vibration, or a frequency leaves (0, Nyquist).
 
     Examples
     --------
@@ -555,24 +480,7 @@ def spread_plant(
             "a frequency prior needs a plant with a vibration; got one without any. Try "
             "tip_tilt_plant(..., vibrations=[Vibration(...)])."
         )
-    if (half_width_hz is None) == (frequencies_hz is None):
-        raise ProblemError(
-            "give one of half_width_hz and frequencies_hz; "
-            f"got half_width_hz={half_width_hz!r} and frequencies_hz={frequencies_hz!r}."
-        )
-    first = plant.vibrations[0].frequency_hz
-    made: list[Vibration] = []
-    motions: Motions = ()
-    for line, motion in zip(plant.vibrations, plant.motions, strict=True):
-        if frequencies_hz is None:
-            given = line_frequencies(line.frequency_hz, half_width_hz, lines)
-        else:
-            given = np.atleast_1d(real_array(frequencies_hz, "frequencies_hz"))
-            if line.frequency_hz != first:
-                raise ProblemError(
-                    "frequencies_hz is for vibrations of one frequency; got vibrations at "
-                    f"{first:.6g} and {line.frequency_hz:.6g} Hz. Try half_width_hz."
-                )
-        made += spread_lines(line, given, weights)
-        motions += (motion,) * (len(made) - len(motions))
-    return assemble(replace(parts, vibrations=tuple(made), motions=motions))
+    shares = [spread_lines(line, half_width_hz, lines) for line in plant.vibrations]
+    spread = tuple(line for share in shares for line in share)
+    motions = tuple(motion for motion in plant.motions for _ in range(lines))
+    return assemble(replace(parts, vibrations=spread, motions=motions))
