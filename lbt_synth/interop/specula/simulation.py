@@ -15,8 +15,14 @@ from lbt_synth.design import Design
 from lbt_synth.design.modal import MixedController
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.interop.specula.calibration import Calibration, cache_directory, calibrate
-from lbt_synth.interop.specula.optics import EndToEndSystem, Modes, Optics
+from lbt_synth.interop.specula.optics import (
+    Calibration,
+    EndToEndSystem,
+    Modes,
+    Optics,
+    cache_directory,
+    calibrate,
+)
 from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
 from lbt_synth.loop.simulation.run import SteppedController, run_frames
