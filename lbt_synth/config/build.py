@@ -173,16 +173,9 @@ def vibration_numbers(
         key = f"{owner}.vibrations[{i}]"
         _require_below_nyquist(section.frequency_hz, rate, f"{key}.frequency_hz")
         for direction in _directions(section, axes, key):
-            yield (
-                section,
-                key,
-                {
-                    "frequency_hz": section.frequency_hz,
-                    "damping": section.damping,
-                    "rms_nm": vibration_rms_nm(section, settings, key),
-                    "direction": direction,
-                },
-            )
+            place = {"frequency_hz": section.frequency_hz, "direction": direction}
+            rms_nm = vibration_rms_nm(section, settings, key)
+            yield section, key, {**place, "damping": section.damping, "rms_nm": rms_nm}
 
 
 def _directions(
@@ -438,24 +431,13 @@ def build_end_to_end_setup(
     telescope, air = require_telescope(settings, hint), require_atmosphere(settings, hint)
     pyramid, modes = settings.sensor.pyramid, settings.mirror.modes
     calibrated = "must be left out for an end-to-end simulation, which calibrates it in nanometres"
-    turbulence = settings.true_turbulence
+    turbulence, screens = settings.true_turbulence, "must be a length: phase screens have an end"
+    needs = "for an end-to-end simulation"
     for key, right, why in (
         ("sensor.pyramid", pyramid is not None, f"is missing; {hint}"),
-        (
-            "atmosphere.outer_scale_m",
-            air.outer_scale_m is not None,
-            "must be a length: phase screens have an end. Try 25",
-        ),
-        (
-            "truth.turbulence",
-            turbulence == "frozen_flow",
-            f"must be frozen_flow for an end-to-end simulation; got {turbulence}",
-        ),
-        (
-            "loop.axes",
-            hardware.modes == 2,
-            f"must be 2, as an end-to-end simulation needs tip and tilt; got {hardware.modes}",
-        ),
+        ("atmosphere.outer_scale_m", air.outer_scale_m is not None, f"{screens}. Try 25"),
+        ("truth.turbulence", turbulence == "frozen_flow", f"must be frozen_flow {needs}"),
+        ("loop.axes", hardware.modes == 2, f"must be 2, tip and tilt, {needs}"),
         ("mirror.modes", modes is not None, f"is missing; {hint}"),
         ("sensor.matrix", settings.sensor.matrix is None, calibrated),
         ("mirror.influence_matrix", settings.mirror.influence_matrix is None, calibrated),

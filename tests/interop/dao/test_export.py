@@ -91,14 +91,11 @@ def shaped_run(shaped):
     return total, noise, own[0, 1000:, 0]
 
 
-@pytest.mark.parametrize("order", [20, 16])
-def test_a_shaped_design_that_single_precision_breaks_is_made_again(
-    tmp_path, shaped, shaped_run, order
-):
+def test_a_shaped_design_that_single_precision_breaks_is_made_again(tmp_path, shaped, shaped_run):
     """In the arithmetic of the computer the loop leaves what the design leaves in double."""
-    written = lbt.interop.export(tmp_path / "k.npy", shaped, "dao", order=order)
+    written = lbt.interop.export(tmp_path / "k.npy", shaped, "dao", order=20)
     matrix = np.load(written.files[0])
-    assert matrix.shape == (2 * order + 1, 1)
+    assert matrix.shape == (41, 1)
     assert max(written_radius(matrix, gain) for gain in np.geomspace(0.5, 1.2, 40)) < 1
     beside = json.loads((tmp_path / "k.npy.certificate.json").read_text())
     assert written.notes[0].startswith("made again for single precision")
