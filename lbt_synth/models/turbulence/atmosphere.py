@@ -44,7 +44,6 @@ _VON_KARMAN = 0.0228956  # phase spectrum constant, Noll's 0.023 to more digits
 
 _PER_LOOP = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")
 _TERMS = 12  # of the polynomial over an octave of the outer scale
-_FEW_SCALES = 16  # up to this many outer scales have a table each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -305,7 +304,7 @@ class FrozenFlows:
         x = np.log(frequency) + np.log(unique.real[:, None])
         values = np.empty(x.shape)
         ratios = np.unique(unique.imag)
-        if len(ratios) <= _FEW_SCALES:
+        if len(ratios) <= _TERMS:  # a polynomial needs as many tables
             for ratio in ratios:
                 rows = unique.imag == ratio
                 values[rows] = tilt_spline(float(ratio), air.obstruction)(x[rows])
