@@ -15,11 +15,11 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 4480,
-    "config": 1900,
+    "config": 1876,
     "design": 8220,
     "files": 1608,
     "identification": 11270,
-    "interop": 4375,
+    "interop": 4440,
     "linear": 6078,
     "loop": 5050,
     "methods": 1109,
@@ -30,10 +30,10 @@ LINES = {
     "errors, validation": 642,
 }
 COUNTS = {
-    "files of the package": 284,
-    "public names": 237,
-    "tuned constants": 696,
-    "lines of tests": 41320,
+    "files of the package": 265,
+    "public names": 236,
+    "tuned constants": 694,
+    "lines of tests": 41100,
     "words of docs": 75543,
 }
 

@@ -277,50 +277,52 @@ def export(
     ...     np.load(file).tolist()
     [[0.5, 0.5, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
     """
-    own = target_named(target)
-    given = {"modes": modes, "other_gain": other_gain}
-    options |= {name: value for name, value in given.items() if value is not None}
-    if unknown := options.keys() - own.options.keys():
+    program = target_named(target)
+    mode_options = {"modes": modes, "other_gain": other_gain}
+    options |= {name: value for name, value in mode_options.items() if value is not None}
+    if unknown := options.keys() - program.options.keys():
         raise ProblemError(f"{min(unknown)} is no option of target {target}. Leave it out.")
-    settings = {**own.options, **options}
-    place = require_ending(path, f"a file for {target}", own.endings) if own.endings else Path(path)
+    settings = {**program.options, **options}
+    place = Path(path)
+    if program.endings:
+        place = require_ending(path, f"a file for {target}", program.endings)
     parts, count = mode_designs(
         design,
         target,
         modes=modes,
         other_gain=other_gain,
         hardware=hardware,
-        modal=modes is not None if own.modal is None else own.modal,
-        mixed=own.mixed,
-        reads_others=own.reads_others,
+        modal=modes is not None if program.modal is None else program.modal,
+        mixed=program.mixed,
+        reads_others=program.reads_others,
     )
     first = parts[0].design
     origin = _provenance_lines(first, gain_digest)
-    numbers = own.round([part.design for part in parts], **settings)
-    whole = own.join(numbers, parts, count)
+    numbers = program.round([part.design for part in parts], **settings)
+    file_numbers = program.join(numbers, parts, count)
     pairs = list(zip(parts, numbers, strict=True))
-    error = max(rehearsal_error(part.design, own.start(held, np.inf)) for part, held in pairs)
-    precision = settings.get("precision", own.arithmetic.precision)
-    files = own.write(place, whole, first, origin, gain_digest=gain_digest, **settings)
-    again = own.read(files, whole)
-    if not _is_same(again, whole):
+    error = max(rehearsal_error(part.design, program.start(held, np.inf)) for part, held in pairs)
+    precision = settings.get("precision", program.arithmetic.precision)
+    files = program.write(place, file_numbers, first, origin, gain_digest=gain_digest, **settings)
+    again = program.read(files, file_numbers)
+    if not _is_same(again, file_numbers):
         raise NumericalError(
             "the file must hold the numbers that are proved; what is read from it is another.",
             status="arithmetic",
         )
-    checks = _proved(own, pairs, error)
-    _require_proved(target, precision, checks, error, own.hint)
-    remarks = [own.remark(part.design, held) for part, held in pairs]
+    checks = _proved(program, pairs, error)
+    _require_proved(target, precision, checks, error, program.hint)
+    remarks = [program.remark(part.design, held) for part, held in pairs]
     notes = list(dict.fromkeys(filter(None, remarks)))
-    if own.contents:
+    if program.contents:
         make_directory(place, parents=False)
-    settings |= {"modes": count, "notes": notes, **own.facts(whole, **settings)}
+    settings |= {"modes": count, "notes": notes, **program.facts(file_numbers, **settings)}
     kept = {name: settings[name] for name in sorted(settings) if settings[name] is not None}
-    certificate = _certificate(files, target, own.arithmetic, checks, gain_digest, kept)
+    certificate = _certificate(files, target, program.arithmetic, checks, gain_digest, kept)
     return Exported(
         files=write_together(dict((*files.items(), *certificate.items()))),
         error=error,
-        start=lambda limit: own.start(again, limit),
+        start=lambda limit: program.start(again, limit),
         checks=checks,
         notes=tuple(notes),
     )
@@ -353,19 +355,19 @@ def _is_same(one: Any, other: Any) -> bool:
     if isinstance(one, Mapping):
         return one.keys() == other.keys() and all(_is_same(one[key], other[key]) for key in one)
     if is_dataclass(one):
-        names = (each.name for each in fields(one))
+        names = (entry.name for entry in fields(one))
         return all(_is_same(getattr(one, name), getattr(other, name)) for name in names)
     return bool(one == other)
 
 
 def _proved(
-    own: Target, pairs: Sequence[tuple[ModeDesign, Any]], error: float
+    program: Target, pairs: Sequence[tuple[ModeDesign, Any]], error: float
 ) -> tuple[Check, ...]:
     """Check the loop of each design with its numbers in the file."""
     checks: list[Check] = []
     controlled = sum(len(part.modes) for part, _ in pairs)
     for part, numbers in pairs:
-        proof = list(prove_written(part.design, own.computed(part.design, numbers)))
+        proof = list(prove_written(part.design, program.computed(part.design, numbers)))
         if part.design.other_sensors:
             how = "a run in which each sensor is missing for a while"
             name = "commands in a rehearsal, difference"

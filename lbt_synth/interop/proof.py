@@ -85,8 +85,8 @@ def sums_variance(
     """
 
     def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
-        own = measured.size - signals
-        terms = np.abs(whole) * np.concatenate([measured[own:], commands, measured[:own]])
+        direct = measured.size - signals
+        terms = np.abs(whole) * np.concatenate([measured[direct:], commands, measured[:direct]])
         sums = np.where(terms > 0, np.cumsum(terms, axis=1), 0.0)
         return np.asarray(roundoff**2 / 3 * np.sum(terms**2 + sums**2, axis=1))
 
@@ -153,8 +153,8 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
         return checks
     inside = (gain for gain in scenario_gains(design) if low <= gain <= high)
     checks += (_residual_check(design, hardware, written, gain) for gain in inside)
-    own, other = (close_loop(hardware, c) for c in (design.controller, controller))
-    before, after = (hinf_norm(loop.output_sensitivity()).value for loop in (own, other))
+    exact, other = (close_loop(hardware, c) for c in (design.controller, controller))
+    before, after = (hinf_norm(loop.output_sensitivity()).value for loop in (exact, other))
     change = written.response_change
     after += change(1.0) if change else 0.0
     checks.append(Check("modulus margin, loss", float(after / before) - 1, LOSS, "level sets"))
@@ -280,8 +280,8 @@ def _mode_of(loop: ClosedLoop, mode: int, rows: slice) -> SingleModeLoop:
     direct = [s.D[:, mode], s.D[:, n:] @ hardware.sensor[:, mode]]
     system = replace(s, B=np.stack(inputs, axis=1), C=s.C[rows], D=np.stack(direct, axis=1)[rows])
     one = hardware.single_mode()
-    own = replace(loop, system=system, hardware=one)
-    loops = {loop.sensor_gain: own}
+    mode_loop = replace(loop, system=system, hardware=one)
+    loops = {loop.sensor_gain: mode_loop}
     return SingleModeLoop(hardware=one, controller=loop.controller, in_frames=True, _loops=loops)
 
 

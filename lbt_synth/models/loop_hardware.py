@@ -109,12 +109,12 @@ class LoopHardware(Summarised):
             n = influence.shape[0]
         if n < 1 or (influence is not None and influence.shape[1] < 1):
             raise ProblemError(f"a loop needs at least one mode and one command; got {n} modes.")
-        given = {"sensor_matrix": sensor, "influence_matrix": influence}
-        for name, value in given.items():
+        matrices = {"sensor_matrix": sensor, "influence_matrix": influence}
+        for name, value in matrices.items():
             if value is not None and not np.any(value):
                 raise ProblemError(f"{name} must respond to something; got only zeros.")
-            given[name] = frozen_copy(np.eye(n)) if value is None else value
-        check_fields(self, modes=n, **given)
+            matrices[name] = frozen_copy(np.eye(n)) if value is None else value
+        check_fields(self, modes=n, **matrices)
         if self.mirror is not None:
             _ = self.mirror_system  # refuses a mirror that does not fit the frame rate
 

@@ -116,8 +116,10 @@ class WavefrontSensor:
     sensor_matrix: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        given = None if self.sensor_matrix is None else matrix(self.sensor_matrix, "sensor_matrix")
-        check_fields(self, sensor_matrix=given)
+        response = (
+            None if self.sensor_matrix is None else matrix(self.sensor_matrix, "sensor_matrix")
+        )
+        check_fields(self, sensor_matrix=response)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -312,7 +314,7 @@ class SensorSuite:
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of all accelerometer channels."""
-        return tuple(name for each in self.accelerometers for name in each.channels)
+        return tuple(name for sensor in self.accelerometers for name in sensor.channels)
 
     def period(self, hardware: LoopHardware) -> int:
         """Return the common period of all sensors [frames of the loop]."""
@@ -341,7 +343,7 @@ class SensorSuite:
     def marked(self, units: tuple[str, ...], hardware: LoopHardware) -> BoolArray:
         """Return which measurements some sensors or channels give, (q,)."""
         rows = self.rows(hardware)
-        out = np.zeros(max(own.stop for own in rows.values()), dtype=np.bool_)
+        out = np.zeros(max(place.stop for place in rows.values()), dtype=np.bool_)
         for unit in units:
             if unit not in rows:
                 raise ProblemError(
@@ -352,7 +354,7 @@ class SensorSuite:
 
     def noise_factor(self, own: FloatArray, modes: int) -> FloatArray:
         """Return the square root of all noise, from that of the loop's own sensor, (q, q)."""
-        return np.asarray(block_diag(own, *(each.noise_factor(modes) for each in self.sensors)))
+        return np.asarray(block_diag(own, *(sensor.noise_factor(modes) for sensor in self.sensors)))
 
     def read(self, hardware: LoopHardware) -> BoolArray:
         """Return which measurements are read in each frame of the common period, (N, q)."""

@@ -245,13 +245,13 @@ class SumSpectrum:
     @property
     def breakpoints_hz(self) -> FloatArray:
         """Frequencies where one of the parts says that it has kinks [Hz]."""
-        kinks = [breakpoints_below(part, np.inf) for part in self.parts]
+        kinks = [breakpoints_below(spectrum, np.inf) for spectrum in self.parts]
         return frozen_copy(np.unique(np.concatenate(kinks)))
 
     def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """Return the spectrum at frequencies [Hz], the sum of the parts' [nm^2/Hz]."""
         x = real_array(frequency_hz, "frequency_hz")
-        return np.asarray(sum(part.psd(x) for part in self.parts), dtype=np.float64)
+        return np.asarray(sum(spectrum.psd(x) for spectrum in self.parts), dtype=np.float64)
 
 
 def spectrum_density(spectrum: Spectrum, frequency_hz: FloatArray) -> FloatArray:

@@ -54,7 +54,7 @@ def disturbance_facts(
 ) -> DisturbanceFacts:
     """Return the facts of disturbances; what axes have in common is said once."""
     return DisturbanceFacts(
-        turbulence=_join(_spectrum_text(each) for each in turbulence),
+        turbulence=_join(_spectrum_text(spectrum) for spectrum in turbulence),
         vibrations=_vibrations_text(vibrations),
         noise_nm=_join(nm_text(noise, _DIGITS) for noise in np.ravel(noise_nm)),
         sensor_gain=sensor_gain,
@@ -156,8 +156,8 @@ class Truth(Summarised):
     motions: Motions = ()
 
     def __post_init__(self) -> None:
-        given = self.turbulence
-        parts = tuple(given) if isinstance(given, Sequence) else (given,)
+        turbulence = self.turbulence
+        parts = tuple(turbulence) if isinstance(turbulence, Sequence) else (turbulence,)
         if not parts:
             raise DimensionError(
                 "turbulence must be one spectrum, or one per mode; got an empty sequence. For no "
@@ -178,7 +178,7 @@ class Truth(Summarised):
         noise = one_or_each(self.noise_nm, "noise_nm", at_least=0)
         check_fields(
             self,
-            turbulence=parts if isinstance(given, Sequence) else given,
+            turbulence=parts if isinstance(turbulence, Sequence) else turbulence,
             vibrations=tuple(self.vibrations),
             noise_nm=float(noise) if noise.ndim == 0 else noise,
             frequency_errors_hz=self._checked_errors(),
@@ -295,11 +295,11 @@ class Truth(Summarised):
 
         Equal AR models are one spectrum. Spectra for another number of modes are a DimensionError.
         """
-        found: dict[object, tuple[Spectrum, list[int]]] = {}
+        groups: dict[object, tuple[Spectrum, list[int]]] = {}
         for mode, spectrum in enumerate(self.turbulence_per_mode(modes)):
             if spectrum is not None:
-                found.setdefault(spectrum_key(spectrum), (spectrum, []))[1].append(mode)
-        return tuple((spectrum, tuple(own)) for spectrum, own in found.values())
+                groups.setdefault(spectrum_key(spectrum), (spectrum, []))[1].append(mode)
+        return tuple((spectrum, tuple(members)) for spectrum, members in groups.values())
 
     def noise_per_measurement(self, measurements: int) -> FloatArray:
         """Return the standard deviation of the noise on each measurement, (q,) [nm].

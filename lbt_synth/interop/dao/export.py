@@ -235,13 +235,13 @@ def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float3
     least, best = np.inf, steps
     for _ in range(_ORDERS):
         order = rng.permutation(used.size)
-        R, wanted, whole = np.linalg.qr(triangle[:, order])[1], steps[order], np.zeros(used.size)
+        R, wanted, nearest = np.linalg.qr(triangle[:, order])[1], steps[order], np.zeros(used.size)
         for k in range(used.size - 1, -1, -1):
-            made_up = R[k, k + 1 :] @ (wanted[k + 1 :] - whole[k + 1 :]) / R[k, k]
-            whole[k] = np.round(wanted[k] + made_up)
-        miss = float(np.linalg.norm(R @ (whole - wanted)))
+            made_up = R[k, k + 1 :] @ (wanted[k + 1 :] - nearest[k + 1 :]) / R[k, k]
+            nearest[k] = np.round(wanted[k] + made_up)
+        miss = float(np.linalg.norm(R @ (nearest - wanted)))
         if miss < least:
-            least, best = miss, whole[np.argsort(order)]
+            least, best = miss, nearest[np.argsort(order)]
     rounded = np.zeros(exact.size, dtype=np.float32)
     rounded[used] = best * step
     return rounded

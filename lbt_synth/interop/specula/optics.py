@@ -332,8 +332,8 @@ class Optics:
         self._tilts.value[:] = tilts_nm
         if self._weather:
             self._weather[0].value[:] = seeing * self.system.reference_seeing_arcsec
-        for given in (self._commands, self._tilts, self._pupil, *self._weather):
-            given.generation_time = self._time_ns
+        for signal in (self._commands, self._tilts, self._pupil, *self._weather):
+            signal.generation_time = self._time_ns
         self._trigger(self._train)
         return np.array(self._slopes.outputs["out_slopes"].slopes, dtype=np.float64)
 

@@ -118,8 +118,8 @@ class EndToEndRun:
         y, phase = self.measurements[1:, modes], self.residual_nm[:-1, modes]
         power = np.sum(phase**2, axis=axis)
         gain = np.asarray(np.sum(y * phase, axis=axis) / power)
-        left = np.mean((y - gain * phase) ** 2, axis=axis)
-        return gain, np.asarray(np.sqrt(left / power)), np.asarray(np.sqrt(left))
+        rest = np.mean((y - gain * phase) ** 2, axis=axis)
+        return gain, np.asarray(np.sqrt(rest / power)), np.asarray(np.sqrt(rest))
 
     @property
     def tip_tilt_gain(self) -> float:

@@ -275,9 +275,11 @@ def _integrals(loop: PositionLoop, ways: FloatArray, ends: FloatArray) -> FloatA
     """
     per_sample = loop.position_integral(1.0) @ ways
     before = np.vstack([np.zeros(ways.shape[2]), np.cumsum(per_sample, axis=0)])
-    whole = np.minimum(ends.astype(np.int64), len(ways) - 1)
-    parts = [loop.position_integral(end - i) @ ways[i] for i, end in zip(whole, ends, strict=True)]
-    return np.asarray(before[whole] + np.array(parts))
+    started = np.minimum(ends.astype(np.int64), len(ways) - 1)
+    parts = [
+        loop.position_integral(end - i) @ ways[i] for i, end in zip(started, ends, strict=True)
+    ]
+    return np.asarray(before[started] + np.array(parts))
 
 
 def _taps(core: Response) -> FloatArray:
@@ -290,8 +292,8 @@ def _taps(core: Response) -> FloatArray:
             f"of {radius:.9g} per frame. Raise the bandwidth or the damping of its local loop."
         )
     taps = core.impulse(frames)
-    left = np.cumsum(np.abs(taps[::-1]))[::-1]
-    taps = taps[: max(int(np.sum(left > _TAIL)), 1)]
+    rest = np.cumsum(np.abs(taps[::-1]))[::-1]
+    taps = taps[: max(int(np.sum(rest > _TAIL)), 1)]
     return np.asarray(taps / taps.sum())
 
 

@@ -114,7 +114,7 @@ def memory(exposures: list[Exposure], modes: int, period: int) -> Memory:
     that has begun and the readings that wait are its states. Where an exposure ends within a frame,
     that frame counts for both exposures, in part.
     """
-    blocks = [_exposure_memory(each, modes, period) for each in exposures]
+    blocks = [_exposure_memory(exposure, modes, period) for exposure in exposures]
     states = [block[0].shape[1] for block in blocks]
     rows = [block[2].shape[1] for block in blocks]
     A, B = np.zeros((period, sum(states), sum(states))), np.zeros((period, sum(states), modes))
@@ -130,27 +130,27 @@ def _exposure_memory(
     exposure: Exposure, modes: int, period: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return A, B, C of the memory of one sensor, with states [sum, newest reading, older...]."""
-    own, whole = exposure.period, int(np.floor(exposure.age_frames + WHOLE))
-    late = exposure.age_frames - whole  # by which the exposure ends before its last frame does
+    frames, age = exposure.period, int(np.floor(exposure.age_frames + WHOLE))
+    late = exposure.age_frames - age  # by which the exposure ends before its last frame does
     late = 0.0 if late < WHOLE else late
-    held = 1 + (whole - own) // own  # readings that wait when one is taken
-    sums = int(own > 1 or late > 0)  # states before the readings
+    held = 1 + (age - frames) // frames  # readings that wait when one is taken
+    sums = int(frames > 1 or late > 0)  # states before the readings
     size = sums + held
-    ends = (own - whole - 1) % own  # frame of the period in which an exposure ends
+    ends = (frames - age - 1) % frames  # frame of the period in which an exposure ends
     A, B = np.zeros((period, size, size)), np.zeros((period, size))
     for t in range(period):
-        if t % own == ends:
-            B[t, sums] = (1 - late) / own
+        if t % frames == ends:
+            B[t, sums] = (1 - late) / frames
             A[t, sums + 1 :, sums:-1] = np.eye(held - 1)
             if sums:
-                A[t, 1, 0], B[t, 0] = 1.0, late / own
+                A[t, 1, 0], B[t, 0] = 1.0, late / frames
         else:
-            A[t], B[t, :sums] = np.eye(size), 1 / own
+            A[t], B[t, :sums] = np.eye(size), 1 / frames
     C = np.zeros((len(exposure.response), size * modes))
     C[:, -modes:] = exposure.response
-    each = np.eye(modes)
+    identity = np.eye(modes)
     stack = np.broadcast_to(C, (period, *C.shape))
-    return np.asarray(np.kron(A, each)), np.asarray(np.kron(B[:, :, None], each)), stack
+    return np.asarray(np.kron(A, identity)), np.asarray(np.kron(B[:, :, None], identity)), stack
 
 
 def known_states(hardware: LoopHardware) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -191,8 +191,8 @@ class PlantMatrices:
 
 def plant_matrices(parts: PlantParts) -> PlantMatrices:
     """Return the matrices of a plant from its parts."""
-    own = _own_matrices(parts)
-    return _with_other_sensors(own, parts) if parts.hardware.suite.sensors else own
+    alone = _own_matrices(parts)
+    return _with_other_sensors(alone, parts) if parts.hardware.suite.sensors else alone
 
 
 def _own_matrices(parts: PlantParts) -> PlantMatrices:
@@ -234,7 +234,7 @@ def _companion(coefficients: FloatArray) -> FloatArray:
     return A
 
 
-def _with_other_sensors(own: PlantMatrices, parts: PlantParts) -> PlantMatrices:
+def _with_other_sensors(alone: PlantMatrices, parts: PlantParts) -> PlantMatrices:
     """Add to the plant of the own sensor what the others remember and read."""
     hardware, period = parts.hardware, parts.hardware.period
     # the plant's state is that of the frame in which u(k) acts: older readings by so many frames
@@ -244,22 +244,22 @@ def _with_other_sensors(own: PlantMatrices, parts: PlantParts) -> PlantMatrices:
         for exposure in other_exposures(hardware)
     ]
     waiting = memory(late, hardware.modes, period)
-    shaken = _shaken_plant(own, parts, ahead)
+    shaken = _shaken_plant(alone, parts, ahead)
     newest = 2 * len(parts.vibrations) + parts.order * hardware.modes
-    total = own.A[newest : newest + hardware.modes]  # total(k) from x(k): it is held in x(k+1)
+    total = alone.A[newest : newest + hardware.modes]  # total(k) from x(k): it is held in x(k+1)
     n, w = shaken.A.shape[1], waiting.n_states
-    to_own = np.hstack([shaken.to_own, np.zeros((len(own.A), w))])
+    to_own = np.hstack([shaken.to_own, np.zeros((len(alone.A), w))])
     A = np.zeros((period, n + w, n + w))
     A[:, :n, :n], A[:, n:, n:] = shaken.A, waiting.A
     A[:, n:] += waiting.B @ (total @ to_own)
-    q0, q1, q2 = len(own.C), waiting.C.shape[1], len(shaken.C)
+    q0, q1, q2 = len(alone.C), waiting.C.shape[1], len(shaken.C)
     C = np.zeros((period, q0 + q1 + q2, n + w))
-    C[:, :q0], C[:, q0 : q0 + q1, n:], C[:, q0 + q1 :, :n] = own.C @ to_own, waiting.C, shaken.C
+    C[:, :q0], C[:, q0 : q0 + q1, n:], C[:, q0 + q1 :, :n] = alone.C @ to_own, waiting.C, shaken.C
     noise = hardware.suite.noise_factor(parts.noise_factor, hardware.modes)
     drives = shaken.B.shape[1]
     B, D = np.zeros((n + w, drives + len(noise))), np.zeros((len(noise), drives + len(noise)))
     B[:n, :drives], D[:, drives:] = shaken.B, noise
-    return PlantMatrices(A=A, B=B, C=C, D=D, L=own.L @ to_own)
+    return PlantMatrices(A=A, B=B, C=C, D=D, L=alone.L @ to_own)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -272,23 +272,23 @@ class _ShakenPlant:
     to_own: FloatArray  # (n0, n): to the states of the loop's own plant, older samples left out
 
 
-def _shaken_plant(own: PlantMatrices, parts: PlantParts, ahead: int) -> _ShakenPlant:
+def _shaken_plant(alone: PlantMatrices, parts: PlantParts, ahead: int) -> _ShakenPlant:
     """Put the oscillators that accelerometers see in the place of their vibrations."""
     hardware, motions, suite = parts.hardware, parts.motions, parts.hardware.suite
-    p, q0, period = len(parts.vibrations), len(own.C), hardware.period
+    p, q0, period = len(parts.vibrations), len(alone.C), hardware.period
     seen = [j for j, motion in enumerate(motions) if motion]
     lines = [
         seen_vibration(parts.vibrations[j], motions[j], suite.accelerometers, hardware, ahead=ahead)
         for j in seen
     ]
-    kept = np.delete(np.arange(len(own.A)), [*seen, *(p + j for j in seen)])
-    drives = np.delete(np.arange(own.B.shape[1] - q0), seen)
+    kept = np.delete(np.arange(len(alone.A)), [*seen, *(p + j for j in seen)])
+    drives = np.delete(np.arange(alone.B.shape[1] - q0), seen)
     size, width = len(kept) + sum(s.n_states for s in lines), len(drives)
-    to_own, C = np.zeros((len(own.A), size)), np.zeros((len(suite.channels), size))
+    to_own, C = np.zeros((len(alone.A), size)), np.zeros((len(suite.channels), size))
     to_own[kept, : len(kept)] = np.eye(len(kept))
     A = np.zeros((period, size, size))
     B = np.zeros((size, width + sum(s.B.shape[-1] for s in lines)))
-    B[: len(kept), :width] = own.B[np.ix_(kept, drives)]
+    B[: len(kept), :width] = alone.B[np.ix_(kept, drives)]
     row = len(kept)
     for j, line in zip(seen, lines, strict=True):
         line_A, line_B, line_C, _ = line.stacks()
@@ -299,5 +299,5 @@ def _shaken_plant(own: PlantMatrices, parts: PlantParts, ahead: int) -> _ShakenP
         channels = [i for i, name in enumerate(suite.channels) if name in motions[j]]
         C[channels, states] = line_C[0, 1:]
         row, width = states.stop, width + moved
-    A[:, : len(kept)] = own.A[kept] @ to_own
+    A[:, : len(kept)] = alone.A[kept] @ to_own
     return _ShakenPlant(A=A, B=B, C=C, to_own=to_own)

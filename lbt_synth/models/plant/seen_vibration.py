@@ -188,8 +188,8 @@ def _sampled(angle: float, damping: float) -> tuple[FloatArray, FloatArray]:
     The oscillator has the angular frequency ``angle``, the force a unit density.
     """
     rates = np.array([[0.0, 1.0, 0.0], [-(angle**2), -2 * damping * angle, 0.0], [1.0, 0.0, 0.0]])
-    whole = np.zeros((6, 6))
-    whole[:3, :3], whole[3:, 3:], whole[1, 4] = -rates, rates.T, 1.0
-    both = expm(whole)
+    generator = np.zeros((6, 6))
+    generator[:3, :3], generator[3:, 3:], generator[1, 4] = -rates, rates.T, 1.0
+    both = expm(generator)
     transition = both[3:, 3:].T
     return transition, np.asarray(np.linalg.cholesky(symmetrise(transition @ both[:3, 3:])))

@@ -144,11 +144,11 @@ class TipTiltPlant(EstimationProblem):
         """
         A_known, B_known, C_known, D_known = known_states(self.hardware)
         (A, B, C, _), n, past = self.stacks(), self.n_states, A_known.shape[-1]
-        whole = np.zeros((self.period, n + past, n + past))
-        whole[:, :n, :n], whole[:, n:, n:] = A, A_known
+        A_full = np.zeros((self.period, n + past, n + past))
+        A_full[:, :n, :n], A_full[:, n:, n:] = A, A_known
         entry = np.concatenate([np.zeros((self.period, n, B_known.shape[-1])), B_known], axis=1)
         stacks = {
-            "A": whole,
+            "A": A_full,
             "B": np.concatenate([B, np.zeros((self.period, past, B.shape[-1]))], axis=1),
             "C": np.concatenate([C, C_known], axis=2),
             "B_known": entry,  # u(k-1) is the input

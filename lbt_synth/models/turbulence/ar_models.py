@@ -328,16 +328,16 @@ class ModalTurbulence:
         >>> lbt.models.ModalTurbulence.of([slow, slow]).n_modes
         2
         """
-        each = (models,) if isinstance(models, ARModel) else sequence(models, "models")
-        if not each or not all(isinstance(model, ARModel) for model in each):
-            kinds = sorted({type(model).__name__ for model in each}) or "an empty list"
+        processes = (models,) if isinstance(models, ARModel) else sequence(models, "models")
+        if not processes or not all(isinstance(model, ARModel) for model in processes):
+            kinds = sorted({type(model).__name__ for model in processes}) or "an empty list"
             raise ProblemError(f"models must be one ARModel a mode; got {kinds}.")
-        rate = each[0].frame_rate_hz
-        if not all(np.isclose(model.frame_rate_hz, rate, rtol=1e-9) for model in each):
+        rate = processes[0].frame_rate_hz
+        if not all(np.isclose(model.frame_rate_hz, rate, rtol=1e-9) for model in processes):
             raise ProblemError("all models must be sampled at the same frame rate; they are not.")
         return cls(
-            coefficients=padded_coefficients(each),
-            driving_rms_nm=frozen_copy([model.driving_rms_nm for model in each]),
+            coefficients=padded_coefficients(processes),
+            driving_rms_nm=frozen_copy([model.driving_rms_nm for model in processes]),
             frame_rate_hz=rate,
         )
 

@@ -277,8 +277,8 @@ class FrozenFlows:
 
     def take(self, rows: IntArray) -> FrozenFlows:
         """Return the flows of some loops."""
-        given = {name: getattr(self, name) for name in _PER_LOOP}
-        return replace(self, **{n: value[rows] for n, value in given.items() if value is not None})
+        arrays = {name: getattr(self, name) for name in _PER_LOOP}
+        return replace(self, **{n: value[rows] for n, value in arrays.items() if value is not None})
 
     def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """One-sided temporal power spectra (p, f) of one axis [nm^2/Hz] at frequencies (f,) [Hz].
@@ -329,10 +329,10 @@ def _interpolate_over_scales(
 ) -> None:
     """Fill in the logarithms of spectra that each have their own outer scale."""
     octave = np.floor(np.log2(scale_ratio))
-    for each in np.unique(octave):
-        knots, coefficients = _octave_splines(int(each), obstruction)
-        rows = np.flatnonzero(octave == each)
-        place = 2 * (np.log2(scale_ratio[rows]) - each) - 1
+    for number in np.unique(octave):
+        knots, coefficients = _octave_splines(int(number), obstruction)
+        rows = np.flatnonzero(octave == number)
+        place = 2 * (np.log2(scale_ratio[rows]) - number) - 1
         for row, terms in zip(rows, chebyshev.chebvander(place, _TERMS - 1), strict=True):
             spline = PPoly(coefficients @ terms, knots)
             values[row] = LogSpline(spline=spline)(x[row])
