@@ -116,7 +116,7 @@ class TargetChoice(Action):
 
 def init(parser: ArgumentParser) -> None:
     """Write a commented configuration to begin with."""
-    from lbt_synth.config.templates import telescope_names
+    from lbt_synth.config.load import telescope_names
 
     text = "published numbers and their sources (default generic: assumed ones)"
     add_option(parser, "--telescope", telescope_names(), text)

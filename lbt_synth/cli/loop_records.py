@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config
-from lbt_synth.config.identified_system import RAISED, require_writable_facts
-from lbt_synth.config.write import config_text
+from lbt_synth.config.write import RAISED, config_text, require_writable_facts
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.identification import (

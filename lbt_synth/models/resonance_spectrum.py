@@ -134,9 +134,11 @@ def resonance_densities(
     The slopes are those of the logarithm by the logarithms of frequency and damping ratio; s is
     (f,). Those of several sections have their number in ``sections`` (c,), all 1 by default.
     """
-    each = [recursion(*pair) for pair in zip(frequency.tolist(), damping.tolist(), strict=True)]
-    b, p = np.array([row[:2] for row in each]).T[..., None]
-    by_b, by_p = np.array([row[2] for row in each]).transpose(1, 0, 2)  # by the logarithms
+    recursions = [
+        recursion(*pair) for pair in zip(frequency.tolist(), damping.tolist(), strict=True)
+    ]
+    b, p = np.array([row[:2] for row in recursions]).T[..., None]
+    by_b, by_p = np.array([row[2] for row in recursions]).transpose(1, 0, 2)  # by the logarithms
     half, wide = (2 - p) / 2, s * (1 - s / 4)
     near = s * -half
     near += b
