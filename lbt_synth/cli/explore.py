@@ -10,7 +10,7 @@ from pathlib import Path
 from lbt_synth.cli.loop_inputs import load_designs, load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.explore.exploration import explore, quick_view, whole_view
+from lbt_synth.report.explore.exploration import explore, new_view
 from lbt_synth.storage.atomic_files import require_writable
 
 _MOST_PORTS = 65535
@@ -30,7 +30,7 @@ def run(arguments: Namespace) -> Report:
     require_writable(folder / "explored-1.yaml")
     config = load_shown(arguments)
     exploration = explore(config, load_designs(arguments.gains))
-    first = whole_view(exploration, quick_view(exploration))
+    first = new_view(exploration)
 
     from lbt_synth.report.explore.server import serve  # bokeh's server, slow to import
 

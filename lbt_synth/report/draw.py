@@ -37,7 +37,7 @@ FIGURE_ENDINGS = (".png", ".pdf", ".svg")
 
 # Okabe and Ito's palette, in an order that also darkens and lightens in grey
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-_GREY = "#404040"
+GREY = "#404040"
 # Lengths of strokes and gaps, in widths of the line
 _DASHES: tuple[tuple[float, ...], ...] = (
     (),
@@ -71,7 +71,7 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 def colour(look: int | None) -> str:
     """Colour of a look, as #rrggbb; None is grey."""
-    return _GREY if look is None else _COLOURS[look % len(_COLOURS)]
+    return GREY if look is None else _COLOURS[look % len(_COLOURS)]
 
 
 def dashes(look: int | None) -> tuple[float, ...]:
@@ -347,7 +347,7 @@ class Panel:
         place = self._shown(axis, [at])
         draw = self.axes.axvline if axis == "x" else self.axes.axhline
         strokes = _DASHES[dash]
-        style = {"color": _GREY, "linewidth": 1.0, "linestyle": (0, strokes) if strokes else "-"}
+        style = {"color": GREY, "linewidth": 1.0, "linestyle": (0, strokes) if strokes else "-"}
         draw(place[0], zorder=1.6, label=_label(name), **style)
 
     def span(
