@@ -25,11 +25,11 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ConfigError, ProblemError
-from lbt_synth.loop import least_residual, stable_sensor_gains
+from lbt_synth.loop import least_residual
 from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models import PositionLoop
-from lbt_synth.report.designs.report import refine_values, require_compatible
+from lbt_synth.report.designs.report import refine_values, require_compatible, stable_interval
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
 from lbt_synth.report.figures.studies import limits_figure, mirror_figure, tradeoff_figure
 from lbt_synth.storage.display_unit import nm_text
@@ -327,9 +327,8 @@ def _stable_gains(design: Design, grid: RobustnessMap, assumed: float) -> list[t
     for delay, stable in zip(grid.delay_errors_frames, grid.stable, strict=True):
         real = replace(hardware, delay_frames=hardware.delay_frames + delay)
         # around the gain that the design assumes, if the loop is stable there
-        starts = [assumed, *grid.sensor_gains[stable]]
-        tried = (stable_sensor_gains(real, design.controller, nominal=s / assumed) for s in starts)
-        low, high = next((ends for ends in tried if not np.isnan(ends[0])), (np.nan, np.nan))
+        starts = [1.0, *grid.sensor_gains[stable] / assumed]
+        low, high = stable_interval(real, design.controller, starts)
         intervals.append((low * assumed, high * assumed))
     return intervals
 

@@ -16,18 +16,7 @@ from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import Figure, drawing
 from lbt_synth.report.figures import identification_figure
-from lbt_synth.report.page.html import (
-    Block,
-    Chart,
-    Notice,
-    Page,
-    chart,
-    creation_time,
-    paragraph,
-    read_source,
-    source_section,
-    time_text,
-)
+from lbt_synth.report.page.html import Block, Chart, Notice, Page, chart, new_page, paragraph
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
@@ -118,24 +107,20 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
 
     ``files`` are those of the record and of the given design, whose digests the page gives.
     """
-    roles = ("record", "gain file")
-    read = [read_source(Path(file), role)[0] for file, role in zip(files, roles, strict=False)]
-    name = read[0][0] if read else found.record.source or "a record"
     record, tables = found.record, diagnosis_tables(found)
+    name = Path(files[0]).name if files else record.source or "a record"
+    duration = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
     disturbance: list[Block] = [*tables["disturbance"], *_spectrum_charts(found)]
-    sections: dict[str, tuple[str, Sequence[Block]]] = {
-        "verdict": ("Verdict", _verdict_blocks(found, tables["verdict"])),
-        "record": ("Record", tables["record"]),
-        "loop": ("Loop that ran", (paragraph("law"), *tables["loop"])),
-        "disturbance": ("Disturbance", disturbance or ["No model was identified."]),
-        **source_section(read),
-    }
-    return Page(
-        title=f"Diagnosis of {name}",
-        subtitle=f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz, "
-        f"{count_text(record.axes, 'axis', 'axes')}. Made "
-        f"{time_text(creation_time())}.",
-        sections=sections,
+    return new_page(
+        f"Diagnosis of {name}",
+        f"{duration}, {count_text(record.axes, 'axis', 'axes')}",
+        {
+            "Verdict": _verdict_blocks(found, tables["verdict"]),
+            "Record": tables["record"],
+            "Loop that ran": (paragraph("law"), *tables["loop"]),
+            "Disturbance": disturbance or ["No model was identified."],
+        },
+        sources=list(zip(files, ("record", "gain file"), strict=False)),
     )
 
 

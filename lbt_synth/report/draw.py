@@ -62,11 +62,9 @@ _AROUND_IN = 0.55  # below and above the axes of a panel
 _FLAG_IN = 0.15  # width of an upright text
 _LONGEST = {"name": 60, "category": 36}  # letters in a legend, and beside bars
 _ROOM = 0.04  # around what is drawn, as a part of its extent
-_MOST_RATIO = 1e8  # of the ends of a logarithmic scale: a zero must not stretch it
 _FEW_DECADES = 150  # ratio of the ends below which a logarithmic scale has ticks at 2 and 5, too
-_STEPS = (1, 2, 5, 10)  # of ticks within a decade
+_MOST_RATIO = 1e8  # of the ends of a logarithmic scale: a zero must not stretch it
 _CONTOURS = 6  # of a map, about, at round values
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def colour(look: int | None) -> str:
@@ -219,16 +217,11 @@ def _draw_legend(figure: Figure, panels: Sequence[Panel], height: float) -> None
 
 def _draw_colour_bar(panels: Sequence[Panel], *, below: bool) -> bool:
     """Draw one colour bar for all maps, and return whether there are any."""
-    from matplotlib.colors import LogNorm
-    from matplotlib.ticker import FuncFormatter
-
     mapped = [panel for panel in panels if panel.image is not None]
     if not mapped:
         return False
     image, places = mapped[0].image, [panel.axes for panel in mapped]
     style: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 40} if below else {}
-    if isinstance(image.norm, LogNorm):
-        style["format"] = FuncFormatter(tick_text)
     bar = mapped[0].figure.colorbar(image, ax=places, **style)
     bar.set_label(mapped[0].image_text)
     bar.outline.set_visible(False)
@@ -250,9 +243,8 @@ class Panel:
         self.title_lines = 0
         self._title = ""
         self._axis: dict[str, dict[str, Any]] = {}
-        self._heights: list[FloatArray] = []  # of curves
-        self._flags: tuple[FloatArray, FloatArray, Sequence[str]] | None = None
-        self.is_equal = self._stands = False
+        self._flags: tuple[FloatArray, FloatArray, Sequence[str]] = np.zeros(0), np.zeros(0), ()
+        self.is_equal = False
         axes.margins(x=0, y=_ROOM)
         self.set_axes({}, {})
 
@@ -267,8 +259,7 @@ class Panel:
         """Name the axes, before anything is drawn.
 
         Each has a label, and may have a unit ("-" of a pure number), ends (low, high), and a
-        logarithmic scale (log), on which nothing is drawn that is not positive. What is beyond an
-        end is not drawn; a low or high end of y moves out where a curve runs along it.
+        logarithmic scale (log), on which nothing is drawn that is not positive.
         """
         for name, axis in (("x", x), ("y", y)):
             unit, factor = shown_unit(axis.get("unit", ""))
@@ -282,7 +273,7 @@ class Panel:
             }
             getattr(self.axes, f"set_{name}scale")("log" if axis.get("log") else "linear")
         self._title = title
-        self.is_equal = self._stands = equal
+        self.is_equal = equal
 
     def _shown(self, name: str, values: ArrayLike) -> FloatArray:
         """Return values of an axis in the unit that is shown."""
@@ -310,7 +301,6 @@ class Panel:
         style = line_style(**look)
         label = f"_{name}" if quiet else _label(name)
         (line,) = self.axes.plot(along, up, drawstyle=step, label=label, **style)
-        self._heights.append(up)
         if "marker" in style:
             self.axes.margins(x=_ROOM)
         if error is not None:
@@ -337,7 +327,6 @@ class Panel:
         """Shade the area between two curves, (n,) each."""
         along, least, most = self._shown("x", x), self._shown("y", low), self._shown("y", high)
         self.axes.fill_between(along, least, most, label=_label(name), **_fill_style(look))
-        self._stands = True
         if name:
             self._note(f"{name}, from", along, least)
             self._note(f"{name}, to", along, most)
@@ -384,7 +373,6 @@ class Panel:
         self.axes.margins(x=_ROOM)
         self.axes.tick_params(axis="y", length=0)
         self.axes.grid(visible=False, axis="y")
-        self._stands = True
 
     def flags(self, x: ArrayLike, y: ArrayLike, texts: Sequence[str]) -> None:
         """Write upright texts along the upper edge, each with a line down to its point; x rises."""
@@ -424,44 +412,28 @@ class Panel:
             self.axes.patch.set(**_BLANK)
             corner = [edges[0][0]] * 2, edges[1][0], edges[1][0]
             self.axes.fill_between(*corner, label=_label(blank), **_BLANK)
-        self._stands = True
         for place, row in zip(up, values, strict=True):
             self._note(f"{label} at {self._axis['y']['text']} {place:g}", along, row)
 
-    def _limits(self, name: str) -> tuple[float, float]:
-        """Return the ends of the scale of an axis: those that are given, else those of the data."""
-        log, (first, last) = self._axis[name]["log"], self._axis[name]["ends"]
-        low, high = getattr(self.axes, f"get_{name}lim")()
-        if log:
-            low = max(low, high / _MOST_RATIO)
-        low, high = low if first is None else first, high if last is None else last
-        if first is not None and high <= low:  # all values are below the end that is given
-            high = 2 * low if log else low + 1
-        if log or name == "x" or self._stands:  # areas and bars stand on an end
-            return low, high
-        room = _ROOM * (high - low)
-        heights = np.concatenate([np.zeros(0), *self._heights])
-        low -= room * (first is not None and bool(np.any(np.isclose(heights, low))))
-        high += room * (last is not None and bool(np.any(np.isclose(heights, high))))
-        return low, high
-
     def finish(self) -> None:
         """Set the scales and their ticks, and write the title."""
-        from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+        from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
         for name, place in (("x", self.axes.xaxis), ("y", self.axes.yaxis)):
-            low, high = self._limits(name)
-            getattr(self.axes, f"set_{name}lim")(low, high)
-            if self._axis[name]["log"]:
-                factors = (1, 2, 5) if high < _FEW_DECADES * low else (1,)
-                decades, equal_steps = LogLocator(subs=factors), MaxNLocator(7, steps=_STEPS)
-                place.set_major_locator(equal_steps if high < 10 * low else decades)
-                place.set_major_formatter(FuncFormatter(tick_text))
+            axis = self._axis[name]
+            (first, last), (low, high) = axis["ends"], getattr(self.axes, f"get_{name}lim")()
+            low, high = low if first is None else first, high if last is None else last
+            if axis["log"]:
+                low = max(low, high / _MOST_RATIO)
+                subs = (1, 2, 5) if high < _FEW_DECADES * low else (1,)
+                linear, decades = MaxNLocator(7, steps=[1, 2, 5, 10]), LogLocator(subs=subs)
+                place.set_major_locator(linear if high < 10 * low else decades)
+                place.set_major_formatter("{x:g}")
                 place.set_minor_locator(NullLocator())
-            place.set_label_text(self._axis[name]["text"], parse_math=False)
+            getattr(self.axes, f"set_{name}lim")(low, high if high > low else low + 1)
+            place.set_label_text(axis["text"], parse_math=False)
         width_in = self.axes.get_window_extent().width / self.axes.figure.dpi
-        if self._flags is not None:
-            self._draw_flags(width_in)
+        self._draw_flags(width_in)
         letters = max(12, int(width_in / _LETTER_IN))
         lines = textwrap.wrap(shorten(self._title, 3 * letters), letters)
         self.title_lines = len(lines)
@@ -469,8 +441,9 @@ class Panel:
 
     def _draw_flags(self, width_in: float) -> None:
         """Draw upright texts without overlaps on axes of a width."""
-        assert self._flags is not None
         x, y, texts = self._flags
+        if not texts:
+            return
         points = self.axes.transData.transform(np.column_stack((x, y)))
         across = self.axes.transAxes.inverted().transform(points)[:, 0]
         places = spread_labels(across, _FLAG_IN / width_in)
@@ -488,15 +461,6 @@ class Panel:
                 color="0.15",
                 arrowprops={**line, "shrinkA": 0, "shrinkB": 0},
             )
-
-
-def tick_text(value: float, _: object = None) -> str:
-    """Return the text of a tick of a logarithmic scale: 0.01, 5, 200, 10⁻⁶, 2·10⁵."""
-    if value == 0 or 0.999e-3 <= value <= 1.001e4:
-        return f"{value:g}"
-    power = int(np.floor(np.log10(value) + 1e-9))
-    factor, raised = f"{value / 10.0**power:.6g}", f"10{str(power).translate(_RAISED)}"
-    return raised if factor == "1" else f"{factor}·{raised}"
 
 
 def shorten(text: str, most: int) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -21,14 +22,10 @@ from lbt_synth.report.page.html import (
     Chart,
     Notice,
     Page,
-    Sections,
     chart,
-    creation_time,
+    new_page,
     paragraph,
-    read_source,
-    source_section,
     survival_blocks,
-    time_text,
 )
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, duration_text, listing_text
@@ -114,29 +111,22 @@ def study_page(
     }
     names = short_names(statistics.parameters)
     varying = sum(np.ptp(column) > 0 for column in values.values())
-    reading = [paragraph(name) for name in ("intervals", "indices")]
-    made = time_text(creation_time())
-    return Page(
-        title=f"Robustness study {study.source.name}",
-        subtitle=(
-            f"{statistics.samples} samples of {varying} parameters, "
-            f"{count_text(len(statistics.controllers), 'controller')}. Made {made}."
-        ),
-        sections={
-            "summary": ("Summary", _summary_blocks(study, statistics, samples)),
-            "samples": ("What was sampled", _samples_blocks(study, values, names)),
-            "controllers": ("Controllers", _controllers_blocks(study, statistics, failures)),
-            "dependence": (
-                "What the Strehl ratio depends on",
-                _dependence_blocks(statistics, samples, values, names),
+    return new_page(
+        f"Robustness study {study.source.name}",
+        f"{statistics.samples} samples of {varying} parameters, "
+        f"{count_text(len(statistics.controllers), 'controller')}",
+        {
+            "Summary": _summary_blocks(study, statistics, samples),
+            "What was sampled": _samples_blocks(study, values, names),
+            "Controllers": _controllers_blocks(study, statistics, failures),
+            "What the Strehl ratio depends on": _dependence_blocks(
+                statistics, samples, values, names
             ),
-            "worst": (
-                "Worst samples",
-                _worst_blocks(study, statistics, columns, names, os.fspath(folder)),
-            ),
-            "reading": ("How to read the figures", reading),
-            **_origin_section(study, statistics, computing_s),
+            "Worst samples": _worst_blocks(study, statistics, columns, names, os.fspath(folder)),
+            "How to read the figures": [paragraph(name) for name in ("intervals", "indices")],
         },
+        sources=list(zip_longest(study.inputs, ("study", "configuration"), fillvalue="gain file")),
+        facts=[_origin_table(study, statistics, computing_s)],
     )
 
 
@@ -305,22 +295,13 @@ def _worst_blocks(
     return [opening, *tables, (caption, "\n".join(dict.fromkeys(commands)))]
 
 
-def _origin_section(study: Study, statistics: StudyStatistics, computing_s: float) -> Sections:
-    """Name the files and programs that the page was made from."""
-    rows = [
+def _origin_table(study: Study, statistics: StudyStatistics, computing_s: float) -> Table:
+    rows = (
         ("samples with results", f"{statistics.samples} of {study.samples}"),
         ("digest of the study", study.digest),
         ("computing time, of all processes together", duration_text(computing_s)),
-    ]
-    about = Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,))
-    sources, texts = [], {}
-    for place, path in enumerate(study.inputs):
-        role = ("study", "configuration", "gain file")[min(place, 2)]
-        source, content = read_source(path, role)
-        sources.append(source)
-        if role != "gain file":
-            texts[f"{role.capitalize()} {source[0]}"] = content.decode("utf-8-sig", "replace")
-    return source_section(sources, texts=texts, about=about)
+    )
+    return Table(caption="Study", headings=("what", "value"), rows=rows, words=(1,))
 
 
 def _distribution_chart(samples: Mapping[str, Samples]) -> list[Chart]:

@@ -108,21 +108,17 @@ def whole_page(name: str = "first") -> Page:
         headings=("quantity", *(f"design {i}" for i in range(8))),
         rows=(("value", *(str(i) for i in range(8))),),
     )
+    sections = {
+        f"Summary of {name}": (
+            f"Words of {name}. " * 20,
+            Notice(text=f"{name} is bad", tone="bad"),
+            Notice(text="note", tone="note"),
+            table,
+            wide,
+        ),
+        "Charts": every_mark(name),
+        "Listing": ((name, f"a: 1\n\tb: {name}\n" + 200 * "x"),),
+    }
     return Page(
-        title=f"Page of {name}",
-        subtitle=f"about {name}",
-        sections={
-            "summary": (
-                f"Summary of {name}",
-                (
-                    f"Words of {name}. " * 20,
-                    Notice(text=f"{name} is bad", tone="bad"),
-                    Notice(text="note", tone="note"),
-                    table,
-                    wide,
-                ),
-            ),
-            "charts": ("Charts", every_mark(name)),
-            "listing": ("Listing", ((name, f"a: 1\n\tb: {name}\n" + 200 * "x"),)),
-        },
+        title=f"Page of {name}", subtitle=f"about {name}", sections=sections, digests={}, made=""
     )

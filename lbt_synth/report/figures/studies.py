@@ -23,6 +23,7 @@ from lbt_synth.studies.robustness import FAMILIES
 from lbt_synth.validation import real_array, require_instance
 
 FREQUENCY_ERROR = {"label": "frequency error, truth less design", "unit": "Hz"}
+SENSOR_GAIN = {"label": "sensor gain", "unit": "-"}
 SHORT_FREQUENCY_ERROR = {"label": "frequency error", "unit": "Hz"}  # of narrow panels
 _POINTS: dict[str, Any] = {"marker": "own", "size": 4.0}
 _RINGS: dict[str, Any] = {"line": False, "marker": "own", "filled": False, "size": 9.0}
@@ -175,8 +176,7 @@ def robustness_map_figure(
             late = f", delay error {delay:+g} frames" if len(delays) > 1 or delay != 0 else ""
             for name, grid in maps.items():
                 panel = next(remaining)
-                y_axis = {"label": "sensor gain", "unit": "-"}
-                panel.set_axes(x_axis, y_axis, title=f"{name}{late}")
+                panel.set_axes(x_axis, SENSOR_GAIN, title=f"{name}{late}")
                 _draw_map(panel, grid, row, ends, real_gain)
     return panels[0].figure
 
