@@ -18,7 +18,7 @@ from lbt_synth.cli.loop_inputs import (
     say_limit,
     truth_at_sensor_gain,
 )
-from lbt_synth.cli.output import Report, require_outputs, write_outputs
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.parser import command_options
 from lbt_synth.cli.progress import show_spinner, track_progress
 from lbt_synth.config import Config
@@ -44,7 +44,6 @@ _SHOWN = 8  # sensor gains of a map, and taps of a mirror, that are printed of m
 
 def run_limits(arguments: Namespace) -> Report:
     """Compare designs with the least residual of any linear controller."""
-    require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
     config = load_shown(arguments)
     files = load_designs(arguments.gains, any_sensors=True)
     with show_spinner("comparing", quiet=arguments.json):
@@ -61,6 +60,7 @@ def run_limits(arguments: Namespace) -> Report:
         study.rows,
         without=no_band,
         hidden=() if study.shift_hz.size else ("worst_nm",),
+        figure=lambda: limits_figure(study),
     )
     report.data["limit_nm"] = None if study.limit is None else study.limit.rms_nm
     if study.band is not None:
@@ -70,9 +70,6 @@ def run_limits(arguments: Namespace) -> Report:
             "band_achieved_nm": study.band.achieved_nm,
         }
     report.notes += [*_limit_notes(study, config), *_design_notes(config, designs, study)]
-    write_outputs(
-        report, arguments.output, study.rows, figure=lambda: limits_figure(study), without=no_band
-    )
     return report
 
 
@@ -122,7 +119,6 @@ def _design_notes(config: Config, designs: dict[str, Design], study: LimitStudy)
 
 def run_tradeoff(arguments: Namespace) -> Report:
     """Design filters from the least norm to the least variance, and compare them."""
-    require_outputs(arguments.output, inputs=[arguments.config])
     count = integer(arguments.points, "--points", at_least=2)
     taps = integer(arguments.taps, "--taps", at_least=1)
     config = load_shown(arguments)
@@ -136,23 +132,24 @@ def run_tradeoff(arguments: Namespace) -> Report:
     )
     least = points[0].design
     report = Report()
-    caption, hidden = "Trade-off of variance, norm and sensor gain", ("design",)
-    report.add_rows("points", caption, points, without=hidden)
+    report.add_rows(
+        "points",
+        "Trade-off of variance, norm and sensor gain",
+        points,
+        without=("design",),
+        figure=lambda: tradeoff_figure(points),
+    )
     report.data |= {"gamma_least": least.gamma_least, "gamma_infeasible": least.gamma_infeasible}
     report.notes.append(
         f"the least norm of any filter lies between {nm_text(least.gamma_infeasible, '.9g')} and "
         f"{nm_text(least.gamma_least, '.9g')}"
     )
     report.notes += own_sensor_notes(config)
-    write_outputs(
-        report, arguments.output, points, figure=lambda: tradeoff_figure(points), without=hidden
-    )
     return report
 
 
 def run_mirror(arguments: Namespace) -> Report:
     """Show how the mirror of a configuration settles, and compare designs on it."""
-    require_outputs(arguments.output, inputs=[arguments.config])
     config = load_shown(arguments)
     plant, shell = config.plant.own_sensor_alone(), _require_local_loop(config)
     hardware = plant.hardware
@@ -183,14 +180,13 @@ def run_mirror(arguments: Namespace) -> Report:
             limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
         ),
     )
-    report.add_rows("rows", f"Designs on this mirror; {config.imaging.label}", rows)
-    report.notes.append(f"weights of u(k), u(k-1), ... in exposure k: {', '.join(shown)}")
-    write_outputs(
-        report,
-        arguments.output,
+    report.add_rows(
+        "rows",
+        f"Designs on this mirror; {config.imaging.label}",
         rows,
         figure=lambda: mirror_figure(hardware, tolerance=arguments.tolerance),
     )
+    report.notes.append(f"weights of u(k), u(k-1), ... in exposure k: {', '.join(shown)}")
     return report
 
 
@@ -207,7 +203,6 @@ def _require_local_loop(config: Config) -> PositionLoop:
 
 def run_robustness(arguments: Namespace) -> Report:
     """Compute the Strehl ratio over an error of the vibration frequency."""
-    require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
     _refuse_unused_options(arguments)
     config = load_shown(arguments)
     return (_map_designs if arguments.gains else _redesign)(config, arguments)
@@ -247,9 +242,8 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
     )
     report = Report()
     caption = f"Robustness to the vibration frequency; {config.imaging.label}"
-    report.add_rows("rows", caption, rows)
+    report.add_rows("rows", caption, rows, figure=lambda: robustness_figure(rows))
     report.notes += own_sensor_notes(config)
-    write_outputs(report, arguments.output, rows, figure=lambda: robustness_figure(rows))
     return report
 
 
@@ -275,7 +269,8 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
                 delay_errors_frames=delays,
             )
             maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
-    report = Report(data={"maps": {}})
+    report = Report(data={"maps": {}}, figure=lambda: robustness_map_figure(maps))
+    report.rows = [point for name, grid in maps.items() for point in _map_points(name, grid)]
     for name, grid in maps.items():
         intervals = _stable_gains(designs[name], grid, assumed[name])
         report.data["maps"][name] = asdict(grid) | {"stable_sensor_gains": intervals}
@@ -283,12 +278,6 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
         title = f"{name}: {config.imaging.label}, over frequency errors of {low:+g} to {high:+g} Hz"
         report.tables.append(row_table(title, list(_map_lines(grid))))
         report.notes += _map_notes(name, designs[name], config, grid, intervals)
-    write_outputs(
-        report,
-        arguments.output,
-        [point for name, grid in maps.items() for point in _map_points(name, grid)],
-        figure=lambda: robustness_map_figure(maps),
-    )
     return report
 
 

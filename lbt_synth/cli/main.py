@@ -48,15 +48,14 @@ class Terminated(KeyboardInterrupt):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    words = sys.argv[1:] if argv is None else list(argv)
+    words = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
     named = next((word for word in words if not word.startswith("-")), "")
     if any(word.endswith(".fits") for word in words):
         importlib.import_module("astropy.io.fits")  # which looks through all modules: few as yet
     arguments = build_parser(named).parse_args(words)
     try:
-        run = _find_command(arguments.command)
         with _terminable(), own_display_unit():
-            report = run(arguments)
+            report = _run_command(arguments)
     except LbtSynthError as error:
         return _fail(error, _say_error(error, arguments), arguments)
     except MemoryError:
@@ -70,6 +69,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     report.print(as_json=arguments.json)
     return DONE if report.passed else FAILED
+
+
+def _run_command(arguments: Namespace) -> Report:
+    from lbt_synth.cli.output import run_with_outputs  # slow to import for --help
+
+    return run_with_outputs(_find_command(arguments.command), arguments)
 
 
 def _find_command(command: str) -> Callable[[Namespace], Report]:

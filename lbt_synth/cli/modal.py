@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from lbt_synth import models
 from lbt_synth.cli.loop_inputs import choose_wavefront_unit
-from lbt_synth.cli.output import Report, require_outputs, write_outputs
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_residuals
@@ -33,7 +33,6 @@ _MIRROR_NOTE = (
 
 def run(arguments: Namespace) -> Report:
     """Compare integrators, optimised gains and Kalman filters, mode by mode."""
-    require_outputs(arguments.output, inputs=[arguments.config])
     choose_wavefront_unit(arguments)
     config = load_config(arguments.config)
     count = _mode_count(arguments.modes, config)
@@ -58,7 +57,12 @@ def run(arguments: Namespace) -> Report:
         for name, rms in left.items()
     ]
     report.tables.append(row_table("All modes", totals))
-    report.add_rows("rows", "By radial order, residuals over its modes", rows)
+    report.add_rows(
+        "rows",
+        "By radial order, residuals over its modes",
+        rows,
+        figure=lambda: modal_figure(residuals, gains=gains, turbulence_nm=air.rms_nm),
+    )
     report.notes += [
         "turbulence: AR1 models, von Karman variances, poles by radial order.",
         "vibrations: those of the model, on tip and tilt.",
@@ -66,12 +70,6 @@ def run(arguments: Namespace) -> Report:
         *([] if config.hardware.mirror is None else [_MIRROR_NOTE]),
         "the modes are those of Zernike, independent; nothing leaks from one to another.",
     ]
-    write_outputs(
-        report,
-        arguments.output,
-        rows,
-        figure=lambda: modal_figure(residuals, gains=gains, turbulence_nm=air.rms_nm),
-    )
     return report
 
 

@@ -221,6 +221,9 @@ def _draw_colour_bar(panels: Sequence[Panel], *, below: bool) -> bool:
     if not mapped:
         return False
     image, places = mapped[0].image, [panel.axes for panel in mapped]
+    lowest, highest = zip(*(panel.image.get_clim() for panel in mapped), strict=True)
+    for panel in mapped:  # one scale for all
+        panel.image.set_clim(min(lowest), max(highest))
     style: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 40} if below else {}
     bar = mapped[0].figure.colorbar(image, ax=places, **style)
     bar.set_label(mapped[0].image_text)
@@ -386,14 +389,13 @@ class Panel:
         label: str,
         unit: str = "",
         *,
-        ends: tuple[float, float],
         log: bool = False,
         contours: bool = False,
         blank: str = "no value",
     ) -> None:
         """Draw values (ny, nx) over a grid of increasing centres, nan hatched as ``blank``.
 
-        ``ends`` are those of the colours; contours are lines of equal, round values.
+        Contours are lines of equal, round values.
         """
         from matplotlib.colors import ListedColormap, LogNorm, Normalize
 
@@ -401,6 +403,7 @@ class Panel:
         edges, shown = (_cell_edges(along), _cell_edges(up)), np.ma.masked_invalid(values)
         self.axes.grid(visible=False)
         self.axes.margins(0)
+        ends = (np.nanmin(values), np.nanmax(values)) if shown.count() else (0.0, 1.0)
         norm = (LogNorm if log else Normalize)(*ends)
         self.image = self.axes.pcolormesh(*edges, shown, cmap="viridis", norm=norm, rasterized=True)
         self.image_text = f"{label} [{unit}]" if unit else label

@@ -379,12 +379,10 @@ def _map_charts(
         strehl, kept = (samples[one.controller][name] for name in ("strehl", "evaluated"))
         places = parameters[first][kept], parameters[second][kept]
         x, y, mean = binned_map(*places, strehl[kept])
-        low, high = (100 * float(end(mean)) for end in (np.nanmin, np.nanmax))
-        ends = 5 * float(np.floor(low / 5)), 5 * float(np.floor(high / 5)) + 5
         with drawing([2.6]) as (panel,):
             panel.set_axes({"label": names[first]}, {"label": names[second]})
             label: dict[str, Any] = {"label": "mean Strehl ratio", "unit": "%"}
-            panel.map(x, y, 100 * mean, ends=ends, blank="no sample", **label)
+            panel.map(x, y, 100 * mean, blank="no sample", **label)
         facts = {"x": names[first], "y": names[second], "x_path": first, "y_path": second}
         facts["controller"] = one.controller
         charts.append(chart(f"map-{place + 1}", panel.figure, group="study-map", **facts))

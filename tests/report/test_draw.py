@@ -117,7 +117,7 @@ def test_a_figure_on_axes_of_the_user():
     own = Figure()
     with drawing([2.0], axes=own.subplots()) as (panel,):
         panel.set_axes(X, Y)
-        panel.map(np.arange(2.0), np.arange(2.0), np.eye(2), "ratio", "%", ends=(0.0, 1.0))
+        panel.map(np.arange(2.0), np.arange(2.0), np.eye(2), "ratio", "%")
     assert own.axes[1].get_ylabel() == "ratio [%]"  # of the colour bar
 
 

@@ -78,9 +78,9 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
             panel.set_axes(
                 {"label": "error", "unit": "Hz"}, {"label": "gain", "unit": "-"}, title=title
             )
-            ends, gains = (float(title == "other"), 30.0), np.array([0.2, 0.4, 0.7, 1.0, 1.4])
+            gains = np.array([0.2, 0.4, 0.7, 1.0, 1.4])
             more = {"log": title == "other", "contours": True, "blank": "unstable"}
-            panel.map(np.arange(6.0), gains, values, "ratio", "%", ends=ends, **more)
+            panel.map(np.arange(6.0), gains, values, "ratio", "%", **more)
     words = {"caption": "Two maps.", "alt": "Values rise to the upper right."}
     maps = Chart(key="maps", title="Maps", figure=panels[0].figure, **words)
     turn = np.linspace(0, 2 * np.pi, 61)

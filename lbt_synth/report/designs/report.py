@@ -61,7 +61,7 @@ class DesignAssessment:
     margins: LoopMargins | None
     moving: MovingGain | None
     # interval of real sensor gains with a stable loop, relative to the sensor matrix of the
-    # configuration: around the real one, the assumed one, or one of the map; nan where there is none
+    # configuration, around the real one, the assumed one, or one of the map; nan for none
     sensor_gains: tuple[float, float]
     checks: tuple[Check, ...]  # the certificate, recomputed
     certificate_error: str  # why it could not be; empty if it could
@@ -170,7 +170,7 @@ def require_compatible(name: str, design: Design, hardware: LoopHardware) -> Non
 def stable_interval(
     hardware: LoopHardware, controller: Controller, starts: Iterable[float]
 ) -> tuple[float, float]:
-    """Return the interval of stable sensor gains around the first of some that is stable, or nan."""
+    """Return the interval of stable sensor gains around the first stable one of some, or nan."""
     intervals = (stable_sensor_gains(hardware, controller, nominal=start) for start in starts)
     return next((ends for ends in intervals if not np.isnan(ends[0])), (np.nan, np.nan))
 

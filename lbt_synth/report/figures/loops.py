@@ -48,40 +48,38 @@ def loop_figure(
 ) -> Figure:
     """Draw a view of the loops of designs.
 
+    Loops are broken at each measurement in turn, the others closed; axes that respond alike are one
+    curve. A loop that is unstable is named and not drawn.
+
     Parameters
     ----------
     designs : mapping of str to Design
         Designs by the name they get in the legend. Each needs a loop, but for ``"sigma"``.
     kind : {"sigma", "bode", "nyquist", "nichols", "step"}
         ``"sigma"``: largest singular values of the estimation error, the rejection and the noise
-        transfer, a panel each, the vibration frequencies marked. Axes that do not mix have a curve
-        each; of others the largest singular value is that of the worst direction.
-        ``"bode"``: gain and phase over frequency, with the margins; the phase has no jumps and
-        includes the delay.
-        ``"nyquist"``: the complex plane, a panel for each design. Around -1 are the circles of
-        the modulus margin and of the disk margin of all axes at once; no loop enters them.
-        ``"nichols"``: gain over phase. A loop that stays outside a contour has its modulus margin.
-        ``"step"``: residual and command after a step of the wavefront, in two panels.
-        Loops are broken at each measurement in turn, the others closed; axes that respond alike
-        are one curve.
+        transfer, a panel each, the vibration frequencies marked; axes that do not mix have a curve
+        each. ``"bode"``: gain and phase over frequency, with the margins; the phase has no jumps
+        and includes the delay. ``"nyquist"``: the complex plane, a panel for each design, with the
+        circles of the modulus and of the disk margin, which no loop enters. ``"nichols"``: gain
+        over phase; a loop outside a contour has its modulus margin. ``"step"``: residual and
+        command after a step of the wavefront, in two panels.
     sensor_gain : float, optional
         Real sensor gain, relative to the one of each design.
     unit_weights : bool, optional
-        Draw the estimation error against disturbances of unit size, as the paper
-        does, instead of the weighted ones of each design.
+        Draw the estimation error against disturbances of unit size, as Agapito et al. (2008) do,
+        instead of the weighted ones of each design.
     axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
+        Your own matplotlib axes, one per panel; by default a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure
-        A loop that is unstable at this sensor gain is named and not drawn.
+        The figure.
 
     Raises
     ------
     ProblemError
-        If there is no design, one has no loop, there is no such view,
-        or ``axes`` are not one per panel.
+        If there is no design or no such view, a design has no loop, or ``axes`` do not fit.
 
     Examples
     --------

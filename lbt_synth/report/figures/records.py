@@ -105,7 +105,7 @@ def identification_figure(
     designs : mapping of str to Controller or Design, optional
         Controllers whose predicted residual is drawn, by name.
     axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
+        Your own matplotlib axes, one per panel; by default a new figure.
 
     Returns
     -------
@@ -119,8 +119,7 @@ def identification_figure(
     Raises
     ------
     ProblemError
-        If the model is none, or a design does not fit its loop,
-        or ``axes`` are not one per panel.
+        If the model is none, a design does not fit its loop, or ``axes`` are not one per panel.
     UnstableLoopError
         If the loop of a design is unstable.
 
@@ -128,10 +127,8 @@ def identification_figure(
     --------
     >>> import numpy as np
     >>> import lbt_synth as lbt
-    >>> rng = np.random.default_rng(0)
-    >>> record = lbt.identification.loop_record(
-    ...     np.cumsum(rng.standard_normal((4096, 1)), axis=0), frame_rate_hz=500, unit="nm"
-    ... )
+    >>> drift = np.cumsum(np.random.default_rng(0).standard_normal((4096, 1)), axis=0)
+    >>> record = lbt.identification.loop_record(drift, frame_rate_hz=500, unit="nm")
     >>> len(lbt.report.figures.identification_figure(lbt.identify(record)).axes)
     3
     """
@@ -164,28 +161,30 @@ def _predicted_residuals(
     model: IdentifiedModel, designs: Mapping[str, Controller | Design]
 ) -> dict[str, list[FloatArray]]:
     """Densities of the residual that each design would leave on each axis, (f,) each."""
-    out: dict[str, list[FloatArray]] = {}
-    for name, thing in designs.items():
-        controller = as_controller(thing)
+    residuals: dict[str, list[FloatArray]] = {}
+    for name, design in designs.items():
+        controller = as_controller(design)
         if not isinstance(controller, Controller):
             raise ProblemError(
-                f"designs must be Controllers or Designs; got {type(thing).__name__} for {name!r}."
+                f"designs must be Controllers or Designs; got {type(design).__name__} for {name!r}."
             )
         loop = close_loop(model.hardware, controller)
         loop.require_stable()
-        out[name] = []
-        for i, axis in enumerate(model.axes):
-            f = axis.frequency_hz
-            rejected = np.abs(loop.sensitivity(f))[:, i] ** 2
-            passed = np.abs(loop.noise_transfer(f))[:, i] ** 2
-            density = np.zeros(f.size)
-            for j, other in enumerate(model.axes):
-                white = _noise_density(other)
-                phase = np.interp(f, other.frequency_hz, other.fitted_nm2_hz) - white
-                density += rejected[:, j] * phase
-                density += passed[:, j] * white * other.sensor_gain**2
-            out[name].append(density)
-    return out
+        residuals[name] = [_residual_density(model, loop, i) for i in range(len(model.axes))]
+    return residuals
+
+
+def _residual_density(model: IdentifiedModel, loop: ClosedLoop, i: int) -> FloatArray:
+    """Density of the residual of an axis, of the phase and the noise of all axes, (f,)."""
+    f = model.axes[i].frequency_hz
+    rejected = np.abs(loop.sensitivity(f)[:, i]) ** 2
+    passed = np.abs(loop.noise_transfer(f)[:, i]) ** 2
+    density = np.zeros(f.size)
+    for j, axis in enumerate(model.axes):
+        white = _noise_density(axis)
+        phase = np.interp(f, axis.frequency_hz, axis.fitted_nm2_hz) - white
+        density += rejected[:, j] * phase + passed[:, j] * white * axis.sensor_gain**2
+    return density
 
 
 def _noise_density(axis: IdentifiedAxis) -> float:
