@@ -3,60 +3,48 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lbt_synth.identification import Diagnosis
 from lbt_synth.identification.diagnosis.rows import law_facts
 from lbt_synth.identification.diagnosis.verdict import NARROW, diagnosis_verdict
 from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
-from lbt_synth.report.draw import Figure, drawing
+from lbt_synth.report.draw import draw_bars
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.page.html import Block, Chart, Notice, Page, chart, new_page, paragraph
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
 
-_ROW_IN = 0.42  # height of a category
-_SIGMAS = 2.0
+_SIGMAS = 2.0  # of an interval that holds 95 %
+_RESIDUAL = {"label": "residual", "unit": "nm rms", "low": 0}
 
 
 def _residual_charts(found: Diagnosis) -> list[Chart]:
     """Return bars of the residuals on unseen data, and of the parts of the disturbance."""
     charts = []
     if rows := found.residuals:
-        values = np.array([row.replayed_nm for row in rows])
-        errors = _SIGMAS * np.array([row.replayed_error_nm for row in rows])
-        promised = np.array([row.model_nm for row in rows])
-        names = [row.name for row in rows]
-        intervals = {"data": (values - errors, values + errors)}
-        figure = _draw_bars(names, {"data": values, "model": promised}, intervals)
+        values, errors, promised = np.array(
+            [(row.replayed_nm, _SIGMAS * row.replayed_error_nm, row.model_nm) for row in rows]
+        ).T
+        bars, intervals = (
+            {"data": values, "model": promised},
+            {"data": (values - errors, values + errors)},
+        )
+        figure = draw_bars(_RESIDUAL, [row.name for row in rows], bars, intervals)
         charts.append(chart("residuals", figure))
     if costs := found.costs:
-        columns = {"loop that ran": "running_nm", "best design": "best_nm"}
         bars = {
-            name: np.array([getattr(row, field) for row in costs])
-            for name, field in columns.items()
+            "loop that ran": np.array([row.running_nm for row in costs]),
+            "best design": np.array([row.best_nm for row in costs]),
         }
-        figure = _draw_bars([row.part for row in costs], bars, {})
-        best = found.best or "none"
-        charts.append(chart("costs", figure, best=best))
+        figure = draw_bars(_RESIDUAL, [row.part for row in costs], bars, {})
+        charts.append(chart("costs", figure, best=found.best or "none"))
     return charts
-
-
-def _draw_bars(
-    names: Sequence[str],
-    bars: Mapping[str, ArrayLike],
-    intervals: Mapping[str, tuple[ArrayLike, ArrayLike]],
-) -> Figure:
-    with drawing([_ROW_IN * max(len(names), 2)]) as (panel,):
-        panel.set_axes({"label": "residual", "unit": "nm rms", "low": 0}, {})
-        panel.bars(names, bars, intervals)
-    return panel.figure
 
 
 def _spectrum_charts(found: Diagnosis) -> list[Chart]:

@@ -55,6 +55,8 @@ _BLANK: dict[str, Any] = {
     "hatch": "////",
     "linewidth": 0,
 }
+_BAR_IN = 0.24  # height of a bar
+_HIGHEST_IN = 7.5  # of a panel that fits a sheet of paper
 PANEL_IN = 2.1  # height of a panel, unless it says another
 _WIDTH_IN = 7.0  # of a figure
 _LETTER_IN = 0.068  # width of a letter at 8 points, generously
@@ -534,6 +536,20 @@ def line_style(
 
 def _fill_style(look: int | None) -> dict[str, Any]:
     return {"color": colour(look), "alpha": _SHADE, "linewidth": 0}
+
+
+def draw_bars(
+    axis: Mapping[str, Any],
+    categories: Sequence[str],
+    bars: Mapping[str, ArrayLike],
+    intervals: Mapping[str, tuple[ArrayLike, ArrayLike]],
+) -> Figure:
+    """Draw bars of each name along an axis, one per category, and intervals around some."""
+    height_in = 0.2 + _BAR_IN * max(2, len(categories) * len(bars))
+    with drawing([min(height_in, _HIGHEST_IN)]) as (panel,):
+        panel.set_axes(axis, {})
+        panel.bars(categories, bars, intervals)
+    return panel.figure
 
 
 def count_columns(panels: int) -> int:

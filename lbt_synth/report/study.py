@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.methods.request import fixed_design
-from lbt_synth.report.draw import PANEL_IN, drawing
+from lbt_synth.report.draw import PANEL_IN, draw_bars, drawing
 from lbt_synth.report.page.html import (
     Block,
     Chart,
@@ -50,6 +50,7 @@ _POINTS = 400  # of a cumulative distribution
 _BINS = 30  # of a histogram, and along either axis of a map, at most
 _WITHIN = 1, 99  # percentiles at the edges of a map; its outermost cells hold what is beyond
 _PER_CELL = 8  # samples in a cell of a map on average, at least
+_QUANTILES = (0, 50, 100)  # percents of a parameter that are listed
 _MOST_FAILURES = 10  # that are listed
 _PARAMETERS = 5  # of a worst sample: with row and Strehl ratio, they fill a sheet
 Names = Mapping[str, str]  # what each parameter is called
@@ -98,8 +99,8 @@ def study_page(
     >>> columns = dict(zip(study.parameter_names, study.values(0, 2).T))
     >>> columns |= {f"kalman.{name}": [1.0, 0.5] for name in ("strehl", "residual_nm")}
     >>> columns["kalman.stable"] = [1, 1]
-    >>> found = lbt.studies.study_statistics(columns, study.parameter_names, ["kalman"])
-    >>> lbt.report.study_page(study, columns, found).title
+    >>> statistics = lbt.studies.study_statistics(columns, study.parameter_names, ["kalman"])
+    >>> lbt.report.study_page(study, columns, statistics).title
     'Robustness study study.yaml'
     """
     samples = {
@@ -146,32 +147,40 @@ def _summary_blocks(
     study: Study, statistics: StudyStatistics, samples: Mapping[str, Samples]
 ) -> list[Block]:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
-    unstable = [controller for controller in statistics.controllers if controller.unstable]
-    failed = [controller for controller in statistics.controllers if controller.failed]
-    warnings = []
-    if statistics.samples < study.samples:
-        warnings.append(paragraph("incomplete", done=statistics.samples, samples=study.samples))
-    if unstable:
-        parts = ", ".join(
-            f"{controller.controller} in {controller.unstable} of {controller.samples} "
-            f"({percent(controller.unstable_share.value, 2)} %)"
-            for controller in unstable
+    unstable = ", ".join(
+        f"{one.controller} in {one.unstable} of {one.samples} "
+        f"({percent(one.unstable_share.value, 2)} %)"
+        for one in statistics.controllers
+        if one.unstable
+    )
+    failed = ", ".join(f"{c.controller} {c.failed}" for c in statistics.controllers if c.failed)
+    done, whole = statistics.samples, study.samples
+    blocks: list[Block] = [
+        Notice(text=text, tone=tone)
+        for text, tone, is_so in (
+            (paragraph("incomplete", done=done, samples=whole), "bad", done < whole),
+            (f"Unstable loops: {unstable}.", "bad", unstable),
+            (
+                f"Evaluations that failed, and are in none of the figures: {failed}.",
+                "bad",
+                failed,
+            ),
+            (
+                "Every controller is stable in every sample, and none failed.",
+                "good",
+                done and not unstable and not failed,
+            ),
         )
-        warnings.append(f"Unstable loops: {parts}.")
-    if failed:
-        parts = ", ".join(f"{controller.controller} {controller.failed}" for controller in failed)
-        warnings.append(f"Evaluations that failed, and are in none of the figures: {parts}.")
-    blocks: list[Block] = [Notice(text=text, tone="bad") for text in warnings]
-    if not unstable and not failed and statistics.samples:
-        text = "Every controller is stable in every sample, and none failed."
-        blocks.append(Notice(text=text, tone="good"))
-    blocks += [
+        if is_so
+    ]
+    return [
+        *blocks,
         _verdict_text(statistics.controllers),
         *survival_blocks(_design_margins(study, statistics)),
         strehl_table(statistics),
         residual_table(statistics),
+        *_distribution_chart(samples),
     ]
-    return [*blocks, *_distribution_chart(samples)]
 
 
 def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, LoopMargins]:
@@ -210,28 +219,24 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
 
 def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names) -> list[Block]:
     """Show the parameters and their histograms."""
-    distributions = {name: section.text for name, section in study.settings.parameters.items()}
-    rows = tuple(
+    settings = study.settings
+    texts = {name: section.text for name, section in settings.parameters.items()}
+    rows = [
         (
             names[name],
             name,
-            distributions.get(name, ""),
-            *(f"{value:.4g}" for value in np.percentile(column, (0, 50, 100))),
+            texts.get(name, ""),
+            *(f"{q:.4g}" for q in np.percentile(c, _QUANTILES)),
         )
-        for name, column in values.items()
-    )
-    table = Table(
-        caption="Parameters",
-        headings=("parameter", "its place", "distribution", "least", "median", "greatest"),
-        rows=rows,
-        words=(1, 2),
-    )
-    settings = study.settings
-    opening = (
+        for name, c in values.items()
+    ]
+    headings = ("parameter", "its place", "distribution", "least", "median", "greatest")
+    return [
         f"{study.samples} samples (sampling: {settings.sampling}, seed: {settings.seed}, "
-        f"evaluation: {settings.evaluation})."
-    )
-    return [opening, table, *_histogram_chart(values, names)]
+        f"evaluation: {settings.evaluation}).",
+        Table(caption="Parameters", headings=headings, rows=tuple(rows), words=(1, 2)),
+        *_histogram_chart(values, names),
+    ]
 
 
 def _controllers_blocks(
@@ -357,11 +362,9 @@ def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]
         bars[one.controller] = np.maximum(value, 0)
         low, high = np.maximum((value - 2 * error, value + 2 * error), 0)
         intervals[one.controller] = low, high
-    height_in = min(max(0.8, 0.24 * len(statistics.ranked) * len(bars) + 0.2), 7.5)  # fits a sheet
-    with drawing([height_in]) as (panel,):
-        panel.set_axes({"label": "variance explained by itself", "unit": "%", "low": 0}, {})
-        panel.bars([names[name] for name in statistics.ranked], bars, intervals)
-    return [chart("sensitivity", panel.figure)]
+    listed = [names[name] for name in statistics.ranked]
+    axis = {"label": "variance explained by itself", "unit": "%", "low": 0}
+    return [chart("sensitivity", draw_bars(axis, listed, bars, intervals))]
 
 
 def _map_charts(

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import label
 
 from lbt_synth import studies
 from lbt_synth.config import Config
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.interop import frame_cost
-from lbt_synth.interop.c.export import FrameCost
 from lbt_synth.linear import Controller
 from lbt_synth.loop import (
     ClosedLoop,
@@ -55,22 +55,20 @@ class DesignAssessment:
     design: Design
     loop: ClosedLoop  # with the real sensor gain
     notes: tuple[str, ...]  # how the loop that it was made for differs from this one
-    # None where the loop is unstable: the exact residual, the margins at the real sensor gain, and
-    # the intervals around it of a gain that moves
+    # None where the loop is unstable: the exact residual, the margins at the real sensor gain, the
+    # intervals around it of a gain that moves, and a run in time
     budget: ResidualBudget | None
     margins: LoopMargins | None
     moving: MovingGain | None
+    run: Simulation | None
     # interval of real sensor gains with a stable loop, relative to the sensor matrix of the
     # configuration, around the real one, the assumed one, or one of the map; nan for none
     sensor_gains: tuple[float, float]
     checks: tuple[Check, ...]  # the certificate, recomputed
     certificate_error: str  # why it could not be; empty if it could
-    cost: FrameCost  # arithmetic of one frame, as exported to C
     map: RobustnessMap  # Strehl ratio over the frequency error and the real sensor gain
     strehls: FloatArray  # (e,): Strehl ratio over the frequency error at the real sensor gain
     limits: LimitRow  # residual, Strehl ratio, and how far they are from the limits
-    run: Simulation | None  # in the simulated loop; None where it is unstable
-    run_strehls: FloatArray  # (cases,): Strehl ratios of the run
 
     @property
     def stable(self) -> bool:
@@ -95,18 +93,16 @@ def assess_design(
     hardware, truth, settings = config.hardware, config.truth, config.settings.simulation
     real_gain = config.sensor_gain * truth.sensor_gain
     gains = np.unique([*config.settings.robustness.sensor_gains, real_gain])
-    image = robustness_map(
-        design,
-        truth,
-        config.imaging,
-        hardware=hardware,
-        errors_hz=errors_hz,
-        sensor_gains=gains / config.sensor_gain,
-    )
-    checks, complaint = _recertify(design)
-    budget = margins = moving = run = None
+    over: dict[str, Any] = {"errors_hz": errors_hz, "sensor_gains": gains / config.sensor_gain}
+    image = robustness_map(design, truth, config.imaging, hardware=hardware, **over)
+    checks: tuple[Check, ...] = ()
+    complaint, budget, margins, moving, run = "", None, None, None, None
+    try:
+        checks = design.recertify().checks
+    except (LbtSynthError, ArithmeticError) as error:
+        complaint = str(error)
     starts = [loop.sensor_gain, 1.0, *image.sensor_gains[image.stable[0]]]
-    interval = stable_interval(hardware, design.controller, starts)
+    low, high = stable_interval(hardware, design.controller, starts)
     if loop.is_stable:
         budget, margins, moving = (
             residual_budget(loop, truth),
@@ -130,15 +126,13 @@ def assess_design(
         budget=budget,
         margins=margins,
         moving=moving,
-        sensor_gains=(interval[0] * config.sensor_gain, interval[1] * config.sensor_gain),
+        run=run,
+        sensor_gains=(low * config.sensor_gain, high * config.sensor_gain),
         checks=checks,
         certificate_error=complaint,
-        cost=frame_cost(design),
         map=replace(image, sensor_gains=frozen_copy(gains)),  # the real ones again
         strehls=image.strehl[0, int(np.searchsorted(gains, real_gain))],
         limits=limits,
-        run=run,
-        run_strehls=np.zeros(0) if run is None else run.strehl(config.imaging),
     )
 
 
@@ -173,14 +167,6 @@ def stable_interval(
     """Return the interval of stable sensor gains around the first stable one of some, or nan."""
     intervals = (stable_sensor_gains(hardware, controller, nominal=start) for start in starts)
     return next((ends for ends in intervals if not np.isnan(ends[0])), (np.nan, np.nan))
-
-
-def _recertify(design: Design) -> tuple[tuple[Check, ...], str]:
-    """Return the checks of the recomputed certificate, or why that failed."""
-    try:
-        return design.recertify().checks, ""
-    except (LbtSynthError, ArithmeticError) as error:
-        return (), str(error)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -230,7 +216,7 @@ def design_report(
     designs : mapping of str to Design
         Designs by name.
     gain_files : mapping of str to path-like, optional
-        Files that designs came from, whose digests the report gives.
+        Files that designs came from, whose digests the page gives.
 
     Returns
     -------
@@ -305,71 +291,66 @@ def refine_values(values: Sequence[float]) -> FloatArray:
 
 _RMS: dict[str, Any] = {"unit": "nm rms", "format": ".1f"}
 _RATIO: dict[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}
-_BUDGET = {"turbulence": "turbulence", "vibration": "vibration", "noise": "noise"}
-_BUDGET |= {"within": "within frames"}
+_PARTS = ("turbulence", "vibration", "noise", "within")  # of a residual
 _MARGINS = (
     ("modulus", "modulus margin", ""),
     ("phase_deg", "phase margin", "deg"),
     ("delay_frames", "delay margin", "frames"),
     ("crossover_hz", "highest crossover", "Hz"),
 )
-# of the table of all designs: its groups, with the names of their facts
-_GROUPS: dict[str, tuple[str, ...]] = {
-    "Design": (
-        *("method", "route", "n_states", "multiplications", "gamma", "estimation_rms"),
-        "certificate",
-    ),
-    "In the loop of the configuration": (
-        *("loop", "spectral_radius", "residual_nm", *(f"{name}_nm" for name in _BUDGET)),
-        *("strehl", "strehl_simulated", "scatter"),
-    ),
-    "Distance to the limit of any linear controller": ("above_limit_percent",),
-    "Over frequency errors of {}": (
-        *("worst_nm", "worst_strehl", "good_errors", "above_band_limit_percent"),
-    ),
-    "Margins at the real sensor gain": (
-        *("modulus", "gain_margin", "phase_deg", "delay_frames", "crossover_hz"),
-        *("stable_gains", "moving_gains"),
-    ),
+# of the table of all designs: its groups, by the first of their facts
+_GROUPS = {
+    "origin": "Design",
+    "loop": "In the loop of the configuration",
+    "above_limit_percent": "Distance to the limit of any linear controller",
+    "worst_nm": "Over frequency errors of {}",
+    "modulus": "Margins at the real sensor gain",
 }
-WORDS = ("certificate", "loop", "good_errors", "gain_margin", "stable_gains", "moving_gains")
+WORDS = (
+    "origin",
+    "certificate",
+    "loop",
+    "good_errors",
+    "gain_margin",
+    "stable_gains",
+    "moving_gains",
+)
 _TONES = {"passed": "good", "stable": "good", "FAILED": "bad", "NOT": "bad", "UNSTABLE": "bad"}
 
 
 def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
     """Return the numbers of a design, and those of ``WORDS``, which are texts.
 
-    The page prints each column's help.
+    The page prints what has a help, in this order.
     """
     design, row, margins, moving = one.design, one.limits, one.margins, one.moving
     limits, gain, ranged = report.limits, report.config.sensor_gain, report.errors_hz.size > 1
     factors = None if margins is None else (margins.gain_low, margins.gain_high)
     moves = None if moving is None else (gain * moving.moving_low, gain * moving.moving_high)
+    strehls = np.zeros(0) if one.run is None else one.run.strehl(report.config.imaging)
+    mean = float(np.mean(strehls)) if strehls.size else None
+    scatter = 100 * float(np.std(strehls, ddof=1)) if strehls.size > 1 else None
     parts = {
-        f"{name}_nm": fact(getattr(one.budget, f"{name}_nm", None), help=f"of that {word}", **_RMS)
-        for name, word in _BUDGET.items()
+        f"{part}_nm": fact(getattr(one.budget, f"{part}_nm", None), help=f"of that {part}", **_RMS)
+        for part in _PARTS
     }
-    shown = {
+    numbers = {
         name: fact(getattr(margins, name, None), help=text, format=".3g", unit=unit)
         for name, text, unit in _MARGINS
     }
-    simulated = 100 * one.run_strehls
-    scatter = float(np.std(simulated, ddof=1)) if simulated.size > 1 else None
+    norm: dict[str, Any] = {"unit": "nm", "format": ".5g"}
+    known, anywhere = "frequency known", "frequency anywhere in this range"
     return facts(
         design=fact(one.name, "design"),
-        method=fact(design.method, "method", help="method"),
-        route=fact(design.solver.route, help="computed by"),
-        n_states=fact(design.controller.n_states, help="states of the controller"),
-        multiplications=fact(one.cost.multiplications, help="multiplications per frame"),
-        gamma=fact(
-            design.gamma,
-            unit="nm",
-            format=".5g",
-            help="achieved gamma, norm of the error in its own model",
-        ),
-        estimation_rms=fact(design.rms, help="error in its own model", **_RMS),
+        method=fact(design.method, "method"),
         stable=fact(one.stable, "stable"),
         certified=fact(one.certified, "certified"),
+        route=fact(design.solver.route),
+        origin=fact(f"{design.method}, {design.solver.route}", help="method, computed by"),
+        n_states=fact(design.controller.n_states, help="states of the controller"),
+        multiplications=fact(frame_cost(design).multiplications, help="multiplications per frame"),
+        gamma=fact(design.gamma, help="achieved gamma, norm of the error in its own model", **norm),
+        estimation_rms=fact(design.rms, help="error in its own model", **_RMS),
         certificate=fact(_certificate_word(one), help="certificate, recomputed"),
         loop=fact("stable" if one.stable else "UNSTABLE", help="closed loop"),
         spectral_radius=fact(
@@ -378,25 +359,19 @@ def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
         residual_nm=fact(row.residual_nm, "residual", help="residual, exact", **_RMS),
         **parts,
         strehl=fact(row.strehl, "Strehl", help="Strehl ratio, exact", **_RATIO),
-        strehl_simulated=fact(
-            float(np.mean(one.run_strehls)) if one.run_strehls.size else None,
-            help="Strehl ratio, simulated",
-            **_RATIO,
-        ),
+        strehl_simulated=fact(mean, help="Strehl ratio, simulated", **_RATIO),
         scatter=fact(scatter, help="its scatter between runs", unit="points", format=".2f"),
+        above_limit_percent=_above(row.above_limit_percent, limits.limit, known),
+        worst_nm=fact(row.worst_nm if ranged else None, help="worst residual", **_RMS),
         worst_strehl=fact(
             float(one.strehls.min()), "worst Strehl", help="worst Strehl ratio", **_RATIO
-        ),
-        worst_nm=fact(row.worst_nm if ranged else None, help="worst residual", **_RMS),
-        above_limit_percent=_above(row.above_limit_percent, limits.limit, "frequency known"),
-        above_band_limit_percent=_above(
-            row.above_band_limit_percent, limits.band, "frequency anywhere in this range"
         ),
         good_errors=fact(
             _interval(good_range(report, one), "+.4g"),
             help="within 10 % of its best Strehl ratio [Hz]",
         ),
-        **shown,
+        above_band_limit_percent=_above(row.above_band_limit_percent, limits.band, anywhere),
+        **numbers,
         gain_margin=fact(_interval(factors, ".3g"), help="gain margin, factors"),
         stable_gains=fact(_interval(one.sensor_gains), help="stable real sensor gains"),
         moving_gains=fact(_interval(moves), help="proved while the gain moves at any speed"),
@@ -412,9 +387,8 @@ def _above(percent: float, limit: ResidualLimit | BandLimit | None, where: str) 
 
 
 def _interval(ends: tuple[float, float] | None, spec: str = ".4g") -> str:
-    if ends is None or np.isnan(ends[0]):
-        return "-"
-    return f"{ends[0]:{spec}} to {ends[1]:{spec}}"
+    """Return an interval as a text; a dash where there is none."""
+    return "-" if ends is None or np.isnan(ends[0]) else f"{ends[0]:{spec}} to {ends[1]:{spec}}"
 
 
 def _certificate_word(one: DesignAssessment) -> str:
@@ -425,7 +399,7 @@ def _certificate_word(one: DesignAssessment) -> str:
     return f"FAILED, {failed} of {count}" if failed else f"passed, {count}"
 
 
-KEPT = 0.9  # of its best Strehl ratio, within which a design counts as good
+_KEPT = 0.9  # of its best Strehl ratio, within which a design counts as good
 
 
 def good_range(report: DesignReport, one: DesignAssessment) -> tuple[float, float] | None:
@@ -433,14 +407,11 @@ def good_range(report: DesignReport, one: DesignAssessment) -> tuple[float, floa
 
     None where it is unstable, or where there is no range of errors.
     """
-    errors_hz = report.errors_hz
-    if not one.stable or errors_hz.size == 1:
+    if not one.stable or report.errors_hz.size == 1:
         return None
-    best = int(np.argmax(one.strehls))
-    poor = np.flatnonzero(one.strehls < KEPT * np.max(one.strehls))
-    first = int(np.max(poor[poor < best], initial=-1)) + 1
-    last = int(np.min(poor[poor > best], initial=errors_hz.size)) - 1
-    return float(errors_hz[first]), float(errors_hz[last])
+    runs, _ = label(one.strehls >= _KEPT * np.max(one.strehls))
+    good = report.errors_hz[runs == runs[np.argmax(one.strehls)]]
+    return float(good[0]), float(good[-1])
 
 
 def verdict(report: DesignReport) -> str:
@@ -450,35 +421,35 @@ def verdict(report: DesignReport) -> str:
     """
     sentences = []
     if report.stable:
-        shown = {one.name: one.limits.residual_nm for one in report.stable}
-        least, names = _leaders(
-            {n: nm_text(v, ".1f", unit="nm rms") for n, v in shown.items()}, shown
-        )
         strehl = max(one.limits.strehl for one in report.stable)
         where = ", if the vibrations are where the configuration has them"
+        least = _leaders(
+            {one.name: one.limits.residual_nm for one in report.stable},
+            lambda residual_nm: nm_text(residual_nm, ".1f", unit="nm rms"),
+        )
         sentences.append(
-            f"Least residual: {names}, {least} (Strehl ratio {100 * strehl:.1f} %)"
+            f"Least residual: {least} (Strehl ratio {100 * strehl:.1f} %)"
             f"{where if report.config.truth.vibrations else ''}."
         )
     if report.stable and report.errors_hz.size > 1:
-        worst = {one.name: -100 * float(np.min(one.strehls)) for one in report.stable}
-        most, names = _leaders(
-            {name: f"{-percent:.1f} %" for name, percent in worst.items()}, worst
-        )
         first, last = (f"{report.errors_hz[i]:+.4g}" for i in (0, -1))
+        most = _leaders(
+            {one.name: -100 * float(np.min(one.strehls)) for one in report.stable},
+            lambda percent: f"{-percent:.1f} %",
+        )
         sentences.append(
             f"Highest Strehl ratio at worst, if their frequencies are wrong by {first} to {last} "
-            f"Hz: {names}, {most}."
+            f"Hz: {most}."
         )
     sentences.append(_certificate_sentence(report))
     # a number stays in one line with its unit
     return re.sub(r"(?<=\d) (?=%|nm|um|mas|urad|Hz)", "\u00a0", " ".join(sentences))
 
 
-def _leaders(texts: Mapping[str, str], values: Mapping[str, float]) -> tuple[str, str]:
-    """Return the text of the least value, and the names of all designs that show the same."""
-    text = texts[min(values, key=lambda name: values[name])]
-    return text, listing_text([name for name, other in texts.items() if other == text])
+def _leaders(values: Mapping[str, float], show: Callable[[float], str]) -> str:
+    """Name the designs that show the same as the one of the least value, and say that."""
+    least = show(min(values.values()))
+    return f"{listing_text([n for n, value in values.items() if show(value) == least])}, {least}"
 
 
 def _certificate_sentence(report: DesignReport) -> str:
@@ -502,16 +473,16 @@ def summary_table(report: DesignReport) -> Table:
     """All designs side by side, in groups; a line that no design has a value for is left out."""
     rows = [design_facts(report, one) for one in report.assessments]
     ends = f"{report.errors_hz[0]:.4g} to {report.errors_hz[-1]:.4g} Hz"
-    printed = {each.name: each for each in columns(rows[0])}
     lines: list[tuple[str | Cell, ...]] = []
-    for group, names in _GROUPS.items():
-        cells = {name: [printed[name].text(row) for row in rows] for name in names}
-        kept = {name: texts for name, texts in cells.items() if set(texts) != {"-"}}
-        lines += [(group.format(ends),)] if kept else []
-        for name, texts in kept.items():
-            how = printed[name]
-            title = f"{how.help} [{how.shown_unit}]" if how.unit else how.help
-            lines.append((title, *map(_toned, texts)))
+    group = ""
+    for each in columns(rows[0]):
+        group = _GROUPS.get(each.name, group).format(ends)
+        texts = [each.text(row) for row in rows]
+        if not each.help or set(texts) == {"-"}:
+            continue
+        title = f"{each.help} [{each.shown_unit}]" if each.unit else each.help
+        lines += [] if (group,) in lines else [(group,)]
+        lines.append((title, *map(_toned, texts)))
     return Table(
         caption=f"Summary at a real sensor gain of {report.real_gain:.4g}; "
         f"{report.config.imaging.label}",

@@ -67,7 +67,7 @@ def test_the_page_is_complete(text, report, config):
     ):
         assert word in titles
     for heading in (
-        "method",
+        "method, computed by",
         "Strehl ratio, exact [%]",
         "modulus margin",
         "states of the controller",

@@ -129,4 +129,4 @@ def test_simulations_agree_with_the_exact_answer(report):
         f, _, simulated, expected = run_spectra(one.run, one.loop, report.config.truth)
         ratio = (simulated / expected)[f > 5]
         assert np.mean(ratio) == pytest.approx(1, abs=0.06)
-        assert np.ptp(one.run_strehls) > 0
+        assert np.ptp(one.run.strehl(report.config.imaging)) > 0
