@@ -435,7 +435,9 @@ class Panel:
                 place.set_major_locator(linear if high < 10 * low else decades)
                 place.set_major_formatter("{x:g}")
                 place.set_minor_locator(NullLocator())
-            getattr(self.axes, f"set_{name}lim")(low, high if high > low else low + 1)
+            if first is not None and high <= low:  # all values are below the end that is given
+                high = low + 1
+            getattr(self.axes, f"set_{name}lim")(low, high)
             place.set_label_text(axis["text"], parse_math=False)
         width_in = self.axes.get_window_extent().width / self.axes.figure.dpi
         self._draw_flags(width_in)

@@ -48,6 +48,14 @@ def test_titles_are_whole_and_stay_above_their_panel(columns):
         assert title.y1 <= names.get_window_extent().y0 + 1
 
 
+def test_bars_are_in_view_from_the_top():
+    axes = every_mark()[2].figure.axes[0]
+    low, high = axes.get_ylim()
+    places = [bar.get_y() + bar.get_height() / 2 for bar in axes.patches]
+    assert low > max(places) > min(places) > high
+    assert [text.get_text() for text in axes.get_yticklabels()] == ["a.b", "first", "c"]
+
+
 def test_an_end_that_is_given_stays_and_the_other_has_room():
     with drawing([2.0]) as (panel,):
         panel.set_axes(X, {"label": "y", "low": 0.0})
