@@ -36,12 +36,7 @@ from lbt_synth.storage.rows import (
     row_table,
 )
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.paper import (
-    all_cases,
-    end_to_end_tables,
-    plan_cases,
-    rms_modal_difference,
-)
+from lbt_synth.studies.paper import all_cases, end_to_end_tables, plan_cases, rms_modal_difference
 from lbt_synth.validation import integer
 
 _LEAST_GAIN = 0.01  # optical gain of tip and tilt; less is what a saturated pyramid shows

@@ -53,11 +53,7 @@ def run(arguments: Namespace) -> Report:
         series = (_recorded if recorded else _drawn)(arguments, design)
         source, disturbance, hardware, imaging, ran = series
         found = rehearse(
-            design,
-            arguments.target,
-            disturbance,
-            hardware=hardware,
-            stroke=arguments.stroke,
+            design, arguments.target, disturbance, hardware=hardware, stroke=arguments.stroke
         )
     loops = {f"in {arguments.target}": found.target, "design, double precision": found.design}
     rows = [

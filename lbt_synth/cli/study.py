@@ -103,11 +103,7 @@ def _compute(loaded: studies.Study, folder: Path, arguments: Namespace) -> Study
             keep_finished(folder),
         ):
             return studies.run_study(
-                loaded,
-                folder,
-                executor=executor,
-                workers=workers,
-                progress=count,
+                loaded, folder, executor=executor, workers=workers, progress=count
             )
 
 

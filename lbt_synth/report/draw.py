@@ -321,13 +321,7 @@ class Panel:
         self.series.append(Series(panel=title, heading=heading, name=name, x=x, y=y))
 
     def area(
-        self,
-        name: str,
-        x: ArrayLike,
-        low: ArrayLike,
-        high: ArrayLike,
-        *,
-        look: int | None = 0,
+        self, name: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, look: int | None = 0
     ) -> None:
         """Shade the area between two curves, (n,) each."""
         along, least, most = self._shown("x", x), self._shown("y", low), self._shown("y", high)

@@ -160,11 +160,7 @@ def _summary_blocks(
         for text, tone, is_so in (
             (paragraph("incomplete", done=done, samples=whole), "bad", done < whole),
             (f"Unstable loops: {unstable}.", "bad", unstable),
-            (
-                f"Evaluations that failed, and are in none of the figures: {failed}.",
-                "bad",
-                failed,
-            ),
+            (f"Evaluations that failed, and are in none of the figures: {failed}.", "bad", failed),
             (
                 "Every controller is stable in every sample, and none failed.",
                 "good",

@@ -15,12 +15,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.loop.simulation.run import Drop
 from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.report.designs.report import DesignAssessment, DesignReport, summary_table, verdict
-from lbt_synth.report.draw import (
-    Figure,
-    count_columns,
-    drawing,
-    square_in,
-)
+from lbt_synth.report.draw import Figure, count_columns, drawing, square_in
 from lbt_synth.report.figures.loops import (
     FREQUENCY,
     draw_bode,

@@ -61,16 +61,22 @@ Numbers: TypeAlias = tuple[dict[str, tuple[FloatArray, FloatArray]], Sequence[fl
 _REACH = 3.0  # of the plane of a loop gain, to each side of -1
 _FAR = 3 * _REACH  # outside that plane; a canvas takes no larger numbers
 _DECADES = 4  # of a logarithmic scale of ordinates
-_ROOM = 0.05  # decades above the highest curve
-# of each figure: what is on its axes, and which of them are logarithmic
+# of each figure: what is on its axes, with units of wavefronts in braces; those over frequency show
+# a field of a design on logarithmic scales
+_FIELDS = {
+    "explore-rejection": "rejection",
+    "explore-noise": "noise_transfer",
+    "explore-spectrum": "spectrum_nm2_hz",
+    "explore-sigma": "error_nm",
+}
 _AXES = {
-    "explore-rejection": ("frequency [Hz]", "\u03c3\u0304, phase to residual [-]", "xy"),
-    "explore-noise": ("frequency [Hz]", "\u03c3\u0304, noise to residual [-]", "xy"),
-    "explore-nyquist": ("real part [-]", "imaginary part [-]", ""),
-    "explore-spectrum": ("frequency [Hz]", "power spectrum [{nm²/Hz}]", "xy"),
-    "explore-strehl": ("frequency error [Hz]", "Strehl ratio [%]", ""),
-    "explore-poles": ("real part [-]", "imaginary part [-]", ""),
-    "explore-sigma": ("frequency [Hz]", "\u03c3\u0304, disturbances to error [{nm}]", "xy"),
+    "explore-rejection": ("frequency [Hz]", "\u03c3\u0304, phase to residual [-]"),
+    "explore-noise": ("frequency [Hz]", "\u03c3\u0304, noise to residual [-]"),
+    "explore-nyquist": ("real part [-]", "imaginary part [-]"),
+    "explore-spectrum": ("frequency [Hz]", "power spectrum [{nm²/Hz}]"),
+    "explore-strehl": ("frequency error [Hz]", "Strehl ratio [%]"),
+    "explore-poles": ("real part [-]", "imaginary part [-]"),
+    "explore-sigma": ("frequency [Hz]", "\u03c3\u0304, disturbances to error [{nm}]"),
 }
 
 
@@ -78,21 +84,16 @@ def explore_numbers(
     shown: Mapping[str, Shown], lines_hz: Sequence[float], shift_hz: float
 ) -> dict[str, Numbers]:
     """Return what each figure shows of designs, with true lines and where the slider stands."""
-    density, error = shown_unit("nm²/Hz")[1], shown_unit("nm")[1]
     numbers: dict[str, Numbers] = {}
-    for key, field, factor in (
-        ("explore-rejection", "rejection", 1.0),
-        ("explore-noise", "noise_transfer", 1.0),
-        ("explore-spectrum", "spectrum_nm2_hz", density),
-        ("explore-sigma", "error_nm", error),
-    ):
+    factors = {"spectrum_nm2_hz": shown_unit("nm²/Hz")[1], "error_nm": shown_unit("nm")[1]}
+    for key, field in _FIELDS.items():
         curves = {
-            name: (one.frequency_hz, factor * getattr(one, field))
+            name: (one.frequency_hz, factors.get(field, 1.0) * getattr(one, field))
             for name, one in shown.items()
             if getattr(one, field) is not None
         }
         values = np.concatenate([np.ones(1), *(y for _, y in curves.values())])
-        high = float(10.0 ** np.ceil(np.log10(np.nanmax(values)) + _ROOM))
+        high = float(10.0 ** np.ceil(np.log10(1.1 * np.nanmax(values))))
         grid = next(iter(shown.values())).frequency_hz
         ends = (float(grid[0]), float(grid[-1])), (high / 10**_DECADES, high)
         numbers[key] = curves, lines_hz, ends
@@ -108,7 +109,7 @@ def explore_numbers(
     shifts = np.concatenate([x for x, _ in strehls.values()])
     across = float(np.min(shifts)) - 1e-9, float(np.max(shifts)) + 1e-9
     numbers["explore-strehl"] = strehls, [shift_hz], (across, (low, high + 0.04 * (high - low)))
-    return {key: numbers[key] for key in _AXES}
+    return numbers
 
 
 def _loop_gains(one: Shown) -> tuple[FloatArray, FloatArray]:
@@ -122,58 +123,56 @@ class LivePanel:
     """A figure with the curves of all designs, the rules across them, and what they mean."""
 
     def __init__(self, key: str) -> None:
-        *labels, self._log = _AXES[key]
         units = {unit: shown_unit(unit)[0] for unit in ("nm", "nm²/Hz")}
-        self._is_points = key == "explore-poles"
-        square = key in ("explore-nyquist", "explore-poles")
-        self.figure = new_figure(
-            **{f"{n}_axis_type": "log" if n in self._log else "linear" for n in "xy"},
-            **{f"{n}_range": Range1d() for n in "xy"},
+        self._is_log, self._is_points = key in _FIELDS, key == "explore-poles"
+        square, scale = (
+            key in ("explore-nyquist", "explore-poles"),
+            "log" if self._is_log else "linear",
+        )
+        self.figure = figure = new_figure(
             name=key,
             title=words()[key]["title"],
             **({"width": 330} if square else {"sizing_mode": "stretch_width"}),
             height=330 if square else 300,
+            x_axis_type=scale,
+            y_axis_type=scale,
+            x_range=Range1d(),
+            y_range=Range1d(),
             tools="box_zoom,pan,wheel_zoom,reset",
             toolbar_location="above",
             min_border_left=64,  # figures above each other are in line
         )
         # a finger scrolls the page
-        self.figure.toolbar.update(logo=None, active_drag=None, active_scroll=None)
-        for axis, text in zip((self.figure.xaxis[0], self.figure.yaxis[0]), labels, strict=True):
+        figure.toolbar.update(logo=None, active_drag=None, active_scroll=None)
+        for axis, text in zip((figure.xaxis[0], figure.yaxis[0]), _AXES[key], strict=True):
             axis.axis_label = PlainText(text=text.format_map(units))
         self.rules = ColumnDataSource({"at": []})
         self.curves = ColumnDataSource({name: [] for name in ("x", "y", "name", "colour", "look")})
-        self.figure.vspan(x="at", source=self.rules, line_color=GREY, line_dash="4 5")
-        place = {"source": self.curves, "line_color": "colour"}
+        figure.vspan(x="at", source=self.rules, line_color=GREY, line_dash="4 5")
         if self._is_points:
-            style = {"marker": "look", "size": 8, "line_width": 1.5, "fill_color": None}
-            marks = self.figure.scatter("x", "y", **place, **style)
-        else:
-            marks = self.figure.multi_line("x", "y", **place, line_dash="look", line_width=2)
-        self._draw_guides(key)
-        tips = [("", "@name"), *((f"{n}", f"$snap_{n}{{%.4g}}") for n in "xy")]
-        formats = {f"$snap_{n}": "printf" for n in "xy"}
-        self.figure.add_tools(HoverTool(renderers=[marks], tooltips=tips, formatters=formats))
-        caption = Div(text=escape(words()[key]["caption"]), sizing_mode="stretch_width")
-        self.root = column(self.figure, caption, sizing_mode="stretch_width")
-
-    def _draw_guides(self, key: str) -> None:
-        """Draw what the curves are compared with."""
-        thin = {"line_color": GREY, "line_width": 1.2}
-        if key == "explore-rejection":
-            self.figure.hspan(y=[1.0], **thin)
-        elif key == "explore-nyquist":
-            self.figure.scatter([-1.0], [0.0], marker="cross", size=13, line_color=GREY)
-        elif key == "explore-poles":
+            marks = figure.scatter(
+                marker="look", size=8, fill_color=None, **_MARKS, source=self.curves
+            )
             turn = np.linspace(0, 2 * np.pi, 181)
-            self.figure.line(np.cos(turn), np.sin(turn), **thin)
+            figure.line(np.cos(turn), np.sin(turn), line_color=GREY)
+        else:
+            marks = figure.multi_line(line_dash="look", **_MARKS, source=self.curves)
+        if key == "explore-rejection":
+            figure.hspan(y=[1.0], line_color=GREY)
+        elif key == "explore-nyquist":
+            figure.scatter([-1.0], [0.0], marker="cross", size=13, line_color=GREY)
+        tips = [("", "@name"), ("x", "$snap_x{%.4g}"), ("y", "$snap_y{%.4g}")]
+        formats = dict.fromkeys(("$snap_x", "$snap_y"), "printf")
+        figure.add_tools(HoverTool(renderers=[marks], tooltips=tips, formatters=formats))
+        caption = Div(text=escape(words()[key]["caption"]), sizing_mode="stretch_width")
+        self.root = column(figure, caption, sizing_mode="stretch_width")
 
     def show(self, numbers: Numbers, looks: Mapping[str, int]) -> None:
         """Show curves in the looks of their designs."""
         curves, rules, ends = numbers
         self.rules.data = {"at": np.array(rules)}
         x = [x for x, _ in curves.values()]
-        y = [np.where(y > 0, y, np.nan) if "y" in self._log else y for _, y in curves.values()]
+        y = [np.where(y > 0, y, np.nan) if self._is_log else y for _, y in curves.values()]
         name, number = list(curves), [looks[name] for name in curves]
         look = list(map(_strokes, number))
         if self._is_points:  # a row for each
@@ -188,6 +187,7 @@ class LivePanel:
             scale.update(start=start, end=end)
 
 
+_MARKS: dict[str, Any] = {"x": "x", "y": "y", "line_color": "colour", "line_width": 2}
 _MARKERS = ("circle", "square", "triangle", "diamond", "cross", "x")
 
 

@@ -124,11 +124,7 @@ def closed_loops(
 
 
 def frequency_grid(
-    rate_hz: float,
-    special_hz: Sequence[float] = (),
-    *,
-    points: int = _POINTS,
-    near: int = 60,
+    rate_hz: float, special_hz: Sequence[float] = (), *, points: int = _POINTS, near: int = 60
 ) -> FloatArray:
     """Logarithmic grid up to Nyquist, denser around special frequencies and below Nyquist.
 

@@ -98,10 +98,7 @@ def strehl_axis(percents: ArrayLike) -> dict[str, Any]:
 
 
 def robustness_map_figure(
-    maps: Mapping[str, RobustnessMap],
-    *,
-    real_gain: float | None = None,
-    axes: OwnAxes = None,
+    maps: Mapping[str, RobustnessMap], *, real_gain: float | None = None, axes: OwnAxes = None
 ) -> Figure:
     """Draw the Strehl ratio of designs over frequency error and sensor gain.
 
