@@ -12,17 +12,14 @@ from lbt_synth.cli.output import Report
 from lbt_synth.errors import ProblemError
 from lbt_synth.report.explore.exploration import explore, new_view
 from lbt_synth.storage.atomic_files import require_writable
+from lbt_synth.validation import integer
 
-_MOST_PORTS = 65535
 _LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
 def run(arguments: Namespace) -> Report:
     """Serve the page until it is interrupted."""
-    if not 0 <= arguments.port <= _MOST_PORTS:
-        raise ProblemError(f"--port must be from 0 to {_MOST_PORTS}; got {arguments.port}.")
-    if not arguments.host:
-        raise ProblemError("--host must be a name or an address; got an empty text.")
+    integer(arguments.port, "--port", at_least=0, at_most=65_535)
     for origin in arguments.origin:
         if not re.fullmatch(r"[\w.*-]+:\d{1,5}", origin):
             raise ProblemError(f"--origin must be HOST:PORT, as localhost:8080; got {origin!r}.")

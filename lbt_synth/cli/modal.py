@@ -22,7 +22,6 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.validation import FloatArray, integer
 
-_MOST_MODES = 20_000
 _RMS: dict[str, Any] = {"unit": "nm", "format": ".1f"}
 _MIRROR_NOTE = (
     "mirror: its local loop on every mode; the Kalman filters know its real positions, but command "
@@ -110,7 +109,7 @@ def _mode_count(given: int | None, config: Config) -> int:
             f"{config.source}: the key mirror.modes is missing; give it, or --modes.",
             path="mirror.modes",
         )
-    return integer(count, "modes", at_least=2, at_most=_MOST_MODES)
+    return integer(count, "modes", at_least=2)
 
 
 def _noise_nm(config: Config, count: int) -> tuple[FloatArray, str]:

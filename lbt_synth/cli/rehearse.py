@@ -32,7 +32,7 @@ from lbt_synth.validation import FloatArray, integer, number
 _FRAMES = 8000  # of a drawn disturbance
 _DRAWN = ("frames", "seed")  # options that only a drawn disturbance has
 _ALWAYS = ("target", "file", "stroke", "wavelength_um", "output", "json", "unit", "show_unit")
-_FEWEST, _MOST = 256, 10_000_000  # of a record, and of a drawn disturbance
+_FEWEST = 256  # frames of a record
 
 
 # the source in words, what the loops run_rehearse on, and residual and commands of a record
@@ -186,6 +186,6 @@ def _drawn(arguments: Namespace, design: Design) -> _Series:
     frames, alone = _FRAMES, config.hardware.own_sensor_alone()
     seed = integer(arguments.seed, "--seed", at_least=0)
     if arguments.frames is not None:
-        frames = integer(arguments.frames, "--frames", at_least=1, at_most=_MOST)
+        frames = integer(arguments.frames, "--frames", at_least=1)
     drawn = draw_disturbance(config.truth, alone, frames=frames, seed=seed)
     return f"{frames} frames of its own truth", drawn, config.hardware, imaging, None

@@ -48,9 +48,7 @@ from lbt_synth.validation import FloatArray
 
 _POINTS = 400  # of a cumulative distribution
 _BINS = 30  # of a histogram, and along either axis of a map, at most
-_WITHIN = 1, 99  # percentiles at the edges of a map; its outermost cells hold what is beyond
 _PER_CELL = 8  # samples in a cell of a map on average, at least
-_QUANTILES = (0, 50, 100)  # percents of a parameter that are listed
 _MOST_FAILURES = 10  # that are listed
 _PARAMETERS = 5  # of a worst sample: with row and Strehl ratio, they fill a sheet
 Names = Mapping[str, str]  # what each parameter is called
@@ -222,7 +220,7 @@ def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names
             names[name],
             name,
             texts.get(name, ""),
-            *(f"{q:.4g}" for q in np.percentile(c, _QUANTILES)),
+            *(f"{q:.4g}" for q in np.quantile(c, (0, 0.5, 1))),
         )
         for name, c in values.items()
     ]
@@ -414,15 +412,13 @@ def binned_map(
 
 
 def _cells(values: FloatArray, cells: int) -> tuple[FloatArray, FloatArray]:
-    """Return the centres of the cells along one axis, and their edges."""
-    ordered = np.sort(values)
-    if is_list(ordered):
+    """Return the centres of the cells along one axis, and their edges.
+
+    A list has a cell for each value, other values have cells of equal width.
+    """
+    if is_list(np.sort(values)):
         centres = np.unique(values)
         inner = (centres[:-1] + centres[1:]) / 2
-    else:
-        low, high = np.percentile(ordered, _WITHIN)
-        if not low < high:
-            low, high = ordered[0], ordered[-1]
-        edges = np.linspace(low, high, cells + 1)
-        centres, inner = (edges[:-1] + edges[1:]) / 2, edges[1:-1]
-    return centres, np.concatenate(([ordered[0] - 1], inner, [ordered[-1] + 1]))
+        return centres, np.concatenate(([centres[0] - 1], inner, [centres[-1] + 1]))
+    edges = np.linspace(values.min(), values.max(), cells + 1)
+    return (edges[:-1] + edges[1:]) / 2, edges

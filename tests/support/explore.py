@@ -69,18 +69,17 @@ def await_verdict(browser):
     return text_of(browser, "verdict")
 
 
-def move(browser, key, part):
-    """Move a slider to a part of its range and release it; return the verdict."""
-    browser.execute_script(SET, key, "value", part, True)
-    await_true(lambda: text_of(browser, "verdict") == "Designing …", within_s=10)
-    return await_verdict(browser)
+def move(browser, key, part, *, final=True):
+    """Move a slider to a part of its range and release it; return the verdict, a new one."""
+    said = text_of(browser, "verdict")
+    browser.execute_script(SET, key, "value", part, final)
+    await_true(lambda: text_of(browser, "verdict") not in (said, "", "Designing …"))
+    return text_of(browser, "verdict")
 
 
 def choose(browser, method):
     """Choose a method, and return the verdict on its design."""
-    browser.execute_script(SET, "method", "value", method, False)
-    await_true(lambda: text_of(browser, "verdict") == "Designing …", within_s=10)
-    return await_verdict(browser)
+    return move(browser, "method", method, final=False)
 
 
 def press(browser, name):

@@ -24,7 +24,13 @@ from lbt_synth.report.figures.loops import (
     draw_steps,
     sigma_curves,
 )
-from lbt_synth.report.figures.records import SPECTRUM, TIME, run_spectra, sensor_failure_figure
+from lbt_synth.report.figures.records import (
+    SERIES_S,
+    SPECTRUM,
+    TIME,
+    run_spectra,
+    sensor_failure_figure,
+)
 from lbt_synth.report.figures.studies import (
     FREQUENCY_ERROR,
     SENSOR_GAIN,
@@ -47,8 +53,6 @@ from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies.limits import TruthComparison, compare_in_truth
 from lbt_synth.studies.robustness import run_failures
-
-_EXCERPT = 400  # frames of a simulated series
 
 
 def design_page(report: DesignReport, *, title: str | None = None) -> Page:
@@ -266,14 +270,15 @@ def _simulation_blocks(report: DesignReport) -> list[Block]:
     if not runs:
         return ["No loop is stable, so none was simulated."]
     rate_hz, frames = runs[0][1].frame_rate_hz, runs[0][1].residual_nm.shape[1]
-    time_s = np.arange(min(frames, _EXCERPT)) / rate_hz
-    reach = 1.05 * max(float(np.max(np.abs(run.residual_nm[0, :_EXCERPT, 0]))) for _, run in runs)
+    shown = min(frames, int(SERIES_S * rate_hz))
+    time_s = np.arange(shown) / rate_hz
+    reach = 1.05 * max(float(np.max(np.abs(run.residual_nm[0, :shown, 0]))) for _, run in runs)
     residual = {"label": "residual", "unit": "nm", "low": -reach, "high": reach}
     with drawing([0.95] * len(runs)) as series:
         for panel, (one, run) in zip(series, runs, strict=True):
             panel.set_axes(TIME, residual, title=one.name)
             style: dict[str, Any] = {"look": report.names.index(one.name), "dash": 0}
-            y = run.residual_nm[0, :_EXCERPT, 0]
+            y = run.residual_nm[0, :shown, 0]
             panel.curve("residual", time_s, y, quiet=True, width=0.9, **style)
     with drawing([2.2] * len(runs), columns=count_columns(len(runs))) as spectra:
         for panel, (one, run) in zip(spectra, runs, strict=True):

@@ -27,7 +27,7 @@ from lbt_synth.models import Vibration
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.report.designs.report import frequency_errors, require_compatible
 from lbt_synth.report.figures.loops import frequency_grid
-from lbt_synth.report.figures.records import exact_spectrum
+from lbt_synth.report.figures.records import SEGMENT, exact_spectrum
 from lbt_synth.storage.display_unit import nm_text, shown_unit
 from lbt_synth.storage.rows import fact, facts, row_table
 from lbt_synth.storage.tables import Table
@@ -259,7 +259,6 @@ def _true_lines(config: Config, content: Content) -> list[Content]:
 
 _POINTS, _NEAR_A_LINE = 240, 28  # frequencies of a curve: in all, and on each side of a line
 _SHIFTS = 15  # of the true lines, for which a Strehl ratio is computed
-SEGMENT = 2048  # frames of a segment of the spectrum
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

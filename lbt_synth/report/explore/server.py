@@ -151,12 +151,12 @@ class LivePanel:
         figure.vspan(x="at", source=self.rules, line_color=GREY, line_dash="4 5")
         if self._is_points:
             marks = figure.scatter(
-                marker="look", size=8, fill_color=None, **_MARKS, source=self.curves
+                "x", "y", marker="look", size=8, fill_color=None, **_MARKS, source=self.curves
             )
             turn = np.linspace(0, 2 * np.pi, 181)
             figure.line(np.cos(turn), np.sin(turn), line_color=GREY)
         else:
-            marks = figure.multi_line(line_dash="look", **_MARKS, source=self.curves)
+            marks = figure.multi_line("x", "y", line_dash="look", **_MARKS, source=self.curves)
         if key == "explore-rejection":
             figure.hspan(y=[1.0], line_color=GREY)
         elif key == "explore-nyquist":
@@ -187,7 +187,7 @@ class LivePanel:
             scale.update(start=start, end=end)
 
 
-_MARKS: dict[str, Any] = {"x": "x", "y": "y", "line_color": "colour", "line_width": 2}
+_MARKS: dict[str, Any] = {"line_color": "colour", "line_width": 2}
 _MARKERS = ("circle", "square", "triangle", "diamond", "cross", "x")
 
 
@@ -251,7 +251,6 @@ def _value(knob: Knob, place: float) -> float:
 
 
 _QUICK_S = 0.3  # a design that takes longer is made when a slider is released
-_MOST_KEPT = 5  # designs beside those of the command; more curves hide one another
 _THREADS = 3  # of a page: for a slow design, a quick one, and a verdict
 _SWITCH_S = 0.0005  # after which a thread that computes lets another go on; Python's 5 ms stutter
 _GRID = {"display": "grid", "grid-template-columns": "repeat(auto-fill, minmax(330px, 1fr))"}
@@ -373,10 +372,7 @@ class Session:
         view = self._view
         moves = describe_moves(self._exploration, view)
         name = f"{view.name}, {moves}" if moves else f"{view.name}, kept"
-        self._kept.pop(name, None)
         self._kept[name] = view.shown[view.name]
-        if len(self._kept) > _MOST_KEPT:
-            del self._kept[next(iter(self._kept))]
         self._show(self._number, view)
 
     def _save(self) -> None:

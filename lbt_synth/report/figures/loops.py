@@ -20,7 +20,6 @@ from lbt_synth.validation import ComplexArray, FloatArray, choice
 
 FREQUENCY = {"label": "frequency", "unit": "Hz", "log": True}
 _DECADES = 3.6  # of frequency that are drawn, below half the frame rate
-_DEEPEST = 1e5  # below the highest value: a zero at the Nyquist frequency is no scale
 _POINTS = 1200  # of a grid of frequencies
 _LOWEST_DB, _HIGHEST_DB = -40.0, 60.0
 _REACH = 2.5  # of a Nyquist plot from its centre
@@ -126,9 +125,10 @@ def closed_loops(
 def frequency_grid(
     rate_hz: float, special_hz: Sequence[float] = (), *, points: int = _POINTS, near: int = 60
 ) -> FloatArray:
-    """Logarithmic grid up to Nyquist, denser around special frequencies and below Nyquist.
+    """Logarithmic grid below Nyquist, denser around special frequencies and towards Nyquist.
 
-    It has so many points, and so many more near each special one, on either side of it.
+    It has so many points, and so many more near each special one, on either side of it. Nyquist
+    itself is left out: a zero there is no scale.
     """
     nyquist = rate_hz / 2
     grids = [np.geomspace(nyquist / 10**_DECADES, nyquist, points)]
@@ -136,7 +136,7 @@ def frequency_grid(
         spread = np.geomspace(1e-4, 0.2, near)
         grids += [centre * (1 + spread), centre * (1 - spread), np.array([centre])]
     grid = np.unique(np.concatenate(grids))
-    return grid[(grid > 0) & (grid <= nyquist)]
+    return grid[(grid > 0) & (grid < nyquist)]
 
 
 def draw_design(
@@ -229,10 +229,7 @@ def draw_sigma(
     ]
     with drawing([PANEL_IN] * len(drawn), axes=axes) as panels:
         for panel, (number, label, of, norms) in zip(panels, drawn, strict=True):
-            values = np.concatenate([np.zeros(1), *(y for _, y in norms.values() if y is not None)])
-            floor = float(np.max(values)) / _DEEPEST
-            low = floor if np.any(values[1:] < floor) and floor > 0 else None
-            y_axis = {"label": f"\u03c3\u0304, {label}", "unit": of, "log": True, "low": low}
+            y_axis = {"label": f"\u03c3\u0304, {label}", "unit": of, "log": True}
             panel.set_axes(FREQUENCY, y_axis, title=title if number == 1 else "")
             for name, (f, norm) in norms.items():
                 is_unstable = number > 0 and name in loops and not loops[name].is_stable

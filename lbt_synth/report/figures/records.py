@@ -23,7 +23,7 @@ from lbt_synth.validation import FloatArray, require_instance
 
 TIME = {"label": "time", "unit": "s"}
 SPECTRUM = {"label": "power spectrum", "unit": "nm²/Hz", "log": True}
-_SERIES_S = 1.0  # of a series, in which single oscillations are seen
+SERIES_S = 1.0  # of a series, in which single oscillations are seen
 _WINDOW_S = 0.1  # over which the size of the residual is averaged
 _BANDS = 240  # of equal ratio over which the periodogram is averaged
 _KOLMOGOROV = 1.6276  # Kolmogorov's statistic at 1 %
@@ -37,7 +37,7 @@ def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None)
     """
     _, frames, n = run.residual_nm.shape
     names = _NAMES if n <= 2 else [f"mode {i}" for i in range(1, n + 1)]
-    shown = min(frames, int(np.ceil(_SERIES_S * run.frame_rate_hz)))
+    shown = min(frames, int(np.ceil(SERIES_S * run.frame_rate_hz)))
     time = np.arange(shown) / run.frame_rate_hz
     with drawing([PANEL_IN, PANEL_IN], axes=axes) as (series, spectra):
         series.set_axes(TIME, {"label": "residual", "unit": "nm"}, title=title)
@@ -279,7 +279,7 @@ def _draw_innovations(panel: Panel, axis: IdentifiedAxis, frequency: dict[str, o
     panel.curve("excess", test.frequency_hz, excess, width=1.0, quiet=True)
 
 
-_SEGMENT = 2048  # frames of a segment of the spectra, at most
+SEGMENT = 2048  # frames of a segment of the spectra, at most
 
 
 def run_spectra(
@@ -290,7 +290,7 @@ def run_spectra(
     They are by Welch's method, means over the runs and sums over the axes [nm^2/Hz], (f,). The
     exact one is by the transfer functions, with the window's image of each sinusoid.
     """
-    length = min(run.residual_nm.shape[1], _SEGMENT)
+    length = min(run.residual_nm.shape[1], SEGMENT)
     spectra = []
     for series in (run.total_nm, run.residual_nm):
         f, density = welch(series, run.frame_rate_hz, nperseg=length, detrend=False, axis=1)

@@ -196,15 +196,14 @@ def limits_figure(study: LimitStudy, *, over_errors: bool = False, axes: OwnAxes
 _NAMES = dict(
     zip(FAMILIES, ("least variance at this norm", "central H∞ filter of this norm"), strict=True)
 )
-_GAINS = (1e-2, 1e2)  # sensor gains that a trade-off shows
 
 
 def tradeoff_figure(points: Sequence[Facts], *, axes: OwnAxes = None) -> Figure:
     """Draw deviation and stable sensor gains over the norm of the estimation error.
 
     Above, the standard deviation; below, if there are loops, the interval of sensor gains for which
-    each is stable. An end of it that is 0, or beyond what is shown, has no line: the shaded area
-    goes on to the edge. Norms that no filter reaches are shaded.
+    each is stable. An end of it that is 0 has no line: the shaded area goes on to the edge. Norms
+    that no filter reaches are shaded.
     """
     if not points:
         raise ProblemError("a trade-off figure needs at least one point; got none.")
@@ -217,9 +216,8 @@ def tradeoff_figure(points: Sequence[Facts], *, axes: OwnAxes = None) -> Figure:
     shown_gains = {"label": "sensor gains with a stable loop", "unit": "-", "log": True}
     with drawing([2.3] * (1 + loops), axes=axes) as panels:
         panels[0].set_axes(x_axis, {"label": "estimation error, rms", "unit": unit})
-        ends = [end for p in points for end in (p.gain_low, p.gain_high)]
-        drawn = [end for end in ends if _GAINS[0] < end < _GAINS[1]]
-        edges = min([1.0, *drawn]) / 2, 2 * max([1.0, *drawn])
+        ends = [end for p in points for end in (p.gain_low, p.gain_high) if 0 < end < np.inf]
+        edges = min([1.0, *ends]) / 2, 2 * max([1.0, *ends])
         if loops:
             panels[1].set_axes(x_axis, shown_gains | {"low": edges[0], "high": edges[1]})
         for look, family in enumerate(dict.fromkeys(point.family for point in points)):
@@ -231,7 +229,7 @@ def tradeoff_figure(points: Sequence[Facts], *, axes: OwnAxes = None) -> Figure:
             interval = np.array([(p.gain_low, p.gain_high) for p in own]).T
             panels[1].area("", gamma, *np.clip(interval, *edges), look=look)
             for gains in interval:
-                inside = np.where((gains > _GAINS[0]) & (gains < _GAINS[1]), gains, np.nan)
+                inside = np.where((gains > 0) & (gains < np.inf), gains, np.nan)
                 panels[1].curve(name, gamma, inside, look=look, **_POINTS)
         least = min(point.rms for point in points)
         panels[0].curve("Kalman", [max(norms)], [least], look=None, **_RINGS)
@@ -308,10 +306,6 @@ def modal_figure(
     return panels[0].figure
 
 
-_MOST_POINTS = 4000
-_SHOWN_TAP = 5e-3  # taps after the last one of this size are not drawn
-
-
 def mirror_figure(
     hardware: LoopHardware, *, tolerance: float = 0.1, axes: OwnAxes = None
 ) -> Figure:
@@ -334,11 +328,10 @@ def mirror_figure(
     if time_ms[-1] < end_ms:  # it has decayed: the rest is its final position
         time_ms = np.append(time_ms, end_ms)
     position = np.append(step.position, 1.0)[: time_ms.size]
-    shown = np.flatnonzero(time_ms <= end_ms)
-    shown = shown[:: max(1, shown.size // _MOST_POINTS)]
+    shown = time_ms <= end_ms
     taps = hardware.mirror_taps
     ideal = replace(hardware, mirror=None).mirror_taps
-    count = max(int(np.flatnonzero(np.abs(taps) > _SHOWN_TAP)[-1]) + 1, ideal.size)
+    count = max(np.trim_zeros(taps.round(2), "b").size, ideal.size)  # of half a percent and more
     time = {"label": "time since the command arrived", "unit": "ms", "low": 0, "high": end_ms}
     with drawing([2.4, 2.4], columns=2, axes=axes) as (response, weights):
         response.set_axes(time, {"label": "position / final position"})

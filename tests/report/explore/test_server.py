@@ -138,15 +138,14 @@ def test_sliders_follow_the_method(own):
     assert not own["damping"].visible
 
 
-def test_kept_curves_are_named_by_their_moves(own, monkeypatch):
-    monkeypatch.setattr(server, "_MOST_KEPT", 2)
+def test_kept_curves_are_named_by_their_moves(own):
     own.session._keep()
     own.move(delay=2.5)
     own.session._keep()
     assert own.names() == ["Kalman", "Kalman, kept", "Kalman, total delay 2.5 frames"]
     own.move(delay=2.0, gain=0.5)
     own.session._keep()
-    assert own.names()[1:] == ["Kalman, total delay 2.5 frames", "Kalman, real sensor gain 0.5"]
+    assert own.names()[2:] == ["Kalman, total delay 2.5 frames", "Kalman, real sensor gain 0.5"]
     own.session._reset()
     own.verdict()
     assert own.names() == ["Kalman"]
