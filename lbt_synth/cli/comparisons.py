@@ -20,7 +20,7 @@ from lbt_synth.cli.loop_inputs import (
 )
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.parser import command_options
-from lbt_synth.cli.progress import show_spinner, track_progress
+from lbt_synth.cli.progress import track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
@@ -45,12 +45,11 @@ def run_limits(arguments: Namespace) -> Report:
     """Compare designs with the least residual of any linear controller."""
     config = load_shown(arguments)
     files = load_designs(arguments.gains, any_sensors=True)
-    with show_spinner("comparing", quiet=arguments.json):
-        designs = _config_designs(config)
-        designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}
-        study = studies.limits(
-            designs, config.hardware, config.truth, config.imaging, errors_hz=config.errors_hz
-        )
+    designs = _config_designs(config)
+    designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}
+    study = studies.limits(
+        designs, config.hardware, config.truth, config.imaging, errors_hz=config.errors_hz
+    )
     no_band = () if study.band is not None else ("above_band_limit_percent",)
     report = Report()
     report.add_rows(
@@ -126,7 +125,6 @@ def run_tradeoff(arguments: Namespace) -> Report:
             studies.tradeoff(config.plant.own_sensor_alone(), points=count, taps=taps),
             total=count * len(FAMILIES),
             what="filters",
-            quiet=arguments.json,
         )
     )
     least = points[0].design
@@ -153,13 +151,9 @@ def run_mirror(arguments: Namespace) -> Report:
     plant, shell = config.plant.own_sensor_alone(), _require_local_loop(config)
     hardware = plant.hardware
     step = shell.step_response(arguments.tolerance)
-    with show_spinner("designing", quiet=arguments.json):
-        rows = mirror_rows(
-            plant,
-            config.truth,
-            config.imaging,
-            command_weight=config.settings.design.command_weight,
-        )
+    rows = mirror_rows(
+        plant, config.truth, config.imaging, command_weight=config.settings.design.command_weight
+    )
     taps = hardware.mirror_taps
     shown = [f"{tap:.4f}" for tap in taps[:_SHOWN]] + ["..."] * (taps.size > _SHOWN)
     report = Report(data={"taps": taps})
@@ -236,7 +230,6 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
             ),
             total=len(errors) * len(default_methods()),
             what="designs",
-            quiet=arguments.json,
         )
     )
     report = Report()
@@ -257,17 +250,16 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
     designs = load_designs(arguments.gains)
     assumed = {name: _assumed_gain(name, d, config) for name, d in designs.items()}
     maps = {}
-    with show_spinner("mapping", quiet=arguments.json):
-        for name, design in designs.items():
-            grid = studies.robustness_map(
-                design,
-                config.truth,
-                config.imaging,
-                errors_hz=errors,
-                sensor_gains=gains / assumed[name],
-                delay_errors_frames=delays,
-            )
-            maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
+    for name, design in designs.items():
+        grid = studies.robustness_map(
+            design,
+            config.truth,
+            config.imaging,
+            errors_hz=errors,
+            sensor_gains=gains / assumed[name],
+            delay_errors_frames=delays,
+        )
+        maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
     report = Report(data={"maps": {}}, figure=lambda: robustness_map_figure(maps))
     report.rows = [point for name, grid in maps.items() for point in _map_points(name, grid)]
     for name, grid in maps.items():

@@ -56,7 +56,7 @@ def run(arguments: Namespace) -> Report:
     figure_file, telemetry_file, summary_file = outputs
     calibration = calibrate_setup(setup, arguments)
     total = setup.frames + setup.settle_frames
-    with count_progress(total=total, what="frames", quiet=arguments.json) as count:
+    with count_progress(total=total, what="frames") as count:
         loop_run = setup.run(design, calibration=calibration, cache=arguments.cache, progress=count)
     _require_seen(loop_run)
     system = loop_run.system
@@ -137,9 +137,7 @@ def load_setup(arguments: Namespace) -> EndToEndSetup:
 
 def calibrate_setup(setup: EndToEndSetup, arguments: Namespace) -> Calibration:
     """Calibrate a system, or take its calibration from the cache, behind a progress bar."""
-    with count_progress(
-        total=setup.system.modes, what="calibration", quiet=arguments.json
-    ) as count:
+    with count_progress(total=setup.system.modes, what="calibration") as count:
         return calibrate(setup.system, cache=arguments.cache, progress=count)
 
 
@@ -192,7 +190,7 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     calibrate_setup(setup, arguments)
     with (
         choose_engine(arguments) as (executor, workers),
-        count_progress(total=total, what="runs", quiet=arguments.json) as advance,
+        count_progress(total=total, what="runs") as advance,
         keep_finished(case_folder),
     ):
         table = end_to_end_tables(

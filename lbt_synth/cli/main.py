@@ -23,6 +23,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from lbt_synth.cli.parser import build_parser, command_module, command_options
+from lbt_synth.cli.progress import show_progress
 from lbt_synth.cli.streams import discard, print_error
 from lbt_synth.errors import ConfigError, LbtSynthError, SynthesisError
 from lbt_synth.storage.display_unit import own_display_unit
@@ -54,7 +55,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         importlib.import_module("astropy.io.fits")  # which looks through all modules: few as yet
     arguments = build_parser(named).parse_args(words)
     try:
-        with _terminable(), own_display_unit():
+        quiet = arguments.json or arguments.command == "explore"  # which prints while it runs
+        with _terminable(), own_display_unit(), show_progress(arguments.command, quiet=quiet):
             report = _run_command(arguments)
     except LbtSynthError as error:
         return _fail(error, _say_error(error, arguments), arguments)

@@ -12,7 +12,6 @@ from scipy.optimize import minimize_scalar
 from lbt_synth import models
 from lbt_synth.cli.loop_inputs import choose_wavefront_unit
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config, load_config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_residuals
 from lbt_synth.errors import ConfigError
@@ -39,11 +38,10 @@ def run(arguments: Namespace) -> Report:
         "the turbulence of hundreds of modes is computed from it"
     )
     noise, assumed = _noise_nm(config, count)
-    with show_spinner("designing", quiet=arguments.json):
-        air = models.modal_turbulence(
-            atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz
-        )
-        uniform, gains, residuals = _design_controllers(config, air, noise)
+    air = models.modal_turbulence(
+        atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz
+    )
+    uniform, gains, residuals = _design_controllers(config, air, noise)
     rows = _order_rows(air.rms_nm, noise, gains, *residuals.values())
     whole = {name: _total_rms(rms) for name, rms in residuals.items()}
     alone = _total_rms(air.rms_nm)

@@ -10,7 +10,6 @@ import numpy as np
 
 from lbt_synth.cli.loop_inputs import choose_design_unit, load_designs
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import show_spinner
 from lbt_synth.design import Design
 from lbt_synth.errors import UnstableLoopError
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
@@ -43,9 +42,8 @@ def run(arguments: Namespace) -> Report:
     designs, gain = load_designs(arguments.gains), arguments.gain_factor
     choose_design_unit(arguments, *designs.values())
     report = Report(figure=lambda: loop_figure(designs, view, sensor_gain=gain))
-    with show_spinner("drawing", quiet=arguments.json):
-        _add_margins(report, designs, gain)
-        curves = _draw(view, designs, gain)
+    _add_margins(report, designs, gain)
+    curves = _draw(view, designs, gain)
     if not curves:
         raise UnstableLoopError(
             f"no loop is stable at {gain:g} times the sensor gain that its design assumes, and "

@@ -14,7 +14,6 @@ from lbt_synth.cli.loop_inputs import choose_unit, load_design, load_shown
 from lbt_synth.cli.loop_records import load_series, record_imaging, require_series
 from lbt_synth.cli.output import Report, require_figure
 from lbt_synth.cli.parser import command_options
-from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
@@ -48,13 +47,12 @@ def run(arguments: Namespace) -> Report:
         require_figure(arguments.output, inputs=given)
     _refuse_idle_options(arguments)
     design = load_design(arguments.gain)
-    with show_spinner("rehearsing", quiet=arguments.json):
-        recorded = arguments.file is not None
-        series = (_recorded if recorded else _drawn)(arguments, design)
-        source, disturbance, hardware, imaging, ran = series
-        found = rehearse(
-            design, arguments.target, disturbance, hardware=hardware, stroke=arguments.stroke
-        )
+    recorded = arguments.file is not None
+    series = (_recorded if recorded else _drawn)(arguments, design)
+    source, disturbance, hardware, imaging, ran = series
+    found = rehearse(
+        design, arguments.target, disturbance, hardware=hardware, stroke=arguments.stroke
+    )
     loops = {f"in {arguments.target}": found.target, "design, double precision": found.design}
     rows = [
         _describe(

@@ -8,7 +8,6 @@ from typing import Any
 
 from lbt_synth.cli.loop_inputs import load_designs, load_shown, named_difference_notes
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
@@ -41,10 +40,9 @@ def run(arguments: Namespace) -> Report:
     files = dict(zip(designs, arguments.gains, strict=True))
     if several:
         return _report_sensors(arguments, config, designs, several, files)
-    with show_spinner("report", quiet=arguments.json):
-        found = design_report(config, designs, gain_files=files)
-        page = design_page(found, title=arguments.title)
-        written = write_page(page, arguments.output, pdf=arguments.pdf)
+    found = design_report(config, designs, gain_files=files)
+    page = design_page(found, title=arguments.title)
+    written = write_page(page, arguments.output, pdf=arguments.pdf)
     rows = [design_facts(found, one) for one in found.assessments]
     report = Report(
         data={
@@ -84,9 +82,8 @@ def _report_sensors(
             f"{', '.join(several)} of the first kind and {alone} of the second. lbt-synth limits "
             "takes both."
         )
-    with show_spinner("report", quiet=arguments.json):
-        page, found = sensors_page(config, designs, gain_files=files, title=arguments.title)
-        written = write_page(page, arguments.output, pdf=arguments.pdf)
+    page, found = sensors_page(config, designs, gain_files=files, title=arguments.title)
+    written = write_page(page, arguments.output, pdf=arguments.pdf)
     report = Report()
     caption = f"Designs in the loop of {config.source.name}; {config.imaging.label}"
     report.add_rows("rows", caption, found.rows, hidden=("worst_nm", "above_band_limit_percent"))

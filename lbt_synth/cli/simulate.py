@@ -13,7 +13,6 @@ import numpy as np
 from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import load_shown, loop_difference_notes, truth_at_sensor_gain
 from lbt_synth.cli.output import Report, require_figure, write_telemetry
-from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
@@ -97,17 +96,16 @@ def run(arguments: Namespace) -> Report:
     # the same settling for all controllers, so that one seed is one weather
     settle = max(settings.settle_frames, settling_frames(loop.radius_per_frame))
     title = design.method
-    with show_spinner("closing the loop", quiet=arguments.json):
-        if design.other_sensors:
-            settle = settings.settle_frames
-            simulation, segments = run_failures(design, config, truth, drops, **sizes)
-            places, exact_nm = [s for s, _ in segments], [row.exact_nm for _, row in segments]
-            draw = partial(sensor_failure_figure, segments=places, exact_nm=exact_nm)
-        else:
-            simulation, segments = _simulate(arguments, design, truth, config, settle, sizes), []
-            title += ": the first second above, mean spectrum of all runs below"
-            draw = partial(simulation_figure)
-        strehls = simulation.strehl(config.imaging)
+    if design.other_sensors:
+        settle = settings.settle_frames
+        simulation, segments = run_failures(design, config, truth, drops, **sizes)
+        places, exact_nm = [s for s, _ in segments], [row.exact_nm for _, row in segments]
+        draw = partial(sensor_failure_figure, segments=places, exact_nm=exact_nm)
+    else:
+        simulation, segments = _simulate(arguments, design, truth, config, settle, sizes), []
+        title += ": the first second above, mean spectrum of all runs below"
+        draw = partial(simulation_figure)
+    strehls = simulation.strehl(config.imaging)
     report = _describe_simulation(
         simulation, strehls, _exact_answers(loop, config, truth), design, config.imaging
     )

@@ -11,7 +11,7 @@ from lbt_synth import studies
 from lbt_synth.cli.engine import choose_engine, keep_finished
 from lbt_synth.cli.loop_inputs import load_shown
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import count_progress, show_spinner
+from lbt_synth.cli.progress import count_progress
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
@@ -34,8 +34,7 @@ def run(arguments: Namespace) -> Report:
     folder = Path(arguments.output)
     if arguments.pdf:
         require_weasyprint()
-    with show_spinner("reading the study, designing", quiet=arguments.json):
-        loaded = studies.load_study(arguments.study)
+    loaded = studies.load_study(arguments.study)
     load_shown(arguments, loaded.config)
     refuse_replacing(output_paths(folder, loaded), loaded.inputs)
     if arguments.dry_run:
@@ -98,10 +97,7 @@ def _compute(loaded: studies.Study, folder: Path, arguments: Namespace) -> Study
     """Run what is missing of a study."""
     with choose_engine(arguments) as (executor, workers):
         make_directory(folder)
-        with (
-            count_progress(total=loaded.samples, what="samples", quiet=arguments.json) as count,
-            keep_finished(folder),
-        ):
+        with count_progress(total=loaded.samples, what="samples") as count, keep_finished(folder):
             return studies.run_study(
                 loaded, folder, executor=executor, workers=workers, progress=count
             )
@@ -122,8 +118,7 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     if not local:
         with choose_engine(arguments) as (_, count):
             pass
-    with show_spinner("measuring a batch", quiet=arguments.json):
-        cost = _estimate(loaded, min(count, os.cpu_count() or 1) if local else count)
+    cost = _estimate(loaded, min(count, os.cpu_count() or 1) if local else count)
     if not local:
         where = f"{count} threads of {arguments.dask}, as quick as this one"
     parameters = {name: section.text for name, section in loaded.settings.parameters.items()}
@@ -168,8 +163,7 @@ def _estimate(loaded: studies.Study, at_once: int) -> Facts:
 def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
     if 0 <= arguments.row < loaded.samples:  # else it is refused
         make_directory(folder)
-    with show_spinner("replaying", quiet=arguments.json):
-        replay = replay_row(loaded, folder, arguments.row)
+    replay = replay_row(loaded, folder, arguments.row)
     stored, fresh, row = replay.stored, replay.fresh, arguments.row
     values = loaded.parameters_by_name(loaded.values(row, row + 1)[0])
     report = Report(
