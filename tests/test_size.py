@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 4480,
+    "cli": 4515,
     "config": 2331,
     "design": 8220,
     "files": 1608,
@@ -24,7 +24,7 @@ LINES = {
     "loop": 5050,
     "methods": 1109,
     "models": 4550,
-    "report": 4850,
+    "report": 4590,
     "storage": 1049,
     "studies": 3050,
     "errors, validation": 642,

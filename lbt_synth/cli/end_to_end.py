@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lbt_synth.cli.arguments import given_options, option_name
-from lbt_synth.cli.engine import choose_engine, keep_finished
+from lbt_synth.cli.engine import run_in_parts
 from lbt_synth.cli.loop_inputs import choose_wavefront_unit, load_design, load_designs
 from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.progress import count_progress
@@ -186,22 +186,11 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     }
     total = len(all_cases(plan_cases(setup, designs, **plan)))
     make_directory(folder)
-    case_folder = make_directory(folder / "cases")
     calibrate_setup(setup, arguments)
-    with (
-        choose_engine(arguments) as (executor, workers),
-        count_progress(total=total, what="runs") as advance,
-        keep_finished(case_folder),
-    ):
+    case_folder = folder / "cases"
+    with run_in_parts(arguments, case_folder, total=total, what="runs") as engine:
         table = end_to_end_tables(
-            setup,
-            case_folder,
-            designs,
-            **plan,
-            executor=executor,
-            workers=workers,
-            cache=arguments.cache,
-            progress=advance,
+            setup, case_folder, designs, **plan, **engine, cache=arguments.cache
         )
     printed = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
     files = [write_atomically(folder / _TABLE_FILES[n][0], csv_rows(printed[n])) for n in printed]

@@ -8,17 +8,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from lbt_synth import studies
-from lbt_synth.cli.engine import choose_engine, keep_finished
+from lbt_synth.cli.engine import choose_engine, run_in_parts
 from lbt_synth.cli.loop_inputs import load_shown
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import count_progress
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.grid import timed
-from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths, part_rows, replay_row
+from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, part_rows, replay_row
 from lbt_synth.studies.study.sample import evaluate_samples
 from lbt_synth.studies.study.statistics import summary_tables, worst_table
 from lbt_synth.validation import integer
@@ -45,7 +44,8 @@ def run(arguments: Namespace) -> Report:
 
 
 def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
-    run = _compute(loaded, folder, arguments)
+    with run_in_parts(arguments, folder, total=loaded.samples, what="samples") as engine:
+        run = studies.run_study(loaded, folder, **engine)
     names, columns = loaded.parameter_names, run.columns
     statistics = studies.study_statistics(columns, names, tuple(loaded.controllers))
     pages = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
@@ -91,16 +91,6 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
             *(f"{'written' if now else 'unchanged'}: {path}" for path, now in files.items()),
         ],
     )
-
-
-def _compute(loaded: studies.Study, folder: Path, arguments: Namespace) -> StudyRun:
-    """Run what is missing of a study."""
-    with choose_engine(arguments) as (executor, workers):
-        make_directory(folder)
-        with count_progress(total=loaded.samples, what="samples") as count, keep_finished(folder):
-            return studies.run_study(
-                loaded, folder, executor=executor, workers=workers, progress=count
-            )
 
 
 def _sampling_notes(loaded: studies.Study) -> list[str]:
