@@ -52,7 +52,7 @@ def run_in_parts(
     """
     with (
         choose_engine(arguments) as (executor, workers),
-        count_progress(total=total, what=what) as n,
+        count_progress(total=total, what=what) as count,
     ):
         make_directory(folder)
         try:

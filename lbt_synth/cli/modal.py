@@ -43,15 +43,20 @@ def run(arguments: Namespace) -> Report:
     )
     uniform, gains, residuals = _design_controllers(config, air, noise)
     rows = _order_rows(air.rms_nm, noise, gains, *residuals.values())
-    whole = {name: _total_rms(rms) for name, rms in residuals.items()}
+    totals_nm = {name: _total_rms(rms) for name, rms in residuals.items()}
     alone = _total_rms(air.rms_nm)
     report = Report(
-        data={"modes": count, "uniform_gain": uniform, "residual_nm": whole, "turbulence_nm": alone}
+        data={
+            "modes": count,
+            "uniform_gain": uniform,
+            "residual_nm": totals_nm,
+            "turbulence_nm": alone,
+        }
     )
-    left = {"none, turbulence alone": alone, **whole}
+    all_nm = {"none, turbulence alone": alone, **totals_nm}
     totals = [
         facts(controller=fact(name, "controller"), residual_nm=fact(rms, "residual", **_RMS))
-        for name, rms in left.items()
+        for name, rms in all_nm.items()
     ]
     report.tables.append(row_table("All modes", totals))
     report.add_rows(
@@ -137,14 +142,14 @@ def _noise_nm(config: Config, count: int) -> tuple[FloatArray, str]:
 
 def _axis_vibrations(config: Config, count: int) -> dict[int, list[models.Vibration]]:
     """Return the vibrations of the model on tip and on tilt, each axis by itself."""
-    found: dict[int, list[models.Vibration]] = {}
+    vibrations: dict[int, list[models.Vibration]] = {}
     for line in config.plant.vibrations:
         for axis, part in enumerate(line.direction):
             size = abs(part) * line.rms_nm
             if axis < count and size > 1e-9 * line.rms_nm:
                 own = replace(line, rms_nm=size, direction=(1.0,))
-                found.setdefault(axis, []).append(own)
-    return found
+                vibrations.setdefault(axis, []).append(own)
+    return vibrations
 
 
 def _total_rms(rms: FloatArray) -> float:

@@ -61,7 +61,7 @@ class Report:
         self,
         key: str,
         caption: str,
-        found: Sequence[Any],
+        rows: Sequence[Any],
         *,
         without: Collection[str] = (),
         hidden: Collection[str] = (),
@@ -73,10 +73,10 @@ class Report:
         figure, it and the rows are what -o writes.
         """
         if figure is not None:
-            self.rows, self.without, self.figure = found, without, figure
-        self.data[key] = [json_record(row, without=without) for row in found]
-        self._add_units(found[0])
-        self.tables.append(row_table(caption, found, without=(*without, *hidden)))
+            self.rows, self.without, self.figure = rows, without, figure
+        self.data[key] = [json_record(row, without=without) for row in rows]
+        self._add_units(rows[0])
+        self.tables.append(row_table(caption, rows, without=(*without, *hidden)))
 
     def add_records(self, *rows: Any, key: str = "") -> None:
         """Add the values of rows, with their units, to the data or under a key of it."""

@@ -42,26 +42,34 @@ _Series: TypeAlias = tuple[
 
 def run(arguments: Namespace) -> Report:
     """Run the loop in the arithmetic of a target, beside the design and what ran."""
-    given = [path for path in (arguments.gain, arguments.file) if path is not None]
+    inputs = [path for path in (arguments.gain, arguments.file) if path is not None]
     if arguments.output is not None:
-        require_figure(arguments.output, inputs=given)
+        require_figure(arguments.output, inputs=inputs)
     _refuse_idle_options(arguments)
     design = load_design(arguments.gain)
     recorded = arguments.file is not None
     series = (_recorded if recorded else _drawn)(arguments, design)
     source, disturbance, hardware, imaging, ran = series
-    found = rehearse(
+    rehearsal = rehearse(
         design, arguments.target, disturbance, hardware=hardware, stroke=arguments.stroke
     )
-    loops = {f"in {arguments.target}": found.target, "design, double precision": found.design}
+    loops = {
+        f"in {arguments.target}": rehearsal.target,
+        "design, double precision": rehearsal.design,
+    }
     rows = [
         _describe(
-            name, one.image_nm2[0], one.commands[0], one.strehl, imaging, found.clipped_frames(one)
+            name,
+            one.image_nm2[0],
+            one.commands[0],
+            one.strehl,
+            imaging,
+            rehearsal.clipped_frames(one),
         )
         for name, one in loops.items()
     ]
     if ran is not None:
-        residual, commands = (part[found.settle_frames :] for part in ran)
+        residual, commands = (part[rehearsal.settle_frames :] for part in ran)
 
         def ratio(camera: Imaging) -> FloatArray:
             return np.array([series_strehl(residual, camera)])
@@ -70,8 +78,8 @@ def run(arguments: Namespace) -> Report:
     report = Report(data={"gain": arguments.gain, "target": arguments.target})
     what = f"Rehearsal for {arguments.target} on {source}; {imaging.label}"
     report.add_rows("loops", what, rows)
-    report.add_facts("The target beside the design", _difference_facts(found))
-    report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", found.checks)
+    report.add_facts("The target beside the design", _difference_facts(rehearsal))
+    report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", rehearsal.checks)
     if arguments.file is not None:
         report.notes += [
             "note: residuals are of means over frames, and hold the noise of the measurements.",
@@ -80,7 +88,7 @@ def run(arguments: Namespace) -> Report:
     if design.hardware is not None:
         report.notes += [f"note: {text}" for text in loop_differences(design.hardware, hardware)]
     if arguments.output is not None:
-        figure = simulation_figure(found.target, title=f"{design.method} in {arguments.target}")
+        figure = simulation_figure(rehearsal.target, title=f"{design.method} in {arguments.target}")
         report.note_written(save_figure(figure, arguments.output))
     return report
 
@@ -110,16 +118,16 @@ def _describe(
     )
 
 
-def _difference_facts(found: Rehearsal) -> Facts:
+def _difference_facts(rehearsal: Rehearsal) -> Facts:
     """Return how far the target is from the design."""
-    apart_nm = found.differences
+    apart_nm = rehearsal.differences
     rms_nm = float(np.sqrt(np.mean(np.sum(apart_nm**2, axis=1))))
     settled = "frames before, in which the loops settle"
     return facts(
         difference_rms_nm=fact(rms_nm, "difference of the commands", unit="nm rms"),
         difference_largest_nm=fact(float(np.max(np.abs(apart_nm))), "  largest", unit="nm"),
         frames=fact(len(apart_nm), "frames compared"),
-        settle_frames=fact(found.settle_frames, settled),
+        settle_frames=fact(rehearsal.settle_frames, settled),
     )
 
 

@@ -24,10 +24,10 @@ _SIGMAS = 2.0  # of an interval that holds 95 %
 _RESIDUAL = {"label": "residual", "unit": "nm rms", "low": 0}
 
 
-def _residual_charts(found: Diagnosis) -> list[Chart]:
+def _residual_charts(diagnosis: Diagnosis) -> list[Chart]:
     """Return bars of the residuals on unseen data, and of the parts of the disturbance."""
     charts = []
-    if rows := found.residuals:
+    if rows := diagnosis.residuals:
         values, errors, promised = np.array(
             [(row.replayed_nm, _SIGMAS * row.replayed_error_nm, row.model_nm) for row in rows]
         ).T
@@ -37,50 +37,50 @@ def _residual_charts(found: Diagnosis) -> list[Chart]:
         )
         figure = draw_bars(_RESIDUAL, [row.name for row in rows], bars, intervals)
         charts.append(chart("residuals", figure))
-    if costs := found.costs:
+    if costs := diagnosis.costs:
         bars = {
             "loop that ran": np.array([row.running_nm for row in costs]),
             "best design": np.array([row.best_nm for row in costs]),
         }
         figure = draw_bars(_RESIDUAL, [row.part for row in costs], bars, {})
-        charts.append(chart("costs", figure, best=found.best or "none"))
+        charts.append(chart("costs", figure, best=diagnosis.best or "none"))
     return charts
 
 
-def _spectrum_charts(found: Diagnosis) -> list[Chart]:
+def _spectrum_charts(diagnosis: Diagnosis) -> list[Chart]:
     """Return the chart of the identified model."""
-    if found.model is None:
+    if diagnosis.model is None:
         return []
-    designs = {} if found.best_design is None else {found.best: found.best_design}
-    figure = identification_figure(found.model, designs=designs)
+    designs = {} if diagnosis.best_design is None else {diagnosis.best: diagnosis.best_design}
+    figure = identification_figure(diagnosis.model, designs=designs)
     return [chart("identification", figure)]
 
 
-def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
+def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, list[Table]]:
     """Return the tables of a diagnosis by their sections, without those of what is not known."""
-    record, health = found.record, found.record.health
+    record, health = diagnosis.record, diagnosis.record.health
     text = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
     if health.jitter_frames is not None:
         text += f", clock jitter {health.jitter_frames:.2g} frames rms"
-    channels = [row_table(f"Record: {text}. {health.summary()}", found.channels)]
+    channels = [row_table(f"Record: {text}. {health.summary()}", diagnosis.channels)]
     # what a correction lacks is a consequence of other faults, and of the beginning
-    if faults := [each for each in health.findings if each.kind != NOT_KNOWN]:
+    if faults := [finding for finding in health.findings if finding.kind != NOT_KNOWN]:
         channels.append(row_table("Faults", faults))
-    commands, law = found.commands, found.law
+    commands, law = diagnosis.commands, diagnosis.law
     loop = {
         "How the commands reach the measurements": commands and [commands.facts()],
         "Control law in use, from y to u": law and [law_facts(law)],
-        "Loop": found.loop and [found.loop],
+        "Loop": diagnosis.loop and [diagnosis.loop],
     }
-    best = f" (best design: {found.best})" if found.best else ""
-    half = "whole record" if found.comparison is None else "first half"
+    best = f" (best design: {diagnosis.best})" if diagnosis.best else ""
+    half = "whole record" if diagnosis.comparison is None else "first half"
     unseen = "Residual on the second half of the record, by models of the first"
     residuals = {
-        f"What each part leaves by the model of the {half}{best}": found.costs,
-        f"{unseen}; {found.imaging.label}": found.residuals,
+        f"What each part leaves by the model of the {half}{best}": diagnosis.costs,
+        f"{unseen}; {diagnosis.imaging.label}": diagnosis.residuals,
     }
-    given = found.given
-    lines = [] if found.model is None else model_tables(found.model)[1:]
+    given = diagnosis.given
+    lines = [] if diagnosis.model is None else model_tables(diagnosis.model)[1:]
     return {
         "record": channels,
         "loop": [row_table(caption, rows) for caption, rows in loop.items() if rows],
@@ -90,20 +90,20 @@ def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
     }
 
 
-def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = ()) -> Page:
+def diagnosis_page(diagnosis: Diagnosis, files: Sequence[str | os.PathLike[str]] = ()) -> Page:
     """Return the page of a diagnosis.
 
     ``files`` are those of the record and of the given design, whose digests the page gives.
     """
-    record, tables = found.record, diagnosis_tables(found)
+    record, tables = diagnosis.record, diagnosis_tables(diagnosis)
     name = Path(files[0]).name if files else record.source or "a record"
     duration = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
-    disturbance: list[Block] = [*tables["disturbance"], *_spectrum_charts(found)]
+    disturbance: list[Block] = [*tables["disturbance"], *_spectrum_charts(diagnosis)]
     return new_page(
         f"Diagnosis of {name}",
         f"{duration}, {count_text(record.axes, 'axis', 'axes')}",
         {
-            "Verdict": _verdict_blocks(found, tables["verdict"]),
+            "Verdict": _verdict_blocks(diagnosis, tables["verdict"]),
             "Record": tables["record"],
             "Loop that ran": (paragraph("law"), *tables["loop"]),
             "Disturbance": disturbance or ["No model was identified."],
@@ -112,14 +112,14 @@ def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = (
     )
 
 
-def _verdict_blocks(found: Diagnosis, tables: Sequence[Table]) -> list[Block]:
-    state, *rest = diagnosis_verdict(found)
-    wrong = found.doubt or any(row.serious for row in found.channels)
-    doubtful = found.loop is None or found.loop.modulus < NARROW
+def _verdict_blocks(diagnosis: Diagnosis, tables: Sequence[Table]) -> list[Block]:
+    state, *rest = diagnosis_verdict(diagnosis)
+    wrong = diagnosis.doubt or any(row.serious for row in diagnosis.channels)
+    doubtful = diagnosis.loop is None or diagnosis.loop.modulus < NARROW
     return [
         Notice(text=state, tone="bad" if wrong else "note" if doubtful else "good"),
         " ".join(rest),
         *tables,
-        *_residual_charts(found),
-        *(Notice(text=f"{note[0].upper()}{note[1:]}") for note in found.notes),
+        *_residual_charts(diagnosis),
+        *(Notice(text=f"{note[0].upper()}{note[1:]}") for note in diagnosis.notes),
     ]

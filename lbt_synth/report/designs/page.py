@@ -257,8 +257,8 @@ def _draw_poles(designs: Sequence[DesignAssessment]) -> Figure:
             title = one.name if one.stable else f"{one.name}: unstable"
             panel.set_axes(real, imaginary, title=title, equal=True)
             panel.curve("unit circle", turn.real, turn.imag, look=None, width=1.0, numbers=False)
-            own = {"look": 1, "marker": "o", **points}
-            panel.curve("controller alone", controller.real, controller.imag, **own)
+            rings = {"look": 1, "marker": "o", **points}
+            panel.curve("controller alone", controller.real, controller.imag, **rings)
             panel.curve("closed loop", loop.real, loop.imag, look=0, marker="x", **points)
     return panels[0].figure
 
@@ -283,9 +283,9 @@ def _simulation_blocks(report: DesignReport) -> list[Block]:
     with drawing([2.2] * len(runs), columns=count_columns(len(runs))) as spectra:
         for panel, (one, run) in zip(spectra, runs, strict=True):
             panel.set_axes(FREQUENCY, SPECTRUM, title=one.name)
-            f, opened, left, exact = run_spectra(run, one.loop, report.config.truth)
+            f, opened, simulated, exact = run_spectra(run, one.loop, report.config.truth)
             panel.curve("before the correction", f, opened, look=None, width=0.8)
-            panel.curve("residual, simulated", f, left, look=5, dash=0)
+            panel.curve("residual, simulated", f, simulated, look=5, dash=0)
             panel.curve("residual, exact", f, exact, look=1, width=1.4)
     return [
         f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}.",

@@ -137,26 +137,26 @@ def assess_design(
 
 def require_compatible(name: str, design: Design, hardware: LoopHardware) -> None:
     """Refuse a design that cannot be run in a loop."""
-    own = design.hardware
-    if own is None:
+    made_for = design.hardware
+    if made_for is None:
         raise ProblemError(
             f"{name} is a filter of a bare estimation problem; expected a design for a loop. "
             "Design it for the plant of a configuration."
         )
     for what, mine, theirs in (
-        ("axes", own.modes, hardware.modes),
-        ("measurements", own.n_measurements, hardware.n_measurements),
-        ("commands", own.n_commands, hardware.n_commands),
+        ("axes", made_for.modes, hardware.modes),
+        ("measurements", made_for.n_measurements, hardware.n_measurements),
+        ("commands", made_for.n_commands, hardware.n_commands),
     ):
         if mine != theirs:
             raise ProblemError(
                 f"{name} must be for the configuration's {theirs} {what}; got a design for {mine}. "
                 "Design it for this configuration."
             )
-    if not np.isclose(own.frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9):
+    if not np.isclose(made_for.frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9):
         raise ProblemError(
             f"{name} must run at the configuration's {hardware.frame_rate_hz:g} Hz; got a design "
-            f"for {own.frame_rate_hz:g} Hz. Design it for this frame rate."
+            f"for {made_for.frame_rate_hz:g} Hz. Design it for this frame rate."
         )
 
 
@@ -283,9 +283,9 @@ def frequency_errors(config: Config) -> FloatArray:
 
 def refine_values(values: Sequence[float]) -> FloatArray:
     """Sort values, and add three between any two of them."""
-    known = np.unique(values)
-    places = np.arange(4 * known.size - 3) / 4
-    return np.asarray(np.interp(places, np.arange(known.size), known))
+    ordered = np.unique(values)
+    places = np.arange(4 * ordered.size - 3) / 4
+    return np.asarray(np.interp(places, np.arange(ordered.size), ordered))
 
 
 _RMS: dict[str, Any] = {"unit": "nm rms", "format": ".1f"}
@@ -338,7 +338,7 @@ def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
         for name, text, unit in _MARGINS
     }
     norm: dict[str, Any] = {"unit": "nm", "format": ".5g"}
-    known, anywhere = "frequency known", "frequency anywhere in this range"
+    at_known, anywhere = "frequency known", "frequency anywhere in this range"
     return facts(
         design=fact(one.name, "design"),
         method=fact(design.method, "method"),
@@ -360,7 +360,7 @@ def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
         strehl=fact(row.strehl, "Strehl", help="Strehl ratio, exact", **_RATIO),
         strehl_simulated=fact(mean, help="Strehl ratio, simulated", **_RATIO),
         scatter=fact(scatter, help="its scatter between runs", unit="points", format=".2f"),
-        above_limit_percent=_above(row.above_limit_percent, limits.limit, known),
+        above_limit_percent=_above(row.above_limit_percent, limits.limit, at_known),
         worst_nm=fact(row.worst_nm if ranged else None, help="worst residual", **_RMS),
         worst_strehl=fact(
             float(one.strehls.min()), "worst Strehl", help="worst Strehl ratio", **_RATIO
@@ -474,12 +474,12 @@ def summary_table(report: DesignReport) -> Table:
     ends = f"{report.errors_hz[0]:.4g} to {report.errors_hz[-1]:.4g} Hz"
     lines: list[tuple[str | Cell, ...]] = []
     group = ""
-    for each in columns(rows[0]):
-        group = _GROUPS.get(each.name, group).format(ends)
-        texts = [each.text(row) for row in rows]
-        if not each.help or set(texts) == {"-"}:
+    for how in columns(rows[0]):
+        group = _GROUPS.get(how.name, group).format(ends)
+        texts = [how.text(row) for row in rows]
+        if not how.help or set(texts) == {"-"}:
             continue
-        title = f"{each.help} [{each.shown_unit}]" if each.unit else each.help
+        title = f"{how.help} [{how.shown_unit}]" if how.unit else how.help
         lines += [] if (group,) in lines else [(group,)]
         lines.append((title, *map(_toned, texts)))
     return Table(

@@ -289,8 +289,8 @@ def draw_bode(loops: Loops, *, axes: OwnAxes = None) -> Figure:
     """Draw gain and phase of broken loops, with their margins."""
     opened = open_loops(loops)
     points = [None if broken is None else loop_points(broken) for *_, broken in opened]
-    gains = np.concatenate([np.zeros(1), *(each[1] for each in points if each)])
-    phases = np.concatenate([[-180.0, -90.0], *(each[2] for each in points if each)])
+    gains = np.concatenate([np.zeros(1), *(curve[1] for curve in points if curve)])
+    phases = np.concatenate([[-180.0, -90.0], *(curve[2] for curve in points if curve)])
     y_axis = {
         "label": "loop gain",
         "unit": "dB",
@@ -301,13 +301,13 @@ def draw_bode(loops: Loops, *, axes: OwnAxes = None) -> Figure:
         above.set_axes(FREQUENCY, y_axis)
         below.set_axes(FREQUENCY, {"label": "phase", "unit": "deg"})
         above.rule("", 0.0, "y", dash=1)
-        for each, curves in zip(opened, points, strict=True):
+        for drawn, curves in zip(opened, points, strict=True):
             if curves is None:
-                _draw_opened(above, each, [], [])
+                _draw_opened(above, drawn, [], [])
                 continue
             f, gain, phase, _ = curves
-            _draw_opened(above, each, f, np.maximum(gain, 2 * _LOWEST_DB))  # a zero is far below
-            _draw_opened(below, each, f, phase)
+            _draw_opened(above, drawn, f, np.maximum(gain, 2 * _LOWEST_DB))  # a zero is far below
+            _draw_opened(below, drawn, f, phase)
         for at in _critical_phases(float(np.nanmin(phases)), float(np.nanmax(phases))):
             below.rule("", at, "y", dash=1)
         for broken in (broken for *_, broken in opened if broken is not None):
@@ -376,8 +376,8 @@ def _draw_nichols(loops: Loops, *, axes: OwnAxes = None) -> Figure:
     x_axis = {"label": "phase", "unit": "deg", "low": lowest, "high": highest}
     with drawing([2 * PANEL_IN], axes=axes) as (panel,):
         panel.set_axes(x_axis, {"label": "loop gain", "unit": "dB", "high": 40.0})
-        for each, curve in zip(opened, curves, strict=True):
-            _draw_opened(panel, each, *curve)
+        for drawn, curve in zip(opened, curves, strict=True):
+            _draw_opened(panel, drawn, *curve)
         for broken in (broken for *_, broken in opened if broken is not None):
             for _, ends in _phase_marks(broken):
                 _mark(panel, "phase margin", ends, [0.0, 0.0], "o")
@@ -430,7 +430,7 @@ def design_steps(loops: Loops, *, frames: int = SHOWN_FRAMES) -> dict[str, list[
         unlike: list[LoopStep] = []
         for axis in range(loop.hardware.modes if loop.is_stable else 0):
             step = step_response(loop, axis=axis, frames=frames)
-            if not any(np.allclose(step.residual, each.residual) for each in unlike):
+            if not any(np.allclose(step.residual, other.residual) for other in unlike):
                 unlike.append(step)
         steps[name] = unlike
     return steps

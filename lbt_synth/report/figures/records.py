@@ -67,10 +67,10 @@ def sensor_failure_figure(
     _, frames, n = run.residual_nm.shape
     time = np.arange(frames) / run.frame_rate_hz
     window = max(int(_WINDOW_S * run.frame_rate_hz), 1)
-    whole = frames // window * window
-    power = np.mean(np.sum(run.residual_nm[:, :whole] ** 2, axis=2), axis=0)
+    end = frames // window * window
+    power = np.mean(np.sum(run.residual_nm[:, :end] ** 2, axis=2), axis=0)
     rms_nm = np.sqrt(power.reshape(-1, window).mean(axis=1))
-    centres = time[:whole].reshape(-1, window).mean(axis=1)
+    centres = time[:end].reshape(-1, window).mean(axis=1)
     failures = [segment for segment in segments if segment.text]
     looks = {text: 3 + i for i, text in enumerate(dict.fromkeys(s.text for s in failures))}
     with drawing([PANEL_IN, PANEL_IN]) as (series, size):
@@ -327,8 +327,8 @@ def exact_spectrum(
             total += share * gain * line.ar_model(rate).psd(inside)
             continue
         seen_nm = np.sinc(line.frequency_hz / rate) * line.amplitude_nm
-        left = seen_nm * loop.sensitivity([line.frequency_hz])[0] @ direction
-        power = float(np.sum(np.abs(left) ** 2)) / 2
+        residual = seen_nm * loop.sensitivity([line.frequency_hz])[0] @ direction
+        power = float(np.sum(np.abs(residual) ** 2)) / 2
         offset = 2 * np.pi * (frequency_hz - line.frequency_hz) / rate
         _, image = freqz(get_window("hann", length), worN=np.abs(offset))
         window = np.abs(image)  # whose squares sum up to 3/8 of its length

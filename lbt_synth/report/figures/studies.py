@@ -72,11 +72,11 @@ def robustness_figure(
     with drawing([2.5], axes=axes) as (panel,):
         panel.set_axes(FREQUENCY_ERROR, strehl_axis([*strehls, *papers]))
         for look, method in enumerate(dict.fromkeys(row.method for row in rows)):
-            own = sorted((r for r in rows if r.method == method), key=lambda r: r.error_hz)
-            label, errors = design_label(method), np.array([r.error_hz for r in own])
-            stable = np.array([r.stable for r in own])
+            entries = sorted((r for r in rows if r.method == method), key=lambda r: r.error_hz)
+            label, errors = design_label(method), np.array([r.error_hz for r in entries])
+            stable = np.array([r.stable for r in entries])
             if stable.any():
-                y = np.where(stable, [100 * r.strehl for r in own], np.nan)
+                y = np.where(stable, [100 * r.strehl for r in entries], np.nan)
                 panel.curve(label, errors, y, look=look, **_POINTS)
             if not stable.all():
                 lost, name = errors[~stable], f"{label}: unstable"
@@ -221,12 +221,12 @@ def tradeoff_figure(points: Sequence[Facts], *, axes: OwnAxes = None) -> Figure:
         if loops:
             panels[1].set_axes(x_axis, shown_gains | {"low": edges[0], "high": edges[1]})
         for look, family in enumerate(dict.fromkeys(point.family for point in points)):
-            own = sorted((p for p in points if p.family == family), key=lambda p: p.gamma)
-            gamma, name = np.array([p.gamma for p in own]), _NAMES.get(family, family)
-            panels[0].curve(name, gamma, [p.rms for p in own], look=look, **_POINTS)
+            entries = sorted((p for p in points if p.family == family), key=lambda p: p.gamma)
+            gamma, name = np.array([p.gamma for p in entries]), _NAMES.get(family, family)
+            panels[0].curve(name, gamma, [p.rms for p in entries], look=look, **_POINTS)
             if not loops:
                 continue
-            interval = np.array([(p.gain_low, p.gain_high) for p in own]).T
+            interval = np.array([(p.gain_low, p.gain_high) for p in entries]).T
             panels[1].area("", gamma, *np.clip(interval, *edges), look=look)
             for gains in interval:
                 inside = np.where((gains > 0) & (gains < np.inf), gains, np.nan)
@@ -391,9 +391,9 @@ def end_to_end_table_figure(entries: Sequence[Facts]) -> Figure:
         for panel, method in zip(panels, methods, strict=True):
             panel.set_axes(x_axis, y_axis, title=design_label(method))
             names = ("error_hz", "paper", "modal", "strehl", "scatter")
-            own = [e for e in rows if e.method == method]
+            entries = [e for e in rows if e.method == method]
             error, paper, modal, strehl, scatter = (
-                np.array([getattr(e, name) for e in own], dtype=float) for name in names
+                np.array([getattr(e, name) for e in entries], dtype=float) for name in names
             )
             if not np.isnan(paper[0]):  # it published none of its own integrator
                 panel.curve("Agapito et al. 2008", error, paper, look=3, **_POINTS)
