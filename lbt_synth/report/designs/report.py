@@ -290,7 +290,8 @@ def refine_values(values: Sequence[float]) -> FloatArray:
 
 _RMS: dict[str, Any] = {"unit": "nm rms", "format": ".1f"}
 _RATIO: dict[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}
-_PARTS = ("turbulence", "vibration", "noise", "within")  # of a residual
+_PARTS = {"turbulence": "turbulence", "vibration": "vibration", "noise": "noise"}  # of a residual
+_PARTS |= {"within": "within frames"}
 _MARGINS = (
     ("modulus", "modulus margin", ""),
     ("phase_deg", "phase margin", "deg"),
@@ -330,8 +331,8 @@ def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
     mean = float(np.mean(strehls)) if strehls.size else None
     scatter = 100 * float(np.std(strehls, ddof=1)) if strehls.size > 1 else None
     parts = {
-        f"{part}_nm": fact(getattr(one.budget, f"{part}_nm", None), help=f"of that {part}", **_RMS)
-        for part in _PARTS
+        f"{part}_nm": fact(getattr(one.budget, f"{part}_nm", None), help=f"of that {word}", **_RMS)
+        for part, word in _PARTS.items()
     }
     numbers = {
         name: fact(getattr(margins, name, None), help=text, format=".3g", unit=unit)
