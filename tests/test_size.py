@@ -18,7 +18,7 @@ LINES = {
     "config": 2331,
     "design": 8220,
     "files": 1608,
-    "identification": 11270,
+    "identification": 10760,
     "interop": 4375,
     "linear": 6078,
     "loop": 5050,
@@ -30,10 +30,10 @@ LINES = {
     "errors, validation": 642,
 }
 COUNTS = {
-    "files of the package": 284,
-    "public names": 237,
-    "tuned constants": 696,
-    "lines of tests": 41320,
+    "files of the package": 282,
+    "public names": 236,
+    "tuned constants": 673,
+    "lines of tests": 41270,
     "words of docs": 75543,
 }
 

@@ -14,13 +14,12 @@ from lbt_synth.cli.progress import count_progress
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import Diagnosis, LoopRecord, diagnose
 from lbt_synth.identification.commands.control_law import ControlLaw
-from lbt_synth.identification.diagnosis.rows import live_axes
-from lbt_synth.identification.diagnosis.verdict import diagnosis_verdict
+from lbt_synth.identification.diagnosis.rows import disturbance_lines, live_axes
 from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.rows import json_record
 
-_STEPS = 4
+_STEPS = 3
 
 
 def run(arguments: Namespace) -> Report:
@@ -44,10 +43,9 @@ def run(arguments: Namespace) -> Report:
             progress=count,
             **loop_records.identification_options(arguments, record),
         )
-    verdict = diagnosis_verdict(found)
     report = Report(
-        data={"source": str(arguments.file), "verdict": verdict, **_diagnosis_data(found)},
-        opening=list(verdict),
+        data={"source": str(arguments.file), "verdict": found.verdict, **_diagnosis_data(found)},
+        opening=list(found.verdict),
         tables=[table for own in diagnosis_tables(found).values() for table in own],
         notes=[loop_records.marked_note(note) for note in found.notes],
     )
@@ -68,6 +66,7 @@ def _load(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
 def _diagnosis_data(found: Diagnosis) -> dict[str, Any]:
     """Return a diagnosis for JSON; what could not be said is null or empty."""
     record = found.record
+    lines = () if found.model is None else disturbance_lines(found.model)
     return {
         "doubt": found.doubt or None,
         "record": loop_records.record_data(record),
@@ -75,11 +74,10 @@ def _diagnosis_data(found: Diagnosis) -> dict[str, Any]:
         "commands": None if found.commands is None else json_record(found.commands.facts()),
         "control_law": None if found.law is None else _law_data(found.law),
         "loop": None if found.loop is None else json_record(found.loop),
-        "lines": [asdict(line) for line in found.lines],
+        "lines": [asdict(line) for line in lines],
         "costs": [json_record(row) for row in found.costs],
         "residuals": [json_record(row) for row in found.residuals],
         "best": found.best or None,
-        "given": None if found.given is None else json_record(found.given),
         "notes": found.notes,
     }
 

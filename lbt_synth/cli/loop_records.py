@@ -239,7 +239,7 @@ def read_accelerations(arguments: Namespace, record: LoopRecord) -> Readings:
 
 
 def add_accelerometers(report: Report, found: AccelerometerTransfers) -> None:
-    """Add how the channels of accelerometers move with the lines, and what each is worth."""
+    """Add how the channels of accelerometers move with the lines, and what is used."""
     if found.transfers:
         report.add_rows("accelerometer_lines", "Accelerometers and lines", found.transfers)
     report.add_rows("accelerometers", "Accelerometers", found.channels)
@@ -247,10 +247,6 @@ def add_accelerometers(report: Report, found: AccelerometerTransfers) -> None:
         name: getattr(found, f"shift_{name}") for name in ("frames", "error_frames")
     }
     report.notes.append(f"note: {found.shift_text}")
-    if found.worth_text:
-        report.notes.append(f"note: {found.worth_text}.")
-    names = ("alone_nm", "together_nm")
-    report.data["accelerometer_residuals"] = {name: getattr(found, name) for name in names}
 
 
 def find_places(arguments: Namespace, model: str | Path | None, **others: Path) -> dict[str, Path]:

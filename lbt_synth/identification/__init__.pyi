@@ -22,6 +22,5 @@ from .records.line_priors import load_lines as load_lines
 from .records.record import LoopRecord as LoopRecord
 from .records.record import SpectrumRecord as SpectrumRecord
 from .records.record import require_length as require_length
-from .sensor_gains import allowed_gains as allowed_gains
 from .stretches import split_halves as split_halves
 from .tracking import TrackingController as TrackingController

@@ -1,39 +1,40 @@
 """A certified controller from a record, tested on data that it has not seen.
 
 The Kalman filter is the default. It stays unless another method leaves clearly less on every third
-of the test: one that wins on some parts only has won by what changed between them.
+of the test: one that wins on some parts only has won by what changed between them. A design is
+stable at all sensor gains that the record allows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.identification.commands.verdict import explain_commands, judge_fitted_gains
-from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
-from lbt_synth.identification.fit.identify import identify
-from lbt_synth.identification.prediction.comparison import (
-    PredictionTable,
-    compare_on_record,
-    stable_designs,
+from lbt_synth.errors import CertificateError, NumericalError, ProblemError, SynthesisError
+from lbt_synth.identification.commands.repair import CommandRepair
+from lbt_synth.identification.commands.verdict import (
+    could_have_run,
+    explain_commands,
+    judge_fitted_gains,
+    record_law,
 )
+from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, POSSIBLE_GAINS
+from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
+from lbt_synth.identification.fit.identify import OPEN_GAIN, identify
+from lbt_synth.identification.prediction.comparison import PredictionTable, compare_designs
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
-from lbt_synth.identification.sensor_gains import (
-    allowed_gains,
-    design_for_gains,
-    unstable_gains,
-)
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, close_loop, residual_budget
+from lbt_synth.loop import Imaging, close_loop, residual_budget, stable_sensor_gains
 from lbt_synth.methods.registry import (
     default_method,
     gain_robust_method,
@@ -41,17 +42,16 @@ from lbt_synth.methods.registry import (
     record_methods,
 )
 from lbt_synth.methods.request import PlantInputs, design_request, option_owners
-from lbt_synth.models import TipTiltPlant
+from lbt_synth.models import LoopHardware, TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import choice, require_instance
+from lbt_synth.validation import FloatArray, choice, require_instance
 
 _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
-_PARTS = 3  # of the test, on each of which another method has to win
-_ERRORS = 2.0  # of the difference by which another method has to leave less than the default
-_LEAST_SHARE = 0.02  # of the measured variance: 1 % of the rms, less than conditions change by
+_MISFIT = 1.5  # factor by which a gain may be off where the model leaves something out
+_STEP = 0.05  # of the logarithm of a gain, between gains that are tried: a loop hardly changes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -95,15 +95,13 @@ def design_from_record(
 ) -> RecordedDesign:
     """Identify a loop from its record, design a controller, and test it on unseen data.
 
-    Before anything is fitted, the commands must explain the measurements as they are given
-    (``explain_commands``). The test is honest and conservative: a model of the first half of
-    the usable frames gives a design, and that is replayed on the second half. The design that is
-    returned is made the same way from all frames.
+    Before anything is fitted, the commands must explain the measurements as they are given. The
+    test is honest and conservative: designs for a model of the first half of the usable frames are
+    replayed on the second half. The design that is returned is made the same way from all frames.
 
-    Without a method, the quick ones that need no more than a plant are tested in this way. The
-    Kalman filter stays unless another one leaves less on each third of the test, by more than twice
-    the error of the difference and 2 % of the measured variance. Where it does not stay, the test
-    is a little kind to the chosen one.
+    Without a method, the quick ones that need no more than a plant are tested. The Kalman filter
+    stays unless another one leaves less on each third of the test, by more than 2 % of the measured
+    variance and than twice the error of the difference, or by 25 % of the rms.
 
     Parameters
     ----------
@@ -120,8 +118,8 @@ def design_from_record(
     accept_record : bool, optional
         Go on although something else explains the record better; the design says so.
     command_scale_known : bool, optional
-        The commands were recorded at the size that was applied. No record can tell this from
-        half that size, so by default a design is also stable at half the sensor gain.
+        The commands were recorded at the size that was applied. No record can tell; by default a
+        design is also stable at half the sensor gain.
     progress : callable, optional
         Called with 1 after each of 3 steps.
     **options
@@ -162,46 +160,33 @@ def design_from_record(
     True
     """
     defaults = {} if gamma_ratio is None else {"gamma_ratio": gamma_ratio}
-    usable = _require_able(record, method, defaults)
+    seconds = _require_able(record, method, defaults)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     options |= {"sensor_gain": sensor_gain, "announced": announced}
     first, _ = split_halves(record.stretches(), record.frames)
     half = identify(record, stretches=first, **options)
     finds_gain = record.commands is not None and sensor_gain is None
-    design = partial(_design, defaults=defaults)
     if finds_gain:
         assumptions += _judge_gains(half, accept_record)
-    designs: dict[str, Design] = {}
-    if method is None:
-        tried = {name: method_named(name).reference_options for name in quick_methods()}
-        designs, missing = stable_designs(half.plant(), tried, defaults)
-        notes += missing
-    if not designs:
-        name = method or default_method()
-        designs = {method_named(name).title: design(name, half)}
     step(1)
-    held_out = compare_on_record(record, half, designs, imaging=imaging or Imaging())
+    names = quick_methods() if method is None else [method]
+    requests = {name: {} if method else method_named(name).reference_options for name in names}
+    held_out, designs = compare_designs(
+        record, half, requests, defaults=defaults, imaging=imaging or Imaging()
+    )
+    if not designs:
+        raise NumericalError(f"no design holds the loop: {'; '.join(held_out.notes)}.")
     if method is None:
-        names = {method_named(name).title: name for name in quick_methods()}
-        rows = [(names[row.name], row.replayed) for row in held_out.entries if row.name in names]
-        residuals = {name: residual for name, residual in rows if residual is not None}
-        unsafe = []
-        if finds_gain:
-            path, allowed = half.hardware, allowed_gains(record, half)
-            unsafe = [
-                names[title]
-                for title, tried_design in designs.items()
-                if unstable_gains(path, tried_design.controller, allowed) is not None
-            ]
-        method, words = choose_method(residuals, unsafe)
-        notes += words
+        rows = [(row.name, row.replayed) for row in held_out.entries if row.name in designs]
+        title, note = choose_method({name: data for name, data in rows if data is not None})
+        method = next(name for name in names if method_named(name).title == title)
+        notes.append(note)
     step(1)
     model = identify(record, start=half, **options)
-    made, careful = design_for_gains(
+    made, price = design_for_gains(
         model,
-        partial(design, method),
-        _design_robustly,
+        lambda assumed: _design(method, assumed, defaults),
         allowed_gains(record, model) if finds_gain else None,
         command_scale_known=command_scale_known,
     )
@@ -214,15 +199,16 @@ def design_from_record(
         name=method_named(method).title,
         notes=(
             *notes,
-            *careful,
+            *price,
             *_compare_gains(model, half),
             *note_drift(record, model.plant(), made.controller),
-            *_note_short(usable, model),
+            *_note_short(seconds, model),
         ),
     )
 
 
-def _design(method: str, model: IdentifiedModel, *, defaults: Mapping[str, Any]) -> Design:
+def _design(method: str, model: IdentifiedModel, defaults: Mapping[str, Any]) -> Design:
+    """Return the design of a method for a model."""
     inputs = PlantInputs(plant=model.plant(), design_defaults=defaults)
     return design_request(method, {}).build(inputs)
 
@@ -238,22 +224,6 @@ def _require_able(record: LoopRecord, method: str | None, defaults: Mapping[str,
     return require_length(record, seconds=LEAST_SECONDS) / record.frame_rate_hz
 
 
-def _design_robustly(model: IdentifiedModel, gains: tuple[float, float]) -> Design:
-    """Design for an interval of gains, relative to the model's, by a method that can."""
-    inputs = PlantInputs(plant=model.plant(), sensor_gains=gains)
-    return design_request(gain_robust_method(), {}).build(inputs)
-
-
-def _note_short(seconds: float, model: IdentifiedModel) -> Iterator[str]:
-    """Yield what a short record leaves open."""
-    if seconds < _SHORT_SECONDS:
-        resolution_hz = max(axis.resolution_hz for axis in model.axes)
-        yield (
-            f"the record is short ({seconds:.3g} s): it does not tell lines less than "
-            f"{resolution_hz:.2g} Hz apart from one. Half a minute shows more"
-        )
-
-
 def _judge_commands(
     record: LoopRecord, sensor_gain: float | Sequence[float] | None, accept: bool
 ) -> tuple[list[str], list[str]]:
@@ -263,11 +233,11 @@ def _judge_commands(
     verdict = explain_commands(record, sensor_gain=sensor_gain)
     if not accept:
         verdict.require_accepted()
-    given = []
+    assumptions = list(verdict.overruled)
     if sensor_gain is not None:
         gains = " and ".join(f"{gain:g}" for gain in np.ravel(sensor_gain))
-        given = [f"the sensor gain is {gains}, as it was given"]
-    return list(verdict.notes), [*verdict.overruled, *given]
+        assumptions.append(f"the sensor gain is {gains}, as it was given")
+    return list(verdict.notes), assumptions
 
 
 def _judge_gains(model: IdentifiedModel, accept: bool) -> tuple[str, ...]:
@@ -280,15 +250,13 @@ def _judge_gains(model: IdentifiedModel, accept: bool) -> tuple[str, ...]:
 
 
 def _compare_gains(model: IdentifiedModel, half: IdentifiedModel) -> Iterator[str]:
-    """Warn of sensor gains that disagree."""
-    for i, (whole, first) in enumerate(zip(model.axes, half.axes, strict=True)):
-        if whole.sensor_gain_error is None or first.sensor_gain_error is None:
-            continue
-        apart = abs(whole.sensor_gain - first.sensor_gain)
-        if apart > DIFFERENT * float(np.hypot(whole.sensor_gain_error, first.sensor_gain_error)):
+    """Warn of sensor gains that changed after the first half of a record."""
+    for i, (axis, first) in enumerate(zip(model.axes, half.axes, strict=True)):
+        error = np.hypot(axis.sensor_gain_error or np.inf, first.sensor_gain_error or np.inf)
+        if abs(axis.sensor_gain - first.sensor_gain) > DIFFERENT * error:
             yield (
                 f"warning: axis {i} has a sensor gain of {first.sensor_gain:.3f} in the first half "
-                f"of the record, and of {whole.sensor_gain:.3f} in all of it"
+                f"of the record, and of {axis.sensor_gain:.3f} in all of it"
             )
 
 
@@ -315,52 +283,191 @@ def note_drift(record: LoopRecord, plant: TipTiltPlant, controller: Controller) 
             )
 
 
+def _note_short(seconds: float, model: IdentifiedModel) -> Iterator[str]:
+    """Yield what a short record leaves open."""
+    if seconds < _SHORT_SECONDS:
+        resolution_hz = max(axis.resolution_hz for axis in model.axes)
+        yield (
+            f"the record is short ({seconds:.3g} s): it does not tell lines less than "
+            f"{resolution_hz:.2g} Hz apart from one. Half a minute shows more"
+        )
+
+
 def quick_methods() -> list[str]:
     """Return the names of the methods that an automatic choice tries, the default first."""
     names = [name for name in record_methods() if not method_named(name).slow]
     return sorted(names, key=lambda name: name != default_method())
 
 
-def choose_method(
-    residuals: Mapping[str, ResidualEstimate], unsafe: Collection[str] = ()
-) -> tuple[str, list[str]]:
+def choose_method(residuals: Mapping[str, ResidualEstimate]) -> tuple[str, str]:
     """Choose the default method, unless another one leaves clearly less on every third of a test.
 
-    The loops of ``unsafe`` designs are unstable at a sensor gain that the record allows. Return the
-    name of the method, and by how much it is better.
+    The residuals are by the titles of methods; return one of these, and why it is chosen.
     """
-    usual, notes = default_method(), list[str]()
-    ordered = sorted(residuals, key=lambda name: residuals[name].total_nm2)
-    if usual not in residuals:
-        title = method_named(ordered[0]).title
-        return ordered[0], [f"the {title} is chosen: of the methods that are left it leaves least"]
-    for name in ordered:
-        if not _is_better(residuals[name], residuals[usual]):
-            continue
-        title = method_named(name).title
-        if name not in unsafe:
-            difference, error = residuals[usual].above(residuals[name])
-            gained = nm_text(difference, error_nm=error, unit="nm^2")
-            words = (
-                f"the {title} is chosen: on each of {_PARTS} parts of the test it leaves less than "
-                f"the {method_named(usual).title}, in all by {gained}"
+    ordered = sorted(residuals, key=lambda title: residuals[title].total_nm2)
+    usual = method_named(default_method()).title
+    usual = usual if usual in residuals else ordered[0]
+    for title in ordered:
+        thirds = zip(residuals[usual].parts(3), residuals[title].parts(3), strict=True)
+        if all(third.is_clearly_above(other) for third, other in thirds):
+            difference, error = residuals[usual].above(residuals[title])
+            return title, (
+                f"the {title} is chosen: on each third of the test it leaves less than the "
+                f"{usual}, in all by {nm_text(difference, error_nm=error, unit='nm^2')}"
             )
-            return name, [words, *notes]
-        notes.append(
-            f"the {title} is left out: its loop is unstable at a sensor gain that the record allows"
-        )
-    words = (
-        f"the {method_named(usual).title} stays: no method tried leaves less on each of {_PARTS} "
-        f"parts of the test, by more than {_ERRORS:g} standard errors and "
-        f"{100 * _LEAST_SHARE:g} % of the variance"
+    return usual, f"the {usual} stays: no method leaves clearly less on each third of the test"
+
+
+def allowed_gains(record: LoopRecord, model: IdentifiedModel) -> FloatArray:
+    """Return the interval of sensor gains of each axis that a closed-loop record allows, (axes, 2).
+
+    Within three standard errors of the model's, and a factor of 1.5 where its innovations are not
+    white. Of these, only gains at which the law that ran was stable, and from 0.2 to 1.25, as
+    sensors have them, if the model's is among these.
+    """
+    running = _running_gains(record)
+    rows = []
+    for axis in model.axes:
+        gain, error = axis.sensor_gain, axis.sensor_gain_error or 0.0
+        factor = np.exp(DIFFERENT * error / gain) * (1.0 if axis.whiteness.white else _MISFIT)
+        is_plausible = PLAUSIBLE_GAINS[0] <= gain <= PLAUSIBLE_GAINS[1]
+        ends = np.array([gain / factor, gain * factor])
+        for limits in (running, PLAUSIBLE_GAINS if is_plausible else POSSIBLE_GAINS):
+            ends = np.clip(ends, *limits)
+        rows.append(ends)
+    return np.array(rows)
+
+
+def _running_gains(record: LoopRecord) -> tuple[float, float]:
+    """Return the ends of the possible gains beyond which the law that ran was unstable."""
+    law = record_law(record)
+    if law is None or law.kind == "none" or law.lag_frames < 0:
+        return POSSIBLE_GAINS
+    gains, one = _gains_between(*POSSIBLE_GAINS), np.ones((1, record.axes))
+    ran = [could_have_run(CommandRepair(), gain * one, record, law) for gain in gains]
+    if not any(ran):
+        return POSSIBLE_GAINS
+    beside = np.convolve(ran, [1, 1, 1], "same") > 0  # the limit is between two gains
+    return float(gains[beside][0]), float(gains[beside][-1])
+
+
+def _gains_between(start: float, end: float) -> FloatArray:
+    """Return gains from one to another, both of them included."""
+    return np.geomspace(start, end, int(np.ceil(abs(np.log(end / start)) / _STEP)) + 1)
+
+
+def unstable_gains(
+    hardware: LoopHardware, controller: Controller, gains: FloatArray
+) -> FloatArray | None:
+    """Return sensor gains within intervals (axes, 2) at which a loop is unstable.
+
+    Each corner of the box is tried, and all common factors on the gains of the hardware that its
+    sides allow: exact for axes that decouple. None if the loop is stable at all of them.
+    """
+    for corner in product(*gains):
+        path = replace(hardware, sensor_matrix=np.diag(corner))
+        if not close_loop(path, controller).is_stable:
+            return np.array(corner)
+    assumed = np.diag(hardware.sensor)
+    factors = gains / assumed[:, None]
+    low, high = stable_sensor_gains(hardware, controller)
+    for factor in (np.min(factors), np.max(factors)):
+        if not low < factor < high:
+            return np.asarray(factor * assumed)
+    return None
+
+
+def design_for_gains(
+    model: IdentifiedModel,
+    design: Callable[[IdentifiedModel], Design],
+    allowed: FloatArray | None,
+    *,
+    command_scale_known: bool,
+) -> tuple[Design, tuple[str, ...]]:
+    """Return a design that is stable at all sensor gains that a record allows, and notes.
+
+    Its first assumption says which gains these are. Commands that were recorded at half their size
+    look like twice the sensor gain, and no record can tell; so unless the scale of the commands is
+    known, half of the gains are possible, and each axis may have those of both. Where the design
+    for the fitted gain is unstable at one of them, the best of the designs that assume another gain
+    takes its place, or a robust one.
+    """
+    usual = design(model)
+    if allowed is None:
+        return usual, ()
+    intervals = allowed
+    assumed = (
+        f"the sensor gain lies within {_in_words(allowed)}, as the record and its model allow; "
+        "the loop is stable at all of these"
     )
-    return usual, [words, *notes]
+    if command_scale_known:
+        assumed += ". The commands were recorded at the size that was applied, as was stated"
+    else:
+        intervals = np.tile([allowed.min() / 2, allowed.max()], (len(allowed), 1))
+        assumed += " and at half of them, should the commands be recorded at half their size"
+        if np.ptp(allowed, axis=0).any():
+            assumed += ", and each axis at those of both, because they differ"
+    bad = unstable_gains(model.hardware, usual.controller, intervals)
+    if bad is None:
+        return replace(usual, assumptions=(assumed, *usual.assumptions)), ()
+    safe = _assume_another(model, design, intervals) or _robust(model, intervals)
+    if safe is None:
+        gain = ", ".join(f"{value:.3g}" for value in bad)
+        advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
+        raise CertificateError(
+            f"the loop of the design is unstable at the sensor gain {gain}, and the record allows "
+            f"{_in_words(intervals)}. Record with a higher loop gain, look for jumps in the "
+            f"record, give the sensor gain{advice}."
+        )
+    note = (
+        f"to be stable at sensor gains of {_in_words(intervals)}, the design leaves "
+        f"{nm_text(_residual_nm(safe, model))} in the model; without that it would leave "
+        f"{nm_text(_residual_nm(usual, model))}"
+    )
+    wanted = list[str]()
+    if not command_scale_known:
+        wanted.append("--command-scale 1 if the commands were recorded at the size applied")
+    if any((axis.sensor_gain_error or 0.0) > OPEN_GAIN * axis.sensor_gain for axis in model.axes):
+        wanted.append("--sensor-gain, which the record leaves open")
+    if wanted:
+        note = f"warning: {note}. Give {' or '.join(wanted)}"
+    return replace(safe, assumptions=(assumed, *safe.assumptions)), (note,)
 
 
-def _is_better(residual: ResidualEstimate, usual: ResidualEstimate) -> bool:
-    """Whether a residual is clearly less than the usual one on every part of the test."""
-    for part, reference in zip(residual.parts(_PARTS), usual.parts(_PARTS), strict=True):
-        difference, error = reference.above(part)
-        if difference <= max(_ERRORS * error, _LEAST_SHARE * reference.measured_nm2):
-            return False
-    return True
+def _assume_another(
+    model: IdentifiedModel, design: Callable[[IdentifiedModel], Design], intervals: FloatArray
+) -> Design | None:
+    """Return the better of the designs for the nearest gains, below and above, stable at all."""
+    fitted, stable = float(np.exp(np.mean(np.log(model.sensor_gains)))), []
+    for end in (float(np.min(intervals)), float(np.max(intervals))):
+        for gain in _gains_between(fitted, end)[1:].tolist():
+            axes = tuple(replace(axis, sensor_gain=gain) for axis in model.axes)
+            with suppress(SynthesisError):
+                careful = design(replace(model, axes=axes))
+                if unstable_gains(model.hardware, careful.controller, intervals) is None:
+                    stable.append(careful)
+                    break
+    return min(stable, key=lambda careful: _residual_nm(careful, model), default=None)
+
+
+def _residual_nm(design: Design, model: IdentifiedModel) -> float:
+    """Return what a design leaves in a model; infinite where its loop is unstable."""
+    loop = close_loop(model.hardware, design.controller)
+    return residual_budget(loop, model.truth()).rms_nm if loop.is_stable else float("inf")
+
+
+def _robust(model: IdentifiedModel, intervals: FloatArray) -> Design | None:
+    """Return a design by robust synthesis over the gains; None where there is none."""
+    factors = intervals / np.array(model.sensor_gains)[:, None]
+    gains = float(np.min(factors)), float(np.max(factors))
+    inputs = PlantInputs(plant=model.plant(), sensor_gains=gains)
+    with suppress(SynthesisError, ProblemError):  # a plant without lines has no such design
+        design = design_request(gain_robust_method(), {}).build(inputs)
+        if unstable_gains(model.hardware, design.controller, intervals) is None:
+            return design
+    return None
+
+
+def _in_words(intervals: FloatArray) -> str:
+    """Return intervals of gains as text, equal ones once."""
+    return " and ".join(dict.fromkeys(f"{low:.3g} to {high:.3g}" for low, high in intervals))

@@ -41,7 +41,7 @@ def split_halves(
     Parameters
     ----------
     stretches : sequence of (start, stop), or None
-        Contiguous usable frames, in order; None for the whole record.
+        Contiguous usable frames, in order; None for the whole record of so many ``frames``.
     frames : int
         Frames of the record.
     fit_share : float, optional

@@ -8,6 +8,7 @@ the recorded ``ybar`` has the state that it would have if it had always run: no 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -19,14 +20,14 @@ from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.fit.identify import axis_periodogram, find_axis
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.linear.block_filtering import last_state
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.validation import FloatArray, IntArray, float_array, number, require_instance
+from lbt_synth.validation import FloatArray, float_array, number, require_instance
 
-_LEAST_FRAMES = 512  # in a window: fewer are no spectrum
+_LEAST_FRAMES = 2 * SHORTEST_SEGMENT  # in a window: fewer are no spectrum
 _MOST_SPOILT = 0.01  # of the frames of a window; with more there is no fit
-_WINDOWS = 2  # lengths of the window that are recorded, for the state of a new filter
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,10 +48,9 @@ class TrackingController:
     each axis in the last ``window_s`` seconds; the sensor gain stays that of the plant. The filter
     for them runs over the record, and takes over between two frames.
 
-    No update can stop the loop: if more than 1 % of the window's frames have no measurement, the
-    fit fails, the design does not pass its certificate, or its loop would be unstable, the running
-    filter stays, and :attr:`history` says why. In a frame whose measurement is not finite, the
-    command is held and the estimate goes on by the model alone.
+    No update can stop the loop: if more than 1 % of the window's frames have no finite measurement,
+    the fit fails, the design does not pass its certificate, or its loop would be unstable, the
+    running filter stays, and :attr:`history` says why.
 
     Parameters
     ----------
@@ -99,17 +99,12 @@ class TrackingController:
         if not np.array_equal(hardware.sensor, np.diag(gains)) or np.any(gains <= 0):
             raise ProblemError(
                 "each measurement must be of one axis, with a gain above 0; got a sensor matrix "
-                f"{hardware.sensor.tolist()}. Recombine the measurements into axes before the "
-                "controller."
+                f"{hardware.sensor.tolist()}. Recombine the measurements into axes first."
             )
-        window_s = number(window_s, "window_s", at_least=_LEAST_FRAMES / rate)
-        self._window = round(window_s * rate)
+        self._window = round(number(window_s, "window_s", at_least=_LEAST_FRAMES / rate) * rate)
         self._every = round(number(update_s, "update_s", at_least=1 / rate) * rate)
         self._hardware, self._gains = hardware, gains.tolist()
-        lines = np.zeros((hardware.modes, 0))
-        if plant.vibrations:
-            lines = np.transpose([line.direction for line in plant.vibrations])
-        self._most_lines = 1 + int(np.max(np.count_nonzero(lines, axis=1)))  # a new one may appear
+        self._most_lines = 1 + len(plant.vibrations)  # a new one may appear
         self._design_filter, self._first = design, design(plant)
         self.reset()
 
@@ -126,10 +121,8 @@ class TrackingController:
     def reset(self) -> None:
         """Return to the first filter, with zero states, and forget everything."""
         hw, self._mirror = self._hardware, self._hardware.mirror_system.whole
-        frames = _WINDOWS * self._window
-        self._measurements = np.zeros((frames, hw.n_measurements))
-        self._corrections = np.zeros((frames, hw.modes))
-        self._spoilt = np.zeros(frames, dtype=np.bool_)
+        # measurements, corrections, and whether they are spoilt, of the last frames
+        self._past: deque[FloatArray] = deque(maxlen=self._window)
         self._frames = 0
         self._position = np.zeros((self._mirror.n_states, hw.n_commands))
         self._command = np.zeros(hw.n_commands)
@@ -159,9 +152,7 @@ class TrackingController:
         self._state = F @ self._state + K @ (measured + S @ correction)
         if not spoilt:
             self._command = to_command @ self._state
-        row = self._frames % len(self._spoilt)
-        self._measurements[row], self._corrections[row] = measured, correction
-        self._spoilt[row] = spoilt
+        self._past.append(np.concatenate([measured, correction, [spoilt]]))
         self._frames += 1
         since_full = self._frames - self._window
         if since_full >= 0 and since_full % self._every == 0:
@@ -187,21 +178,20 @@ class TrackingController:
 
     def _identify(self) -> TipTiltPlant:
         """Return the plant of the last window."""
-        hw, rows = self._hardware, self._rows(self._window)
-        share = float(np.mean(self._spoilt[rows]))
+        hw, window = self._hardware, np.array(self._past)
+        share = float(np.mean(window[:, -1]))
         if share > _MOST_SPOILT:
             raise ProblemError(
                 f"at most {100 * _MOST_SPOILT:g} % of a window's measurements may be missing; got "
                 f"{100 * share:.3g} %. The next window may have fewer."
             )
-        each = zip(self._measurements[rows].T, self._corrections[rows].T, strict=True)
-        periodograms = [axis_periodogram(y, c, hw.frame_rate_hz, None) for y, c in each]
-        axes = tuple(
-            find_axis(Search(data=data, gain=gain, most_lines=self._most_lines))
-            for data, gain in zip(periodograms, self._gains, strict=True)
-        )
+        axes = []
+        for i, gain in enumerate(self._gains):
+            y, c = window[:, i], window[:, hw.n_measurements + i]
+            data = axis_periodogram(y, c, hw.frame_rate_hz, None)
+            axes.append(find_axis(Search(data=data, gain=gain, most_lines=self._most_lines)))
         model = IdentifiedModel(
-            axes=axes,
+            axes=tuple(axes),
             frame_rate_hz=hw.frame_rate_hz,
             delay_frames=hw.delay_frames,
             mirror=hw.mirror,
@@ -214,14 +204,8 @@ class TrackingController:
             raise ProblemError("the loop must be stable with the new filter; it is not.")
         self._take(design)
         F, K, *_ = self._filter
-        rows = self._rows(len(self._spoilt))
-        open_loop = self._measurements[rows] + self._corrections[rows] @ self._hardware.sensor.T
-        self._state = last_state(F, open_loop @ K.T)
-
-    def _rows(self, most: int) -> IntArray:
-        """Return where the last frames are in the record, the oldest first."""
-        count = min(most, self._frames, len(self._spoilt))
-        return np.arange(self._frames - count, self._frames, dtype=np.int64) % len(self._spoilt)
+        measured, corrections, _ = np.split(np.array(self._past), [len(K.T), -1], axis=1)
+        self._state = last_state(F, (measured + corrections @ self._hardware.sensor.T) @ K.T)
 
     def _take(self, design: FilterDesign) -> None:
         """Set the filter: its matrices F, K and C, and from state to command."""

@@ -57,6 +57,8 @@ class EnsembleVibration:
         Direction over the modes, made a unit vector; along the first of two by default.
     damping : float or (p,) array_like, optional
         Damping ratio, above 0; without it the vibration is a sinusoid.
+    sections : int, optional
+        Resonances in series, of a bump.
 
     Raises
     ------
@@ -75,6 +77,7 @@ class EnsembleVibration:
     rms_nm: Any
     direction: Any = (1.0, 0.0)
     damping: Any = None
+    sections: int = 1
 
     def __post_init__(self) -> None:
         for name in ("frequency_hz", "rms_nm", "damping"):
@@ -95,6 +98,7 @@ def ensemble_vibration(vibration: Vibration | SinusoidalVibration) -> EnsembleVi
         rms_nm=vibration.rms_nm,
         direction=vibration.direction,
         damping=vibration.damping if isinstance(vibration, Vibration) else None,
+        sections=vibration.sections if isinstance(vibration, Vibration) else 1,
     )
 
 
@@ -365,6 +369,7 @@ def residuals_from_matrices(
                         line.damping[rows],
                         share * line.rms_nm[rows],
                         hardware.frame_rate_hz,
+                        line.sections,
                     )
                     moved = loops.of_process(*process, along[..., None])
                 else:

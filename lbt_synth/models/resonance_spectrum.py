@@ -9,11 +9,16 @@ f_s, is ``x(k+1) = a1 x(k) + a2 x(k-1) + v(k)``. With ``q = -a2``, ``b = 1 - a1 
 
 Both are sums and products without cancellation, down to any frequency and damping. A damping
 ratio above 1 means two real poles; the formulas are smooth at 1.
+
+A bump is a process of m such sections in series. Its spectrum of unit variance is ``U^m / M``, U
+that of one section and ``M = (1 / pi) int U^m dw`` over the angles w per frame from 0 to pi.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -22,6 +27,7 @@ from lbt_synth.validation import FloatArray
 
 PARAMETERS = 3  # of a component: log frequency, log damping, log variance
 WIDE_DAMPING = 0.1  # damping ratio of a resonance that is no line
+_NODES = 96  # of the integral over a bump, which then has 12 digits
 Jacobian = tuple[tuple[float, float], tuple[float, float]]
 Number = TypeVar("Number", float, FloatArray)
 
@@ -75,23 +81,60 @@ def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
     return np.stack([poles, -(decay**2)], axis=-1)
 
 
-def unit_density(frequency: float, damping: float, s: FloatArray) -> FloatArray:
-    """Spectrum of unit variance of a resonance, (f,) as s is."""
+def unit_density(
+    frequency: float, damping: float, s: FloatArray, sections: int = 1
+) -> FloatArray:
+    """Spectrum of unit variance of a resonance, or of some in series, (f,) as s is."""
     b, p, _ = recursion(frequency, damping)
     size = s * ((p - 2) / 2)
     size += b
     size *= size
     size += p**2 * s * (1 - s / 4)
-    return np.asarray(_drive(b, p) / size)
+    density = np.asarray(_drive(b, p) / size)
+    if sections == 1:
+        return density
+    return np.asarray(density**sections / series_variance(frequency, damping, sections)[0])
+
+
+@lru_cache(maxsize=512)
+def series_variance(
+    frequency: float, damping: float, sections: int
+) -> tuple[float, tuple[float, float]]:
+    """Return M of sections in series, and its logarithm's slopes by log frequency and log damping.
+
+    The substitution ``w = frequency (1 + damping tan x)`` makes the integrand smooth.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    width = damping * frequency
+    low, high = math.atan(-1 / damping), math.atan((math.pi - frequency) / width)
+    x = low + (high - low) * (nodes + 1) / 2
+    s = 4 * np.sin((frequency + width * np.tan(x)) / 2) ** 2
+    one = np.ones(1)
+    density, slopes = resonance_densities(frequency * one, damping * one, one, s)
+    share = (high - low) / 2 * weights * width / np.cos(x) ** 2 / math.pi * density[0] ** sections
+    variance = float(np.sum(share))
+    by_frequency, by_damping = (sections * slopes[0] @ share / variance).tolist()
+    return variance, (by_frequency, by_damping)
+
+
+def section_drives(frequency: float, damping: float, sections: int) -> FloatArray:
+    """Return the driving deviations of processes of 1, 2, ... sections of unit variance, (m,)."""
+    drive = coefficients(frequency, damping)[2]
+    variances = [series_variance(frequency, damping, m)[0] for m in range(1, sections + 1)]
+    return np.sqrt(drive ** np.arange(1, sections + 1) / np.array(variances))
 
 
 def resonance_densities(
-    frequency: FloatArray, damping: FloatArray, variance: FloatArray, s: FloatArray
+    frequency: FloatArray,
+    damping: FloatArray,
+    variance: FloatArray,
+    s: FloatArray,
+    sections: Sequence[int] = (),
 ) -> tuple[FloatArray, FloatArray]:
     """Spectra of c resonances, (c, f), with their logarithmic slopes (c, 2, f).
 
     The slopes are those of the logarithm by the logarithms of frequency and damping ratio; s is
-    (f,).
+    (f,). Those of several sections have their number in ``sections`` (c,), all 1 by default.
     """
     each = [recursion(*pair) for pair in zip(frequency.tolist(), damping.tolist(), strict=True)]
     b, p = np.array([row[:2] for row in each]).T[..., None]
@@ -110,7 +153,15 @@ def resonance_densities(
     top = (1 / b - 1 / rest) * by_b + (1 / p - 2 / rest + 1 / (2 - p)) * by_p  # of the numerator
     falls = [top + by_p / half, -2 * by_b - b / half * by_p, -2 * p / half * by_p]
     slopes = np.stack(falls, axis=2) @ shapes
-    over *= _drive(b, p) * variance[:, None]
+    over *= _drive(b, p)
+    for i, m in enumerate(sections):
+        if m > 1:
+            mean, by_log = series_variance(float(frequency[i]), float(damping[i]), m)
+            over[i] **= m
+            over[i] /= mean
+            slopes[i] *= m
+            slopes[i] -= np.array(by_log)[:, None]
+    over *= variance[:, None]
     return over, slopes
 
 

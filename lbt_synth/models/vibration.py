@@ -16,14 +16,23 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.ar_model import ARModel, variance_ratios
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.resonance_spectrum import coefficient_rows
-from lbt_synth.validation import FloatArray, Positive, check_fields, choice, number, real_array
+from lbt_synth.validation import (
+    FloatArray,
+    Positive,
+    check_fields,
+    choice,
+    integer,
+    number,
+    real_array,
+)
 
+MOST_SECTIONS = 4  # of a bump: the coefficients of more in series lose too many digits
 _UNIT = 1e-15  # rounding of a length of one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vibration:
-    """A narrow line: a damped resonance driven by white noise.
+    """A narrow line, a damped resonance driven by white noise; or a bump, some in series.
 
     Parameters
     ----------
@@ -35,6 +44,9 @@ class Vibration:
         Standard deviation of the displacement along its direction [nm rms wavefront].
     direction : tuple of float, optional
         Direction over the modes, made a unit vector; ``(1, 0)`` shakes tip.
+    sections : int, optional
+        How many resonances of this frequency and damping stand in series, 1 to 4. The flanks of
+        a bump of several are steeper than those of one that is as wide.
 
     Raises
     ------
@@ -53,12 +65,14 @@ class Vibration:
     damping: Annotated[float, ("above", 0)]
     rms_nm: Positive
     direction: tuple[float, ...] = (1.0, 0.0)
+    sections: int = 1
 
     def __post_init__(self) -> None:
-        check_fields(self, direction=unit_direction(self.direction))
+        sections = integer(self.sections, "sections", at_least=1, at_most=MOST_SECTIONS)
+        check_fields(self, direction=unit_direction(self.direction), sections=sections)
 
     def ar_model(self, frame_rate_hz: float) -> ARModel:
-        """Return the AR2 process of this rms, sampled at a frame rate [Hz].
+        """Return the AR process of this rms, of order 2 a section, sampled at a frame rate [Hz].
 
         A line that is not below the Nyquist frequency raises a ProblemError.
 
@@ -71,7 +85,7 @@ class Vibration:
         """
         rate = number(frame_rate_hz, "frame_rate_hz", above=0)
         a, driving = sampled_lines(
-            np.array(self.frequency_hz), np.array(self.damping), self.rms_nm, rate
+            np.array(self.frequency_hz), np.array(self.damping), self.rms_nm, rate, self.sections
         )
         return ARModel(coefficients=a, driving_rms_nm=float(driving), frame_rate_hz=rate)
 
@@ -143,13 +157,31 @@ def require_below_nyquist(frequency_hz: float, frame_rate_hz: float) -> None:
 
 
 def sampled_lines(
-    frequency_hz: FloatArray, damping: FloatArray, rms_nm: FloatArray | float, frame_rate_hz: float
+    frequency_hz: FloatArray,
+    damping: FloatArray,
+    rms_nm: FloatArray | float,
+    frame_rate_hz: float,
+    sections: int = 1,
 ) -> tuple[FloatArray, FloatArray]:
-    """Coefficients (p, 2) and driving noise (p,) [nm] of p vibrations at a frame rate."""
+    """Coefficients (p, 2 m) and driving noise (p,) [nm] of p vibrations of m sections."""
     require_below_nyquist(float(np.max(frequency_hz, initial=0.0)), frame_rate_hz)
     a = coefficient_rows(2 * np.pi * frequency_hz / frame_rate_hz, damping)
+    if sections > 1:
+        a = _series_coefficients(a, sections)
     # by the rounded coefficients, so that the process has exactly this rms
     return a, np.asarray(rms_nm / np.sqrt(variance_ratios(a)))
+
+
+def _series_coefficients(one: FloatArray, sections: int) -> FloatArray:
+    """Coefficients (..., 2 m) of m sections in series, each of coefficients (..., 2)."""
+    factor = np.concatenate([np.ones_like(one[..., :1]), -one], axis=-1)
+    product = factor
+    for _ in range(sections - 1):
+        longer = np.zeros((*product.shape[:-1], product.shape[-1] + 2))
+        for lag in range(3):
+            longer[..., lag : lag + product.shape[-1]] += factor[..., lag : lag + 1] * product
+        product = longer
+    return -product[..., 1:]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

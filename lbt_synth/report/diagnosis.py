@@ -10,13 +10,12 @@ import numpy as np
 
 from lbt_synth.identification import Diagnosis
 from lbt_synth.identification.diagnosis.rows import law_facts
-from lbt_synth.identification.diagnosis.verdict import NARROW, diagnosis_verdict
 from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import draw_bars
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.page.html import Block, Chart, Notice, Page, chart, new_page, paragraph
-from lbt_synth.storage.rows import fact_table, row_table
+from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
 
@@ -73,20 +72,17 @@ def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, list[Table]]:
         "Loop": diagnosis.loop and [diagnosis.loop],
     }
     best = f" (best design: {diagnosis.best})" if diagnosis.best else ""
-    half = "whole record" if diagnosis.comparison is None else "first half"
     unseen = "Residual on the second half of the record, by models of the first"
     residuals = {
-        f"What each part leaves by the model of the {half}{best}": diagnosis.costs,
+        f"What each part leaves by the model of the first half{best}": diagnosis.costs,
         f"{unseen}; {diagnosis.imaging.label}": diagnosis.residuals,
     }
-    given = diagnosis.given
     lines = [] if diagnosis.model is None else model_tables(diagnosis.model)[1:]
     return {
         "record": channels,
         "loop": [row_table(caption, rows) for caption, rows in loop.items() if rows],
         "disturbance": lines,
-        "verdict": [row_table(caption, rows) for caption, rows in residuals.items() if rows]
-        + ([] if given is None else [fact_table("The gain file on this record", given)]),
+        "verdict": [row_table(caption, rows) for caption, rows in residuals.items() if rows],
     }
 
 
@@ -113,11 +109,9 @@ def diagnosis_page(diagnosis: Diagnosis, files: Sequence[str | os.PathLike[str]]
 
 
 def _verdict_blocks(diagnosis: Diagnosis, tables: Sequence[Table]) -> list[Block]:
-    state, *rest = diagnosis_verdict(diagnosis)
-    wrong = diagnosis.doubt or any(row.serious for row in diagnosis.channels)
-    doubtful = diagnosis.loop is None or diagnosis.loop.modulus < NARROW
+    state, *rest = diagnosis.verdict
     return [
-        Notice(text=state, tone="bad" if wrong else "note" if doubtful else "good"),
+        Notice(text=state, tone=diagnosis.findings[0].tone),
         " ".join(rest),
         *tables,
         *_residual_charts(diagnosis),

@@ -1,24 +1,37 @@
 """A design from a record, and what is noted against it.
 
-The method that a record asks for, and when the default one stays.
+The method that a record asks for, when the default one stays, and the gains that a record allows.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import pytest
+from support.control_laws import ordinary_loop
 from support.night import GAIN, night_record
-from support.recorded_loops import LINE, RATE, spliced_record
+from support.recorded_loops import LINE, RATE, drifting_record, resonant_record, spliced_record
+from support.wrong_commands import record
 
 import lbt_synth as lbt
-from lbt_synth.identification.auto import choose_method, note_drift, quick_methods
+from lbt_synth.identification import auto
+from lbt_synth.identification.auto import (
+    allowed_gains,
+    choose_method,
+    design_for_gains,
+    note_drift,
+    quick_methods,
+    unstable_gains,
+)
 from lbt_synth.identification.prediction.residual import estimate_residual
 from lbt_synth.methods import method_named, registry
-from lbt_synth.methods.registry import default_method
+from lbt_synth.methods.registry import default_method, gain_robust_method
 
 DRIFT_HZ = 500.0
+TITLES = {name: method_named(name).title for name in ("kalman", "hinf", "lqg")}
+USUAL = TITLES["kalman"]
 SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=DRIFT_HZ)
 
 
@@ -62,7 +75,7 @@ def test_a_design_needs_a_delay_and_data():
         lbt.design_from_record(short, method="magic")
 
 
-def drifting_record(offset_nm: float, speed_nm_s: float) -> lbt.identification.LoopRecord:
+def offset_record(offset_nm: float, speed_nm_s: float) -> lbt.identification.LoopRecord:
     """A record of noise whose commands move, on the second axis; its sensor gain is 0.5."""
     noise = np.random.default_rng(0).standard_normal((5000, 2))
     commands = np.zeros((5000, 2))
@@ -79,8 +92,8 @@ def test_what_a_filter_leaves_of_a_drift_is_noted():
     controller = lbt.kalman(plant).controller
     left = abs(lbt.close_loop(plant.hardware, controller).sensitivity([1e-6])[0, 1, 1])
     assert 0.01 < left < 0.5
-    assert list(note_drift(drifting_record(10.0, 1.0), plant, controller)) == []
-    (note,) = note_drift(drifting_record(3000.0, -200.0), plant, controller)
+    assert list(note_drift(offset_record(10.0, 1.0), plant, controller)) == []
+    (note,) = note_drift(offset_record(3000.0, -200.0), plant, controller)
     assert note.startswith("axis 1 of the record stands 3e+03 nm off zero and drifts by -200 nm/s.")
     said = float(note.split("leaves up to ")[1].split(" nm")[0])
     assert said == pytest.approx(left * (3000 + 5 * 200), rel=0.05)
@@ -88,7 +101,7 @@ def test_what_a_filter_leaves_of_a_drift_is_noted():
 
 def residuals(*, error, **differences):
     """Residuals of methods, whose variances are below 1000 by differences on three parts."""
-    parts = {"kalman": [], **{name: [] for name in differences}}
+    parts = {USUAL: [], **{TITLES[name]: [] for name in differences}}
     for i in range(3):
         common, own = np.random.default_rng(i).standard_normal((2, 6000))
         common *= np.sqrt(1000 / np.mean(common**2))
@@ -96,9 +109,9 @@ def residuals(*, error, **differences):
         # its product with the common part scatters
         size = 6000 * error**2 / 4000
         own *= np.sqrt(size / np.mean(own**2))
-        parts["kalman"].append(common)
+        parts[USUAL].append(common)
         for name, less in differences.items():
-            parts[name].append(np.sqrt(1 - (less[i] + size) / 1000) * common + own)
+            parts[TITLES[name]].append(np.sqrt(1 - (less[i] + size) / 1000) * common + own)
     zero = np.zeros((1, 1))
     return {
         name: estimate_residual(np.concatenate(series)[:, None], ((5, 18_005),), zero, zero)
@@ -118,13 +131,15 @@ def residuals(*, error, **differences):
 )
 def test_the_default_stays_unless_another_wins_every_part(differences, error, chosen):
     compared = residuals(error=error, hinf=differences)
-    pairs = zip(*(compared[name].parts(3) for name in ("kalman", "hinf")), strict=True)
+    pairs = zip(
+        *(compared[name].parts(3) for name in TITLES.values() if name in compared), strict=True
+    )
     for (usual, other), difference in zip(pairs, differences, strict=True):
         above, its_error = usual.above(other)
         assert above == pytest.approx(difference)
         assert its_error == pytest.approx(error, rel=0.3) or difference >= 400
-    method, (note,) = choose_method(compared)
-    assert method == chosen
+    title, note = choose_method(compared)
+    assert title == TITLES[chosen]
     words = "H-infinity filter is chosen" if chosen == "hinf" else "Kalman filter stays"
     assert f"the {words}" in note
     assert not note.endswith(".")  # whoever prints it ends it
@@ -132,25 +147,18 @@ def test_the_default_stays_unless_another_wins_every_part(differences, error, ch
 
 def test_a_method_that_leaves_clearly_less_says_by_how_much():
     compared = residuals(error=4.0, hinf=(100.0, 200.0, 300.0))
-    difference, error = compared["kalman"].above(compared["hinf"])
-    _, (note,) = choose_method(compared)
+    difference, error = compared[USUAL].above(compared[TITLES["hinf"]])
+    _, note = choose_method(compared)
     assert note.endswith(f"less than the Kalman filter, in all by 200 +- {error:.2g} nm^2")
     assert difference == pytest.approx(200)
 
 
-def test_a_method_that_a_possible_gain_makes_unstable_is_not_chosen():
-    compared = residuals(error=4.0, hinf=(200.0,) * 3, lqg=(100.0,) * 3)
-    method, notes = choose_method(compared, {"hinf"})
-    assert method == "lqg"
-    assert "H-infinity filter is left out: its loop is unstable" in notes[1]
-
-
 def test_without_the_default_the_best_is_chosen():
     compared = residuals(error=4.0, hinf=(-200.0,) * 3, lqg=(-100.0,) * 3)
-    del compared["kalman"]
-    method, (note,) = choose_method(compared)
-    assert method == "lqg"
-    assert "of the methods that are left" in note
+    del compared[USUAL]
+    title, note = choose_method(compared)
+    assert title == TITLES["lqg"]
+    assert note.startswith(f"the {title} stays")
 
 
 def test_all_quick_methods_are_in_the_table_of_unseen_data():
@@ -170,3 +178,190 @@ def test_slow_methods_are_not_tried(monkeypatch):
         newcomer = replace(usual, name="newcomer", slow=slow)
         monkeypatch.setitem(registry._methods_of_folder(), "newcomer", newcomer)
         assert ("newcomer" in quick_methods()) is not slow
+
+
+@pytest.fixture(scope="module")
+def loop() -> tuple[lbt.identification.LoopRecord, lbt.identification.IdentifiedModel]:
+    """Return the record of a loop of sensor gain 0.9 and its model."""
+    record = spliced_record((0,), lines=LINE, frames=20_000, sensor_gain=0.9)
+    return record, lbt.identify(record)
+
+
+def with_gain(
+    model: lbt.identification.IdentifiedModel, gain: float, error: float
+) -> lbt.identification.IdentifiedModel:
+    """Return a model with another gain and error."""
+    axes = (replace(a, sensor_gain=gain, sensor_gain_error=error) for a in model.axes)
+    return replace(model, axes=tuple(axes))
+
+
+@pytest.mark.parametrize("seed", [0, 2, 337])
+def test_a_drift_over_frozen_flow_does_not_carry_the_gain_away(seed: int) -> None:
+    """It did, to 0.03: what the loop leaves is coloured noise over a line, at no gain at all."""
+    record = drifting_record(seed)
+    model = lbt.identify(record)
+    ((low, high),) = allowed_gains(record, model)
+    assert low < 0.5859 < high
+    error = model.axes[0].sensor_gain_error
+    assert error is not None
+    assert model.sensor_gains[0] == pytest.approx(0.5859, abs=3 * error)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_true_gain_is_allowed(seed: int) -> None:
+    ordinary = record(*ordinary_loop(seed))
+    low, high = allowed_gains(ordinary, lbt.identify(ordinary)).T
+    assert np.all(low < 0.7)
+    assert np.all(high > 0.7)
+    assert np.all(high / low < 2)
+
+
+def test_wide_resonances_leave_the_true_gain_allowed() -> None:
+    resonant = resonant_record()
+    low, high = allowed_gains(resonant, lbt.identify(resonant)).T
+    assert np.all(low < 0.9)
+    assert np.all(high > 0.9)
+    assert np.all(high / low < 1.6)
+
+
+def test_the_interval_is_what_the_fit_the_sensor_and_the_law_allow(loop) -> None:
+    """The integrator of gain 0.4 was stable below a sensor gain of 2.5."""
+    record, model = loop
+    ((low, high),) = allowed_gains(record, with_gain(model, 0.8, 0.08))
+    assert (low, high) == pytest.approx((0.8 * np.exp(-0.3), 0.8 * np.exp(0.3)))
+    ((low, high),) = allowed_gains(record, with_gain(model, 0.8, 0.4))
+    assert (low, high) == pytest.approx((0.2, 1.25))  # of sensors
+    ((low, high),) = allowed_gains(record, with_gain(model, 1.3, 0.4))
+    assert low == pytest.approx(1.3 * np.exp(-3 * 0.4 / 1.3))
+    assert high == pytest.approx(2.5)
+    white = model.axes[0].whiteness
+    odd = replace(model.axes[0], whiteness=replace(white, p_value=1e-9))
+    ((low, high),) = allowed_gains(record, replace(model, axes=(odd,)))
+    error = odd.sensor_gain_error / odd.sensor_gain
+    assert low == pytest.approx(odd.sensor_gain / (1.5 * np.exp(3 * error)))
+    assert high == pytest.approx(1.25)
+
+
+def test_gains_at_which_a_loop_is_unstable() -> None:
+    """An integrator of gain g is stable below a sensor gain of 1 / g."""
+    path = lbt.LoopHardware(frame_rate_hz=1000)
+    controller = lbt.integrator(path, gain=0.5).controller
+    assert unstable_gains(path, controller, np.array([[0.1, 1.99], [0.2, 1.99]])) is None
+    bad = unstable_gains(path, controller, np.array([[0.1, 1.0], [0.2, 2.01]]))
+    assert bad is not None
+    assert bad[1] == 2.01
+
+
+def kalman(model: lbt.identification.IdentifiedModel) -> lbt.Design:
+    return lbt.kalman(model.plant())
+
+
+@cache
+def hinf(model: lbt.identification.IdentifiedModel) -> lbt.Design:
+    return lbt.hinf(
+        model.plant(), gamma_ratio=1.02, route="riccati"
+    )  # its controller alone is unstable
+
+
+@pytest.fixture
+def no_robust(monkeypatch) -> None:
+    """Let robust synthesis find nothing."""
+
+    def fail() -> str:
+        raise lbt.errors.InfeasibleError("too much")
+
+    monkeypatch.setattr(auto, "gain_robust_method", fail)
+
+
+def test_gains_that_the_fit_shows_keep_the_design(loop) -> None:
+    _, model = loop
+    allowed = np.array([[0.6, 1.2]])
+    design, notes = design_for_gains(model, kalman, allowed, command_scale_known=True)
+    assert design.method == "kalman"
+    (text,) = design.assumptions
+    assert "the loop is stable at all of these" in text
+    assert "at the size that was applied, as was stated" in text
+    assert notes == ()
+    free, _ = design_for_gains(model, kalman, None, command_scale_known=False)
+    assert free.assumptions == ()
+
+
+def beyond_its_margin(model: lbt.identification.IdentifiedModel, factor: float = 1.1) -> np.ndarray:
+    """Return gains from the model's to a factor beyond the largest of its filter's stable loop."""
+    (gain,) = model.sensor_gains
+    _, high = lbt.loop.stable_sensor_gains(model.hardware, kalman(model).controller)
+    return np.array([[0.9 * gain, factor * high * gain]])
+
+
+def test_another_gain_is_assumed_where_the_fitted_one_is_unstable() -> None:
+    """At the price that the note says, which is less than that of a robust design."""
+    line = ((60.0, 0.004, 100.0),)
+    model = lbt.identify(spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9))
+    allowed = beyond_its_margin(model)
+    design, (note,) = design_for_gains(model, kalman, allowed, command_scale_known=True)
+    assert design.method == "kalman"
+    assert unstable_gains(model.hardware, design.controller, allowed) is None
+    assert note.startswith(f"to be stable at sensor gains of {allowed[0, 0]:.3g} to")
+    loops = [lbt.close_loop(model.hardware, each.controller) for each in (kalman(model), design)]
+    least, paid = (lbt.residual_budget(loop, model.truth()).rms_nm for loop in loops)
+    assert least < paid < 1.1 * least
+
+
+def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain() -> None:
+    line = ((60.0, 0.004, 100.0),)
+    model = lbt.identify(spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9))
+    allowed = np.array([[0.8, 1.0]])
+    make = partial(design_for_gains, model, hinf, allowed=allowed)
+    best, notes = make(command_scale_known=True)
+    halves = allowed * [0.5, 1.0]
+    assert best.method == "hinf"
+    assert notes == ()
+    assert unstable_gains(model.hardware, best.controller, halves) is not None
+    safe, (note,) = make(command_scale_known=False)
+    assert unstable_gains(model.hardware, safe.controller, halves) is None
+    assert "at half of them" in safe.assumptions[0]
+    assert "--command-scale 1" in note or "without that it would leave" in note
+
+
+def test_a_gain_that_the_record_leaves_open_is_asked_for() -> None:
+    line = ((60.0, 0.004, 100.0),)
+    model = lbt.identify(spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9))
+    open_gain = with_gain(model, model.sensor_gains[0], 0.4)
+    allowed = beyond_its_margin(model, 1.5)
+    _, (note,) = design_for_gains(open_gain, kalman, allowed, command_scale_known=True)
+    assert note.startswith("warning: to be stable")
+    assert "Give --sensor-gain, which the record leaves open" in note
+
+
+@pytest.mark.parametrize("size", [0.5, 2.0])
+def test_axes_of_different_gains_may_have_those_of_both(size: float) -> None:
+    """Commands of one axis at twice their size gave a design that was unstable in the loop."""
+    y, u = ordinary_loop()
+    made = lbt.design_from_record(record(y, u * [1.0, size]))
+    gains = made.model.sensor_gains
+    assert gains == pytest.approx((0.7, 0.7 / size), rel=0.15)
+    assert "each axis at those of both, because they differ" in made.design.assumptions[0]
+    both = np.outer([1, 1], [min(gains), max(gains)])
+    assert unstable_gains(made.model.hardware, made.controller, both) is None
+    assert any("recorded at another size" in note for note in made.model.notes)
+
+
+def test_gains_that_are_too_far_apart_take_robust_synthesis(loop) -> None:
+    _, model = loop
+    wide = np.array([[0.02, 0.9]])
+    safe, _ = design_for_gains(model, hinf, wide, command_scale_known=True)
+    assert safe.method == gain_robust_method()
+    assert unstable_gains(model.hardware, safe.controller, wide) is None
+    assert "lies within 0.02 to 0.9" in safe.assumptions[0]
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.usefixtures("no_robust")
+def test_gains_that_no_design_holds_are_refused(loop, known: bool) -> None:
+    _, model = loop
+    wide = np.array([[0.02, 0.9]])
+    with pytest.raises(
+        lbt.errors.CertificateError, match=r"the record allows 0.0\d to 0.9"
+    ) as caught:
+        design_for_gains(model, hinf, wide, command_scale_known=known)
+    assert ("or say --command-scale 1" in str(caught.value)) is not known

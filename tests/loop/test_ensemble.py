@@ -173,6 +173,18 @@ def test_each_loop_on_its_own_under_processes(which, request):
         agree(found, design, w, single)
 
 
+def test_a_bump_shakes_each_loop_as_it_shakes_one(kalman):
+    bump = lbt.Vibration(frequency_hz=40, damping=0.2, rms_nm=100, sections=3)
+    shaken = EnsembleVibration(frequency_hz=[40, 45], rms_nm=100, damping=0.2, sections=3)
+    ensemble = LoopEnsemble(turbulence=SLOW, vibrations=(shaken,), noise_nm=10)
+    left = ensemble_residuals(kalman.controller, kalman.hardware, ensemble).rms_nm
+    loop = lbt.close_loop(kalman.hardware, kalman.controller)
+    for frequency_hz, rms_nm in zip((40, 45), left, strict=True):
+        line = replace(bump, frequency_hz=frequency_hz)
+        truth = lbt.Truth(turbulence=SLOW, vibrations=(line,), noise_nm=10)
+        assert rms_nm == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=1e-8)
+
+
 def test_unstable_loops_have_no_residual(kalman):
     w = weather(20, seed=3)
     w["gains"] = np.linspace(0.2, 4, 20)

@@ -8,7 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 
-from lbt_synth.models.resonance_spectrum import coefficients, log_density, log_roll_off
+from lbt_synth.models.resonance_spectrum import (
+    coefficients,
+    log_density,
+    log_roll_off,
+    resonance_densities,
+    unit_density,
+)
 
 RATE = 1000.0
 
@@ -50,6 +56,30 @@ def test_density_has_unit_variance_and_passes_critical_damping_smoothly() -> Non
     around = [log_density(0.1, z, s[1:]) for z in (1 - 1e-9, 1 + 1e-9)]
     for one, other in zip(*around, strict=True):
         assert np.allclose(one, other, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "damping"), [(0.25, 0.1), (0.25, 0.02), (1.0, 0.3), (2.9, 0.2), (0.02, 0.5)]
+)
+@pytest.mark.parametrize("sections", [2, 4])
+def test_a_bump_has_unit_variance_and_right_slopes(
+    frequency: float, damping: float, sections: int
+) -> None:
+    w = np.linspace(0, np.pi, 200_001)
+    s = 4 * np.sin(w / 2) ** 2
+    assert trapezoid(unit_density(frequency, damping, s, sections), w) == pytest.approx(np.pi)
+    h, unit = 1e-5, np.ones(1)
+    _, slopes = resonance_densities(frequency * unit, damping * unit, unit, s, [sections])
+    for slope, move in zip(slopes[0], ((h, 0), (0, h)), strict=True):
+        up, down = (
+            np.log(
+                unit_density(
+                    frequency * np.exp(t * move[0]), damping * np.exp(t * move[1]), s, sections
+                )
+            )
+            for t in (1, -1)
+        )
+        assert np.allclose(slope, (up - down) / (2 * h), rtol=1e-5, atol=1e-4)
 
 
 def test_roll_off_has_unit_gain_at_zero_and_a_right_derivative() -> None:

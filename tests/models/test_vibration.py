@@ -27,6 +27,18 @@ def test_vibration_keeps_its_rms(frequency, damping, rms):
     assert model.rms_nm == pytest.approx(rms, rel=1e-7)
 
 
+@pytest.mark.parametrize("sections", [1, 2, 4])
+def test_a_bump_is_its_resonances_in_series(sections):
+    """The spectrum of the process is the power of that of one, at the rms that was asked for."""
+    bump = lbt.Vibration(frequency_hz=40, damping=0.2, rms_nm=100, sections=sections)
+    one = replace(bump, sections=1).ar_model(1000)
+    process, f = bump.ar_model(1000), np.array([5.0, 30.0, 40.0, 60.0, 300.0])
+    assert process.order == 2 * sections
+    assert process.rms_nm == pytest.approx(100, rel=1e-6)
+    ratio = process.psd(f) / one.psd(f) ** sections
+    assert ratio == pytest.approx(np.full(5, ratio[0]), rel=1e-6)
+
+
 def test_retuned_vibration_holds_what_it_is_told():
     line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
     driving = line.ar_model(800).driving_rms_nm
@@ -138,6 +150,7 @@ def test_wrong_vibrations_are_refused():
     beyond = "below the Nyquist frequency 400 Hz; got 500 Hz"
     for call, words in (
         *((lambda v=v: line(damping=v), "damping must be") for v in (0.0, -1.0)),
+        *((lambda v=v: line(sections=v), "sections must be") for v in (0, 5, 1.5)),
         (lambda: line(frequency_hz=500).ar_model(800), beyond),
         (lambda: checked_direction(drifting(end_hz=500), PATH), beyond),
         (lambda: drifting(start_hz=0), "start_hz must be above 0"),

@@ -25,7 +25,6 @@ from lbt_synth.validation import BoolArray, FloatArray, float_array, number
 _MISSING = 0.1  # of the frames without a number, from which a channel counts as dead
 _NAME = re.compile(r"\w[\w .+-]*$")
 _SPELLINGS = re.compile(r"\s*/\s*s(\^|\*\*)?2$|\s*/\s*s²$|[ .*]s(\^|\*\*)?-2$")
-_SAME = 1e-7  # relative, between rates that are one
 
 Readings = tuple[tuple[str, ...], FloatArray, tuple[str, ...]]  # channels, values, notes
 
@@ -84,43 +83,35 @@ def _is_offset(series: FloatArray) -> bool:
 
 def _m_s2(column: Column, unit: str | None, source: Path) -> float:
     """Return the m/s^2 of one unit of a column: as given, as its heading says, or one."""
-    said = _SPELLINGS.sub("/s2", (column.unit or "").strip()).replace("µ", "u").lower()
-    if said and said not in M_S2:
-        if unit is None:
-            raise TelemetryError(
-                f"accelerations must be in one of {', '.join(M_S2)}; {column.name} of {source} is "
-                f"in {column.unit!r}. Scale them, or give acceleration_unit.",
-                path=source,
-            )
-    elif said and unit is not None and M_S2[said] != M_S2[unit]:
+    heading = _SPELLINGS.sub("/s2", (column.unit or "").strip()).replace("µ", "u").lower()
+    factor = M_S2.get(heading or "m/s2") if unit is None else M_S2[unit]
+    if factor is None or M_S2.get(heading, factor) != factor:
         raise TelemetryError(
-            f"{column.name} of {source} is in {column.unit}, and acceleration_unit says {unit}: "
-            "which is right? Leave the option away, or correct the heading.",
+            f"accelerations must be in one of {', '.join(M_S2)}; {column.name} of {source} is in "
+            f"{column.unit!r}, and acceleration_unit says {unit}. Scale them, or correct which is "
+            "wrong.",
             path=source,
         )
-    return M_S2[unit or said or "m/s2"]
+    return factor
 
 
 def _on_own_clock(
     contents: Contents, values: FloatArray, rate_hz: float | None, frame_rate_hz: float
 ) -> tuple[FloatArray, float, list[str]]:
     """Return readings without jumps in time, NaN where rows are missing, and their rate."""
-    stated = (
-        {rate_hz} if rate_hz is not None else set(contents.facts.get("frame_rate_hz", {}).values())
-    )
+    in_file = contents.facts.get("frame_rate_hz", {}).values()
+    stated = set(in_file) if rate_hz is None else {rate_hz}
     if len(stated) > 1:
         raise ProblemError(
             "the file of the accelerometers gives several rates: "
-            f"{', '.join(f'{each:g}' for each in sorted(stated))} Hz. Give accelerometer_rate_hz."
+            f"{', '.join(f'{rate:g}' for rate in sorted(stated))} Hz. Give accelerometer_rate_hz."
         )
     own_hz = number(stated.pop(), "accelerometer_rate_hz", above=0) if stated else None
-    clocks = {each.role: each for each in contents.columns if each.role in CLOCKS}
+    clocks = {column.role: column for column in contents.columns if column.role in CLOCKS}
     times, counter = clocks.get("times"), clocks.get("frame_numbers")
     if times is None and counter is None:
-        said = (
-            "" if own_hz else "no rate is given for the accelerometers: that of the loop is taken"
-        )
-        return values, own_hz or frame_rate_hz, [said] if said else []
+        note = "no rate is given for the accelerometers: that of the loop is taken"
+        return values, own_hz or frame_rate_hz, [] if own_hz else [note]
     clock = build_clock(
         len(values),
         frame_rate_hz=own_hz or (frame_rate_hz if times is None else None),
@@ -133,43 +124,31 @@ def _on_own_clock(
 
 
 def resample(values: FloatArray, rate_hz: float, frame_rate_hz: float) -> FloatArray:
-    """Return readings (n, channels) at the frames of a loop, faster ones averaged over each.
+    """Return readings (n, channels) averaged over the frames of a loop, NaN beside missing ones.
 
-    Between readings they follow a cubic spline; frames beside a missing reading are NaN.
+    A reading is the mean over its period: their sum has a cubic spline through the ends of the
+    periods, whose differences are the means over frames.
     """
     ratio = rate_hz / frame_rate_hz
-    if ratio < 1 - _SAME:
+    frames = int(len(values) / ratio)
+    if round(ratio, 6) < 1 or frames < 1:
         raise ProblemError(
-            f"accelerations must come at least once a frame, {frame_rate_hz:g} Hz; got "
-            f"{rate_hz:g} Hz. Record them faster, or give accelerometer_rate_hz if that is wrong."
+            f"accelerations must come at least once a frame, {frame_rate_hz:g} Hz, and last a "
+            f"frame; got {len(values)} readings at {rate_hz:g} Hz. Is the rate right? If so, "
+            "record them faster; else give accelerometer_rate_hz."
         )
-    many = max(round(ratio), 1)
-    frames = int(np.floor(len(values) / ratio * (1 + _SAME)))
-    if frames < 1:
-        raise ProblemError(
-            f"accelerations must last a frame of the loop, {1 / frame_rate_hz:g} s; got "
-            f"{len(values)} readings at {rate_hz:g} Hz. Is the rate right?"
-        )
-    if abs(ratio - many) <= _SAME * many:
-        whole = values[: frames * many].reshape(-1, many, values.shape[1])
-        return np.asarray(whole.mean(axis=1))
-    place = (np.arange(frames * many) + 0.5) / many * ratio - 0.5  # of readings
-    each = at_places(values, place).reshape(frames, many, values.shape[1])
-    return np.asarray(each.mean(axis=1))
-
-
-def at_places(values: FloatArray, place: FloatArray) -> FloatArray:
-    """Return readings (n, channels) between their places, NaN beside missing ones."""
-    rows, out = np.arange(float(len(values))), np.empty((len(place), values.shape[1]))
-    below = np.clip(np.floor(place).astype(int), 0, len(values) - 2)
+    edges, places = np.arange(len(values) + 1), np.arange(frames + 1) * ratio
+    first = np.floor(places[:-1]).astype(int)
+    last = np.minimum(np.ceil(places[1:]).astype(int), len(values))
+    out = np.full((frames, values.shape[1]), np.nan)
     for c, series in enumerate(values.T):
         good = np.isfinite(series)
-        if not good.any():
-            out[:, c] = np.nan
-            continue
-        filled = np.interp(rows, rows[good], series[good])
-        sure = good[below] & good[below + 1]
-        out[:, c] = np.where(sure, CubicSpline(rows, filled)(place), np.nan)
+        if good.any():
+            mean = float(np.mean(series[good]))
+            total = np.append(0.0, np.cumsum(fill(series, good) - mean))
+            gone = np.append(0, np.cumsum(~good))
+            means = np.diff(CubicSpline(edges, total)(places)) / ratio + mean
+            out[:, c] = np.where(gone[last] == gone[first], means, np.nan)
     return out
 
 
@@ -177,27 +156,19 @@ def fill_missing(accelerations: ArrayLike) -> tuple[FloatArray, BoolArray]:
     """Return readings (frames, channels) with zeros in gaps, and the frames without one.
 
     Held values and spikes are missing, too; gaps of a few frames are bridged. A channel that misses
-    more than a tenth of the frames becomes zeros, and spoils no frame.
+    more than a tenth of the frames that any channel has becomes zeros, and spoils no frame.
     """
-    given = as_columns(accelerations)
-    good, filled = np.isfinite(given), np.zeros(given.shape)
-    ended = np.mean(good, axis=0) < 1 - _MISSING
-    for c, series in enumerate(given.T):
+    readings = float_array(accelerations, "accelerations")
+    readings = readings[:, None] if readings.ndim == 1 else readings
+    if readings.ndim != 2 or readings.size == 0:
+        raise DimensionError(f"accelerations must be (frames, channels); got {readings.shape}.")
+    good, filled = np.isfinite(readings), np.zeros(readings.shape)
+    recorded = np.sum(good.any(axis=1))
+    for c, series in enumerate(readings.T):
         held = find_stuck(series, good[:, c])
         good[:, c] &= ~held & ~find_outliers(series, good[:, c] & ~held)
         filled[:, c] = fill(series, good[:, c])
         gaps = runs(~good[:, c])
-        good[:, c] |= mark(gaps[gaps[:, 1] - gaps[:, 0] <= BRIDGED_FRAMES], len(given))
-    fine = np.mean(good, axis=0) >= 1 - _MISSING
-    if not fine.any() and ended.all():  # one that ends early may be whole until then
-        fine = good.any(axis=0)
+        good[:, c] |= mark(gaps[gaps[:, 1] - gaps[:, 0] <= BRIDGED_FRAMES], len(series))
+    fine = np.sum(good, axis=0) >= (1 - _MISSING) * recorded
     return np.where(good & fine, filled, 0.0), np.asarray(good[:, fine].all(axis=1))
-
-
-def as_columns(accelerations: ArrayLike) -> FloatArray:
-    """Return accelerations as (frames, channels)."""
-    given = float_array(accelerations, "accelerations")
-    given = given[:, None] if given.ndim == 1 else given
-    if given.ndim != 2 or given.size == 0:
-        raise DimensionError(f"accelerations must be (frames, channels); got {given.shape}.")
-    return given

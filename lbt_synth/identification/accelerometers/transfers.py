@@ -3,51 +3,44 @@
 One regression: around each line, a Wiener filter with the spectra of the model estimates the line's
 motion from the wavefront. Given the wavefront, the readings of a channel are normal with the mean
 ``expected F`` and the variance ``noise + open``: what the wavefront leaves open of the lines moves
-the channel, too, and does not bias it. The factors F of all lines are found together with these
-weights, in turn with the noise, whose median is robust against lines of the channel's own.
-
-Readings may lag behind by some frames, which turns the phase of every frequency in proportion. They
-are moved by whole frames if the slope of the phase within the lines is surely not that of readings
-beside the wavefront. What is left of a shift is in the phases of the lines.
+the channel, too. The factors F of all lines are found together with these weights, in turn with the
+noise, whose median is robust against lines of the channel's own. Readings are moved by whole frames
+if the slope of the phase within the lines surely says so; the rest of a shift is in the phases.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.signal import detrend
 from scipy.signal.windows import tukey
 from scipy.special import gammaincc
 
-from lbt_synth.design import kalman
 from lbt_synth.design.fallbacks import MOST_UNITS
-from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.accelerometers.readings import fill_missing
 from lbt_synth.identification.fit.identified_model import (
     DIFFERENT,
     IdentifiedLine,
     IdentifiedModel,
 )
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT, TAPER
 from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.models import Accelerometer, Motion, SensorSuite
 from lbt_synth.models.sensor_suite import LONGEST_DELAY
-from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import column, nm_column, table_row
+from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, number
 
-_NM = 1e-9
 _TINY = np.finfo(np.float64).tiny
-_EXTRA = f"left out, because others show more and a design takes {MOST_UNITS - 1} channels"
-_FEWEST_VALUES = 4  # a series of no more different numbers is rounding
+_NOTHING = "adds nothing"
+_EXTRA = f"left out, because a design takes {MOST_UNITS - 1} channels"
 _DEAD_M_S2 = 1e-9  # rms, a thousandth of what a quiet accelerometer resolves
-_BLOCK_S = 100.0  # that is transformed at once, which bounds the memory for a long record
-_TAPERED = 0.2  # of a block, at both ends together, against leakage of the turbulence
-_INDEPENDENT = (1 - 5 * _TAPERED / 8) ** 2 / (1 - 93 * _TAPERED / 128)  # of tapered values
-_SHORTEST = 256  # frames of a stretch that shows a line
+_INDEPENDENT = (1 - 5 * TAPER / 8) ** 2 / (1 - 93 * TAPER / 128)  # of tapered values
 _REACH = 20.0  # half widths of a line, or bins, from its centre to the edge of its band
 _ROUNDS = 20  # of factors and noise, of which each brings them nearer by a factor of two or more
 _DOUBT = 0.01  # chance below which a channel moves at a line more than its noise explains
@@ -97,13 +90,7 @@ class ChannelRow:
         format=".3g",
         help="Noise of a reading, near the lines it is used for",
     )
-    verdict: str = column("verdict", help="What it is used for, or what is wrong with it")
-    residual_nm: float = nm_column(
-        "with the wavefront",
-        format=".2f",
-        default=float("nan"),
-        help="Residual by the model of a Kalman filter of both",
-    )
+    verdict: str = column("verdict", help="Whether it is used, or why not")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -120,8 +107,6 @@ class AccelerometerTransfers:
     # age of a reading for which the phases hold; 1 is the wavefront's of the same frame
     age_frames: int
     rate_hz: float  # readings per second, after averaging
-    alone_nm: float = float("nan")  # residual by the model of a Kalman filter of the wavefront
-    together_nm: float = float("nan")  # and of one that reads all used channels, too
 
     @property
     def used(self) -> tuple[ChannelRow, ...]:
@@ -131,8 +116,8 @@ class AccelerometerTransfers:
 
     def loop_age(self, delay_frames: float) -> int:
         """Return the age of a reading in a loop of some delay: 1 where the clocks hide it."""
-        known = self.age_frames >= 0 and 1 <= self.age_frames + delay_frames - 1 <= LONGEST_DELAY
-        return self.age_frames if known else 1
+        delay = self.age_frames + delay_frames - 1
+        return self.age_frames if self.age_frames >= 0 and 1 <= delay <= LONGEST_DELAY else 1
 
     @property
     def shift_text(self) -> str:
@@ -146,17 +131,6 @@ class AccelerometerTransfers:
             f"the accelerometers lag behind the wavefront by {self.shift_frames:.3g} +- "
             f"{self.shift_error_frames:.2g} frames, by the slope of the phase within lines. Phases "
             f"hold for a shift of {self.age_frames - 1}."
-        )
-
-    @property
-    def worth_text(self) -> str:
-        """What the channels buy, in words; empty where none shows a line, or it is not known."""
-        if not np.isfinite(self.together_nm):
-            return ""
-        return (
-            "by the model, the Kalman filter of the wavefront leaves "
-            f"{nm_text(self.alone_nm)}, and with {', '.join(row.channel for row in self.used)} "
-            f"{nm_text(self.together_nm)}"
         )
 
 
@@ -175,12 +149,9 @@ def accelerometer_transfers(
 
     ``a_c(k) = 1e-9 sum_j F_cj a_j(k-g) + noise``
 
-    with a_j(k) the mean acceleration of the line j [nm/s^2 of wavefront] over frame k, which is
-    ``-(2 pi f)^2`` times the mean position in it, g the age of the reading, and F_cj a complex
-    factor, whose size is the motion and whose angle the phase. In bands around the lines, the
-    factors are those of a weighted regression of the channel on the lines as the wavefront shows
-    them by the spectra of the model. What the wavefront leaves open of the lines is a second noise
-    that grows with the factors. Standard errors count those of the model's sensor gains.
+    with a_j(k) the mean acceleration of the line j [nm/s^2 of wavefront] over frame k, g the age of
+    the reading, and F_cj a complex factor, whose size is the motion and whose angle the phase.
+    Standard errors count those of the model's sensor gains.
 
     Parameters
     ----------
@@ -222,47 +193,44 @@ def accelerometer_transfers(
     >>> record = lbt.identification.loop_record(z, frame_rate_hz=1000, unit="nm")
     >>> found = lbt.identification.accelerometer_transfers(lbt.identify(record), record, a)
     >>> round(found.transfers[0].motion_nm_per_nm, 1), found.channels[0].verdict
-    (2.0, 'used for 31 Hz')
+    (2.0, 'used')
     """
     readings, good = fill_missing(accelerations)
-    names = _names(channels, readings.shape[1])
+    names = _check_names(channels, readings.shape[1])
     if len(model.axes) != record.axes:
         raise DimensionError(
             f"model and record must have the same axes; got {len(model.axes)} and {record.axes}."
         )
     alarm = number(false_alarm, "false_alarm", above=0, below=1)
-    largest = int(number(largest_shift_s, "largest_shift_s", at_least=0) * model.frame_rate_hz)
-    live = [c for c, series in enumerate(readings.T) if _is_live(series[good])]
+    largest_s = number(largest_shift_s, "largest_shift_s", at_least=0)
+    live = np.std(readings[good], axis=0) > _DEAD_M_S2
     places = [i for i, part in enumerate(model.parts) if part.kind == "line"]
-    fits: list[_ChannelFit] = []
-    shift, error, lag, limit = 0.0, float("inf"), 0, 0.0
-    if live and places:
-        lines = [model.parts[i] for i in places]
-        widest = max(line.damping * line.frequency_hz for line in lines)
-        shifts = 1 + np.ceil(4 * widest * largest / model.frame_rate_hz)  # that differ
-        limit = alarm / (len(live) * len(lines) * shifts)
-        lag, fits, (shift, error) = _lay_and_fit(
+    places.sort(key=lambda i: model.parts[i].frequency_hz)
+    lines = [model.parts[i] for i in places]
+    lag, shift, error, transfers = 0, 0.0, float("inf"), tuple[TransferRow, ...]()
+    noise, verdicts = np.full(len(names), np.nan), np.where(live, _NOTHING, "dead").astype(object)
+    if live.any() and lines:
+        widest_hz = max(line.damping * line.frequency_hz for line in lines)
+        shifts = 1 + np.ceil(4 * widest_hz * largest_s)  # that differ
+        limit = alarm / (np.sum(live) * len(lines) * shifts)
+        largest = int(largest_s * model.frame_rate_hz)
+        lag, fits, shift, error = _lay_and_fit(
             model, record, lines, readings[:, live], good, largest, limit
         )
-    rows = [
-        _transfer_row(fit, j, names[c], places[j], model, limit)
-        for c, fit in zip(live, fits, strict=False)
-        for j in np.argsort([model.parts[place].frequency_hz for place in places]).tolist()
-    ]
-    noises = {
-        names[c]: fit.noise_m_s2(model.frame_rate_hz, limit)
-        for c, fit in zip(live, fits, strict=False)
-    }
-    shown = [row for row in rows if row.useful]
-    best = _best_channels(shown, noises, model)
-    transfers = AccelerometerTransfers(
-        transfers=tuple(replace(row, useful=row.useful and row.channel in best) for row in rows),
+        shown = fits.chances < limit
+        # the channels that show most of the lines' power, as many as a design takes
+        power = (fits.coherences * shown) @ np.array([line.rms_nm**2 for line in lines])
+        used = shown & (power >= np.sort(power)[-(MOST_UNITS - 1) :][0])[:, None]
+        near = shown | ~shown.any(axis=1, keepdims=True)  # the lines it shows, or all
+        level = np.sum(fits.noise * near, axis=1) / np.sum(near, axis=1)
+        noise[live] = np.sqrt(level * model.frame_rate_hz / 2)
+        verdicts[live] = np.select([used.any(1), shown.any(1)], ["used", _EXTRA], _NOTHING)
+        channels = [name for name, is_live in zip(names, live, strict=True) if is_live]
+        transfers = _transfer_rows(channels, places, lines, fits, used)
+    return AccelerometerTransfers(
+        transfers=transfers,
         channels=tuple(
-            ChannelRow(
-                channel=name,
-                noise_m_s2=noises.get(name, np.nan),
-                verdict=_verdict(name, shown, name in best) if c in live else "dead",
-            )
+            ChannelRow(channel=name, noise_m_s2=float(noise[c]), verdict=str(verdicts[c]))
             for c, name in enumerate(names)
         ),
         shift_frames=shift,
@@ -270,20 +238,10 @@ def accelerometer_transfers(
         age_frames=lag + 1,
         rate_hz=model.frame_rate_hz,
     )
-    if not best:
-        return transfers
-    try:
-        return _with_residuals(transfers, model)
-    except LbtSynthError:  # no filter of these sensors: the motions are not lost
-        return transfers
 
 
-def _is_live(readings: FloatArray) -> bool:
-    """Return whether the readings (frames,) of a channel are more than rounding."""
-    return np.unique(readings).size > _FEWEST_VALUES and float(np.std(readings)) > _DEAD_M_S2
-
-
-def _names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
+def _check_names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
+    """Return the names of channels; refuse two of one name, or too few."""
     names = tuple(channels or (f"channel{c + 1}" for c in range(count)))
     if len(names) != count or len(set(names)) < count:
         raise ProblemError(
@@ -292,82 +250,39 @@ def _names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
     return names
 
 
-def _verdict(name: str, shown: Sequence[TransferRow], best: bool) -> str:
-    """Return what a channel is used for, in words."""
-    lines = [f"{row.frequency_hz:.3g}" for row in shown if row.channel == name]
-    if not lines:
-        return "adds nothing"
-    use = f"{'used for' if best else 'shows'} {', '.join(lines)} Hz"
-    return use if best else f"{_EXTRA}; {use}"
-
-
-def _transfer_row(
-    fit: _ChannelFit, j: int, name: str, place: int, model: IdentifiedModel, limit: float
-) -> TransferRow:
-    """Return what the fit of a channel says of one line."""
-    factor, (error, across) = fit.factors[j], fit.errors(j)
-    return TransferRow(
-        channel=name,
-        line=place,
-        frequency_hz=model.parts[place].frequency_hz,
-        motion_nm_per_nm=float(abs(factor)),
-        motion_error_nm_per_nm=error,
-        phase_deg=float(np.degrees(np.angle(factor))),
-        phase_error_deg=float(min(np.degrees(across / max(abs(factor), _TINY)), 180.0)),
-        coherence=float(fit.coherences[j]),
-        chance=float(fit.chances[j]),
-        useful=bool(fit.chances[j] < limit),
-    )
-
-
-def _best_channels(
-    shown: Sequence[TransferRow], noises: Mapping[str, float], model: IdentifiedModel
-) -> list[str]:
-    """Return the channels that tell most of the lines' power, as many as a design takes."""
-    worth = dict.fromkeys((row.channel for row in shown), 0.0)
-    for row in shown:
-        line = model.parts[row.line]
-        size = _NM * (2 * np.pi * line.frequency_hz) ** 2 * line.rms_nm * row.motion_nm_per_nm
-        signal = (size / max(noises[row.channel], _TINY)) ** 2
-        worth[row.channel] += line.rms_nm**2 * float(np.log1p(signal))
-    return sorted(worth, key=lambda name: -worth[name])[: MOST_UNITS - 1]
-
-
-def _with_residuals(
-    transfers: AccelerometerTransfers, model: IdentifiedModel
-) -> AccelerometerTransfers:
-    """Add what a Kalman filter leaves by the model without channels, with each, and with all."""
-    plant, age = model.plant(), transfers.loop_age(model.delay_frames)
-
-    def residual_nm(channels: Sequence[ChannelRow]) -> float:
-        instrument = Accelerometer(
-            name="accelerometer",
-            rate_hz=transfers.rate_hz,
-            delay_frames=age + model.delay_frames - 1,
-            channels=tuple(row.channel for row in channels),
-            noise_m_s2=np.array([row.noise_m_s2 for row in channels]),
+def _transfer_rows(
+    channels: Sequence[str],
+    places: Sequence[int],
+    lines: Sequence[IdentifiedLine],
+    fits: _Fits,
+    used: BoolArray,
+) -> tuple[TransferRow, ...]:
+    """Return what the fits of channels say of lines."""
+    size = np.abs(fits.factors)
+    turned = np.minimum(np.degrees(fits.across / np.maximum(size, _TINY)), 180.0)
+    return tuple(
+        TransferRow(
+            channel=name,
+            line=places[j],
+            frequency_hz=line.frequency_hz,
+            motion_nm_per_nm=float(size[c, j]),
+            motion_error_nm_per_nm=float(fits.along[c, j]),
+            phase_deg=float(np.angle(fits.factors[c, j], deg=True)),
+            phase_error_deg=float(turned[c, j]),
+            coherence=float(fits.coherences[c, j]),
+            chance=float(fits.chances[c, j]),
+            useful=bool(used[c, j]),
         )
-        motions: list[dict[str, Motion]] = [{} for _ in model.parts]
-        for row in transfers.transfers:
-            if row.useful and row.channel in instrument.channels:
-                motion = Motion(size=row.motion_nm_per_nm, phase_deg=row.phase_deg)
-                motions[row.line][row.channel] = motion
-        return kalman(plant.with_sensors(SensorSuite(sensors=(instrument,)), tuple(motions))).rms
-
-    rows = [
-        replace(row, residual_nm=residual_nm([row])) if row in transfers.used else row
-        for row in transfers.channels
-    ]
-    together_nm = residual_nm(transfers.used)
-    alone_nm = kalman(plant).rms
-    return replace(transfers, channels=tuple(rows), alone_nm=alone_nm, together_nm=together_nm)
+        for c, name in enumerate(channels)
+        for j, line in enumerate(lines)
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Bands:
-    """Frequencies of a block of a record around all lines; densities per Hz."""
+    """Frequencies of a stretch of a record around all lines; densities per Hz."""
 
-    frames: int  # of the block
+    frames: int  # of the stretch
     bins: IntArray  # (f,): of its transform
     angle: FloatArray  # (f,) [rad per frame]
     readings: ComplexArray  # (f, channels) [m/s^2]
@@ -382,13 +297,12 @@ class _Bands:
         return np.asarray(np.maximum(self.shapes @ np.abs(factors) ** 2 - seen, 0.0))
 
 
-def _transform(series: FloatArray, rate: float) -> ComplexArray:
-    """Return tapered transforms (f, n), whose squares are densities, without mean and slope."""
-    time = np.linspace(-1, 1, len(series))
-    level = series - series.mean(axis=0) - np.outer(time, time @ series / (time @ time))
-    taper = tukey(len(series), _TAPERED)
+def _transform(series: FloatArray, rate: float, inside: BoolArray) -> ComplexArray:
+    """Return tapered transforms in bands (f, n), whose squares are densities, without a slope."""
+    taper = tukey(len(series), TAPER)
     scale = np.sqrt(2 / (rate * np.sum(taper**2)))
-    return np.asarray(scale * np.fft.rfft(taper[:, None] * level, axis=0))
+    transforms = [scale * np.fft.rfft(taper * detrend(column))[inside] for column in series.T]
+    return np.stack(transforms, axis=1)
 
 
 def _density(line: IdentifiedLine, frequency_hz: FloatArray, bin_hz: float) -> FloatArray:
@@ -408,7 +322,7 @@ def _make_bands(
     wavefront: FloatArray,
     readings: FloatArray,
 ) -> _Bands:
-    """Return the bands of a block of readings and of the wavefront beside its changes by gains."""
+    """Return the bands of a stretch: readings, wavefront and its changes by gains."""
     rate, count = model.frame_rate_hz, len(readings)
     bin_hz = rate / count
     frequency = np.asarray(bin_hz * np.arange(count // 2 + 1), dtype=np.float64)
@@ -417,10 +331,10 @@ def _make_bands(
         reach = _REACH * max(line.damping * line.frequency_hz, bin_hz)
         inside |= np.abs(frequency - line.frequency_hz) <= min(reach, line.frequency_hz / 4)
     f, axes = frequency[inside], len(model.axes)
-    z, moved = np.split(_transform(wavefront, rate)[inside], 2, axis=1)
+    z, moved = np.split(_transform(wavefront, rate, inside), 2, axis=1)
     along = np.array([(line.direction or (1.0,))[:axes] for line in lines])
     # the mean acceleration over a frame, of the mean position in it
-    swing = -_NM * (2 * np.pi * f) ** 2
+    swing = -1e-9 * (2 * np.pi * f) ** 2  # in m/s^2 a nm
     shapes = np.stack([_density(line, f, bin_hz) for line in lines], axis=1)
     background = [np.interp(f, a.frequency_hz, a.background_nm2_hz) for a in model.axes]
     total = np.einsum("fj,ja,jb->fab", shapes, along, along)
@@ -433,7 +347,7 @@ def _make_bands(
         frames=count,
         bins=np.flatnonzero(inside),
         angle=2 * np.pi * f / rate,
-        readings=_transform(readings, rate)[inside],
+        readings=_transform(readings, rate, inside),
         expected=np.einsum("faj,fa->fj", gain, z),
         moved=np.transpose(gain, (0, 2, 1)) * moved[:, None],
         seen=half,
@@ -449,7 +363,7 @@ def _lay_and_fit(
     good: BoolArray,
     largest: int,
     limit: float,
-) -> tuple[int, list[_ChannelFit], tuple[float, float]]:
+) -> tuple[int, _Fits, float, float]:
     """Lay readings beside the wavefront: with the likeliest shift, or as given if that is not sure.
 
     Return by how many frames they were moved, the fits, and the shift with its standard error.
@@ -463,34 +377,29 @@ def _lay_and_fit(
         frames = np.arange(record.frames) + lag
         rows = np.clip(frames, 0, len(readings) - 1)
         usable = record.usable & (frames == rows) & good[rows]
-        blocks = []
-        for start, stop in runs(usable).tolist():
-            if stop - start >= _SHORTEST:
-                count = int(np.ceil((stop - start) / (_BLOCK_S * model.frame_rate_hz)))
-                edges = np.linspace(start, stop, count + 1).astype(int).tolist()
-                blocks += [slice(a, b) for a, b in pairwise(edges)]
-        if not blocks:
+        bands = [
+            _make_bands(model, lines, wavefront[start:stop], readings[rows[start:stop]])
+            for start, stop in runs(usable).tolist()
+            if stop - start >= SHORTEST_SEGMENT
+        ]
+        if not bands:
             raise ProblemError(
-                f"record and accelerations must have {_SHORTEST} usable frames in a row side by "
-                f"side; they have {record.frames} and {len(readings)} frames."
+                f"record and accelerations must have {SHORTEST_SEGMENT} usable frames in a row "
+                f"side by side; they have {record.frames} and {len(readings)} frames."
             )
-        return [_make_bands(model, lines, wavefront[x], readings[rows[x]]) for x in blocks]
-
-    def fit(bands: Sequence[_Bands], lag: int) -> tuple[list[_ChannelFit], float, float]:
-        fits = [_fit_channel(bands, channel) for channel in range(readings.shape[1])]
-        slope, error = _slope_shift(fits, limit)
-        return fits, lag + slope, error
+        return bands
 
     bands = beside(0)
-    likeliest = _likeliest_lag(bands, largest)
-    fits, shift, error = fit(beside(likeliest), likeliest)
-    if abs(shift) > DIFFERENT * error:
-        lag = round(shift)
-        fits, shift, error = fit(beside(lag), lag)
-        return lag, fits, (shift, error)
-    if likeliest:
-        fits, *_ = fit(bands, 0)
-    return 0, fits, (shift if np.isfinite(error) else 0.0, error)
+    lag = _likeliest_lag(bands, largest)
+    fits = _fit_channels(beside(lag))
+    late, error = _slope_shift(fits, limit)
+    if not abs(lag + late) > DIFFERENT * error:
+        return 0, _fit_channels(bands), lag + late if np.isfinite(error) else 0.0, error
+    if round(late):
+        lag += round(late)
+        fits = _fit_channels(beside(lag))
+        late, error = _slope_shift(fits, limit)
+    return lag, fits, lag + late, error
 
 
 def _likeliest_lag(bands: Sequence[_Bands], largest: int) -> int:
@@ -499,44 +408,35 @@ def _likeliest_lag(bands: Sequence[_Bands], largest: int) -> int:
     total = np.zeros(lags.size)
     for band in bands:
         near = np.abs(lags) <= band.frames // 2
-        for expected in band.expected.T:
-            for reading in band.readings.T:
-                product = expected.conj() * reading
-                spectrum = np.zeros(band.frames, dtype=np.complex128)
-                spectrum[band.bins] = product
-                agreement = np.abs(band.frames * np.fft.ifft(spectrum)) ** 2
-                power = max(float(np.sum(np.abs(product) ** 2)), _TINY)
-                total[near] += agreement[lags[near] % band.frames] / power
+        for expected, reading in product(band.expected.T, band.readings.T):
+            spectrum = np.zeros(band.frames, dtype=np.complex128)
+            spectrum[band.bins] = expected.conj() * reading
+            agreement = np.abs(band.frames * np.fft.ifft(spectrum)) ** 2
+            power = max(float(np.sum(np.abs(spectrum) ** 2)), _TINY)
+            total[near] += agreement[lags[near] % band.frames] / power
     return int(lags[np.argmax(total)])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _ChannelFit:
-    """Factors of one channel for all lines."""
+class _Fits(NamedTuple):
+    """Factors of channels for lines, (channels, lines) each; of one channel, (lines,)."""
 
-    factors: ComplexArray  # (lines,)
-    variances: FloatArray  # (lines,): of the complex factors, for the gains of the model
-    slopes: ComplexArray  # (lines, axes): of the factors, for a standard error of each sensor gain
-    chances: FloatArray  # (lines,): that a channel without a line would show as much
-    coherences: FloatArray  # (lines,)
-    noise: FloatArray  # (lines,): density near each line [(m/s^2)^2/Hz]
-    shifts: FloatArray  # (lines,): lag by the slope of the phase within each line [frames]
-    shift_weights: FloatArray  # (lines,): their inverse variances
-
-    def errors(self, j: int) -> tuple[float, float]:
-        """Return the standard errors of a factor along itself, and across: of size and phase."""
-        turned = self.slopes[j] * np.exp(-1j * np.angle(self.factors[j]))
-        scatter = self.variances[j] / 2
-        along, across = (np.sqrt(scatter + np.sum(x**2)) for x in (turned.real, turned.imag))
-        return float(along), float(across)
-
-    def noise_m_s2(self, rate: float, limit: float) -> float:
-        """Return the noise of a reading near the lines that the channel shows, or near all."""
-        shown = self.chances < limit
-        return float(np.sqrt(np.mean(self.noise[shown if shown.any() else ...]) * rate / 2))
+    factors: ComplexArray
+    along: FloatArray  # standard errors of them, along themselves: of the size
+    across: FloatArray  # and across: of the phase, times the size
+    chances: FloatArray  # that a channel without a line would show as much
+    coherences: FloatArray
+    noise: FloatArray  # density near each line [(m/s^2)^2/Hz]
+    shifts: FloatArray  # lag by the slope of the phase within each line [frames]
+    shift_weights: FloatArray  # their inverse variances
 
 
-def _fit_channel(bands: Sequence[_Bands], channel: int) -> _ChannelFit:
+def _fit_channels(bands: Sequence[_Bands]) -> _Fits:
+    """Fit the factors of all channels for all lines."""
+    channels = range(bands[0].readings.shape[1])
+    return _Fits(*map(np.array, zip(*(_fit_channel(bands, c) for c in channels), strict=True)))
+
+
+def _fit_channel(bands: Sequence[_Bands], channel: int) -> _Fits:
     """Fit the factors of a channel for all lines, and test each of them."""
     x, moved, angle = (
         np.concatenate([getattr(band, name) for band in bands])
@@ -555,40 +455,42 @@ def _fit_channel(bands: Sequence[_Bands], channel: int) -> _ChannelFit:
         opened = np.concatenate([band.open_power(factors) for band in bands])
     error = a - x @ factors
     slopes = -bread @ (x.conj().T @ (weights[:, None] * np.einsum("fja,j->fa", moved, factors)))
-    shares = np.abs(x) ** 2 * weights[:, None]
+    size = np.abs(x) ** 2
+    shares = size * weights[:, None]
     shares /= np.maximum(shares.sum(axis=0), _TINY)
     values = np.maximum(_INDEPENDENT / np.sum(shares**2, axis=0), 1.0)  # at each line
     degrees = np.maximum(values - 1, 0.5)
     excess = (np.abs(error) ** 2 * weights) @ shares
+    more = np.maximum(excess * values / degrees, 1.0)
+    # a channel with a motion of its own there
     doubtful = gammaincc(degrees, excess * values) < _DOUBT
-    more = np.maximum(excess * values / degrees, 1.0)  # a channel with a motion of its own there
+    raised, degrees = np.where(doubtful, more, 1.0), np.where(doubtful, degrees, len(a))
     variances = np.diag(bread).real / _INDEPENDENT
-    ratios = np.abs(factors) ** 2 / np.maximum(variances, _TINY)
-    ratios, degrees = np.where(
-        doubtful, [ratios / more, degrees], [ratios, np.full_like(more, len(a))]
-    )
-    left = np.abs(error) ** 2 @ shares
-    shown = np.abs(factors) ** 2 * np.sum(np.abs(x) ** 2 * shares, axis=0)
+    ratios = np.abs(factors) ** 2 / np.maximum(raised * variances, _TINY)
+    rest = np.abs(error) ** 2 @ shares
+    shown = np.abs(factors) ** 2 * np.sum(size * shares, axis=0)
+    scatter = variances * more / 2
+    moves = slopes * np.exp(-1j * np.angle(factors))[:, None]
     # a small shift turns the phase in proportion to the distance from the middle of the line
     turn = -1j * (angle[:, None] - angle @ shares) * factors * x
-    size = np.maximum(np.sum(np.abs(turn) ** 2 * weights[:, None], axis=0), _TINY)
-    return _ChannelFit(
+    turned = np.maximum(np.sum(np.abs(turn) ** 2 * weights[:, None], axis=0), _TINY)
+    return _Fits(
         factors=factors,
-        variances=variances * more,
-        slopes=slopes,
+        along=np.sqrt(scatter + np.sum(moves.real**2, axis=1)),
+        across=np.sqrt(scatter + np.sum(moves.imag**2, axis=1)),
         chances=np.exp(-degrees * np.log1p(ratios / degrees)),
-        coherences=shown / np.maximum(shown + left, _TINY),
-        noise=noise * np.where(doubtful, more, 1.0),
-        shifts=np.real((weights * error) @ turn.conj()) / size,
-        shift_weights=2 * _INDEPENDENT * size / more,
+        coherences=shown / np.maximum(shown + rest, _TINY),
+        noise=noise * raised,
+        shifts=np.real((weights * error) @ turn.conj()) / turned,
+        shift_weights=2 * _INDEPENDENT * turned / more,
     )
 
 
-def _slope_shift(fits: Sequence[_ChannelFit], limit: float) -> tuple[float, float]:
+def _slope_shift(fits: _Fits, limit: float) -> tuple[float, float]:
     """Return by how many frames readings are late beyond the lag, and its standard error."""
-    shown = [fit.chances < limit for fit in fits]
-    weights = np.concatenate([fit.shift_weights[s] for fit, s in zip(fits, shown, strict=True)])
-    shifts = np.concatenate([fit.shifts[s] for fit, s in zip(fits, shown, strict=True)])
+    shown = fits.chances < limit
+    weights = fits.shift_weights[shown]
     if not weights.sum() > 0:
         return 0.0, float("inf")
-    return float(weights @ shifts / weights.sum()), float(1 / np.sqrt(weights.sum()))
+    shift = float(weights @ fits.shifts[shown] / weights.sum())
+    return shift, float(1 / np.sqrt(weights.sum()))

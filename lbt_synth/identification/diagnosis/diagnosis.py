@@ -1,44 +1,64 @@
-"""The autopsy of a record: all that it tells of its loop, in rows."""
+"""The autopsy of a record: all that it tells of its loop, in rows and in findings.
+
+The verdict is in three sentences. Its residuals are those on the second half of the record, with
+errors; the model says only how the variance of one divides among the parts of the disturbance.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
 
 from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import LbtSynthError
-from lbt_synth.identification.commands.control_law import ControlLaw
+from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
 from lbt_synth.identification.diagnosis.rows import (
+    FEW,
     ChannelRow,
     CostRow,
-    design_differences,
     disturbance_costs,
     disturbance_lines,
     given_controller,
-    given_design_facts,
+    given_design_notes,
     judge_channels,
     loop_facts,
-    running_controller,
 )
-from lbt_synth.identification.fit.identified_model import IdentifiedLine, IdentifiedModel
+from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.prediction.comparison import (
     INTEGRATOR,
+    RAN,
     PredictionRow,
     PredictionTable,
-    compare_on_record,
-    stable_designs,
+    compare_designs,
 )
-from lbt_synth.identification.prediction.residual import ResidualEstimate
+from lbt_synth.identification.prediction.residual import MUCH, gather
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, close_loop
+from lbt_synth.loop import Imaging
 from lbt_synth.methods.registry import all_methods, reference_methods
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts
+from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import require_instance
+
+_NARROW = 0.3  # modulus margin: less is a gain margin below 1.4
+_LEAST_SHARE = 0.05  # of the residual variance, of a part that is named
+_DELAY_WARNING = "warning: a delay of"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Finding:
+    """One thing that a record tells, and what it asks for."""
+
+    tone: Literal["good", "note", "bad"] = "bad"
+    sentence: str
+    advice: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -47,31 +67,20 @@ class Diagnosis:
 
     Attributes
     ----------
-    record : LoopRecord
-        The record.
-    imaging : Imaging
-        The camera of Strehl ratios.
-    commands : CommandVerdict or None
-        How the commands reach the measurements; None of an open loop.
+    record, imaging, commands : LoopRecord, Imaging, CommandVerdict or None
+        The record, the camera of Strehl ratios, and how commands reach the measurements (None of an
+        open loop).
     channels : tuple of ChannelRow
         Measurements and commands, one by one.
-    model : IdentifiedModel or None
-        The model of the whole record, and why there is none in ``notes``.
-    loop : Facts or None
-        The loop that ran, by law and model.
-    lines : tuple of IdentifiedLine
-        Resonances that are no turbulence, by frequency.
+    model, loop : IdentifiedModel or None, Facts or None
+        The model of the whole record, and the loop that ran, by law and model.
     comparison : PredictionTable or None
         Residuals on the second half of the record, by models of the first.
-    best : str
-        Row of the comparison that leaves least, of the designs.
-    best_design : Design or None
-        The same design, for the model of the first half.
+    best, best_design : str, Design or None
+        Row of the comparison that leaves least, of the designs, and that design.
     costs : tuple of CostRow
-        What each part of the disturbance costs by the model of the first half (of the whole record
-        where there is no comparison), the most costly first; the last row is all.
-    given : Facts or None
-        A given design on this record.
+        What each part of the disturbance costs by the model of the first half, the most costly
+        first; the last row is all.
     notes : tuple of str
         What could not be said and why, and what else should be known.
     """
@@ -82,12 +91,10 @@ class Diagnosis:
     channels: tuple[ChannelRow, ...] = ()
     model: IdentifiedModel | None = None
     loop: Facts | None = None
-    lines: tuple[IdentifiedLine, ...] = ()
     comparison: PredictionTable | None = None
     best: str = ""
     best_design: Design | None = None
     costs: tuple[CostRow, ...] = ()
-    given: Facts | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -105,14 +112,22 @@ class Diagnosis:
         """Rows of the comparison, for tables."""
         return () if self.comparison is None else self.comparison.entries
 
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the record tells, the most urgent first; the last one is about its residual."""
+        faults = list(_find_faults(self)) or [_judge_loop(self)]
+        return (*faults, Finding(sentence=_residual_text(self), advice=_advice_text(self)))
+
+    @property
+    def verdict(self) -> tuple[str, str, str]:
+        """Three sentences: the record, what its residual is made of, what to change first."""
+        *state, residual = self.findings
+        advice = next(finding.advice for finding in (*state, residual) if finding.advice)
+        return " ".join(finding.sentence for finding in state), residual.sentence, advice
+
     def row(self, name: str) -> PredictionRow | None:
         """Return a row of the comparison, None where there is none."""
         return next((row for row in self.residuals if row.name == name), None)
-
-    def residual(self, name: str) -> ResidualEstimate | None:
-        """Return the residual on unseen data of a row, None where there is none."""
-        row = self.row(name)
-        return None if row is None else row.replayed
 
 
 def diagnose(
@@ -131,13 +146,13 @@ def diagnose(
     record : LoopRecord
         What the loop recorded; the delay of a closed loop must be known.
     given : mapping of str to Design, optional
-        One design to try on the record, by its name.
+        Designs to try on the record, by their names.
     whole : LoopRecord, optional
         The record with those axes, too, that are left out of ``record`` because they are dead.
     imaging : Imaging, optional
         The camera, for Strehl ratios; 2.2 um by default.
     progress : callable, optional
-        Called with 1 after each of 4 steps.
+        Called with 1 after each of 3 steps.
     **options
         As :func:`identify` takes them.
 
@@ -170,121 +185,182 @@ def diagnose(
     ('pure integrator', ['turbulence', 'measurement noise', 'all'])
     """
     require_instance(record, LoopRecord)
-    step = progress or (lambda _: None)
-    notes: list[str] = []
+    step, designs, notes = progress or (lambda _: None), given or {}, list[str]()
     commands = None
     if record.commands is not None:
         commands = explain_commands(record, sensor_gain=options.get("sensor_gain"))
         notes += commands.notes
+    if whole is not None and whole.axes > record.axes:
+        notes.append("the rest is of the axis that lives: the other one is dead")
     diagnosis = Diagnosis(
         record=record,
-        imaging=Imaging() if imaging is None else imaging,
+        imaging=imaging or Imaging(),
         commands=commands,
         channels=judge_channels(record if whole is None else whole),
     )
     step(1)
-    if whole is not None and whole.axes > record.axes:
-        notes.append("the rest is of the axis that lives: the other one is dead")
-    if not diagnosis.doubt:
-        diagnosis = _examine_loop(diagnosis, dict(given or {}), options, notes, step)
-    elif given:
-        notes.append("the given design was not tried: the commands are not right")
-    return replace(diagnosis, notes=tuple(notes))
-
-
-def _examine_loop(
-    diagnosis: Diagnosis,
-    given: dict[str, Design],
-    options: dict[str, Any],
-    notes: list[str],
-    step: Callable[[int], object],
-) -> Diagnosis:
-    """Add what models of the record tell: of all of it, and of its first half on the second."""
-    record = diagnosis.record
-
-    def fit(**more: Any) -> IdentifiedModel:
+    if diagnosis.doubt:
+        notes += ["the given design was not tried: the commands are not right"] * bool(designs)
+        return replace(diagnosis, notes=tuple(notes))
+    try:
         require_length(record)
-        return identify(record, **options | more)
-
-    model = _attempt(fit, "model", notes)
+        model = identify(record, **options)
+    except LbtSynthError as error:
+        return replace(diagnosis, notes=(*notes, f"no model: {error}"))
     step(1)
-    if model is None:
-        return diagnosis
+    law, running = diagnosis.law, None
+    if law is not None and law.is_sure and law.lag_frames >= 0:
+        running = law_controller(law, model.frame_rate_hz)
+    controllers = {name: given_controller(design, model) for name, design in designs.items()}
     notes += model.notes
-    controllers = {name: given_controller(design, model) for name, design in given.items()}
-    running = running_controller(diagnosis.law, record.frame_rate_hz)
-    facts = loop_facts(model, running)
-    diagnosis = replace(diagnosis, model=model, loop=facts, lines=disturbance_lines(model))
-    first, _ = split_halves(record.stretches(), record.frames)
-    # one sensor gain for all that is said: a half shows it less well
-    fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
-    half = _attempt(lambda: fit(**fixed), "model of the first half", notes)
+    for name, design in designs.items():
+        notes += given_design_notes(name, design, model)
+    diagnosis = replace(diagnosis, model=model, loop=loop_facts(model, running))
+    try:
+        diagnosis = _compare(diagnosis, model, running, controllers, options)
+    except LbtSynthError as error:
+        notes.append(f"no comparison on unseen data: {error}")
     step(1)
-    plant = (model if half is None else half).plant()
-    if running is not None and not close_loop(plant.hardware, running).is_stable:
-        notes.append("the law of the commands is unstable at the sensor gain of the model")
-        running = None
-    if half is not None:
-        diagnosis = _compare(diagnosis, half, running, controllers, notes)
-    best, imaging = diagnosis.best_design, diagnosis.imaging
-    lines = disturbance_lines(model if half is None else half)
-    chosen = None if best is None else best.controller
-    costs = _attempt(
-        lambda: disturbance_costs(plant, lines, running, chosen, imaging), "costs", notes
-    )
-    step(1)
-    diagnosis = replace(diagnosis, costs=costs or ())
-    for name, design in given.items():
-        notes += design_differences(design, model)
-        row = diagnosis.row(name)
-        diagnosis = replace(diagnosis, given=given_design_facts(name, design, model, row))
-    return diagnosis
+    notes += [] if diagnosis.comparison is None else diagnosis.comparison.notes
+    return replace(diagnosis, notes=tuple(notes))
 
 
 def _compare(
     diagnosis: Diagnosis,
-    half: IdentifiedModel,
+    model: IdentifiedModel,
     running: Controller | None,
     given: Mapping[str, Controller],
-    notes: list[str],
+    options: Mapping[str, Any],
 ) -> Diagnosis:
-    """Add residuals on the second half, and the best design there for a model of the first."""
-    plant = half.plant()
-    with_bands = [m for m in all_methods().values() if m.plant_section is not None]
-    methods = (*reference_methods(estimators_only=True), *with_bands)
-    designs, missing = stable_designs(plant, {method.name: {} for method in methods})
-    stable = {
-        name: controller
-        for name, controller in given.items()
-        if close_loop(plant.hardware, controller).is_stable
-    }
-    unstable = given.keys() - stable.keys()
-    notes += missing
-    notes += [f"{name} is unstable in the loop of this record" for name in unstable]
-    table = _attempt(
-        lambda: compare_on_record(
-            diagnosis.record,
-            half,
-            {**designs, **stable},
-            running=running,
-            imaging=diagnosis.imaging,
-        ),
-        "comparison on unseen data",
-        notes,
+    """Add residuals on the second half, the best design there, and costs, by a model of the first.
+
+    Its sensor gain is that of the whole record, because a half shows it less well.
+    """
+    record, imaging = diagnosis.record, diagnosis.imaging
+    first, _ = split_halves(record.stretches(), record.frames)
+    fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
+    half = identify(record, **{**options, **fixed})
+    robust = [m for m in all_methods().values() if m.plant_section is not None]
+    names = [m.name for m in (*reference_methods(estimators_only=True), *robust)]
+    table, designs = compare_designs(
+        record, half, {name: {} for name in names}, others=given, running=running, imaging=imaging
     )
-    if table is None:
-        return diagnosis
-    notes += table.notes
-    designs[INTEGRATOR] = model_integrator(plant)  # the comparison has it
+    designs[INTEGRATOR] = model_integrator(half.plant())  # the comparison has it
     residuals = {row.name: row.replayed.total_nm2 for row in table.entries if row.replayed}
     best = min(designs, key=lambda name: residuals[name])
-    return replace(diagnosis, comparison=table, best=best, best_design=designs[best])
+    chosen, lines = designs[best], disturbance_lines(half)
+    costs = disturbance_costs(half.plant(), lines, running, chosen.controller, imaging)
+    return replace(diagnosis, comparison=table, best=best, best_design=chosen, costs=costs)
 
 
-def _attempt(compute: Callable[[], Any], what: str, notes: list[str]) -> Any:
-    """Return what is computed; None, and a note, where it cannot be."""
-    try:
-        return compute()
-    except LbtSynthError as error:
-        notes.append(f"no {what}: {error}")
-        return None
+def _find_faults(diagnosis: Diagnosis) -> Iterator[Finding]:
+    """Yield what must be changed before anything else can be said."""
+    bad = [row for row in diagnosis.channels if row.serious]
+    faults = [f"the {row.channel} is {row.state}" for row in bad]
+    if diagnosis.record.lost > FEW:
+        faults.append(f"{100 * diagnosis.record.lost:.2g} % of the frames are lost")
+    if faults:
+        advice = f"First look at the {bad[0].channel}, which is {bad[0].state}." if bad else ""
+        yield Finding(sentence=f"The record has faults: {'; '.join(faults)}.", advice=advice)
+    if diagnosis.commands is not None and diagnosis.doubt:
+        yield Finding(
+            sentence=f"The commands are not those that the mirror followed: {diagnosis.doubt}.",
+            advice=f"First {diagnosis.commands.advice}.",
+        )
+    for note in diagnosis.notes:
+        if note.startswith(_DELAY_WARNING):
+            warning = note.removeprefix("warning: ")
+            yield Finding(
+                tone="note",
+                sentence=f"The delay of the record is doubtful: {warning}.",
+                advice="First check the delay, on which sensor gain and designs depend.",
+            )
+
+
+def _judge_loop(diagnosis: Diagnosis) -> Finding:
+    """Say what ran, and whether it was stable."""
+    law, loop = "an open loop ran", diagnosis.loop
+    if diagnosis.law is not None:
+        law = f"{diagnosis.law.name} ran{diagnosis.law.lag_text}"
+    if loop is None:
+        return Finding(tone="note", sentence=f"The record shows no fault, and {law}.")
+    gain = f"at the sensor gain of {loop.sensor_gain}"
+    if loop.spectral_radius >= 1:
+        sentence = f"The record shows no fault, but {law}, which is UNSTABLE {gain}."
+        return Finding(sentence=sentence)
+    stable = f", stable {gain}" if loop.stable_gains else ""
+    narrow = bool(loop.modulus < _NARROW)
+    if narrow:
+        stable += f" but with a modulus margin of {loop.modulus:.2g} only"
+    tone: Literal["good", "note"] = "note" if narrow else "good"
+    return Finding(tone=tone, sentence=f"The record is sound: {law}{stable}.")
+
+
+def _residual_text(diagnosis: Diagnosis) -> str:
+    """Say what the loop that ran leaves, from which measurement that follows, and of what it is."""
+    row = diagnosis.row(RAN)
+    ran = None if row is None else row.replayed
+    parts = _parts_text(diagnosis, "best_nm" if ran is None else "running_nm")
+    if row is None or ran is None:
+        if not parts:
+            return "Nothing can be said of its residual."
+        return f"What the {diagnosis.best} would leave is by the model {parts}."
+    y = gather(diagnosis.record.measurements, ran.stretches)
+    measured_nm = float(np.sqrt(np.mean(np.sum(y**2, axis=1))))
+    noise_nm = float(np.sqrt(np.trace(ran.noise_nm2)))
+    by_model = f": by the model {parts}" if parts else ""
+    if row.contradicts_model:
+        by_model += f"; the data contradict the model, which expects {nm_text(row.model_nm)}"
+    return (
+        f"It leaves {ran.text} on unseen data ({nm_text(measured_nm)} were measured at this sensor "
+        f"gain, and {nm_text(noise_nm)} are noise{_strehl_text(diagnosis, RAN)}){by_model}."
+    )
+
+
+def _strehl_text(diagnosis: Diagnosis, name: str) -> str:
+    """Return the Strehl ratio of a row, to go on in a list; empty where it is not known."""
+    row = diagnosis.row(name)
+    return "" if row is None or np.isnan(row.strehl) else f"; Strehl ratio {row.strehl:.3f}"
+
+
+def _parts_text(diagnosis: Diagnosis, field: str) -> str:
+    """Say which parts of a residual variance are how large by the model, the largest first."""
+    named = []
+    for row in diagnosis.costs[:-1]:
+        share = (getattr(row, field) / getattr(diagnosis.costs[-1], field)) ** 2
+        if share >= _LEAST_SHARE:  # not of a residual that is not known
+            named.append(f"{100 * share:.0f} % of the {row.part}")
+    return listing_text(named)
+
+
+def _advice_text(diagnosis: Diagnosis) -> str:
+    """Say what to change first in a loop whose record has no fault."""
+    name, residuals = diagnosis.best, {row.name: row.replayed for row in diagnosis.residuals}
+    ran, best, slow = (residuals.get(row) for row in (RAN, name, INTEGRATOR))
+    if best is None or slow is None:
+        return "Record longer before anything is changed."
+    strehl = _strehl_text(diagnosis, name)
+    if ran is None:
+        return f"The {name} leaves least on unseen data: {best.text}{strehl}."
+    if not ran.is_clearly_above(best):
+        return f"Change nothing: of all that was tried the {name} leaves least, {best.text}."
+    if ran.is_clearly_above(slow) and slow.total_nm2 < MUCH**2 * best.total_nm2:
+        other = f"{strehl}" if name == INTEGRATOR else f", the {name} {best.text}"
+        return (
+            f"First change the gain{_gain_text(diagnosis)}: the {INTEGRATOR} leaves {slow.text} on "
+            f"unseen data{other}."
+        )
+    return (
+        f"First change the controller: the {name} leaves {best.text} on unseen data{strehl}. The "
+        f"{INTEGRATOR} leaves {slow.text}."
+    )
+
+
+def _gain_text(diagnosis: Diagnosis) -> str:
+    """Say from which gain to which, where an integrator ran."""
+    law = diagnosis.law
+    if law is None or law.order != 1 or diagnosis.model is None:
+        return ""
+    design = model_integrator(diagnosis.model.plant())
+    best = float(np.mean(np.diag(design.controller.B)))
+    return f" from {float(np.mean(np.diag(law.gain))):.3g} to {best:.3g}"

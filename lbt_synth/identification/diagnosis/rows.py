@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
+from lbt_synth.identification.commands.control_law import ControlLaw
 from lbt_synth.identification.fit.identified_model import (
     DIFFERENT,
     IdentifiedLine,
     IdentifiedModel,
 )
-from lbt_synth.identification.prediction.comparison import PredictionRow
 from lbt_synth.identification.records.from_series import TREND, end_scatters
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, jitter_strehl, loop_margins, residual_budget
 from lbt_synth.loop.budget import line_covariance
 from lbt_synth.loop.stable_range import stable_sensor_gains
-from lbt_synth.methods.registry import design_title
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import (
     Facts,
     column,
@@ -36,17 +35,94 @@ from lbt_synth.storage.rows import (
 )
 from lbt_synth.validation import BoolArray, FloatArray
 
-_STABLE_GAINS = "stable sensor gains"
 AXES = ("tip", "tilt")
-_DEAD = 0.5  # of the frames, on one value
-_NOISIER = 3.0  # times the other axis
-FEW = 0.01  # of the frames, that may have a fault
 DEAD = "dead"
+FEW = 0.01  # of the frames, that may have a fault
+_NOISIER = 3.0  # times the other axis, from frame to frame: turbulence and lines are more alike
 _WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel
 _WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers", "held": "held"}
-_SAME_RATE = 1e-3
-_AGREES = 0.1  # of the residual that its own model promises: what conditions change
 _ALL = "all"  # parts together
+
+
+@table_row
+class ChannelRow:
+    """One channel of a record."""
+
+    channel: str = column("channel", help="What it is")
+    rms_nm: float = nm_column("rms", help="Deviation from its mean")
+    step_nm: float = column(
+        "frame to frame", unit="nm", format=".3g", help="Rms difference of two frames"
+    )
+    drift_nm: float = nm_column("drift", help="Mean of the last quarter less that of the first")
+    change: float = column(
+        "scatter, end/start", format=".2f", help="Rms difference, last quarter over first"
+    )
+    faulty: float = column(help="Part of the frames with a fault of this channel")
+    state: str = column("state", help="What is wrong with it, or good")
+
+    @property
+    def serious(self) -> bool:
+        """Whether something is wrong with it that more than a few frames have."""
+        return self.state == DEAD or self.faulty > FEW or any(map(self.state.count, _WHOLE))
+
+
+def judge_channels(record: LoopRecord) -> tuple[ChannelRow, ...]:
+    """Return what is known of each channel of a record, the measurements first."""
+    everywhere = np.ones(record.frames, dtype=np.bool_)
+    channels = [
+        ("measurements", record.measurements, record.measured, record.usable),
+        ("commands", record.commands, record.commanded, everywhere),
+    ]
+    return tuple(
+        _judge_channel(record, series, axis, values, usable if good is None else good)
+        for series, values, good, usable in channels
+        if values is not None
+        for axis in range(record.axes)
+    )
+
+
+def live_axes(record: LoopRecord) -> list[int]:
+    """Return the axes whose measurements are not dead."""
+    rows = judge_channels(record)[: record.axes]
+    return [axis for axis, row in enumerate(rows) if row.state != DEAD]
+
+
+def _judge_channel(
+    record: LoopRecord, series: str, axis: int, values: FloatArray, good: BoolArray
+) -> ChannelRow:
+    """Return what is known of one column of the measurements or commands, (frames, axes)."""
+    faults = {
+        finding.kind: finding.fraction
+        for finding in record.health.findings
+        if (finding.series, finding.axis) == (series, axis) and finding.kind in _WORDS
+    }
+    steps = np.diff(values, axis=0)[good[1:] & good[:-1]]
+    steps_nm = np.sqrt(np.mean(steps**2, axis=0)) if steps.size else np.full(record.axes, np.nan)
+    channel = values[good, axis] if good.any() else values[:, axis]
+    first, last = end_scatters(values[:, axis], good)
+    change, quarter = last / first if first > 0 else np.nan, len(channel) // 4
+    drift_nm = np.mean(channel[-quarter:]) - np.mean(channel[:quarter]) if quarter else np.nan
+    words = [f"{_WORDS[kind]} ({100 * share:.2g} %)" for kind, share in faults.items()]
+    held = faults.get("stuck", 0.0) + faults.get("held", 0.0)
+    if np.ptp(channel) == 0 or held > 1 / 2:
+        words = [DEAD]
+    elif series == "measurements":
+        is_so = (
+            steps_nm[axis] > _NOISIER * np.max(np.delete(steps_nm, axis), initial=0.0) > 0,
+            record.commands is not None and abs(drift_nm) > np.std(channel),
+            change > TREND or change < 1 / TREND,
+        )
+        words += [word for word, so in zip(_WHOLE, is_so, strict=True) if so]
+    name = AXES[axis] if record.axes == len(AXES) else ""
+    return ChannelRow(
+        channel=f"{name} {series.removesuffix('s')}".strip(),
+        rms_nm=float(np.std(channel)),
+        step_nm=float(steps_nm[axis]),
+        drift_nm=float(drift_nm),
+        change=float(change),
+        faulty=sum(faults.values()),
+        state=", ".join(words) or "good",
+    )
 
 
 def law_facts(law: ControlLaw) -> Facts:
@@ -74,13 +150,6 @@ def _distinct(texts: Iterable[str]) -> list[str]:
     return listed[:1] if len(set(listed)) == 1 else listed
 
 
-def running_controller(law: ControlLaw | None, frame_rate_hz: float) -> Controller | None:
-    """Return the controller that ran, None where its law is not known well enough."""
-    if law is None or not law.is_sure or law.lag_frames < 0:
-        return None
-    return law_controller(law, frame_rate_hz)
-
-
 def loop_facts(model: IdentifiedModel, running: Controller | None) -> Facts:
     """Return the loop that ran, by its law and the model, with what is known of its stability."""
     gains = [
@@ -94,16 +163,16 @@ def loop_facts(model: IdentifiedModel, running: Controller | None) -> Facts:
     if running is not None:
         loop = close_loop(model.hardware, running)
         radius = loop.spectral_radius
+        stable = _stable_gains(model, running) or "unstable at this one"
         if loop.is_stable:
             margins = loop_margins(loop)
             modulus, crossover = margins.modulus, margins.crossover_hz
-        stable = _stable_gains(model, running)
     return facts(
         delay_frames=fact(model.delay_frames, "delay", unit="frames"),
         sensor_gain=fact(", ".join(_distinct(gains)), "sensor gain"),
         sensor_gain_note=fact(", ".join(_distinct(notes))),
         spectral_radius=fact(radius, "spectral radius", format=".5f"),
-        stable_gains=fact(stable or "unstable at this one" * (running is not None), _STABLE_GAINS),
+        stable_gains=fact(stable, "stable sensor gains"),
         modulus=fact(modulus, "modulus margin", format=".3f"),
         crossover_hz=fact(crossover, "crossover", unit="Hz", format=".3g"),
     )
@@ -118,105 +187,16 @@ def _stable_gains(model: IdentifiedModel, controller: Controller) -> str:
     return f"{low * nominal:.3g} to {high * nominal:.3g}"
 
 
-@table_row
-class ChannelRow:
-    """One channel of a record."""
-
-    channel: str = column("channel", help="What it is")
-    rms_nm: float = nm_column("rms", help="Deviation from its mean")
-    step_nm: float = column(
-        "frame to frame", unit="nm", format=".3g", help="Rms difference of two frames"
-    )
-    mean_nm: float = column(unit="nm", help="Mean")
-    drift_nm: float = nm_column("drift", help="Mean of the last quarter less that of the first")
-    change: float = column(
-        "scatter, end/start", format=".2f", help="Rms difference, last quarter over first"
-    )
-    faulty: float = column(help="Part of the frames with a fault of this channel")
-    state: str = column("state", help="What is wrong with it, or good")
-
-    @property
-    def serious(self) -> bool:
-        """Whether something is wrong with it that more than a few frames have."""
-        return self.state == DEAD or self.faulty > FEW or any(map(self.state.count, _WHOLE))
-
-
-def judge_channels(record: LoopRecord) -> tuple[ChannelRow, ...]:
-    """Return what is known of each channel of a record, the measurements first."""
-    measured = record.usable if record.measured is None else record.measured
-    axes = range(record.axes)
-    rows = [_judge_channel(record, axis, record.measurements, measured) for axis in axes]
-    if record.commands is not None:
-        commanded = record.commanded
-        if commanded is None:
-            commanded = np.ones(record.frames, dtype=np.bool_)
-        rows += [_judge_channel(record, axis, record.commands, commanded) for axis in axes]
-    return tuple(rows)
-
-
-def live_axes(record: LoopRecord) -> list[int]:
-    """Return the axes whose measurements are not dead."""
-    rows = judge_channels(record)[: record.axes]
-    return [axis for axis, row in enumerate(rows) if row.state != DEAD]
-
-
-def _judge_channel(
-    record: LoopRecord, axis: int, values: FloatArray, good: BoolArray
-) -> ChannelRow:
-    """Return what is known of one column of the measurements or commands, (frames, axes)."""
-    series = "measurements" if values is record.measurements else "commands"
-    findings = [
-        finding
-        for finding in record.health.findings
-        if (finding.series, finding.axis) == (series, axis) and finding.kind in _WORDS
-    ]
-    channel, steps = values[:, axis], [_step_rms(column, good) for column in values.T]
-    here = channel[good] if good.any() else channel
-    first, last = end_scatters(channel, good)
-    change, quarter = last / first if first > 0 else np.nan, len(here) // 4
-    drift = float(np.mean(here[-quarter:]) - np.mean(here[:quarter])) if quarter else np.nan
-    held = sum(finding.fraction for finding in findings if finding.kind in ("stuck", "held"))
-    words = [f"{_WORDS[finding.kind]} ({100 * finding.fraction:.2g} %)" for finding in findings]
-    if np.ptp(here) == 0 or held > _DEAD:
-        words = [DEAD]
-    elif series == "measurements":
-        others = [step for i, step in enumerate(steps) if i != axis]
-        faults = (
-            bool(others) and steps[axis] > _NOISIER * max(others),
-            record.commands is not None and abs(drift) > float(np.std(here)),
-            change > TREND or change < 1 / TREND,
-        )
-        words += [word for word, is_so in zip(_WHOLE, faults, strict=True) if is_so]
-    name = AXES[axis] if record.axes == len(AXES) else ""
-    return ChannelRow(
-        channel=f"{name} {series.removesuffix('s')}".strip(),
-        rms_nm=float(np.std(here)),
-        step_nm=steps[axis],
-        mean_nm=float(np.mean(here)),
-        drift_nm=drift,
-        change=change,
-        faulty=sum(finding.fraction for finding in findings),
-        state=", ".join(words) or "good",
-    )
-
-
-def _step_rms(series: FloatArray, good: BoolArray) -> float:
-    """Return the rms difference of neighbouring good frames, nan without any."""
-    pairs = good[1:] & good[:-1]
-    return float(np.sqrt(np.mean(np.diff(series)[pairs] ** 2))) if pairs.any() else np.nan
-
-
 def given_controller(design: Design, model: IdentifiedModel) -> Controller:
     """Return a given controller at the frame rate of the record; refuse one of another loop."""
     path = model.hardware
-    sizes = design.controller.D.shape
+    sizes, rate = design.controller.D.shape, 1 / design.controller.dt_s
     if sizes != (path.n_commands, path.n_measurements):
         raise ProblemError(
             f"the gain file is of {sizes[1]} measurements and {sizes[0]} commands, and the record "
             f"has {path.modes} axes. Give one for this record, or choose the axes."
         )
-    rate = 1 / design.controller.dt_s
-    if not np.isclose(rate, path.frame_rate_hz, rtol=_SAME_RATE):
+    if round(rate / path.frame_rate_hz, 2) != 1:
         raise ProblemError(
             f"the gain file is for {rate:.6g} Hz, and the record has {path.frame_rate_hz:.6g} Hz. "
             "Give one for this frame rate."
@@ -224,54 +204,25 @@ def given_controller(design: Design, model: IdentifiedModel) -> Controller:
     return replace(design.controller, dt_s=path.dt_s)
 
 
-def given_design_facts(
-    name: str,
-    design: Design,
-    model: IdentifiedModel,
-    replayed: PredictionRow | None,
-) -> Facts:
-    """Return what a given design does on the record, replayed where its loop is stable."""
-    controller = given_controller(design, model)
-    promised = design.rms
-    return facts(
-        design=fact(name, "design"),
-        method=fact(design_title(design.method), "method"),
-        stable=fact(close_loop(model.hardware, controller).is_stable, "stable"),
-        stable_gains=fact(_stable_gains(model, controller), _STABLE_GAINS),
-        own_model_nm=fact(promised, "promised by its own model", unit="nm", format=".2f"),
-        agreement=fact(_agreement(promised, replayed), "agrees with its model"),
-    )
-
-
-def _agreement(promised_nm: float, replayed: PredictionRow | None) -> str:
-    """Say whether the data agree with the residual that the design's own model promises."""
-    if replayed is None or not promised_nm > 0 or not replayed.replayed_nm > 0:
-        return "not known"
-    ratio = replayed.replayed_nm / promised_nm
-    # the error of the logarithm, so that a large residual does not excuse itself
-    error = replayed.replayed_error_nm / replayed.replayed_nm
-    if abs(np.log(ratio)) <= max(DIFFERENT * error, _AGREES):
-        return "yes"
-    return f"no: {'more' if ratio > 1 else 'less'} than promised, by a factor {ratio:.2f}"
-
-
-def design_differences(design: Design, model: IdentifiedModel) -> list[str]:
-    """Say how the loop that a design was made for differs from that of the record."""
-    if design.hardware is None:
-        return []
-    own = design.hardware
-    notes = []
-    sensor = np.diag(own.sensor) if own.sensor.shape == (own.modes, own.modes) else np.zeros(0)
-    if sensor.size == len(model.axes):
-        for i, (axis, assumed) in enumerate(zip(model.axes, sensor.tolist(), strict=True)):
+def given_design_notes(name: str, design: Design, model: IdentifiedModel) -> list[str]:
+    """Say what a given design promises, and how its loop differs from that of the record."""
+    stable = _stable_gains(model, given_controller(design, model))
+    notes = [
+        f"{name} promises {nm_text(design.rms)} by its own model, and its loop is "
+        f"{f'stable at sensor gains of {stable}' if stable else 'unstable'}"
+    ]
+    if (path := design.hardware) is None:
+        return notes
+    if path.sensor.shape == (path.modes, path.modes):
+        for i, (axis, assumed) in enumerate(zip(model.axes, np.diag(path.sensor), strict=True)):
             error = axis.sensor_gain_error
             if error is not None and abs(assumed - axis.sensor_gain) > DIFFERENT * error:
                 notes.append(
-                    f"the gain file assumes a sensor gain of {assumed:.3f} on axis {i}; the record "
-                    f"has {axis.sensor_gain:.3f} +- {error:.3f}"
+                    f"{name} assumes a sensor gain of {assumed:.3f} on axis {i}; the record has "
+                    f"{axis.sensor_gain:.3f} +- {error:.3f}"
                 )
-    here = replace(model.hardware, sensor_matrix=own.sensor, influence_matrix=own.influence)
-    return [*notes, *(f"the gain file was {text}" for text in loop_differences(own, here))]
+    here = replace(model.hardware, sensor_matrix=path.sensor, influence_matrix=path.influence)
+    return [*notes, *(f"{name} was {text}" for text in loop_differences(path, here))]
 
 
 def disturbance_lines(model: IdentifiedModel) -> tuple[IdentifiedLine, ...]:
@@ -281,18 +232,14 @@ def disturbance_lines(model: IdentifiedModel) -> tuple[IdentifiedLine, ...]:
 
 
 def line_name(line: IdentifiedLine) -> str:
-    """Return what a table of costs calls a resonance."""
-    return f"{'line' if line.kind == 'line' else 'broad resonance'} at {line.frequency_hz:.4g} Hz"
-
-
-def line_place(line: IdentifiedLine) -> str:
-    """Return along what a line shakes, to go on in a sentence; empty of a loop of one axis."""
-    direction = line.direction or (1.0,)
+    """Return what a table of costs calls a resonance, and along what it shakes."""
+    kind = "line" if line.kind == "line" else "broad resonance"
+    name, direction = f"{kind} at {line.frequency_hz:.4g} Hz", line.direction or (1.0,)
     if len(direction) == 1:
-        return ""
+        return name
     if np.count_nonzero(direction) == 1:
-        return f" in {AXES[int(np.argmax(np.abs(direction)))]}"
-    return f" along {line.direction_deg:.0f} deg"
+        return f"{name} in {AXES[int(np.argmax(np.abs(direction)))]}"
+    return f"{name} along {line.direction_deg:.0f} deg"
 
 
 @table_row
@@ -304,7 +251,6 @@ class CostRow:
     running_strehl: float = percent_column("Strehl lost", help="Strehl ratio that this costs")
     best_nm: float = nm_column("best design", help="Residual that it leaves in the best design")
     best_strehl: float = percent_column("Strehl lost", help="Strehl ratio that this costs")
-    where: str = field(default="")  # along what a line shakes, to go on in a sentence
 
 
 def disturbance_costs(
@@ -319,55 +265,44 @@ def disturbance_costs(
     The Strehl ratio that a part costs is that of the residual without it, less that with it: as
     residuals add up in the exponent, these do not add up to the whole loss.
     """
-    tables = [_covariances(plant, lines, controller) for controller in (running, best)]
-    names = next((list(table) for table in tables if table), [])
-    where = {line_name(line): line_place(line) for line in lines}
-    rows = []
-    for name in names:
-        numbers = [_rms_and_strehl(table, name, imaging) for table in tables]
-        (running_nm, running_strehl), (best_nm, best_strehl) = numbers
-        rows.append(
-            CostRow(
-                part=name,
-                running_nm=running_nm,
-                running_strehl=running_strehl,
-                best_nm=best_nm,
-                best_strehl=best_strehl,
-                where=where.get(name, ""),
-            )
+    ran, designed = (_costs(plant, lines, controller, imaging) for controller in (running, best))
+    costs = ran or designed
+    order = sorted(costs, key=lambda name: (name == _ALL, -costs[name][0]))
+    unknown = np.nan, np.nan
+    return tuple(
+        CostRow(
+            part=name,
+            running_nm=ran.get(name, unknown)[0],
+            running_strehl=ran.get(name, unknown)[1],
+            best_nm=designed.get(name, unknown)[0],
+            best_strehl=designed.get(name, unknown)[1],
         )
-    by = "running_nm" if tables[0] else "best_nm"
-    rows.sort(key=lambda row: (row.part == _ALL, -getattr(row, by)))
-    return tuple(rows)
+        for name in order
+    )
 
 
-def _covariances(
-    plant: TipTiltPlant, lines: Sequence[IdentifiedLine], controller: Controller | None
-) -> dict[str, FloatArray]:
-    """Return the covariance (n, n) of the residual by part, and of all; none of no stable loop."""
-    if controller is None:
-        return {}
-    loop = close_loop(plant.hardware, controller)
-    if not loop.is_stable:
+def _costs(
+    plant: TipTiltPlant,
+    lines: Sequence[IdentifiedLine],
+    controller: Controller | None,
+    imaging: Imaging,
+) -> dict[str, tuple[float, float]]:
+    """Return rms and lost Strehl ratio by part, and of all; none of no stable loop."""
+    if controller is None or not (loop := close_loop(plant.hardware, controller)).is_stable:
         return {}
     budget = residual_budget(loop, plant, frame_means=True)
-    out = {"turbulence": budget.turbulence_nm2, "measurement noise": budget.noise_nm2}
+    parts = {"turbulence": budget.turbulence_nm2, "measurement noise": budget.noise_nm2}
     for line in lines:  # two of one frequency are one part
         name = line_name(line)
-        out[name] = out.get(name, 0.0) + line_covariance(loop, line.vibration())
-    rest = budget.total_nm2 - np.sum(list(out.values()), axis=0)
-    out["turbulence"] = out["turbulence"] + rest  # slow resonances are turbulence
-    return out | {_ALL: budget.total_nm2}
-
-
-def _rms_and_strehl(
-    parts: Mapping[str, FloatArray], name: str, imaging: Imaging
-) -> tuple[float, float]:
-    """Return the rms that a part leaves, and the Strehl ratio that it costs."""
-    if name not in parts:
-        return np.nan, np.nan
-    others = [parts[part] for part in parts if part not in (name, _ALL)]
-    rest = np.sum(others, axis=0) if name != _ALL else 0 * parts[_ALL]
-    strehl = jitter_strehl(parts[_ALL], imaging=imaging)
-    rms_nm = float(np.sqrt(max(np.trace(parts[name]), 0.0)))
-    return rms_nm, jitter_strehl(rest, imaging=imaging) - strehl
+        parts[name] = parts.get(name, 0.0) + line_covariance(loop, line.vibration())
+    total = budget.total_nm2
+    # slow resonances are turbulence
+    parts["turbulence"] = parts["turbulence"] + total - np.sum(list(parts.values()), axis=0)
+    strehl = jitter_strehl(total, imaging=imaging)
+    costs = {}
+    for name, covariance in {**parts, _ALL: total}.items():
+        others = [parts[other] for other in parts if other != name] if name != _ALL else []
+        rest = np.sum(others, axis=0) if others else 0 * total
+        rms_nm = float(np.sqrt(max(np.trace(covariance), 0.0)))
+        costs[name] = rms_nm, jitter_strehl(rest, imaging=imaging) - strehl
+    return costs

@@ -45,6 +45,8 @@ GAIN_ERROR = 0.5  # of the logarithm of a sensor gain, before the data say more
 TYPICAL_GAIN = 0.7  # of a sensor, before the data say more
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
 _COLOURED = 9.0  # the same of a colour of the noise, which a wrong gain can explain, too
+_WORTH = 1e-3  # of the innovations' variance, by which a line upon a bump must lower it
+_FAR = 2.0  # half widths of a section from the middle of a bump: what lies beyond is not upon it
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
 _LOWEST = 0.1  # bins: a component below is a slope without a frequency
 _SHIFTS = np.arange(-2, 2.01, 0.25)  # bins by which a narrow line is moved
@@ -173,7 +175,7 @@ class Search:
             reach = fine * step + _WIDEST_HZ / _SHARE / 2  # beyond, this limit is wider
             near = slice(*np.searchsorted(f, [centre - reach, centre + reach]))
             away = np.maximum(np.abs(f[near] - centre) - fine * step, 0)
-            wide = _SHARE * np.maximum(half_width, 2 * away)
+            wide = _SHARE / line.sections * np.maximum(half_width, 2 * away)
             size[near] = np.minimum(size[near], np.maximum(step, wide))
         group = np.floor(np.cumsum(step / size) - 1e-9)
         return self.data.merge(np.flatnonzero(np.diff(group, prepend=-np.inf) > 0))
@@ -220,20 +222,28 @@ def likeliest(search: Search, fits: Iterable[FittedModel | None]) -> FittedModel
     return min(settled, key=lambda model: cost(search, model), default=None)
 
 
-def required_evidence(search: Search, component: Component) -> float:
-    """Return what a component must add to the logarithm of the likelihood.
+def required_evidence(search: Search, spectrum: SpectrumModel, i: int) -> float:
+    """Return what component i must add to the logarithm of the likelihood.
 
     Less for an announced line, whose place was not searched for, and for a drift, which has two
-    parameters.
+    parameters; more for a bump, which has the number of its sections beside three. Of many data
+    these are small beside what a bump of the wrong shape lacks: a component upon one must lower the
+    variance of the innovations by a part that shows.
     """
+    component = spectrum.components[i]
     if component.announced is not None:
         return _ANNOUNCED
-    return search.price - search.parameter_price * (component.kind == "drift")
+    more = (component.sections > 1) - (component.kind == "drift")
+    price = search.price + more * search.parameter_price
+    bumps = [c for k, c in enumerate(spectrum.components) if c.sections > 1 and k != i]
+    away = (abs(component.log_frequency - c.log_frequency) / c.damping_ratio for c in bumps)
+    upon = component.kind == "line" and min(away, default=_FAR) < _FAR
+    return max(price, upon * _WORTH * float(np.sum(search.data.count)))
 
 
 def total_price(search: Search, spectrum: SpectrumModel) -> float:
     """Return the price of all that a model has beside its turbulence."""
-    prices = sum(required_evidence(search, component) for component in spectrum.components[1:])
+    prices = sum(required_evidence(search, spectrum, i) for i in range(1, len(spectrum.components)))
     background = spectrum.background
     colour = _COLOURED if background.colour else 0.0
     return prices + colour + background.rolls_off * search.parameter_price
@@ -270,7 +280,7 @@ def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> Fitt
         neighbour = _overlapping(search, spectrum, i)
         less = _drop(data, spectrum, i, neighbour)
         if less is not None:
-            required = required_evidence(search, component)
+            required = required_evidence(search, spectrum, i)
             spare = contrast(data, less) - whole - 4 * required
             patient = thorough and (neighbour is not None or not component.is_narrow)
             if patient or spare <= 0:

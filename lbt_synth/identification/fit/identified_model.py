@@ -64,6 +64,8 @@ class IdentifiedLine:
     corner_hz, corner_error_hz : float or None
         Corner beyond which the density of the turbulence falls by another f^(-5/3), as of frozen
         flow, and its standard error [Hz].
+    sections : int
+        How many resonances in series it is: more than one make a bump of steep flanks.
     """
 
     kind: Kind
@@ -81,6 +83,7 @@ class IdentifiedLine:
     direction_error_deg: float | None = None
     corner_hz: float | None = None
     corner_error_hz: float | None = None
+    sections: int = 1
 
     @property
     def direction_deg(self) -> float | None:
@@ -100,6 +103,7 @@ class IdentifiedLine:
             damping=self.damping,
             rms_nm=self.rms_nm,
             direction=direction or self.direction or (1.0, 0.0),
+            sections=self.sections,
         )
 
 

@@ -27,6 +27,7 @@ from lbt_synth.identification.fit.spectrum_model import (
     damping_parameter,
 )
 from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
+from lbt_synth.models.vibration import MOST_SECTIONS
 from lbt_synth.validation import FloatArray
 
 _LITTLE, _CLEARLY = 0.1, 1.0  # log-likelihood that a component or a move must save at least
@@ -43,8 +44,12 @@ _WIDEST_LINE = 0.98  # damping ratio
 _BANDS = 80  # of the background
 _WIDEST = 0.3  # of its frequency: a band that is tried, and the damping ratio of a new component
 _NARROWEST = 1e-4  # damping ratio of a new component
+_BESIDE = 0.08  # of its frequency: lines that are nearer may be one bump
+_SEEN = 3.0  # bins: a line of that half width shows the shape of its flanks
+_ROUGH = 2.0  # prices: a bump that is less likely before it is fitted is none, but for one of many
+_TO_HALF = 2 * float(np.log(2))  # square of a Gaussian's half width at half height over its variance
 _OTHER_GAINS = (0.4, 0.9)  # of a sensor, from which models that are as likely are sought
-_SAME_GAIN = 0.15  # of a logarithm: nearer gains have the same optimum
+_SAME_GAIN = 0.05  # of a logarithm: nearer gains have the same optimum
 _AS_LIKELY = 5.0  # log-likelihood by which one of two gains is excluded
 
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
@@ -137,7 +142,7 @@ def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
     """Make the strongest slow component the turbulence, where a resonance took its place."""
     spectrum, lowest = model.spectrum, search.log_angle(search.lowest_line_hz)
     first = spectrum.components[0]
-    slow = [i for i, c in enumerate(spectrum.components) if c.kind == "slow"]
+    slow = [i for i, c in enumerate(spectrum.components) if c.kind in ("slow", "drift")]
     if first.log_frequency < lowest or not slow or first.damping_ratio > _WIDEST_LINE:
         return model
     i = max(slow, key=lambda k: spectrum.components[k].log_power)
@@ -175,6 +180,7 @@ def _trials(
         excesses = excesses[: len(excesses) // 2]
     if all(c.kind != "drift" for c in spectrum.components):
         yield _add_drift(search, spectrum), _LITTLE
+    yield from ((trial, _LITTLE) for trial in _bumps(search, spectrum))
     for i, component in enumerate(spectrum.components):
         if moves and component.kind == "line":
             yield from ((trial, _CLEARLY) for trial in _line_moves(search, spectrum, i))
@@ -285,6 +291,68 @@ def find_excesses(search: Search, spectrum: SpectrumModel) -> list[Excess]:
     if sum(c.kind == "slow" for c in spectrum.components) >= _MOST_SLOW:
         return [(worth, component) for worth, component in excesses if component.kind == "line"]
     return excesses
+
+
+def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
+    """Yield models with one bump in the place of neighbouring lines, or of a wide resonance.
+
+    The highest of the lines may stand upon a bump of the others.
+    """
+    components, data = spectrum.components, search.merge(spectrum)
+    whole = contrast(data, spectrum)
+    lines = [
+        i
+        for i, c in enumerate(components)
+        if c.kind == "line" and c.announced is None and c.damping_ratio < _WIDEST
+    ]
+    lines.sort(key=lambda i: components[i].log_frequency)
+    clusters = list[list[int]]()
+    for i in lines:
+        c = components[i]
+        last = components[clusters[-1][-1]] if clusters else None
+        if last and c.log_frequency - last.log_frequency < _BESIDE + c.damping_ratio:
+            clusters[-1].append(i)
+        else:
+            clusters.append([i])
+    for cluster in clusters:
+        first, counts = components[cluster[0]], {2, MOST_SECTIONS}
+        groups = [cluster]
+        if len(cluster) == 1:
+            if search.place(first)[1] < _SEEN * search.data.step_hz:
+                continue
+            counts = {first.sections - 1, first.sections + 1} & set(range(1, MOST_SECTIONS + 1))
+        elif len(cluster) > 2:
+            heights = [components[i].log_power - components[i].damping for i in cluster]
+            groups.append([i for i in cluster if i != cluster[int(np.argmax(heights))]])
+        for group, sections in product(groups, sorted(counts)):
+            others = (c for i, c in enumerate(components) if i not in group)
+            bump = _bump([components[i] for i in group], sections)
+            trial = replace(spectrum, components=(*others, bump))
+            if len(group) > 2 or contrast(data, trial) < whole + _ROUGH * search.price:
+                yield trial
+
+
+def _bump(members: Sequence[Component], sections: int) -> Component:
+    """Return one component of the power, centre and width of some lines."""
+    power = np.exp([c.log_power for c in members])
+    place = np.array([c.frequency for c in members])
+    half = np.array([c.damping_ratio * c.frequency * _half_width(c.sections) for c in members])
+    centre = float(np.average(place, weights=power))
+    spread = float(np.average((place - centre) ** 2, weights=power))
+    width = float(np.sqrt(_TO_HALF * spread + np.average(half, weights=power) ** 2))
+    ratio = min(width / centre / _half_width(sections), _WIDEST_LINE)
+    return replace(
+        members[0],
+        log_frequency=float(np.log(centre)),
+        damping=damping_parameter("line", ratio),
+        log_power=float(np.log(np.sum(power))),
+        sections=sections,
+    )
+
+
+def _half_width(sections: int) -> float:
+    """Return the half width at half height of sections in series over that of one."""
+    return float(np.sqrt(2 ** (1 / sections) - 1))
 
 
 def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[SpectrumModel]:

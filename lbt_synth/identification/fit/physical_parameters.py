@@ -170,7 +170,7 @@ def _describe_line(
     variance += error.log_power**2 / 4
     height = float(np.interp(frequency, data.frequency_hz, density))
     rest = float(np.interp(frequency, data.frequency_hz, fitted - density))
-    narrow = damping < WIDE_DAMPING and height > rest
+    narrow = line.sections == 1 and damping < WIDE_DAMPING and height > rest
     slow = line.kind != "line" or frequency < search.lowest_line_hz
     kind: Kind = "turbulence" if slow else "line" if narrow else "broad"
     return IdentifiedLine(
@@ -185,6 +185,7 @@ def _describe_line(
         prominence=height / rest if rest > 0 else float("inf"),
         evidence=model.evidence[i],
         announced=line.announced is not None,
+        sections=line.sections,
     )
 
 

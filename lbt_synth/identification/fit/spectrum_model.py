@@ -52,6 +52,7 @@ class Component:
     log_ratio: float = 0.0  # of its variance on the second axis over that on the first
     sign: float = 1.0  # of the ratio of the amplitudes
     name: int = 0  # by which a search for what axes share finds it again
+    sections: int = 1  # resonances in series, of a bump
 
     @property
     def frequency(self) -> float:
@@ -67,8 +68,8 @@ class Component:
 
     @property
     def is_narrow(self) -> bool:
-        """Whether it is a line, not a wide resonance or a part of the turbulence."""
-        return self.kind == "line" and self.damping_ratio <= WIDE_DAMPING
+        """Whether it is a line, not a wide resonance, a bump or a part of the turbulence."""
+        return self.kind == "line" and self.sections == 1 and self.damping_ratio <= WIDE_DAMPING
 
     @property
     def damping_slope(self) -> float:
@@ -188,9 +189,8 @@ class SpectrumModel:
         for i, c in enumerate(self.components):
             f, damping, power, *ratio = numbers[self.place(i) : self.place(i + 1)]
             log_ratio = ratio[0] if ratio else 0.0
-            components.append(
-                Component(c.kind, f, damping, power, c.announced, c.axis, log_ratio, c.sign, c.name)
-            )
+            facts = c.announced, c.axis, log_ratio, c.sign, c.name, c.sections
+            components.append(Component(c.kind, f, damping, power, *facts))
         return SpectrumModel(tuple(axes), tuple(components), self.roll_off_order)
 
     def with_background(self, **changes: float) -> SpectrumModel:

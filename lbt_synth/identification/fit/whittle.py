@@ -194,7 +194,7 @@ def _smear(
     narrow = []
     for i, c in enumerate(components):
         place = c.frequency / data.angle_s * data.duration_s
-        if c.kind == "line" and c.damping_ratio * place <= WIDE:
+        if c.kind == "line" and c.sections == 1 and c.damping_ratio * place <= WIDE:
             narrow.append((i, place, c.damping_ratio * place))
     if not narrow:
         return
@@ -232,7 +232,7 @@ def component_density(
 ) -> FloatArray:
     """Return the density of a component, behind a roll-off of a corner and an order, (f,)."""
     s, c = data.half_angle_square, component
-    density = unit_density(c.frequency, c.damping_ratio, s)
+    density = unit_density(c.frequency, c.damping_ratio, s, c.sections)
     if roll_off is not None:
         density *= np.exp(_log_fall(data, *roll_off)[0])
     _smear(data, [c], density[None])
@@ -332,7 +332,8 @@ def densities(
     rows = [(c.frequency, c.damping_ratio, c.damping_slope, c.log_power) for c in components]
     frequency, ratio, slope, power = np.array(rows).reshape(-1, 4).T
     variance = 2 / data.frame_rate_hz * np.exp(power)
-    density, slopes = resonance_densities(frequency, ratio, variance, s)
+    sections = [c.sections for c in components]
+    density, slopes = resonance_densities(frequency, ratio, variance, s, sections)
     by_corner = np.zeros_like(density)
     for i, component in enumerate(components):
         if component.kind == "turbulence":

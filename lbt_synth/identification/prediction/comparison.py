@@ -1,17 +1,15 @@
 """Controllers compared on data that nothing was fitted to, beside what the model promises.
 
-One of them is the best FIR predictor of a record by least squares, without a model of the
-disturbance. With the mirror's taps c, the filtered series ``zf(k) = c[0] z(k) + c[1] z(k-1) + ...``
-and commands ``u(k) = a[0] z(k) + a[1] z(k-1) + ...``, the measured residual is ``e(k) = z(k) - a[0]
-zf(k-1) - a[1] zf(k-2) - ...``: a linear regression whose sum of squares is the one that a replay
-measures, for fractional delays and mirrors that move as well.
+One of them is the FIR predictor of a record by least squares. With the mirror's taps c, the series
+``zf(k) = c[0] z(k) + c[1] z(k-1) + ...`` and commands ``u(k) = a[0] z(k) + a[1] z(k-1) + ...``, the
+measured residual is ``e(k) = z(k) - a[0] zf(k-1) - a[1] zf(k-2) - ...``: a linear regression whose
+sum of squares is the one that a replay measures, for any delay and mirror.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,9 +17,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design, model_integrator
-from lbt_synth.errors import LbtSynthError, ProblemError, UnstableLoopError
+from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.prediction.residual import (
+    SURPRISING,
     ResidualEstimate,
     check_series,
     estimate_residual,
@@ -36,14 +35,7 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.linear.held_controller import as_controller
-from lbt_synth.loop import (
-    ClosedLoop,
-    Imaging,
-    close_loop,
-    jitter_strehl,
-    residual_budget,
-    youla_controller,
-)
+from lbt_synth.loop import Imaging, close_loop, jitter_strehl, residual_budget, youla_controller
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import PlantInputs, design_request
@@ -55,10 +47,6 @@ RAN = "what ran"
 INTEGRATOR = "best integrator"
 PREDICTOR = "least-squares predictor"
 LIMIT = "limit of performance"
-_RESERVED = (RAN, INTEGRATOR, PREDICTOR, LIMIT)
-_MOST_TAPS = 1000
-_LEAST_ROWS = 4  # frames per coefficient
-_MOST_DEVIATIONS = 4.0  # standard errors between data and model that chance explains
 
 
 @table_row
@@ -90,7 +78,7 @@ class PredictionRow:
     @property
     def contradicts_model(self) -> bool:
         """Whether data and model are further apart than chance explains."""
-        return bool(abs(self.deviations) > _MOST_DEVIATIONS)
+        return bool(abs(self.deviations) > SURPRISING)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -118,10 +106,8 @@ class PredictionTable:
         for entry in self.entries:
             if entry.name == name:
                 return entry
-        raise ProblemError(
-            f"the table has the rows {', '.join(entry.name for entry in self.entries)}; got "
-            f"{name!r}."
-        )
+        names = ", ".join(entry.name for entry in self.entries)
+        raise ProblemError(f"the table has the rows {names}; got {name!r}.")
 
 
 def least_squares_predictor(
@@ -135,15 +121,10 @@ def least_squares_predictor(
 
     Parameters
     ----------
-    open_loop : (frames, n) array_like
-        Recorded pseudo-open-loop series ``z(k) = phi_tot(k-1) + S^-1 w(k)`` [nm].
-    hardware : LoopHardware
-        The loop: delay, mirror, sensor and influence matrix, both square and invertible. The sensor
-        matrix has the sensor gain that z was formed with.
+    open_loop, hardware, stretches
+        As for :func:`replayed_residual`.
     taps : int, optional
-        Coefficients per mode, at most 1000.
-    stretches : sequence of (start, stop), optional
-        Contiguous usable frames to fit; by default the whole record.
+        Coefficients per mode.
 
     Returns
     -------
@@ -151,14 +132,13 @@ def least_squares_predictor(
         From y(k) to u(k). The filter is its Youla parameter (:func:`youla_controller`): the loop
         is stable for any coefficients, at the sensor gain of the fit.
     coefficients : (n, taps) ndarray
-        What z_i(k-l) adds to the correction of mode i that u(k) commands. Regressors that depend
-        on each other get the coefficients of least norm.
+        What z_i(k-l) adds to the correction of mode i that u(k) commands; of least norm where
+        regressors depend on each other.
 
     Raises
     ------
     ProblemError
-        If a value is out of range, sizes clash, or there are fewer than four frames per
-        coefficient.
+        If a value is out of range, sizes clash, or there are fewer frames than coefficients.
 
     Examples
     --------
@@ -174,18 +154,17 @@ def least_squares_predictor(
     True
     """
     require_instance(hardware, LoopHardware)
-    count = integer(taps, "taps", at_least=1, at_most=_MOST_TAPS)
+    count = integer(taps, "taps", at_least=1)
     back, n = inverse_sensor(hardware), hardware.modes
     need = "a predictor needs a command for every mode, and an influence matrix"
     to_command = invert(hardware.influence, need)
     series, parts = check_series(open_loop, n, stretches)
     blocks = [_regression(series[a:b], hardware.mirror_taps, count) for a, b in parts]
     X, Z = (np.concatenate(block) for block in zip(*blocks, strict=True))
-    if len(X) < _LEAST_ROWS * count:
+    if len(X) < count:
         raise ProblemError(
-            f"a predictor of {count} coefficients needs at least {_LEAST_ROWS * count} frames to "
-            f"fit, beside {count} and the mirror's at the beginning of each stretch; got "
-            f"{len(X)}. Record more, or lower taps."
+            f"a predictor needs a frame to fit for each of {count} coefficients, beside {count} at "
+            f"the beginning of each stretch; got {len(X)}. Record more, or lower taps."
         )
     tolerance = np.finfo(float).eps * (count + 1)
     fits = [np.linalg.lstsq(X[:, i], Z[:, i], rcond=tolerance)[0] for i in range(n)]
@@ -202,17 +181,17 @@ def least_squares_predictor(
 
 
 def _regression(
-    part: FloatArray, mirror_taps: FloatArray, count: int
+    series: FloatArray, mirror_taps: FloatArray, count: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return regressors ``zf(k-1), zf(k-2), ...`` (rows, n, taps) and targets z(k) (rows, n)."""
-    frames, n = part.shape
+    frames, n = series.shape
     m = len(mirror_taps)
     rows = frames - (m - 1) - count  # the first needs zf(k-taps), which needs m values of z
     if rows < 1:
         return np.zeros((0, n, count)), np.zeros((0, n))
-    filtered = sliding_window_view(part, m, axis=0) @ mirror_taps[::-1]
+    filtered = sliding_window_view(series, m, axis=0) @ mirror_taps[::-1]
     late = sliding_window_view(filtered, count, axis=0)[:rows, :, ::-1]
-    return np.asarray(late), part[m - 1 + count :]
+    return np.asarray(late), series[m - 1 + count :]
 
 
 def prediction_against_data(
@@ -229,28 +208,22 @@ def prediction_against_data(
 ) -> PredictionTable:
     """Replay controllers on frames that nothing was fitted to, and compare with the model.
 
-    Other rows are the integrator of least residual by the model, a least-squares predictor from
-    the frames of the fit (:func:`least_squares_predictor`), and the least residual of any linear
-    controller if the model is the truth.
+    Other rows are the best integrator by the model, a :func:`least_squares_predictor` from the
+    first half of the frames, and the least residual of any linear controller if the model is true.
 
     Parameters
     ----------
     plant : TipTiltPlant
         The model, with its sensor gain in the sensor matrix. For an honest comparison it was not
         identified from the frames of the test.
-    open_loop : (frames, n) array_like
-        Recorded pseudo-open-loop series ``z(k) = phi_tot(k-1) + w(k) / g`` [nm].
+    open_loop, stretches, noise_error_nm
+        As for :func:`replayed_residual`; the halves of :func:`split_halves` are to fit and to test.
     controllers : mapping of str to Controller or Design
-        What is compared, by name.
-    stretches : sequence of (start, stop), optional
-        Contiguous usable frames, over which controllers run; by default the whole record. The
-        halves of :func:`split_halves` are to fit and to test.
+        What is compared, by name; one whose loop is unstable is left out, with a note.
     measurements : (frames, q) array_like, optional
         Measurements y(k) of the loop that ran, for its own row [nm].
     running : Controller or Design, optional
         The controller that ran, if it is known, for what the model says of it.
-    noise_error_nm : float or (q,) array_like, optional
-        Standard error of the plant's noise [nm].
     imaging : Imaging, optional
         The camera, for Strehl ratios on at most two axes.
     taps : int, optional
@@ -265,8 +238,6 @@ def prediction_against_data(
     ------
     ProblemError
         If sizes clash, a name is taken or a value is out of its range, or frames are too few.
-    UnstableLoopError
-        If a controller does not hold the plant's loop.
     NumericalError
         If the limit does not settle.
 
@@ -294,114 +265,91 @@ def prediction_against_data(
     hardware = plant.hardware
     series, runs = check_series(open_loop, hardware.modes, stretches)
     fit, later = split_halves(runs, len(series))
-    test, replayed = settled_test(runs, later, hardware.frame_rate_hz)
-    noise = mode_noise(hardware, plant.R, noise_error_nm=noise_error_nm)
-    for name in controllers:
-        if name in _RESERVED or not isinstance(name, str):
-            raise ProblemError(
-                f"a controller may not be called {name!r}; its row is taken. Give another name."
-            )
+    test = settled_test(runs, later, hardware)
+    noise = mode_noise(hardware, plant.R, noise_error_nm)
     predictor, _ = least_squares_predictor(series, hardware, taps=taps, stretches=fit)
     designs = {INTEGRATOR: model_integrator(plant), **controllers, PREDICTOR: predictor}
-    loops = {name: _close_stable_loop(plant, name, thing) for name, thing in designs.items()}
-    measured = {name: replay(loop, series, replayed) for name, loop in loops.items()}
+    if len(designs) < 2 + len(controllers) or {RAN, LIMIT} & set(controllers):
+        raise ProblemError(
+            f"no controller may be called {RAN}, {INTEGRATOR}, {PREDICTOR} or {LIMIT}, as other "
+            f"rows are; got {', '.join(controllers)}. Give other names."
+        )
+    if running is not None:
+        designs[RAN] = running
+    loops = {name: close_loop(hardware, as_controller(x)) for name, x in designs.items()}
+    stable = {name: loop for name, loop in loops.items() if loop.is_stable}
+    unstable = loops.keys() - stable.keys()
+    notes = [f"{name} is unstable at the sensor gain of the model" for name in sorted(unstable)]
+    measured = {name: replay(stable[name], series, runs) for name in stable if name != RAN}
     if measurements is not None:
         y, _ = check_series(measurements, hardware.n_measurements, test, "measurements")
         if len(y) != len(series):
-            raise ProblemError(
-                f"measurements must have the {len(series)} frames of open_loop; got {len(y)}."
-            )
+            frames = f"the {len(series)} frames of open_loop"
+            raise ProblemError(f"measurements must have {frames}; got {len(y)}.")
         measured = {RAN: y @ inverse_sensor(hardware).T, **measured}
-    if running is not None:
-        if measurements is None:
-            raise ProblemError("the controller that ran needs its measurements; got none.")
-        loops[RAN] = _close_stable_loop(plant, RAN, running)
+    elif running is not None:
+        raise ProblemError("the controller that ran needs its measurements; got none.")
     rows = []
     for name, residual in measured.items():
         estimate = estimate_residual(gather(residual, test), test, *noise)
         promised = None
-        if name in loops:  # as a record has it, in means over frames
-            promised = residual_budget(loops[name], plant, frame_means=True).total_nm2
+        if name in stable:  # as a record has it, in means over frames
+            promised = residual_budget(stable[name], plant, frame_means=True).total_nm2
         rows.append(_build_row(name, estimate, promised, imaging))
-    notes = _note_refuted(rows)
+    if refuted := [row.name for row in rows if row.replayed and row.replayed.refuted]:
+        notes.append(
+            f"no residual on the data of {', '.join(refuted)}: its variance is more than "
+            f"{SURPRISING:g} standard errors below zero; the model has more noise than the data, "
+            "or another sensor gain. Identify the noise again."
+        )
     try:
         limit = least_model_residual(plant, frame_means=True)
     except ProblemError as error:  # modes that do not decouple, or a mirror without a limit
-        notes = (f"no {LIMIT}: {error}", *notes)
+        notes.append(f"no {LIMIT}: {error}")
     else:
         along = limit.directions.T * limit.variance_nm2 @ limit.directions
         rows.append(_build_row(LIMIT, None, along, imaging))
-    return PredictionTable(entries=tuple(rows), fit=fit, test=test, notes=notes)
+    return PredictionTable(entries=tuple(rows), fit=fit, test=test, notes=tuple(notes))
 
 
-def stable_designs(
-    plant: TipTiltPlant,
-    options: Mapping[str, Mapping[str, Any]],
-    defaults: Mapping[str, Any] = MappingProxyType({}),
-) -> tuple[dict[str, Design], list[str]]:
-    """Return designs that hold a plant's loop, by titles, and why others are missing.
-
-    ``options`` are those of each method, by its name.
-    """
-    inputs = PlantInputs(plant=plant, design_defaults=defaults)
-    designs, notes = dict[str, Design](), list[str]()
-    for name, given in options.items():
-        title = method_named(name).title
-        try:
-            design = design_request(name, given).build(inputs)
-        except LbtSynthError as error:
-            notes.append(f"no {title}: {str(error).rstrip('.')}")
-            continue
-        if close_loop(plant.hardware, design.controller).is_stable:
-            designs[title] = design
-        else:
-            notes.append(f"no {title}: its loop is not stable at the identified sensor gain")
-    return designs, notes
-
-
-def compare_on_record(
+def compare_designs(
     record: LoopRecord,
     half: IdentifiedModel,
-    controllers: Mapping[str, Controller | Design],
+    requests: Mapping[str, Mapping[str, Any]],
     *,
+    defaults: Mapping[str, Any] | None = None,
+    others: Mapping[str, Controller] | None = None,
     running: Controller | None = None,
     imaging: Imaging | None = None,
-) -> PredictionTable:
-    """Return what controllers leave of the second half of a record, by a model of the first."""
-    return prediction_against_data(
-        half.plant(),
+) -> tuple[PredictionTable, dict[str, Design]]:
+    """Return what designs for a model of the first half of a record leave of the second.
+
+    ``requests`` are the options of methods by their names, and ``others`` further controllers by
+    theirs. The designs with a row are returned by their titles; the others have a note.
+    """
+    inputs = PlantInputs(plant=half.plant(), design_defaults=defaults or {})
+    designs, notes = dict[str, Design](), list[str]()
+    for method, options in requests.items():
+        title = method_named(method).title
+        try:
+            designs[title] = design_request(method, options).build(inputs)
+        except LbtSynthError as error:
+            notes.append(f"no {title}: {str(error).rstrip('.')}")
+    table = prediction_against_data(
+        inputs.plant,
         record.pseudo_open_loop(half.sensor_gains),
-        controllers,
+        {**designs, **(others or {})},
         stretches=record.stretches(),
         measurements=None if record.commands is None else record.measurements,
         running=running,
         noise_error_nm=[axis.noise_error_nm for axis in half.axes],
         imaging=imaging,
     )
-
-
-def _note_refuted(rows: list[PredictionRow]) -> tuple[str, ...]:
-    """Return a note on the rows for which the noise cannot be right."""
-    refuted = {row.name: row.replayed for row in rows if row.replayed and row.replayed.refuted}
-    if not refuted:
-        return ()
-    most = max(replayed.errors_below_zero for replayed in refuted.values())
+    rows = {row.name for row in table.entries}
     return (
-        f"no residual on the data of {', '.join(refuted)}: its variance is {most:.3g} standard "
-        "errors below zero, more than chance; the model has more noise than the data, or another "
-        "sensor gain. Identify the noise again.",
+        replace(table, notes=(*notes, *table.notes)),
+        {title: design for title, design in designs.items() if title in rows},
     )
-
-
-def _close_stable_loop(plant: TipTiltPlant, name: str, thing: Controller | Design) -> ClosedLoop:
-    loop = close_loop(plant.hardware, as_controller(thing))
-    try:
-        loop.require_stable()
-    except UnstableLoopError as error:
-        raise UnstableLoopError(
-            f"{name}: {error}", spectral_radius=error.spectral_radius
-        ) from error
-    return loop
 
 
 def _build_row(
@@ -411,21 +359,21 @@ def _build_row(
     imaging: Imaging | None,
 ) -> PredictionRow:
     """Return a row of a residual on the data and a covariance (n, n) that the model promises."""
-    measured = np.nan if replayed is None else replayed.rms_nm
-    model = np.nan if promised is None else float(np.sqrt(np.trace(promised)))
-    strehl = promised_strehl = np.nan
-    if imaging is not None and replayed is not None:
-        strehl = replayed.strehl(imaging)
-    if imaging is not None and promised is not None:
-        promised_strehl = jitter_strehl(promised, imaging=imaging)
+    data_nm = error_nm = model_nm = strehl = model_strehl = np.nan
+    if replayed is not None:
+        data_nm, error_nm = replayed.rms_nm, replayed.rms_error_nm
+        strehl = np.nan if imaging is None else replayed.strehl(imaging)
+    if promised is not None:
+        model_nm = float(np.sqrt(np.trace(promised)))
+        model_strehl = np.nan if imaging is None else jitter_strehl(promised, imaging=imaging)
     return PredictionRow(
         name=name,
-        replayed_nm=measured,
-        replayed_error_nm=np.nan if replayed is None else replayed.rms_error_nm,
-        model_nm=model,
-        ratio=measured / model if model > 0 else np.nan,
+        replayed_nm=data_nm,
+        replayed_error_nm=error_nm,
+        model_nm=model_nm,
+        ratio=data_nm / model_nm if model_nm > 0 else np.nan,
         strehl=strehl,
-        model_strehl=promised_strehl,
+        model_strehl=model_strehl,
         replayed=replayed,
         model_axis_nm=None if promised is None else frozen_copy(np.sqrt(np.diag(promised))),
     )

@@ -1,8 +1,8 @@
 """The residual that a controller would have left of a recorded disturbance.
 
 The state of a loop at the beginning of contiguous frames depends on the frames before, which are
-not known. A replay begins in the equilibrium for the mean of the first frames, and the first half
-second of each stretch does not count.
+not known. A replay begins in the equilibrium for the mean of the first half second of a stretch,
+which does not count.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ from lbt_synth.validation import (
     require_instance,
 )
 
-_TOO_FAR = 4.0  # standard errors below zero that chance does not explain
-_FEWEST = 100  # frames that give a standard error
-_FIRST = 64  # frames whose mean a replay begins with
+SURPRISING = 4.0  # standard errors of a residual that chance does not explain
+MUCH = 1.25  # ratio of residuals that no error excuses: that of a line that beats is too large
+_ERRORS = 2.0  # standard errors by which one residual is clearly above another
+_LEAST_SHARE = 0.02  # of the measured variance: 1 % of the rms, less than conditions change by
 _SETTLE_S = 0.5  # of a stretch, in which loops that reject a hertz forget where they began
 
 
@@ -48,7 +49,7 @@ class ResidualEstimate:
 
     The variance of the noise is subtracted: an estimate may be negative within its error. Its rms
     is then nan, and :attr:`upper_nm` an upper bound. One that is negative by more refutes the
-    noise that was subtracted (:attr:`refuted`).
+    noise (:attr:`refuted`).
 
     Attributes
     ----------
@@ -76,11 +77,6 @@ class ResidualEstimate:
         return frozen_copy(np.diag(self.covariance_nm2))
 
     @property
-    def variance_error_nm2(self) -> FloatArray:
-        """Standard error of each axis' variance, (n,) [nm^2]."""
-        return frozen_copy(np.sqrt(np.diag(self.error_nm4)))
-
-    @property
     def total_nm2(self) -> float:
         """Residual variance over all axes [nm^2]."""
         return float(np.sum(self.variance_nm2))
@@ -106,24 +102,17 @@ class ResidualEstimate:
         return self.total_error_nm2 / (2 * self.rms_nm) if self.total_nm2 > 0 else float("nan")
 
     @property
-    def errors_below_zero(self) -> float:
-        """Standard errors by which the variance, over all axes or of one, is below zero."""
-        below = -np.append(self.variance_nm2, self.total_nm2)
-        error = np.append(self.variance_error_nm2, self.total_error_nm2)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return float(np.max(np.where(below > 0, below / error, 0.0)))
-
-    @property
     def refuted(self) -> bool:
-        """Whether more noise was subtracted than there is, by more than four standard errors."""
-        return self.errors_below_zero > _TOO_FAR
+        """Whether the variance, over all axes or of one, is four standard errors below zero."""
+        variance = np.append(self.variance_nm2, self.total_nm2)
+        error = np.append(np.sqrt(np.diag(self.error_nm4)), self.total_error_nm2)
+        return bool(np.any(variance < -SURPRISING * error))
 
     @property
     def upper_nm(self) -> float:
         """Root of the variance plus two standard errors, at least 0 [nm rms]; nan if refuted."""
-        if self.refuted:
-            return float("nan")
-        return float(np.sqrt(max(self.total_nm2 + 2 * self.total_error_nm2, 0.0)))
+        upper = max(self.total_nm2 + 2 * self.total_error_nm2, 0.0)
+        return float("nan") if self.refuted else float(np.sqrt(upper))
 
     def above(self, other: ResidualEstimate) -> tuple[float, float]:
         """Return how far the variance is above another residual's, and the standard error [nm^2].
@@ -137,6 +126,15 @@ class ResidualEstimate:
         covariance = mean_covariance(one - two, one + two, self.stretches)
         error = float(np.sqrt(max(float(np.sum(covariance)), 0.0)))
         return self.total_nm2 - other.total_nm2, error
+
+    def is_clearly_above(self, other: ResidualEstimate) -> bool:
+        """Whether it is above another residual by more than chance and changing conditions do.
+
+        Two standard errors of the difference are chance, if they are no more than 25 % of the rms.
+        """
+        difference, error = self.above(other)
+        excused = (MUCH**2 - 1) * max(other.total_nm2, other.total_error_nm2)
+        return difference > max(_LEAST_SHARE * self.measured_nm2, min(_ERRORS * error, excused))
 
     def parts(self, count: int) -> list[ResidualEstimate]:
         """Return the residuals of so many consecutive parts of the frames, of equal length."""
@@ -193,18 +191,14 @@ def replayed_residual(
     noise_error_nm: ArrayLike = 0.0,
     stretches: StretchesLike | None = None,
     test: StretchesLike | None = None,
-    from_rest: bool = False,
 ) -> ResidualEstimate:
     """Residual that a controller would have left of a recorded disturbance.
 
     The pseudo-open-loop measurement ``z(k) = phi_tot(k-1) + S^-1 w(k)`` does not depend on the
     controller that ran. From ``y(k) = S (z(k) - c(k))``, with c(k) its own correction, a
-    controller computes exactly the commands of that loop under that disturbance and noise. Its
-    measured residual is ``e(k) = z(k) - c(k) = phi_res(k-1) + S^-1 w(k)``. As c(k) depends on the
-    noise up to frame k-1 only, white noise adds exactly its variance, which is subtracted.
-
-    The controller runs over each stretch from the equilibrium for its first frames, and the first
-    half second of a stretch does not count.
+    controller computes exactly the commands of that loop. Its measured residual is ``e(k) = z(k) -
+    c(k) = phi_res(k-1) + S^-1 w(k)``; c(k) depends on the noise up to frame k-1 only, so white
+    noise adds exactly its variance, which is subtracted.
 
     Parameters
     ----------
@@ -222,17 +216,13 @@ def replayed_residual(
     stretches : sequence of (start, stop), optional
         Contiguous usable frames, in order; by default the whole record.
     test : sequence of (start, stop), optional
-        Frames of them that count; by default all. The frames before are for the controller to
-        warm up.
-    from_rest : bool, optional
-        Start the controller, the delay and the mirror from rest, and count all frames: the
-        replay is then what such a run would have measured, frame by frame.
+        Frames of them that count; by default all, without the first half second of a stretch.
 
     Returns
     -------
     ResidualEstimate
-        Measured residual, its variance without the noise, and standard errors. They include the
-        sampling of Gaussian series and the error of ``noise_nm``, not that of the sensor gain.
+        Measured residual, its variance without the noise, and standard errors: of Gaussian series
+        and of ``noise_nm``, not of the sensor gain.
 
     Raises
     ------
@@ -259,26 +249,20 @@ def replayed_residual(
     require_instance(hardware, LoopHardware)
     deviation = one_or_each(noise_nm, "noise_nm", hardware.n_measurements, at_least=0)
     series, runs = check_series(open_loop, hardware.modes, stretches)
-    noise_nm2 = deviation**2 * np.eye(hardware.n_measurements)
-    noise = mode_noise(hardware, noise_nm2, noise_error_nm=noise_error_nm)
+    noise = mode_noise(hardware, deviation**2 * np.eye(hardware.n_measurements), noise_error_nm)
     loop = close_loop(hardware, controller)
     loop.require_stable()
     tested = runs if test is None else checked_stretches(test, len(series))
-    kept, replayed = settled_test(runs, tested, 0.0 if from_rest else hardware.frame_rate_hz)
-    residual = replay(loop, series, replayed, from_rest=from_rest)
-    return estimate_residual(gather(residual, kept), kept, *noise)
+    kept = settled_test(runs, tested, hardware)
+    return estimate_residual(gather(replay(loop, series, runs), kept), kept, *noise)
 
 
 def mode_noise(
-    hardware: LoopHardware,
-    noise_nm2: FloatArray,
-    *,
-    noise_error_nm: ArrayLike,
+    hardware: LoopHardware, noise_nm2: FloatArray, noise_error_nm: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
     """Return noise (q, q) of the measurements in the modes [nm^2], and its error [nm^4], (n, n).
 
-    The errors of the standard deviations of measurements are independent: an error of one is
-    common to all modes that it measures.
+    The error of a measurement's noise is common to all modes that it measures.
     """
     back = inverse_sensor(hardware)
     error = one_or_each(noise_error_nm, "noise_error_nm", hardware.n_measurements, at_least=0)
@@ -298,10 +282,10 @@ def check_series(
             f"{name} must be (frames, {modes}), a row per frame and a column per mode; got "
             f"{series.shape}."
         )
-    parts = checked_stretches(stretches, len(series))
-    for start, stop in parts:
+    runs = checked_stretches(stretches, len(series))
+    for start, stop in runs:
         real_array(series[start:stop], f"{name}, frames {start} to {stop},")
-    return series, parts
+    return series, runs
 
 
 def inverse_sensor(hardware: LoopHardware) -> FloatArray:
@@ -318,15 +302,12 @@ def invert(square: FloatArray, need: str) -> FloatArray:
     return np.asarray(np.linalg.inv(square))
 
 
-def settled_test(
-    runs: Stretches, test: Stretches, frame_rate_hz: float
-) -> tuple[Stretches, Stretches]:
-    """Return the frames of a test that count, and those that a replay runs over before and in it.
+def settled_test(runs: Stretches, test: Stretches, hardware: LoopHardware) -> Stretches:
+    """Return the frames of a test that count: not those of the first half second of a run.
 
-    A replay begins where contiguous frames do, and what it has measured in their first half second
-    does not count; a rate of 0 counts all. Refuse a test outside of the runs, or of few frames.
+    Refuse a test outside of the runs, or one of less than half a second.
     """
-    settle, kept, replayed = round(_SETTLE_S * frame_rate_hz), [], dict[int, int]()
+    settle, kept = _settle_frames(hardware), []
     for start, stop in test:
         first = next((a for a, b in runs if a <= start and stop <= b), None)
         if first is None:
@@ -334,16 +315,19 @@ def settled_test(
                 f"the test must lie within the usable stretches; got ({start}, {stop}) in "
                 f"{', '.join(map(str, runs))}."
             )
-        if max(start, first + settle) < stop:
+        if first + settle < stop:
             kept.append((max(start, first + settle), stop))
-            replayed[first] = stop
-    frames = sum(stop - start for start, stop in kept)
-    if frames < _FEWEST:
+    if (frames := sum(stop - start for start, stop in kept)) < settle:
         raise ProblemError(
-            f"a residual needs at least {_FEWEST} frames beyond the first {settle} of each "
-            f"stretch; got {frames}. Record more, or split less."
+            f"a residual needs at least {settle} frames beyond the first {settle} of each stretch; "
+            f"got {frames}. Record more, or split less."
         )
-    return tuple(kept), tuple(replayed.items())
+    return tuple(kept)
+
+
+def _settle_frames(hardware: LoopHardware) -> int:
+    """Return the frames in which a loop forgets where it began."""
+    return max(round(_SETTLE_S * hardware.frame_rate_hz), 1)
 
 
 def gather(series: FloatArray, stretches: Stretches) -> FloatArray:
@@ -351,18 +335,16 @@ def gather(series: FloatArray, stretches: Stretches) -> FloatArray:
     return np.concatenate([series[start:stop] for start, stop in stretches])
 
 
-def replay(
-    loop: ClosedLoop, series: FloatArray, runs: Stretches, *, from_rest: bool = False
-) -> FloatArray:
+def replay(loop: ClosedLoop, series: FloatArray, runs: Stretches) -> FloatArray:
     """Return the measured residual (frames, n) of a stable loop on a series, nan outside of runs.
 
     z(k) stands for phi_tot(k-1), without noise: the residual of frame k-1 is e(k).
     """
-    path = loop.rejection()
+    path, first = loop.rejection(), _settle_frames(loop.hardware)
     constant = path.frequency_response([0.0])[0].real  # what the loop leaves of a constant
     residual = np.full(series.shape, np.nan)
     for start, stop in runs:
-        mean = np.mean(series[start : min(stop, start + _FIRST)], axis=0) * (not from_rest)
+        mean = np.mean(series[start : min(stop, start + first)], axis=0)
         residual[start:stop] = filter_series(path, series[start:stop] - mean) + constant @ mean
     return residual
 
@@ -371,32 +353,29 @@ def mean_covariance(one: FloatArray, other: FloatArray, stretches: Stretches) ->
     """Return the covariance over the axes of mean products of two Gaussian series, (n, n).
 
     Over K frames it is ``2 / K`` times the sum of the squared cross-covariances over all lags
-    (M. S. Bartlett, J. Roy. Stat. Soc. Suppl. 8, 27 (1946), doi:10.2307/2983611). A periodogram I
-    has ``E I^2 = 2 S^2``: no spectrum needs to be smoothed.
-
-    ``cov(x_i y_i, x_j y_j)`` over all lags is the mean over the frequencies of ``S(x_i, x_j)
-    conj S(y_i, y_j) + S(x_i, y_j) conj S(y_i, x_j)``. On the diagonal the product of the two
-    periodograms has that mean for x = y, and at least that otherwise; off it, the two factors
-    are taken at neighbouring frequencies, which are independent.
+    (M. S. Bartlett, J. Roy. Stat. Soc. Suppl. 8, 27 (1946), doi:10.2307/2983611), the mean over the
+    frequencies of ``S(x_i, x_j) conj S(y_i, y_j) + S(x_i, y_j) conj S(y_i, x_j)``. A periodogram I
+    has ``E I^2 = 2 S^2``, so on the diagonal the product of the two has that mean without smoothing
+    for x = y, and at least that otherwise; off it, the factors are of neighbouring frequencies.
     """
-    frames, n = one.shape
-    total, start = np.zeros((n, n)), 0
-    for begin, end in stretches:
-        length = end - begin
+    n, start = one.shape[1], 0
+    total = np.zeros((n, n))
+    for length in (stop - begin for begin, stop in stretches):
         x, y = (rfft(series[start : start + length], axis=0) for series in (one, other))
-        weight = np.full(len(x), 2.0)  # a frequency and its negative
-        weight[0] = 1.0
-        weight[-1] = 2.0 if length % 2 else 1.0
-        weight /= length**2
-        part = _products(x, x) * np.roll(_products(y, y).conj(), 1, axis=0)
-        part += _products(x, y) * np.roll(_products(y, x).conj(), 1, axis=0)
-        lower = np.tril(np.tensordot(weight, part.real, 1), -1)
-        total += lower + lower.T + np.diag(weight @ (np.abs(x) ** 2 * np.abs(y) ** 2))
         start += length
-    total /= frames**2
+        weight = np.full(len(x), 2.0 / length**2)  # a frequency and its negative
+        weight[0] /= 2
+        if length % 2 == 0:
+            weight[-1] /= 2
+        product = _products(x, x) * np.roll(_products(y, y).conj(), 1, axis=0)
+        product += _products(x, y) * np.roll(_products(y, x).conj(), 1, axis=0)
+        product[:, range(n), range(n)] = np.abs(x) ** 2 * np.abs(y) ** 2
+        total += np.tensordot(weight, product.real, 1)
+    covariance = np.tril(total) + np.tril(total, -1).T
+    covariance /= len(one) ** 2
     # a covariance is at most the product of the deviations
-    most = np.sqrt(np.outer(np.diag(total), np.diag(total)))
-    return np.asarray(np.clip(total, -most, most))
+    most = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    return np.asarray(np.clip(covariance, -most, most))
 
 
 def _products(x: ComplexArray, y: ComplexArray) -> ComplexArray:

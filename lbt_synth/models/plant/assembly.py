@@ -16,6 +16,7 @@ from lbt_synth.models.ar_model import padded_coefficients
 from lbt_synth.models.plant.parts import PlantParts, held_frames
 from lbt_synth.models.plant.readings import memory, other_exposures
 from lbt_synth.models.plant.seen_vibration import seen_vibration
+from lbt_synth.models.resonance_spectrum import coefficients, section_drives
 from lbt_synth.validation import FloatArray
 
 
@@ -39,21 +40,22 @@ def plant_matrices(parts: PlantParts) -> PlantMatrices:
 def _own_matrices(parts: PlantParts) -> PlantMatrices:
     """Return the matrices of the plant of the loop's own sensor."""
     hardware, p, n = parts.hardware, len(parts.vibrations), parts.hardware.modes
-    ar2 = [line.ar_model(hardware.frame_rate_hz) for line in parts.vibrations]
-    lines = np.array([model.coefficients for model in ar2]).reshape(p, 2)
+    lines, feeds, drives = _section_states(parts)
     air = padded_coefficients(parts.turbulence)
 
-    tur, tot, size = 2 * p, 2 * p + air.size, parts.size  # where parts of the state begin, and end
+    tur = 2 * parts.sections  # where parts of the state begin, and end
+    tot, size = tur + air.size, parts.size
     total = np.zeros((n, size))
     total[:, :p] = np.array([line.direction for line in parts.vibrations]).reshape(p, n).T
     total[:, tur : tur + n] = np.eye(n)
     A = np.zeros((size, size))
     A[:tur, :tur], A[tur:tot, tur:tot] = _companion(lines), _companion(air)
+    A[: parts.sections, : parts.sections] += feeds
     A[tot : tot + n], A[tot + n :, tot : size - n] = total, np.eye(size - tot - n)
 
     q = hardware.n_measurements
     B = np.zeros((size, p + n + q))
-    B[:p, :p] = np.diag([m.driving_rms_nm for m in ar2])
+    B[: parts.sections, :p] = drives
     B[tur : tur + n, p : p + n] = np.diag([m.driving_rms_nm for m in parts.turbulence])
     C = np.zeros((q, size))
     C[:, size - n :] = hardware.sensor
@@ -65,6 +67,30 @@ def _own_matrices(parts: PlantParts) -> PlantMatrices:
         D=np.hstack([np.zeros((q, p + n)), parts.noise_factor]),
         L=(1 - late) * total + late * np.eye(n, size, k=tot),
     )
+
+
+def _section_states(parts: PlantParts) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return AR2 coefficients of all sections, (s, 2), what feeds each, (s, s), and their drives.
+
+    The first p sections are the vibrations themselves. Before that of a bump stand those that
+    feed it, each of the bump's rms: the first of them has the white noise, (s, p).
+    """
+    rate, p = parts.hardware.frame_rate_hz, len(parts.vibrations)
+    lines, place = np.zeros((parts.sections, 2)), p
+    feeds, drives = np.zeros((parts.sections, parts.sections)), np.zeros((parts.sections, p))
+    for j, line in enumerate(parts.vibrations):
+        if line.sections == 1:
+            model = line.ar_model(rate)
+            lines[j], drives[j, j] = model.coefficients, model.driving_rms_nm
+            continue
+        angle = 2 * np.pi * line.frequency_hz / rate
+        chain = [*range(place, place + line.sections - 1), j]
+        place += line.sections - 1
+        deviations = section_drives(angle, line.damping, line.sections)
+        lines[chain] = coefficients(angle, line.damping)[:2]
+        feeds[chain[1:], chain[:-1]] = deviations[1:] / deviations[:-1]
+        drives[chain[0], j] = line.rms_nm * deviations[0]
+    return lines, feeds, drives
 
 
 def _companion(coefficients: FloatArray) -> FloatArray:
@@ -86,7 +112,7 @@ def _with_other_sensors(own: PlantMatrices, parts: PlantParts) -> PlantMatrices:
     ]
     waiting = memory(late, hardware.modes, period)
     shaken = _shaken_plant(own, parts, ahead)
-    newest = 2 * len(parts.vibrations) + parts.order * hardware.modes
+    newest = 2 * parts.sections + parts.order * hardware.modes
     total = own.A[newest : newest + hardware.modes]  # total(k) from x(k): it is held in x(k+1)
     n, w = shaken.A.shape[1], waiting.n_states
     to_own = np.hstack([shaken.to_own, np.zeros((len(own.A), w))])
@@ -116,13 +142,13 @@ class _ShakenPlant:
 def _shaken_plant(own: PlantMatrices, parts: PlantParts, ahead: int) -> _ShakenPlant:
     """Put the oscillators that accelerometers see in the place of their vibrations."""
     hardware, motions, suite = parts.hardware, parts.motions, parts.hardware.suite
-    p, q0, period = len(parts.vibrations), len(own.C), hardware.period
+    q0, period = len(own.C), hardware.period
     seen = [j for j, motion in enumerate(motions) if motion]
     lines = [
         seen_vibration(parts.vibrations[j], motions[j], suite.accelerometers, hardware, ahead=ahead)
         for j in seen
     ]
-    kept = np.delete(np.arange(len(own.A)), [*seen, *(p + j for j in seen)])
+    kept = np.delete(np.arange(len(own.A)), [*seen, *(parts.sections + j for j in seen)])
     drives = np.delete(np.arange(own.B.shape[1] - q0), seen)
     size, width = len(kept) + sum(s.n_states for s in lines), len(drives)
     to_own, C = np.zeros((len(own.A), size)), np.zeros((len(suite.channels), size))

@@ -42,6 +42,13 @@ class PlantParts:
         lines = len(self.vibrations)
         motions = self.motions if any(self.motions) else ({},) * lines
         set_fields(self, motions=checked_motions(motions, self.hardware.suite, lines))
+        for line, motion in zip(self.vibrations, self.motions, strict=True):
+            if line.sections > 1 and motion:
+                raise ProblemError(
+                    f"a bump of {line.sections} sections moves no channel of an accelerometer; got "
+                    f"the motion of {', '.join(motion)} with that at {line.frequency_hz:.6g} Hz. "
+                    "Try sections=1, or leave the motion out."
+                )
 
     @property
     def order(self) -> int:
@@ -49,10 +56,15 @@ class PlantParts:
         return max(model.order for model in self.turbulence)
 
     @property
+    def sections(self) -> int:
+        """Number of resonances, those of a bump each counted."""
+        return sum(line.sections for line in self.vibrations)
+
+    @property
     def size(self) -> int:
         """Number of states of the plant of the loop's own sensor."""
         blocks = self.order + held_frames(self.hardware)
-        return 2 * len(self.vibrations) + blocks * self.hardware.modes
+        return 2 * self.sections + blocks * self.hardware.modes
 
 
 def held_frames(hardware: LoopHardware) -> int:

@@ -11,7 +11,6 @@ from scipy.signal import lfilter
 from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
-from lbt_synth.identification.accelerometers import transfers
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
@@ -86,7 +85,7 @@ def test_factors_shift_and_noise_are_those_of_the_channels():
             assert row.coherence > 0.5
     for row in found.channels:
         assert row.noise_m_s2 == pytest.approx(noise, rel=0.2)
-    assert found.channels[1].verdict == "used for 31, 56 Hz"
+    assert [row.verdict for row in found.channels] == ["used", "used"]
 
 
 def test_errors_count_that_of_the_sensor_gain():
@@ -195,30 +194,8 @@ def test_channels_that_fail_are_named_and_left_out():
         1e-2 * rng.standard_normal(FRAMES),
     )
     verdicts = [row.verdict for row in found.channels]
-    assert verdicts[1:] == ["dead", "dead", "dead", "dead", "adds nothing"]
+    assert verdicts[1:] == ["dead", "adds nothing", "dead", "dead", "adds nothing"]
     assert [row.channel for row in found.used] == ["channel1"]
-
-
-def test_what_channels_buy_is_what_filters_leave():
-    found = find(reading(2.0, -0.7, 1.3, noise=1e-4), reading(2.0, noise=1e-3, seed=1))
-    alone = lbt.kalman(night().model.plant()).rms
-    assert found.alone_nm == pytest.approx(alone)
-    quiet, one_line = (row.residual_nm for row in found.channels)
-    assert found.together_nm <= quiet * (1 + 1e-6) < one_line < 0.99 * alone
-    text = f"leaves {alone:.3g} nm, and with channel1, channel2 {found.together_nm:.3g} nm"
-    assert text in found.worth_text
-    assert find(1e-2 * np.random.default_rng(8).standard_normal(FRAMES)).worth_text == ""
-
-
-def test_motions_are_found_where_no_filter_can_be_designed(monkeypatch):
-    def fails(_):
-        raise lbt.errors.NumericalError("no filter.")
-
-    monkeypatch.setattr(transfers, "kalman", fails)
-    found = find(reading(2.0, -0.7, 1.3, noise=1e-3))
-    assert found.used
-    assert np.isnan(found.together_nm)
-    assert found.worth_text == ""
 
 
 def test_no_more_channels_are_used_than_a_design_takes():

@@ -12,6 +12,7 @@ import lbt_synth as lbt
 from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.diagnosis.rows import (
     disturbance_costs,
+    disturbance_lines,
     judge_channels,
     live_axes,
 )
@@ -126,7 +127,9 @@ def test_squares_add_up_to_the_budget(diagnosis):
     plant = diagnosis.model.plant()
     running = lbt.Controller(A=1.0, B=0.2, C=1.0, D=0.0, dt_s=1e-3)
     best = diagnosis.best_design.controller
-    costs = disturbance_costs(plant, diagnosis.lines, running, best, lbt.Imaging())
+    costs = disturbance_costs(
+        plant, disturbance_lines(diagnosis.model), running, best, lbt.Imaging()
+    )
     *parts, total = costs
     for field, controller in (("running_nm", running), ("best_nm", best)):
         loop = lbt.close_loop(plant.hardware, controller)
@@ -156,10 +159,17 @@ def test_loops_that_are_not_known_cost_nothing_that_is_known(diagnosis):
     plant = diagnosis.model.plant()
     wild = lbt.Controller(A=1.0, B=5.0, C=1.0, D=0.0, dt_s=1e-3)
     rows = disturbance_costs(
-        plant, diagnosis.lines, wild, diagnosis.best_design.controller, lbt.Imaging()
+        plant,
+        disturbance_lines(diagnosis.model),
+        wild,
+        diagnosis.best_design.controller,
+        lbt.Imaging(),
     )
     assert all(np.isnan([row.running_nm, row.running_strehl]).all() for row in rows)
     assert [row.best_nm for row in rows[:-1]] == sorted(
         (r.best_nm for r in rows[:-1]), reverse=True
     )
-    assert disturbance_costs(plant, diagnosis.lines, None, None, lbt.Imaging()) == ()
+    assert (
+        disturbance_costs(plant, disturbance_lines(diagnosis.model), None, None, lbt.Imaging())
+        == ()
+    )

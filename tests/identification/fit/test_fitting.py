@@ -10,7 +10,7 @@ from support.drawn_spectra import drawn_search, empty_search, white_noise
 
 from lbt_synth.identification.fit.fitting import Search, cost, fit, prune, required_evidence
 from lbt_synth.identification.fit.periodogram import loop_periodogram
-from lbt_synth.identification.fit.spectrum_model import Background, SpectrumModel
+from lbt_synth.identification.fit.spectrum_model import Background, Component, SpectrumModel
 from lbt_synth.identification.fit.whittle import contrast
 
 RATE = 1000.0
@@ -36,10 +36,20 @@ def test_a_component_costs_what_its_parameters_do() -> None:
     """A drift has two, a line whose place is known beforehand need not be searched for."""
     search = empty_search()
     line = search.component("line", 100.0, 0.01, 0.1)
-    assert required_evidence(search, line) == pytest.approx(1.5 * np.log(search.data.count.sum()))
-    drift = required_evidence(search, search.drift(0.03, 1.0))
-    assert drift == pytest.approx(2 / 3 * required_evidence(search, line))
-    assert required_evidence(search, replace(line, announced=(0.0, 1.0))) < drift
+    bump = replace(line, sections=2)
+
+    def required(*components: Component) -> float:
+        """Return what the last of them must add."""
+        return required_evidence(search, SpectrumModel((), (line, *components)), len(components))
+
+    values = float(search.data.count.sum())
+    assert required(line) == pytest.approx(1.5 * np.log(values))
+    drift = required(search.drift(0.03, 1.0))
+    assert drift == pytest.approx(2 / 3 * required(line))
+    assert required(replace(line, announced=(0.0, 1.0))) < drift
+    assert required(bump) == pytest.approx(4 / 3 * required(line))
+    assert required(bump, line) == pytest.approx(1e-3 * values)
+    assert required(bump, line.shift(0.1, 0.0, 0.0)) == required(line)
 
 
 def test_a_wide_component_in_the_place_of_the_noise_becomes_noise() -> None:

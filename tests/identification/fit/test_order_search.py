@@ -87,6 +87,51 @@ def test_a_drift_is_a_process_beside_the_turbulence(seed: int) -> None:
     assert np.median(ratio) == pytest.approx(1, rel=0.15)
 
 
+def bump_of(density_nm2_hz: np.ndarray, seed: int) -> SpectrumModel:
+    """Return what is found in random periodograms of a density beside turbulence and noise."""
+    search = empty_search()
+    truth = white_noise().add(search.component("turbulence", 1.0, 0.5, 3000.0))
+    whole = density(search.data, truth) + density_nm2_hz
+    chance = np.random.default_rng(seed).exponential(size=whole.size)
+    drawn = replace(search, data=replace(search.data, measured=whole * chance))
+    return find_components(drawn).spectrum
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_smooth_bump_is_one_component(seed: int) -> None:
+    """One 8 Hz wide was five lines, with errors of 0.1 Hz each; a line stays beside it."""
+    f = empty_search().data.frequency_hz
+    smooth = 2.0 * np.exp(-4 * np.log(2) * ((f - 40) / 8) ** 2)
+    (bump,) = bump_of(smooth, seed).lines
+    assert bump.sections > 1
+    assert np.exp(bump.log_power) == pytest.approx(2.0 * 8 * 1.0645, rel=0.1)
+    line = 60 / np.pi * 0.05 / ((f - 41) ** 2 + 0.05**2)
+    assert sorted(c.sections > 1 for c in bump_of(smooth + line, seed).lines) == [False, True]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_resonance_is_no_bump(seed: int) -> None:
+    search = empty_search()
+    wide = search.component("line", 40.0, 0.1, 400.0)
+    truth = white_noise().add(search.component("turbulence", 1.0, 0.5, 3000.0), wide)
+    (found,) = find_components(drawn_search(truth, seed)).spectrum.lines
+    assert found.sections == 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_turbulence_is_not_taken_for_a_resonance(seed: int) -> None:
+    """A strong resonance over steep air was the turbulence, and the air a drift beside it."""
+    search = empty_search()
+    f = search.data.frequency_hz
+    air = 2000 / (1 + f**2) ** (11 / 6) + 0.05
+    shape = 1 / ((1 - (f / 40) ** 2) ** 2 + (0.2 * f / 40) ** 2)
+    whole = air + 300 * np.interp(40, f, air) * shape / np.max(shape)
+    chance = np.random.default_rng(seed).exponential(size=f.size)
+    drawn = replace(search, data=replace(search.data, measured=whole * chance))
+    first = find_components(drawn).spectrum.components[0]
+    assert search.place(first)[0] < 5
+
+
 @pytest.mark.parametrize("gain", [1e-9, 1e9])
 def test_a_gain_that_ran_away_is_no_error(gain: float) -> None:
     search = empty_search()

@@ -125,12 +125,15 @@ def test_wider_lines_reach_less() -> None:
     assert reach[0] > 400 > 50 > reach[199] > reach[-1] == 0
 
 
-def case(*, drift: bool = False) -> tuple[LoopPeriodogram, SpectrumModel]:
+def case(*, drift: bool = False, bump: bool = False) -> tuple[LoopPeriodogram, SpectrumModel]:
     y, c = integrator_loop(lines=((40, 0.01, 30),), frames=4096)
     data = loop_periodogram(y[:, 0], c[:, 0], frame_rate_hz=RATE, stretches=[(0, len(y))])
     turbulence = Component("turbulence", np.log(1.1 * W), np.log(0.5), np.log(200.0**2))
     line = Component("line", np.log(39 * W), np.log(0.02 / 0.98), np.log(15.0**2))
     components = [turbulence, line]
+    if bump:
+        odds = np.log(0.2 / 0.8)
+        components.append(Component("line", np.log(90 * W), odds, np.log(20.0**2), sections=3))
     if drift:
         components.append(Component("drift", np.log(20 * W), np.log(300.0), np.log(50.0**2)))
         components.append(Component("slow", np.log(3 * W), 0.3, np.log(50.0**2)))
@@ -140,7 +143,7 @@ def case(*, drift: bool = False) -> tuple[LoopPeriodogram, SpectrumModel]:
 
 @pytest.mark.parametrize("drift", [False, True])
 def test_gradient_and_information_of_the_likelihood(drift: bool) -> None:
-    data, spectrum = case(drift=drift)
+    data, spectrum = case(drift=drift, bump=True)
     theta = spectrum.pack()
 
     def gradient(theta: np.ndarray, data: LoopPeriodogram = data) -> np.ndarray:

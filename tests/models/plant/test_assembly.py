@@ -9,9 +9,13 @@ from support.sensor_loops import AIR, FAST, LINES, MOTIONS, SLOW, example_plant,
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models import Accelerometer, SensorSuite, WavefrontSensor
+from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
 from lbt_synth.models.plant.readings import Exposure, memory, other_exposures, own_exposure
 from lbt_synth.models.plant.tip_tilt import retuned_plant
+
+SEEING = Accelerometer(
+    name="mirror", rate_hz=1000, delay_frames=1, channels=("m1",), noise_m_s2=2e-4
+)
 
 
 @pytest.mark.parametrize(
@@ -113,6 +117,27 @@ def test_lines_that_move_keep_their_channels():
     assert spread.motions == (plant.motions[0],) * 3 + (plant.motions[1],) * 3
     one = lbt.models.spread_plant(plant, half_width_hz=1.0, lines=1)
     np.testing.assert_allclose(one.C, plant.C, rtol=1e-12)
+
+
+@pytest.mark.parametrize("sections", [2, 3, 4])
+def test_a_bump_is_a_chain_of_resonances(sections):
+    """The filter leaves what the same bump as one process of order 2 a section leaves."""
+    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=2, frame_rate_hz=1000)
+    bump = lbt.Vibration(frequency_hz=40, damping=0.2, rms_nm=100, sections=sections)
+    line = lbt.Vibration(frequency_hz=90, damping=0.01, rms_nm=20)
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=1000, turbulence=slow, vibrations=[bump, line], noise_nm=5
+    )
+    assert plant.n_states == 2 * sections + 2 + 4
+    design = lbt.kalman(plant)
+    assert design.certificate.passed
+    loop = lbt.close_loop(plant.hardware, design.controller)
+    left = lbt.residual_budget(loop, plant, frame_means=True)
+    assert left.rms_nm == pytest.approx(design.rms, rel=1e-6)
+    moved = tuple({} for _ in plant.vibrations)
+    assert plant.with_sensors(SensorSuite(sensors=(SEEING,)), moved).n_states == plant.n_states
+    with pytest.raises(ProblemError, match="moves no channel of an accelerometer"):
+        plant.with_sensors(SensorSuite(sensors=(SEEING,)), ({"m1": Motion(size=1)}, {}))
 
 
 @pytest.mark.parametrize("steps", [0, 2, 3])
