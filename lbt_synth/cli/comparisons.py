@@ -45,7 +45,10 @@ def run_limits(arguments: Namespace) -> Report:
     """Compare designs with the least residual of any linear controller."""
     config = load_shown(arguments)
     files = load_designs(arguments.gains, any_sensors=True)
-    designs = _config_designs(config)
+    designs = {
+        method.name: config.design(method.name, **method.in_comparison)
+        for method in reference_methods()
+    }
     designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}
     study = studies.limits(
         designs, config.hardware, config.truth, config.imaging, errors_hz=config.errors_hz
@@ -69,13 +72,6 @@ def run_limits(arguments: Namespace) -> Report:
         }
     report.notes += [*_limit_notes(study, config), *_design_notes(config, designs, study)]
     return report
-
-
-def _config_designs(config: Config) -> dict[str, Design]:
-    return {
-        method.name: config.design(method.name, **method.in_comparison)
-        for method in reference_methods()
-    }
 
 
 def _limit_notes(study: LimitStudy, config: Config) -> list[str]:
