@@ -252,6 +252,7 @@ def _value(knob: Knob, place: float) -> float:
 
 _QUICK_S = 0.3  # a design that takes longer is made when a slider is released
 _THREADS = 3  # of a page: for a slow design, a quick one, and a verdict
+_UNUSED_MS = 3_600_000  # after which the session of a page that sleeps is dropped
 _SWITCH_S = 0.0005  # after which a thread that computes lets another go on; Python's 5 ms stutter
 _GRID = {"display": "grid", "grid-template-columns": "repeat(auto-fill, minmax(330px, 1fr))"}
 _HEAD = '{% block preamble %}<meta name="viewport" content="width=device-width">{% endblock %}'
@@ -431,8 +432,13 @@ def serve(
     place = _require_free(host, port)
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     own = (f"{one}:{place}" for one in ("localhost", "127.0.0.1", name))
-    allowed = [*own, *origins]
-    server = Server({"/": open_page}, address=host, port=place, allow_websocket_origin=allowed)
+    server = Server(
+        {"/": open_page},
+        address=host,
+        port=place,
+        allow_websocket_origin=[*own, *origins],
+        unused_session_lifetime_milliseconds=_UNUSED_MS,
+    )
     # a thread that computes must not keep curves from being sent
     sys.setswitchinterval(_SWITCH_S)
     server.start()
