@@ -34,7 +34,7 @@ def run(arguments: Namespace) -> Report:
     choose_unit(arguments, whole.diameter_m)
     live = live_axes(whole)
     record = whole if len(live) in (0, whole.axes) else _load(arguments, live)
-    with count_progress(total=_STEPS, what="diagnosing", quiet=arguments.json) as count:
+    with count_progress(total=_STEPS, what="diagnosing") as count:
         found = diagnose(
             record.bridged(),
             given=given,

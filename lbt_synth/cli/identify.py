@@ -7,7 +7,6 @@ from argparse import Namespace
 from lbt_synth.cli import loop_records
 from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import show_spinner
 from lbt_synth.errors import LbtSynthError
 from lbt_synth.identification import LoopRecord, SpectrumRecord, accelerometer_transfers, identify
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
@@ -24,8 +23,7 @@ def run(arguments: Namespace) -> Report:
         doubts = loop_records.judge_record(arguments, record)
     if isinstance(record, SpectrumRecord):  # it does not hold the timing of the loop
         options |= {name: getattr(arguments, name) for name in ("frame_rate_hz", "delay_frames")}
-    with show_spinner("identifying", quiet=arguments.json):
-        model = identify(record, **options)
+    model = identify(record, **options)
     report = Report(data={"source": str(arguments.file)})
     loop_records.add_record(report, record)
     loop_records.add_model(report, model)
