@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design
 from lbt_synth.identification.commands.verdict import explain_commands, judge_fitted_gains
@@ -23,7 +24,6 @@ from lbt_synth.identification.prediction.comparison import (
     stable_designs,
 )
 from lbt_synth.identification.prediction.residual import ResidualEstimate
-from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.sensor_gains import (
@@ -86,7 +86,7 @@ def design_from_record(
     method: str | None = None,
     gamma_ratio: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
-    announced: Sequence[LinePrior] = (),
+    announced: ArrayLike = (),
     imaging: Imaging | None = None,
     accept_record: bool = False,
     command_scale_known: bool = False,

@@ -146,10 +146,7 @@ def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
     """
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to repair.")
-    commands = np.array(record.commands)
-    good = np.ones(record.frames, dtype=np.bool_)
-    if record.commanded is not None:
-        good = np.array(record.commanded)
+    commands, good = np.array(record.commands), np.array(record.commanded)
     if repair.increments:
         commands = np.cumsum(commands, axis=0)
         good &= np.logical_and.accumulate(good)
@@ -160,5 +157,4 @@ def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
         unknown = slice(0, repair.shift_frames) if late else slice(repair.shift_frames, None)
         commands[unknown], good[unknown] = 0.0, False
     commands = commands @ repair.turn(record.axes).T
-    repaired = replace(record, commands=read_only(commands), commanded=read_only(good))
-    return repaired if record.delay_frames is None else repaired.with_delay(record.delay_frames)
+    return replace(record, commands=read_only(commands), commanded=read_only(good), bridges=None)

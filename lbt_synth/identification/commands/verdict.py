@@ -251,10 +251,12 @@ def record_law(record: LoopRecord) -> ControlLaw | None:
     """Return the control law of a closed-loop record; None where the frames are too few."""
     if record.commands is None:
         return None
-    measured = record.usable if record.measured is None else record.measured
     with suppress(ProblemError):
         return fit_control_law(
-            record.measurements, record.commands, usable=measured, commanded=record.commanded
+            record.measurements,
+            record.commands,
+            usable=record.measured,
+            commanded=record.commanded,
         )
     return None
 

@@ -143,14 +143,10 @@ class ChannelRow:
 
 def judge_channels(record: LoopRecord) -> tuple[ChannelRow, ...]:
     """Return what is known of each channel of a record, the measurements first."""
-    measured = record.usable if record.measured is None else record.measured
     axes = range(record.axes)
-    rows = [_judge_channel(record, axis, record.measurements, measured) for axis in axes]
+    rows = [_judge_channel(record, axis, record.measurements, record.measured) for axis in axes]
     if record.commands is not None:
-        commanded = record.commanded
-        if commanded is None:
-            commanded = np.ones(record.frames, dtype=np.bool_)
-        rows += [_judge_channel(record, axis, record.commands, commanded) for axis in axes]
+        rows += [_judge_channel(record, axis, record.commands, record.commanded) for axis in axes]
     return tuple(rows)
 
 

@@ -45,7 +45,6 @@ from lbt_synth.identification.fit.physical_parameters import (
 )
 from lbt_synth.identification.fit.shared_lines import couple_axes
 from lbt_synth.identification.fit.whittle import FittedModel
-from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
 from lbt_synth.validation import FloatArray, number, real_array, require_instance
@@ -68,7 +67,7 @@ def identify(
     frame_rate_hz: float | None = None,
     delay_frames: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
-    announced: Sequence[LinePrior] = (),
+    announced: ArrayLike = (),
     lowest_line_hz: float = LOWEST_LINE_HZ,
     most_lines: int = MOST_LINES,
     stretches: StretchesLike | None = None,
@@ -96,8 +95,8 @@ def identify(
         Total delay of that loop [frames], if the record does not have it; 2 by default.
     sensor_gain : float or one per axis, optional
         Known sensor gain; like ``stretches`` and ``start`` for series alone.
-    announced : sequence of LinePrior, optional
-        Lines that are known beforehand, for instance from accelerometers.
+    announced : (lines,) or (lines, 2) array_like, optional
+        Frequencies of lines that are known beforehand [Hz], alone or with their standard errors.
     lowest_line_hz : float, optional
         A resonance below is a part of the turbulence [Hz].
     most_lines : int, optional
@@ -139,12 +138,14 @@ def identify(
     >>> lbt.kalman(found.plant()).certificate.passed
     True
     """
-    for line in announced:
-        require_instance(line, LinePrior)
+    lines = real_array(announced, "announced")
+    lines = np.column_stack([lines, 0 * lines]) if lines.ndim == 1 else lines
+    if lines.ndim != 2 or lines.shape[1] != 2:
+        raise DimensionError(f"announced must be (lines,) or (lines, 2); got {lines.shape}.")
     if start is not None:
         require_instance(start, IdentifiedModel)
     options: dict[str, Any] = {
-        "announced": [(line.frequency_hz, line.frequency_error_hz) for line in announced],
+        "announced": lines.tolist(),
         "lowest_line_hz": lowest_line_hz,
         "most_lines": most_lines,
     }
