@@ -38,7 +38,13 @@ from lbt_synth.identification.commands.repair import (
     axes_repair,
     repair_commands,
 )
-from lbt_synth.identification.fit.fitting import GAINS, PLAUSIBLE_GAINS, Search, cost
+from lbt_synth.identification.fit.fitting import (
+    GAINS,
+    PLAUSIBLE_GAINS,
+    TYPICAL_GAIN,
+    Search,
+    cost,
+)
 from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.records.record import LoopRecord
@@ -52,19 +58,18 @@ from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_ins
 AS_GIVEN = "as given"
 _FIND = "find the commands that belong to these measurements"
 _GIVEN = CommandRepair()
-_ODD = 10.0  # nats by which what no law asks for must be likelier, by the model of the fit as well
-_SURPRISING = 3 * CLEAR  # nats by which a repair must be likelier that a law with errors denies
+_ODD = CLEAR / 2  # nats that what no law asks for must add, by the model of the fit as well
+_SURPRISING = 3 * CLEAR  # nats that overrule a law with errors
 _ABSURD = 3e4  # scale of commands without a law, which are rather of another night
 _WRONG_GAIN = 2.0  # factor beyond a given or plausible gain, which a coarse one does not reach
 _WORST_CONDITION = 100.0  # of the gain of a law: beyond, it has no inverse
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
 _HIDES = 0.01  # part of their changes that commands leave unexplained, which moves a gain by 10 %
-_USUAL_GAIN = 0.7  # of a sensor, by whose distance units are told apart
 _COARSE = 1.5  # factor by which a coarse gain may be wrong
 _LINES = 10  # at most, of a fit that tells gains apart: more of them take minutes
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
-_RAN = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
-_ANY = np.geomspace(1.0, 1e-6, 19)[:, None]  # gains of a loop that may be of no sensor
+_RAN = np.array([0.3, 0.7, 1.0])  # gains at which a loop may have run
+_ANY = np.geomspace(1.0, 1e-6, 19)  # gains of a loop that may be of no sensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,7 +77,6 @@ class CommandVerdict:
     """How the commands of a record reach its measurements."""
 
     explanation: str  # the best one, in words; "as given" if that is what was given
-    accepted: bool  # whether a model may be fitted
     repair: CommandRepair = _GIVEN  # without options where nothing is wrong or nothing helps
     delay_frames: float | None = None  # delay that fits, where another was given
     # log-likelihood above that of the record as given; 0 where the law alone decides
@@ -80,6 +84,11 @@ class CommandVerdict:
     gain: FloatArray  # (axes,), coarse sensor gain; nan where the coarse spectrum does not show it
     law: ControlLaw | None  # None where too few frames show it
     notes: tuple[str, ...] = ()  # what to look at although the record is accepted
+
+    @property
+    def accepted(self) -> bool:
+        """Whether a model may be fitted."""
+        return self.explanation == AS_GIVEN
 
     @property
     def options(self) -> str:
@@ -158,7 +167,7 @@ def explain_commands(
             record, measurements=record.measurements[:, moves], commands=record.commands[:, moves]
         )
         return _explain_moving(one, moves, law, gains)
-    refuse = partial(CommandVerdict, accepted=False, gain=np.full(record.axes, np.nan), law=law)
+    refuse = partial(CommandVerdict, gain=np.full(record.axes, np.nan), law=law)
     sure = law if law is not None and law.is_sure else None
     if sure is not None and (doubt := _doubt_law(sure)):
         return refuse(explanation=doubt)
@@ -191,7 +200,6 @@ def explain_commands(
     hidden = (shown <= plausible[0] / _WRONG_GAIN) | (shown >= plausible[1] * _WRONG_GAIN)
     return CommandVerdict(
         explanation=" and ".join(words) or AS_GIVEN,
-        accepted=not words,
         repair=replace(repair, scale=tuple(scale)),
         delay_frames=delay + off if off else None,
         nats=max(choice.nats, 0.0),
@@ -285,7 +293,7 @@ def _explain_by_law(
     if repair.options:
         return refuse(explanation=f"by their law {' and '.join(repair.words())}", repair=repair)
     note = "the commands were not tested: no stretch of usable frames is long enough"
-    return refuse(explanation=AS_GIVEN, accepted=True, notes=(note,))
+    return refuse(explanation=AS_GIVEN, notes=(note,))
 
 
 def _moving_axes(commands: FloatArray) -> BoolArray:
@@ -354,19 +362,17 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
     repairs = list_repairs(record.axes, record.hardware.delay_frames, law, lag)
     axis_contrast, gain, misfit = coarse.compare(repairs)
     contrast = axis_contrast.sum(axis=0)
-    spread = np.array([dispersion(value) for value in misfit])
-    penalty, asked = _penalties(repairs, gain, record, law, lag, spread)
-    best = int(np.argmin(contrast + penalty))
-    clear = CLEAR * float(spread[best])
-    nats = contrast[0] - contrast[best]
+    spread = dispersion(float(misfit[np.argmin(contrast)]))
+    penalty, asked = _penalties(repairs, gain, record, law, lag)
+    best = int(np.argmin(contrast + spread * penalty))
+    clear, nats = CLEAR * spread, float(contrast[0] - contrast[best])
     if asked[best]:
         is_shown = penalty[0] >= _SURPRISING or nats >= clear / 2
     else:
         is_shown = (
             nats >= clear and _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] >= _ODD
         )
-    if not is_shown:
-        best = 0
+    best = best if is_shown else 0
     saved = coarse.unrelated() - np.min(axis_contrast, axis=1)
     followed = np.zeros(record.axes) if law is None else law.axis_coherence
     return _Choice(
@@ -375,7 +381,7 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
         float(contrast[0] - contrast[best]),
         float(contrast[best]),
         clear,
-        (followed < FOLLOWED) & (saved < CLEAR * spread[best]),
+        (followed < FOLLOWED) & (saved < clear),
     )
 
 
@@ -385,32 +391,28 @@ def _penalties(
     record: LoopRecord,
     law: ControlLaw | None,
     lag: int,
-    spread: FloatArray,
 ) -> tuple[FloatArray, BoolArray]:
     """Return the nats that repairs (n,) cost because of the laws they make, and which the law asks.
 
     A loop that would have been unstable has not run. A law that is not exact overrules no clear
     likelihood.
     """
-    unusual = np.array([_is_unusual(repair, law, lag) for repair in repairs])
+    odd = np.array([_is_unusual(repair, law, lag) for repair in repairs])
     impossible = np.zeros(len(repairs), dtype=np.bool_)
     if law is not None and law.is_sure:
         for i, (repair, gain) in enumerate(zip(repairs, gains.T, strict=True)):
-            tried = np.vstack([gain, 0.3 * gain, _RAN * np.ones(record.axes)])
+            tried = np.vstack([gain, _RAN[:, None] * np.ones(record.axes)])
             impossible[i] = not could_have_run(repair, tried, record, law)
         impossible &= not impossible.all()
-    odd = unusual | impossible
+    odd |= impossible
     asked = ~odd & odd[0]
     refuted = np.array(odd if asked.any() else impossible)
     # a slow computer has a lag, and a matrix may couple axes on purpose: the sensor tells
     is_plausible = np.all(np.clip(gains[:, 0], *PLAUSIBLE_GAINS) == gains[:, 0])
     if is_plausible and law is not None and law.order > 0:
         refuted[0] = False
-    surprise = np.inf if law is not None and law.exact else _SURPRISING * spread
-    cost_of_odd = np.where(refuted, surprise, _ODD * odd)
-    fraction = (record.hardware.delay_frames % 1 > 0) & (np.arange(len(repairs)) > 0)
-    nameless = fraction | [bool(repair.matrix) for repair in repairs]
-    return np.asarray(cost_of_odd + _ODD * nameless), asked
+    surprise = np.inf if law is not None and law.exact else _SURPRISING
+    return np.where(refuted, surprise, _ODD * odd), asked
 
 
 def _is_unusual(repair: CommandRepair, law: ControlLaw | None, lag: int) -> bool:
@@ -466,7 +468,7 @@ def _doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray
     """
     if law is None or not law.exact or law.order > SHORT_ORDER:
         return ""
-    tried = np.vstack([gains, 0.3 * gains, 0.1 * gains, *(_ANY * np.ones(record.axes))])
+    tried = np.vstack([gains, 0.3 * gains, 0.1 * gains, *(_ANY[:, None] * np.ones(record.axes))])
     if could_have_run(_GIVEN, tried, record, law):
         return ""
     return (
@@ -508,33 +510,31 @@ def _fit(
 def _scale(
     coarse: CoarseRecord, law: ControlLaw | None, choice: _Choice, plausible: tuple[float, float]
 ) -> FloatArray:
-    """Return the factors (axes,) of commands that make implausible gains plausible ones."""
+    """Return the factors (axes,) of commands that make implausible gains plausible ones.
+
+    Wide resonances that the coarse spectrum lacks move its gains: the fit decides, of commands that
+    are scaled by these.
+    """
     low, high = plausible
-    one, inside = np.ones(choice.gain.size), np.geomspace(low, high, 8)
+    one = np.ones(choice.gain.size)
     if np.all((choice.gain >= low) & (choice.gain <= high)):
         return one
-    plausible_contrasts = coarse.profile(choice.repair, np.tile(inside, (one.size, 1)))
-    if np.sum(np.min(plausible_contrasts, axis=1)) - choice.contrast < choice.clear:
-        return one
-    # wide resonances that the coarse spectrum lacks move its gains: the fit decides, of commands
-    # that are scaled by these
     scaled = replace(choice.repair, scale=tuple(choice.gain))
     free, ratios = _fit(coarse, scaled)
     gains = np.where(np.isfinite(ratios), ratios, 1.0) * choice.gain
     if np.all((gains >= low) & (gains <= high)):
         return one
-    scale = likely_factors(gains, plausible)
+    centre = float(np.mean(np.log(gains)))
+    inside = np.geomspace(low, high, 8)
     if law is not None and law.is_sure:
         if not could_have_run(choice.repair, inside[:, None] * one, coarse.record, law):
-            return scale
-        if np.mean(np.log(gains)) < np.log(low):
+            return likely_factors(gains, plausible)
+        if centre < np.log(low):
             return one  # commands that are too large come from a law that is too strong
-    fitted = float(np.mean(np.log(gains)))
-    tried = (low, float(np.clip(_USUAL_GAIN, low, high)), high)
-    for gain in sorted(tried, key=lambda gain: abs(np.log(gain) - fitted)):
-        if _fit(coarse, scaled, gain / choice.gain)[0] - free < choice.clear:
-            return one  # a plausible gain is nearly as likely
-    return scale
+    nearest = inside[np.argmin(abs(np.log(inside) - centre))]
+    if _fit(coarse, scaled, nearest / choice.gain)[0] - free < choice.clear:
+        return one  # a plausible gain is nearly as likely
+    return likely_factors(gains, plausible)
 
 
 def likely_factors(gains: FloatArray, plausible: tuple[float, float]) -> FloatArray:
@@ -555,7 +555,7 @@ def likely_factors(gains: FloatArray, plausible: tuple[float, float]) -> FloatAr
 def _likely_factor(gain: float, plausible: tuple[float, float]) -> float:
     """Return the factor between units that makes a gain plausible; another one if none does."""
     low, high = plausible
-    usual = float(np.clip(_USUAL_GAIN, low, high))
+    usual = float(np.clip(TYPICAL_GAIN, low, high))
     for margin in (1.0, _COARSE):
         fits = [f for f in _FACTORS if low / margin <= gain / f <= high * margin]
         if fits:
@@ -572,7 +572,6 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
     scale = np.ones(gains.size) if accepted else likely_factors(gains, PLAUSIBLE_GAINS)
     return CommandVerdict(
         explanation=AS_GIVEN if accepted else wrong_scale(scale, gains),
-        accepted=accepted,
         repair=CommandRepair(scale=tuple(scale)),
         gain=frozen_copy(gains / scale),
         law=None,
