@@ -47,7 +47,7 @@ _PEAK, _SKIRT = 3.0, 1.25  # factors of a peak, and of its skirt, over the surro
 _REACH = 40  # frequencies on either side of a peak, which are its surroundings
 _MOST_PEAKS = 16  # each adds two shapes to the fit
 
-# minus the logarithm of the likelihood of each repair, its best gain, and its misfit: the mean
+# minus the logarithm of the likelihood of each guess, its best gain, and its misfit: the mean
 # deviance of a band, about 1 if the shapes suffice
 CoarseFit: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -87,40 +87,35 @@ class CoarseRecord:
         """Return the corrections of repaired commands as series, (frames, axes) [nm]."""
         return self._unturned(repair) @ repair.turn(self.record.axes).T
 
-    def compare(self, repairs: Sequence[CommandRepair]) -> CoarseFit:
-        """Return contrast and best gain of each repair, (axes, n) each, and its misfit, (n,)."""
-        corrections = np.array([self.transform(repair) for repair in repairs])
+    def compare(
+        self, repairs: Sequence[CommandRepair]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return contrast and best gain, (axes, n + 1), and misfit, (n + 1,), of n repairs.
+
+        The last column is of commands that do not reach the measurements.
+        """
+        transforms = [self.transform(repair) for repair in repairs]
+        corrections = np.array([*transforms, 0 * transforms[0]])
         fits = [self._fit_axis(i, corrections[:, i]) for i in range(self.record.axes)]
         contrast, gain, misfit = (np.array(values) for values in zip(*fits, strict=True))
         return contrast, gain, np.mean(misfit, axis=0)
 
-    def profile(self, repair: CommandRepair, gains: FloatArray) -> FloatArray:
-        """Return the contrasts (axes, n) at gains (axes, n)."""
-        pairs = enumerate(zip(self.transform(repair), gains, strict=True))
-        return np.array([self._axis(i, c[None]).fit_profile(g)[0] for i, (c, g) in pairs])
-
-    def unrelated(self) -> FloatArray:
-        """Return the contrast of each axis if commands do not reach the measurements, (axes,)."""
-        return self.profile(CommandRepair(), np.zeros((self.record.axes, 1)))[:, 0]
-
-    def _axis(self, i: int, corrections: ComplexArray) -> CoarseAxis:
-        """Return the bands of one axis, for all repairs of its corrections."""
-        return CoarseAxis(
-            self.frequency_hz,
-            self.measured[i],
-            corrections,
-            independent=self.independent,
-            frame_rate_hz=self.record.frame_rate_hz,
-        )
-
     def _fit_axis(self, i: int, corrections: ComplexArray) -> CoarseFit:
-        """Fit all repairs of one axis, from multiples of the gain that is natural for each."""
-        high = self.frequency_hz > 0.05 * self.record.frame_rate_hz
-        level = np.mean(abs(self.measured[i][:, high]) ** 2)
+        """Fit all guesses of one axis, from multiples of the gain that is natural for each."""
+        measured, rate = self.measured[i], self.record.frame_rate_hz
+        high = self.frequency_hz > 0.05 * rate
+        level = np.mean(abs(measured[:, high]) ** 2)
         steps = np.mean(abs(corrections[..., high]) ** 2, axis=(1, 2))
         rounding = np.finfo(float).eps ** 2 * level  # clipped commands may hardly move
         natural = np.sqrt(level / np.maximum(steps, max(rounding, np.finfo(float).tiny)))
-        return self._axis(i, corrections).fit_guesses(natural[:, None] * _NATURAL_GAINS)
+        axis = CoarseAxis(
+            self.frequency_hz,
+            measured,
+            corrections,
+            independent=self.independent,
+            frame_rate_hz=rate,
+        )
+        return axis.fit_guesses(natural[:, None] * _NATURAL_GAINS)
 
 
 def dispersion(misfit: float) -> float:
@@ -224,25 +219,15 @@ class CoarseAxis:
         skirts = [_resonance(square, centre, _LINE_DAMPING) for centre in centres]
         self.shapes = _shapes(square, frequency_hz[0], skirts)  # of at most 1, (k, b)
 
-    def fit_profile(self, gains: FloatArray) -> CoarseFit:
-        """Fit the spectrum with a single repair at each of its gains (n,)."""
-        return self._minimise(gains, np.zeros(gains.size, dtype=np.intp), free=False)
-
     def fit_guesses(self, starts: FloatArray) -> CoarseFit:
-        """Fit spectrum and gain of each repair, from each of its starting gains (repairs, s)."""
-        guesses, count = starts.shape
-        fits = self._minimise(starts.ravel(), np.repeat(np.arange(guesses), count), free=True)
-        best = np.argmin(fits[0].reshape(guesses, count), axis=1) + count * np.arange(guesses)
-        contrast, gain, misfit = (values[best] for values in fits)
-        return contrast, gain, misfit
-
-    def _minimise(self, gain: FloatArray, guess: IntArray, *, free: bool) -> CoarseFit:
-        """Return the least contrast of each row, its gain and its misfit.
+        """Fit spectrum and gain of each guess, from each of its starting gains (n, s).
 
         The amplitudes of the shapes follow multiplicative updates (C. Fevotte, N. Bertin, J.-L.
-        Durrieu, Neural Comput. 21, 793 (2009), doi:10.1162/neco.2008.04-08-771, algorithm 1), a
-        free gain follows Newton's steps with the expected curvature.
+        Durrieu, Neural Comput. 21, 793 (2009), doi:10.1162/neco.2008.04-08-771, algorithm 1), the
+        gain follows Newton's steps with the expected curvature.
         """
+        guesses, many = starts.shape
+        gain, guess = starts.ravel(), np.repeat(np.arange(guesses), many)
         bands, peaks, shapes = self.bands.row(guess), self.peaks.row(guess), self.shapes
         count, at_peaks = self.bands.count, self.peaks.count
         level = np.median(_power(bands, gain), axis=1)[:, None]
@@ -253,18 +238,18 @@ class CoarseAxis:
             a = a * ((weight * _power(bands, gain) / model) @ shapes.T) / (weight @ shapes.T)
             a = np.maximum(a, 1e-12 * np.max(a, axis=1, keepdims=True))
             model = a @ shapes
-            if free:
-                slope, steep = _slope(bands, gain) / model, _slope(peaks, gain)
-                steep = steep / _power(peaks, gain)
-                gradient = slope @ count + steep @ at_peaks
-                curvature = (bands.corrected / model) @ (2 * count) + steep**2 @ at_peaks
-                step = gradient / np.maximum(curvature, np.finfo(np.float64).tiny)
-                gain = np.clip(gain - step, gain / _LARGEST_STEP, gain * _LARGEST_STEP)
+            slope = _slope(bands, gain) / model
+            steep = _slope(peaks, gain) / _power(peaks, gain)
+            gradient = slope @ count + steep @ at_peaks
+            curvature = (bands.corrected / model) @ (2 * count) + steep**2 @ at_peaks
+            step = gradient / np.maximum(curvature, np.finfo(np.float64).tiny)
+            gain = np.clip(gain - step, gain / _LARGEST_STEP, gain * _LARGEST_STEP)
         ratio = _power(bands, gain) / model
         contrast = (np.log(model) + ratio) @ count
         contrast += (np.log(_power(peaks, gain)) + 1) @ at_peaks
-        deviance = 2 * count * (ratio - 1 - np.log(ratio))
-        return contrast, gain, np.asarray(np.mean(deviance, axis=1))
+        misfit = np.mean(2 * count * (ratio - 1 - np.log(ratio)), axis=1)
+        best = np.argmin(contrast.reshape(starts.shape), axis=1) + many * np.arange(guesses)
+        return contrast[best], gain[best], misfit[best]
 
 
 def _power(data: LoopPeriodogram, gain: FloatArray) -> FloatArray:

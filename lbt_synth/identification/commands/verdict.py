@@ -361,9 +361,10 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
     record = coarse.record
     repairs = list_repairs(record.axes, record.hardware.delay_frames, law, lag)
     axis_contrast, gain, misfit = coarse.compare(repairs)
+    axis_contrast, unrelated = axis_contrast[:, :-1], axis_contrast[:, -1]
     contrast = axis_contrast.sum(axis=0)
     spread = dispersion(float(misfit[np.argmin(contrast)]))
-    penalty, asked = _penalties(repairs, gain, record, law, lag)
+    penalty, asked = _penalties(repairs, gain[:, :-1], record, law, lag)
     best = int(np.argmin(contrast + spread * penalty))
     clear, nats = CLEAR * spread, float(contrast[0] - contrast[best])
     if asked[best]:
@@ -373,7 +374,7 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
             nats >= clear and _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] >= _ODD
         )
     best = best if is_shown else 0
-    saved = coarse.unrelated() - np.min(axis_contrast, axis=1)
+    saved = unrelated - np.min(axis_contrast, axis=1)
     followed = np.zeros(record.axes) if law is None else law.axis_coherence
     return _Choice(
         repairs[best],

@@ -38,21 +38,15 @@ def test_a_matrix_mixes_the_axes(coarse) -> None:
 
 def test_the_record_as_given_is_the_likeliest(coarse) -> None:
     axis_contrast, gain, misfit = coarse.compare(list_repairs(2, 2.0))
-    contrast = axis_contrast.sum(axis=0)
+    contrast = axis_contrast.sum(axis=0)[:-1]
     assert np.all(contrast[1:] > contrast[0] + 5)
     np.testing.assert_allclose(gain[:, 0], 0.7, rtol=0.1)
     assert misfit[0] < 2
 
 
-def test_other_gains_are_less_likely(coarse) -> None:
-    given = CommandRepair()
-    least, gain, _ = coarse.compare([given])
-    more = coarse.profile(given, np.array([[0.35, 0.7, 1.4]] * 2)) - least
-    assert np.all(more > -0.5)
-    assert np.all(more[:, [0, 2]] > 25)
-    own = coarse.profile(given, gain) - least
-    np.testing.assert_allclose(own, 0, atol=0.1)  # what fits end within
-    assert np.sum(coarse.unrelated()) > np.sum(least) + 100
+def test_commands_that_do_not_reach_the_measurements_are_less_likely(coarse) -> None:
+    contrast, _, _ = coarse.compare([CommandRepair()])
+    assert np.sum(contrast[:, 1]) > np.sum(contrast[:, 0]) + 100
 
 
 def white(seed: int, n: int = 1) -> np.ndarray:
@@ -83,8 +77,8 @@ def test_a_mean_slope_does_not_show() -> None:
 
 
 def test_the_contrast_of_white_noise_lies_between_its_bounds() -> None:
-    axis = axis_of(white(2)[:, 0], white(3))
-    (contrast,), _, (misfit,) = axis.fit_profile(np.zeros(1))
+    axis = axis_of(white(2)[:, 0], 0 * white(3))
+    (contrast,), _, (misfit,) = axis.fit_guesses(np.ones((1, 1)))
     power, count = axis.bands.measured, axis.bands.count
     rest = np.sum(axis.peaks.count * (np.log(axis.peaks.measured) + 1))
     least = np.sum(count * (np.log(power) + 1)) + rest
