@@ -89,9 +89,9 @@ def _running_gains(record: LoopRecord) -> tuple[float, float]:
     law = record_law(record)
     if law is None or law.kind == "none" or law.lag_frames < 0:
         return POSSIBLE_GAINS
-    gains, one = np.geomspace(*POSSIBLE_GAINS, _STEPS), np.ones((1, record.axes))
+    gains = np.geomspace(*POSSIBLE_GAINS, _STEPS)
     running = np.flatnonzero(
-        [could_have_run(CommandRepair(), gain * one, record, law) for gain in gains]
+        [could_have_run(CommandRepair(), [gain], record, law) for gain in gains]
     )
     if not running.size:
         return POSSIBLE_GAINS

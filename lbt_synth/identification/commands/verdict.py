@@ -7,7 +7,7 @@ not ask for the repair. The law alone decides on records that are too short for 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -68,7 +68,7 @@ _HIDES = 0.01  # part of their changes that commands leave unexplained, which mo
 _COARSE = 1.5  # factor by which a coarse gain may be wrong
 _LINES = 10  # at most, of a fit that tells gains apart: more of them take minutes
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
-_RAN = np.array([0.3, 0.7, 1.0])  # gains at which a loop may have run
+_RAN = (0.3, 0.7, 1.0)  # gains at which a loop may have run
 _ANY = np.geomspace(1.0, 1e-6, 19)  # gains of a loop that may be of no sensor
 
 
@@ -160,19 +160,19 @@ def explain_commands(
     delay = record.hardware.delay_frames  # refuses a record without one
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
-    gains = None if sensor_gain is None else record.known_gains(sensor_gain)
-    law, moves = record_law(record), _moving_axes(record.commands[record.usable])
-    if moves.any() and not moves.all():
-        one = replace(
-            record, measurements=record.measurements[:, moves], commands=record.commands[:, moves]
-        )
-        return _explain_moving(one, moves, law, gains)
-    refuse = partial(CommandVerdict, gain=np.full(record.axes, np.nan), law=law)
+    known = None if sensor_gain is None else record.known_gains(sensor_gain)
+    shown = record_law(record)
+    commands = record.commands[record.usable]
+    still = np.all(commands == commands[:1], axis=0)
+    if still.any() and not still.all():
+        return _explain_moving(record, record.commands, still, shown, known)
+    law = None if shown is None or shown.kind == "none" else shown
+    refuse = partial(CommandVerdict, gain=np.full(record.axes, np.nan), law=shown)
     sure = law if law is not None and law.is_sure else None
     if sure is not None and (doubt := _doubt_law(sure)):
         return refuse(explanation=doubt)
-    late = 0 if sure is None else sure.lag_frames
-    early, lag = max(-late, 0), max(late, 0)
+    lag = 0 if sure is None else sure.lag_frames
+    early, lag = max(-lag, 0), max(lag, 0)
     if early:  # corrections that follow from the future have no likelihood: they are moved first
         record = repair_commands(record, CommandRepair(shift_frames=early))
         law = None if sure is None else replace(sure, lag_frames=0)
@@ -180,31 +180,30 @@ def explain_commands(
     if not coarse.stretches:
         return _explain_by_law(refuse, record, law, early)
     plausible = PLAUSIBLE_GAINS
-    if gains is not None:
-        plausible = float(np.min(gains)) / _WRONG_GAIN, float(np.max(gains)) * _WRONG_GAIN
+    if known is not None:
+        plausible = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
     choice = _choose(coarse, law, lag)
     scale = np.ones(record.axes)
     if not choice.unrelated.any():
         scale = _scale(coarse, law, choice, plausible)
     if doubt := _doubt_choice(record, law, choice, scale):
         return refuse(explanation=doubt)
-    repair = choice.repair
-    off = repair.shift_frames and repair.shift_frames + lag
-    repair = replace(repair, shift_frames=early or (-lag if repair.shift_frames else 0))
+    off = choice.repair.shift_frames and choice.repair.shift_frames + lag
+    shift = early or (-lag if choice.repair.shift_frames else 0)
+    repair = replace(choice.repair, shift_frames=shift, scale=tuple(scale))
     words = repair.words()
     if off:
         words.append(f"the total delay is {delay + off:g} frames, not {delay:g}")
     if np.any(scale != 1):
         words.append(wrong_scale(scale, choice.gain))
-    shown = choice.gain / scale
-    hidden = (shown <= plausible[0] / _WRONG_GAIN) | (shown >= plausible[1] * _WRONG_GAIN)
-    return CommandVerdict(
+    gain = choice.gain / scale
+    hidden = (gain <= plausible[0] / _WRONG_GAIN) | (gain >= plausible[1] * _WRONG_GAIN)
+    return refuse(
         explanation=" and ".join(words) or AS_GIVEN,
-        repair=replace(repair, scale=tuple(scale)),
+        repair=repair,
         delay_frames=delay + off if off else None,
-        nats=max(choice.nats, 0.0),
-        gain=frozen_copy(np.where(hidden, np.nan, shown)),
-        law=law if not early else sure,
+        nats=choice.nats,
+        gain=frozen_copy(np.where(hidden, np.nan, gain)),
         notes=() if words else _note_law(delay, lag, _unexplained(law)),
     )
 
@@ -213,8 +212,7 @@ def _doubt_choice(
     record: LoopRecord, law: ControlLaw | None, choice: _Choice, scale: FloatArray
 ) -> str:
     """Return what the best repair and scale leave wrong, in words; empty if there is nothing."""
-    lawless = law is None or law.kind == "none"
-    if choice.unrelated.all() or (lawless and np.max(abs(np.log(scale))) > np.log(_ABSURD)):
+    if choice.unrelated.all() or (law is None and np.max(abs(np.log(scale))) > np.log(_ABSURD)):
         return "they have nothing to do with the measurements, as if of another night"
     if choice.unrelated.any():
         axis = int(np.argmax(choice.unrelated))
@@ -231,7 +229,7 @@ def _doubt_choice(
 
 def _unexplained(law: ControlLaw | None) -> str:
     """Return in words that the commands follow their law in part only; empty if they do."""
-    if law is None or law.kind == "none" or law.residual < _HIDES:
+    if law is None or law.residual < _HIDES:
         return ""
     return (
         f"their law leaves {100 * law.residual:.2g} % of their changes unexplained: they are "
@@ -270,13 +268,18 @@ def record_law(record: LoopRecord) -> ControlLaw | None:
 
 
 def _explain_moving(
-    record: LoopRecord, moves: BoolArray, law: ControlLaw | None, known: FloatArray | None
+    record: LoopRecord,
+    commands: FloatArray,
+    still: BoolArray,
+    law: ControlLaw | None,
+    known: FloatArray | None,
 ) -> CommandVerdict:
-    """Explain the commands of the axis that moves, of a record of it; the other loop was open."""
-    verdict = explain_commands(record, sensor_gain=None if known is None else known[moves].tolist())
-    gain = np.full(moves.size, np.nan)
-    gain[moves] = verdict.gain
-    note = f"the commands of axis {int(np.argmin(moves))} stand still: its loop was open"
+    """Explain the commands (frames, axes) of the axis that moves; the other loop was open."""
+    one = replace(record, measurements=record.measurements[:, ~still], commands=commands[:, ~still])
+    verdict = explain_commands(one, sensor_gain=None if known is None else known[~still].tolist())
+    gain = np.full(still.size, np.nan)
+    gain[~still] = verdict.gain
+    note = f"the commands of axis {int(np.argmax(still))} stand still: its loop was open"
     return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
 
 
@@ -284,22 +287,13 @@ def _explain_by_law(
     refuse: Callable[..., CommandVerdict], record: LoopRecord, law: ControlLaw | None, early: int
 ) -> CommandVerdict:
     """Return the verdict on commands whose likelihood no stretch is long enough to tell."""
-    repair = _GIVEN
-    if law is not None and law.exact:
-        repairs = list_repairs(record.axes, record.hardware.delay_frames)
-        ordinary = [repair for repair in repairs if not _is_unusual(repair, law, 0)]
-        repair = ordinary[0] if ordinary else _GIVEN
-    repair = replace(repair, shift_frames=early)
+    repairs = list_repairs(record.axes, record.hardware.delay_frames)
+    ordinary = [r for r in repairs if law is not None and law.exact and not _is_unusual(r, law, 0)]
+    repair = replace(next(iter(ordinary), _GIVEN), shift_frames=early)
     if repair.options:
         return refuse(explanation=f"by their law {' and '.join(repair.words())}", repair=repair)
     note = "the commands were not tested: no stretch of usable frames is long enough"
     return refuse(explanation=AS_GIVEN, notes=(note,))
-
-
-def _moving_axes(commands: FloatArray) -> BoolArray:
-    """Return the axes whose commands (frames, axes) move, (axes,); all of no frames."""
-    moves = np.ptp(commands, axis=0) > 0 if commands.size else np.ones(commands.shape[1])
-    return np.asarray(moves, dtype=np.bool_)
 
 
 def _doubt_law(law: ControlLaw) -> str:
@@ -335,13 +329,13 @@ def list_repairs(
     shifts += [-lag] if lag > MOST_SHIFT_FRAMES else []
     out += [CommandRepair(shift_frames=k) for k in shifts]
     out.append(CommandRepair(increments=True))
-    general = law is not None and law.is_sure and law.axes_kind == "general"
-    if law is not None and general and np.linalg.cond(law.gain) < _WORST_CONDITION:
+    if law is not None and law.is_sure and law.axes_kind == "general":
         # what undoes the gain of the law: a turn, and all of it
-        U, _, Vh = np.linalg.svd(law.gain)
-        inverse = np.linalg.inv(law.gain)
-        for undoing in ((U @ Vh).T, inverse / np.sqrt(abs(np.linalg.det(inverse)))):
-            out.append(CommandRepair(matrix=tuple(undoing.ravel().tolist())))
+        U, s, Vh = np.linalg.svd(law.gain)
+        if s[0] < _WORST_CONDITION * s[-1]:
+            for undone in (np.ones(2), np.sqrt(s[0] * s[1]) / s):
+                matrix = (Vh.T * undone) @ U.T
+                out.append(CommandRepair(matrix=tuple(matrix.ravel().tolist())))
     return out
 
 
@@ -351,7 +345,6 @@ class _Choice(NamedTuple):
     repair: CommandRepair
     gain: FloatArray  # (axes,), of the sensor with it
     nats: float  # by which it is likelier than the record as given
-    contrast: float
     clear: float  # nats that decide
     unrelated: BoolArray  # (axes,), of commands that follow no law and do not reach the axis
 
@@ -360,29 +353,27 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
     """Return the repair that law and likelihood ask for."""
     record = coarse.record
     repairs = list_repairs(record.axes, record.hardware.delay_frames, law, lag)
-    axis_contrast, gain, misfit = coarse.compare(repairs)
-    axis_contrast, unrelated = axis_contrast[:, :-1], axis_contrast[:, -1]
-    contrast = axis_contrast.sum(axis=0)
+    contrasts, gain, misfit = coarse.compare(repairs)
+    contrasts, unrelated = contrasts[:, :-1], contrasts[:, -1]
+    contrast = contrasts.sum(axis=0)
     spread = dispersion(float(misfit[np.argmin(contrast)]))
-    penalty, asked = _penalties(repairs, gain[:, :-1], record, law, lag)
+    penalty, asked = _penalties(repairs, gain, record, law, lag)
     best = int(np.argmin(contrast + spread * penalty))
-    clear, nats = CLEAR * spread, float(contrast[0] - contrast[best])
+    clear, nats = CLEAR * spread, contrast[0] - contrast
     if asked[best]:
-        is_shown = penalty[0] >= _SURPRISING or nats >= clear / 2
+        is_shown = penalty[0] >= _SURPRISING or nats[best] >= clear / 2
     else:
         is_shown = (
-            nats >= clear and _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] >= _ODD
+            nats[best] >= clear and _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] >= _ODD
         )
     best = best if is_shown else 0
-    saved = unrelated - np.min(axis_contrast, axis=1)
     followed = np.zeros(record.axes) if law is None else law.axis_coherence
     return _Choice(
         repairs[best],
         gain[:, best],
-        float(contrast[0] - contrast[best]),
-        float(contrast[best]),
+        max(float(nats[best]), 0.0),
         clear,
-        (followed < FOLLOWED) & (saved < clear),
+        (followed < FOLLOWED) & (unrelated - np.min(contrasts, axis=1) < clear),
     )
 
 
@@ -401,9 +392,8 @@ def _penalties(
     odd = np.array([_is_unusual(repair, law, lag) for repair in repairs])
     impossible = np.zeros(len(repairs), dtype=np.bool_)
     if law is not None and law.is_sure:
-        for i, (repair, gain) in enumerate(zip(repairs, gains.T, strict=True)):
-            tried = np.vstack([gain, _RAN[:, None] * np.ones(record.axes)])
-            impossible[i] = not could_have_run(repair, tried, record, law)
+        for i, repair in enumerate(repairs):
+            impossible[i] = not could_have_run(repair, [gains[:, i], *_RAN], record, law)
         impossible &= not impossible.all()
     odd |= impossible
     asked = ~odd & odd[0]
@@ -419,7 +409,7 @@ def _penalties(
 def _is_unusual(repair: CommandRepair, law: ControlLaw | None, lag: int) -> bool:
     """Return whether a repair makes the control law one that no one would run."""
     shift = repair.shift_frames
-    if law is None or law.kind == "none":
+    if law is None:
         return shift != 0
     if shift:
         return shift != -lag or lag == 0
@@ -433,9 +423,9 @@ def _is_unusual(repair: CommandRepair, law: ControlLaw | None, lag: int) -> bool
 
 
 def could_have_run(
-    repair: CommandRepair, gains: FloatArray, record: LoopRecord, law: ControlLaw
+    repair: CommandRepair, gains: Iterable[FloatArray | float], record: LoopRecord, law: ControlLaw
 ) -> bool:
-    """Return whether the recorded law would have been stable at any gains (n, axes)."""
+    """Return whether the recorded law would have been stable at any gain, of all or each axis."""
     if repair.increments:
         return True  # another law computes the positions
     controller = law_controller(law, record.frame_rate_hz)
@@ -444,7 +434,8 @@ def could_have_run(
         delay_frames=max(record.hardware.delay_frames + repair.shift_frames, 1.0),
         influence_matrix=repair.turn(record.axes),
     )
-    paths = (replace(path, sensor_matrix=np.diag(gain)) for gain in gains)
+    one = np.ones(record.axes)
+    paths = (replace(path, sensor_matrix=np.diag(gain * one)) for gain in gains)
     return any(_moving_radius(path, controller) < 1 for path in paths)
 
 
@@ -469,8 +460,7 @@ def _doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray
     """
     if law is None or not law.exact or law.order > SHORT_ORDER:
         return ""
-    tried = np.vstack([gains, 0.3 * gains, 0.1 * gains, *(_ANY[:, None] * np.ones(record.axes))])
-    if could_have_run(_GIVEN, tried, record, law):
+    if could_have_run(_GIVEN, [gains, 0.3 * gains, 0.1 * gains, *_ANY], record, law):
         return ""
     return (
         "a loop with the law that they follow is unstable at any sensor gain. Check what the "
@@ -528,7 +518,7 @@ def _scale(
     centre = float(np.mean(np.log(gains)))
     inside = np.geomspace(low, high, 8)
     if law is not None and law.is_sure:
-        if not could_have_run(choice.repair, inside[:, None] * one, coarse.record, law):
+        if not could_have_run(choice.repair, inside, coarse.record, law):
             return likely_factors(gains, plausible)
         if centre < np.log(low):
             return one  # commands that are too large come from a law that is too strong
