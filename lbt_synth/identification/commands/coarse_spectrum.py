@@ -31,7 +31,6 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 MOST_SHIFT_FRAMES = 3  # by which commands are tried earlier and later
 SEGMENT_S = 6.0  # resolves lines 0.3 Hz apart, and leaves several segments of half a minute
 CLEAR = 20.0  # nats that decide
-_ENOUGH = 1.5  # mean deviance of a band that the coarse spectrum describes
 _SHORTEST_SEGMENT = 2 * SHORTEST_SEGMENT  # frames, where the record has them
 _MOST_SEGMENTS = 24  # more make the answer slower and not another one
 _NATURAL_GAINS = np.array([0.08, 0.28, 0.8])  # starts, of the gain that makes powers equal
@@ -47,9 +46,8 @@ _PEAK, _SKIRT = 3.0, 1.25  # factors of a peak, and of its skirt, over the surro
 _REACH = 40  # frequencies on either side of a peak, which are its surroundings
 _MOST_PEAKS = 16  # each adds two shapes to the fit
 
-# minus the logarithm of the likelihood of each guess, its best gain, and its misfit: the mean
-# deviance of a band, about 1 if the shapes suffice
-CoarseFit: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+# minus the logarithm of the likelihood of each guess, and its best gain
+CoarseFit: TypeAlias = tuple[FloatArray, FloatArray]
 
 
 class CoarseRecord:
@@ -87,18 +85,16 @@ class CoarseRecord:
         """Return the corrections of repaired commands as series, (frames, axes) [nm]."""
         return self._unturned(repair) @ repair.turn(self.record.axes).T
 
-    def compare(
-        self, repairs: Sequence[CommandRepair]
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return contrast and best gain, (axes, n + 1), and misfit, (n + 1,), of n repairs.
+    def compare(self, repairs: Sequence[CommandRepair]) -> CoarseFit:
+        """Return contrast and best gain of n repairs, (axes, n + 1).
 
         The last column is of commands that do not reach the measurements.
         """
         transforms = [self.transform(repair) for repair in repairs]
         corrections = np.array([*transforms, 0 * transforms[0]])
         fits = [self._fit_axis(i, corrections[:, i]) for i in range(self.record.axes)]
-        contrast, gain, misfit = (np.array(values) for values in zip(*fits, strict=True))
-        return contrast, gain, np.mean(misfit, axis=0)
+        contrast, gain = (np.array(values) for values in zip(*fits, strict=True))
+        return contrast, gain
 
     def _fit_axis(self, i: int, corrections: ComplexArray) -> CoarseFit:
         """Fit all guesses of one axis, from multiples of the gain that is natural for each."""
@@ -116,11 +112,6 @@ class CoarseRecord:
             frame_rate_hz=rate,
         )
         return axis.fit_guesses(natural[:, None] * _NATURAL_GAINS)
-
-
-def dispersion(misfit: float) -> float:
-    """Return the factor by which a misfit raises what decides, at least 1."""
-    return max(1.0, misfit / _ENOUGH)
 
 
 def _segments(stretches: Sequence[tuple[int, int]], frame_rate_hz: float) -> IntArray:
@@ -247,9 +238,8 @@ class CoarseAxis:
         ratio = _power(bands, gain) / model
         contrast = (np.log(model) + ratio) @ count
         contrast += (np.log(_power(peaks, gain)) + 1) @ at_peaks
-        misfit = np.mean(2 * count * (ratio - 1 - np.log(ratio)), axis=1)
         best = np.argmin(contrast.reshape(starts.shape), axis=1) + many * np.arange(guesses)
-        return contrast[best], gain[best], misfit[best]
+        return contrast[best], gain[best]
 
 
 def _power(data: LoopPeriodogram, gain: FloatArray) -> FloatArray:

@@ -7,12 +7,12 @@ not ask for the repair. The law alone decides on records that are too short for 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,6 @@ from lbt_synth.identification.commands.coarse_spectrum import (
     MOST_SHIFT_FRAMES,
     SEGMENT_S,
     CoarseRecord,
-    dispersion,
 )
 from lbt_synth.identification.commands.control_law import (
     FOLLOWED,
@@ -178,7 +177,7 @@ def explain_commands(
         law = None if sure is None else replace(sure, lag_frames=0)
     coarse = CoarseRecord(record)
     if not coarse.stretches:
-        return _explain_by_law(refuse, record, law, early)
+        return replace(refuse(explanation=AS_GIVEN), **_explain_by_law(record, law, early))
     plausible = PLAUSIBLE_GAINS
     if known is not None:
         plausible = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
@@ -217,8 +216,12 @@ def _doubt_choice(
     if choice.unrelated.any():
         axis = int(np.argmax(choice.unrelated))
         return f"those of axis {axis} have nothing to do with its measurements"
-    if choice.repair == _GIVEN and (doubt := _doubt_running(record, law, choice.gain)):
-        return doubt
+    ran = law is None or not law.exact or law.order > SHORT_ORDER or choice.repair != _GIVEN
+    if not ran and law is not None and not could_have_run(_GIVEN, _ANY, record, law):
+        return (
+            "a loop with the law that they follow is unstable at any sensor gain. Check what the "
+            "series are"
+        )
     if np.any(scale < 1) and (hiding := _unexplained(law)):
         return (
             f"{hiding}, which hides the sensor gain. Record more digits, cut the record, or give "
@@ -283,17 +286,15 @@ def _explain_moving(
     return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
 
 
-def _explain_by_law(
-    refuse: Callable[..., CommandVerdict], record: LoopRecord, law: ControlLaw | None, early: int
-) -> CommandVerdict:
-    """Return the verdict on commands whose likelihood no stretch is long enough to tell."""
+def _explain_by_law(record: LoopRecord, law: ControlLaw | None, early: int) -> dict[str, Any]:
+    """Return what differs in the verdict where no stretch is long enough for a likelihood."""
     repairs = list_repairs(record.axes, record.hardware.delay_frames)
     ordinary = [r for r in repairs if law is not None and law.exact and not _is_unusual(r, law, 0)]
     repair = replace(next(iter(ordinary), _GIVEN), shift_frames=early)
     if repair.options:
-        return refuse(explanation=f"by their law {' and '.join(repair.words())}", repair=repair)
+        return {"explanation": f"by their law {' and '.join(repair.words())}", "repair": repair}
     note = "the commands were not tested: no stretch of usable frames is long enough"
-    return refuse(explanation=AS_GIVEN, notes=(note,))
+    return {"notes": (note,)}
 
 
 def _doubt_law(law: ControlLaw) -> str:
@@ -305,11 +306,11 @@ def _doubt_law(law: ControlLaw) -> str:
             f"those of axis {late} follow their measurements {frames} later than those of axis "
             f"{1 - late}; move one of them"
         )
-    steady = np.linalg.norm(np.sum(law.taps, axis=1), axis=1)
     largest = np.sum(np.linalg.norm(law.taps, axis=2), axis=1)
-    if law.order <= 1 and np.all(_WORST_CONDITION * steady < largest):
+    steady = np.sum(law.taps, axis=1) / largest[:, None]
+    if law.order <= 1 and np.max(abs(steady)) < 1 / _WORST_CONDITION:
         return "they follow from the changes of the measurements, as if both had been exchanged"
-    if np.all(followed) and np.linalg.cond(law.gain / largest[:, None]) > _WORST_CONDITION:
+    if np.all(followed) and np.linalg.cond(steady) > _WORST_CONDITION:
         return "those of both axes follow the same measurements: one axis was recorded twice"
     return ""
 
@@ -340,12 +341,11 @@ def list_repairs(
 
 
 class _Choice(NamedTuple):
-    """The best repair of the commands, and how clear it is."""
+    """The best repair of the commands."""
 
     repair: CommandRepair
     gain: FloatArray  # (axes,), of the sensor with it
     nats: float  # by which it is likelier than the record as given
-    clear: float  # nats that decide
     unrelated: BoolArray  # (axes,), of commands that follow no law and do not reach the axis
 
 
@@ -353,18 +353,17 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
     """Return the repair that law and likelihood ask for."""
     record = coarse.record
     repairs = list_repairs(record.axes, record.hardware.delay_frames, law, lag)
-    contrasts, gain, misfit = coarse.compare(repairs)
+    contrasts, gain = coarse.compare(repairs)
     contrasts, unrelated = contrasts[:, :-1], contrasts[:, -1]
     contrast = contrasts.sum(axis=0)
-    spread = dispersion(float(misfit[np.argmin(contrast)]))
     penalty, asked = _penalties(repairs, gain, record, law, lag)
-    best = int(np.argmin(contrast + spread * penalty))
-    clear, nats = CLEAR * spread, contrast[0] - contrast
+    best = int(np.argmin(contrast + penalty))
+    nats = contrast[0] - contrast
     if asked[best]:
-        is_shown = penalty[0] >= _SURPRISING or nats[best] >= clear / 2
+        is_shown = penalty[0] >= _SURPRISING or nats[best] >= CLEAR / 2
     else:
         is_shown = (
-            nats[best] >= clear and _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] >= _ODD
+            nats[best] >= CLEAR and _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] >= _ODD
         )
     best = best if is_shown else 0
     followed = np.zeros(record.axes) if law is None else law.axis_coherence
@@ -372,8 +371,7 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
         repairs[best],
         gain[:, best],
         max(float(nats[best]), 0.0),
-        clear,
-        (followed < FOLLOWED) & (unrelated - np.min(contrasts, axis=1) < clear),
+        (followed < FOLLOWED) & (unrelated - np.min(contrasts, axis=1) < CLEAR),
     )
 
 
@@ -453,21 +451,6 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     return float(np.max(abs(poles[moves]))) if moves.any() else np.inf
 
 
-def _doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray) -> str:
-    """Return that no loop has run with the law of these commands at any gain, in words.
-
-    ``gains`` (axes,) are the likeliest ones.
-    """
-    if law is None or not law.exact or law.order > SHORT_ORDER:
-        return ""
-    if could_have_run(_GIVEN, [gains, 0.3 * gains, 0.1 * gains, *_ANY], record, law):
-        return ""
-    return (
-        "a loop with the law that they follow is unstable at any sensor gain. Check what the "
-        "series are"
-    )
-
-
 def _fit(
     coarse: CoarseRecord, repair: CommandRepair, held: FloatArray | None = None
 ) -> tuple[float, FloatArray]:
@@ -523,7 +506,7 @@ def _scale(
         if centre < np.log(low):
             return one  # commands that are too large come from a law that is too strong
     nearest = inside[np.argmin(abs(np.log(inside) - centre))]
-    if _fit(coarse, scaled, nearest / choice.gain)[0] - free < choice.clear:
+    if _fit(coarse, scaled, nearest / choice.gain)[0] - free < CLEAR:
         return one  # a plausible gain is nearly as likely
     return likely_factors(gains, plausible)
 

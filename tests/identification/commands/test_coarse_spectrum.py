@@ -37,15 +37,14 @@ def test_a_matrix_mixes_the_axes(coarse) -> None:
 
 
 def test_the_record_as_given_is_the_likeliest(coarse) -> None:
-    axis_contrast, gain, misfit = coarse.compare(list_repairs(2, 2.0))
+    axis_contrast, gain = coarse.compare(list_repairs(2, 2.0))
     contrast = axis_contrast.sum(axis=0)[:-1]
     assert np.all(contrast[1:] > contrast[0] + 5)
     np.testing.assert_allclose(gain[:, 0], 0.7, rtol=0.1)
-    assert misfit[0] < 2
 
 
 def test_commands_that_do_not_reach_the_measurements_are_less_likely(coarse) -> None:
-    contrast, _, _ = coarse.compare([CommandRepair()])
+    contrast, _ = coarse.compare([CommandRepair()])
     assert np.sum(contrast[:, 1]) > np.sum(contrast[:, 0]) + 100
 
 
@@ -78,14 +77,13 @@ def test_a_mean_slope_does_not_show() -> None:
 
 def test_the_contrast_of_white_noise_lies_between_its_bounds() -> None:
     axis = axis_of(white(2)[:, 0], 0 * white(3))
-    (contrast,), _, (misfit,) = axis.fit_guesses(np.ones((1, 1)))
+    (contrast,), _ = axis.fit_guesses(np.ones((1, 1)))
     power, count = axis.bands.measured, axis.bands.count
     rest = np.sum(axis.peaks.count * (np.log(axis.peaks.measured) + 1))
     least = np.sum(count * (np.log(power) + 1)) + rest
     mean = np.average(power, weights=count)
     only_noise = np.sum(count) * (np.log(mean) + 1) + rest
     assert least < contrast <= only_noise + 0.1
-    assert misfit == pytest.approx(1.0, abs=0.4)
 
 
 def test_bands_are_as_wide_beside_a_peak_at_the_lowest_frequencies() -> None:
@@ -112,7 +110,7 @@ def test_the_right_correction_is_found_with_its_gain() -> None:
         u[k] = u[k - 1] + 0.5 * y[k]
     guesses = np.column_stack([np.roll(u, 2), 1e-3 * np.roll(u, 2), np.roll(u, 3), -np.roll(u, 2)])
     starts = np.array([[0.3, 1.0], [300.0, 1000.0], [0.3, 1.0], [0.3, 1.0]])
-    contrast, gain, _ = axis_of(y, guesses).fit_guesses(starts)
+    contrast, gain = axis_of(y, guesses).fit_guesses(starts)
     assert gain[0] == pytest.approx(0.6, rel=0.1)
     assert gain[1] == pytest.approx(1000 * gain[0], rel=0.01)
     assert contrast[1] == pytest.approx(contrast[0], abs=0.5)
