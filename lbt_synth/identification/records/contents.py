@@ -33,14 +33,11 @@ TEXTS = (".csv", ".tsv", ".txt", ".dat")
 ENDINGS = (*FITS, ".npy", ".npz", *TEXTS)
 _GAPS = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
 _DELIMITERS = (";", "\t", ",", "|")  # else blanks
-# The roles that make each kind of record: of its series, the first that there is, and beside them.
-_ROLES_OF_KIND: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "closed_loop": (("measurements",), ("commands",)),
-    "open_loop": (("open_loop",), ()),
-    "spectrum": (("density", "amplitude"), ("frequency",)),
+KINDS = {  # and the roles that make a record of each, the first that of its series
+    "closed_loop": ("measurements", "commands"),
+    "open_loop": ("open_loop",),
+    "spectrum": ("density", "frequency"),
 }
-_DENSITIES = {"density", "amplitude"}
-KINDS = tuple(_ROLES_OF_KIND)
 CLOCKS = ("frame_numbers", "times")
 
 Roles = dict[str, list[Column]]
@@ -271,12 +268,11 @@ def select_series(
         series = roles["measurements"]
         named = len({column.axis for column in series} - {None}) == len(series)
         roles["open_loop"] = number_axes(series) if _are_axes(series) and not named else series
-    needed = _needed_roles(roles, kind)
-    if not needed:
-        names = [_ROLES_OF_KIND[kind][0][0], *_ROLES_OF_KIND[kind][1]]
+    needed = KINDS[kind]
+    if not all(role in roles for role in needed):
         raise ProblemError(
-            f"a record of kind {kind} needs columns of {' and '.join(names)}"
-            + _how_to_choose(contents, *names)
+            f"a record of kind {kind} needs columns of {' and '.join(needed)}"
+            + _how_to_choose(contents, *needed)
         )
     clocks = [role for role in CLOCKS if role in roles and kind != "spectrum"]
     chosen = {role: _choose_columns(roles[role], role, axes) for role in [*needed, *clocks]}
@@ -292,13 +288,6 @@ def select_series(
 def number_axes(columns: Sequence[Column]) -> list[Column]:
     """Return columns numbered as axes, in their order."""
     return [replace(column, axis=axis) for axis, column in enumerate(columns)]
-
-
-def _needed_roles(roles: Roles, kind: str) -> list[str]:
-    """Return the roles that make a record of a kind, none where one is missing."""
-    series, beside = _ROLES_OF_KIND[kind]
-    first = [role for role in series if role in roles][:1]
-    return [*first, *beside] if first and all(role in roles for role in beside) else []
 
 
 def _assign_roles(columns: Sequence[Column], chosen: Mapping[str, Any] | None) -> Roles:
@@ -317,9 +306,8 @@ def _assign_roles(columns: Sequence[Column], chosen: Mapping[str, Any] | None) -
     taken = [id(column.values) for of in out.values() for column in of]
     if len(set(taken)) < len(taken):
         raise ProblemError("a column was chosen twice in columns.")
-    fixed = {*chosen, *(_DENSITIES if _DENSITIES & set(chosen) else ())}
     for column in columns:
-        if column.role is not None and column.role not in fixed and id(column.values) not in taken:
+        if column.role is not None and column.role not in chosen and id(column.values) not in taken:
             out.setdefault(column.role, []).append(column)
     return {role: of for role, of in out.items() if of}
 
@@ -361,7 +349,7 @@ def _are_axes(columns: Sequence[Column]) -> bool:
 
 def _find_kind(roles: Roles, contents: Contents) -> str:
     """Return the kind of record that the names tell."""
-    kinds = [kind for kind in KINDS if _needed_roles(roles, kind)]
+    kinds = [kind for kind, needed in KINDS.items() if all(role in roles for role in needed)]
     if len(kinds) == 1:
         return kinds[0]
     if kinds:

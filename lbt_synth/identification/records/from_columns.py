@@ -166,12 +166,11 @@ def build_spectrum(
     roles: Roles, contents: Contents, *, unit: str | None, source: str, **given: Any
 ) -> SpectrumRecord:
     """Make a record of densities; ``given`` are facts, None where the source has to tell."""
-    role, densities = next(iter(roles.items()))
-    (frequency,) = roles["frequency"]
+    densities, (frequency,) = roles["density"], roles["frequency"]
     names = ("frame_rate_hz", "diameter_m", "averages")
     facts = {name: _find_fact(contents, name, given[name]) for name in names}
     own_unit = _find_unit(densities, unit, contents)
-    _require_facts(roles, {role: own_unit}, facts, "spectrum")
+    _require_facts(roles, {"density": own_unit}, facts, "spectrum")
     parted = density_unit(own_unit)
     if parted is None:
         raise ProblemError(
@@ -179,11 +178,6 @@ def build_spectrum(
             f"over sqrt(Hz) (nm/sqrt(Hz)); got {own_unit!r}."
         )
     name, power = parted
-    if role == "amplitude" and power == 2:
-        raise ProblemError(
-            f"{densities[0].name} is named as an amplitude, but has the unit {own_unit!r} of a "
-            "power; choose by columns={'density': ...}."
-        )
     if not frequency.unit:
         contents.notes.append("frequencies were taken for Hz")
     table = _stack_columns([frequency, *densities])

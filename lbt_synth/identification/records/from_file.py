@@ -79,7 +79,7 @@ def load_record(
         Which columns of several, or which modes of telemetry, are the axes; from 0.
     columns : mapping, optional
         What names do not tell: names or numbers (from 0) of columns under "measurements",
-        "open_loop", "commands", "times", "frame_numbers", "frequency", "density" or "amplitude".
+        "open_loop", "commands", "times", "frame_numbers", "frequency" or "density".
     commands : path-like, optional
         Another file, with the commands. Rows are matched by the frame counters of both files,
         or else by the times of both; without a common clock, row by row.
@@ -116,7 +116,7 @@ def load_record(
         "mirror": mirror,
     }
     if kind is not None:
-        choice(kind, "kind", KINDS)
+        choice(kind, "kind", tuple(KINDS))
     of_telemetry = kind in (None, "closed_loop") and columns is None and commands is None
     if isinstance(source, Telemetry):
         _require_series(of_telemetry, averages)

@@ -110,7 +110,6 @@ def test_gaps_of_every_kind():
         ("stuck", "measurements", 0, 40, 500, True),
         ("not finite", "measurements", 1, 3, 200, True),
     ]
-    assert not seen.health.clean
     assert seen.health.usable == np.sum(seen.usable) == 2000 - 44
     assert seen.stretches() == ((0, 100), (101, 200), (203, 500), (540, 2000))
     assert np.all(np.isfinite(seen.measurements))
