@@ -57,17 +57,16 @@ from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_ins
 AS_GIVEN = "as given"
 _FIND = "find the commands that belong to these measurements"
 _GIVEN = CommandRepair()
+_COARSE = 1.5  # factor by which a coarse gain may be wrong
 _ODD = CLEAR / 2  # nats that what no law asks for must add, by the model of the fit as well
 _SURPRISING = 3 * CLEAR  # nats that overrule a law with errors
 _ABSURD = 3e4  # scale of commands without a law, which are rather of another night
 _WRONG_GAIN = 2.0  # factor beyond a given or plausible gain, which a coarse one does not reach
-_WORST_CONDITION = 100.0  # of the gain of a law: beyond, it has no inverse
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
-_HIDES = 0.01  # part of their changes that commands leave unexplained, which moves a gain by 10 %
-_COARSE = 1.5  # factor by which a coarse gain may be wrong
+_LITTLE = 0.01  # of the gain of a law, which has no inverse; or of the changes of commands, which
+# moves a gain by 10 % if the law leaves them
 _LINES = 10  # at most, of a fit that tells gains apart: more of them take minutes
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
-_RAN = (0.3, 0.7, 1.0)  # gains at which a loop may have run
 _ANY = np.geomspace(1.0, 1e-6, 19)  # gains of a loop that may be of no sensor
 
 
@@ -232,7 +231,7 @@ def _doubt_choice(
 
 def _unexplained(law: ControlLaw | None) -> str:
     """Return in words that the commands follow their law in part only; empty if they do."""
-    if law is None or law.residual < _HIDES:
+    if law is None or law.residual < _LITTLE:
         return ""
     return (
         f"their law leaves {100 * law.residual:.2g} % of their changes unexplained: they are "
@@ -308,9 +307,9 @@ def _doubt_law(law: ControlLaw) -> str:
         )
     largest = np.sum(np.linalg.norm(law.taps, axis=2), axis=1)
     steady = np.sum(law.taps, axis=1) / largest[:, None]
-    if law.order <= 1 and np.max(abs(steady)) < 1 / _WORST_CONDITION:
+    if law.order <= 1 and np.max(abs(steady)) < _LITTLE:
         return "they follow from the changes of the measurements, as if both had been exchanged"
-    if np.all(followed) and np.linalg.cond(steady) > _WORST_CONDITION:
+    if np.all(followed) and np.linalg.cond(steady) > 1 / _LITTLE:
         return "those of both axes follow the same measurements: one axis was recorded twice"
     return ""
 
@@ -333,7 +332,7 @@ def list_repairs(
     if law is not None and law.is_sure and law.axes_kind == "general":
         # what undoes the gain of the law: a turn, and all of it
         U, s, Vh = np.linalg.svd(law.gain)
-        if s[0] < _WORST_CONDITION * s[-1]:
+        if s[-1] > _LITTLE * s[0]:
             for undone in (np.ones(2), np.sqrt(s[0] * s[1]) / s):
                 matrix = (Vh.T * undone) @ U.T
                 out.append(CommandRepair(matrix=tuple(matrix.ravel().tolist())))
@@ -391,7 +390,9 @@ def _penalties(
     impossible = np.zeros(len(repairs), dtype=np.bool_)
     if law is not None and law.is_sure:
         for i, repair in enumerate(repairs):
-            impossible[i] = not could_have_run(repair, [gains[:, i], *_RAN], record, law)
+            impossible[i] = not could_have_run(
+                repair, [gains[:, i], TYPICAL_GAIN, *PLAUSIBLE_GAINS], record, law
+            )
         impossible &= not impossible.all()
     odd |= impossible
     asked = ~odd & odd[0]
