@@ -477,28 +477,18 @@ def law_controller(law: ControlLaw, frame_rate_hz: float) -> Controller:
     """
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     if law.kind == "none" or law.lag_frames < 0:
-        why = (
-            "the commands do not follow from the measurements"
-            if law.kind == "none"
-            else f"its commands know measurements of {-law.lag_frames} frames later"
-        )
-        raise ProblemError(f"a controller needs a law that can run; got one where {why}.")
-    axes, lags = len(law.gain), law.taps.shape[1]
-    one, last = np.eye(axes), law.lag_frames + lags - 1
+        raise ProblemError(f"a controller needs a law that can run; got {law.name}{law.lag_text}.")
+    axes, last = len(law.gain), law.lag_frames + law.taps.shape[1] - 1
     slots = max(law.order, 1)  # of u(k-1), u(k-2), ...; then last of y(k-1), y(k-2), ...
-    # each slot moves to the next one of its kind
-    shift = np.eye(slots + last, k=-1)
+    shift = np.eye(slots + last, k=-1)  # each slot moves to the next one of its kind
     shift[slots : slots + 1] = 0.0
-    A = np.asarray(np.kron(shift, one), dtype=np.float64)
-    B = np.zeros((len(A), axes))
+    A = np.asarray(np.kron(shift, np.eye(axes)), dtype=np.float64)
+    taps = np.concatenate([np.zeros((axes, law.lag_frames, axes)), law.taps], axis=1)
     for j in range(law.order):
         A[:axes, axes * j : axes * (j + 1)] = np.diag(law.past[:, j])
-    for lag in range(law.lag_frames, last + 1):
-        if lag:
-            column = axes * (slots + lag - 1)
-            A[:axes, column : column + axes] += law.taps[:, lag - law.lag_frames]
-        else:
-            B[:axes] += law.taps[:, 0]
+    A[:axes, axes * slots :] = taps[:, 1:].reshape(axes, -1)
+    B = np.zeros((len(A), axes))
+    B[:axes] = taps[:, 0]
     if last:
-        B[axes * slots : axes * (slots + 1)] = one
+        B[axes * slots : axes * (slots + 1)] = np.eye(axes)
     return Controller(A=A, B=B, C=np.eye(axes, len(A)), D=np.zeros((axes, axes)), dt_s=1 / rate)
