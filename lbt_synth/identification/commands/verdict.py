@@ -60,7 +60,6 @@ _GIVEN = CommandRepair()
 _COARSE = 1.5  # factor by which a coarse gain may be wrong
 _ODD = CLEAR / 2  # nats that what no law asks for must add, by the model of the fit as well
 _SURPRISING = 3 * CLEAR  # nats that overrule a law with errors
-_ABSURD = 3e4  # scale of commands without a law, which are rather of another night
 _WRONG_GAIN = 2.0  # factor beyond a given or plausible gain, which a coarse one does not reach
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
 _LITTLE = 0.01  # of the gain of a law, which has no inverse; or of the changes of commands, which
@@ -210,7 +209,7 @@ def _doubt_choice(
     record: LoopRecord, law: ControlLaw | None, choice: _Choice, scale: FloatArray
 ) -> str:
     """Return what the best repair and scale leave wrong, in words; empty if there is nothing."""
-    if choice.unrelated.all() or (law is None and np.max(abs(np.log(scale))) > np.log(_ABSURD)):
+    if choice.unrelated.all():
         return "they have nothing to do with the measurements, as if of another night"
     if choice.unrelated.any():
         axis = int(np.argmax(choice.unrelated))

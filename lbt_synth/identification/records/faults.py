@@ -14,6 +14,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.special import ndtri
 
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.storage.rows import column, percent_column, table_row
 from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
@@ -23,7 +24,7 @@ _MANY_RUNS = 100  # needed to compute a chance
 _LIMIT_RATIO = 4  # of values at an end of the range over those at each of as many next levels
 _OUTLIER = 6.5  # standard deviations of the second difference: 1e-4 clean frames in a million
 MAD = 1 / float(ndtri(0.75))  # standard deviation of a normal law over its median deviation
-_BLOCK = 256  # frames of a local scale
+_BLOCK = SHORTEST_SEGMENT  # frames of a local scale
 
 
 def runs(flags: BoolArray) -> IntArray:

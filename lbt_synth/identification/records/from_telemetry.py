@@ -19,7 +19,7 @@ from lbt_synth.validation import FloatArray
 
 _FACTS = ("frame_rate_hz", "delay_frames", "diameter_m", "obstruction")
 _FOREIGN = "timing"  # key of metadata in telemetry of other programs
-_CONDITION = 1e8  # of a response, beyond which its inverse is rounding
+_CONDITION = float(np.finfo(np.float64).eps ** -0.5)  # beyond, an inverse is half rounding
 
 
 def telemetry_record(

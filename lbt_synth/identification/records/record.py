@@ -34,7 +34,7 @@ BRIDGED_FRAMES = 3  # of a hole, over which a slow phase is a cubic
 _BRIDGED_FRACTION = 0.01  # of a record, whose noise may be less than that of the others
 NOT_KNOWN = "correction not known"
 _Delay: TypeAlias = Annotated[float, ("at_least", 1), ("at_most", 100)]
-_LEAST_FRAMES = 1024  # half of which, two segments, show a model to be tested on the others
+_LEAST_FRAMES = 4 * SHORTEST_SEGMENT  # half of which show a model to be tested on the others
 LEAST_SECONDS = 2.0  # slower turbulence moves no filter by much
 
 
