@@ -33,18 +33,17 @@ SEGMENT_S = 6.0  # resolves lines 0.3 Hz apart, and leaves several segments of h
 CLEAR = 20.0  # nats that decide
 _SHORTEST_SEGMENT = 2 * SHORTEST_SEGMENT  # frames, where the record has them
 _MOST_SEGMENTS = 24  # more make the answer slower and not another one
-_NATURAL_GAINS = np.array([0.08, 0.28, 0.8])  # starts, of the gain that makes powers equal
+_NATURAL_GAINS = np.array([0.1, 0.3, 1.0])  # starts, of the gain that makes powers equal
 _BAND = 0.06  # of its frequency: width of a band, in which turbulence is a straight line
 _SHAPES_HZ = np.geomspace(1.5, 25.0, 8)  # of wide resonances, each as wide as their distance
 _SHAPE_DAMPING = 0.5 * float(np.log(_SHAPES_HZ[1] / _SHAPES_HZ[0]))
-_CORNERS, _FASTEST_HZ = 5, 6.0  # of turbulence, up to that of an 8 m telescope
+_FASTEST_HZ = 6.0  # corner of the turbulence of an 8 m telescope
 _LINE_DAMPING = 0.004  # of the skirts of a line, which do not show it
-_SMALLEST = 1e-9  # of the measured power: what a noise-free record leaves of rounding
+_SMALLEST = float(np.finfo(np.float32).eps)  # of the measured power: rounding without noise
 _PASSES = 400  # of the fit, after which no contrast moves by a tenth of what decides
 _LARGEST_STEP = 1.2  # factor on a gain
 _PEAK, _SKIRT = 3.0, 1.25  # factors of a peak, and of its skirt, over the surroundings
 _REACH = 40  # frequencies on either side of a peak, which are its surroundings
-_MOST_PEAKS = 16  # each adds two shapes to the fit
 
 # minus the logarithm of the likelihood of each guess, and its best gain
 CoarseFit: TypeAlias = tuple[FloatArray, FloatArray]
@@ -136,8 +135,7 @@ def find_spectral_peaks(
     above = log - median_filter(log, size=2 * _REACH + 1, mode="nearest")
     region, count = label(above > np.log(_SKIRT))
     height = np.array(maximum(above, region, np.arange(1, count + 1)), dtype=np.float64)
-    strongest = np.argsort(-height, kind="stable")[:_MOST_PEAKS]
-    peaks = 1 + strongest[height[strongest] > np.log(_PEAK)]
+    peaks = 1 + np.flatnonzero(height > np.log(_PEAK))
     is_peak = np.asarray(binary_dilation(np.isin(region, peaks), iterations=2))
     edges = np.flatnonzero(np.diff(np.r_[False, is_peak, False].astype(int))).reshape(-1, 2)
     tops = np.array([a + np.argmax(power[a:b]) for a, b in edges], dtype=np.intp)
@@ -157,7 +155,7 @@ def _shapes(square: FloatArray, lowest_hz: float, skirts: Sequence[FloatArray]) 
     Turbulence falls with slopes of -2, -4 and -6. Nothing but noise and the skirts of slower parts
     has a place at high frequencies: there the corrections of a wrong guess show.
     """
-    corners = np.geomspace(lowest_hz, _FASTEST_HZ, _CORNERS)
+    corners = np.geomspace(lowest_hz, _FASTEST_HZ, 5)
     falls = [(1 + square / corner**2) ** -order for corner in corners for order in (1, 2, 3)]
     wide = [_resonance(square, centre, _SHAPE_DAMPING) for centre in _SHAPES_HZ]
     shapes = np.array([np.ones_like(square), *falls, *wide, *skirts])

@@ -48,10 +48,11 @@ SHORT_ORDER, _LONG_ORDER = 3, 32  # past commands: integrators, and filters of t
 _EXACT = 1e-6  # part of the increments' variance that single precision leaves of an exact law
 _SMALL = 0.05  # part of the variance, or of the largest element, which rounding may make
 _SPARE = 0.2  # of the logarithm of what the richest law leaves, which a simple one may lack
-FOLLOWED = 0.1  # least coherence of an axis that follows its measurements; other nights have 0.02
+# least coherence of an axis that follows its measurements, where other nights have 0.02; and part
+# of the frames that follow no law, of which more are a law of their own
+FOLLOWED = 0.1
 _ADDS_UP = 0.2  # distance from 1 of the pole of an integrator, a leaky one included
 SIGMAS = 4.0  # standard errors within which two numbers are the same
-_MOST_ODD = 0.1  # of the frames, that follow no law: more of them are a law of their own
 
 # weights of past commands (axes, order) and measurements (axes, lags, axes), and the errors of the
 # first of these, (axes,), and of the sums of the others over their lags, (axes, axes)
@@ -246,7 +247,7 @@ def _odd_frames(series: _Series, law: ControlLaw) -> BoolArray:
     floor = np.sqrt(_EXACT) * np.median(np.abs(u[rows] - u[rows - 1]), axis=0)
     beyond = np.any(rest > np.maximum(2 * SIGMAS * MAD * np.median(rest, axis=0), floor), axis=1)
     odd = np.zeros(len(u), dtype=np.bool_)
-    if np.mean(beyond) < _MOST_ODD:
+    if np.mean(beyond) < FOLLOWED:
         odd[rows[beyond]] = True
     return odd
 
