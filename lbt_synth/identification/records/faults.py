@@ -69,9 +69,9 @@ def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
     """Find frames at an end of the range that is reached far more often than values beside it.
 
     The end of a sinusoid's range is reached often, too, but not by a factor of 4 more often
-    than the next values; an end that is cut off is.
+    than the next values; an end that is cut off is. Zeros are those of an open loop.
     """
-    out = np.zeros(len(series), dtype=np.bool_)
+    good, out = good & (series != 0), np.zeros(len(series), dtype=np.bool_)
     values = series[good]
     span = float(np.ptp(values)) if values.size else 0.0
     if span == 0:

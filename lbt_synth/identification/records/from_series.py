@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,12 @@ _LARGEST_NM = 1e30  # a larger number is a filler
 _OPEN_FRAMES = 20  # of zero or equal commands
 TREND = 2.0  # ratio of scatters
 
-Finders = tuple[tuple[str, Callable[[FloatArray, BoolArray], BoolArray]], ...]
+# what spoils a measurement; a command is spoilt by the first alone
+_FINDERS = (
+    ("saturated", faults.find_saturated),
+    ("stuck", faults.find_stuck),
+    ("outlier", faults.find_outliers),
+)
 
 
 def loop_record(
@@ -117,10 +122,10 @@ def loop_record(
     rows = y if u is None else np.hstack([y, u])
     rows, there = _lay_on_grid(rows, clock.frame_of_row, findings, said)
     axes, frames = y.shape[1], len(rows)
-    y, measured = _judge_series(rows[:, :axes], there, "measurements", _MEASURED, findings)
+    y, measured = _judge_series(rows[:, :axes], there, "measurements", findings)
     commanded = np.ones(frames, dtype=np.bool_)
     if u is not None:
-        u, commanded = _judge_series(rows[:, axes:], there, "commands", _COMMANDED, findings)
+        u, commanded = _judge_series(rows[:, axes:], there, "commands", findings)
         findings += _held_commands(u, commanded)
     said += _note_trends(y, measured)
     return LoopRecord(
@@ -175,33 +180,20 @@ def _lay_on_grid(
 
 
 def _judge_series(
-    series: FloatArray, there: BoolArray, name: str, finders: Finders, findings: list[Finding]
+    series: FloatArray, there: BoolArray, name: str, findings: list[Finding]
 ) -> tuple[FloatArray, BoolArray]:
     """Return the series with faults filled, and the frames that are good on all axes."""
     out, all_good = np.empty(series.shape), np.ones(len(series), dtype=np.bool_)
     for axis, column in enumerate(series.T):
         good = there & np.isfinite(column)
         findings += findings_in(there & ~good, "not finite", name, axis)
-        for kind, finder in finders:
+        for kind, finder in _FINDERS[: 1 if name == "commands" else None]:
             faulty = finder(np.where(np.isfinite(column), column, 0.0), good)
             findings += findings_in(faulty, kind, name, axis)
             good &= ~faulty
         out[:, axis] = faults.fill(column, good)
         all_good &= good
     return out, all_good
-
-
-def _find_clipped(series: FloatArray, good: BoolArray) -> BoolArray:
-    """Find commands at a limit; zeros are those of an open loop."""
-    return faults.find_saturated(series, good & (series != 0))
-
-
-_MEASURED: Finders = (
-    ("saturated", faults.find_saturated),
-    ("stuck", faults.find_stuck),
-    ("outlier", faults.find_outliers),
-)
-_COMMANDED: Finders = (("saturated", _find_clipped),)
 
 
 def _held_commands(commands: FloatArray, good: BoolArray) -> Iterator[Finding]:
