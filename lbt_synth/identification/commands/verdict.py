@@ -498,16 +498,15 @@ def _scale(
     gains = np.where(np.isfinite(ratios), ratios, 1.0) * choice.gain
     if np.all((gains >= low) & (gains <= high)):
         return one
-    centre = float(np.mean(np.log(gains)))
-    inside = np.geomspace(low, high, 8)
     if law is not None and law.is_sure:
-        if not could_have_run(choice.repair, inside, coarse.record, law):
+        plausible_gains = np.geomspace(low, high, 8)
+        if not could_have_run(choice.repair, plausible_gains, coarse.record, law):
             return likely_factors(gains, plausible)
-        if centre < np.log(low):
+        if np.mean(np.log(gains)) < np.log(low):
             return one  # commands that are too large come from a law that is too strong
-    nearest = inside[np.argmin(abs(np.log(inside) - centre))]
+    nearest = np.clip(gains, low, high)
     if _fit(coarse, scaled, nearest / choice.gain)[0] - free < CLEAR:
-        return one  # a plausible gain is nearly as likely
+        return one  # plausible gains are nearly as likely
     return likely_factors(gains, plausible)
 
 
