@@ -26,7 +26,7 @@ from lbt_synth.models import PositionLoop
 from lbt_synth.validation import FloatArray, number
 
 _RATES_HZ = (5.0, 1e5)  # plausible for times without a unit
-_FACTS = ("frame_rate_hz", "diameter_m", "delay_frames", "obstruction")
+FACTS = ("frame_rate_hz", "diameter_m", "delay_frames", "obstruction")
 _UNITS = {
     "loop": "nm, um, m of wavefront, or mas, arcsec, urad, rad of tilt",
     "spectrum": "nm^2/Hz, or mas^2/Hz of tilt; nm/sqrt(Hz) of an amplitude",
@@ -45,11 +45,12 @@ def build_loop(
 ) -> LoopRecord:
     """Make a record of series; ``given`` are facts, None where the source has to tell."""
     (role, columns), commands = next(iter(roles.items())), roles.get("commands")
-    facts = {name: _find_fact(contents, name, given[name]) for name in _FACTS}
-    own_unit, u_unit = _find_unit(columns, unit, contents), None
+    facts = {name: _find_fact(contents, name, given[name]) for name in FACTS}
+    units = {role: _find_unit(columns, unit, contents)}
     if commands is not None:
-        u_unit = _find_unit(commands, command_unit, contents, "command_unit") or unit
-    units = {role: own_unit} if commands is None else {role: own_unit, "commands": u_unit}
+        units["commands"] = (
+            _find_unit(commands, command_unit, contents, "command_unit") or unit or ""
+        )
     _require_facts(roles, units, facts)
     (clock,), (counter,) = (roles.get(name, [None]) for name in ("times", "frame_numbers"))
     times = None if clock is None else seconds_per(clock.unit) * clock.values
@@ -58,8 +59,8 @@ def build_loop(
     record = loop_record(
         _stack_columns(columns),
         None if commands is None else _stack_columns(commands),
-        unit=own_unit,
-        command_unit=u_unit,
+        unit=units[role],
+        command_unit=units.get("commands"),
         mirror=mirror,
         times_s=times,
         frame_numbers=None if counter is None else counter.values,
@@ -79,32 +80,26 @@ def build_loop(
 
 
 def _require_facts(
-    roles: Roles, units: Mapping[str, str | None], facts: Mapping[str, Any], kind: str = "loop"
+    roles: Roles, units: Mapping[str, str], facts: Mapping[str, Any], kind: str = "loop"
 ) -> None:
     """Refuse series of which facts are missing, all of them in one message."""
-    bare = [column for role, unit in units.items() if not unit for column in roles[role]]
-    option = (
-        "command_unit" if set(map(id, bare)) == set(map(id, roles.get("commands", ()))) else "unit"
-    )
-    angles = any(is_angle(unit) for unit in units.values() if unit)
-    checks = (
-        (bare, f"the unit of {join_names(bare)}: give {option} ({_UNITS[kind]})"),
-        (
-            angles and facts["diameter_m"] is None,
-            "the telescope, by which angles become nm: give diameter_m",
+    bare = [role for role, unit in units.items() if not unit]
+    option = "command_unit" if bare == ["commands"] else "unit"
+    names = join_names([column for role in bare for column in roles[role]])
+    angles = any(map(is_angle, units.values()))
+    no_rate = facts["frame_rate_hz"] is None and "times" not in roles and kind == "loop"
+    no_delay = "commands" in roles and facts["delay_frames"] is None
+    lacks = {
+        f"the unit of {names}: give {option} ({_UNITS[kind]})": bare,
+        "the telescope, by which angles become nm: give diameter_m": (
+            angles and facts["diameter_m"] is None
         ),
-        (
-            facts["frame_rate_hz"] is None and "times" not in roles and kind == "loop",
-            "the frame rate: give frame_rate_hz, or the times",
-        ),
-        (
-            "commands" in roles and facts["delay_frames"] is None,
-            "the total delay: give delay_frames",
-        ),
-    )
-    missing = [text for lacks, text in checks if lacks]
+        "the frame rate: give frame_rate_hz, or the times": no_rate,
+        "the total delay: give delay_frames": no_delay,
+    }
+    missing = [text for text, is_missing in lacks.items() if is_missing]
     if len(missing) > 1 or bare:
-        volts = VOLTS if option == "command_unit" and bare else {}
+        volts = VOLTS if bare and option == "command_unit" else {}
         raise ProblemError(f"nothing tells {'; '.join(missing)}.", **volts)
 
 

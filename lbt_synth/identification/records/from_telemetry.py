@@ -12,12 +12,11 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry
 from lbt_synth.identification.records.columns import Column, unit_name
 from lbt_synth.identification.records.contents import Contents, choose_axes
-from lbt_synth.identification.records.from_columns import build_loop
+from lbt_synth.identification.records.from_columns import FACTS, build_loop
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models import PositionLoop
 from lbt_synth.validation import FloatArray
 
-_FACTS = ("frame_rate_hz", "delay_frames", "diameter_m", "obstruction")
 _FOREIGN = "timing"  # key of metadata in telemetry of other programs
 _CONDITION = float(np.finfo(np.float64).eps ** -0.5)  # beyond, an inverse is half rounding
 
@@ -34,7 +33,7 @@ def telemetry_record(
     """
     n = telemetry.modes
     chosen = choose_axes(axes, n, "modes")
-    facts = {name: value for name in _FACTS if (value := getattr(telemetry, name)) is not None}
+    facts = {name: value for name in FACTS if (value := getattr(telemetry, name)) is not None}
     contents = Contents(facts={name: {"the telemetry": value} for name, value in facts.items()})
     roles = {role: _modal_columns(telemetry, role, chosen, contents.notes) for role in _MATRICES}
     if telemetry.times_s is not None:
