@@ -44,9 +44,10 @@ def build_clock(
     if frame_numbers is not None:
         frame = _frames_from_counter(_check_rising(frame_numbers, "frame_numbers", rows))
     notes: list[str] = []
+    times = times if rows > 1 else None
     if times is not None and rate is not None and _tell_nothing(times, rate):
         times, notes = None, ["the times do not tell frames apart and were not used"]
-    if times is None or rows == 1:
+    if times is None:
         if rate is None:
             raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
         return Clock(rate, frame, notes)

@@ -228,3 +228,10 @@ def test_whole_seconds_of_another_rate_are_refused():
     times = np.floor(np.arange(30_000) / RATE)
     with pytest.raises(ProblemError):
         loop_record(noise(30_000), frame_rate_hz=1300, times_s=times, unit="nm")
+
+
+def test_one_row_has_no_rate_of_its_own():
+    seen = loop_record([[1.0]], frame_rate_hz=RATE, times_s=[5.0], unit="nm")
+    assert (seen.frame_rate_hz, seen.health.notes) == (RATE, ())
+    with pytest.raises(ProblemError, match="frame rate is not known"):
+        loop_record([[1.0]], times_s=[5.0], unit="nm")
