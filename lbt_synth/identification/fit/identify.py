@@ -46,7 +46,6 @@ from lbt_synth.identification.fit.physical_parameters import (
 )
 from lbt_synth.identification.fit.shared_lines import couple_axes
 from lbt_synth.identification.fit.whittle import FittedModel
-from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
 from lbt_synth.validation import FloatArray, number, one_or_each, real_array, require_instance
@@ -70,7 +69,7 @@ def identify(
     delay_frames: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
     noise_nm: float | Sequence[float] | None = None,
-    announced: Sequence[LinePrior] = (),
+    announced: ArrayLike = (),
     lowest_line_hz: float = LOWEST_LINE_HZ,
     most_lines: int = MOST_LINES,
     stretches: StretchesLike | None = None,
@@ -101,8 +100,8 @@ def identify(
     noise_nm : float or one per axis, optional
         Noise per frame of the sensor of the loop to design for [nm], for spectra alone: those of
         wind shake or of a simulation have none.
-    announced : sequence of LinePrior, optional
-        Lines that are known beforehand, for instance from accelerometers.
+    announced : (lines,) or (lines, 2) array_like, optional
+        Frequencies of lines that are known beforehand [Hz], alone or with their standard errors.
     lowest_line_hz : float, optional
         A resonance below is a part of the turbulence [Hz].
     most_lines : int, optional
@@ -144,12 +143,14 @@ def identify(
     >>> lbt.kalman(found.plant()).certificate.passed
     True
     """
-    for line in announced:
-        require_instance(line, LinePrior)
+    lines = real_array(announced, "announced")
+    lines = np.column_stack([lines, 0 * lines]) if lines.ndim == 1 else lines
+    if lines.ndim != 2 or lines.shape[1] != 2:
+        raise DimensionError(f"announced must be (lines,) or (lines, 2); got {lines.shape}.")
     if start is not None:
         require_instance(start, IdentifiedModel)
     options: dict[str, Any] = {
-        "announced": [(line.frequency_hz, line.frequency_error_hz) for line in announced],
+        "announced": lines.tolist(),
         "lowest_line_hz": lowest_line_hz,
         "most_lines": most_lines,
     }

@@ -29,7 +29,6 @@ from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.identification.fit import identify
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.order_search import find_rivals
-from lbt_synth.identification.records.faults import RecordHealth
 
 RATE = 1000.0
 
@@ -541,7 +540,7 @@ def test_the_limit_of_lines_is_kept_and_noted() -> None:
     [
         ({"sensor_gain": 1e300}, "sensor_gain must be"),
         ({"sensor_gain": "x"}, "sensor_gain must be an array of numbers"),
-        ({"announced": [31.0]}, "LinePrior"),
+        ({"announced": [[31.0, 0.1, 0.0]]}, "announced must be"),
         ({"start": 3}, "IdentifiedModel"),
         ({"stretches": [(2, 4000), (3000, 5000)]}, "in order, apart"),
         ({"stretches": [(0, 4000)]}, "usable"),
@@ -560,8 +559,8 @@ def test_a_dead_axis_is_named() -> None:
     record = lbt.identification.LoopRecord(
         frame_rate_hz=RATE,
         measurements=y,
-        usable=np.ones(6000, dtype=bool),
-        health=RecordHealth(frames=6000, usable=6000),
+        measured=np.ones(6000, dtype=bool),
+        commanded=np.ones(6000, dtype=bool),
     )
     with pytest.raises(ProblemError, match="axis 1 of the record is constant"):
         lbt.identify(record)
