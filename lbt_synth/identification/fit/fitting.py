@@ -47,6 +47,7 @@ _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
 _COLOURED = 9.0  # the same of a colour of the noise, which a wrong gain can explain, too
 _WORTH = 1e-3  # of the innovations' variance, by which a line upon a bump must lower it
 _FAR = 2.0  # half widths of a section from the middle of a bump: what lies beyond is not upon it
+_SEED = 0.01  # of the lowest density: noise from which a fit begins at least
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
 _LOWEST = 0.1  # bins: a component below is a slope without a frequency
 _SHIFTS = np.arange(-2, 2.01, 0.25)  # bins by which a narrow line is moved
@@ -196,6 +197,8 @@ def fit(
     minus a margin.
     """
     data, bound = search.merge(start), float("inf")
+    if len(start.axes) == 1:
+        start = _with_noise(data, start)
     if better_than is not None:
         bound = contrast(data, better_than.spectrum) + margin
     model = minimise(data, start, search.priors(start), bound=bound, accuracy=accuracy)
@@ -207,6 +210,13 @@ def fit(
     if len(inside.components) < len(start.components):
         return fit(search, inside, better_than=better_than, margin=margin, accuracy=accuracy)
     return replace(model, contrast=contrast(search.data, model.spectrum))
+
+
+def _with_noise(data: LoopPeriodogram, spectrum: SpectrumModel) -> SpectrumModel:
+    """Return a model with at least some noise: where it is nothing, it has no slope."""
+    lowest = float(np.min(density(data, spectrum))) * data.frame_rate_hz / 2
+    least = float(np.log(_SEED * lowest))
+    return spectrum.with_background(log_noise=max(spectrum.background.log_noise, least))
 
 
 def refit(search: Search, start: SpectrumModel) -> FittedModel | None:

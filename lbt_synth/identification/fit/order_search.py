@@ -27,6 +27,7 @@ from lbt_synth.identification.fit.spectrum_model import (
     damping_parameter,
 )
 from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
+from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
 from lbt_synth.models.vibration import MOST_SECTIONS
 from lbt_synth.validation import FloatArray
 
@@ -109,9 +110,9 @@ def _settled(models: Sequence[FittedModel | None]) -> list[FittedModel]:
 
 
 def _cost_of_noise(search: Search, model: FittedModel) -> float:
-    """Return the cost of a model in which wide resonances count twice."""
-    spare = sum(not c.is_narrow for c in model.spectrum.lines)
-    return fitting.cost(search, model) + search.price * spare
+    """Return the cost of a model in which wide resonances count twice, and narrower ones less."""
+    widths = [c.damping_ratio / WIDE_DAMPING for c in model.spectrum.lines]
+    return fitting.cost(search, model) + search.price * sum(min(1.0, w**4) for w in widths)
 
 
 def find_components(
