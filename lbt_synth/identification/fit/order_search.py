@@ -49,7 +49,7 @@ _BESIDE = 0.08  # of its frequency: lines that are nearer may be one bump
 _SEEN = 3.0  # bins: a line of that half width shows the shape of its flanks
 _ROUGH = 2.0  # prices: a bump that is less likely before it is fitted is none, but for one of many
 _TO_HALF = 2 * float(np.log(2))  # square of a Gaussian's half width over its variance
-_OTHER_GAINS = (0.4, 0.9)  # of a sensor, from which models that are as likely are sought
+_OTHER_GAINS = (0.4, 0.9, 1.1)  # of a sensor, from which models that are as likely are sought
 _SAME_GAIN = 0.05  # of a logarithm: nearer gains have the same optimum
 _AS_LIKELY = 5.0  # log-likelihood by which one of two gains is excluded
 
