@@ -24,7 +24,7 @@ LINES = {
     "loop": 5050,
     "methods": 1109,
     "models": 4550,
-    "report": 4590,
+    "report": 4602,
     "storage": 1049,
     "studies": 3050,
     "errors, validation": 642,
