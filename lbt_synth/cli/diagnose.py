@@ -25,7 +25,7 @@ _STEPS = 3
 def run(arguments: Namespace) -> Report:
     """Diagnose a record, with a design to try on it if one is given, and write the page."""
     if arguments.output is not None:
-        named = given_options(arguments, "file", "gain", "commands", "lines_file", "accelerometers")
+        named = given_options(arguments, "file", "gain", "commands", "lines_file")
         require_page_names(arguments.output, arguments.pdf, inputs=tuple(named.values()))
     elif arguments.pdf is not None:
         raise ProblemError("--pdf is the page of -o on paper; give -o, too.")

@@ -18,8 +18,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, UnstableLoopError
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
-from lbt_synth.interop.specula.calibration import Calibration
-from lbt_synth.interop.specula.optics import specula_version
+from lbt_synth.interop.specula.optics import Calibration, specula_version
 from lbt_synth.interop.specula.simulation import unread_sensors
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.studies import end_to_end_figure, end_to_end_table_figure

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lbt_synth.cli.output import Report
 from lbt_synth.config import config_schema, identified_config, telescope_template
-from lbt_synth.config.templates import example_files
+from lbt_synth.config.load import example_files
 from lbt_synth.config.write import config_text
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.identification import LoopRecord, SpectrumRecord, identify, load_record

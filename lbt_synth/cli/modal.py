@@ -15,7 +15,7 @@ from lbt_synth.cli.output import Report
 from lbt_synth.config import Config, load_config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_residuals
 from lbt_synth.errors import ConfigError
-from lbt_synth.models.turbulence.zernike import noll_orders
+from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.figures import modal_figure
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table

@@ -17,7 +17,7 @@ from lbt_synth.cli.parser import command_options
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification import require_length
+from lbt_synth.identification.records.record import require_length
 from lbt_synth.interop import Rehearsal, rehearse
 from lbt_synth.loop import Imaging, series_strehl
 from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
