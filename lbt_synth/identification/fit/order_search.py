@@ -47,7 +47,7 @@ _WIDEST = 0.3  # of its frequency: a band that is tried, and the damping ratio o
 _NARROWEST = 1e-4  # damping ratio of a new component
 _BESIDE = 0.08  # of its frequency: lines that are nearer may be one bump
 _SEEN = 3.0  # bins: a line of that half width shows the shape of its flanks
-_ROUGH = 2.0  # prices: a bump that is less likely before it is fitted is none, but for one of many
+_ROUGH = 2.0  # prices: a bump in the place of one line is not fitted if it begins with less
 _TO_HALF = 2 * float(np.log(2))  # square of a Gaussian's half width over its variance
 _OTHER_GAINS = (0.4, 0.9, 1.1)  # of a sensor, from which models that are as likely are sought
 _SAME_GAIN = 0.05  # of a logarithm: nearer gains have the same optimum
@@ -329,7 +329,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
             others = (c for i, c in enumerate(components) if i not in group)
             bump = _bump([components[i] for i in group], sections)
             trial = replace(spectrum, components=(*others, bump))
-            if len(group) > 2 or contrast(data, trial) < whole + _ROUGH * search.price:
+            if len(group) > 1 or contrast(data, trial) < whole + _ROUGH * search.price:
                 yield trial
 
 
