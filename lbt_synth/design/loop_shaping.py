@@ -25,7 +25,7 @@ from lbt_synth.design.shaping.channel import (
     mode_loop,
 )
 from lbt_synth.design.shaping.objectives import VibrationBand, leaves
-from lbt_synth.design.shaping.reduction import ModeSolution, reduce_poles, solve_mode
+from lbt_synth.design.shaping.solution import ModeSolution, reduce_mode, solve_mode
 from lbt_synth.design.shaping.specification import (
     Specification,
     specified_limit,
@@ -142,11 +142,11 @@ def shape(
             basis = laguerre_basis(size, common, dt_s=single.dt_s)
             chosen = long = solve_mode(spec, Channel(hardware=single, basis=basis))
             if order is not None and order < size:
-                chosen = reduce_poles(spec, long, order, tolerance)
+                chosen = reduce_mode(spec, long, order, tolerance)
             solved[spec.key] = long, chosen
     longs, modes = zip(*(solved[spec.key] for spec in specifications), strict=True)
     parameters = tuple(mode.parameter for mode in modes)
-    status, rounds = modes[0].sequence.status, max(long.sequence.programmes for long in longs)
+    status, rounds = modes[0].status, max(long.programmes for long in longs)
     design = ShapedDesign(
         method="robust",
         solver=SolverReport(route="youla", status=status, iterations=rounds),
