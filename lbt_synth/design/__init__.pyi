@@ -21,9 +21,9 @@ from .lqg import LqgDesign as LqgDesign
 from .lqg import lqg as lqg
 from .mixed import central_filter as central_filter
 from .mixed import mixed as mixed
-from .output_feedback.h2_controller import h2_controller as h2_controller
-from .output_feedback.hinf_controller import hinf_controller as hinf_controller
-from .output_feedback.mixed_controller import mixed_controller as mixed_controller
+from .output_feedback import h2_controller as h2_controller
+from .output_feedback import hinf_controller as hinf_controller
+from .output_feedback import mixed_controller as mixed_controller
 from .result import Design as Design
 from .result import SolverReport as SolverReport
 from .robust import robust as robust

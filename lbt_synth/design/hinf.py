@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 SolvedGains: TypeAlias = "FilterRiccati | LmiSolution"
 
 # A level this close to the least one counts as the least one itself.
-_AT_LEAST = 1e-9
+AT_LEAST = 1e-9
 _CONTRADICTION = 1e-9  # relative, what rounding may take from a proof
-_LARGEST_LMI = 20  # states; the inequality takes minutes beyond
+LARGEST_LMI = 20  # states; the inequality takes minutes beyond
 _GREATEST = 1e100
 _GREATEST_RATIO = 1e6
 
@@ -103,7 +103,7 @@ def hinf(
     start = kalman_riccati(problem)
     if route == "lmi":
         problem.require_one_phase("the inequality", "route='riccati'")
-    if route is None and problem.n_states <= _LARGEST_LMI and problem.reads_all:
+    if route is None and problem.n_states <= LARGEST_LMI and problem.reads_all:
         try:
             return _design(problem, start, "lmi", gamma, gamma_ratio)
         except (NumericalError, CertificateError):  # noise far below the signal
@@ -146,7 +146,7 @@ def _design(
     least, infeasible = _verified_bracket(problem, start, gains, witness)
     requested = gamma if gamma is not None else least * (gamma_ratio or 1)
     require_reachable(requested, least)
-    if requested > least * (1 + _AT_LEAST):
+    if requested > least * (1 + AT_LEAST):
         gains = synthesis.central(requested)
     design = filter_design(
         problem,
@@ -166,7 +166,7 @@ def _design(
 
 def require_reachable(gamma: float, least: float) -> None:
     """Refuse a level below the least one."""
-    if gamma < least * (1 - _AT_LEAST):
+    if gamma < least * (1 - AT_LEAST):
         raise InfeasibleError(
             f"gamma must be at least {least:.12g}, the least of this problem; got {gamma:.12g}. "
             "Try gamma_ratio=1.2.",
