@@ -147,32 +147,6 @@ def failure_rows(
 
     The residual is the exact one of the loop where the plant's model is the truth. A frozen reading
     is that of a frame in which all sensors are read, and stays for ever.
-
-    Parameters
-    ----------
-    plant : TipTiltPlant
-        Loop, disturbances and sensors.
-    gains : (N, n, q) ndarray
-        Predictor gains of the filter of all sensors.
-    fallbacks : tuple of Fallback
-        The filter for each set of sensors that fail.
-
-    Returns
-    -------
-    tuple of FailureRow
-        A row per fall-back.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=1000)
-    >>> own = lbt.tip_tilt_plant(frame_rate_hz=1000, turbulence=slow, noise_nm=75, modes=1)
-    >>> second = lbt.models.WavefrontSensor(name="truth", rate_hz=250, delay_frames=2, noise_nm=4)
-    >>> plant = own.with_sensors(lbt.models.SensorSuite(sensors=(second,)))
-    >>> design = lbt.kalman(plant)
-    >>> rows = lbt.design.failure_rows(plant, design.gain_predictor, design.fallbacks)
-    >>> [row.must_switch for row in rows]
-    [False, False, False]
     """
     rows = []
     readings = model_readings(failed_loop(plant, gains, ()), plant)

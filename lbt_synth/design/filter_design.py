@@ -16,11 +16,12 @@ from lbt_synth.design.certificate import (
     NORM_TOLERANCE,
     ORIGIN_TOLERANCE,
     Check,
-    bound_check,
+    Claim,
+    Evidence,
     certify_filter,
     certify_infeasible,
+    measured_claim,
 )
-from lbt_synth.design.claims import Claim, Evidence, measured_claim
 from lbt_synth.design.fallbacks import (
     Fallback,
     dwell_frames,
@@ -57,7 +58,8 @@ ORIGIN = "distance from its Riccati filter"
 def _check_bound(evidence: Evidence, gamma: float) -> Iterator[Check]:
     """Check that the norm keeps its bound, and that the filter is one of this bound."""
     design, norm = evidence.design, evidence.certificate.gamma
-    yield bound_check(norm, gamma)
+    name = "norm of the estimation error over its bound, less 1"
+    yield Check(name, norm / gamma - 1, NORM_TOLERANCE, LEVEL_SETS)
     origins = [evidence.kalman]
     with suppress(NumericalError):
         central = gamma_riccati(design.problem, gamma, start=evidence.kalman)

@@ -9,8 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.design.certificate import Check
-from lbt_synth.design.claims import Claim, Evidence
+from lbt_synth.design.certificate import Check, Claim, Evidence
 from lbt_synth.design.result import (
     UNCERTIFIED,
     Design,

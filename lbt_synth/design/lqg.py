@@ -28,10 +28,12 @@ from lbt_synth.design.certificate import (
     GAIN_TOLERANCE,
     VARIANCE_TOLERANCE,
     Check,
+    Claim,
+    Evidence,
     certify_error,
     certify_filter,
+    measured_claim,
 )
-from lbt_synth.design.claims import Claim, Evidence, measured_claim
 from lbt_synth.design.result import (
     MODEL_LIMITS,
     Design,

@@ -17,9 +17,11 @@ from lbt_synth.design.certificate import (
     VARIANCE_TOLERANCE,
     Certificate,
     Check,
+    Claim,
+    Evidence,
     certify_error,
+    measured_claim,
 )
-from lbt_synth.design.claims import Claim, Evidence, measured_claim
 from lbt_synth.design.hinf import AT_LEAST, LARGEST_LMI, checked_bounds
 from lbt_synth.design.result import Design, SolverReport, with_certificate, without_units
 from lbt_synth.errors import (

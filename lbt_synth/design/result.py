@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
-from lbt_synth.design.certificate import Certificate, stability_check
-from lbt_synth.design.claims import Claim, Evidence
+from lbt_synth.design.certificate import Certificate, Claim, Evidence, stability_check
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget

@@ -45,8 +45,7 @@ class IntegratorOptions(Section):
 
 
 def _build(inputs: DesignInputs, options: IntegratorOptions) -> IntegratorDesign:
-    from lbt_synth.design.integrator import integrator, optimal_integrator
-    from lbt_synth.design.integrator_law import IntegratorLaw
+    from lbt_synth.design.integrator import IntegratorLaw, integrator, optimal_integrator
 
     section: IntegratorOptions | None = inputs.method_section(METHOD.name)
     own = options.model_dump(exclude_unset=True)

@@ -11,9 +11,9 @@ from support.sensor_loops import (
     simulated_covariances,
 )
 
-from lbt_synth.design import failure_rows
 from lbt_synth.design.fallbacks import (
     failed_loop,
+    failure_rows,
     failure_sets,
     make_fallbacks,
 )

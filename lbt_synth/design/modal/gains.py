@@ -17,8 +17,7 @@ from numpy.polynomial.polynomial import polyadd
 from numpy.typing import ArrayLike
 from scipy.special import comb
 
-from lbt_synth.design.integrator import TRIED_GAINS, hardware_gain_limit
-from lbt_synth.design.integrator_law import PURE
+from lbt_synth.design.integrator import PURE, TRIED_GAINS, hardware_gain_limit
 from lbt_synth.design.modal.per_mode import Vibrations, lines_per_mode, number_per_mode
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
