@@ -19,7 +19,7 @@ import numpy as np
 
 import lbt_synth
 from lbt_synth.design import Check, Design
-from lbt_synth.design.modal.per_mode import name_modes
+from lbt_synth.design.modal.stack import name_modes
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
 from lbt_synth.interop.proof import LOSS, NOISE, POLE, Written, prove_written

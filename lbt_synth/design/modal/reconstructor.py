@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design.modal.per_mode import mode_indices, name_modes
+from lbt_synth.design.modal.stack import mode_indices, name_modes
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.validation import FloatArray, integer, matrix, number, read_only, real_array
 
