@@ -1,7 +1,4 @@
-"""The methods of synthesis, one module each; nothing else knows their names.
-
-A module of this folder with a ``METHOD`` is a method.
-"""
+"""The methods of synthesis in one table; nothing else knows their names."""
 
 import lazy_loader
 

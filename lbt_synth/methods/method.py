@@ -35,6 +35,10 @@ class Section(BaseModel):
         extra="forbid", strict=True, allow_inf_nan=False, frozen=True, defer_build=True
     )
 
+    def arguments(self) -> dict[str, Any]:
+        """Return the options as arguments of the function that designs."""
+        return self.model_dump()
+
 
 class DesignInputs(Protocol):
     """What a method designs for: a configuration, or a plant alone.

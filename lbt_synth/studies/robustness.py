@@ -38,8 +38,7 @@ from lbt_synth.loop import (
 )
 from lbt_synth.loop.ensemble import ensemble_vibration
 from lbt_synth.loop.simulation.run import Drop, Segment, run_segments
-from lbt_synth.methods.mixed import METHOD as MIXED
-from lbt_synth.methods.registry import record_methods, reference_methods
+from lbt_synth.methods.registry import MIXED, record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import LoopHardware, SinusoidalVibration, TipTiltPlant, Truth, Vibration
 from lbt_synth.models.loop_hardware import LONGEST_DELAY

@@ -53,7 +53,7 @@ METHOD = Method(
     label="leaky",
     options=LeakyOptions,
     build=build,
-    design="lbt_synth.methods.leaky:LeakyDesign",
+    design="support.leaky_method:LeakyDesign",
     estimator=False,
     configurable=frozenset({"gain"}),
 )

@@ -36,7 +36,7 @@ from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop
-from lbt_synth.methods.registry import all_methods, reference_methods
+from lbt_synth.methods.registry import METHODS, reference_methods
 from lbt_synth.storage.rows import Facts
 from lbt_synth.validation import require_instance
 
@@ -250,7 +250,7 @@ def _compare(
 ) -> Diagnosis:
     """Add residuals on the second half, and the best design there for a model of the first."""
     plant = half.plant()
-    with_bands = [m for m in all_methods().values() if m.plant_section is not None]
+    with_bands = [m for m in METHODS.values() if m.plant_section is not None]
     methods = (*reference_methods(estimators_only=True), *with_bands)
     designs, missing = stable_designs(plant, {method.name: {} for method in methods})
     stable = {

@@ -30,7 +30,7 @@ from bokeh.server.server import Server
 from lbt_synth.config.write import config_text
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.methods.registry import all_methods
+from lbt_synth.methods.registry import METHODS
 from lbt_synth.report.draw import colour, dashes
 from lbt_synth.report.explore.exploration import (
     Exploration,
@@ -338,7 +338,7 @@ class Session:
                 "heading": document.title,
                 "charts": [{"key": key, **words()[key]} for key in keys],
                 "knobs": exploration.knobs,
-                "methods": {m.name: m.title for m in all_methods().values()},
+                "methods": {m.name: m.title for m in METHODS.values()},
                 "method": first.request.method.name,
                 "folder": str(folder),
                 "style": (here / "page/page.css").read_text(encoding="utf-8") + style,
