@@ -7,10 +7,14 @@ from dataclasses import replace
 from typing import Any
 
 from lbt_synth.design.loop_shaping import ShapedDesign, noise_per_mode, shape
-from lbt_synth.design.shaping.bounds import ModulusMargin
+from lbt_synth.design.shaping.demands import (
+    Demand,
+    LoopErrors,
+    ModulusMargin,
+    MovingSensorGain,
+)
 from lbt_synth.design.shaping.objectives import Leaf, ResidualVariance, Total, VibrationBand
-from lbt_synth.design.shaping.specification import Demand, Specification
-from lbt_synth.design.shaping.uncertainty import LoopErrors, MovingSensorGain
+from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import Spectrum, TipTiltPlant, Vibration
 from lbt_synth.models.resonance_spectrum import WIDE_DAMPING

@@ -23,7 +23,7 @@ from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
 if TYPE_CHECKING:
     from lbt_synth.design.loop_shaping import ShapedDesign
     from lbt_synth.design.shaping import VibrationBand
-    from lbt_synth.design.shaping.specification import Demand
+    from lbt_synth.design.shaping.demands import Demand
     from lbt_synth.models import Spectrum, TipTiltPlant, Vibration
 
 Axis: TypeAlias = Literal["tip", "tilt", "both"]

@@ -9,13 +9,19 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import Any, TypeAlias, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from lbt_synth.design.certificate import Check
-from lbt_synth.design.shaping.bounds import Attenuation, Bound, CommandRms
 from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, held_fraction, mode_loop
+from lbt_synth.design.shaping.demands import (
+    Attenuation,
+    CommandRms,
+    Demand,
+    LoopErrors,
+    MovingSensorGain,
+)
 from lbt_synth.design.shaping.frequencies import Grid, distinct_bands, first_grid
 from lbt_synth.design.shaping.objectives import (
     ResidualVariance,
@@ -27,7 +33,6 @@ from lbt_synth.design.shaping.objectives import (
     require_term,
     spectrum_of,
 )
-from lbt_synth.design.shaping.uncertainty import LoopErrors, MovingSensorGain, Uncertainty
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import Constraint, Function
@@ -51,7 +56,6 @@ from lbt_synth.models import (
 from lbt_synth.models.spectra import SumSpectrum
 from lbt_synth.validation import BoolArray, FloatArray, sequence, set_fields
 
-Demand: TypeAlias = Bound | Uncertainty
 _ZERO = 1e-12  # of an entry, over the largest of its matrix
 
 
