@@ -32,7 +32,8 @@ from lbt_synth.design.shaping.specification import (
 )
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
-from lbt_synth.loop import close_loop, youla_controller
+from lbt_synth.loop import close_loop
+from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import Column, column, nm_column, table_row
 from lbt_synth.validation import (

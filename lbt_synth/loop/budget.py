@@ -329,44 +329,6 @@ def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     The paper's equation 1, ``phi_cor(k-1) = N u(k-2)`` (at its delay of two frames), is exact
     for a mirror that settles at once; this is by how much it misses the position averaged
     over the exposure. It is no residual: the loop corrects for part of it.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        The loop, with the real mirror in its hardware.
-    truth : Truth
-        Disturbances; its sensor gain must be the loop's.
-
-    Returns
-    -------
-    ResidualBudget
-        Covariances of the difference, by origin; ``rms_nm`` is its size.
-
-    Raises
-    ------
-    UnstableLoopError
-        If the loop is unstable or marginally stable.
-    ProblemError
-        If a vibration does not fit the loop, or the sensor gains differ.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> shell = lbt.models.PositionLoop.from_bandwidth(
-    ...     natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
-    ... )
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell)
-    >>> shake = lbt.Truth(
-    ...     turbulence=None,
-    ...     noise_nm=1.0,
-    ...     vibrations=(
-    ...         lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,)),
-    ...     ),
-    ... )
-    >>> loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3).controller)
-    >>> missed = lbt.loop.settling_error(loop, shake)
-    >>> 0 < missed.rms_nm < lbt.residual_budget(loop, shake).rms_nm
-    True
     """
     return residual_budget(replace(loop, system=_difference_loop(loop)), truth, frame_means=True)
 

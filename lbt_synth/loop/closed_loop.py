@@ -326,33 +326,8 @@ def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controlle
     u(k-2) + ...)``, with the mirror's taps c (computed by its states where it has dynamics). Every
     controller that stabilises the loop is a stable filter from ybar to u, the Youla parameter, and
     the closed loop is affine in that filter (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans.
-    Autom. Control 21, 319 (1976), doi:10.1109/TAC.1976.1101223).
-
-    Parameters
-    ----------
-    hardware : LoopHardware
-        The loop; its sensor matrix is what the controller believes.
-    parameter : Controller
-        Stable filter from ybar(k) to u(k), in new-state form.
-
-    Returns
-    -------
-    Controller
-        In new-state form, with the mirror (its past commands, if it settles) as further states.
-
-    Raises
-    ------
-    DimensionError
-        If the filter does not fit the loop.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> last = lbt.Controller(A=0.0, B=1.0, C=1.0, D=0.0, dt_s=1 / 800)  # u(k) = ybar(k)
-    >>> controller = lbt.loop.youla_controller(path, last)
-    >>> bool(lbt.close_loop(path, controller).spectral_radius < 1e-3)
-    True
+    Autom. Control 21, 319 (1976), doi:10.1109/TAC.1976.1101223). It has the mirror, or its past
+    commands if it settles, as further states.
     """
     m, q = hardware.n_commands, hardware.n_measurements
     if (len(parameter.C), parameter.B.shape[1]) != (m, q):

@@ -1,8 +1,4 @@
-"""What a method of synthesis is: its name, its options, and what it does with a design.
-
-:class:`Section` is the base of all options and sections that people write: strict types, limits,
-no unknown keys.
-"""
+"""What a method of synthesis is: its name, its options, and what it does with a design."""
 
 from __future__ import annotations
 
@@ -19,17 +15,7 @@ if TYPE_CHECKING:
 
 
 class Section(BaseModel):
-    """Options or a section of a file: strict types, no unknown keys, read-only.
-
-    Examples
-    --------
-    >>> from pydantic import Field
-    >>> from lbt_synth.methods import Section
-    >>> class Leak(Section):
-    ...     leak_per_s: float = Field(gt=0, description="part of the command lost [1/s]")
-    >>> Leak(leak_per_s=5).leak_per_s
-    5.0
-    """
+    """Options or a section of a file: strict types, no unknown keys, read-only."""
 
     model_config = ConfigDict(
         extra="forbid", strict=True, allow_inf_nan=False, frozen=True, defer_build=True
@@ -41,15 +27,7 @@ class Section(BaseModel):
 
 
 class DesignInputs(Protocol):
-    """What a method designs for: a configuration, or a plant alone.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> config.design_defaults["gamma_ratio"], config.method_section("robust")
-    (1.2, None)
-    """
+    """What a method designs for: a configuration, or a plant alone."""
 
     @property
     def plant(self) -> TipTiltPlant:
@@ -119,12 +97,6 @@ class Method:
         Options that it has when designs are compared.
     compared_options : mapping
         Further ones where it stands for what a telescope would run, beside the limits.
-
-    Examples
-    --------
-    >>> from lbt_synth.methods import method_named
-    >>> sorted(method_named("mixed").exclusive)
-    ['gamma', 'gamma_ratio', 'rms']
     """
 
     name: str

@@ -214,29 +214,7 @@ METHODS = {method.name: method for method in (HINF, INTEGRATOR, KALMAN, LQG, MIX
 
 
 def method_named(name: str) -> Method:
-    """Return a method by its name.
-
-    Parameters
-    ----------
-    name : str
-        The name.
-
-    Returns
-    -------
-    Method
-        The method.
-
-    Raises
-    ------
-    ProblemError
-        If there is none of this name.
-
-    Examples
-    --------
-    >>> from lbt_synth.methods import method_named
-    >>> method_named("kalman").title
-    'Kalman filter'
-    """
+    """Return a method by its name; refuse a name that none has."""
     if name not in METHODS:
         close = difflib.get_close_matches(name, METHODS, n=1)
         hint = f" Did you mean {close[0]}?" if close else ""

@@ -33,9 +33,9 @@ from lbt_synth.loop import (
     ensemble_residuals,
     loop_margins,
     residual_budget,
-    settling_error,
     simulate,
 )
+from lbt_synth.loop.budget import settling_error
 from lbt_synth.loop.ensemble import ensemble_vibration
 from lbt_synth.loop.simulation.run import Drop, Segment, run_segments
 from lbt_synth.methods.registry import MIXED, record_methods, reference_methods

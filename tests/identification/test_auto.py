@@ -15,8 +15,8 @@ from support.recorded_loops import LINE, RATE, spliced_record
 import lbt_synth as lbt
 from lbt_synth.identification.auto import choose_method, note_drift, quick_methods
 from lbt_synth.identification.prediction.residual import estimate_residual
-from lbt_synth.methods import method_named, registry
-from lbt_synth.methods.registry import default_method
+from lbt_synth.methods import registry
+from lbt_synth.methods.registry import default_method, method_named
 
 DRIFT_HZ = 500.0
 SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=DRIFT_HZ)

@@ -12,10 +12,10 @@ from support.design_reports import SMALL
 from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
-from lbt_synth.methods import method_named
 from lbt_synth.methods.registry import (
     METHODS,
     design_label,
+    method_named,
     reference_methods,
 )
 

@@ -7,7 +7,7 @@ from lbt_synth.design import Check, Design, SolverReport
 from lbt_synth.design.certificate import Claim
 from lbt_synth.design.result import with_certificate
 from lbt_synth.linear import Controller
-from lbt_synth.methods import Method, Section
+from lbt_synth.methods.method import Method, Section
 
 
 class LeakyOptions(Section):

@@ -26,7 +26,8 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov, toeplitz
 
 from lbt_synth.linear import Controller, StateSpace
-from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
+from lbt_synth.loop import ClosedLoop, close_loop
+from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 

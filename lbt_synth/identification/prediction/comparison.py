@@ -42,8 +42,8 @@ from lbt_synth.loop import (
     close_loop,
     jitter_strehl,
     residual_budget,
-    youla_controller,
 )
+from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import PlantInputs, design_request
