@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, get_args
 
 import numpy as np
 
 from lbt_synth.design.certificate import Check
+from lbt_synth.design.plain import to_plain
 from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, held_fraction, mode_loop
 from lbt_synth.design.shaping.demands import (
     Attenuation,
@@ -26,9 +27,7 @@ from lbt_synth.design.shaping.frequencies import Grid, distinct_bands, first_gri
 from lbt_synth.design.shaping.objectives import (
     ResidualVariance,
     Term,
-    Total,
     VibrationBand,
-    Worst,
     leaves,
     require_term,
     spectrum_of,
@@ -47,10 +46,8 @@ from lbt_synth.loop.least_residuals.residual_limit import (
 )
 from lbt_synth.models import (
     ARModel,
-    Atmosphere,
     LoopHardware,
     Spectrum,
-    TabulatedSpectrum,
     Truth,
 )
 from lbt_synth.models.spectra import SumSpectrum
@@ -100,7 +97,7 @@ class Specification:
             if not isinstance(demand, Demand):
                 known = ", ".join(kind.__name__ for kind in get_args(Demand))
                 raise ProblemError(f"a demand must be one of {known}; got {type(demand).__name__}.")
-        written = [to_metadata(demand) for demand in demands]
+        written = [to_plain(demand) for demand in demands]
         for index, demand in enumerate(demands):
             if written[index] in written[:index]:
                 raise ProblemError(f"each demand must be given once; got twice {demand.label!r}.")
@@ -120,7 +117,7 @@ class Specification:
     @property
     def key(self) -> str:
         """Text that equal specifications share."""
-        return json.dumps(to_metadata(self))
+        return json.dumps(to_plain(self))
 
     @property
     def bands_hz(self) -> tuple[tuple[float, float], ...]:
@@ -164,40 +161,6 @@ class Specification:
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check each demand on the real loop."""
         return tuple(check for demand in self.demands for check in demand.checks(loop))
-
-
-_KINDS: dict[str, type[Any]] = {
-    kind.__name__: kind
-    for kind in (
-        *get_args(Demand),
-        *(Specification, ResidualVariance, VibrationBand, Total, Worst),
-        *(Atmosphere, ARModel, TabulatedSpectrum),
-    )
-}
-
-
-def to_metadata(value: Any) -> Any:
-    """Return a specification, or a part of it, as plain values for JSON."""
-    name = type(value).__name__
-    if name in _KINDS:
-        named = {f.name: to_metadata(getattr(value, f.name)) for f in fields(value)}
-        return {"kind": name, **named}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, list | tuple):
-        return [to_metadata(v) for v in value]
-    return value
-
-
-def from_metadata(data: Any) -> Any:
-    """Rebuild what :func:`to_metadata` wrote; an unknown kind raises KeyError."""
-    if isinstance(data, dict):
-        values = dict(data)
-        kind = _KINDS[values.pop("kind")]
-        return kind(**{key: from_metadata(v) for key, v in values.items()})
-    if isinstance(data, list):
-        return tuple(from_metadata(v) for v in data)
-    return data
 
 
 def violated_demands(
