@@ -130,9 +130,7 @@ def certify_filter(
 ) -> Certificate:
     """Check a predictor gain (n, q) against its problem, and that its variance is the least.
 
-    Eigenvalues give the spectral radius, a Lyapunov equation and its adjoint the variance, level
-    sets and a frequency grid the norm. If the covariance of the Lyapunov equation reproduces the
-    gain, it is the Kalman gain.
+    That holds if the covariance of the Lyapunov equation reproduces the gain.
     """
     error, period = problem.error_system(gain_predictor), problem.period
     name = "spectral radius of the filter" + " over a period" * (period > 1)
@@ -165,11 +163,7 @@ def variance_distance(
 def certify_error(
     error: StateSpace, *, stability: str = "spectral radius of the filter"
 ) -> Certificate:
-    """Certify a system from disturbance to estimation error.
-
-    The checks are stability, the variance by a Lyapunov equation and its adjoint, and the norm by
-    level sets and on a frequency grid. ``stability`` names the first check.
-    """
+    """Certify a system from disturbance to error; ``stability`` names the first check."""
     return _examine_error(error, stability)[0]
 
 
@@ -299,21 +293,11 @@ def _radius_check(name: str, radius: float) -> Check:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Evidence:
-    """What is computed of a design from its matrices alone, once for all its claims.
-
-    Attributes
-    ----------
-    design : Design
-        The design.
-    certificate : Certificate
-        Checks that rest on no claim, the first one on stability; and the norms of its error.
-    kalman : FilterRiccati or None
-        The Kalman filter of a filter's problem.
-    """
+    """What is computed of a design from its matrices alone, once for all its claims."""
 
     design: Any
-    certificate: Certificate
-    kalman: Any = None
+    certificate: Certificate  # checks that rest on no claim, stability first; norms of the error
+    kalman: Any = None  # the Kalman filter of a filter's problem
 
 
 def _made_of_it(evidence: Evidence, value: Any) -> Iterable[Check]:
@@ -323,25 +307,9 @@ def _made_of_it(evidence: Evidence, value: Any) -> Iterable[Check]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim(Column):
-    """A number, or one per mode, that a design says of itself.
+    """A number, or one per mode, that a design says of itself: how it is printed and checked."""
 
-    Attributes
-    ----------
-    name : str
-        Its key in gain files and in JSON.
-    heading, unit, format : str
-        How it is printed.
-    checks : callable
-        From the evidence and the value claimed to the checks of it.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> [claim.name for claim in lbt.kalman(walk).CLAIMS][:2]
-    ['rms', 'gamma']
-    """
-
+    # from the evidence and the value claimed to the checks of it
     checks: Callable[[Evidence, Any], Iterable[Check]] = _made_of_it
 
 

@@ -202,18 +202,7 @@ class FilterDesign(Design):
         return False
 
     def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
-        """System from w to the estimation error.
-
-        Parameters
-        ----------
-        problem : EstimationProblem, optional
-            Problem with other disturbances; the design's own by default.
-
-        Returns
-        -------
-        StateSpace
-            The system.
-        """
+        """System from w to the estimation error, of the design's own problem by default."""
         return (problem or self.problem).error_system(self.gain_predictor)
 
     def derived(self) -> dict[str, Any]:

@@ -195,7 +195,7 @@ def _design_h2(scaled: ScaledPlant, equations: TwoRiccati, share: float) -> Cont
 
 
 def _least_rms(equations: TwoRiccati) -> float:
-    """Return the least standard deviation: that with known state, and that of estimating the law.
+    """Return the least standard deviation of z.
 
     ``|z|^2`` is the cost with known state and disturbance, plus that of the distance of the
     control from ``F x + F0 w``, of which the measurements leave an error.

@@ -189,13 +189,7 @@ class MixedController:
         return command
 
     def banks(self) -> tuple[Bank, ...]:
-        """Return the controllers of single modes and the filter as banks, without a reconstructor.
-
-        Raises
-        ------
-        ProblemError
-            If the filter is no linear controller of this package.
-        """
+        """Return integrators and filter as banks; one that is only stepped is a ProblemError."""
         if self._running is not None:
             raise ProblemError(
                 "only a filter with matrices (a design or a Controller) makes a linear "

@@ -131,13 +131,7 @@ class Specification:
         return tuple(spectrum for spectrum in found if spectrum is not None)
 
     def require_fitting(self, hardware: LoopHardware) -> None:
-        """Refuse bands beyond the Nyquist frequency, and models of another frame rate.
-
-        Raises
-        ------
-        ProblemError
-            Naming the band or the rate.
-        """
+        """Refuse bands beyond the Nyquist frequency, and models of another frame rate."""
         nyquist = hardware.frame_rate_hz / 2
         for low, high in self.bands_hz:
             if high > nyquist:
