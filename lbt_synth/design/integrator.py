@@ -271,8 +271,7 @@ def _design_with_gain(
 def integrator_gain_limit(delay_frames: float) -> float:
     """Gain at which an integrator loop becomes unstable.
 
-    ``2 sin(pi / (2 (2 d - 1)))`` for a whole delay of d frames; for a fractional
-    one the limit is found numerically.
+    It is ``2 sin(pi / (2 (2 d - 1)))`` for a whole delay of d frames.
 
     Parameters
     ----------
@@ -295,17 +294,11 @@ def integrator_gain_limit(delay_frames: float) -> float:
     >>> [round(lbt.design.integrator_gain_limit(d), 3) for d in (2, 3, 4)]
     [1.0, 0.618, 0.445]
     """
-    hardware = LoopHardware(frame_rate_hz=1.0, delay_frames=delay_frames, modes=1)
-    d = hardware.delay_frames
-    if d == round(d):
-        return float(2 * np.sin(np.pi / (2 * (2 * d - 1))))
-    return _limit_above(hardware, 0.5 / d)  # stable: well below the limit of the next whole delay
+    return hardware_gain_limit(LoopHardware(frame_rate_hz=1.0, delay_frames=delay_frames, modes=1))
 
 
 def hardware_gain_limit(hardware: LoopHardware, law: IntegratorLaw = PURE) -> float:
     """Gain at which the loop of a law becomes unstable, with the dynamics of the mirror."""
-    if hardware.mirror is None and law.is_pure:
-        return integrator_gain_limit(hardware.delay_frames)
     single = hardware.single_mode()
     taps = single.mirror_taps
     mean_delay_frames = 1 + float(np.abs(np.arange(taps.size) @ taps))
@@ -321,12 +314,7 @@ def hardware_gain_limit(hardware: LoopHardware, law: IntegratorLaw = PURE) -> fl
                 f"frames without a zero_hz below {highest:.3g}; "
                 f"got {'none' if law.zero_hz is None else f'{law.zero_hz:g}'}."
             )
-    return _limit_above(single, gain, law)
-
-
-def _limit_above(hardware: LoopHardware, gain: float, law: IntegratorLaw = PURE) -> float:
-    """Return the gain limit of a loop that is stable with a given gain."""
-    return gain * stable_sensor_gains(hardware, law.controller(hardware, gain))[1]
+    return gain * stable_sensor_gains(single, law.controller(single, gain))[1]
 
 
 def _allowed_gains(hardware: LoopHardware, law: IntegratorLaw, trials: FloatArray) -> FloatArray:

@@ -24,7 +24,6 @@ from lbt_synth.loop.evaluator import ResidualBudget
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
-    IntArray,
     Obstruction,
     Positive,
     check_fields,
@@ -187,20 +186,13 @@ def _integrated_otf(
 ) -> FloatArray:
     """Return Strehl ratios (p,) of jitters of a spread (p,), in turns of phase over the pupil."""
     fineness = np.ceil(np.log2(np.maximum(spread / _TURNS, 1.0))).astype(np.int64)
-    directions = np.minimum(
-        _directions(covariance, lines, imaging.cycles_per_nm), _DIRECTIONS << fineness
-    )
     # |f.a|^2 and f'Sf are quadratic forms of f
     forms = _quadratic_form(np.real(np.einsum("psi,psj->psij", lines, lines.conj())))
     widths = _quadratic_form(covariance)
-    # jitter along the axes is the same in all four quadrants
-    aligned = ~np.any(forms[..., 1], axis=1) & (widths[:, 1] == 0)
     out = np.empty(len(spread))
-    rules = np.column_stack([fineness, directions, aligned])
-    unique, own = np.unique(rules, axis=0, return_inverse=True)
-    for i, rule in enumerate(unique.tolist()):
-        members = np.flatnonzero(own.reshape(-1) == i)
-        squares, weight = _weighted_otf(imaging.obstruction, *rule)
+    for level in np.unique(fineness).tolist():
+        members = np.flatnonzero(fineness == level)
+        squares, weight = _weighted_otf(imaging.obstruction, level)
         squares = squares * imaging.cycles_per_nm**2
         step = max(1, _POINT_CHUNK // weight.size)
         for start in range(0, len(members), step):
@@ -210,7 +202,7 @@ def _integrated_otf(
                 if np.any(forms[part, line]):
                     turns_squared = np.maximum(forms[part, line] @ squares, 0)
                     factor = factor * j0(2 * np.pi * np.sqrt(turns_squared))
-            out[part] = imaging.other_modes * (factor @ weight)
+            out[part] = imaging.other_modes * np.minimum(factor @ weight, 1.0)
     return out
 
 
@@ -219,22 +211,6 @@ def _quadratic_form(matrices: FloatArray) -> FloatArray:
     if matrices.shape[-1] == 1:
         matrices = matrices * np.diag([1.0, 0.0])
     return np.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], axis=-1)
-
-
-def _directions(covariance: FloatArray, lines: ComplexArray, cycles_per_nm: float) -> IntArray:
-    """Return how many directions of half a turn each jitter needs, (p,): a power of two.
-
-    The sum over N of them misses the harmonics from 2 N on: at most ``exp(growth - 4 N)``, where
-    ``exp(growth)`` bounds the integrand at angles with an imaginary part of 2. That is 1e-15 here.
-    """
-    variance, last = covariance[:, 0, 0], covariance[:, -1, -1]
-    two = covariance.shape[1] == 2
-    unequal = np.hypot(variance - last, 2 * covariance[:, 0, 1]) if two else variance
-    growth = (np.pi * cycles_per_nm) ** 2 * unequal * (np.cosh(4) - 1)
-    amplitudes = np.sum(np.linalg.norm(lines, axis=2), axis=1)
-    growth += 2 * np.pi * cycles_per_nm * amplitudes * np.sinh(2)
-    exponent = np.ceil(np.log2((growth - np.log(1e-15)) / 4))
-    return np.asarray(2 ** np.minimum(exponent, 30).astype(np.int64))
 
 
 def series_strehl(
@@ -275,13 +251,8 @@ def _require_axes(size: int) -> None:
 
 
 @lru_cache(maxsize=32)
-def _weighted_otf(
-    obstruction: float, fineness: int, directions: int, quadrant: int
-) -> tuple[FloatArray, FloatArray]:
-    """Nodes as (fx^2, 2 fx fy, fy^2) [(D/lambda)^2], and OTF weights of sum 1.
-
-    The nodes fill half the plane; with ``quadrant``, a quarter of it.
-    """
+def _weighted_otf(obstruction: float, fineness: int) -> tuple[FloatArray, FloatArray]:
+    """Nodes in half the plane, (fx^2, 2 fx fy, fy^2) [(D/lambda)^2], and OTF weights of sum 1."""
     eps = obstruction
     kinks = {0.0, 0.02, 0.1, 0.3, eps, (1 - eps) / 2, (1 + eps) / 2, 1.0}
     edges = np.array(sorted(kinks))
@@ -289,7 +260,8 @@ def _weighted_otf(
         edges = np.sort(np.concatenate([edges, (edges[1:] + edges[:-1]) / 2]))
     radius, weight = gauss_panels(edges, 12)
     weight = weight * radius * annular_otf(radius, eps)
-    angle = np.pi * (np.arange(directions // 2 if quadrant else directions) + 0.5) / directions
+    directions = _DIRECTIONS << fineness
+    angle = np.pi * (np.arange(directions) + 0.5) / directions
     fx, fy = np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()
     weights = np.repeat(weight / (weight.sum() * angle.size), angle.size)
     return np.stack([fx**2, 2 * fx * fy, fy**2]), weights

@@ -198,7 +198,7 @@ def dense_strehl(covariance, lines, imaging):
     return imaging.other_modes * float(weight @ factor.mean(axis=1) / weight.sum())
 
 
-def test_fewer_directions_lose_nothing():
+def test_many_jitters_are_integrated_as_each_of_them():
     rng = np.random.default_rng(5)
     count = 300
     roots = 10 ** rng.uniform(0, 3, (count, 1, 1)) * rng.standard_normal((count, 2, 2))
