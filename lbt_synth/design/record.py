@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lbt_synth.design.certificate import Certificate
-from lbt_synth.design.fallbacks import Fallback
+from lbt_synth.design.filter_design import Fallback
 from lbt_synth.design.plain import from_plain, to_plain
 from lbt_synth.design.result import Design, SolverReport
 from lbt_synth.linear import Controller, EstimationProblem, Witness
