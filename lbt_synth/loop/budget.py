@@ -119,10 +119,7 @@ def residual_budget(
 
 
 def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
-    """Return the covariance of all readings in the first frame of a period, (q, q).
-
-    A plant's model is the truth. In that frame every sensor is read.
-    """
+    """Return the covariance (q, q) of all readings in the first frame of a period."""
     every = _evaluator(loop, loop.system, None, in_image=False)
     parts = [every.shaken(_noise_factor(loop, plant.own_noise_factor))]
     for mode, model in enumerate(plant.turbulence):
@@ -326,18 +323,14 @@ def resonance_edges(loop: ClosedLoop) -> FloatArray:
 def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     """Position of a settled mirror less the real one, for the commands that a loop gives.
 
-    The paper's equation 1, ``phi_cor(k-1) = N u(k-2)`` (at its delay of two frames), is exact
-    for a mirror that settles at once; this is by how much it misses the position averaged
-    over the exposure. It is no residual: the loop corrects for part of it.
+    It is by how much the paper's equation 1, ``phi_cor(k-1) = N u(k-2)``, misses the position over
+    the exposure; no residual, as the loop corrects for part of it.
     """
     return residual_budget(replace(loop, system=_difference_loop(loop)), truth, frame_means=True)
 
 
 def _difference_loop(loop: ClosedLoop) -> StateSpace:
-    """Return the loop whose outputs are the settled mirror's position less the real one.
-
-    The real one is the phase less the residual.
-    """
+    """Return the loop to the settled mirror's position less the real one, phase less residual."""
     hardware, s, n = loop.hardware, loop.system, loop.hardware.modes
     if hardware.mirror is None:  # it leaves nothing, not even rounding
         return replace(s, C=0 * s.C[:n], D=0 * s.D[:n])

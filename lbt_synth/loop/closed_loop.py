@@ -85,13 +85,7 @@ class ClosedLoop(Summarised):
         return self.radius_per_frame < 1 - STABILITY_MARGIN
 
     def require_stable(self) -> None:
-        """Raise if the loop is unstable or marginally stable.
-
-        Raises
-        ------
-        UnstableLoopError
-            With the spectral radius.
-        """
+        """Raise UnstableLoopError if the loop is unstable or marginally stable."""
         if not self.is_stable:
             radius = self.radius_per_frame
             word = "a marginally stable" if radius < 1 + STABILITY_MARGIN else "an unstable"
@@ -321,13 +315,11 @@ def loop_matrices(
 def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controller:
     """Return the controller from y to u of a filter from the pseudo-open-loop ybar to u.
 
-    The path from command to measurement is known, and so is the measurement that there would be
-    without any correction, ``ybar(k) = y(k) + sensor_matrix influence_matrix (c[0] u(k-1) + c[1]
-    u(k-2) + ...)``, with the mirror's taps c (computed by its states where it has dynamics). Every
-    controller that stabilises the loop is a stable filter from ybar to u, the Youla parameter, and
-    the closed loop is affine in that filter (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans.
-    Autom. Control 21, 319 (1976), doi:10.1109/TAC.1976.1101223). It has the mirror, or its past
-    commands if it settles, as further states.
+    The measurement that there would be without any correction is known, ``ybar(k) = y(k) +
+    sensor_matrix influence_matrix (c[0] u(k-1) + c[1] u(k-2) + ...)`` with the mirror's taps c.
+    Every controller that stabilises the loop is a stable filter from it to u, in which the closed
+    loop is affine (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans. Autom. Control 21, 319
+    (1976), doi:10.1109/TAC.1976.1101223).
     """
     m, q = hardware.n_commands, hardware.n_measurements
     if (len(parameter.C), parameter.B.shape[1]) != (m, q):

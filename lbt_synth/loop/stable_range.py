@@ -96,10 +96,7 @@ def parts_by_gain(
 
 
 def affine_parts(A0: FloatArray, A1: FloatArray) -> list[AffinePart]:
-    """Split matrices ``A0[t] + g A1[t]``, (N, n, n), into parts whose states act on one another.
-
-    They have the eigenvalues of the whole; equal parts are returned once.
-    """
+    """Split ``A0[t] + g A1[t]``, (N, n, n), into the different parts that act on themselves."""
     links = np.any((A0 != 0) | (A1 != 0), axis=0)
     label = component_labels(links, strong=True)
     parts = (np.ix_(range(len(A0)), label == i, label == i) for i in np.unique(label))
@@ -162,10 +159,7 @@ def stable_sensor_gains(
 
 
 def stable_range(parts: list[AffinePart], nominal: float) -> tuple[float, float]:
-    """Return the interval around a gain in which all parts are stable.
-
-    It is nan where they are not at the nominal gain, 0 and inf beyond a factor of 1e4.
-    """
+    """Return where all parts are stable: nan if nowhere, 0 and inf at open ends."""
     if not affine_radii(parts, np.array([nominal]))[0] < 1:
         return np.nan, np.nan
     ranges = np.array(
@@ -179,10 +173,7 @@ def stable_range(parts: list[AffinePart], nominal: float) -> tuple[float, float]
 
 
 def exact_range(part: AffinePart, nominal: float) -> tuple[float, float] | None:
-    """Return between which numbers a part that is stable at the nominal one stays stable.
-
-    It is None where the matrices repeat with a longer period or change by a higher rank.
-    """
+    """Return where a part stays stable; None for a longer period or a higher rank."""
     start, slope = part
     if len(start) > 1:
         return None
@@ -323,10 +314,7 @@ class MovingGain(Summarised):
 
 
 def circle_norm(loop: ClosedLoop, *, low: float, high: float) -> float:
-    """Return ``r ||T||_inf`` of an interval of gains, which proves it below ``CIRCLE_LIMIT``.
-
-    It is inf where the loop is not stable at the middle of the interval.
-    """
+    """Return ``r ||T||_inf`` of an interval of gains; inf if the middle is unstable."""
     middle = (low + high) / 2
     centred = close_loop(loop.hardware, loop.controller, sensor_gain=middle)
     if not centred.is_stable:
@@ -395,10 +383,7 @@ def moving_gain(loop: ClosedLoop) -> MovingGain:
 def loop_changes(
     hardware: LoopHardware, *, low: float, high: float, delay_frames: float
 ) -> list[LoopChange]:
-    """Return the loops that stand for all gains of an interval, and delays within an error.
-
-    The mirror settles at once if the delay has an error. A delay below one frame does not occur.
-    """
+    """Return the loops that stand for all gains of an interval, and delays within an error."""
     d, own = hardware.delay_frames, hardware.mirror_taps
     early, late = max(d - delay_frames, 1.0), d + delay_frames
     whole = np.arange(np.ceil(early), np.floor(late) + 1).tolist()

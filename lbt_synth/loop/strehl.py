@@ -80,10 +80,7 @@ class Imaging:
 
     @property
     def cycles_per_nm(self) -> float:
-        """Highest spatial frequency D/lambda, in cycles per nm of tilt wavefront.
-
-        An angle of theta is ``theta D / 4`` of wavefront, so that D cancels.
-        """
+        """Highest spatial frequency, in cycles per nm of tilt, ``D / 4`` of an angle."""
         return 4 / (self.wavelength_um * 1e3)
 
 
@@ -268,11 +265,7 @@ def _weighted_otf(obstruction: float, fineness: int) -> tuple[FloatArray, FloatA
 
 
 def annular_otf(radius: FloatArray, obstruction: float) -> FloatArray:
-    """Diffraction-limited transfer function of an annular pupil, at radius f lambda / D.
-
-    It is the autocorrelation of the annulus: the overlap of the two discs, less twice that of
-    disc and obstruction, plus that of the obstructions.
-    """
+    """Transfer function of an annular pupil at radius f lambda / D: the overlap of two annuli."""
     rho, eps = np.asarray(radius, dtype=np.float64), obstruction
     overlap = _lens(rho, 0.5, 0.5)
     if eps > 1e-8:  # the area of a smaller one is rounding
