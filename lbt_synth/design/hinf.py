@@ -74,12 +74,8 @@ def hinf(
         If both bounds are given, or a value is out of its range.
     InfeasibleError
         If the bound is below the least gamma; the message names the least.
-    DetectabilityError
-        If no stable filter exists.
-    NumericalError
-        If the solver fails.
-    CertificateError
-        If the design does not pass its checks.
+    DetectabilityError, NumericalError, CertificateError
+        As :func:`kalman`.
 
     Examples
     --------

@@ -350,12 +350,8 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
         If the plant is none of :func:`tip_tilt_plant`, or an argument is out of its range.
     DimensionError
         If the mirror does not reach every mode.
-    DetectabilityError
-        If no stable filter exists.
-    NumericalError
-        If a Riccati equation is not solved.
-    CertificateError
-        If the design does not pass its checks.
+    DetectabilityError, NumericalError, CertificateError
+        As :func:`kalman`.
 
     Examples
     --------

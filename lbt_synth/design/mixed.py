@@ -90,10 +90,8 @@ def mixed(
         If not exactly one bound is given, or a value is out of its range.
     InfeasibleError
         If no filter meets the bound.
-    NumericalError
-        If the programme fails.
-    CertificateError
-        If the design does not pass its checks.
+    DetectabilityError, NumericalError, CertificateError
+        As :func:`kalman`.
 
     Examples
     --------

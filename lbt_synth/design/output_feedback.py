@@ -246,10 +246,8 @@ def hinf_controller(
         If the bound is below the least gamma; with the least, and the reason.
     ProblemError
         If both bounds are given, or a value is out of its range.
-    NumericalError
-        If the equations or the inequality were not solved.
-    CertificateError
-        If the controller does not pass its checks.
+    NumericalError, CertificateError
+        As :func:`h2_controller`.
 
     References
     ----------

@@ -80,14 +80,8 @@ def robust(
 
     Raises
     ------
-    ProblemError
-        If an argument is out of its range.
-    InfeasibleError
-        If the demands cannot hold together, or not with so few states.
-    NumericalError
-        If a programme fails.
-    CertificateError
-        If the design does not pass its checks.
+    ProblemError, InfeasibleError, NumericalError, CertificateError
+        As :func:`shape`.
 
     Examples
     --------

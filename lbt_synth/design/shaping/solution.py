@@ -31,7 +31,7 @@ _LEAST_SHARE = 1e-3  # of a step that is tried
 _PENALTY = 10.0  # relative rise of the objective that a relative excess of a bound is worth
 _FINE = 2048  # frequencies, at least, at which bounds are looked at between those of a programme
 _MISS = 2e-3  # by which an objective or a worst case may exceed that of the programme's frequencies
-_FLAT = 0.03  # weight of the whole response, beside the spectra: demands hold at all frequencies
+_FLAT = 0.1  # weight of the whole response, beside the spectra: demands hold at all frequencies
 _RELAXED = 1e-6  # relaxations below this are none
 
 
@@ -251,18 +251,19 @@ def reduce_mode(
     spec: Specification, long: ModeSolution, most: int, tolerance: float
 ) -> ModeSolution:
     """Solve with as few functions as keep the objective of a long parameter within a tolerance."""
-    accepted, loss = None, np.inf
+    accepted, losses = None, [np.inf]
     for size in range(most, 0, -1):
         shorter = solve_with_few(spec, long, size)
-        loss = np.inf if shorter is None else shorter.objective_nm / long.objective_nm - 1
-        if shorter is None or loss > tolerance:
+        losses.append(np.inf if shorter is None else shorter.objective_nm / long.objective_nm - 1)
+        if losses[-1] <= tolerance:
+            accepted = shorter
+        elif size < most and losses[-2] > tolerance:  # two in a row: a size alone may be unlucky
             break
-        accepted = shorter
     if accepted is not None:
         return accepted
     states = most + long.channel.hardware.mirror_system.whole.n_states
     best, advice = "none was feasible", f"Try states={2 * states}."
-    if np.isfinite(loss):
+    if np.isfinite(loss := min(losses)):
         best = f"the best lost {100 * loss:.3g} %"
         advice = f"Try states={2 * states} or loss={1.1 * loss:.2g}."
     raise InfeasibleError(
