@@ -25,12 +25,10 @@ from lbt_synth.storage.rows import Column, column, row_table
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import FloatArray, frozen_copy, number, set_fields
 
-GAIN_TOLERANCE = 1e-6
-NORM_TOLERANCE = 1e-6
-ORIGIN_TOLERANCE = 1e-5
-RESIDUAL_TOLERANCE = 1e-8
-INFEASIBLE_TOLERANCE = 1e-9
-VARIANCE_TOLERANCE = 1e-6
+TOLERANCE = 1e-6  # relative, of norms, variances and gains: what two routes differ by at most
+ORIGIN_TOLERANCE = 1e-5  # of a filter from that of its equation, and of a bound that is reached
+RESIDUAL_TOLERANCE = 1e-8  # of a Lyapunov equation
+INFEASIBLE_TOLERANCE = 1e-9  # of a level beside what is proved of it
 LEVEL_SETS = "level sets on the symplectic pencil"
 BY_DISTURBANCES = "disturbances that no measurement shows"
 _GRID = 513  # frequencies from 0 to the Nyquist frequency
@@ -143,7 +141,7 @@ def certify_filter(
         covariances = P[None] if period == 1 else error.covariances()
         distance = variance_distance(problem, gain_predictor, covariances)
         how = "gain recomputed from the Lyapunov covariance"
-        checks.append(Check("distance from the least-variance gain", distance, GAIN_TOLERANCE, how))
+        checks.append(Check("distance from the least-variance gain", distance, TOLERANCE, how))
     powers = certificate.rms_per_output.reshape(period, -1) ** 2  # of all phases, one by one
     rms = frozen_copy(np.sqrt(powers.mean(axis=0)))
     return replace(certificate, checks=tuple(checks), rms_per_output=rms)
@@ -179,7 +177,7 @@ def _examine_error(error: StateSpace, stability: str) -> tuple[Certificate, Floa
     highest = float(np.max(largest_singular_values(error, grid)))
     above = (highest - _rounding(error)) / max(norm.upper, _TINY) - 1
     how = f"{_GRID} frequencies against level sets"
-    peak = Check("singular values above the norm", above, NORM_TOLERANCE, how)
+    peak = Check("singular values above the norm", above, TOLERANCE, how)
     rms = frozen_copy(np.sqrt(np.maximum(variances, 0)))
     certificate = Certificate(checks=(stable, *checks, peak), gamma=norm.value, rms_per_output=rms)
     return certificate, P
@@ -211,7 +209,7 @@ def _examine_variance(error: StateSpace) -> tuple[FloatArray, FloatArray, tuple[
         Check(
             "variance, against its adjoint equation",
             apart,
-            VARIANCE_TOLERANCE,
+            TOLERANCE,
             "relative, two Lyapunov equations",
         ),
     )
@@ -319,6 +317,6 @@ def measured_claim(name: str, heading: str) -> Claim:
     def checks(evidence: Evidence, value: float) -> Iterable[Check]:
         measured = getattr(evidence.certificate, name)
         apart = abs(measured / value - 1) if value > 0 else measured
-        yield Check(f"{heading}, against the one claimed", apart, NORM_TOLERANCE, "relative")
+        yield Check(f"{heading}, against the one claimed", apart, TOLERANCE, "relative")
 
     return Claim(name=name, heading=heading, unit="nm", checks=checks)

@@ -17,11 +17,10 @@ from typing import Any, ClassVar, TypeGuard
 import numpy as np
 
 from lbt_synth.design.certificate import (
-    GAIN_TOLERANCE,
     INFEASIBLE_TOLERANCE,
     LEVEL_SETS,
-    NORM_TOLERANCE,
     ORIGIN_TOLERANCE,
+    TOLERANCE,
     Check,
     Claim,
     Evidence,
@@ -71,7 +70,7 @@ def _check_bound(evidence: Evidence, gamma: float) -> Iterator[Check]:
     """Check that the norm keeps its bound, and that the filter is one of this bound."""
     design, norm = evidence.design, evidence.certificate.gamma
     name = "norm of the estimation error over its bound, less 1"
-    yield Check(name, norm / gamma - 1, NORM_TOLERANCE, LEVEL_SETS)
+    yield Check(name, norm / gamma - 1, TOLERANCE, LEVEL_SETS)
     origins = [evidence.kalman]
     with suppress(NumericalError):
         central = gamma_riccati(design.problem, gamma, start=evidence.kalman)
@@ -86,18 +85,18 @@ def _check_rms_bound(evidence: Evidence, bound: float) -> Iterator[Check]:
     """Check that the deviation keeps its bound, and uses it."""
     apart = evidence.certificate.rms / bound - 1
     name = "standard deviation of the estimation error over its bound, less 1"
-    yield Check(name, apart, NORM_TOLERANCE, "Lyapunov equation")
+    yield Check(name, apart, TOLERANCE, "Lyapunov equation")
     name = "bound over the standard deviation of the estimation error, less 1"
     yield Check(name, -apart, ORIGIN_TOLERANCE, "Lyapunov equation")
 
 
 def _check_least(evidence: Evidence, least: float) -> Iterator[Check]:
     """Check the least norm on both sides: the level above is met, the level below is not."""
-    problem, sides = evidence.design.problem, (-NORM_TOLERANCE, NORM_TOLERANCE)
+    problem, sides = evidence.design.problem, (-TOLERANCE, TOLERANCE)
     meets = [meets_level(problem, least * (1 + side), evidence.kalman) for side in sides]
     off = 0.0 if meets == [False, True] else np.inf
     how = "gamma-Riccati equation on both sides"
-    yield Check("least norm of any filter, error", off, NORM_TOLERANCE, how)
+    yield Check("least norm of any filter, error", off, TOLERANCE, how)
 
 
 def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
@@ -110,7 +109,7 @@ def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
     below = -proved.value / (1 + proved.value)
     yield proved
     name = "level proved over the infeasible level, less 1"
-    yield Check(name, below, NORM_TOLERANCE, proved.computed_by)
+    yield Check(name, below, TOLERANCE, proved.computed_by)
 
 
 RMS = measured_claim("rms", "estimation error, rms")
@@ -330,7 +329,7 @@ class FilterDesign(Design):
         size = max(float(np.max(np.abs(self.gain_predictor), initial=0.0)), 1e-300)
         value = apart / size
         how = "A times the filter gain, relative"
-        return Check("predictor gain against the filter gain", value, GAIN_TOLERANCE, how)
+        return Check("predictor gain against the filter gain", value, TOLERANCE, how)
 
 
 def _distance(design: FilterDesign, origin: FilterRiccati) -> float:
@@ -409,7 +408,7 @@ def fallback_checks(problem: TipTiltPlant, fallbacks: tuple[Fallback, ...]) -> l
         Check(
             "distance from the least-variance gains of any fall-back",
             _fallback_distance(problem, fallback),
-            GAIN_TOLERANCE,
+            TOLERANCE,
             "gains recomputed from the Lyapunov covariances",
         )
         for fallback in fallbacks

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial.chebyshev import Chebyshev, chebpts2
 from scipy.optimize import brentq
 
-from lbt_synth.design.certificate import LEVEL_SETS, NORM_TOLERANCE, Check, Claim, Evidence
+from lbt_synth.design.certificate import LEVEL_SETS, TOLERANCE, Check, Claim, Evidence
 from lbt_synth.design.result import Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller, hinf_norm
@@ -152,7 +152,7 @@ def _margin_claim(name: str, margin: str, unit: str, how: str) -> Claim:
         design = evidence.design
         achieved = design.law.margins(close_loop(design.hardware, design.controller))[name]
         label = f"{margin} demanded over achieved, less 1"
-        yield Check(label, demanded / achieved - 1, NORM_TOLERANCE, how)
+        yield Check(label, demanded / achieved - 1, TOLERANCE, how)
 
     return Claim(name=name, heading=f"{margin} demanded", unit=unit, checks=checks)
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.linalg import block_diag
 
-from lbt_synth.design.certificate import Check, Claim, Evidence
+from lbt_synth.design.certificate import ORIGIN_TOLERANCE, TOLERANCE, Check, Claim, Evidence
 from lbt_synth.design.result import (
     UNCERTIFIED,
     Design,
@@ -43,12 +43,6 @@ from lbt_synth.validation import (
     number,
     require_instance,
 )
-
-_MOST_FUNCTIONS = 400
-_ROUNDED = 5e-7
-_RMS_TOLERANCE = 1e-6
-_CLAIM_TOLERANCE = 1e-5
-_TEST_HZ = (0.0, 0.003, 0.02, 0.11, 0.37)  # parts of the frame rate
 
 
 def shape(
@@ -127,7 +121,7 @@ def shape(
             f"give one specification, or one for each of {hardware.modes} modes; got {len(given)}."
         )
     specifications: tuple[Specification, ...] = given
-    size = integer(functions, "functions", at_least=1, at_most=_MOST_FUNCTIONS)
+    size = integer(functions, "functions", at_least=1, at_most=400)
     common = number(pole, "pole", at_least=0, below=1)
     tolerance = number(loss, "loss", at_least=0)
     require_separable(hardware)
@@ -153,7 +147,7 @@ def shape(
         problem=hardware,
         specifications=specifications,
         parameters=parameters,
-        claims={"objective_nm": tuple(mode.objective_nm * (1 + _ROUNDED) for mode in modes)},
+        claims={"objective_nm": tuple(mode.objective_nm * (1 + TOLERANCE / 2) for mode in modes)},
         long_objective_nm=tuple(long.objective_nm for long in longs),
         long_functions=size,
     )
@@ -172,14 +166,14 @@ def _check_objective(evidence: Evidence, claimed: tuple[float, ...]) -> Iterator
         above = objective / claimed[mode] - 1 if claimed[mode] > 0 else np.inf
         below = claimed[mode] / objective - 1 if objective > 0 else np.inf
         how, name = "closed loops in state space", f"{prefix}objective"
-        yield Check(f"{name} found over the one claimed, less 1", above, _RMS_TOLERANCE, how)
-        yield Check(f"{name} claimed over the one found, less 1", below, _CLAIM_TOLERANCE, how)
+        yield Check(f"{name} found over the one claimed, less 1", above, TOLERANCE, how)
+        yield Check(f"{name} claimed over the one found, less 1", below, ORIGIN_TOLERANCE, how)
     yield _decoupling_check(design)
 
 
 def _decoupling_check(design: ShapedDesign) -> Check:
     """Check that the whole loop rejects what the loops of the single modes reject."""
-    f = np.array(_TEST_HZ) * design.problem.frame_rate_hz
+    f = np.linspace(0, 0.4, 5) * design.problem.frame_rate_hz
     whole = close_loop(design.problem, design.controller).sensitivity(f)
     single = np.zeros_like(whole)
     for mode, parameter in enumerate(design.parameters):
@@ -187,7 +181,7 @@ def _decoupling_check(design: ShapedDesign) -> Check:
         single[:, mode, mode] = loop.sensitivity(f)[:, 0, 0]
     apart = float(np.max(np.abs(whole - single)))
     how = f"sensitivity at {f.size} frequencies"
-    return Check("whole loop against its modes", apart, 1e-6, how)
+    return Check("whole loop against its modes", apart, TOLERANCE, how)
 
 
 @table_row

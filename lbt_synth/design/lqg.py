@@ -25,8 +25,7 @@ from typing import ClassVar, NamedTuple, TypeAlias
 import numpy as np
 
 from lbt_synth.design.certificate import (
-    GAIN_TOLERANCE,
-    VARIANCE_TOLERANCE,
+    TOLERANCE,
     Check,
     Claim,
     Evidence,
@@ -74,7 +73,7 @@ def _check_objective(evidence: Evidence, objective_nm: float) -> Iterator[Check]
     for name, value, claimed in pairs:
         apart = abs(value / claimed - 1) if claimed > 0 else value
         how = "relative, Lyapunov equation of the whole loop"
-        yield Check(name, apart, VARIANCE_TOLERANCE, how)
+        yield Check(name, apart, TOLERANCE, how)
 
 
 def _check_weight(evidence: Evidence, rho: float) -> Iterator[Check]:
@@ -97,7 +96,7 @@ def _check_weight(evidence: Evidence, rho: float) -> Iterator[Check]:
         size = max(float(np.linalg.norm(better)), 1e-300)
         worst = max(worst, float(np.linalg.norm(law - better)) / size)
     how = "gains recomputed from a Lyapunov equation"
-    yield Check("distance from the least-cost regulator", worst, GAIN_TOLERANCE, how)
+    yield Check("distance from the least-cost regulator", worst, TOLERANCE, how)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -13,8 +13,7 @@ import numpy as np
 from lbt_synth.design.certificate import (
     INFEASIBLE_TOLERANCE,
     LEVEL_SETS,
-    NORM_TOLERANCE,
-    VARIANCE_TOLERANCE,
+    TOLERANCE,
     Certificate,
     Check,
     Claim,
@@ -58,14 +57,14 @@ _INSIDE = 1e-3  # share of gamma that is kept for what lies between the frequenc
 def _check_bound(evidence: Evidence, gamma: float) -> Iterator[Check]:
     """Check that the norm keeps its bound."""
     above = evidence.certificate.gamma / gamma - 1
-    yield Check("norm of the closed loop over its bound, less 1", above, NORM_TOLERANCE, LEVEL_SETS)
+    yield Check("norm of the closed loop over its bound, less 1", above, TOLERANCE, LEVEL_SETS)
 
 
 def _check_least_rms(evidence: Evidence, least: float) -> Iterator[Check]:
     """Check that the variance is what the equations say the least one is."""
     above = evidence.certificate.rms / max(least, 1e-300) - 1
     how = "closed loop against the Riccati equations"
-    yield Check("rms over the least, less 1", above, VARIANCE_TOLERANCE, how)
+    yield Check("rms over the least, less 1", above, TOLERANCE, how)
 
 
 def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:

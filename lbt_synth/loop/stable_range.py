@@ -66,7 +66,6 @@ _LONGEST = 100  # delay up to which it is sought [frames]
 # loop with a pole nearer to the unit circle does not count as stable.
 CIRCLE_LIMIT = 1 - 1e-7
 _WIDEST_MOVING = 100.0  # factor on the loop's gain beyond which no pyramid's optical gain lies
-_BISECTIONS = 10  # of the share of an interval: the ends are then exact to 1 % or better
 _NONE = np.zeros(0)
 # a loop of another gain, over the one assumed, and delay [frames], and taps of
 # ``z^-1 (M_d - g M_d')``, (t,)
@@ -74,7 +73,7 @@ LoopChange: TypeAlias = tuple[float, float, FloatArray]
 FRAGILE_FRAMES = 0.1  # of delay: what a camera's clock or a busy computer adds
 FRAGILE_DB = 2.0  # of the sensor gain: what the seeing changes within minutes
 _MOST = 10.0  # times these errors: one frame, and a factor of 10
-_HALVINGS = 12  # of that range, to 0.03 % of a frame
+_HALVINGS = 12  # of a range: to 0.03 % of a frame, and to 0.1 % of an end of gains
 _LEVEL = 1 - 1e-6  # of the real part, below which one is proved to stay
 
 
@@ -367,10 +366,7 @@ def moving_gain(loop: ClosedLoop) -> MovingGain:
         low, high = interval(share)
         return circle_norm(loop, low=low, high=high) < CIRCLE_LIMIT
 
-    proved, failed = (1.0, 1.0) if proves(1.0) else (0.0, 1.0)
-    for _ in range(_BISECTIONS if proved < failed else 0):
-        middle = (proved + failed) / 2
-        proved, failed = (middle, failed) if proves(middle) else (proved, middle)
+    proved = _largest_proved(proves, 1.0)
     low, high = interval(proved) if proved else (np.nan, np.nan)
     return MovingGain(
         constant_low=constant[0],
@@ -430,12 +426,17 @@ def errors_together(loop: ClosedLoop) -> float:
         systems = (append_taps(part, taps) for *_, taps in changes for part in parts)
         return all(largest_real_part(system, least=_LEVEL) < 1 for system in systems)
 
-    if is_proved(_MOST):
-        return _MOST
-    low, high = 0.0, _MOST
+    return _largest_proved(is_proved, _MOST)
+
+
+def _largest_proved(proves: Callable[[float], bool], most: float) -> float:
+    """Return the largest number up to ``most`` that is proved, as all below it, by bisection."""
+    if proves(most):
+        return most
+    low, high = 0.0, most
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        low, high = (middle, high) if is_proved(middle) else (low, middle)
+        low, high = (middle, high) if proves(middle) else (low, middle)
     return low
 
 

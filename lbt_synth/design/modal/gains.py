@@ -49,7 +49,7 @@ Density = Callable[[FloatArray], FloatArray]
 
 _GRID = 161  # loop gains
 _HIGHEST = 0.9999  # end of the grid, as a part of the stability limit
-_RESONANT = (0.3, 0.6, 0.8, 0.9, 0.97, 0.99, 0.999)  # parts of it whose resonance is resolved
+_RESONANT = 1 - np.geomspace(0.7, 1e-3, 7)  # parts of it whose resonance is resolved
 _WINDOW = 10  # points that a polynomial interpolates
 _GOLDEN = (np.sqrt(5) - 1) / 2
 _STEPS = 45  # golden sections, to 1e-9 of the bracket

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design.certificate import VARIANCE_TOLERANCE, Certificate, Check
+from lbt_synth.design.certificate import TOLERANCE, Certificate, Check
 from lbt_synth.design.filter_design import FilterDesign
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import UNCERTIFIED, require_hardware
@@ -321,10 +321,10 @@ def _design_filter(plant: TipTiltPlant, modes: list[int]) -> FilterDesign:
 def joining_check(stacked: FloatArray, alone: FloatArray) -> Check:
     """Check the residuals (n,) of the loops of all modes against those of their designs."""
     apart = np.abs((stacked / alone) ** 2 - 1)
-    failing = np.flatnonzero(~(apart < VARIANCE_TOLERANCE))
+    failing = np.flatnonzero(~(apart < TOLERANCE))
     name = f"{_JOINED} ({name_modes(failing)})" if failing.size else _JOINED
     how = "relative variance, loops as arrays and one by one"
-    return Check(name, float(np.max(apart)), VARIANCE_TOLERANCE, how)
+    return Check(name, float(np.max(apart)), TOLERANCE, how)
 
 
 def modal_residuals(
