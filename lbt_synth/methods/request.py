@@ -1,7 +1,4 @@
-"""A method of synthesis with its options, as a command or a study asks for it.
-
-:class:`PlantInputs` lets a study or a record, which have a plant alone, build it.
-"""
+"""A method of synthesis with its options, as a command, a study or a record asks for it."""
 
 from __future__ import annotations
 

@@ -37,11 +37,16 @@ _PLAIN = {"moving_gain", "modulus_margin", "delay_error_frames", "functions", "p
 _PLAIN |= {"states", "loss"}  # options that robust takes as they are
 
 
-class BandSection(Section):
-    """A band in which a vibration may be anywhere."""
+class _Ends(Section):
+    """The ends of a band."""
 
     low_hz: HertzFromZero = Field(description="lower end of the band [Hz]")
     high_hz: Hertz = Field(description="upper end of the band [Hz]")
+
+
+class BandSection(_Ends):
+    """A band in which a vibration may be anywhere."""
+
     rms_nm: Nanometres | None = Field(default=None, description="standard deviation [nm rms]")
     rms_mas: Milliarcseconds | None = Field(default=None, description="standard deviation [mas]")
     axis: Axis = Field(default="both", description="tip, tilt or both")
@@ -54,21 +59,17 @@ class BandSection(Section):
         return self
 
 
-class AttenuationSection(Section):
+class AttenuationSection(_Ends):
     """One step of a mask on the rejection."""
 
-    low_hz: HertzFromZero = Field(description="lower end of the band [Hz]")
-    high_hz: Hertz = Field(description="upper end of the band [Hz]")
     at_most: Ratio = Field(description="largest modulus of the rejection in it")
     sensor_gain: Gain | None = Field(default=None, description="real sensor gain at which it holds")
 
 
-class MirrorUncertaintySection(Section):
+class MirrorUncertaintySection(_Ends):
     """Relative uncertainty of the mirror in a band."""
 
     relative: Ratio = Field(description="relative error of the mirror's response")
-    low_hz: HertzFromZero = Field(description="lower end of the band [Hz]")
-    high_hz: Hertz = Field(description="upper end of the band [Hz]")
 
 
 class RobustSection(Section):
