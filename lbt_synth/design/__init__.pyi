@@ -12,6 +12,7 @@ from .integrator import model_integrator as model_integrator
 from .integrator import optimal_integrator as optimal_integrator
 from .kalman import kalman as kalman
 from .loop_shaping import ShapedDesign as ShapedDesign
+from .loop_shaping import robust as robust
 from .loop_shaping import shape as shape
 from .lqg import LqgDesign as LqgDesign
 from .lqg import lqg as lqg
@@ -22,4 +23,3 @@ from .output_feedback import hinf_controller as hinf_controller
 from .output_feedback import mixed_controller as mixed_controller
 from .result import Design as Design
 from .result import SolverReport as SolverReport
-from .robust import robust as robust

@@ -136,7 +136,7 @@ class RobustSection(Section):
 
 def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
     """Design the controller; the section's sensor gains are real, the design's are relative."""
-    from lbt_synth.design.robust import robust
+    from lbt_synth.design.loop_shaping import robust
 
     section: RobustSection | None = inputs.method_section(ROBUST.name)
     if section is None:
