@@ -16,13 +16,13 @@ GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 4480,
     "config": 2331,
-    "design": 8220,
+    "design": 7570,
     "files": 1608,
     "identification": 11270,
     "interop": 4375,
     "linear": 6078,
-    "loop": 5050,
-    "methods": 1109,
+    "loop": 4905,
+    "methods": 920,
     "models": 4550,
     "report": 4850,
     "storage": 1049,
@@ -30,11 +30,11 @@ LINES = {
     "errors, validation": 642,
 }
 COUNTS = {
-    "files of the package": 284,
-    "public names": 237,
-    "tuned constants": 696,
-    "lines of tests": 41320,
-    "words of docs": 75543,
+    "files of the package": 268,
+    "public names": 230,
+    "tuned constants": 660,
+    "lines of tests": 41182,
+    "words of docs": 75591,
 }
 
 
