@@ -168,5 +168,5 @@ def test_slow_methods_are_not_tried(monkeypatch):
     usual = method_named(default_method())
     for slow in (False, True):
         newcomer = replace(usual, name="newcomer", slow=slow)
-        monkeypatch.setitem(registry._methods_of_folder(), "newcomer", newcomer)
+        monkeypatch.setitem(registry.METHODS, "newcomer", newcomer)
         assert ("newcomer" in quick_methods()) is not slow
