@@ -156,7 +156,7 @@ class ResidualEstimate:
             return float("nan")
         values, vectors = np.linalg.eigh(self.covariance_nm2)
         covariance = vectors * np.maximum(values, 0.0) @ vectors.T
-        return jitter_strehl(covariance, imaging=imaging)
+        return float(jitter_strehl(covariance, imaging=imaging))
 
     @property
     def text(self) -> str:
