@@ -17,7 +17,6 @@ from lbt_synth.errors import LbtSynthError
 from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
 from lbt_synth.identification.diagnosis.rows import (
-    FEW,
     ChannelRow,
     CostRow,
     disturbance_costs,
@@ -37,7 +36,7 @@ from lbt_synth.identification.prediction.comparison import (
     compare_designs,
 )
 from lbt_synth.identification.prediction.residual import MUCH, gather
-from lbt_synth.identification.records.record import LoopRecord, require_length
+from lbt_synth.identification.records.record import FEW, LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging

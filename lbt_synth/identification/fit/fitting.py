@@ -42,6 +42,7 @@ GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
 PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
 POSSIBLE_GAINS = (0.08, 2.5)  # of a sensor at all, with light lost or commands at half their size
 GAIN_ERROR = 0.5  # of the logarithm of a sensor gain, before the data say more
+GAIN_STEP = 0.05  # of the logarithm of a gain: nearer ones are as good as the same
 TYPICAL_GAIN = 0.7  # of a sensor, before the data say more
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
 _COLOURED = 9.0  # the same of a colour of the noise, which a wrong gain can explain, too
@@ -68,7 +69,7 @@ _DAMPING: dict[Kind, tuple[float, float]] = {
 _FINE = 0.02  # of a frequency: a smooth spectrum does not change in such a band
 _WIDEST_HZ, _SHARE = 3.0, 0.1  # of a group, and of what it holds of a line
 _BINS, _SIDELOBES = 10, 64  # on either side of a line that stay single; of a line as narrow as bins
-_SMEARED = 3  # bins: a narrower line has the sidelobes of the taper
+RESOLVED = 3  # bins: a narrower line has the sidelobes of the taper, a wider one flanks of its own
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -172,7 +173,7 @@ class Search:
         size = np.maximum(step, np.minimum(_FINE * f, _WIDEST_HZ))
         for line in spectrum.lines:
             centre, half_width = self.place(line)
-            fine = _SIDELOBES if half_width < _SMEARED * step else _BINS
+            fine = _SIDELOBES if half_width < RESOLVED * step else _BINS
             reach = fine * step + _WIDEST_HZ / _SHARE / 2  # beyond, this limit is wider
             near = slice(*np.searchsorted(f, [centre - reach, centre + reach]))
             away = np.maximum(np.abs(f[near] - centre) - fine * step, 0)

@@ -17,7 +17,7 @@ import numpy as np
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
-from lbt_synth.identification.fit.fitting import GAINS, TYPICAL_GAIN, Search
+from lbt_synth.identification.fit.fitting import GAIN_STEP, GAINS, TYPICAL_GAIN, Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import SEARCHED
 from lbt_synth.identification.fit.spectrum_model import (
@@ -38,7 +38,7 @@ _MOST_SLOW = 2  # parts of the turbulence beside the first
 _COLOUR = 0.3  # of the noise, where a fit begins
 _MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz] and damping: starts of a fit
-_CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a drift beside turbulence may meet the noise
+_CROSSINGS_HZ = np.geomspace(1.0, 100.0, 5)  # where a drift beside turbulence may meet the noise
 OVERDAMPED = 3.0  # damping ratio of turbulence that may stand for a drift
 _SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
 _WIDEST_LINE = 0.98  # damping ratio
@@ -46,11 +46,8 @@ _BANDS = 80  # of the background
 _WIDEST = 0.3  # of its frequency: a band that is tried, and the damping ratio of a new component
 _NARROWEST = 1e-4  # damping ratio of a new component
 _BESIDE = 0.08  # of its frequency: lines that are nearer may be one bump
-_SEEN = 3.0  # bins: a line of that half width shows the shape of its flanks
-_ROUGH = 2.0  # prices: a bump in the place of one line is not fitted if it begins with less
 _TO_HALF = 2 * float(np.log(2))  # square of a Gaussian's half width over its variance
 _OTHER_GAINS = (0.4, 0.9, 1.1)  # of a sensor, from which models that are as likely are sought
-_SAME_GAIN = 0.05  # of a logarithm: nearer gains have the same optimum
 _AS_LIKELY = 5.0  # log-likelihood by which one of two gains is excluded
 
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
@@ -82,7 +79,7 @@ def find_rivals(
     """
     model, rivals = models[0], list(models)
     for gain in _OTHER_GAINS if other_gains else ():
-        if abs(np.log(gain) - model.spectrum.background.log_gain) >= _SAME_GAIN:
+        if abs(np.log(gain) - model.spectrum.background.log_gain) >= GAIN_STEP:
             with suppress(NumericalError):
                 held = find_components(replace(search, gain=gain), rounds=FEW_ROUNDS)
                 rivals += _settled([fitting.fit(search, held.spectrum)])
@@ -319,7 +316,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
         first, counts = components[cluster[0]], {2, MOST_SECTIONS}
         groups = [cluster]
         if len(cluster) == 1:
-            if search.place(first)[1] < _SEEN * search.data.step_hz:
+            if search.place(first)[1] < fitting.RESOLVED * search.data.step_hz:
                 continue
             counts = {first.sections - 1, first.sections + 1} & set(range(1, MOST_SECTIONS + 1))
         elif len(cluster) > 2:
@@ -329,7 +326,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
             others = (c for i, c in enumerate(components) if i not in group)
             bump = _bump([components[i] for i in group], sections)
             trial = replace(spectrum, components=(*others, bump))
-            if len(group) > 1 or contrast(data, trial) < whole + _ROUGH * search.price:
+            if len(group) > 1 or contrast(data, trial) < whole + search.price:
                 yield trial
 
 

@@ -20,7 +20,6 @@ from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.prediction.residual import (
-    SURPRISING,
     ResidualEstimate,
     check_series,
     estimate_residual,
@@ -31,6 +30,7 @@ from lbt_synth.identification.prediction.residual import (
     replay,
     settled_test,
 )
+from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, split_halves
 from lbt_synth.linear import Controller
