@@ -81,7 +81,7 @@ def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
     squares = decay**2
     # what rounding hides is nothing: a coefficient of 1e-37 has states that no solver can scale
     squares = np.where(squares < np.finfo(float).eps, 0.0, squares)
-    return np.stack([poles, -squares], axis=-1)
+    return np.stack([poles, 0.0 - squares], axis=-1)
 
 
 def unit_density(frequency: float, damping: float, s: FloatArray, sections: int = 1) -> FloatArray:
