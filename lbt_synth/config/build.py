@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -20,10 +20,12 @@ from lbt_synth.config.schema import (
     VibrationSection,
 )
 from lbt_synth.errors import ConfigError, name_key
-from lbt_synth.interop import EndToEndSetup, EndToEndSystem
 from lbt_synth.models.sensor_suite import Motions, Sensor, checked_motions
 from lbt_synth.models.vibration import TrueVibration, spread_lines
 from lbt_synth.validation import FloatArray, agree, frozen_copy
+
+if TYPE_CHECKING:
+    from lbt_synth.interop import EndToEndSetup
 
 T = TypeVar("T")
 _AXES = {"tip": [(1.0, 0.0)], "tilt": [(0.0, 1.0)], "both": [(1.0, 0.0), (0.0, 1.0)]}
@@ -428,6 +430,8 @@ def build_end_to_end_setup(
     settings: FileSection, hardware: models.LoopHardware, truth: models.Truth
 ) -> EndToEndSetup:
     """Build the simulation that a configuration describes; refuse one that describes none."""
+    from lbt_synth.interop import EndToEndSetup, EndToEndSystem  # half of the time of a design
+
     hint = "an end-to-end simulation needs it"
     telescope, air = require_telescope(settings, hint), require_atmosphere(settings, hint)
     pyramid, modes = settings.sensor.pyramid, settings.mirror.modes
