@@ -133,7 +133,7 @@ def test_entries_are_means_over_seeds_beside_the_modal_analysis(table):
     assert slow[3.5] < slow[-3.5]  # an integrator rejects 23.5 Hz less than 16.5 Hz
 
 
-@pytest.mark.parametrize("gain", [-0.1, 0.0, 5.0])
+@pytest.mark.parametrize("gain", [-0.1, 5.0])
 def test_a_loop_that_is_unstable_at_the_measured_gain_predicts_nothing(setup, rows, gain):
     table = make_entries(rows, fake_results(rows, gain=gain), setup)
     assert {e.modal for e in table} == {0.0}

@@ -221,8 +221,7 @@ def test_tables_are_written_from_the_parts(tmp_path):
     assert_whole(folder, study)
 
 
-@pytest.mark.parametrize("evaluation", ["exact", "simulation"])
-@pytest.mark.parametrize("turbulence", ["ar1", "ar2"])
+@pytest.mark.parametrize(("evaluation", "turbulence"), [("exact", "ar2"), ("simulation", "ar1")])
 def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
     base = LBT_TEXT.replace("kind: ar1", f"kind: {turbulence}").replace(
         "turbulence: frozen_flow", "turbulence: model"
