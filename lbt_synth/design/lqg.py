@@ -46,7 +46,7 @@ from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
-from lbt_synth.models.plant.parts import held_frames
+from lbt_synth.models.plant.assembly import held_frames
 from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.storage.rows import Column
 from lbt_synth.validation import (
@@ -251,12 +251,11 @@ def lqg_controller(
     """Make the controller from y(k) to u(k): the filter, and the states of mirror and delay."""
     hardware = plant.hardware
     full = replace(estimation_plant(plant), hardware=hardware).full()
-    n, (states, q) = full.n_states, gain_predictor.shape
-    law, gain = np.zeros((hardware.modes, n)), np.zeros((n, q))
-    law[:, :states], gain[:states] = gain_state, gain_predictor
+    states, law = len(gain_predictor), np.zeros((hardware.modes, full.n_states))
+    law[:, :states] = gain_state
     end = states + gain_mirror.size * hardware.n_commands
     law[:, states:end] = -np.kron(gain_mirror, hardware.influence)
-    return replace(full, L=law).controller(gain)
+    return full.controller(gain_predictor, hardware.projector @ law)
 
 
 def estimation_plant(plant: TipTiltPlant) -> TipTiltPlant:

@@ -14,13 +14,12 @@ from lbt_synth.design.result import Design, SolverReport
 from lbt_synth.linear import Controller, EstimationProblem, Witness
 from lbt_synth.models import (
     ARModel,
-    FullStatePlant,
     LoopHardware,
     PositionLoop,
     TipTiltPlant,
     Vibration,
 )
-from lbt_synth.models.plant.parts import PlantParts
+from lbt_synth.models.plant.assembly import PlantParts
 from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.models.sensor_suite import (
     Accelerometer,
@@ -48,7 +47,6 @@ _CHECK = ("name", "value", "limit", "computed_by")
 _PROBLEMS: dict[str, type[EstimationProblem | LoopHardware]] = {
     "problem": EstimationProblem,
     "plant": TipTiltPlant,
-    "full plant": FullStatePlant,
     "loop": LoopHardware,
 }
 
@@ -107,11 +105,11 @@ class DesignRecord:
         if kind is LoopHardware:
             return self.hardware()
         if kind is not EstimationProblem:
-            return self._assembled_plant(full=kind is FullStatePlant)
+            return self._assembled_plant()
         fields: dict[str, Any] = {name: self.arrays[f"PLANT_{name}"] for name in "ABCDL"}
         return EstimationProblem(**fields, dt_s=self.meta["dt_s"])
 
-    def _assembled_plant(self, *, full: bool) -> EstimationProblem:
+    def _assembled_plant(self) -> TipTiltPlant:
         """Return the plant of loop, turbulence, vibrations and noise, with a filter's memory."""
         hardware, meta = self.hardware(), self.meta
         parts = PlantParts(
@@ -130,7 +128,7 @@ class DesignRecord:
                 for moved in meta["motions"]
             ),
         )
-        plant = assemble(parts).full() if full else assemble(parts)
+        plant = assemble(parts)
         memory = self.arrays["PLANT_L"][:, plant.n_states :]
         return plant.with_memory(memory) if memory.size else plant
 
@@ -290,7 +288,7 @@ def record_problem(problem: EstimationProblem | LoopHardware) -> DesignRecord:
     if problem is getattr(problem, "hardware", None):
         return DesignRecord(meta=meta)
     arrays: Arrays = {f"PLANT_{name}": getattr(problem, name) for name in "ABCDL"}
-    plant: TipTiltPlant | None = getattr(problem, "reduced", None)
+    plant = problem if isinstance(problem, TipTiltPlant) else None
     if plant is not None:
         meta["turbulence"] = [
             {"coefficients": ar.coefficients.tolist(), "driving_rms_nm": ar.driving_rms_nm}

@@ -154,7 +154,7 @@ class Design(Summarised, ABC):
     @property
     def plant(self) -> TipTiltPlant | None:
         """Plant that the design is for, with its models; None for one that is made of less."""
-        return getattr(self.problem, "reduced", None)
+        return self.problem if isinstance(self.problem, TipTiltPlant) else None
 
     @property
     def gamma(self) -> float:

@@ -14,6 +14,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError, SynthesisError
@@ -29,7 +30,6 @@ from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedM
 from lbt_synth.identification.fit.identify import OPEN_GAIN, identify
 from lbt_synth.identification.prediction.comparison import PredictionTable, compare_designs
 from lbt_synth.identification.prediction.residual import ResidualEstimate
-from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
@@ -86,7 +86,7 @@ def design_from_record(
     method: str | None = None,
     gamma_ratio: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
-    announced: Sequence[LinePrior] = (),
+    announced: ArrayLike = (),
     imaging: Imaging | None = None,
     accept_record: bool = False,
     command_scale_known: bool = False,
@@ -343,8 +343,8 @@ def _running_gains(record: LoopRecord) -> tuple[float, float]:
     law = record_law(record)
     if law is None or law.kind == "none" or law.lag_frames < 0:
         return POSSIBLE_GAINS
-    gains, one = _gains_between(*POSSIBLE_GAINS), np.ones((1, record.axes))
-    ran = [could_have_run(CommandRepair(), gain * one, record, law) for gain in gains]
+    gains = _gains_between(*POSSIBLE_GAINS)
+    ran = [could_have_run(CommandRepair(), [gain], record, law) for gain in gains]
     if not any(ran):
         return POSSIBLE_GAINS
     beside = np.convolve(ran, [1, 1, 1], "same") > 0  # the limit is between two gains

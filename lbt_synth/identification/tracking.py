@@ -217,8 +217,7 @@ class TrackingController:
 def _plant_of(design: object) -> TipTiltPlant:
     """Return the plant of a filter; refuse a design that is none, or of another problem."""
     plant: TipTiltPlant | None = getattr(design, "plant", None)
-    same = plant is getattr(design, "problem", None)  # not so the full form of a plant
-    if plant is None or not same or not hasattr(design, "gain_filter"):
+    if plant is None or not hasattr(design, "gain_filter"):
         kind = getattr(design, "method", type(design).__name__)
         raise ProblemError(
             "only filters of a TipTiltPlant can take over in a running loop (kalman, hinf, mixed, "

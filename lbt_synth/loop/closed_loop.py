@@ -13,7 +13,7 @@ from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.held_controller import HasController, as_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response
-from lbt_synth.models.plant.readings import memory, other_exposures, own_exposure
+from lbt_synth.models.plant.assembly import memory, other_exposures, own_exposure
 from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.storage.rows import fact, fact_table, facts
 from lbt_synth.storage.summaries import Summarised, Summary

@@ -228,7 +228,9 @@ class LoopEnsemble:
                 limit, got = f"the Nyquist frequency {nyquist:.6g} Hz", np.max(line.frequency_hz)
                 raise ProblemError(f"a vibration must lie below {limit}; got {got:.6g} Hz.")
             values = {name: getattr(line, name) for name in ("frequency_hz", "rms_nm", "damping")}
-            whole = {k: np.broadcast_to(v, (p,)) for k, v in values.items() if v is not None}
+            whole: dict[str, Any] = {
+                k: np.broadcast_to(v, (p,)) for k, v in values.items() if v is not None
+            }
             out.append(replace(line, **whole, direction=np.broadcast_to(line.direction, (p, n))))
         return out
 

@@ -27,9 +27,8 @@ from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_rule
 from lbt_synth.models import ARModel, FrozenFlows, ModalTurbulence, Spectrum
-from lbt_synth.models.ar_model import companions, densities
 from lbt_synth.models.mirror.frame_rate_system import Hold
-from lbt_synth.models.spectra import breakpoints_below, spectrum_density
+from lbt_synth.models.spectra import breakpoints_below, companions, densities, spectrum_density
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact, fact_table, facts
 from lbt_synth.storage.summaries import Summarised, Summary

@@ -290,14 +290,14 @@ def test_shaping_takes_a_moving_mirror_and_refuses_its_delay_errors():
 def test_wrong_arguments_are_refused():
     plant = slow_plant(2.0, shell())
     with pytest.raises(lbt.errors.ProblemError, match="plant must be a TipTiltPlant"):
-        lbt.lqg(plant.full())
+        lbt.lqg(lbt.LoopHardware(frame_rate_hz=800))
     with pytest.raises(lbt.errors.ProblemError, match="command_weight must be at least 0"):
         lbt.lqg(plant, command_weight=-1.0)
     flat = slow_plant(2.0, shell(), modes=2, influence_matrix=[[1.0], [0.5]])
     with pytest.raises(lbt.errors.DimensionError, match="must have rank 2"):
         lbt.lqg(flat)
     with pytest.raises(lbt.errors.ProblemError, match="plant must be a TipTiltPlant"):
-        mirror_rows(plant.full(), lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8))
+        mirror_rows(plant.hardware, lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8))
     with pytest.raises(lbt.errors.ProblemError, match="settles at once"):
         mirror_figure(lbt.LoopHardware(frame_rate_hz=800))
 

@@ -68,14 +68,13 @@ class ChannelRow:
 
 def judge_channels(record: LoopRecord) -> tuple[ChannelRow, ...]:
     """Return what is known of each channel of a record, the measurements first."""
-    everywhere = np.ones(record.frames, dtype=np.bool_)
     channels = [
-        ("measurements", record.measurements, record.measured, record.usable),
-        ("commands", record.commands, record.commanded, everywhere),
+        ("measurements", record.measurements, record.measured),
+        ("commands", record.commands, record.commanded),
     ]
     return tuple(
-        _judge_channel(record, series, axis, values, usable if good is None else good)
-        for series, values, good, usable in channels
+        _judge_channel(record, series, axis, values, good)
+        for series, values, good in channels
         if values is not None
         for axis in range(record.axes)
     )

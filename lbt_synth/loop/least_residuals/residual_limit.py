@@ -23,7 +23,7 @@ from lbt_synth.models import (
     Truth,
     Vibration,
 )
-from lbt_synth.models.plant.readings import other_exposures
+from lbt_synth.models.plant.assembly import other_exposures
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 

@@ -18,7 +18,7 @@ from lbt_synth.loop.closed_loop import ClosedLoop, close_loop, reads_others
 from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
 from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
-from lbt_synth.models.plant.readings import memory, other_exposures, own_exposure
+from lbt_synth.models.plant.assembly import memory, other_exposures, own_exposure
 from lbt_synth.storage.summaries import Summarised
 from lbt_synth.validation import FloatArray, choice, frozen_copy, integer, number, require_instance
 

@@ -28,7 +28,6 @@ from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.identification.fit import identify
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.order_search import find_rivals
-from lbt_synth.identification.records.faults import RecordHealth
 
 RATE = 1000.0
 
@@ -394,8 +393,8 @@ def find_axes(y: np.ndarray, u: np.ndarray | None = None, **options: object) -> 
         frame_rate_hz=RATE,
         measurements=y,
         commands=u,
-        usable=np.ones(len(y), dtype=bool),
-        health=RecordHealth(frames=len(y), usable=len(y)),
+        measured=np.ones(len(y), dtype=bool),
+        commanded=np.ones(len(y), dtype=bool),
     )
     return lbt.identify(record, **options)
 
@@ -428,7 +427,8 @@ REFUSALS = [
     (lambda: find_record(sensor_gain=1e300), ProblemError, "sensor_gain must be"),
     (lambda: find_record(sensor_gain="x"), ProblemError, "sensor_gain must be an array of numbers"),
     (lambda: find_record(sensor_gain=[1.0, 2.0]), ProblemError, r"or one per measurement \(1\)"),
-    (lambda: find_record(announced=[31.0]), ProblemError, "LinePrior"),
+    (lambda: find_record(announced=[[31.0, 0.1, 0.0]]), ProblemError, "announced must be"),
+    (lambda: find_record(noise_nm=5.0), ProblemError, "noise_nm is for spectra"),
     (lambda: find_record(start=3), ProblemError, "IdentifiedModel"),
     (lambda: find_record(stretches=[(2, 4000), (3000, 5000)]), ProblemError, "in order, apart"),
     (lambda: find_record(stretches=[(0, 4000)]), ProblemError, "usable"),
@@ -437,6 +437,7 @@ REFUSALS = [
     (lambda: find_axes(WHITE, WHITE), ProblemError, "give delay_frames"),
     (lambda: find_axes(WHITE * [1, 0]), ProblemError, "axis 1 of the record is constant"),
     (lambda: find_eris(sensor_gain=0.5), ProblemError, "is for series of a loop"),
+    (lambda: find_eris(noise_nm=0.0), ProblemError, "noise_nm must be above 0"),
     (lambda: find_eris(stretches=[(0, 600)]), ProblemError, "is for series of a loop"),
     (lambda: find_eris(start=eris_model()), ProblemError, "is for series of a loop"),
 ]
@@ -524,6 +525,18 @@ def test_spectrum_without_scatter_is_taken_for_one_periodogram(example):
         peaks = np.array(example.peaks(plain.frequency_hz, column))[:, 0]
         assert all(np.min(np.abs(peaks - line.frequency_hz)) < 0.06 for line in axis.lines)
         assert all(line.rms_nm < 30 for line in axis.lines)  # 332 where it counts as a million
+
+
+def test_the_noise_of_a_spectrum_without_any_is_stated():
+    """A spectrum of wind shake has none, and no filter is designed for that."""
+    f = np.arange(0.5, 400, 0.5)
+    shake = 3000 / (1 + (f / 1.5) ** 2) ** 2 + 16 / np.pi / ((f - 18) ** 2 + 0.16)
+    spectrum = lbt.identification.SpectrumRecord(frequency_hz=f, density_nm2_hz=shake[:, None])
+    stated = lbt.identify(spectrum, frame_rate_hz=1000, noise_nm=5.0)
+    assert stated.axes[0].noise_nm == 5.0
+    design = lbt.kalman(stated.plant())
+    assert design.certificate.passed
+    assert stated.truth().noise_nm.tolist() == [5.0]
 
 
 def test_known_lines_are_found(model):

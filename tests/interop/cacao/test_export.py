@@ -82,7 +82,7 @@ def test_the_bound_on_the_loss_holds(steps, gain):
         lbt.close_loop(design.hardware, c, sensor_gain=gain) for c in (design.controller, written)
     ]
     before, after = (np.sqrt(mode_variances(design, loop, slice(1)))[0] for loop in loops)
-    if gain == 1:
+    if gain == 1 and steps == 20:
         own = lbt.residual_budget(loops[1], design.problem, frame_means=True).rms_nm
         assert after == pytest.approx(own, rel=1e-9)
     bound = found.residual_nm(gain, found.cut_norm(steps)) / before
