@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.gain_file_edits import ORIGINALS, original
+from support.gain_files import ORIGINALS, original
 
 import lbt_synth as lbt
 from lbt_synth.design.record import DesignRecord, rebuild_design, record_design

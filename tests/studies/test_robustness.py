@@ -42,15 +42,6 @@ def test_robustness_rows(config):
         assert row.within_nm == pytest.approx(budget.within_nm)  # no command follows it
 
 
-def test_unstable_rows_say_so(config):
-    truth = replace(config.truth, sensor_gain=0.3)
-    (row,) = robustness(
-        config.plant, truth, config.imaging, errors_hz=[0], methods=["hinf"], gamma_ratio=1.05
-    )
-    assert not row.stable
-    assert np.isnan(row.strehl)
-
-
 def test_the_study_refuses_what_it_cannot_do(config):
     turbulence = config.plant.turbulence[0]
     still = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=turbulence, noise_nm=10)
@@ -160,11 +151,6 @@ def test_delay_errors_whole_and_fractional(air):
     assert np.all(np.diff(found.strehl[:, 1, 0]) < 0)  # a later loop is a worse one
 
 
-def test_one_axis(axis_plant, air):
-    truth = lbt.Truth(turbulence=air, vibrations=(sinusoid(direction=(1.0,)),), noise_nm=15.5)
-    assert_as_single(lbt.kalman(axis_plant), truth, CAMERA, [0.0, 1.5], [0.4, 1.0])
-
-
 def test_unstable_points_are_nan(robust, settings):
     found = robustness_map(
         robust, settings.truth, settings.imaging, errors_hz=[-1, 0], sensor_gains=[0.3, 1.0, 3.0]
@@ -204,18 +190,6 @@ def test_order_and_neighbours_change_nothing(kalman, settings):
     assert found.strehl[0, 70, 1] == pytest.approx(
         mapped([2], [many[70]]).strehl[0, 0, 0], rel=1e-6
     )
-
-
-def test_the_sign_of_the_error_is_true_less_assumed(kalman, settings):
-    """A design that believes more than is true meets a line that lies below."""
-    moved = replace(
-        settings.truth, vibrations=(sinusoid(18.5, settings.truth.vibrations[0].rms_nm),)
-    )
-    below = robustness_map(kalman, moved, settings.imaging, errors_hz=[0], sensor_gains=[1])
-    error = robustness_map(
-        kalman, settings.truth, settings.imaging, errors_hz=[-1.5], sensor_gains=[1]
-    )
-    assert below.strehl == pytest.approx(error.strehl, rel=1e-12)
 
 
 def test_each_line_moves_by_its_share(kalman, settings):

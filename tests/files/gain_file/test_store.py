@@ -1,5 +1,8 @@
 """Gain files: round trips, damage, tampering, hostile files."""
 
+import copy
+import functools
+import json
 import os
 import re
 import subprocess
@@ -12,25 +15,16 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from support.exports import relative
-from support.gain_file_edits import (
-    COMMANDS,
-    ENDINGS,
-    ORIGINALS,
-    Edit,
-    command,
-    judge,
-    original,
-    random_edits,
-    run_quietly,
-    saved,
-)
-from support.gain_files import edited_file
+from support.gain_files import ORIGINALS, edited_file, original
 from support.plants import LBT_YAML, ROOT
 from support.specula_filters import noise_series, simulate_commands
 
 import lbt_synth as lbt
+from lbt_synth.design.record import record_design
 from lbt_synth.files.gain_file.store import load_with_digest, require_certificate, require_same
-from lbt_synth.storage.array_file import npz_bytes
+from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
+
+ENDINGS = ("fits", "npz")
 
 
 def state_space_filter(path):
@@ -351,63 +345,151 @@ def test_the_same_measurements_give_the_same_commands(simulated_designs, specula
     assert relative(series[name][1], expected) < LIMITS[precision]
 
 
-HARMLESS = ("refused", "no other design", "another claim that holds", "cannot be written")
-QUICK = ("kalman", "bare", "integrator")
+# What a design does not depend on: words, what its solver said, values of checks (rounding).
+NOTES = {"solver", "assumptions", "library_version", "bound_programme", "long_objective_nm"}
+NOTES |= {"long_functions", "value", "computed_by", "configuration"}
+MISSING = object()
 
 
-def refused_commands(name, ending, folder, commands):
-    """Commands that do not take a file as it was written."""
-    path = saved(name, ending).write(folder / f"{name}.{ending}")
-    return [each for each in commands if run_quietly(command(each, path))[0] != 0]
+def fields(value, place=()):
+    """Yield places and values of all fields of a tree of dictionaries and lists, branches too."""
+    if place:
+        yield place, value
+    if isinstance(value, dict | list):
+        for key in value if isinstance(value, dict) else range(len(value)):
+            yield from fields(value[key], (*place, key))
 
 
-def test_a_sample_of_edits(tmp_path):
-    for name, ending in zip(QUICK, (*ENDINGS, "npz"), strict=True):
-        assert not refused_commands(name, ending, tmp_path, ("verify",))
-    verdicts = [judge(edit, tmp_path, ("verify",)) for edit in random_edits(24, 1, QUICK)]
-    assert set(verdicts) <= set(HARMLESS), verdicts
-    assert verdicts.count("refused") > 18
+def replacements(value):
+    """Return what a hostile hand may write in place of a field."""
+    if isinstance(value, np.ndarray):
+        one = value.copy()
+        one.flat[np.argmax(np.abs(value))] *= 1.01
+        other = [one, 0.8 * value, value[:-1], value[None], np.full_like(value, np.nan)]
+    elif isinstance(value, bool):
+        other = [not value, "yes"]
+    elif isinstance(value, int | float):
+        other = [1.01 * value, 7 * value, -value, 0.0, 1e300, float("nan"), str(value), [value]]
+    elif isinstance(value, str):
+        other = ["kalman", "hinf", "integrator", "lqg", "plant", value + " x", "", "\ud800", 3]
+    elif isinstance(value, list):
+        other = [value[:-1], [*value, 1.0], [*value, *value], "list"]
+    elif isinstance(value, dict):
+        other = [list(value), value | {"more": 1}, "dict"]
+    else:
+        other = [100.0, "none", []]
+    if isinstance(value, np.ndarray):
+        return [*(new for new in other if not np.array_equal(new, value)), None, MISSING]
+    return [new for new in [*other, None, MISSING] if type(new) is not type(value) or new != value]
+
+
+def without_notes(value):
+    if isinstance(value, dict):
+        return {key: without_notes(each) for key, each in value.items() if key not in NOTES}
+    return [without_notes(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def difference(one, other):
+    """Say whether two designs are the same but for notes, or another word beside equal claims."""
+    one, other = record_design(one), record_design(other)
+    equal = one.arrays.keys() == other.arrays.keys() and all(
+        np.shape(array) == np.shape(other.arrays[name])
+        and np.allclose(array, other.arrays[name], rtol=1e-12, atol=0)
+        for name, array in one.arrays.items()
+    )
+    if not equal or one.meta["claims"] != other.meta["claims"]:
+        return "another design"
+    same = without_notes(one.meta) == without_notes(other.meta)
+    return "the same design" if same else "another word"
+
+
+def outcome(name, parts, place, new, path):
+    """Say what comes of a file of which one field was changed and the digest written again."""
+    document = copy.deepcopy(parts)
+    *before, last = place
+    branch = functools.reduce(lambda at, key: at[key], before, document)
+    if new is MISSING:
+        del branch[last]
+    else:
+        branch[last] = new
+    try:
+        document["meta"]["digest"] = digest(document["arrays"], document["meta"])
+        path.write_bytes(npz_bytes(document["arrays"], json.dumps(document["meta"])))
+    except (TypeError, ValueError, AttributeError):
+        return "cannot be written"
+    try:
+        back = lbt.load_gain(path)
+    except lbt.errors.GainFileError as error:
+        return "refused" if "\n" not in str(error) else "refused in many lines"
+    if not back.recertify().passed:
+        return "refused"
+    kind = difference(back, original(name))
+    return f"{kind}: {place[-1]}" if kind == "another word" else kind
+
+
+def outcomes(name, count, folder):
+    """Count what comes of some of all changes of one field of the file of a design."""
+    arrays, text = read_npz(lbt.save_gain(folder / "g.npz", original(name)).read_bytes())
+    parts = {"arrays": dict(arrays), "meta": json.loads(text)}
+    edits = [
+        (place, new)
+        for place, value in fields(parts)
+        if len(place) > 1 and place[-1] != "digest"
+        for new in replacements(value)
+    ]
+    chosen = np.random.default_rng(1).permutation(len(edits))[:count]
+    return Counter(outcome(name, parts, *edits[i], folder / "g.npz") for i in chosen)
+
+
+# Nothing proves the period of a problem without a loop, names, and a calibrated feed-forward; and
+# an objective that was computed again holds.
+WORDS = ("dt_s", "name", "method", "feed_forward", "low_hz", "high_hz", "rms_nm")
+WORDS = {f"another word: {key}" for key in WORDS}
+HARMLESS = {"refused", "the same design", "cannot be written"}
+
+
+@pytest.mark.parametrize("name", ["kalman", "bare", "integrator"])
+def test_no_edit_of_some_is_taken_for_another_design(tmp_path, name):
+    counts = outcomes(name, 30, tmp_path)
+    assert counts.keys() <= HARMLESS | WORDS
+    assert counts["refused"] > 15
 
 
 @pytest.mark.study
-def test_no_edit_is_taken_for_a_certified_design(tmp_path, capsys):
-    """2,000 edits over methods and formats print the table of docs/gain_file.md."""
-    for name in ORIGINALS:
-        for ending in ENDINGS:
-            assert not refused_commands(name, ending, tmp_path, ("verify", "show", "export"))
-    assert not refused_commands("kalman", "npz", tmp_path, ("simulate",))
-    counts = {name: Counter() for name in ORIGINALS}
-    told = []
-    for number, edit in enumerate(random_edits(2000)):
-        verdict = judge(edit, tmp_path, COMMANDS if number % 10 == 0 else ("verify",))
-        kind = verdict if verdict in HARMLESS else verdict.split()[0]
-        counts[edit.design][kind] += 1
-        if kind not in HARMLESS or (kind == "no other design" and not edit.is_note):
-            told.append((verdict, edit.design, edit.ending, edit.place, edit.change))
-    kinds = (*HARMLESS, "certified", "traceback", "more")
+@pytest.mark.parametrize("name", ORIGINALS)
+def test_no_edit_is_taken_for_another_design(tmp_path, name, capsys):
+    """The rows of the table of docs/gain_file.md."""
+    counts = outcomes(name, 180, tmp_path)
     with capsys.disabled():
-        print(f"\n| design | {' | '.join(kinds)} |")
-        for name, each in counts.items():
-            print(f"| {name} | {' | '.join(str(each[kind]) for kind in kinds)} |")
-        print(f"| all | {' | '.join(str(sum(c[k] for c in counts.values())) for k in kinds)} |")
-        print(*told, sep="\n")
-    assert not [entry for entry in told if entry[0] not in HARMLESS]
+        row = [counts[kind] for kind in ("refused", "the same design", "cannot be written")]
+        print("|", " | ".join(map(str, [name, *row, sum(counts[kind] for kind in WORDS)])), "|")
+    assert counts.keys() <= HARMLESS | WORDS
 
 
 def test_another_claim_that_holds_has_another_digest(tmp_path):
     """The band's worst frequency is at its other end: from 9.09 Hz on it promises no less."""
-    place = ("meta", "specifications", 0, "objective", "terms", 1, "low_hz")
-    edit = Edit("shaped", "npz", place, "times 1.01", 9.09)
-    assert judge(edit, tmp_path, ("verify",)) == "another claim that holds"
-    contents = (saved("shaped", "npz"), saved("shaped", "npz").changed(edit))
-    digests = [load_with_digest(each.write(tmp_path / "g.npz"))[1] for each in contents]
-    assert digests[0] != digests[1]
-    wider = replace(edit, place=(*place[:-1], "high_hz"), value=12.0)  # it leaves more there
-    assert judge(wider, tmp_path, ("verify",)) == "refused"
-    place = ("meta", "specifications", 0, "demands")  # a demand that is there twice
-    demands = saved("shaped", "npz").parts["meta"]["specifications"][0]["demands"]
-    edit = Edit("shaped", "npz", place, "longer", [*demands, *demands])
-    assert judge(edit, tmp_path, ("verify",)) == "refused"
+
+    def promise(**band):
+        def change(document):
+            document["meta"]["specifications"][0]["objective"]["terms"][1].update(band)
+
+        return edited_file(tmp_path / "g.npz", original("shaped"), change)
+
+    unchanged, narrow = (load_with_digest(promise(**band)) for band in ({}, {"low_hz": 9.09}))
+    assert narrow[0].recertify().passed
+    assert narrow[1] != unchanged[1]
+    with pytest.raises(lbt.errors.GainFileError):  # it leaves more there
+        lbt.load_gain(promise(high_hz=12.0))
+    with pytest.raises(lbt.errors.GainFileError):  # demands that are there twice
+        lbt.load_gain(
+            edited_file(
+                tmp_path / "g.npz",
+                original("shaped"),
+                lambda d: d["meta"]["specifications"][0].update(
+                    demands=2 * d["meta"]["specifications"][0]["demands"]
+                ),
+            )
+        )
 
 
 @pytest.mark.parametrize(

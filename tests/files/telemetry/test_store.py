@@ -15,7 +15,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.files import Telemetry, load_telemetry, save_telemetry, telemetry_from_simulation
 from lbt_synth.files.telemetry import store
 from lbt_synth.files.telemetry.aot import lost_fields
-from lbt_synth.files.telemetry.telemetry import CONVENTION, LAYERS
+from lbt_synth.files.telemetry.telemetry import LAYERS
 from lbt_synth.storage import array_file as archive
 
 
@@ -262,16 +262,6 @@ def test_the_fits_file_explains_itself(tmp_path):
         assert names[-1] == "META"
     with np.load(lbt.files.save_telemetry(tmp_path / "t.npz", seen)) as arrays:
         assert np.array_equal(arrays["MIRROR_TAPS"], seen.hardware.mirror_taps)
-
-
-def test_a_settled_mirror_leaves_the_file_as_it_was(tmp_path):
-    seen = full(mirror=None)
-    assert seen.convention == CONVENTION
-    assert seen.mirror_taps is None
-    arrays, meta = store.pack(seen, "float64")
-    assert "MIRROR_TAPS" not in arrays
-    assert "mirror" not in meta  # what 0.1 wrote, and reads
-    assert store.unpack(arrays, meta).mirror is None
 
 
 def test_the_camera_gives_telescope_and_strehl_ratio():

@@ -157,25 +157,6 @@ def test_a_colour_that_is_hardly_likelier_widens_the_error_of_the_gain() -> None
     assert found.noise_correlation_error > 0.05
 
 
-def test_a_drift_is_not_taken_for_coloured_noise() -> None:
-    """It was: 73 nm of a correlation of 0.95, which a design would take for white noise."""
-    air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=12, diameter_m=8.22)
-    drift = lbt.models.ARModel(coefficients=[0.999], driving_rms_nm=30, frame_rate_hz=RATE)
-    y, c = integrator_loop(
-        lines=((30.0, 0.004, 60.0),),
-        noise=2.4,
-        sensor_gain=0.76,
-        turbulence=lbt.models.SumSpectrum(parts=[air, drift]),
-        frames=12_000,
-        seed=12,
-    )
-    found = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
-    assert found.noise_nm < 10
-    assert found.noise_correlation == 0
-    assert found.sensor_gain_error is not None
-    assert found.sensor_gain == pytest.approx(0.76, abs=3 * found.sensor_gain_error)
-
-
 @pytest.mark.parametrize(("gain", "seed"), [(0.25, 8), (0.4, 0)])
 def test_a_rough_gain_has_rivals(gain: float, seed: int) -> None:
     """Five seconds under a drift: the gains were 4 to 6 of their errors below the truth."""
@@ -563,30 +544,6 @@ def test_identified_rms_are_those_of_the_bins(model, seen, example):
             assert 0 < line.rms_error_nm < line.rms_nm
             strong += abs(line.rms_nm - size) < 2 * line.rms_error_nm
     assert strong >= 17  # of 22
-
-
-def test_kalman_removes_what_the_integrator_leaves_of_the_lines(model, seen, example):
-    met, plant = example.disturbance(seen), example.composed(model)
-    lines = {}
-    for name, design in {
-        "integrator": lbt.design.model_integrator(plant),
-        "Kalman": lbt.kalman(plant),
-    }.items():
-        assert design.certificate.passed
-        loop = lbt.close_loop(plant.hardware, design.controller)
-        parts = example.residual(loop, met)
-        lines[name] = example.rms(parts["lines"])
-        # bin by bin, without quadrature
-        f, step = seen.frequency_hz, np.median(np.diff(seen.frequency_hz))
-        excess = np.array([part.psd(f) for part in met.lines]).T
-        power = np.einsum("fij,fj->", np.abs(loop.sensitivity(f)) ** 2, excess) * step
-        assert lines[name] == pytest.approx(np.sqrt(power), rel=0.16)
-        assert example.rms(parts["total"]) ** 2 == pytest.approx(
-            sum(example.rms(parts[key]) ** 2 for key in parts if key != "total")
-        )
-        limit = lbt.loop.least_residual(plant.hardware, met.whole)
-        assert limit.rms_nm < example.rms(parts["total"])
-    assert lines["Kalman"] < 0.3 * lines["integrator"]
 
 
 def test_a_printed_model_lists_its_vibrations_with_their_errors(model):

@@ -8,7 +8,6 @@ from support.plants import LBT_YAML
 from support.studies import BASE, LBT_TEXT, load_small_study, study_file
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.studies.study import sample as evaluation
 from lbt_synth.studies.study.sample import evaluate_samples
@@ -122,40 +121,6 @@ def test_unstable_loops_and_samples_that_fail(tmp_path):
     np.testing.assert_array_equal(np.isnan(columns["tight.stable"]), slow)
     lost = slow | (columns["tight.stable"] == 0)
     np.testing.assert_array_equal(np.isnan(columns["tight.strehl"]), lost)
-
-
-def test_simulated_samples(tmp_path):
-    study = load_small_study(
-        tmp_path,
-        evaluation="simulation",
-        controllers="{a: {design: kalman}, b: "
-        "{design: integrator, gain: 0.3}, c: {design: integrator, gain: 0.9}}",
-        parameters="{truth.sensor_gain: {uniform: [1.2, 1.3]}}",
-    )
-    assert study.result_columns[:3] == ("a.strehl", "a.residual_nm", "a.stable")
-    columns, _ = evaluate_samples(study, study.values(3, 5), 3)
-    assert columns["c.stable"].tolist() == [0, 0]
-    for i, row in enumerate((3, 4)):
-        _, hardware, truth = make_sample(study, study.values(row, row + 1)[0])
-        loops = [
-            lbt.close_loop(
-                hardware, study.controllers[name].controller, sensor_gain=truth.sensor_gain
-            )
-            for name in "ab"
-        ]
-        settle = max(100, *(settling_frames(x.spectral_radius) for x in loops))
-        for loop, name in zip(loops, "ab", strict=True):
-            run = lbt.simulate(
-                loop.controller,
-                truth,
-                hardware=hardware,
-                frames=400,
-                cases=1,
-                seed=study.simulation_seed(row),
-                settle_frames=settle,
-            )
-            assert columns[f"{name}.strehl"][i] == run.strehl(study.config.imaging).mean()
-    assert study.simulation_seed(3) != study.simulation_seed(4)
 
 
 COUNT = 8
