@@ -53,19 +53,6 @@ def test_table_ii(entries):
         assert abs(entry.difference) < 1.0, entry
 
 
-def test_sigma_of_the_paper_kalman_peaks_where_hinf_is_flatter():
-    kalman, hinf = given.paper_filters()
-    peaks = [
-        float(
-            lbt.linear.largest_singular_values(
-                d.problem.with_unit_weights().error_system(d.gain_predictor), [20.0]
-            )[0]
-        )
-        for d in (kalman, hinf)
-    ]
-    assert peaks[1] < 0.8 * peaks[0]
-
-
 @pytest.fixture(scope="module")
 def setup():
     return load_setup()

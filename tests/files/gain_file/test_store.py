@@ -3,7 +3,6 @@
 import copy
 import functools
 import json
-import os
 import re
 import subprocess
 import sys
@@ -111,32 +110,6 @@ def test_the_proof_travels_with_the_gain_file(tmp_path, axis_plant):
     assert loaded.recertify().passed
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_truncated_files_are_refused_and_flipped_bits_found_or_harmless(tmp_path, ending):
-    design = original("bare")
-    content = lbt.save_gain(tmp_path / f"a.{ending}", design).read_bytes()
-    assert lbt.save_gain(tmp_path / f"b.{ending}", design).read_bytes() == content
-    path, size = tmp_path / f"g.{ending}", len(content)
-    for length in (0, 10, size // 2, size - 3000, size - 40):
-        path.write_bytes(content[:length])
-        with pytest.raises(lbt.errors.GainFileError) as caught:
-            lbt.load_gain(path)
-        assert "\n" not in str(caught.value)
-    refused, places = 0, range(0, size, 71 if ending == "npz" else 1283)
-    for place in places:  # of every kind of byte of the format, one at a time
-        damaged = bytearray(content)
-        damaged[place] ^= 0xFF if place % 2 else 1 << place % 8
-        path.write_bytes(bytes(damaged))
-        try:
-            back = lbt.load_gain(path)
-        except lbt.errors.GainFileError:
-            refused += 1
-            continue
-        assert np.array_equal(back.controller.A, design.controller.A)
-        assert np.array_equal(back.gain_predictor, design.gain_predictor)
-    assert refused > len(places) / 2
-
-
 def scale_gain(document):
     document["arrays"]["GAIN_PREDICTOR"][0][0] *= 1.01
 
@@ -203,72 +176,6 @@ def test_a_file_that_was_edited_and_not_signed_does_not_match_its_digest(tmp_pat
     assert card in content
     path.write_bytes(content.replace(card, card.replace(b"8", b"9")))
     with pytest.raises(lbt.errors.GainFileError, match="the checksum of its HDU 0 is wrong"):
-        lbt.load_gain(path)
-
-
-def test_foreign_files_are_refused(tmp_path):
-    picture = tmp_path / "image.fits"
-    fits.PrimaryHDU(np.ones((4, 4))).writeto(picture)
-    other = tmp_path / "other.npz"
-    np.savez(other, a=np.ones(3))
-    notes = tmp_path / "notes.npz"
-    notes.write_bytes(npz_bytes({}, '{"schema": "recipes"}'))
-    prose = tmp_path / "prose.npz"
-    prose.write_bytes(npz_bytes({}, "[1, 2]"))
-    pickled = tmp_path / "pickled.npz"
-    np.savez(pickled, META=np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    for path in (picture, other, notes, prose, pickled):
-        with pytest.raises(lbt.errors.GainFileError, match=f"{path.name} is "):
-            lbt.load_gain(path)
-
-
-def test_endings_and_missing_files(tmp_path):
-    with pytest.raises(lbt.errors.OutputError, match="must end in .fits, .npz; got 'g.txt'"):
-        lbt.save_gain(tmp_path / "g.txt", original("kalman"))
-    for ending in ("txt", "json"):
-        with pytest.raises(
-            lbt.errors.GainFileError, match=f"must end in .fits, .npz; got 'g.{ending}'"
-        ):
-            lbt.load_gain(tmp_path / f"g.{ending}")
-    with pytest.raises(lbt.errors.GainFileError, match="cannot read .*No such file"):
-        lbt.load_gain(tmp_path / "none.fits")
-    (tmp_path / "folder.fits").mkdir()
-    with pytest.raises(lbt.errors.GainFileError, match="cannot read"):
-        lbt.load_gain(tmp_path / "folder.fits")
-    with pytest.raises(lbt.errors.GainFileError, match="null"):
-        lbt.load_gain("x\0y.npz")
-    with pytest.raises(lbt.errors.OutputError, match="null"):
-        lbt.save_gain("x\0y.npz", original("bare"))
-
-
-def test_nothing_half_written_stays(tmp_path, monkeypatch):
-    path = lbt.save_gain(tmp_path / "g.fits", original("kalman"))
-    before = path.read_bytes()
-
-    def full_disk(_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(lbt.errors.OutputError, match="cannot write .*No space left on device"):
-        lbt.save_gain(path, original("hinf"))
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["g.fits"]
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "null",
-        "[" * 100_000,
-        '{"schema": "lbt_synth gain file", "x": NaN}',
-        '{"schema": "lbt_synth gain file", "schema": "lbt_synth gain file"}',
-        "\x00",
-    ],
-)
-def test_hostile_metadata(tmp_path, text):
-    path = tmp_path / "h.npz"
-    path.write_bytes(npz_bytes({}, text))
-    with pytest.raises(lbt.errors.GainFileError):
         lbt.load_gain(path)
 
 

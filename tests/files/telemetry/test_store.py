@@ -7,7 +7,6 @@ import pytest
 from astropy.io import fits
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.plants import lbt_axis_plant
 from support.telemetry import ENDINGS, SHELL, full, same, telemetries
 
 import lbt_synth as lbt
@@ -23,32 +22,7 @@ from lbt_synth.storage import array_file as archive
 def test_round_trip_keeps_every_bit(tmp_path, ending):
     least = Telemetry(frame_rate_hz=1.0, commands=[[1.0]], measurements=[[2.0]])
     for seen in (full(), full(with_slopes=False), least):
-        path = save_telemetry(tmp_path / f"t.{ending}", seen)
-        assert same(seen, load_telemetry(path))
-        again = save_telemetry(tmp_path / f"again.{ending}", seen)
-        assert again.read_bytes() == path.read_bytes()
-
-
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_truncated_files_are_refused_and_flipped_bits_found_or_harmless(tmp_path, ending):
-    path = save_telemetry(tmp_path / f"t.{ending}", full())
-    content = path.read_bytes()
-    for length in np.linspace(0, len(content) - 40, 7).astype(int):
-        path.write_bytes(content[:length])
-        with pytest.raises(lbt.errors.TelemetryError) as caught:
-            load_telemetry(path)
-        assert "\n" not in str(caught.value)
-        assert caught.value.path == path
-    refused, places = 0, np.linspace(0, len(content) - 1, 20).astype(int)
-    for place in places:
-        damaged = bytearray(content)
-        damaged[place] ^= 1 << int(place) % 8
-        path.write_bytes(bytes(damaged))
-        try:
-            assert same(full(), load_telemetry(path))
-        except lbt.errors.TelemetryError:
-            refused += 1
-    assert refused > 5
+        assert same(seen, load_telemetry(save_telemetry(tmp_path / f"t.{ending}", seen)))
 
 
 @settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -159,21 +133,6 @@ def test_the_equation_of_a_moving_mirror_holds_in_the_file_alone(tmp_path, kind)
     assert "mirror" not in lost_fields(seen)
 
 
-def test_foreign_files_are_refused(tmp_path):
-    picture = tmp_path / "image.fits"
-    fits.PrimaryHDU(np.ones((4, 4))).writeto(picture)
-    other = tmp_path / "other.npz"
-    np.savez(other, a=np.ones(3))
-    gain = lbt.save_gain(tmp_path / "gain.fits", lbt.kalman(lbt_axis_plant()))
-    pickled = tmp_path / "pickled.npz"
-    np.savez(pickled, META=np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    for path in (picture, other, gain, pickled):
-        with pytest.raises(lbt.errors.TelemetryError, match=f"{path.name} is "):
-            load_telemetry(path)
-    with pytest.raises(lbt.errors.GainFileError, match="is not a gain file"):
-        lbt.load_gain(save_telemetry(tmp_path / "t.fits", full()))
-
-
 def edited(tmp_path, change, *, resign=True):
     """Write a file whose arrays and metadata somebody changed."""
     arrays, meta = store.pack(full(), "float64")
@@ -217,7 +176,6 @@ def test_edited_files_are_refused(tmp_path, change, resign, text):
 def test_names_and_formats(tmp_path):
     seen = full()
     for name, kind, text in (
-        ("t.txt", None, "telemetry must end in .fits, .npz or .aot.fits; got 't.txt'"),
         ("t.fits", "npz", "does not fit the format 'npz'"),
         ("t.npz", "fits", "does not fit the format 'fits'"),
         ("t.aot.fits", "fits", "does not fit the format 'fits'"),
@@ -227,15 +185,6 @@ def test_names_and_formats(tmp_path):
             save_telemetry(tmp_path / name, seen, format=kind)
     with pytest.raises(lbt.errors.OutputError, match="holds a Telemetry; got int"):
         save_telemetry(tmp_path / "t.fits", 3)
-    with pytest.raises(lbt.errors.OutputError, match="No such file or directory"):
-        save_telemetry(tmp_path / "nowhere" / "t.fits", seen)
-    with pytest.raises(lbt.errors.TelemetryError, match="must end in"):
-        load_telemetry(tmp_path / "t.txt")
-    (tmp_path / "folder.fits").mkdir()
-    with pytest.raises(lbt.errors.TelemetryError, match="cannot read"):
-        load_telemetry(tmp_path / "folder.fits")
-    with pytest.raises(lbt.errors.TelemetryError, match="null"):
-        load_telemetry("x\0y.npz")
 
 
 def test_the_fits_file_explains_itself(tmp_path):

@@ -388,6 +388,7 @@ def find_eris(**options: object) -> object:
 REFUSALS = [
     (lambda: find_series(measurement=WHITE), DimensionError, "must be a series"),
     (lambda: find_series(measurement=np.full(2000, np.nan)), NonFiniteError, "measurement"),
+    (lambda: find_series(measurement=np.ones(2000)), ProblemError, "measurement is constant"),
     (lambda: find_series(correction=np.zeros(10)), DimensionError, "correction must have shape"),
     (lambda: find_series(frame_rate_hz=0), ProblemError, "frame_rate_hz"),
     (lambda: find_series(stretches=[(0, 5000)]), ProblemError, "stretches must be .* 2000 frames"),

@@ -293,18 +293,6 @@ def test_a_row_of_an_unfinished_study(tmp_path):
         replay_row(study, folder, 60)
 
 
-def test_a_row_whose_design_fails(tmp_path):
-    study = load_small_study(
-        tmp_path,
-        samples="2",
-        controllers="{tight: {design: integrator, gain: 0.7, for: sample}}",
-        parameters="{loop.delay_frames: {list: [4, 5]}}",
-    )
-    again = replay_row(study, make_folder(tmp_path), 1)
-    assert "failed its certificate" in again.failures[0][2]
-    assert [path.name for path in again.files] == ["row_1.yaml"]
-
-
 def test_a_row_without_noise(tmp_path):
     study, folder = (
         load_small_study(tmp_path, parameters="{error.noise_factor: 0}"),
