@@ -16,14 +16,14 @@ GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 4480,
     "config": 1876,
-    "design": 8220,
+    "design": 7570,
     "files": 1608,
     "identification": 10620,
-    "interop": 4375,
+    "interop": 4360,
     "linear": 6078,
-    "loop": 5050,
-    "methods": 1109,
-    "models": 4420,
+    "loop": 4905,
+    "methods": 920,
+    "models": 4400,
     "report": 4590,
     "storage": 1049,
     "studies": 3050,
@@ -31,8 +31,8 @@ LINES = {
 }
 COUNTS = {
     "files of the package": 265,
-    "public names": 232,
-    "tuned constants": 666,
+    "public names": 230,
+    "tuned constants": 660,
     "lines of tests": 41100,
     "words of docs": 75543,
 }

@@ -137,9 +137,9 @@ def design(parser: ArgumentParser) -> None:
 
 def _add_method_options(parser: ArgumentParser) -> None:
     """Add ``--method`` and the options of all methods; each method checks its own."""
-    from lbt_synth.methods.registry import all_methods, option_names
+    from lbt_synth.methods.registry import METHODS, option_names
 
-    methods = all_methods()
+    methods = METHODS
     parser.add_argument(
         "--method",
         choices=tuple(methods),

@@ -19,8 +19,9 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.records.record import require_length
 from lbt_synth.interop import Rehearsal, rehearse
-from lbt_synth.loop import Imaging, series_strehl
+from lbt_synth.loop import Imaging
 from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
+from lbt_synth.loop.strehl import series_strehl
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.draw import save_figure

@@ -18,7 +18,7 @@ from pydantic import (
 from lbt_synth.errors import suggest_word
 from lbt_synth.methods import quantities as q
 from lbt_synth.methods.method import Section
-from lbt_synth.methods.registry import all_methods
+from lbt_synth.methods.registry import METHODS
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 
 Matrix: TypeAlias = list[list[q.Entry]]
@@ -292,7 +292,7 @@ class ImagingSection(Section):
 def _design_section() -> type[Section]:
     """Return the defaults of the synthesis: options of the methods, and their own sections."""
     fields: dict[str, Any] = {}
-    for method in all_methods().values():
+    for method in METHODS.values():
         for name in sorted(method.configurable):
             option = method.options.model_fields[name]
             fields[name] = (option.annotation, option)

@@ -25,7 +25,7 @@ from lbt_synth.identification.commands.verdict import (
     judge_fitted_gains,
     record_law,
 )
-from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, POSSIBLE_GAINS
+from lbt_synth.identification.fit.fitting import GAIN_STEP, PLAUSIBLE_GAINS, POSSIBLE_GAINS
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.fit.identify import OPEN_GAIN, identify
 from lbt_synth.identification.prediction.comparison import PredictionTable, compare_designs
@@ -51,7 +51,6 @@ _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 _MISFIT = 1.5  # factor by which a gain may be off where the model leaves something out
-_STEP = 0.05  # of the logarithm of a gain, between gains that are tried: a loop hardly changes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -353,7 +352,7 @@ def _running_gains(record: LoopRecord) -> tuple[float, float]:
 
 def _gains_between(start: float, end: float) -> FloatArray:
     """Return gains from one to another, both of them included."""
-    return np.geomspace(start, end, int(np.ceil(abs(np.log(end / start)) / _STEP)) + 1)
+    return np.geomspace(start, end, int(np.ceil(abs(np.log(end / start)) / GAIN_STEP)) + 1)
 
 
 def unstable_gains(

@@ -21,7 +21,7 @@ import numpy as np
 
 import lbt_synth
 from lbt_synth.design import Check, Design
-from lbt_synth.design.modal.per_mode import name_modes
+from lbt_synth.design.modal.stack import name_modes
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs

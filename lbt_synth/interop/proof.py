@@ -13,15 +13,17 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design import Check, Design
-from lbt_synth.design.shaping.bounds import Attenuation, CommandRms
 from lbt_synth.design.shaping.channel import SingleModeLoop
-from lbt_synth.design.shaping.objectives import leaves
-from lbt_synth.design.shaping.specification import Demand, Specification
-from lbt_synth.design.shaping.uncertainty import (
+from lbt_synth.design.shaping.demands import (
+    Attenuation,
+    CommandRms,
+    Demand,
     LoopErrors,
     MirrorUncertainty,
     MovingSensorGain,
 )
+from lbt_synth.design.shaping.objectives import leaves
+from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
 from lbt_synth.linear.lyapunov import output_variances, stationary_root

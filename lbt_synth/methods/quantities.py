@@ -1,8 +1,4 @@
-"""Numbers that people write in files, with limits beyond which no telescope lies.
-
-A number outside them has a wrong unit or is a slip, and squares of it would overflow or vanish
-beside the others. Zero is allowed only where it means that something is not there.
-"""
+"""Numbers that people write in files, with limits beyond which a unit is wrong or a slip."""
 
 from __future__ import annotations
 
@@ -31,8 +27,6 @@ Gain: TypeAlias = Annotated[float, Field(ge=1e-3, le=1e3)]
 Ratio: TypeAlias = Annotated[float, Field(ge=1e-6, le=1e6)]
 RatioFromZero: TypeAlias = Annotated[float, Field(ge=0, le=1e6)]
 Entry: TypeAlias = Annotated[float, Field(ge=-1e6, le=1e6)]
-
-
 Acceleration: TypeAlias = Annotated[float, Field(ge=1e-12, le=1e3)]
 
 

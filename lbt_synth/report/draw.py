@@ -226,6 +226,7 @@ def _draw_colour_bar(panels: Sequence[Panel], *, below: bool) -> bool:
     lowest, highest = zip(*(panel.image.get_clim() for panel in mapped), strict=True)
     for panel in mapped:  # one scale for all
         panel.image.set_clim(min(lowest), max(highest))
+        panel.draw_contours()
     style: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 40} if below else {}
     bar = mapped[0].figure.colorbar(image, ax=places, **style)
     bar.set_label(mapped[0].image_text)
@@ -244,6 +245,7 @@ class Panel:
         self.axes = axes
         self.image: Any = None  # of a map
         self.image_text = ""
+        self._levels: tuple[FloatArray, FloatArray, Any] | None = None  # of contours
         self.series: list[Series] = []
         self.title_lines = 0
         self._title = ""
@@ -393,7 +395,7 @@ class Panel:
 
         Contours are lines of equal, round values.
         """
-        from matplotlib.colors import ListedColormap, LogNorm, Normalize
+        from matplotlib.colors import LogNorm, Normalize
 
         along, up = self._shown("x", x), self._shown("y", y)
         edges, shown = (_cell_edges(along), _cell_edges(up)), np.ma.masked_invalid(values)
@@ -404,15 +406,22 @@ class Panel:
         self.image = self.axes.pcolormesh(*edges, shown, cmap="viridis", norm=norm, rasterized=True)
         self.image_text = f"{label} [{unit}]" if unit else label
         if contours and min(values.shape) > 1 and np.ptp(shown.compressed()) > 0:
-            shades = {"cmap": ListedColormap(["white", "black"]), "norm": Normalize(*ends)}
-            lines = self.axes.contour(along, up, shown, _CONTOURS, linewidths=0.8, **shades)
-            self.axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
+            self._levels = along, up, shown
         if np.any(np.isnan(values)):  # what no cell covers
             self.axes.patch.set(**_BLANK)
             corner = [edges[0][0]] * 2, edges[1][0], edges[1][0]
             self.axes.fill_between(*corner, label=_label(blank), **_BLANK)
         for place, row in zip(up, values, strict=True):
             self._note(f"{label} at {self._axis['y']['text']} {place:g}", along, row)
+
+    def draw_contours(self) -> None:
+        """Draw lines of equal, round values over a map, light where it is dark."""
+        from matplotlib.colors import ListedColormap
+
+        if self._levels is not None:
+            style = {"cmap": ListedColormap(["white", "black"]), "norm": self.image.norm}
+            lines = self.axes.contour(*self._levels, _CONTOURS, linewidths=0.8, **style)
+            self.axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
 
     def finish(self) -> None:
         """Set the scales and their ticks, and write the title."""

@@ -165,7 +165,7 @@ def loaded_by_command(*words):
 def test_a_design_of_one_sensor_loads_what_it_uses(tmp_path, method):
     """What a design does not need took half of its time."""
     ours = (
-        *("design.loop_shaping", "design.modal", "design.shaping.reduction"),
+        *("design.loop_shaping", "design.modal", "design.shaping.solution"),
         *("design.mixed", "design.lqg"),
         *("linear.riccati.periodic", "linear.output_feedback"),
         *("loop.simulation", "interop", "config.end_to_end", "studies.study", "studies.robustness"),

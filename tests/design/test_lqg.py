@@ -15,6 +15,7 @@ from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.design.lqg import _pieces, loop_variances, mirror_core
+from lbt_synth.loop.budget import settling_error
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.report.figures.studies import mirror_figure
@@ -200,7 +201,7 @@ def test_what_is_left_of_the_settled_mirror():
     design = lbt.lqg(plant)
     truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
     loop = lbt.close_loop(plant.hardware, design.controller)
-    left = lbt.loop.settling_error(loop, truth)
+    left = settling_error(loop, truth)
     run = lbt.simulate(
         design.controller, truth, hardware=plant.hardware, frames=60_000, seed=1, cases=2
     )
@@ -219,7 +220,7 @@ def test_what_is_left_of_the_settled_mirror():
     z = np.exp(2j * np.pi * 20 / 800)
     change = z**-1 - np.sum(taps * z ** -np.arange(taps.size))
     command = loop.system.frequency_response([20.0])[0, 1, 0] * 100 * np.sqrt(2)
-    assert abs(lbt.loop.settling_error(loop, shake).line_amplitudes_nm[0, 0]) == pytest.approx(
+    assert abs(settling_error(loop, shake).line_amplitudes_nm[0, 0]) == pytest.approx(
         abs(change * command), rel=1e-9
     )
 
@@ -228,7 +229,7 @@ def test_a_settled_mirror_leaves_nothing():
     plant = slow_plant(2.25)
     loop = lbt.close_loop(plant.hardware, lbt.lqg(plant).controller)
     truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
-    assert lbt.loop.settling_error(loop, truth).rms_nm == 0
+    assert settling_error(loop, truth).rms_nm == 0
 
 
 def test_the_other_designs_and_analyses_take_a_moving_mirror():

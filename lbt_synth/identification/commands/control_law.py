@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.records.faults import MAD, find_saturated
+from lbt_synth.identification.records.faults import MAD, SURPRISING, find_saturated
 from lbt_synth.linear import Controller
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
@@ -52,7 +52,6 @@ _SPARE = 0.2  # of the logarithm of what the richest law leaves, which a simple 
 # of the frames that follow no law, of which more are a law of their own
 FOLLOWED = 0.1
 _ADDS_UP = 0.2  # distance from 1 of the pole of an integrator, a leaky one included
-SIGMAS = 4.0  # standard errors within which two numbers are the same
 
 # weights of past commands (axes, order) and measurements (axes, lags, axes), and the errors of the
 # first of these, (axes,), and of the sums of the others over their lags, (axes, axes)
@@ -245,7 +244,9 @@ def _odd_frames(series: _Series, law: ControlLaw) -> BoolArray:
     rest = rest - sum(series.y[rows - lag] @ law.taps[:, i].T for i, lag in enumerate(lags))
     rest = np.abs(rest - np.median(rest, axis=0))
     floor = np.sqrt(_EXACT) * np.median(np.abs(u[rows] - u[rows - 1]), axis=0)
-    beyond = np.any(rest > np.maximum(2 * SIGMAS * MAD * np.median(rest, axis=0), floor), axis=1)
+    beyond = np.any(
+        rest > np.maximum(2 * SURPRISING * MAD * np.median(rest, axis=0), floor), axis=1
+    )
     odd = np.zeros(len(u), dtype=np.bool_)
     if np.mean(beyond) < FOLLOWED:
         odd[rows[beyond]] = True
@@ -442,7 +443,7 @@ def _kind(poles: ComplexArray, past_error: FloatArray) -> LawKind:
     if order == 0:
         return "proportional"
     if order == 1:
-        is_pure = np.all(distance <= np.maximum(_EXACT, SIGMAS * past_error)[:, None])
+        is_pure = np.all(distance <= np.maximum(_EXACT, SURPRISING * past_error)[:, None])
         return "pure integrator" if is_pure else "leaky integrator"
     if order == 2 and np.all(distance < _ADDS_UP):
         return "double integrator"
@@ -457,7 +458,7 @@ def classify_matrix(values: ArrayLike, errors: ArrayLike = 0.0) -> tuple[AxisKin
     other.
     """
     g = square(values, "values")
-    doubt = SIGMAS * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
+    doubt = SURPRISING * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
     small = _SMALL * np.max(np.abs(g), initial=0.0)
     least = np.where(np.isfinite(doubt), np.maximum(doubt, small), np.inf)
     g = np.where(np.abs(g) <= least, 0.0, g)

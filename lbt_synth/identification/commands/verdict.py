@@ -26,7 +26,6 @@ from lbt_synth.identification.commands.coarse_spectrum import (
 from lbt_synth.identification.commands.control_law import (
     FOLLOWED,
     SHORT_ORDER,
-    SIGMAS,
     ControlLaw,
     classify_matrix,
     fit_control_law,
@@ -46,6 +45,7 @@ from lbt_synth.identification.fit.fitting import (
 )
 from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components
 from lbt_synth.identification.fit.periodogram import loop_periodogram
+from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
@@ -541,7 +541,7 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
 
     The fit shows gains beyond the plausible ones where the coarse model leaves them open.
     """
-    accepted = not np.all(gains - SIGMAS * errors > PLAUSIBLE_GAINS[1])
+    accepted = not np.all(gains - SURPRISING * errors > PLAUSIBLE_GAINS[1])
     scale = np.ones(gains.size) if accepted else likely_factors(gains, PLAUSIBLE_GAINS)
     return CommandVerdict(
         explanation=AS_GIVEN if accepted else wrong_scale(scale, gains),

@@ -16,7 +16,7 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedModel,
 )
 from lbt_synth.identification.records.from_series import TREND, end_scatters
-from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.records.record import FEW, LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, jitter_strehl, loop_margins, residual_budget
 from lbt_synth.loop.budget import line_covariance
@@ -37,7 +37,6 @@ from lbt_synth.validation import BoolArray, FloatArray
 
 AXES = ("tip", "tilt")
 DEAD = "dead"
-FEW = 0.01  # of the frames, that may have a fault
 _NOISIER = 3.0  # times the other axis, from frame to frame: turbulence and lines are more alike
 _WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel
 _WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers", "held": "held"}

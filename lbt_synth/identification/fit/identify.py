@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.fitting import (
     GAIN_ERROR,
+    GAIN_STEP,
     LOWEST_LINE_HZ,
     MOST_LINES,
     PLAUSIBLE_GAINS,
@@ -46,6 +47,7 @@ from lbt_synth.identification.fit.physical_parameters import (
 )
 from lbt_synth.identification.fit.shared_lines import couple_axes
 from lbt_synth.identification.fit.whittle import FittedModel
+from lbt_synth.identification.records.faults import RARE
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
 from lbt_synth.validation import FloatArray, number, one_or_each, real_array, require_instance
@@ -54,10 +56,8 @@ _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
 _UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be coloured
-_NOT_WHITE = 1e-3  # probability of white innovations below which a note says so
 OPEN_GAIN = 0.3  # relative error of a gain that a record leaves open
 _POOR_GAIN = 0.1  # relative error from which a note says so
-_ROUGH_GAIN = 0.05  # relative error from which other gains are tried
 _AMBIGUOUS = 2.0  # times the error of a fit to more data: it had rivals
 _LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0  # of the periodograms in a density
 
@@ -351,7 +351,7 @@ def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[st
             )
     for i, axis in enumerate(axes):
         test = axis.whiteness
-        if test.p_value < _NOT_WHITE or test.correlation_p_value < _NOT_WHITE:
+        if min(test.p_value, test.correlation_p_value) < RARE:
             yield (
                 f"warning: the innovations of axis {i} are not white (p = {test.p_value:.2g}, "
                 f"{test.correlation_p_value:.2g}): the model leaves something out, such as noise "
@@ -456,7 +456,7 @@ def _is_clear(model: FittedModel, start: IdentifiedAxis | None) -> bool:
     turbulence, narrow = model.spectrum.components[0], [c.is_narrow for c in model.spectrum.lines]
     plain = all(narrow) and not background.colour and turbulence.damping_ratio < OVERDAMPED
     low, high = PLAUSIBLE_GAINS
-    return low <= background.gain <= high and (compared or (plain and error < _ROUGH_GAIN))
+    return low <= background.gain <= high and (compared or (plain and error < GAIN_STEP))
 
 
 def refit_axis(axis: IdentifiedAxis, search: Search, error: float, note: str) -> IdentifiedAxis:

@@ -19,7 +19,8 @@ from lbt_synth.storage.rows import column, percent_column, table_row
 from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 _SHORTEST_RUN = 5  # equal values, a stuck sensor
-_RARE = 1e-3  # runs of chance allowed in a record
+SURPRISING = 4.0  # standard errors that chance does not explain: 0.006 %
+RARE = 1e-3  # chance of what a good record may show, and is noted
 _MANY_RUNS = 100  # needed to compute a chance
 _LIMIT_RATIO = 4  # of values at an end of the range over those at each of as many next levels
 _OUTLIER = 6.5  # standard deviations of the second difference: 1e-4 clean frames in a million
@@ -61,7 +62,7 @@ def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
     many = longer[1:] >= _MANY_RUNS
     chances = longer[2:][many[:-1]] / longer[1:-1][many[:-1]]
     chance = max(float(np.max(chances, initial=0.0)), np.finfo(float).tiny)
-    least = np.inf if chance >= 1 else 1 + np.log(_RARE / len(series)) / np.log(chance)
+    least = np.inf if chance >= 1 else 1 + np.log(RARE / len(series)) / np.log(chance)
     return mark(stretches[lengths >= max(least, _SHORTEST_RUN)], len(series))
 
 

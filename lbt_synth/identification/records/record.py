@@ -31,7 +31,7 @@ from lbt_synth.validation import (
 )
 
 BRIDGED_FRAMES = 3  # of a hole, over which a slow phase is a cubic
-_BRIDGED_FRACTION = 0.01  # of a record, whose noise may be less than that of the others
+FEW = 0.01  # of the frames, that may have a fault or be bridged: they move no result
 NOT_KNOWN = "correction not known"
 _Delay: TypeAlias = Annotated[float, ("at_least", 1), ("at_most", 100)]
 _LEAST_FRAMES = 4 * SHORTEST_SEGMENT  # half of which show a model to be tested on the others
@@ -263,7 +263,7 @@ class LoopRecord:
         lengths = holes[:, 1] - holes[:, 0]
         order = np.argsort(lengths, kind="stable")
         short = order[lengths[order] <= BRIDGED_FRAMES]
-        chosen = short[np.cumsum(lengths[short]) <= _BRIDGED_FRACTION * self.frames]
+        chosen = short[np.cumsum(lengths[short]) <= FEW * self.frames]
         if not chosen.size or self.bridges is not None:
             return self
         for start, stop in holes[chosen]:
@@ -274,7 +274,7 @@ class LoopRecord:
             "interpolated"
         )
         if beyond := len(short) - len(chosen):
-            note += f"; {beyond} more such holes were left, beyond {100 * _BRIDGED_FRACTION:g} %"
+            note += f"; {beyond} more such holes were left, beyond {100 * FEW:g} %"
         y = self.known_gains(sensor_gain) * (series - self.corrections())
         return replace(
             self,

@@ -34,7 +34,8 @@ from lbt_synth.interop.proof import (
     scenario_gains,
 )
 from lbt_synth.linear import StateSpace, hinf_norm
-from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
+from lbt_synth.loop import ClosedLoop, close_loop
+from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import open_fits
 from lbt_synth.validation import FloatArray, integer, number

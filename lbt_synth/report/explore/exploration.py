@@ -21,7 +21,7 @@ from lbt_synth.linear import hinf_norm, largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.method import Method, Section
-from lbt_synth.methods.registry import all_methods, default_method, design_title, method_named
+from lbt_synth.methods.registry import METHODS, default_method, design_title, method_named
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Vibration
 from lbt_synth.models.vibration import stationary_vibrations
@@ -72,7 +72,7 @@ class Knob:
 
 def list_knobs(config: Config) -> tuple[Knob, ...]:
     """Return what can be moved in a configuration: the loop and the sky, then the design."""
-    own = (knob for method in all_methods().values() for knob in _method_knobs(method, config))
+    own = (knob for method in METHODS.values() for knob in _method_knobs(method, config))
     return (*_loop_knobs(config), *_model_knobs(config), *own)
 
 
@@ -115,7 +115,7 @@ def _model_knobs(config: Config) -> Iterator[Knob]:
     lines = config.settings.model.vibrations
     if not lines:
         return
-    filters = [method for method in all_methods().values() if method.estimator]
+    filters = [method for method in METHODS.values() if method.estimator]
     methods = frozenset(method.name for method in filters)
     damping = float(np.exp(np.mean(np.log([line.damping for line in lines]))))
     knob = _factor_knob("damping", "assumed damping", "", damping, 10.0, _scale_damping)

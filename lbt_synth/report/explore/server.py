@@ -37,7 +37,7 @@ from bokeh.server.server import Server
 from lbt_synth.config.write import config_text
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.methods.registry import all_methods
+from lbt_synth.methods.registry import METHODS
 from lbt_synth.report.draw import GREY, colour, dashes
 from lbt_synth.report.explore.exploration import (
     Exploration,
@@ -271,7 +271,7 @@ class Session:
         self._kept: dict[str, Shown] = {}
         self._threads = ThreadPoolExecutor(_THREADS)
         self._sliders = {knob: knob_slider(knob) for knob in exploration.knobs}
-        methods = [(method.name, method.title) for method in all_methods().values()]
+        methods = [(method.name, method.title) for method in METHODS.values()]
         name = first.request.method.name
         self._method = Select(name="method", title="Method", value=name, options=methods)
         self._verdict, self._facts, self._files = (

@@ -129,7 +129,7 @@ def scale_gain(document):
         (
             "kalman",
             lambda d: d["meta"].update(schema_version=99, library_version="0.2.0"),
-            "layout version 99, of lbt_synth 0.2.0; this version reads 4. Design it again "
+            "layout version 99, of lbt_synth 0.2.0; this version reads 5. Design it again "
             "with lbt-synth design CONFIG --method METHOD -o FILE.",
         ),
         ("kalman", lambda d: d["meta"].update(schema_version=1), "layout version 1, of"),
