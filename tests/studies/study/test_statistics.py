@@ -20,6 +20,7 @@ from lbt_synth.studies.study.statistics import (
 )
 
 NAN = float("nan")
+RESULTS = ("stable", "strehl", "residual_nm")
 
 
 def draw_points(kind, n, dimensions, seed):
@@ -235,6 +236,19 @@ def test_what_only_two_together_do_is_in_no_index():
         assert row["index"] < 0.02
     interactions = summary_tables(found)[-1].rows[-1]
     assert float(interactions[1].split()[0]) > 97
+
+
+def test_failed_samples_are_left_out_of_indices():
+    u = draw_points("independent", 300, 2, seed=3)
+    columns = make_columns({"q": u[:, 0], "p": u[:, 1]}, {"a": 0.2 * u[:, 0] + 0.5 * u[:, 1]})
+    failed = np.arange(300) % 7 == 0
+    nans = {f"a.{name}": np.where(failed, NAN, columns[f"a.{name}"]) for name in RESULTS}
+    kept = {name: column[~failed] for name, column in columns.items()}
+    spoilt, whole = (study_statistics(each, ["q", "p"], ["a"]) for each in (columns | nans, kept))
+    assert spoilt.ranked == whole.ranked == ("p", "q")
+    for name in ("p", "q"):
+        expected = whole.controllers[0].sensitivity[name]
+        assert spoilt.controllers[0].sensitivity[name] == pytest.approx(expected, rel=1e-12)
 
 
 def test_constants_have_no_index():
