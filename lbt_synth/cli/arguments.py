@@ -408,6 +408,8 @@ def _add_prior_knowledge(parser: ArgumentParser) -> None:
     """Add what is known before an identification."""
     known = parser.add_argument_group("what is known beforehand")
     add_option(known, "--sensor-gain", float, "sensor gain, of both axes or of each", nargs="+")
+    text = "noise per frame of the loop's sensor [nm], beside a spectrum that has none"
+    add_option(known, "--noise-nm", float, text, nargs="+")
     add_option(known, "--lines-hz", float, "frequencies of vibrations [Hz]", nargs="+")
     add_option(known, "--lines-error-hz", float, "standard error of --lines-hz [Hz]", 0.1)
     add_option(known, "--lines-file", str, "text file with one frequency per row [Hz]")

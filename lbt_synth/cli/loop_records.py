@@ -186,11 +186,13 @@ def identification_options(
         "lowest_line_hz": arguments.lowest_line_hz,
         "most_lines": arguments.most_lines,
     }
-    if isinstance(record, LoopRecord):
-        options["sensor_gain"] = arguments.sensor_gain
-    elif arguments.sensor_gain is not None:
-        raise ProblemError("a spectrum is of the phase: it has no sensor gain to be given.")
-    return options
+    if isinstance(record, SpectrumRecord):
+        if arguments.sensor_gain is not None:
+            raise ProblemError("a spectrum is of the phase: it has no sensor gain to be given.")
+        return options | {"noise_nm": arguments.noise_nm}
+    if arguments.noise_nm is not None:
+        raise ProblemError("--noise-nm is for spectra; the noise of a series is found in it.")
+    return options | {"sensor_gain": arguments.sensor_gain}
 
 
 def _expected_lines(arguments: Namespace) -> FloatArray:

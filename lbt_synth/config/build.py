@@ -175,7 +175,8 @@ def vibration_numbers(
         for direction in _directions(section, axes, key):
             place = {"frequency_hz": section.frequency_hz, "direction": direction}
             rms_nm = vibration_rms_nm(section, settings, key)
-            yield section, key, {**place, "damping": section.damping, "rms_nm": rms_nm}
+            place |= {"damping": section.damping, "rms_nm": rms_nm}
+            yield section, key, place | ({"sections": section.sections} if section.sections else {})
 
 
 def _directions(

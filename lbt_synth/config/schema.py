@@ -20,9 +20,11 @@ from lbt_synth.methods import quantities as q
 from lbt_synth.methods.method import Section
 from lbt_synth.methods.registry import METHODS
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
+from lbt_synth.models.vibration import MOST_SECTIONS
 
 Matrix: TypeAlias = list[list[q.Entry]]
 _TAGS = (q.ONE, q.EACH)  # in the places of mistakes
+_SECTIONS = "how many equal resonances in series it is: a bump of steep flanks has 2 to 4"
 
 
 def _rule(mistake: Callable[[Any], str]) -> Any:
@@ -221,9 +223,10 @@ class _LineSection(Section):
 class VibrationSection(_LineSection):
     """A vibration of the model; ``spread_hz`` makes several ``lines`` of it."""
 
-    damping: q.Damping = key("damping ratio")
+    damping: q.Damping = key("damping ratio; above 1 nothing oscillates")
     spread_hz: q.Hertz | None = key("half width of its interval [Hz]", None)
     lines: int | None = key("how many lines cover it (default 5)", None, ge=1, le=64)
+    sections: int = key(_SECTIONS, 1, ge=1, le=MOST_SECTIONS)
     _of_spread = goes_with("spread_hz", "lines")
 
 
@@ -232,10 +235,11 @@ class TrueVibrationSection(_LineSection):
 
     kind: Literal["sinusoid", "resonance", "drift"] = key("sinusoid, resonance or drift")
     damping: q.Damping | None = key("damping ratio of a resonance or a drift", None)
+    sections: int | None = key(_SECTIONS, None, ge=1, le=MOST_SECTIONS)
     end_hz: q.Hertz | None = key("frequency at the end of a drift [Hz]", None)
     duration_s: q.Seconds | None = key("duration of a drift [s]", None)
     _rules = by_kind(
-        sinusoid=(), resonance=("damping",), drift=("damping?", "end_hz", "duration_s")
+        sinusoid=(), resonance=("damping", "sections?"), drift=("damping?", "end_hz", "duration_s")
     )
 
 

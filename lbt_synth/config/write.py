@@ -323,6 +323,8 @@ def _vibration_sections(model: IdentifiedModel, comments: dict[str, str]) -> lis
         for key in ("frequency_hz", "damping"):
             entry[key] = float(getattr(line, key))
         entry["rms_nm"] = _raised(line.rms_nm, f"{path}.rms_nm", comments)
+        if line.sections > 1:
+            entry["sections"] = line.sections
         sections.append(entry)
     return sections
 

@@ -17,6 +17,5 @@ from .records.from_file import load_record as load_record
 from .records.from_series import loop_record as loop_record
 from .records.record import LoopRecord as LoopRecord
 from .records.record import SpectrumRecord as SpectrumRecord
-from .records.record import require_length as require_length
 from .stretches import split_halves as split_halves
 from .tracking import TrackingController as TrackingController

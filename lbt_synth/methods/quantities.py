@@ -11,7 +11,7 @@ ONE, EACH = "one", "each"  # one value for all axes, or a list with one per axis
 Count: TypeAlias = Annotated[int, Field(ge=1, le=10**9)]
 Whole: TypeAlias = Annotated[int, Field(ge=0, le=10**9)]
 Fraction: TypeAlias = Annotated[float, Field(ge=1e-6, le=1)]
-Damping: TypeAlias = Annotated[float, Field(ge=1e-7, lt=1)]
+Damping: TypeAlias = Annotated[float, Field(ge=1e-7, le=1e6)]  # far above 1: a drift
 Metres: TypeAlias = Annotated[float, Field(ge=1e-2, le=1e6)]
 MetresPerSecond: TypeAlias = Annotated[float, Field(ge=1e-3, le=1e3)]
 Arcseconds: TypeAlias = Annotated[float, Field(ge=1e-2, le=100)]

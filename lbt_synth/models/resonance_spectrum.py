@@ -78,7 +78,10 @@ def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
     poles = np.where(
         damping < 1, 2 * decay * np.cos(frequency * root), np.exp(-slow) + np.exp(-fast)
     )
-    return np.stack([poles, -(decay**2)], axis=-1)
+    squares = decay**2
+    # what rounding hides is nothing: a coefficient of 1e-37 has states that no solver can scale
+    squares = np.where(squares < np.finfo(float).eps, 0.0, squares)
+    return np.stack([poles, 0.0 - squares], axis=-1)
 
 
 def unit_density(frequency: float, damping: float, s: FloatArray, sections: int = 1) -> FloatArray:

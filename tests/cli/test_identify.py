@@ -127,6 +127,10 @@ def test_a_spectrum(tmp_path, capsys):
     config = lbt.load_config(tmp_path / "m.yaml")
     assert config.hardware.frame_rate_hz == 1000
     assert config.plant.vibrations[0].frequency_hz == pytest.approx(52, abs=0.3)
+    stated = ("--kind", "spectrum", "--noise-nm", 7, "-o", tmp_path / "n.yaml", "--no-figure")
+    status, _, error = run(capsys, "identify", file, *options, *stated)
+    assert (status, error) == (0, "")
+    assert np.diag(lbt.load_config(tmp_path / "n.yaml").plant.R) == pytest.approx(49)
     status, _, error = run(
         capsys, "auto", file, "-o", tmp_path / "t.fits", *options, "--kind", "spectrum"
     )

@@ -156,6 +156,21 @@ def test_a_line_of_both_axes_is_written_once_with_its_direction(tmp_path):
     assert row.endswith("# standard error 0.8 degrees")
 
 
+def test_drifts_and_bumps_are_written(tmp_path):
+    """A drift was refused after the fit: its damping ratio is far above 1."""
+    drift = Line(frequency_hz=18.0, damping=300.0, rms_nm=50.0)
+    bump = Line(frequency_hz=42.0, damping=0.17, rms_nm=30.0, sections=4)
+    made = lbt.load_config(
+        save_identified(tmp_path, Model(axes=(replace(TIP, parts=(drift, bump)),)))
+    )
+    assert [(line.damping, line.sections) for line in made.plant.vibrations] == [
+        (300, 1),
+        (0.17, 4),
+    ]
+    assert made.truth.vibrations == made.plant.vibrations
+    assert lbt.kalman(made.plant).certificate.passed
+
+
 def test_the_residual_of_the_kalman_filter_is_the_estimation_error(tmp_path):
     """The truth is the model: an exact check of the whole chain."""
     config = lbt.load_config(save_identified(tmp_path, TWO))
@@ -213,7 +228,7 @@ def test_quiet_axes_have_no_vibrations(tmp_path):
         (Model(axes=(replace(TIP, noise_nm=-1.0),)), {}, "sensor.noise_nm"),
         (Model(axes=(replace(TIP, sensor_gain=-1.0),)), {}, "model.sensor_gain"),
         (
-            Model(axes=(replace(TIP, parts=(Line(frequency_hz=3, damping=1.0, rms_nm=1),)),)),
+            Model(axes=(replace(TIP, parts=(Line(frequency_hz=3, damping=0.0, rms_nm=1),)),)),
             {},
             r"model.vibrations\[0\].damping",
         ),

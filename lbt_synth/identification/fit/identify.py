@@ -368,7 +368,11 @@ def _identify_spectra(
     options: dict[str, Any],
 ) -> IdentifiedModel:
     """Identify each spectrum, between 0 and the Nyquist frequency of the loop."""
-    stated = None if noise_nm is None else one_or_each(noise_nm, "noise_nm", record.axes, above=0)
+    stated = np.zeros(record.axes)  # 0 where it is that of the spectrum
+    if noise_nm is not None:
+        noise = np.atleast_1d(real_array(noise_nm, "noise_nm"))
+        one = noise[0] if noise.size == 1 else noise
+        stated += one_or_each(one, "noise_nm", record.axes, above=0)
     rate = frame_rate_hz if frame_rate_hz is not None else record.frame_rate_hz
     if rate is None:
         raise ProblemError(
@@ -379,9 +383,10 @@ def _identify_spectra(
     f, densities = record.frequency_hz[inside], record.density_nm2_hz[inside].T
     options |= {"frame_rate_hz": rate, "averages": record.averages}
     axes = [identify_spectrum(f, density, **options) for density in densities]
-    if stated is not None:
-        each = zip(axes, np.broadcast_to(stated, (len(axes),)).tolist(), strict=True)
-        axes = [replace(axis, noise_nm=noise, noise_error_nm=0.0) for axis, noise in each]
+    axes = [
+        replace(axis, noise_nm=noise, noise_error_nm=0.0) if noise else axis
+        for axis, noise in zip(axes, stated.tolist(), strict=True)
+    ]
     left = int(np.sum(record.frequency_hz >= rate / 2))
     notes = [f"{left} frequencies beyond {rate / 2:g} Hz were left out"] if left else []
     notes += [
