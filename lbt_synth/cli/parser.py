@@ -94,9 +94,10 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
         dest="command", metavar="COMMAND", required=True, help="one of those below"
     )
     for name, add_arguments in COMMANDS.items():
-        command = commands.add_parser(
-            name, description=" ".join((add_arguments.__doc__ or "").split())
-        )
+        text = " ".join((add_arguments.__doc__ or "").split())
+        # a script for a shell has the commands with a help; the groups list them for the others
+        listed = {"help": text} if len(named) > 1 else {}
+        command = commands.add_parser(name, description=text, **listed)
         arguments.add_switch(command, "--json", "print one JSON object instead")
         if name in named:
             add_arguments(command)

@@ -18,6 +18,7 @@ from lbt_synth.design.modal.reconstructor import Reconstructor
 from lbt_synth.design.modal.stack import Bank, mode_indices, number_per_mode
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear import Controller
+from lbt_synth.linear.state_space import RunningController
 from lbt_synth.loop.simulation.run import SteppedController
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import (
@@ -246,7 +247,12 @@ class MixedController:
 
 
 def _controller_of(given: Any) -> Any:
-    """Return the controller of a design, or of one that runs; anything else as it is."""
+    """Return the controller of a design, or of one that runs; anything else as it is.
+
+    What is stepped may have a controller of more inputs than it is given.
+    """
+    if isinstance(given, SteppedController) and not isinstance(given, RunningController):
+        return given
     return getattr(given, "controller", given)
 
 
@@ -260,7 +266,8 @@ def _filter_parts(given: Any, modes: IntArray) -> tuple[tuple[Bank, ...], Steppe
             )
         return tuple(bank.for_modes(modes) for bank in banks), None
     controller = _controller_of(given)
-    if isinstance(controller, Controller):
+    # a filter that runs in another form reads what its matrices do not say
+    if isinstance(controller, Controller) and getattr(given, "form", "plain") == "plain":
         A, B, C, D = (getattr(controller, name) for name in "ABCD")
         if D.shape != (modes.size, modes.size):
             raise DimensionError(
