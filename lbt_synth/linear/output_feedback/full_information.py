@@ -16,8 +16,7 @@ from scipy.linalg import block_diag
 
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.riccati.dare import solve_dare
-from lbt_synth.linear.riccati.equations import Equations
-from lbt_synth.linear.riccati.routes import solve_by_doubling, solve_by_schur
+from lbt_synth.linear.riccati.equations import Equations, solve_by_doubling, solve_by_schur
 from lbt_synth.validation import FloatArray
 
 _ROUNDING = 1e-9  # share of a solution that its residual, or a negative part, may be

@@ -10,7 +10,7 @@ from lbt_synth.errors import DetectabilityError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.matrix_functions import nearest_powers_of_two
 from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati
-from lbt_synth.linear.riccati.solvability import unstable_hidden_mode
+from lbt_synth.linear.riccati.dare import unstable_hidden_mode
 from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 

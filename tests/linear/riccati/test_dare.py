@@ -145,8 +145,6 @@ def test_singular_input_weights(seed, n, m):
     Q = C.T @ C
     solution = lbt.solve_dare(A, B, Q, np.zeros((m, m)))
     assert solution.route in ("shifted doubling", "schur")
-    assert solution.attempts[0].route == "doubling"
-    assert solution.attempts[0].solved == 0
     zero = np.zeros((n, m))
     scale = np.linalg.norm(solution.X) * (1 + np.linalg.norm(A) ** 2)
     assert np.linalg.norm(residual(A, B, Q, np.zeros((m, m)), zero, solution.X)) / scale < 1e-9
@@ -241,10 +239,6 @@ def test_a_later_route_takes_over(monkeypatch):
     solution = lbt.solve_dare(1, 1, 1, 1)
     assert solution.X[0, 0] == pytest.approx((1 + np.sqrt(5)) / 2, rel=1e-14)
     assert solution.route == "schur"
-    assert [(a.route, a.tried, a.solved) for a in solution.attempts] == [
-        ("broken", 1, 0),
-        ("schur", 1, 1),
-    ]
 
 
 def test_sizes_from_1e_minus_300_to_1e300():
