@@ -23,7 +23,7 @@ from lbt_synth.design.modal.per_mode import name_modes
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
 from lbt_synth.interop.proof import LOSS, NOISE, POLE, Written, prove_written
-from lbt_synth.linear.state_space import RunningController
+from lbt_synth.linear.controller import RunningController
 from lbt_synth.loop.simulation.disturbances import Disturbance
 from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
 from lbt_synth.models import LoopHardware, Truth

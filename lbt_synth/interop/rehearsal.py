@@ -13,7 +13,7 @@ from lbt_synth.design import Check, Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.pipeline import export, target_named
-from lbt_synth.linear.held_controller import as_controller
+from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.simulation.disturbances import Disturbance
 from lbt_synth.loop.simulation.run import Simulation, settling_frames, simulate

@@ -8,8 +8,9 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
+from lbt_synth.linear.controller import Controller
 from lbt_synth.linear.matrix_functions import nearest_powers_of_two, transpose
-from lbt_synth.linear.state_space import Controller, LinearSystem, StateSpace
+from lbt_synth.linear.state_space import LinearSystem, StateSpace
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,

@@ -13,8 +13,7 @@ import numpy as np
 from scipy.linalg import block_diag, matrix_balance
 
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.linear.other_systems import SAMPLE_FIRST
-from lbt_synth.linear.state_space import StateSpace
+from lbt_synth.linear.state_space import SAMPLE_FIRST, StateSpace
 from lbt_synth.storage.summaries import Summarised
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (

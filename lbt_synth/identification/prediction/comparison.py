@@ -34,7 +34,7 @@ from lbt_synth.identification.prediction.residual import (
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.linear.held_controller import as_controller
+from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import Imaging, close_loop, jitter_strehl, residual_budget, youla_controller
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.methods.registry import method_named
