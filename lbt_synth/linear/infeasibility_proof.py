@@ -35,7 +35,7 @@ from lbt_synth.linear.matrix_functions import as_stack, component_labels
 from lbt_synth.validation import FloatArray, matrix, set_fields
 
 _RANK_TOLERANCE = 1e-13
-_SLOW = 0.999  # a pole of the backward recursion beyond this may belong to a sinusoid
+_SLOW = 0.99  # a pole of a worst case beyond this may belong to a steady oscillation
 _SMALLEST_SCALE = 1e-7  # of a state, as a part of the largest standard deviation
 _STRAYED = 1e-9  # share of the successors that may lie where no filter has an error
 
@@ -192,9 +192,9 @@ def worst_invisible_disturbance(
     P, covariance = P / units / units.T, covariance / units / units.T
     candidates = [_worst_burst(problem, P, gamma)]
     if problem.period == 1:
-        poles = np.linalg.eigvals(_backward(problem, 0, P, gamma)[0])
-        slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]
-        candidates += [_sinusoid(problem, float(np.angle(pole))) for pole in slow]
+        system, gain = problem.read_parts(0), (problem.L, np.zeros_like(problem.L @ problem.B))
+        angles = slow_angles(_backward(problem, 0, P, gamma)[0])
+        candidates += [steady_oscillation(system, gain, angle) for angle in angles]
     best = max(candidates, key=lambda witness: infeasible_level(problem, witness, covariance))
     return replace(best, states=units * best.states)
 
@@ -241,16 +241,31 @@ def _backward(
     return np.asarray(backward, dtype=np.float64), B
 
 
-def _sinusoid(problem: EstimationProblem, angle: float) -> Witness:
-    """Return the invisible sinusoid of one frequency that has the most z for its w."""
-    (A, B, C, D), L = problem.read_parts(0), problem.L
+def steady_oscillation(
+    system: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    gain: tuple[FloatArray, FloatArray],
+    angle: float,
+) -> Witness:
+    """Return the oscillation of one frequency that a system does not show, and that gains most.
+
+    Of ``e^(j angle) x = A x + B w`` with ``C x + D w = 0``, the pair of the largest ``L x + M w``
+    for its w; nothing where there is none.
+    """
+    (A, B, C, D), (L, M) = system, gain
     n = len(A)
-    # e^(j angle) x = A x + B w and C x + D w = 0
-    steady = np.block([[np.exp(1j * angle) * np.eye(n) - A, -B], [C, D]])
-    pairs = null_space(steady)
-    x, w = pairs[:n], pairs[n:]
-    gained, spent = (L @ x).conj().T @ (L @ x), w.conj().T @ w
-    floor = 1e-13 * np.trace(spent).real * np.eye(len(spent))
-    best = pairs @ eigh(gained, spent + floor)[1][:, -1]
-    parts = np.stack([best.real, best.imag], axis=1)
-    return Witness(states=parts[:n], disturbances=parts[n:])
+    pairs = null_space(np.block([[np.exp(1j * angle) * np.eye(n) - A, -B], [C, D]]))
+    if pairs.shape[1] == 0:
+        return Witness(states=np.zeros((n, 1)), disturbances=np.zeros((B.shape[1], 1)))
+    gained, disturbances = L @ pairs[:n] + M @ pairs[n:], pairs[n:]
+    spent = disturbances.conj().T @ disturbances
+    floor = 1e-13 * max(np.trace(spent).real, 1e-300) * np.eye(len(spent))
+    best = pairs @ eigh(gained.conj().T @ gained, spent + floor)[1][:, -1]
+    phases = np.stack([best.real, best.imag], axis=1)
+    return Witness(states=phases[:n], disturbances=phases[n:])
+
+
+def slow_angles(A: FloatArray) -> list[float]:
+    """Return the angles of the slow poles of a recursion, the slowest first."""
+    poles = np.linalg.eigvals(A)
+    slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]
+    return [float(np.angle(pole)) for pole in slow[np.argsort(-np.abs(slow))]]
