@@ -80,9 +80,8 @@ class ControlWitness:
     """Why no controller reaches a level."""
 
     reason: str  # the reason in words
-    unseen: Witness | None = (
-        None  # states (n, r) and disturbances (m1, r) that no measurement shows
-    )
+    # states (n, r) and disturbances (m1, r) that no measurement shows
+    unseen: Witness | None = None
     # costates (n, s) and weights of the error (p1, s) that no control moves
     unmoved: Witness | None = None
 
