@@ -11,8 +11,7 @@ from lbt_synth.design.output_feedback.result import (
     first_certified,
 )
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.output_feedback.scaled_plant import scaled_plant
-from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati
+from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati, scaled_plant
 
 
 def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:

@@ -19,8 +19,7 @@ from lbt_synth.design.output_feedback.result import (
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.output_feedback.lower_bound import NO_PROOF, infeasible_control_level
-from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant, scaled_plant
-from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati
+from lbt_synth.linear.output_feedback.two_riccati import ScaledPlant, TwoRiccati, scaled_plant
 from lbt_synth.validation import choice
 
 if TYPE_CHECKING:

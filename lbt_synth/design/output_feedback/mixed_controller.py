@@ -14,8 +14,12 @@ from lbt_synth.design.output_feedback.result import (
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.norms import hinf_norm
-from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant, scaled_plant
-from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati, free_parameter
+from lbt_synth.linear.output_feedback.two_riccati import (
+    ScaledPlant,
+    TwoRiccati,
+    free_parameter,
+    scaled_plant,
+)
 from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.validation import integer, number
 

@@ -33,8 +33,7 @@ from lbt_synth.linear.output_feedback.lower_bound import (
     ControlWitness,
     infeasible_control_level,
 )
-from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant, scaled_plant
-from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati
+from lbt_synth.linear.output_feedback.two_riccati import ScaledPlant, TwoRiccati, scaled_plant
 from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.summaries import Summary

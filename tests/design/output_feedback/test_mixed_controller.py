@@ -7,8 +7,7 @@ from support.generalized_plants import random_plant
 
 import lbt_synth as lbt
 from lbt_synth.errors import InfeasibleError
-from lbt_synth.linear.output_feedback.scaled_plant import scaled_plant
-from lbt_synth.linear.output_feedback.two_riccati import free_parameter
+from lbt_synth.linear.output_feedback.two_riccati import free_parameter, scaled_plant
 
 
 @pytest.mark.parametrize("seed", [1, 2, 6])
