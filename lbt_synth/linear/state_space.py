@@ -47,10 +47,8 @@ SAMPLE_FIRST = (
     "norm, which the default, a zero-order hold, does not."
 )
 
-_PROBES = 5  # points at which partial fractions are checked by solving linear systems
-_AGREEMENT = 1e-9
+_AGREEMENT = 1e-9  # relative, of partial fractions with solved linear systems at five points
 _CHUNK = 60_000  # complex numbers that a frequency response computes at once; they fit a cache
-_PHASE_CHUNK = 2_000_000  # and that of all phases
 
 
 @table_row
@@ -334,7 +332,7 @@ class StateSpace(LinearSystem):
         z = np.exp(2j * np.pi * frequency * self.dt_s)
         (p, m), N, whole = self.D.shape[-2:], self.period, self.lifted()
         schur = complex_schur(whole.A)
-        step = max(1, _PHASE_CHUNK // (N * max(p, self.n_states)))
+        step = max(1, _CHUNK // max(p, self.n_states, 1))
         out = np.empty((z.size, N, p, m), dtype=np.complex128)
         for j in range(m):  # the input of a period is one of its columns times z^0, z^1, ...
             column = replace(whole, B=whole.B[:, j::m], D=whole.D[:, j::m])
@@ -487,7 +485,7 @@ def stacked_response(matrices: tuple[FloatArray, ...], z: ComplexArray) -> Compl
         residues = np.einsum("kms,ksq->smqk", C @ vectors, entries)
         for pole, residue in zip(poles.T, residues, strict=True):
             planes += residue[:, :, None] * (1 / (z[:, None] - pole))
-    probes = np.linspace(0, z.size - 1, _PROBES).astype(np.int64)
+    probes = np.linspace(0, z.size - 1, 5).astype(np.int64)
     pencils = z[probes, None, None, None] * np.eye(A.shape[1]) - A
     direct = C @ np.linalg.solve(pencils, B.astype(np.complex128)) + D
     apart = np.max(np.abs(out[probes] - direct), axis=(0, 2, 3))

@@ -24,7 +24,7 @@ from scipy.linalg import null_space
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate, filter_gains
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
-from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.conic_program import require_optimum
 from lbt_synth.linear.lmi.programmes import solve, symmetric_variable, symmetrise
 from lbt_synth.linear.matrix_functions import part_labels, semidefinite_root
 from lbt_synth.validation import FloatArray, IntArray, frozen_copy

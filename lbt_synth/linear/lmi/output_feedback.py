@@ -16,7 +16,7 @@ from scipy.linalg import null_space
 
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.infeasibility_proof import Witness
-from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.conic_program import require_optimum
 from lbt_synth.linear.lmi.programmes import norm_below, solve, symmetrise
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.lower_bound import (
