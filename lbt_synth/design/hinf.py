@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
-
 import numpy as np
 
 from lbt_synth.design.filter_design import FilterDesign, filter_design
@@ -20,11 +18,6 @@ from lbt_synth.linear.riccati.filtering import (
     least_gamma,
 )
 from lbt_synth.validation import choice, number
-
-if TYPE_CHECKING:
-    from lbt_synth.linear.lmi.filters import LmiSolution
-
-SolvedGains: TypeAlias = "FilterRiccati | LmiSolution"
 
 # A level this close to the least one counts as the least one itself.
 _AT_LEAST = 1e-9
@@ -181,12 +174,12 @@ class _RiccatiRoute:
     def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
         self.problem, self.start = problem, start
 
-    def least_gamma(self) -> tuple[SolvedGains, Witness]:
+    def least_gamma(self) -> tuple[FilterRiccati, Witness]:
         lower, upper = _kalman_bracket(self.problem, self.start)
         _, level, best = least_gamma(self.problem, lower=lower, upper=upper, start=self.start)
         return best, worst_invisible_disturbance(self.problem, best.P, level, self.start.P)
 
-    def central(self, gamma: float) -> SolvedGains:
+    def central(self, gamma: float) -> FilterRiccati:
         solution = gamma_riccati(self.problem, gamma, start=self.start)
         if solution is None:
             raise InfeasibleError(
@@ -204,19 +197,19 @@ class _LmiRoute:
         self.problem, self.start = problem, start
         self.scale = _kalman_bracket(problem, start)[1]
 
-    def least_gamma(self) -> tuple[SolvedGains, Witness]:
+    def least_gamma(self) -> tuple[FilterRiccati, Witness]:
         from lbt_synth.linear.lmi.filters import least_gamma_lmi
 
         return least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
 
-    def central(self, gamma: float) -> SolvedGains:
+    def central(self, gamma: float) -> FilterRiccati:
         from lbt_synth.linear.lmi.filters import hinf_lmi
 
         return hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
 
 
 def _verified_bracket(
-    problem: EstimationProblem, start: FilterRiccati, gains: SolvedGains, witness: Witness
+    problem: EstimationProblem, start: FilterRiccati, gains: FilterRiccati, witness: Witness
 ) -> tuple[float, float]:
     """Bounds of the least gamma: the norm of a filter, and a level that a witness refutes."""
     error = problem.error_system(gains.gain_predictor)

@@ -12,7 +12,7 @@ Control", SIAM (1999), doi:10.1137/1.9781611970760, chapter 4 (a-priori filter).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import reduce
+from functools import cache, reduce
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -60,10 +60,10 @@ class FilterRiccati:
     gain_predictor: FloatArray
     gain_filter: FloatArray
     # relative residual of the equation; with a longer period, relative change of P in the last
-    # Newton step, or over a period
+    # Newton step, or over a period; nan of an inequality
     residual: float
-    iterations: int  # number of doublings
-    status: str  # the route that gave P
+    iterations: int  # number of doublings, or of steps of the solver
+    status: str  # the route that gave P, or what the solver reports; no certificate uses it
 
 
 def require_detectable(problem: EstimationProblem) -> None:
@@ -420,15 +420,14 @@ def least_gamma(
     def slack(gamma: float) -> float:
         nonlocal lower
         trial = equation.trial(gamma)
-        if trial.P is not None:
-            met[gamma] = trial
-        else:
+        if trial.P is None:
             lower = max(lower, gamma)
+            return min(trial.slack, -_GAMMA_TOLERANCE)  # at a slack of 0 there is no filter
+        met[gamma] = trial
         return trial.slack
 
     for _ in range(60):  # the upper level is feasible in exact arithmetic
-        above = slack(upper)
-        if above > 0:
+        if slack(upper) > 0:
             break
         upper *= 1.0001 if upper < 1.01 * lower else 1.01
     if not met:
@@ -437,33 +436,21 @@ def least_gamma(
             "the Kalman filter. Scale the states to similar sizes.",
             gamma=upper,
         )
-    root = lower
-    below = slack(lower) if lower < upper else 1.0
-    if below <= 0:
-        start_level = upper  # the slack is almost linear in s = (start_level / gamma)^2
-        slack_at = {(upper / lower) ** 2: below, 1.0: above}
-        s_root = brentq(
-            lambda s: slack_at[s] if s in slack_at else slack(start_level * s**-0.5),
-            (upper / lower) ** 2,
-            1.0,
-            xtol=2 * _GAMMA_TOLERANCE,
-        )
-        root = start_level * s_root**-0.5
-    upper, width = min(met), _GAMMA_TOLERANCE
-    for _ in range(100):  # the search leaves one end of its bracket far away: bring it in
-        if upper - lower <= 2.5 * _GAMMA_TOLERANCE * upper:
-            break
-        above, below = root * (1 + width), root * (1 - width)
-        if above < upper:
-            slack(above)
-        else:
-            slack(below if below > lower and width < 1e-3 else (lower + upper) / 2)
-        upper, width = min(met), 4 * width
+    highest = upper
+
+    @cache
+    def slack_at(s: float) -> float:
+        """Return the slack, which is almost linear in ``s = (highest / gamma)^2``."""
+        return slack(highest * s**-0.5)
+
+    lowest = (upper / lower) ** 2
+    if lowest > 1 and slack_at(lowest) <= 0:
+        brentq(slack_at, lowest, 1.0, xtol=2 * _GAMMA_TOLERANCE)  # its steps are half of it
     for gamma in sorted(met):  # a level too close to the edge may give no filter
         solution = equation.solution(gamma, met[gamma])
         if solution is not None:
             return lower, gamma, solution
     raise NumericalError(
-        f"the least gamma was not bracketed: it lies between {lower:.9g} and {upper:.9g}.",
+        f"the least gamma was not bracketed: it lies between {lower:.9g} and {min(met):.9g}.",
         status="search",
     )
