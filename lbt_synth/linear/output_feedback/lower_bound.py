@@ -104,7 +104,7 @@ def infeasible_control_level(plant: GeneralizedPlant, witness: ControlWitness) -
     What measurements would show or controls move is removed from the pairs first.
     """
     pairs = (witness.unseen, estimation_side), (witness.unmoved, control_side)
-    sides = [_moments(plant, side_of, each) for each, side_of in pairs if each is not None]
+    sides = [_moments(plant, side_of, pair) for pair, side_of in pairs if pair is not None]
     levels = [np.sqrt(side.gained / side.spent) for side in sides if side.spent > 0]
     if len(sides) == 2:
         levels.append(_coupled_level(*sides))
@@ -129,55 +129,39 @@ def _coupled_level(one: _Moments, two: _Moments) -> float:
 
 def _moments(plant: GeneralizedPlant, side_of: _SideOf, pairs: Witness) -> _Moments:
     """Evaluate pairs against the side in whose equation they are the costates."""
-    side = side_of(plant)
-    steady = _hidden(side, pairs.states, pairs.disturbances)
-    growth = steady.after @ steady.after.T - pairs.states @ pairs.states.T
-    size = float(np.sum(pairs.states**2))
-    turning = pairs.states.shape[1] <= 2 and np.linalg.norm(growth) <= _STEADY * size
-    if steady.hidden and turning:
-        none = np.zeros((len(pairs.states), 1))
-        return _Moments(steady.gained, steady.spent, none)
+    side, states = side_of(plant), pairs.states
+    after, steady = _hide(side, states, pairs.disturbances)
+    growth, size = after @ after.T - states @ states.T, float(np.sum(states**2))
+    turning = states.shape[1] <= 2 and np.linalg.norm(growth) <= _STEADY * size
+    if steady is not None and turning:
+        return steady
     basis, inverse = storage_coordinates(_storage_root_of(plant, side_of))
-    return _moments_within(side, pairs, basis, inverse)
+    before = inverse @ states
+    after, within = _hide(side, basis @ before, pairs.disturbances)
+    inner = inverse @ after  # before any square, which would double its rounding
+    strayed = np.linalg.norm(after - basis @ inner)
+    if within is None or strayed > _STRAYED * np.linalg.norm(after):
+        return _Moments(0.0, 1.0, np.zeros_like(states))
+    values, vectors = np.linalg.eigh(inner @ inner.T - before @ before.T)
+    spent = within.spent - float(values[values < 0].sum())
+    return _Moments(within.gained, spent, basis @ (vectors * np.sqrt(np.maximum(values, 0))))
 
 
-def _moments_within(side: Side, pairs: Witness, basis: FloatArray, inverse: FloatArray) -> _Moments:
-    """Evaluate pairs in the range of a storage matrix."""
-    before = inverse @ pairs.states
-    states = basis @ before
-    found = _hidden(side, states, pairs.disturbances)
-    after = inverse @ found.after  # before any square, which would double its rounding
-    strayed = np.linalg.norm(found.after - basis @ after)
-    if strayed > _STRAYED * np.linalg.norm(found.after) or not found.hidden:
-        return _Moments(0.0, 1.0, np.zeros((len(states), 1)))
-    values, vectors = np.linalg.eigh(after @ after.T - before @ before.T)
-    spent = found.spent - float(values[values < 0].sum())
-    return _Moments(found.gained, spent, basis @ (vectors * np.sqrt(np.maximum(values, 0))))
+def _hide(
+    side: Side, states: FloatArray, signals: FloatArray
+) -> tuple[FloatArray, _Moments | None]:
+    """Change signals as little as hides them from what the constraint reads.
 
-
-@dataclass(frozen=True, slots=True)
-class _Hidden:
-    """Pairs after the least change that hides them."""
-
-    after: FloatArray  # (n, r)
-    gained: float
-    spent: float
-    hidden: bool
-
-
-def _hidden(side: Side, states: FloatArray, signals: FloatArray) -> _Hidden:
-    """Change signals as little as hides them from what the constraint reads."""
+    Return the successors (n, r), and the moments without growth; None where they are not hidden.
+    """
     shown = side.B2.T @ states + side.D12.T @ signals
     signals = signals - np.linalg.pinv(side.D12.T, rcond=1e-10) @ shown
-    left = side.B2.T @ states + side.D12.T @ signals
-    size = np.linalg.norm(side.B2.T @ states) + np.linalg.norm(side.D12.T @ signals)
+    seen, cancelled = side.B2.T @ states, side.D12.T @ signals
+    size = np.linalg.norm(seen) + np.linalg.norm(cancelled)
     gain = side.B1.T @ states + side.D11.T @ signals
-    return _Hidden(
-        after=side.A.T @ states + side.C1.T @ signals,
-        gained=float(np.sum(gain**2)),
-        spent=float(np.sum(signals**2)),
-        hidden=bool(np.linalg.norm(left) <= _STEADY * size),
-    )
+    moments = _Moments(float(np.sum(gain**2)), float(np.sum(signals**2)), np.zeros_like(states))
+    is_hidden = np.linalg.norm(seen + cancelled) <= _STEADY * size
+    return side.A.T @ states + side.C1.T @ signals, moments if is_hidden else None
 
 
 def storage_coordinates(root: FloatArray) -> tuple[FloatArray, FloatArray]:

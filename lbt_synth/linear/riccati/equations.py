@@ -27,7 +27,6 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 # Where the platform has it, the residual is formed with 64 bits of mantissa instead of 53:
 # the limit of accuracy is then the rounding of X itself, not that of the products.
 _Extended = np.longdouble
-_NEWTON_STEPS = 10
 _SETTLED = 1e-13  # a Newton step this small is the last one
 _BALANCING_STEPS = 6
 _WELL_CONDITIONED = 1e-8  # least ratio of R's eigenvalues at which R is inverted
@@ -205,9 +204,7 @@ class Equations:
             gains, residual, size = self.evaluate(X)
             X, error = X.copy(), np.full(len(X), np.inf)
             active = np.flatnonzero(np.isfinite(size))
-            for _ in range(_NEWTON_STEPS):
-                if active.size == 0:
-                    break
+            while active.size:
                 part = self.take(active)
                 closed = transpose(part.A - part.B @ gains[active])
                 step = smith_sum(closed, residual[active])

@@ -131,9 +131,7 @@ def _in_noise_units(problem: EstimationProblem) -> tuple[EstimationProblem, Floa
     """Return the problem in units (q,) of the noise of its measurements, powers of two."""
     D = as_stack(problem.D) * problem.read[:, :, None]
     units = nearest_powers_of_two(np.linalg.norm(D, axis=-1).max(axis=0))
-    C, D = problem.C / units[:, None], problem.D / units[:, None]
-    A, B, L, read = problem.A, problem.B, problem.L, problem.read
-    return EstimationProblem(A=A, B=B, C=C, D=D, L=L, read=read, dt_s=problem.dt_s), units
+    return problem.bare(C=problem.C / units[:, None], D=problem.D / units[:, None]), units
 
 
 def _over_a_period(problem: EstimationProblem) -> EstimationProblem:
