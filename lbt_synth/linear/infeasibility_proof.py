@@ -215,19 +215,17 @@ def _worst_burst(problem: EstimationProblem, P: FloatArray, gamma: float) -> Wit
     costates = stationary_root(around, end[:, None])  # of the phase where the burst ends
     if not np.all(np.isfinite(costates)):  # a recursion that rounding makes unstable
         costates = end[:, None]
-    states: dict[int, FloatArray] = {}
-    disturbances: dict[int, FloatArray] = {}
+    pairs: dict[int, tuple[FloatArray, FloatArray]] = {}
     for t in reversed(order):
         (backward, B), (_, _, C, D) = steps[t], problem.read_parts(t)
         before = backward @ costates
-        states[t] = phases[t] @ before
-        hiding = -D.T @ np.linalg.solve(D @ D.T, C @ states[t])
-        disturbances[t] = B.T @ costates + hiding
+        x = phases[t] @ before
+        pairs[t] = x, B.T @ costates - D.T @ np.linalg.solve(D @ D.T, C @ x)
         costates = before
-    return Witness(
-        states=np.stack([states[t] for t in range(N)]),
-        disturbances=np.stack([disturbances[t] for t in range(N)]),
+    states, disturbances = (
+        np.stack(kind) for kind in zip(*(pairs[t] for t in range(N)), strict=True)
     )
+    return Witness(states=states, disturbances=disturbances)
 
 
 def _backward(
