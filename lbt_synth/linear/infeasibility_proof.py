@@ -37,7 +37,7 @@ from lbt_synth.validation import FloatArray, matrix, set_fields
 _RANK_TOLERANCE = 1e-13
 _SLOW = 0.99  # a pole of a worst case beyond this may belong to a steady oscillation
 _SMALLEST_SCALE = 1e-7  # of a state, as a part of the largest standard deviation
-_STRAYED = 1e-9  # share of the successors that may lie where no filter has an error
+_STRAYED = 1e-10  # share of the successors that may lie outside of the range of every storage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -117,37 +117,33 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
         A, B, C, D = problem.read_parts(t)
         w = w - D.T @ np.linalg.solve(D @ D.T, C @ x + D @ w)
         after, onward = A @ x + B @ w, (t + 1) % problem.period
-        pair = _gain_of_step(problem.L, after, states[onward], spaces[onward], covariances[onward])
-        if pair is None:
+        growth = priced_growth(after, states[onward], *spaces[onward])
+        if growth is None:
             return 0.0
-        gained, spent = gained + pair[0], spent + float(np.sum(w**2)) + pair[1]
+        root, price = growth
+        gained += float(np.sum((problem.L @ states[onward]) ** 2) + np.sum((problem.L @ root) ** 2))
+        spent += float(np.sum(w**2)) + price
     return float(np.sqrt(gained / spent)) if spent > 0 else 0.0
 
 
-def _gain_of_step(
-    L: FloatArray,
-    after: FloatArray,
-    then: FloatArray,
-    space: tuple[FloatArray, FloatArray],
-    covariance: FloatArray,
-) -> tuple[float, float] | None:
-    """Return power of z after a step, and price of the shortfall; None where successors stray.
+def priced_growth(
+    after: FloatArray, states: FloatArray, basis: FloatArray, inverse: FloatArray
+) -> tuple[FloatArray, float] | None:
+    """Return a root (n, r) of the moments that successors have more than states, and its price.
 
-    The states of the next phase are ``then``, and there is the space of a filter's error.
+    The price is that of a shortfall by rounding. The moments are formed in the coordinates of a
+    storage, its basis (n, r) and inverse; None where successors stray from its range.
     """
-    basis, inverse = space
-    deviation = np.sqrt(np.diag(covariance))
-    scale = np.maximum(deviation, _SMALLEST_SCALE * deviation.max(initial=0.0))[:, None]
+    inner, before = inverse @ after, inverse @ states  # squares would double their rounding
+    deviation = np.linalg.norm(basis, axis=1, keepdims=True)
+    scale = np.maximum(deviation, _SMALLEST_SCALE * deviation.max(initial=0.0))
     scale = np.where(scale > 0, scale, 1.0)
-    own, own_then = inverse @ after, inverse @ then  # squares would double their rounding
-    strayed = np.linalg.norm((after - basis @ own) / scale)
+    strayed = np.linalg.norm((after - basis @ inner) / scale)
     if strayed > _STRAYED * np.linalg.norm(after / scale):
         return None
-    # after after' = x x' + growth; only rounding makes an eigenvalue of the growth negative
-    values, vectors = np.linalg.eigh(own @ own.T - own_then @ own_then.T)
-    growth_root = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
-    gained = float(np.sum((L @ then) ** 2) + np.sum((L @ growth_root) ** 2))
-    return gained, -float(values[values < 0].sum())
+    values, vectors = np.linalg.eigh(inner @ inner.T - before @ before.T)
+    root = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
+    return root, -float(values[values < 0].sum())
 
 
 def whitening_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

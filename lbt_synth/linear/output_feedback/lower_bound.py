@@ -26,7 +26,12 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError, SynthesisError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.infeasibility_proof import Witness, scaled_basis, steady_oscillation
+from lbt_synth.linear.infeasibility_proof import (
+    Witness,
+    priced_growth,
+    scaled_basis,
+    steady_oscillation,
+)
 from lbt_synth.linear.lyapunov import stationary_root
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.riccati.dare import solve_dare
@@ -34,7 +39,6 @@ from lbt_synth.validation import FloatArray
 
 _STEPS = 64  # of the recursion that bounds the storage matrix
 _STEADY = 1e-12  # part of the states' moments by which those of an oscillation may change
-_STRAYED = 1e-10  # share of the successors that may lie outside of the storage's range
 _RANK = 1e-8  # share of the largest root of a cost that counts as none
 _SINGULAR = 1e-15  # of what the largest control moves, that counts as none
 
@@ -136,15 +140,13 @@ def _moments(plant: GeneralizedPlant, side_of: _SideOf, pairs: Witness) -> _Mome
     if steady is not None and turning:
         return steady
     basis, inverse = storage_coordinates(_storage_root_of(plant, side_of))
-    before = inverse @ states
-    after, within = _hide(side, basis @ before, pairs.disturbances)
-    inner = inverse @ after  # before any square, which would double its rounding
-    strayed = np.linalg.norm(after - basis @ inner)
-    if within is None or strayed > _STRAYED * np.linalg.norm(after):
+    states = basis @ (inverse @ states)
+    after, within = _hide(side, states, pairs.disturbances)
+    priced = priced_growth(after, states, basis, inverse)
+    if within is None or priced is None:
         return _Moments(0.0, 1.0, np.zeros_like(states))
-    values, vectors = np.linalg.eigh(inner @ inner.T - before @ before.T)
-    spent = within.spent - float(values[values < 0].sum())
-    return _Moments(within.gained, spent, basis @ (vectors * np.sqrt(np.maximum(values, 0))))
+    root, price = priced
+    return _Moments(within.gained, within.spent + price, root)
 
 
 def _hide(
