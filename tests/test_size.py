@@ -20,7 +20,7 @@ LINES = {
     "files": 1608,
     "identification": 10760,
     "interop": 4375,
-    "linear": 6078,
+    "linear": 5874,
     "loop": 5050,
     "methods": 1109,
     "models": 4550,

@@ -254,17 +254,17 @@ def estimator_form(controller: Controller | HasController) -> EstimatorForm:
     >>> round(lbt.linear.estimator_form(kalman).spectral_radius, 3)
     0.962
     """
-    given = as_controller(controller)
-    own = _with_command_state(given) if np.any(given.D) else given
-    applied = _conditioning_gain(own) if own.applied is None else own.applied
-    A = own.A - applied @ own.C
-    terms = np.abs(own.A) + np.abs(applied) @ np.abs(own.C)
+    plain = as_controller(controller)
+    delayed = _with_command_state(plain) if np.any(plain.D) else plain
+    applied = _conditioning_gain(delayed) if delayed.applied is None else delayed.applied
+    A = delayed.A - applied @ delayed.C
+    terms = np.abs(delayed.A) + np.abs(applied) @ np.abs(delayed.C)
     form = EstimatorForm(
         A=frozen_copy(np.where(np.abs(A) > _ROUNDED * terms, A, 0.0)),
-        B=own.B,
+        B=delayed.B,
         applied=frozen_copy(applied),
-        C=own.C,
-        dt_s=own.dt_s,
+        C=delayed.C,
+        dt_s=delayed.dt_s,
     )
     if not form.spectral_radius < _STABLE:
         raise NumericalError(

@@ -107,7 +107,7 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
             f"{witness.period}."
         )
     covariances, disturbances = as_stack(covariance), as_stack(witness.disturbances)
-    spaces = [whitening_coordinates(own) for own in covariances]
+    spaces = [whitening_coordinates(P) for P in covariances]
     states = [  # in the space of a filter's error
         basis @ (inverse @ x)
         for x, (basis, inverse) in zip(as_stack(witness.states), spaces, strict=True)
@@ -157,12 +157,12 @@ def whitening_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArra
     sizes: list[FloatArray] = []
     directions: list[FloatArray] = []
     for part in range(np.max(label) + 1):
-        own = np.flatnonzero(label == part)
-        units = spread[own]
-        values, vectors = np.linalg.eigh(covariance[np.ix_(own, own)] / np.outer(units, units))
+        rows = np.flatnonzero(label == part)
+        units = spread[rows]
+        values, vectors = np.linalg.eigh(covariance[np.ix_(rows, rows)] / np.outer(units, units))
         kept = values > _RANK_TOLERANCE * values[-1]
         sizes.append(np.sqrt(values[kept]))
-        directions.append(np.eye(len(label))[:, own] @ vectors[:, kept])
+        directions.append(np.eye(len(label))[:, rows] @ vectors[:, kept])
     return scaled_basis(spread, np.hstack(directions), np.concatenate(sizes))
 
 
@@ -202,10 +202,10 @@ def _worst_burst(problem: EstimationProblem, P: FloatArray, gamma: float) -> Wit
     is the worst past that leads there.
     """
     N, L, phases = problem.period, problem.L, as_stack(P)
-    top = [np.linalg.eigh(L @ own @ L.T) for own in phases]
+    top = [np.linalg.eigh(L @ X @ L.T) for X in phases]
     last = int(np.argmax([values[-1] for values, _ in top]))
     end = L.T @ top[last][1][:, -1]
-    steps = [_backward(problem, t, own, gamma) for t, own in enumerate(phases)]
+    steps = [_backward(problem, t, X, gamma) for t, X in enumerate(phases)]
     order = [(last + k) % N for k in range(N)]
     around = reduce(np.matmul, (steps[t][0] for t in order))
     costates = stationary_root(around, end[:, None])  # of the phase where the burst ends

@@ -85,8 +85,8 @@ def _refine(
     A: FloatArray, Q: FloatArray, X: FloatArray, precision: type[np.floating[Any]]
 ) -> tuple[FloatArray, FloatArray]:
     """Correct X by its residual, summed in some precision; return the relative steps as well."""
-    left, middle = A.astype(precision), X.astype(precision)
-    residual = (left @ middle @ transpose(left) - middle + Q).astype(np.float64)
+    Ap, Xp = A.astype(precision), X.astype(precision)
+    residual = (Ap @ Xp @ transpose(Ap) - Xp + Q).astype(np.float64)
     step = smith_sum(A, symmetrise(residual))
     return symmetrise(X + step), frobenius_norms(step) / np.maximum(frobenius_norms(X), 1e-300)
 

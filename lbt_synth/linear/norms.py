@@ -123,9 +123,9 @@ def square_parts(G: StateSpace) -> list[StateSpace]:
 def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
     """Largest singular value over a band of frequencies; poles outside the band do no harm."""
     low, high = (2 * np.pi * f * system.dt_s for f in (low_hz, high_hz))
-    found = _peak(system.balanced(), low, high)
+    norm = _peak(system.balanced(), low, high)
     # rounding must not move an end of the band outside the band
-    return replace(found, peak_frequency_hz=min(max(found.peak_frequency_hz, low_hz), high_hz))
+    return replace(norm, peak_frequency_hz=min(max(norm.peak_frequency_hz, low_hz), high_hz))
 
 
 def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:

@@ -172,15 +172,15 @@ def minimize(
         for constraint, places in zip(constraints, chosen, strict=True):
             _constrain(programme, _part(constraint, places), origin)
         linear, roots = _Model(programme, origin, scale).expression(function)
-        found = programme.minimize(linear, 2 * roots.T @ roots)
-        if found.status not in USABLE:
-            return None, found.status
-        c = origin + found.x[:size]
+        solution = programme.minimize(linear, 2 * roots.T @ roots)
+        if solution.status not in USABLE:
+            return None, solution.status
+        c = origin + solution.x[:size]
         exceeded = [
             _use(constraint, c) > 1 + 10 * SETTINGS["tol_feas"] for constraint in constraints
         ]
         if not any(np.any(new & ~old) for new, old in zip(exceeded, chosen, strict=True)):
-            return c, found.status
+            return c, solution.status
         chosen = [new | old for new, old in zip(exceeded, chosen, strict=True)]
 
 
@@ -245,9 +245,9 @@ class _Model:
             weighted = list(zip(function.weights, function.parts, strict=True))
             if function.worst:
                 return self._largest(weighted)
-            found = [(w, self.expression(part)) for w, part in weighted]
-            linear = np.sum([w * line for w, (line, _) in found], axis=0)
-            return linear, np.concatenate([np.sqrt(w) * roots for w, (_, roots) in found])
+            models = [(w, self.expression(part)) for w, part in weighted]
+            linear = np.sum([w * line for w, (line, _) in models], axis=0)
+            return linear, np.concatenate([np.sqrt(w) * roots for w, (_, roots) in models])
         if function.worst:
             return self._worst(function)
         gradient, hessian = _second_order(function, self.origin)
@@ -302,8 +302,8 @@ def _second_order(function: Fractions, c: FloatArray) -> tuple[FloatArray, Float
     n = c.size
     J, r = slopes.reshape(-1, n), values.ravel()
     gradient = 2 * np.real(r.conj() @ J)
-    whole = np.concatenate([J.real, J.imag])
-    hessian = whole.T @ whole
+    real_slopes = np.concatenate([J.real, J.imag])
+    hessian = real_slopes.T @ real_slopes
     if turn is None:
         return gradient, hessian
     steered = np.einsum("fr,frn->fn", values.conj(), slopes)
@@ -358,6 +358,6 @@ def _least_squares_form(function: Fractions) -> tuple[FloatArray, FloatArray]:
     """Root and target with ``sum |centres + rows c|^2 = ||root c - target||^2``."""
     size = function.rows.shape[-1]
     rows = function.rows.reshape(-1, size)
-    whole = np.hstack([rows, -function.centres.reshape(-1, 1)])
-    triangle = np.asarray(np.linalg.qr(np.vstack([whole.real, whole.imag]), mode="r"))
+    system = np.hstack([rows, -function.centres.reshape(-1, 1)])
+    triangle = np.asarray(np.linalg.qr(np.vstack([system.real, system.imag]), mode="r"))
     return triangle[:, :size], triangle[:, size]

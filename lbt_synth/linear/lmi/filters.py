@@ -180,8 +180,8 @@ def _invisible_basis(problem: EstimationProblem) -> tuple[FloatArray, IntArray]:
     basis = np.zeros((len(label), 0))
     parts: IntArray = np.zeros(0, dtype=np.int64)
     for part in np.unique(label):
-        own = label == part
-        vectors = np.eye(len(label))[:, own] @ null_space(seen[:, own])
+        rows = label == part
+        vectors = np.eye(len(label))[:, rows] @ null_space(seen[:, rows])
         basis = np.hstack([basis, vectors])
         parts = np.append(parts, np.full(vectors.shape[1], part))
     return basis, parts

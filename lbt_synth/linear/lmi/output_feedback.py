@@ -80,8 +80,8 @@ class _Storage:
     def pairs(self, dual: FloatArray) -> Witness:
         """Return the pairs of a dual solution."""
         count = self.hidden.shape[1]
-        found = self.hidden @ semidefinite_root(dual[:count, :count])
-        return Witness(states=self.basis @ found[: self.size], disturbances=found[self.size :])
+        moments = self.hidden @ semidefinite_root(dual[:count, :count])
+        return Witness(states=self.basis @ moments[: self.size], disturbances=moments[self.size :])
 
 
 def least_variance_below(

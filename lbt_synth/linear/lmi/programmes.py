@@ -35,8 +35,8 @@ def norm_below(real: Any, imaginary: Any, level: Any) -> Any:
     """Return the constraint that a complex matrix has a spectral norm of at most a level."""
     block = cp.bmat([[real, -imaginary], [imaginary, real]])
     rows, columns = block.shape
-    whole = cp.bmat([[level * np.eye(rows), block], [block.T, level * np.eye(columns)]])
-    return symmetrise(whole) >> 0
+    inequality = cp.bmat([[level * np.eye(rows), block], [block.T, level * np.eye(columns)]])
+    return symmetrise(inequality) >> 0
 
 
 def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:

@@ -94,24 +94,24 @@ class FullInformation:
         return slack, None
 
     def _judge(
-        self, equation: Equations, found: FloatArray, gamma: float
+        self, equation: Equations, X: FloatArray, gamma: float
     ) -> tuple[float, FloatArray | None]:
         """Return the slack of a solution, and its X if it is one that a controller can have."""
         m, unit = self.B.shape[1], gamma**2 / max(float(np.sum(self.B**2)), 1e-300)
-        gains, residual, relative = equation.evaluate(found)
+        gains, residual, relative = equation.evaluate(X)
         nothing = float(np.linalg.norm(residual)) < _ROUNDING * unit
         if not (nothing or relative[0] < _ROUNDING):
             return -1.0, None
         if np.max(np.abs(equation.poles(gains))) >= 1:
             return -1.0, None
-        weights = equation.weights(found)[0]
+        weights = equation.weights(X)[0]
         answer = np.linalg.solve(weights[m:, m:], weights[m:, :m])
         slack = -float(np.linalg.eigvalsh(weights[:m, :m] - weights[:m, m:] @ answer)[-1])
         if slack <= 0:
             return slack, None
-        sizes = np.linalg.eigvalsh(found[0])
+        sizes = np.linalg.eigvalsh(X[0])
         negative = sizes[0] < -_ROUNDING * max(sizes[-1], unit)
-        return (-1.0, None) if negative else (slack, found[0])
+        return (-1.0, None) if negative else (slack, X[0])
 
     def _equation(self, gamma: float) -> Equations:
         """Return the equation of the excess; disturbances are in units of the level."""
@@ -193,13 +193,13 @@ class TwoRiccati:
 
         Raises a NumericalError if not even the level of the least variance has one.
         """
-        found: dict[float, LevelSolution] = {}
+        solutions: dict[float, LevelSolution] = {}
 
         def slack(gamma: float) -> float:
             value, solution = self.solve(gamma)
             if solution is None:
                 return min(value, -_TOLERANCE)  # at a slack of 0 there is no controller
-            found[gamma] = solution
+            solutions[gamma] = solution
             return value
 
         loop = self.plant.closed_loop(self.least_variance())
@@ -209,16 +209,16 @@ class TwoRiccati:
         for growth in np.geomspace(1e-9, 1e9, 19):  # next to nothing rounding is larger
             if not np.isfinite(upper) or slack(upper * (1 + growth)) > 0:
                 break
-        if not found:
+        if not solutions:
             raise NumericalError(
                 "the Riccati equations have no solution at the level of the least variance. "
                 "Scale states and signals to similar sizes.",
                 status="search",
             )
-        upper = min(found)
+        upper = min(solutions)
         if lower < upper and slack(lower) <= 0:
             brentq(slack, lower, upper, xtol=2 * _TOLERANCE * upper)  # its steps are half of it
-        return found[min(found)]
+        return solutions[min(solutions)]
 
     def proofs(self, solution: LevelSolution, plant: GeneralizedPlant) -> list[ControlWitness]:
         """Return what may prove of a plant, this or the one next to it, that no level is lower.
@@ -503,8 +503,8 @@ def _cancelling(plant: GeneralizedPlant) -> FloatArray:
     through = P.D11 + P.D12 @ K @ P.D21
     cancelled = _size(P.C1 + P.D12 @ K @ P.C2, P.D12, through)
     cancelled *= _size(P.B1 + P.B2 @ K @ P.D21, P.D21, through)
-    left = _size(P.C1, P.D12, P.D11) * _size(P.B1, P.D21, P.D11)
-    return K if cancelled < left else 0 * K
+    uncancelled = _size(P.C1, P.D12, P.D11) * _size(P.B1, P.D21, P.D11)
+    return K if cancelled < uncancelled else 0 * K
 
 
 def _size(*parts: FloatArray) -> float:

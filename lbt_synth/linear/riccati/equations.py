@@ -319,18 +319,18 @@ def doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, I
     has converged or diverged. The parts of one whose states do not act on one another are apart.
     """
     label = component_labels(np.any((A != 0) | (G != 0) | (H != 0), axis=0))
-    found, steps = np.zeros_like(H), np.zeros(len(A), dtype=np.int64)
+    solutions, steps = np.zeros_like(H), np.zeros(len(A), dtype=np.int64)
     for part in range(np.max(label, initial=-1) + 1):
-        own = np.ix_(range(len(A)), label == part, label == part)
-        found[own], made = _doubling_of_part(A[own], G[own], H[own])
+        block = np.ix_(range(len(A)), label == part, label == part)
+        solutions[block], made = _doubling_of_part(A[block], G[block], H[block])
         steps = np.maximum(steps, made)
-    return found, steps
+    return solutions, steps
 
 
 def _doubling_of_part(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, IntArray]:
     X, going, n = H, np.arange(len(A)), A.shape[-1]
     one = np.eye(n)
-    found, steps = np.full_like(H, np.nan), np.zeros(len(A), dtype=np.int64)
+    solutions, steps = np.full_like(H, np.nan), np.zeros(len(A), dtype=np.int64)
     with np.errstate(all="ignore"):
         for step in range(1, _MOST_DOUBLINGS + 1):
             solved = solve_stack(one + G @ X, np.concatenate([A, G], axis=-1))
@@ -345,8 +345,8 @@ def _doubling_of_part(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[Floa
             steps[going] = step
             if not keep.all():
                 converged = still & np.isfinite(size)
-                found[going[converged]] = X[converged]
+                solutions[going[converged]] = X[converged]
                 going, A, G, X = going[keep], A[keep], G[keep], X[keep]
                 if going.size == 0:
                     break
-    return found, steps
+    return solutions, steps
