@@ -34,7 +34,11 @@ def ratios() -> None:
 
 def reduced() -> None:
     """The Kalman gain with and without the known input among the states."""
-    small, full = lbt.kalman(PLANT), lbt.kalman(PLANT.full())
+    form = PLANT.full()
+    problem = lbt.EstimationProblem(
+        **{name: getattr(form, name) for name in "ABCDL"}, dt_s=PLANT.dt_s
+    )
+    small, full = lbt.kalman(PLANT), lbt.kalman(problem)
     rows = small.gain_predictor.shape[0]
     print(
         f"full form: {len(full.gain_predictor)} states, gain differs by "

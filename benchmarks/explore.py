@@ -6,9 +6,8 @@ from the repository::
     python benchmarks/explore.py [METHOD...]
 
 The loop has two axes and five lines on each. First the processor time of each step of a move; then
-each slider goes over its range in steps, and the time counts from the event of the slider to the
-frame after the paint of the curves that follow from it, and of all: the Strehl curve and the table
-come last.
+each slider goes over its range in steps, and the time counts from its new value to the frame after
+the one in which the last figure has its new curves.
 """
 
 import os
@@ -19,63 +18,58 @@ from pathlib import Path
 from statistics import median, quantiles
 
 import lbt_synth as lbt
-from lbt_synth.report.explore.exploration import (
-    explore,
-    fulfil,
-    judge,
-    loop_curves,
-    quick_view,
-    whole_view,
-)
+from lbt_synth.report.explore.exploration import explore, fulfil, judge, new_view, show_design
 
 sys.path.insert(0, "tests")  # what opens the page is what the tests use
 
 from support.browser import chromium
 from support.configs import write_config
-from support.explore import await_state, choose, five_lines, move, reset, served
+from support.explore import MODEL, await_verdict, choose, five_lines, served
 
 STEPS = 12
+TIMED = f"""
+const [name, part, done] = arguments, slider = {MODEL}(name), start = performance.now();
+const figure = {MODEL}("explore-rejection"), source = figure.renderers[1].data_source;
+const timed = () => {{
+  source.properties.data.change.disconnect(timed);
+  requestAnimationFrame(() => requestAnimationFrame(() => done(performance.now() - start)));
+}};
+source.properties.data.change.connect(timed);
+slider.value = slider.start + part * (slider.end - slider.start);
+"""
 
 
 def processor(path: Path, method: str) -> None:
     """Print the processor time of the steps of one move."""
     exploration = explore(lbt.load_config(path), {})
+    start = exploration.config
     wish = method, {"gain": 0.9, "noise": 20.0}
-    view = quick_view(exploration, *wish)
-    whole = whole_view(exploration, view)
+    view = new_view(exploration, *wish)
     steps = {
-        "configuration": lambda: fulfil(*wish, exploration.knobs, exploration.config),
+        "configuration": lambda: fulfil(*wish, exploration.knobs, start),
         "certified design": lambda: view.config.design(view.request),
-        "curves": lambda: loop_curves(view.design, view.config),
-        "Strehl curve, residual": lambda: whole_view(exploration, view),
-        "verdict": lambda: judge(whole),
+        "what is shown": lambda: show_design(view.design, view.config, start, 0.0),
+        "verdict": lambda: judge(view),
     }
     for name, step in steps.items():
         times = []
         for _ in range(3 if name == "verdict" else STEPS):
-            start = time.thread_time()
+            begin = time.thread_time()
             step()
-            times.append(1e3 * (time.thread_time() - start))
+            times.append(1e3 * (time.thread_time() - begin))
         print(f"  {name:24s} {median(times):12.1f} ms of the processor")
 
 
 def page(browser, method: str) -> None:
-    """Print the times of all sliders of a method."""
-    keys = browser.execute_script(
-        "return [...document.querySelectorAll('.knob:not([hidden]) input')].map(e => e.id)"
-    )
+    """Print the times of the sliders that move any design."""
     every = []
-    for key in keys:
-        times = [move(browser, key, 0.3 + 0.4 * i / STEPS) for i in range(STEPS)]
+    for key in ("delay", "gain", "noise", "shift", "seeing", "wind", "damping"):
+        parts = [0.3 + 0.4 * i / STEPS for i in range(STEPS)]
+        times = [browser.execute_async_script(TIMED, key, part) for part in parts]
         every += times
-        first, last = (median(column) for column in zip(*times, strict=True))
-        print(f"  {key:24s} {first:12.0f} {last:9.0f}", flush=True)
-        reset(browser)
-    curves = [first for first, _ in every]
-    print(
-        f"  {'all sliders':24s} {median(curves):12.0f} {median(last for _, last in every):9.0f}   "
-        f"(9 of 10 curves within {quantiles(curves, n=10)[-1]:.0f} ms)"
-    )
+        print(f"  {key:24s} {median(times):12.0f}", flush=True)
+    within = quantiles(every, n=10)[-1]
+    print(f"  {'all sliders':24s} {median(every):12.0f}   (9 of 10 within {within:.0f} ms)")
 
 
 if __name__ == "__main__":
@@ -86,12 +80,13 @@ if __name__ == "__main__":
         with served(config, folder=folder) as address:
             browser.set_window_size(1400, 1000)
             browser.get(address)
-            await_state(browser, "judged", 0)
+            await_verdict(browser)
             for method in methods:
                 load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
                 print(f"{method}: medians of {STEPS}, {load}")
                 processor(config, method)
-                choose(browser, method)
-                print(f"  {'':24s} {'curves [ms]':>12s} {'all [ms]':>9s}")
+                if method != "kalman":
+                    choose(browser, method)
+                print(f"  {'':24s} {'curves [ms]':>12s}")
                 page(browser, method)
         browser.quit()

@@ -25,13 +25,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag, eigh, solve_discrete_lyapunov, solve_toeplitz
+from scipy.linalg import block_diag, solve_toeplitz
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.design.shaping.channel import Channel, laguerre_basis, orthonormal_basis
-from lbt_synth.design.shaping.reduction import WeightedResponse, fit_poles, starting_poles
+from lbt_synth.design.shaping.channel import Basis, Channel, laguerre_basis
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.prediction.residual import (
     check_series,
@@ -42,7 +41,7 @@ from lbt_synth.identification.prediction.residual import (
 from lbt_synth.identification.stretches import Stretches, StretchesLike, cut_stretches
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
-from lbt_synth.loop import youla_controller
+from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray, integer, number, require_instance
 
@@ -147,8 +146,7 @@ def integrators(hardware: lbt.models.LoopHardware, gains: Sequence[float]) -> lb
 
 _MOST_ORDER = 40
 _MOST_FREQUENCIES = 2048
-_LONG, _LONG_POLE = 80, 0.7  # Laguerre functions of the filter whose poles are tried first
-_SLOW = 1e-3  # angle per frame of the slowest poles that are tried
+_LONG, _LONG_POLE = 80, 0.7  # Laguerre functions of the filter that is then truncated
 
 
 def spectral_design(
@@ -196,35 +194,24 @@ def _filter_for_axis(
     f = np.append(0.0, smooth.frequency_hz)
     power = np.append(mean**2, smooth.measured * smooth.step_hz)
     size = np.sqrt(power / np.sum(power))
-    z = np.exp(2j * np.pi * f * hardware.dt_s)
     path: ComplexArray = Channel(
         hardware=single, basis=laguerre_basis(1, 0.0, dt_s=hardware.dt_s)
     ).complementary_rows(f)[:, 0]
     weight = size * np.abs(path)
     # |size (1 - path Q)| = |weight / path - weight Q|: Q is fitted to the inverse of the path
     target = size * np.exp(-1j * np.angle(path))
-    response = WeightedResponse(z, target, weight)
     long = laguerre_basis(_LONG, _LONG_POLE, dt_s=hardware.dt_s)
-    coefficients = response.coefficients(long.response(f))
-    starts = [
-        _dominant_poles(long.A, coefficients, order),
-        starting_poles(order, bands=np.zeros((0, 2)), noise_rad=_SLOW),
-    ]
-    poles = min((fit_poles(response, start) for start in starts), key=lambda fit: fit[1])[0]
-    basis = orthonormal_basis(poles, dt_s=hardware.dt_s)
-    return basis.parameter(response.coefficients(basis.response(f)))
+    few, _ = long.truncated(_fitted(long, f, weight, target), order, f, weight)
+    return few.parameter(_fitted(few, f, weight, target))
 
 
-def _dominant_poles(A: FloatArray, coefficients: FloatArray, order: int) -> ComplexArray:
-    """Return the poles of a balanced truncation of a filter in an orthonormal basis.
-
-    The states of the basis are balanced inputs already (``A A' + B B' = I``): those kept are the
-    main axes of what the output shows of them.
-    """
-    seen = solve_discrete_lyapunov(A.T, np.outer(coefficients, coefficients))
-    _, axes = eigh(seen)
-    kept = axes[:, -order:]
-    return np.asarray(np.linalg.eigvals(kept.T @ A @ kept), dtype=np.complex128)
+def _fitted(
+    basis: Basis, frequency_hz: FloatArray, weight: FloatArray, target: ComplexArray
+) -> FloatArray:
+    """Return the coefficients of a weighted response that is closest to a target."""
+    rows = weight[:, None] * basis.response(frequency_hz)
+    columns, goal = (np.concatenate([x.real, x.imag]) for x in (rows, target))
+    return np.asarray(np.linalg.lstsq(columns, goal, rcond=None)[0])
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 import lbt_synth as lbt
-from lbt_synth.models.turbulence.zernike import noll_orders
+from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.draw import save_figure
 
 MODES, RATE_HZ = 672, 800.0

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.linalg
 
 import lbt_synth as lbt
+from lbt_synth.design.certificate import certify_filter
 from lbt_synth.design.integrator import hardware_gain_limit
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models.resonance_spectrum import coefficients, log_density
@@ -158,7 +159,7 @@ def _peer_is_certified(plant: lbt.models.TipTiltPlant) -> bool:
         return False
     innovation = plant.R + plant.C @ P @ plant.C.T
     gain = np.linalg.solve(innovation, (plant.A @ P @ plant.C.T + plant.S).T).T
-    return lbt.design.certify_filter(plant, gain, least_variance=True).passed
+    return certify_filter(plant, gain, least_variance=True).passed
 
 
 def margins(count: int) -> str:

@@ -65,8 +65,9 @@ def rounded_times() -> None:
         times = 1e-3 * (np.round(ms) if rng.choice([0, 1]) else np.floor(ms))
         times = times + rng.choice([0, 1.7e9])
         try:
-            frame = build_clock(len(kept), frame_rate_hz=rate, times_s=times).frame_of_row
-            word = "right" if np.array_equal(frame, kept) else "wrong"
+            clock = build_clock(len(kept), frame_rate_hz=rate, times_s=times)
+            word = "right" if np.array_equal(clock.frame_of_row, kept) else "wrong"
+            word = "not used" if "not used" in "".join(clock.notes) else word
         except lbt.errors.ProblemError:
             word = "refused"
         key = (rows, count > 0, word)
@@ -103,7 +104,7 @@ def pseudo_open_loop() -> None:
             controller = lbt.integrator(path, gain=0.2).controller
             run = lbt.simulate(controller, truth, hardware=path, frames=30_000)
             night = lbt.files.telemetry_from_simulation(run, path)
-            seen = lbt.identification.record_from_telemetry(night)
+            seen = lbt.load_record(night)
             good = np.flatnonzero(seen.usable)
             error = seen.pseudo_open_loop(0.4)[good] - run.total_nm[0, good - 1]
             print(

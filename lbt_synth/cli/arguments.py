@@ -116,7 +116,7 @@ class TargetChoice(Action):
 
 def init(parser: ArgumentParser) -> None:
     """Write a commented configuration to begin with."""
-    from lbt_synth.config.templates import telescope_names
+    from lbt_synth.config.load import telescope_names
 
     text = "published numbers and their sources (default generic: assumed ones)"
     add_option(parser, "--telescope", telescope_names(), text)
@@ -137,9 +137,9 @@ def design(parser: ArgumentParser) -> None:
 
 def _add_method_options(parser: ArgumentParser) -> None:
     """Add ``--method`` and the options of all methods; each method checks its own."""
-    from lbt_synth.methods.registry import all_methods, option_names
+    from lbt_synth.methods.registry import METHODS, option_names
 
-    methods = all_methods()
+    methods = METHODS
     parser.add_argument(
         "--method",
         choices=tuple(methods),
@@ -408,18 +408,11 @@ def _add_prior_knowledge(parser: ArgumentParser) -> None:
     """Add what is known before an identification."""
     known = parser.add_argument_group("what is known beforehand")
     add_option(known, "--sensor-gain", float, "sensor gain, of both axes or of each", nargs="+")
+    text = "noise per frame of the loop's sensor [nm], beside a spectrum that has none"
+    add_option(known, "--noise-nm", float, text, nargs="+")
     add_option(known, "--lines-hz", float, "frequencies of vibrations [Hz]", nargs="+")
     add_option(known, "--lines-error-hz", float, "standard error of --lines-hz [Hz]", 0.1)
     add_option(known, "--lines-file", str, "text file with one frequency per row [Hz]")
-    text = (
-        "NPY or CSV with one column per channel and one row per frame of the record: what is "
-        "coherent with it is expected as a line"
-    )
-    add_option(known, "--accelerometers", str, text)
-    text = "their rate (default: that of the file's times or header, else the frame rate) [Hz]"
-    add_option(known, "--accelerometer-rate-hz", float, text)
-    text = f"their unit: {', '.join(M_S2)} (default: that of the headings, else m/s2)"
-    add_option(known, "--acceleration-unit", tuple(M_S2), text, metavar="UNIT")
     add_option(known, "--lowest-line-hz", float, "what is below counts as turbulence [Hz]", 3.0)
     add_option(known, "--most-lines", int, "most vibrations per axis", 20)
 
@@ -449,6 +442,13 @@ def _add_record(parser: ArgumentParser) -> None:
 def identify(parser: ArgumentParser) -> None:
     """Identify turbulence, vibrations, noise and sensor gain from a record."""
     _add_record(parser)
+    moving = parser.add_argument_group("accelerometers")
+    text = "NPY or CSV with one column per channel and one row per frame of the record"
+    add_option(moving, "--accelerometers", str, text)
+    text = "their rate (default: that of the file's times or header, else the frame rate) [Hz]"
+    add_option(moving, "--accelerometer-rate-hz", float, text)
+    text = f"their unit: {', '.join(M_S2)} (default: that of the headings, else m/s2)"
+    add_option(moving, "--acceleration-unit", tuple(M_S2), text, metavar="UNIT")
     add_output(parser, "configuration to write (.yaml)")
 
 

@@ -24,7 +24,7 @@ def run(arguments: Namespace) -> Report:
     )
     choose_unit(arguments, record.diameter_m)
     imaging = loop_records.record_imaging(arguments, record)
-    with count_progress(total=3, what="identifying and designing", quiet=arguments.json) as count:
+    with count_progress(total=3, what="identifying and designing") as count:
         found = design_from_record(
             record,
             method=arguments.method,

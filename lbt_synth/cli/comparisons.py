@@ -18,18 +18,18 @@ from lbt_synth.cli.loop_inputs import (
     say_limit,
     truth_at_sensor_gain,
 )
-from lbt_synth.cli.output import Report, require_outputs, write_outputs
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.parser import command_options
-from lbt_synth.cli.progress import show_spinner, track_progress
+from lbt_synth.cli.progress import track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ConfigError, ProblemError
-from lbt_synth.loop import least_residual, stable_sensor_gains
+from lbt_synth.loop import least_residual
 from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models import PositionLoop
-from lbt_synth.report.designs.report import refine_values, require_compatible
+from lbt_synth.report.designs.report import refine_values, require_compatible, stable_interval
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
 from lbt_synth.report.figures.studies import limits_figure, mirror_figure, tradeoff_figure
 from lbt_synth.storage.display_unit import nm_text
@@ -38,21 +38,21 @@ from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, default_methods, mirror_rows
 from lbt_synth.validation import FloatArray, agree, frozen_copy, integer, number
 
-_MOST_VALUES = 2001  # of frequency errors or sensor gains
 _SHOWN = 8  # sensor gains of a map, and taps of a mirror, that are printed of more
 
 
 def run_limits(arguments: Namespace) -> Report:
     """Compare designs with the least residual of any linear controller."""
-    require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
     config = load_shown(arguments)
     files = load_designs(arguments.gains, any_sensors=True)
-    with show_spinner("comparing", quiet=arguments.json):
-        designs = _config_designs(config)
-        designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}
-        study = studies.limits(
-            designs, config.hardware, config.truth, config.imaging, errors_hz=config.errors_hz
-        )
+    designs = {
+        method.name: config.design(method.name, **method.in_comparison)
+        for method in reference_methods()
+    }
+    designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}
+    study = studies.limits(
+        designs, config.hardware, config.truth, config.imaging, errors_hz=config.errors_hz
+    )
     no_band = () if study.band is not None else ("above_band_limit_percent",)
     report = Report()
     report.add_rows(
@@ -61,6 +61,7 @@ def run_limits(arguments: Namespace) -> Report:
         study.rows,
         without=no_band,
         hidden=() if study.shift_hz.size else ("worst_nm",),
+        figure=lambda: limits_figure(study),
     )
     report.data["limit_nm"] = None if study.limit is None else study.limit.rms_nm
     if study.band is not None:
@@ -70,17 +71,7 @@ def run_limits(arguments: Namespace) -> Report:
             "band_achieved_nm": study.band.achieved_nm,
         }
     report.notes += [*_limit_notes(study, config), *_design_notes(config, designs, study)]
-    write_outputs(
-        report, arguments.output, study.rows, figure=lambda: limits_figure(study), without=no_band
-    )
     return report
-
-
-def _config_designs(config: Config) -> dict[str, Design]:
-    return {
-        method.name: config.design(method.name, **method.in_comparison)
-        for method in reference_methods()
-    }
 
 
 def _limit_notes(study: LimitStudy, config: Config) -> list[str]:
@@ -122,7 +113,6 @@ def _design_notes(config: Config, designs: dict[str, Design], study: LimitStudy)
 
 def run_tradeoff(arguments: Namespace) -> Report:
     """Design filters from the least norm to the least variance, and compare them."""
-    require_outputs(arguments.output, inputs=[arguments.config])
     count = integer(arguments.points, "--points", at_least=2)
     taps = integer(arguments.taps, "--taps", at_least=1)
     config = load_shown(arguments)
@@ -131,39 +121,35 @@ def run_tradeoff(arguments: Namespace) -> Report:
             studies.tradeoff(config.plant.own_sensor_alone(), points=count, taps=taps),
             total=count * len(FAMILIES),
             what="filters",
-            quiet=arguments.json,
         )
     )
     least = points[0].design
     report = Report()
-    caption, hidden = "Trade-off of variance, norm and sensor gain", ("design",)
-    report.add_rows("points", caption, points, without=hidden)
+    report.add_rows(
+        "points",
+        "Trade-off of variance, norm and sensor gain",
+        points,
+        without=("design",),
+        figure=lambda: tradeoff_figure(points),
+    )
     report.data |= {"gamma_least": least.gamma_least, "gamma_infeasible": least.gamma_infeasible}
     report.notes.append(
         f"the least norm of any filter lies between {nm_text(least.gamma_infeasible, '.9g')} and "
         f"{nm_text(least.gamma_least, '.9g')}"
     )
     report.notes += own_sensor_notes(config)
-    write_outputs(
-        report, arguments.output, points, figure=lambda: tradeoff_figure(points), without=hidden
-    )
     return report
 
 
 def run_mirror(arguments: Namespace) -> Report:
     """Show how the mirror of a configuration settles, and compare designs on it."""
-    require_outputs(arguments.output, inputs=[arguments.config])
     config = load_shown(arguments)
     plant, shell = config.plant.own_sensor_alone(), _require_local_loop(config)
     hardware = plant.hardware
     step = shell.step_response(arguments.tolerance)
-    with show_spinner("designing", quiet=arguments.json):
-        rows = mirror_rows(
-            plant,
-            config.truth,
-            config.imaging,
-            command_weight=config.settings.design.command_weight,
-        )
+    rows = mirror_rows(
+        plant, config.truth, config.imaging, command_weight=config.settings.design.command_weight
+    )
     taps = hardware.mirror_taps
     shown = [f"{tap:.4f}" for tap in taps[:_SHOWN]] + ["..."] * (taps.size > _SHOWN)
     report = Report(data={"taps": taps})
@@ -183,14 +169,13 @@ def run_mirror(arguments: Namespace) -> Report:
             limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
         ),
     )
-    report.add_rows("rows", f"Designs on this mirror; {config.imaging.label}", rows)
-    report.notes.append(f"weights of u(k), u(k-1), ... in exposure k: {', '.join(shown)}")
-    write_outputs(
-        report,
-        arguments.output,
+    report.add_rows(
+        "rows",
+        f"Designs on this mirror; {config.imaging.label}",
         rows,
         figure=lambda: mirror_figure(hardware, tolerance=arguments.tolerance),
     )
+    report.notes.append(f"weights of u(k), u(k-1), ... in exposure k: {', '.join(shown)}")
     return report
 
 
@@ -207,7 +192,6 @@ def _require_local_loop(config: Config) -> PositionLoop:
 
 def run_robustness(arguments: Namespace) -> Report:
     """Compute the Strehl ratio over an error of the vibration frequency."""
-    require_outputs(arguments.output, inputs=[arguments.config, *arguments.gains])
     _refuse_unused_options(arguments)
     config = load_shown(arguments)
     return (_map_designs if arguments.gains else _redesign)(config, arguments)
@@ -242,14 +226,12 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
             ),
             total=len(errors) * len(default_methods()),
             what="designs",
-            quiet=arguments.json,
         )
     )
     report = Report()
     caption = f"Robustness to the vibration frequency; {config.imaging.label}"
-    report.add_rows("rows", caption, rows)
+    report.add_rows("rows", caption, rows, figure=lambda: robustness_figure(rows))
     report.notes += own_sensor_notes(config)
-    write_outputs(report, arguments.output, rows, figure=lambda: robustness_figure(rows))
     return report
 
 
@@ -264,18 +246,18 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
     designs = load_designs(arguments.gains)
     assumed = {name: _assumed_gain(name, d, config) for name, d in designs.items()}
     maps = {}
-    with show_spinner("mapping", quiet=arguments.json):
-        for name, design in designs.items():
-            grid = studies.robustness_map(
-                design,
-                config.truth,
-                config.imaging,
-                errors_hz=errors,
-                sensor_gains=gains / assumed[name],
-                delay_errors_frames=delays,
-            )
-            maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
-    report = Report(data={"maps": {}})
+    for name, design in designs.items():
+        grid = studies.robustness_map(
+            design,
+            config.truth,
+            config.imaging,
+            errors_hz=errors,
+            sensor_gains=gains / assumed[name],
+            delay_errors_frames=delays,
+        )
+        maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
+    report = Report(data={"maps": {}}, figure=lambda: robustness_map_figure(maps))
+    report.rows = [point for name, grid in maps.items() for point in _map_points(name, grid)]
     for name, grid in maps.items():
         intervals = _stable_gains(designs[name], grid, assumed[name])
         report.data["maps"][name] = asdict(grid) | {"stable_sensor_gains": intervals}
@@ -283,12 +265,6 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
         title = f"{name}: {config.imaging.label}, over frequency errors of {low:+g} to {high:+g} Hz"
         report.tables.append(row_table(title, list(_map_lines(grid))))
         report.notes += _map_notes(name, designs[name], config, grid, intervals)
-    write_outputs(
-        report,
-        arguments.output,
-        [point for name, grid in maps.items() for point in _map_points(name, grid)],
-        figure=lambda: robustness_map_figure(maps),
-    )
     return report
 
 
@@ -299,10 +275,10 @@ def _parse_range(
     if given is None:
         return np.array(default)
     low, high, count = (number(value, option) for value in given)
-    if not (low < high and count.is_integer() and 2 <= count <= _MOST_VALUES):
+    if not (low < high and count.is_integer() and count >= 2):
         raise ProblemError(
-            f"{option} must be LOW HIGH COUNT with LOW below HIGH and a COUNT of 2 to "
-            f"{_MOST_VALUES}; got {low:g} {high:g} {count:g}."
+            f"{option} must be LOW HIGH COUNT with LOW below HIGH and a COUNT of at least 2; got "
+            f"{low:g} {high:g} {count:g}."
         )
     return np.linspace(low, high, int(count))
 
@@ -327,9 +303,8 @@ def _stable_gains(design: Design, grid: RobustnessMap, assumed: float) -> list[t
     for delay, stable in zip(grid.delay_errors_frames, grid.stable, strict=True):
         real = replace(hardware, delay_frames=hardware.delay_frames + delay)
         # around the gain that the design assumes, if the loop is stable there
-        starts = [assumed, *grid.sensor_gains[stable]]
-        tried = (stable_sensor_gains(real, design.controller, nominal=s / assumed) for s in starts)
-        low, high = next((ends for ends in tried if not np.isnan(ends[0])), (np.nan, np.nan))
+        starts = [1.0, *grid.sensor_gains[stable] / assumed]
+        low, high = stable_interval(real, design.controller, starts)
         intervals.append((low * assumed, high * assumed))
     return intervals
 

@@ -12,7 +12,6 @@ import numpy as np
 from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import add_truth, choose_design_unit, load_shown
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.design.result import without_units
@@ -35,13 +34,11 @@ def run(arguments: Namespace) -> Report:
     request = design_request(arguments.method, given, _WORDING)
     require_writable(require_gain_name(arguments.output), inputs=[arguments.config])
     config = load_shown(arguments)
-    with show_spinner(f"designing ({request.method.name})", quiet=arguments.json):
-        design = config.design(request)
+    design = config.design(request)
     path = save_gain(arguments.output, design)
     report = describe_design(design)
-    with show_spinner("comparing in the truth", quiet=arguments.json):
-        alike = () if given else (request.method.name,)
-        add_truth(report, design, config, without=alike)
+    alike = () if given else (request.method.name,)
+    add_truth(report, design, config, without=alike)
     if design.method != request.method.name:
         title = design_title(design.method)
         report.notes.append(
@@ -156,8 +153,7 @@ def run_show(arguments: Namespace) -> Report:
         report.data["frame_cost"] = json_record(cost)
         report.tables.append(fact_table("Cost per frame, as exported to C", cost))
     if design.configuration:
-        with show_spinner("comparing in the truth", quiet=arguments.json):
-            add_truth(report, design, config_from_text(design.configuration, Path(arguments.gain)))
+        add_truth(report, design, config_from_text(design.configuration, Path(arguments.gain)))
     return report
 
 

@@ -25,7 +25,7 @@ _STEPS = 3
 def run(arguments: Namespace) -> Report:
     """Diagnose a record, with a design to try on it if one is given, and write the page."""
     if arguments.output is not None:
-        named = given_options(arguments, "file", "gain", "commands", "lines_file", "accelerometers")
+        named = given_options(arguments, "file", "gain", "commands", "lines_file")
         require_page_names(arguments.output, arguments.pdf, inputs=tuple(named.values()))
     elif arguments.pdf is not None:
         raise ProblemError("--pdf is the page of -o on paper; give -o, too.")
@@ -34,7 +34,7 @@ def run(arguments: Namespace) -> Report:
     choose_unit(arguments, whole.diameter_m)
     live = live_axes(whole)
     record = whole if len(live) in (0, whole.axes) else _load(arguments, live)
-    with count_progress(total=_STEPS, what="diagnosing", quiet=arguments.json) as count:
+    with count_progress(total=_STEPS, what="diagnosing") as count:
         found = diagnose(
             record.bridged(),
             given=given,

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lbt_synth.cli.arguments import given_options, option_name
-from lbt_synth.cli.engine import choose_engine, keep_finished
+from lbt_synth.cli.engine import run_in_parts
 from lbt_synth.cli.loop_inputs import choose_wavefront_unit, load_design, load_designs
 from lbt_synth.cli.output import Report, json_value
 from lbt_synth.cli.progress import count_progress
@@ -18,8 +18,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, UnstableLoopError
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
-from lbt_synth.interop.specula.calibration import Calibration
-from lbt_synth.interop.specula.optics import specula_version
+from lbt_synth.interop.specula.optics import Calibration, specula_version
 from lbt_synth.interop.specula.simulation import unread_sensors
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.studies import end_to_end_figure, end_to_end_table_figure
@@ -36,12 +35,7 @@ from lbt_synth.storage.rows import (
     row_table,
 )
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.paper import (
-    all_cases,
-    end_to_end_tables,
-    plan_cases,
-    rms_modal_difference,
-)
+from lbt_synth.studies.paper import all_cases, end_to_end_tables, plan_cases, rms_modal_difference
 from lbt_synth.validation import integer
 
 _LEAST_GAIN = 0.01  # optical gain of tip and tilt; less is what a saturated pyramid shows
@@ -61,7 +55,7 @@ def run(arguments: Namespace) -> Report:
     figure_file, telemetry_file, summary_file = outputs
     calibration = calibrate_setup(setup, arguments)
     total = setup.frames + setup.settle_frames
-    with count_progress(total=total, what="frames", quiet=arguments.json) as count:
+    with count_progress(total=total, what="frames") as count:
         loop_run = setup.run(design, calibration=calibration, cache=arguments.cache, progress=count)
     _require_seen(loop_run)
     system = loop_run.system
@@ -142,9 +136,7 @@ def load_setup(arguments: Namespace) -> EndToEndSetup:
 
 def calibrate_setup(setup: EndToEndSetup, arguments: Namespace) -> Calibration:
     """Calibrate a system, or take its calibration from the cache, behind a progress bar."""
-    with count_progress(
-        total=setup.system.modes, what="calibration", quiet=arguments.json
-    ) as count:
+    with count_progress(total=setup.system.modes, what="calibration") as count:
         return calibrate(setup.system, cache=arguments.cache, progress=count)
 
 
@@ -193,22 +185,11 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     }
     total = len(all_cases(plan_cases(setup, designs, **plan)))
     make_directory(folder)
-    case_folder = make_directory(folder / "cases")
     calibrate_setup(setup, arguments)
-    with (
-        choose_engine(arguments) as (executor, workers),
-        count_progress(total=total, what="runs", quiet=arguments.json) as advance,
-        keep_finished(case_folder),
-    ):
+    case_folder = folder / "cases"
+    with run_in_parts(arguments, case_folder, total=total, what="runs") as engine:
         table = end_to_end_tables(
-            setup,
-            case_folder,
-            designs,
-            **plan,
-            executor=executor,
-            workers=workers,
-            cache=arguments.cache,
-            progress=advance,
+            setup, case_folder, designs, **plan, **engine, cache=arguments.cache
         )
     printed = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
     files = [write_atomically(folder / _TABLE_FILES[n][0], csv_rows(printed[n])) for n in printed]

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import lbt_synth
+from lbt_synth.cli.progress import count_progress
 from lbt_synth.cli.streams import print_error
 from lbt_synth.errors import MissingExtraError, ProblemError
+from lbt_synth.storage.atomic_files import make_directory
 from lbt_synth.storage.thread_limits import limit_threads
 from lbt_synth.storage.worker_processes import WorkerPool
 from lbt_synth.validation import integer
@@ -41,13 +43,23 @@ def _start_processes(jobs: int) -> Iterator[tuple[Executor, int]]:
 
 
 @contextmanager
-def keep_finished(folder: Path) -> Iterator[None]:
-    """Say where what is finished stays if the user interrupts the rest."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        print_error(f"what is finished is kept in {folder}; start it again to continue")
-        raise
+def run_in_parts(
+    arguments: Namespace, folder: Path, *, total: int, what: str
+) -> Iterator[dict[str, Any]]:
+    """Provide the executor, its workers and a progress bar for work that resumes from a folder.
+
+    An interruption says where what is finished stays.
+    """
+    with (
+        choose_engine(arguments) as (executor, workers),
+        count_progress(total=total, what=what) as count,
+    ):
+        make_directory(folder)
+        try:
+            yield {"executor": executor, "workers": workers, "progress": count}
+        except KeyboardInterrupt:
+            print_error(f"what is finished is kept in {folder}; start it again to continue")
+            raise
 
 
 @contextmanager

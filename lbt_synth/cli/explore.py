@@ -10,19 +10,16 @@ from pathlib import Path
 from lbt_synth.cli.loop_inputs import load_designs, load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.explore.exploration import explore, quick_view, whole_view
+from lbt_synth.report.explore.exploration import explore, new_view
 from lbt_synth.storage.atomic_files import require_writable
+from lbt_synth.validation import integer
 
-_MOST_PORTS = 65535
 _LOCAL = ("localhost", "127.0.0.1", "::1")
 
 
 def run(arguments: Namespace) -> Report:
     """Serve the page until it is interrupted."""
-    if not 0 <= arguments.port <= _MOST_PORTS:
-        raise ProblemError(f"--port must be from 0 to {_MOST_PORTS}; got {arguments.port}.")
-    if not arguments.host:
-        raise ProblemError("--host must be a name or an address; got an empty text.")
+    integer(arguments.port, "--port", at_least=0, at_most=65_535)
     for origin in arguments.origin:
         if not re.fullmatch(r"[\w.*-]+:\d{1,5}", origin):
             raise ProblemError(f"--origin must be HOST:PORT, as localhost:8080; got {origin!r}.")
@@ -30,7 +27,7 @@ def run(arguments: Namespace) -> Report:
     require_writable(folder / "explored-1.yaml")
     config = load_shown(arguments)
     exploration = explore(config, load_designs(arguments.gains))
-    first = whole_view(exploration, quick_view(exploration))
+    first = new_view(exploration)
 
     from lbt_synth.report.explore.server import serve  # bokeh's server, slow to import
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import show_spinner
 from lbt_synth.errors import GainFileError, ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.interop import export, frame_cost, target_named
@@ -34,8 +33,7 @@ def run(arguments: Namespace) -> Report:
     require_writable(*target.places(output), inputs=[arguments.gain])
     design = load_gain(arguments.gain)
     digest = file_sha256(arguments.gain, GainFileError)
-    with show_spinner("exporting", quiet=arguments.json):
-        written = export(output, design, arguments.target, gain_digest=digest, **options)
+    written = export(output, design, arguments.target, gain_digest=digest, **options)
     report = Report(
         data={"gain": arguments.gain, "gain_digest": digest, "target": arguments.target}
     )

@@ -9,9 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import config_schema, identified_config, telescope_template
-from lbt_synth.config.templates import example_files
+from lbt_synth.config.load import example_files
 from lbt_synth.config.write import config_text
 from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.identification import LoopRecord, SpectrumRecord, identify, load_record
@@ -48,8 +47,7 @@ def run(arguments: Namespace) -> Report:
     require_writable(file, schema, inputs=[record] if record else [])
     if record:
         _refuse_taken({file: None}, force=arguments.force)
-        with show_spinner("identifying", quiet=arguments.json):
-            text = _text_of_record(record, arguments.telescope)
+        text = _text_of_record(record, arguments.telescope)
     else:
         text = telescope_template(arguments.telescope or _USUAL)
     contents = {

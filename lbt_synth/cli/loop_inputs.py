@@ -69,8 +69,8 @@ def choose_design_unit(arguments: Namespace, *designs: Design) -> None:
     if arguments.unit is None:
         return
     texts = {each.configuration for each in designs if each.configuration}
-    found = {config_from_text(text, Path("gain file")).imaging.diameter_m for text in texts}
-    choose_unit(arguments, found.pop() if len(found) == 1 else None)
+    diameters = {config_from_text(text, Path("gain file")).imaging.diameter_m for text in texts}
+    choose_unit(arguments, diameters.pop() if len(diameters) == 1 else None)
 
 
 def load_design(path: str, *, any_sensors: bool = False) -> Design:
@@ -170,15 +170,15 @@ def add_truth(
             "lbt-synth simulate runs it."
         )
         return
-    found = compare_in_truth({_NAME: design}, config, without=without)
+    comparison = compare_in_truth({_NAME: design}, config, without=without)
     caption = f"In the truth of {config.source.name}; {config.imaging.label}"
-    report.add_rows("truth", caption, found.rows, without=_WITHOUT)
+    report.add_rows("truth", caption, comparison.rows, without=_WITHOUT)
     report.data |= {
-        "truth_limit_nm": None if found.limit is None else found.limit.rms_nm,
+        "truth_limit_nm": None if comparison.limit is None else comparison.limit.rms_nm,
         "wavelength_um": config.imaging.wavelength_um,
-        "truth_warnings": found.warnings[_NAME],
+        "truth_warnings": comparison.warnings[_NAME],
     }
-    if found.limit is not None:
-        report.notes.append(say_limit(found.limit, config))
-    report.notes += [f"warning: {text}." for text in found.warnings[_NAME]]
-    report.notes += [f"note: {text}" for text in found.notes]
+    if comparison.limit is not None:
+        report.notes.append(say_limit(comparison.limit, config))
+    report.notes += [f"warning: {text}." for text in comparison.warnings[_NAME]]
+    report.notes += [f"note: {text}" for text in comparison.notes]

@@ -8,42 +8,35 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lbt_synth.cli.arguments import given_options, option_name
+import numpy as np
+
+from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config
-from lbt_synth.config.identified_system import RAISED, require_writable_facts
-from lbt_synth.config.write import config_text
-from lbt_synth.errors import ProblemError
+from lbt_synth.config.write import RAISED, config_text, require_writable_facts
+from lbt_synth.errors import ProblemError, TelemetryError
 from lbt_synth.files import save_gain
 from lbt_synth.identification import (
     IdentifiedAxis,
     IdentifiedModel,
-    LinePrior,
     LoopRecord,
     SpectrumRecord,
-    accelerometer_lines,
-    load_lines,
     load_record,
-    require_length,
 )
-from lbt_synth.identification.accelerometers.readings import (
-    Readings,
-    fill_missing,
-    lay_beside,
-    load_readings,
-)
+from lbt_synth.identification.accelerometers.readings import Readings, load_readings
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
 from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.fit.identified_model import axis_names, model_tables
-from lbt_synth.identification.records.record import LEAST_SECONDS
+from lbt_synth.identification.records.contents import TEXTS, join_names, read_contents
+from lbt_synth.identification.records.record import LEAST_SECONDS, require_length
 from lbt_synth.loop import Imaging
 from lbt_synth.report.draw import require_figure_name, save_figure
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import number
+from lbt_synth.validation import FloatArray, number
 
 if TYPE_CHECKING:  # it loads the methods of synthesis, which identify does not need
     from lbt_synth.identification.auto import RecordedDesign
@@ -189,43 +182,39 @@ def identification_options(
         wavelength_um=imaging_wavelength_um(arguments, record),
     )
     options: dict[str, Any] = {
-        "announced": _expected_lines(arguments, record),
+        "announced": _expected_lines(arguments),
         "lowest_line_hz": arguments.lowest_line_hz,
         "most_lines": arguments.most_lines,
     }
-    if isinstance(record, LoopRecord):
-        options["sensor_gain"] = arguments.sensor_gain
-    elif arguments.sensor_gain is not None:
-        raise ProblemError("a spectrum is of the phase: it has no sensor gain to be given.")
-    return options
+    if isinstance(record, SpectrumRecord):
+        if arguments.sensor_gain is not None:
+            raise ProblemError("a spectrum is of the phase: it has no sensor gain to be given.")
+        return options | {"noise_nm": arguments.noise_nm}
+    if arguments.noise_nm is not None:
+        raise ProblemError("--noise-nm is for spectra; the noise of a series is found in it.")
+    return options | {"sensor_gain": arguments.sensor_gain}
 
 
-def _expected_lines(
-    arguments: Namespace, record: LoopRecord | SpectrumRecord
-) -> tuple[LinePrior, ...]:
-    """Return lines known beforehand, from the arguments, a file, and accelerometers."""
-    lines: list[LinePrior] = []
+def _expected_lines(arguments: Namespace) -> FloatArray:
+    """Return lines known beforehand and their errors, (lines, 2) [Hz], by arguments and a file."""
+    lines = []
     if arguments.lines_hz is not None:
         error = number(arguments.lines_error_hz, "lines_error_hz", at_least=0)
-        frequencies = [number(each, "lines_hz", above=0) for each in arguments.lines_hz]
-        lines += load_lines([(each, error) for each in frequencies])
+        lines = [(number(line, "lines_hz", above=0), error) for line in arguments.lines_hz]
     if arguments.lines_file is not None:
-        lines += load_lines(arguments.lines_file)
-    if arguments.accelerometers is None:
-        for option in given_options(arguments, "accelerometer_rate_hz", "acceleration_unit"):
-            raise ProblemError(f"{option_name(option)} goes with --accelerometers.")
-    else:
-        if isinstance(record, SpectrumRecord):
+        path = require_ending(arguments.lines_file, "a list of lines", TEXTS, TelemetryError)
+        columns = read_contents(path).columns
+        # headings, if there are any, must say which column has the frequencies
+        columns.sort(key=lambda column: bool(column.name) and column.role != "frequency")
+        roles = [column.role == "frequency" for column in columns if column.name]
+        table = np.column_stack([column.values for column in columns])
+        if table.shape[1] > 2 or sum(roles) != bool(roles) or np.isnan(table[:, 0]).any():
             raise ProblemError(
-                "accelerometers are compared with the recorded series; got a spectrum. Give their "
-                "lines by --lines-hz."
+                f"{path} must have a frequency_hz in each row, and no more than an error_hz beside "
+                f"it; got {join_names(columns)}."
             )
-        _, readings, _ = read_accelerations(arguments, record)
-        values, known = fill_missing(lay_beside(readings, record.frames))
-        lines += accelerometer_lines(
-            values, record.pseudo_open_loop(), record.frame_rate_hz, usable=record.usable & known
-        )
-    return tuple(lines)
+        lines += [(row[0], np.nansum(row[1:])) for row in table]
+    return np.reshape(lines, (-1, 2))
 
 
 def read_accelerations(arguments: Namespace, record: LoopRecord) -> Readings:

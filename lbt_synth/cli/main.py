@@ -23,6 +23,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from lbt_synth.cli.parser import build_parser, command_module, command_options
+from lbt_synth.cli.progress import show_progress
 from lbt_synth.cli.streams import discard, print_error
 from lbt_synth.errors import ConfigError, LbtSynthError, SynthesisError
 from lbt_synth.storage.display_unit import own_display_unit
@@ -48,15 +49,15 @@ class Terminated(KeyboardInterrupt):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
-    words = sys.argv[1:] if argv is None else list(argv)
+    words = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
     named = next((word for word in words if not word.startswith("-")), "")
     if any(word.endswith(".fits") for word in words):
         importlib.import_module("astropy.io.fits")  # which looks through all modules: few as yet
     arguments = build_parser(named).parse_args(words)
     try:
-        run = _find_command(arguments.command)
-        with _terminable(), own_display_unit():
-            report = run(arguments)
+        quiet = arguments.json or arguments.command == "explore"  # which prints while it runs
+        with _terminable(), own_display_unit(), show_progress(arguments.command, quiet=quiet):
+            report = _run_command(arguments)
     except LbtSynthError as error:
         return _fail(error, _say_error(error, arguments), arguments)
     except MemoryError:
@@ -70,6 +71,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     report.print(as_json=arguments.json)
     return DONE if report.passed else FAILED
+
+
+def _run_command(arguments: Namespace) -> Report:
+    from lbt_synth.cli.output import run_with_outputs  # slow to import for --help
+
+    return run_with_outputs(_find_command(arguments.command), arguments)
 
 
 def _find_command(command: str) -> Callable[[Namespace], Report]:

@@ -11,18 +11,16 @@ from scipy.optimize import minimize_scalar
 
 from lbt_synth import models
 from lbt_synth.cli.loop_inputs import choose_wavefront_unit
-from lbt_synth.cli.output import Report, require_outputs, write_outputs
-from lbt_synth.cli.progress import show_spinner
+from lbt_synth.cli.output import Report
 from lbt_synth.config import Config, load_config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_residuals
 from lbt_synth.errors import ConfigError
-from lbt_synth.models.turbulence.zernike import noll_orders
+from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.figures import modal_figure
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.validation import FloatArray, integer
 
-_MOST_MODES = 20_000
 _RMS: dict[str, Any] = {"unit": "nm", "format": ".1f"}
 _MIRROR_NOTE = (
     "mirror: its local loop on every mode; the Kalman filters know its real positions, but command "
@@ -33,7 +31,6 @@ _MIRROR_NOTE = (
 
 def run(arguments: Namespace) -> Report:
     """Compare integrators, optimised gains and Kalman filters, mode by mode."""
-    require_outputs(arguments.output, inputs=[arguments.config])
     choose_wavefront_unit(arguments)
     config = load_config(arguments.config)
     count = _mode_count(arguments.modes, config)
@@ -41,24 +38,33 @@ def run(arguments: Namespace) -> Report:
         "the turbulence of hundreds of modes is computed from it"
     )
     noise, assumed = _noise_nm(config, count)
-    with show_spinner("designing", quiet=arguments.json):
-        air = models.modal_turbulence(
-            atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz
-        )
-        uniform, gains, residuals = _design_controllers(config, air, noise)
+    air = models.modal_turbulence(
+        atmosphere, modes=count, frame_rate_hz=config.hardware.frame_rate_hz
+    )
+    uniform, gains, residuals = _design_controllers(config, air, noise)
     rows = _order_rows(air.rms_nm, noise, gains, *residuals.values())
-    whole = {name: _total_rms(rms) for name, rms in residuals.items()}
+    totals_nm = {name: _total_rms(rms) for name, rms in residuals.items()}
     alone = _total_rms(air.rms_nm)
     report = Report(
-        data={"modes": count, "uniform_gain": uniform, "residual_nm": whole, "turbulence_nm": alone}
+        data={
+            "modes": count,
+            "uniform_gain": uniform,
+            "residual_nm": totals_nm,
+            "turbulence_nm": alone,
+        }
     )
-    left = {"none, turbulence alone": alone, **whole}
+    all_nm = {"none, turbulence alone": alone, **totals_nm}
     totals = [
         facts(controller=fact(name, "controller"), residual_nm=fact(rms, "residual", **_RMS))
-        for name, rms in left.items()
+        for name, rms in all_nm.items()
     ]
     report.tables.append(row_table("All modes", totals))
-    report.add_rows("rows", "By radial order, residuals over its modes", rows)
+    report.add_rows(
+        "rows",
+        "By radial order, residuals over its modes",
+        rows,
+        figure=lambda: modal_figure(residuals, gains=gains, turbulence_nm=air.rms_nm),
+    )
     report.notes += [
         "turbulence: AR1 models, von Karman variances, poles by radial order.",
         "vibrations: those of the model, on tip and tilt.",
@@ -66,12 +72,6 @@ def run(arguments: Namespace) -> Report:
         *([] if config.hardware.mirror is None else [_MIRROR_NOTE]),
         "the modes are those of Zernike, independent; nothing leaks from one to another.",
     ]
-    write_outputs(
-        report,
-        arguments.output,
-        rows,
-        figure=lambda: modal_figure(residuals, gains=gains, turbulence_nm=air.rms_nm),
-    )
     return report
 
 
@@ -112,7 +112,7 @@ def _mode_count(given: int | None, config: Config) -> int:
             f"{config.source}: the key mirror.modes is missing; give it, or --modes.",
             path="mirror.modes",
         )
-    return integer(count, "modes", at_least=2, at_most=_MOST_MODES)
+    return integer(count, "modes", at_least=2)
 
 
 def _noise_nm(config: Config, count: int) -> tuple[FloatArray, str]:
@@ -142,14 +142,14 @@ def _noise_nm(config: Config, count: int) -> tuple[FloatArray, str]:
 
 def _axis_vibrations(config: Config, count: int) -> dict[int, list[models.Vibration]]:
     """Return the vibrations of the model on tip and on tilt, each axis by itself."""
-    found: dict[int, list[models.Vibration]] = {}
+    vibrations: dict[int, list[models.Vibration]] = {}
     for line in config.plant.vibrations:
         for axis, part in enumerate(line.direction):
             size = abs(part) * line.rms_nm
             if axis < count and size > 1e-9 * line.rms_nm:
                 own = replace(line, rms_nm=size, direction=(1.0,))
-                found.setdefault(axis, []).append(own)
-    return found
+                vibrations.setdefault(axis, []).append(own)
+    return vibrations
 
 
 def _total_rms(rms: FloatArray) -> float:

@@ -7,9 +7,9 @@ import math
 import os
 import shutil
 import sys
+from argparse import Namespace
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,6 +44,10 @@ class Report:
     tables: list[Table] = field(default_factory=list)  # what people see
     notes: list[str] = field(default_factory=list)  # lines below the tables
     passed: bool = True  # False makes the exit status 1
+    # what -o writes: rows of a .csv, but for some of their fields, and a figure
+    rows: Sequence[Any] = ()
+    without: Collection[str] = ()
+    figure: Callable[[], Any] | None = None
 
     def add_table(
         self, caption: str, headings: Sequence[str], cells: Iterable[Sequence[Any]]
@@ -57,18 +61,22 @@ class Report:
         self,
         key: str,
         caption: str,
-        found: Sequence[Any],
+        rows: Sequence[Any],
         *,
         without: Collection[str] = (),
         hidden: Collection[str] = (),
+        figure: Callable[[], Any] | None = None,
     ) -> None:
         """Add rows of one type under a key of the data, with their units, and as a table.
 
-        Fields of ``without`` are left out of both, and those of ``hidden`` out of the table.
+        Fields of ``without`` are left out of both, and those of ``hidden`` out of the table. With a
+        figure, it and the rows are what -o writes.
         """
-        self.data[key] = [json_record(row, without=without) for row in found]
-        self._add_units(found[0])
-        self.tables.append(row_table(caption, found, without=(*without, *hidden)))
+        if figure is not None:
+            self.rows, self.without, self.figure = rows, without, figure
+        self.data[key] = [json_record(row, without=without) for row in rows]
+        self._add_units(rows[0])
+        self.tables.append(row_table(caption, rows, without=(*without, *hidden)))
 
     def add_records(self, *rows: Any, key: str = "") -> None:
         """Add the values of rows, with their units, to the data or under a key of it."""
@@ -131,34 +139,30 @@ def require_figure(output: str, *, inputs: Sequence[str]) -> None:
     require_writable(require_figure_name(output), inputs=inputs)
 
 
-def require_outputs(outputs: Sequence[str], *, inputs: Sequence[str]) -> None:
-    """Refuse outputs that cannot become a table or a figure, or would replace an input."""
+def run_with_outputs(run: Callable[[Namespace], Report], arguments: Namespace) -> Report:
+    """Run a command, and write its rows to outputs in .csv and its figure to all others.
+
+    An output that cannot become one or the other, or would replace an input, is refused before.
+    """
+    outputs = getattr(arguments, "output", None)
+    if not isinstance(outputs, list):  # of a command that writes something else
+        return run(arguments)
     for output in outputs:
-        if Path(output).suffix.lower() not in (".csv", *FIGURE_ENDINGS):
+        if not output.lower().endswith((".csv", *FIGURE_ENDINGS)):
             raise ProblemError(
                 f"an output must end in .csv, {', '.join(FIGURE_ENDINGS)}; got {output!r}."
             )
-    require_writable(*outputs, inputs=inputs)
-
-
-def write_outputs(
-    report: Report,
-    outputs: Sequence[str],
-    rows: Sequence[Any],
-    *,
-    figure: Callable[[], Any],
-    without: Collection[str] = (),
-) -> None:
-    """Write the rows to outputs in .csv and the figure to all others, and note them in the report.
-
-    ``without`` names the fields of the rows that a .csv leaves out.
-    """
-    report.note_files(
-        write_atomically(output, csv_rows(rows, without=without))
-        if Path(output).suffix.lower() == ".csv"
-        else save_figure(figure(), output)
-        for output in outputs
-    )
+    inputs = [getattr(arguments, "config", None), *getattr(arguments, "gains", ())]
+    require_writable(*outputs, inputs=[path for path in inputs if path])
+    report = run(arguments)
+    if (figure := report.figure) is not None:
+        report.note_files(
+            write_atomically(output, csv_rows(report.rows, without=report.without))
+            if output.lower().endswith(".csv")
+            else save_figure(figure(), output)
+            for output in outputs
+        )
+    return report
 
 
 def write_telemetry(

@@ -39,8 +39,7 @@ def run(arguments: Namespace) -> Report:
     choose_unit(arguments, DIAMETER_M)
     folder = make_directory(arguments.output)
     rows = [
-        (row, modal_row(row))
-        for row in track_progress(plan_rows(), total=_ROWS, what="tables", quiet=arguments.json)
+        (row, modal_row(row)) for row in track_progress(plan_rows(), total=_ROWS, what="tables")
     ]
     second, third = (
         [table_entry(*pair) for pair in rows if pair[0].table == table] for table in ("II", "III")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from argparse import Action, ArgumentParser, Namespace
 from collections.abc import Iterator
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NoReturn, cast
 
 import lbt_synth
@@ -15,24 +16,31 @@ from lbt_synth.errors import suggest_word
 if TYPE_CHECKING:  # slow to import for --help
     from lbt_synth.cli.output import Report
 
-# In the order of the help, each with the function that adds its arguments, whose docstring is its
-# help.
+# In the order of the help: groups with a line on each, and the functions that add the arguments of
+# their commands, whose docstrings are the help of these.
+GROUPS = {
+    "start: a configuration to begin with": (arguments.init, arguments.completion),
+    "design: from a configuration to a gain file": (arguments.design,),
+    "look: what a design does in the loop, and what could be better": (
+        *(arguments.plot, arguments.simulate, arguments.report, arguments.explore),
+        *(arguments.limits, arguments.robustness, arguments.tradeoff, arguments.study),
+        *(arguments.mirror, arguments.modal),
+    ),
+    "prove: what a gain file holds, and whether it is true": (arguments.show, arguments.verify),
+    "records: from what a loop recorded to a model and a design": (
+        *(arguments.telemetry, arguments.identify, arguments.auto, arguments.diagnose),
+    ),
+    "at the telescope: a gain file in another program": (arguments.export, arguments.rehearse),
+    "the paper: the tables of Agapito et al. 2008": (
+        *(arguments.paper, arguments.end_to_end, arguments.end_to_end_table),
+    ),
+}
 COMMANDS = {
     add_arguments.__name__.replace("_", "-"): add_arguments
-    for add_arguments in (
-        arguments.init,
-        *(arguments.design, arguments.show, arguments.verify),
-        *(arguments.export, arguments.rehearse),
-        arguments.plot,
-        *(arguments.simulate, arguments.telemetry, arguments.identify, arguments.auto),
-        arguments.diagnose,
-        *(arguments.robustness, arguments.tradeoff, arguments.limits, arguments.report),
-        arguments.explore,
-        *(arguments.end_to_end, arguments.end_to_end_table),
-        *(arguments.mirror, arguments.modal, arguments.study, arguments.paper),
-        arguments.completion,
-    )
+    for group in GROUPS.values()
+    for add_arguments in group
 }
+_NAME_WIDTH, _WIDTH = 20, 80  # of the list of commands
 
 
 _SHARED_MODULES = {
@@ -77,19 +85,39 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
     parser = Parser(
         prog="lbt-synth",
         description="Design, certify and analyse tip/tilt controllers that reject vibrations.",
-        epilog="Exit status: 0 done, 1 a design or verification failed, 2 wrong usage or input.",
+        epilog=f"{_list_commands()}\n\nExit status: 0 done, 1 a design or verification failed, 2 "
+        "wrong usage or input.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"lbt-synth {lbt_synth.__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    commands = parser.add_subparsers(
+        dest="command", metavar="COMMAND", required=True, help="one of those below"
+    )
     for name, add_arguments in COMMANDS.items():
-        text = add_arguments.__doc__ or ""
         command = commands.add_parser(
-            name, help=text.splitlines()[0].rstrip("."), description=" ".join(text.split())
+            name, description=" ".join((add_arguments.__doc__ or "").split())
         )
         arguments.add_switch(command, "--json", "print one JSON object instead")
         if name in named:
             add_arguments(command)
     return parser
+
+
+def _list_commands() -> str:
+    """Return the commands in their groups, each with the first sentence of its help."""
+    lines = []
+    for title, group in GROUPS.items():
+        lines += ["", title]
+        for add_arguments in group:
+            name, text = add_arguments.__name__.replace("_", "-"), add_arguments.__doc__ or ""
+            first = f"  {name:{_NAME_WIDTH - 2}}"
+            lines += wrap(
+                text.splitlines()[0].rstrip("."),
+                _WIDTH,
+                initial_indent=first,
+                subsequent_indent=" " * _NAME_WIDTH,
+            )
+    return "\n".join(lines[1:])
 
 
 def command_options(name: str) -> dict[str, tuple[str, Any]]:

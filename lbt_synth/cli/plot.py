@@ -9,8 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lbt_synth.cli.loop_inputs import choose_design_unit, load_designs
-from lbt_synth.cli.output import Report, require_outputs, write_outputs
-from lbt_synth.cli.progress import show_spinner
+from lbt_synth.cli.output import Report
 from lbt_synth.design import Design
 from lbt_synth.errors import UnstableLoopError
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
@@ -30,37 +29,32 @@ from lbt_synth.validation import FloatArray
 
 _SETTLING_FRAMES = 8000  # within which loops settle, beyond what is drawn
 
-
 _UNITS = {"frequency_hz": "Hz", "gain_db": "dB", "phase_deg": "deg", "time_s": "s"}
 _LOOP = ("frequency_hz", "gain_db", "phase_deg", "real", "imaginary")  # phases without jumps
 _SIGMA = ("frequency_hz", "error", "rejection", "noise_transfer")  # of phase and noise to residual
-# named series of numbers, of the loop of a design broken at one measurement, or of a design
-_Curves: TypeAlias = list[tuple[str, dict[str, FloatArray]]]
+# series of numbers of a design, or of its loop broken at one measurement, by their names
+_Curves: TypeAlias = dict[str, dict[str, FloatArray]]
 
 
 def run(arguments: Namespace) -> Report:
     """Print the margins of designs, and write their figure and their points."""
     view = arguments.kind
-    require_outputs(arguments.output, inputs=arguments.gains)
     designs, gain = load_designs(arguments.gains), arguments.gain_factor
     choose_design_unit(arguments, *designs.values())
-    report = Report()
-    with show_spinner("drawing", quiet=arguments.json):
-        _add_margins(report, designs, gain)
-        drawn = _draw(view, designs, gain)
-        if not drawn:
-            raise UnstableLoopError(
-                f"no loop is stable at {gain:g} times the sensor gain that its design assumes, and "
-                "there is nothing to draw; lbt-synth show prints the factors that are stable."
-            )
-        report.data["curves"] = _joined(drawn)
-        report.data["units"] |= {n: unit for n, unit in _UNITS.items() if n in drawn[0][1]}
-        write_outputs(
-            report,
-            arguments.output,
-            list(_points(drawn)),
-            figure=lambda: loop_figure(designs, view, sensor_gain=gain),
+    report = Report(figure=lambda: loop_figure(designs, view, sensor_gain=gain))
+    _add_margins(report, designs, gain)
+    curves = _draw(view, designs, gain)
+    if not curves:
+        raise UnstableLoopError(
+            f"no loop is stable at {gain:g} times the sensor gain that its design assumes, and "
+            "there is nothing to draw; lbt-synth show prints the factors that are stable."
         )
+    report.rows = list(_points(curves))
+    report.data["curves"] = {
+        name: {key: values for key, values in series.items() if not np.isnan(values).all()}
+        for name, series in curves.items()
+    }
+    report.data["units"] |= {name: _UNITS[name] for name in report.rows[0].values if name in _UNITS}
     if view == "step":
         _add_step_facts(report, designs, gain)
     return report
@@ -69,42 +63,31 @@ def run(arguments: Namespace) -> Report:
 def _draw(view: str, designs: Mapping[str, Design], gain_factor: float) -> _Curves:
     """Return the curves of designs in a view; nan stands for what a design does not have."""
     if view == "step":
-        return [
-            (name, {"time_s": step.time_s, "residual": step.residual, "command": step.command})
+        return {
+            name: {"time_s": step.time_s, "residual": step.residual, "command": step.command}
             for name, step in _named_steps(designs, gain_factor)
-        ]
-    curves: _Curves = []
+        }
     if view == "sigma":
         loops = closed_loops(designs, gain_factor, needed=False)
-        for name, (f, *parts) in sigma_curves(designs, loops).items():
-            lines = (np.full(f.size, np.nan) if part is None else part for part in parts)
-            curves.append((name, dict(zip(_SIGMA, (f, *lines), strict=True))))
-        return curves
+        return {
+            name: {
+                key: np.full(f.size, np.nan) if values is None else values
+                for key, values in zip(_SIGMA, (f, *parts), strict=True)
+            }
+            for name, (f, *parts) in sigma_curves(designs, loops).items()
+        }
+    curves: _Curves = {}
     for name, _, _, broken in open_loops(closed_loops(designs, gain_factor)):
         if broken is not None:
             *series, response = loop_points(broken)
-            named = dict(zip(_LOOP, (*series, response.real, response.imag), strict=True))
-            curves.append((name, named))
+            curves[name] = dict(zip(_LOOP, (*series, response.real, response.imag), strict=True))
     return curves
-
-
-def _joined(curves: _Curves) -> dict[str, dict[str, FloatArray]]:
-    """Return the series of each design, end to end; what it has none of is left out."""
-    joined: dict[str, dict[str, FloatArray]] = {}
-    for name, series in curves:
-        for key, values in series.items():
-            parts = joined.setdefault(name, {})
-            parts[key] = np.concatenate([parts.get(key, np.zeros(0)), values])
-    return {
-        name: {key: values for key, values in series.items() if not np.isnan(values).all()}
-        for name, series in joined.items()
-    }
 
 
 def _points(curves: _Curves) -> Iterator[Facts]:
     """Yield a row for each point of the curves."""
-    columns = tuple(Column(name=name) for name in ("design", *curves[0][1]))
-    for name, series in curves:
+    columns = tuple(Column(name=name) for name in ("design", *next(iter(curves.values()))))
+    for name, series in curves.items():
         for numbers in zip(*(values.tolist() for values in series.values()), strict=True):
             yield Facts(columns, {"design": name, **dict(zip(series, numbers, strict=True))})
 

@@ -1,46 +1,51 @@
-"""Spinners and progress bars on standard error, where that is a terminal."""
+"""What is shown on standard error while a command runs, where that is a terminal."""
 
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
+
+_DISPLAY: ContextVar[Any] = ContextVar("display", default=None)  # where somebody looks
 
 
 @contextmanager
-def show_spinner(what: str, *, quiet: bool) -> Iterator[None]:
-    """Show a spinner while the block runs."""
+def show_progress(command: str, *, quiet: bool) -> Iterator[None]:
+    """Show the name of a command while it runs, and below it what it counts."""
     if quiet or not sys.stderr.isatty():
         yield
         return
-    from rich.console import Console  # slow to import where nobody looks
+    from rich import progress as bars  # slow to import where nobody looks
+    from rich.console import Console
 
     console = Console(stderr=True)
-    with console.status(what, spinner="line" if console.options.ascii_only else "dots"):
-        yield
+    columns = (bars.TextColumn("{task.description}"), bars.BarColumn(), bars.TimeRemainingColumn())
+    with bars.Progress(*columns, console=console, transient=True) as display:
+        display.add_task(command, total=None)
+        token = _DISPLAY.set(display)
+        try:
+            yield
+        finally:
+            _DISPLAY.reset(token)
 
 
-def track_progress(items: Iterable[Any], *, total: int, what: str, quiet: bool) -> Iterator[Any]:
+def track_progress(items: Iterable[Any], *, total: int, what: str) -> Iterator[Any]:
     """Yield items and show how many have passed."""
-    with count_progress(total=total, what=what, quiet=quiet) as count:
+    with count_progress(total=total, what=what) as count:
         for item in items:
             yield item
             count(1)
 
 
 @contextmanager
-def count_progress(*, total: int, what: str, quiet: bool) -> Iterator[Callable[[int], None]]:
-    """Yield a function that advances a bar, which is shown after two seconds."""
-    if quiet or not sys.stderr.isatty():
+def count_progress(*, total: int, what: str) -> Iterator[Callable[[int], None]]:
+    """Yield a function that advances a bar."""
+    display = _DISPLAY.get()
+    if display is None:
         yield lambda done: None
         return
-    from rich import progress as bars
-    from rich.console import Console
-
-    start, console = time.monotonic(), Console(stderr=True)
-    shown = bars.TextColumn("{task.description}"), bars.BarColumn(), bars.MofNCompleteColumn()
-    with bars.Progress(*shown, bars.TimeRemainingColumn(), console=console, transient=True) as bar:
-        task = bar.add_task(what, total=total, visible=False)
-        yield lambda done: bar.update(task, advance=done, visible=time.monotonic() - start > 2)
+    task = display.add_task(what, total=total)
+    yield lambda done: display.advance(task, done)
+    display.remove_task(task)

@@ -14,14 +14,14 @@ from lbt_synth.cli.loop_inputs import choose_unit, load_design, load_shown
 from lbt_synth.cli.loop_records import load_series, record_imaging, require_series
 from lbt_synth.cli.output import Report, require_figure
 from lbt_synth.cli.parser import command_options
-from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification import require_length
+from lbt_synth.identification.records.record import require_length
 from lbt_synth.interop import Rehearsal, rehearse
-from lbt_synth.loop import Imaging, series_strehl
+from lbt_synth.loop import Imaging
 from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
+from lbt_synth.loop.strehl import series_strehl
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.draw import save_figure
@@ -32,7 +32,7 @@ from lbt_synth.validation import FloatArray, integer, number
 _FRAMES = 8000  # of a drawn disturbance
 _DRAWN = ("frames", "seed")  # options that only a drawn disturbance has
 _ALWAYS = ("target", "file", "stroke", "wavelength_um", "output", "json", "unit", "show_unit")
-_FEWEST, _MOST = 256, 10_000_000  # of a record, and of a drawn disturbance
+_FEWEST = 256  # frames of a record
 
 
 # the source in words, what the loops run_rehearse on, and residual and commands of a record
@@ -43,31 +43,34 @@ _Series: TypeAlias = tuple[
 
 def run(arguments: Namespace) -> Report:
     """Run the loop in the arithmetic of a target, beside the design and what ran."""
-    given = [path for path in (arguments.gain, arguments.file) if path is not None]
+    inputs = [path for path in (arguments.gain, arguments.file) if path is not None]
     if arguments.output is not None:
-        require_figure(arguments.output, inputs=given)
+        require_figure(arguments.output, inputs=inputs)
     _refuse_idle_options(arguments)
     design = load_design(arguments.gain)
-    with show_spinner("rehearsing", quiet=arguments.json):
-        recorded = arguments.file is not None
-        series = (_recorded if recorded else _drawn)(arguments, design)
-        source, disturbance, hardware, imaging, ran = series
-        found = rehearse(
-            design,
-            arguments.target,
-            disturbance,
-            hardware=hardware,
-            stroke=arguments.stroke,
-        )
-    loops = {f"in {arguments.target}": found.target, "design, double precision": found.design}
+    recorded = arguments.file is not None
+    series = (_recorded if recorded else _drawn)(arguments, design)
+    source, disturbance, hardware, imaging, ran = series
+    rehearsal = rehearse(
+        design, arguments.target, disturbance, hardware=hardware, stroke=arguments.stroke
+    )
+    loops = {
+        f"in {arguments.target}": rehearsal.target,
+        "design, double precision": rehearsal.design,
+    }
     rows = [
         _describe(
-            name, one.image_nm2[0], one.commands[0], one.strehl, imaging, found.clipped_frames(one)
+            name,
+            one.image_nm2[0],
+            one.commands[0],
+            one.strehl,
+            imaging,
+            rehearsal.clipped_frames(one),
         )
         for name, one in loops.items()
     ]
     if ran is not None:
-        residual, commands = (part[found.settle_frames :] for part in ran)
+        residual, commands = (part[rehearsal.settle_frames :] for part in ran)
 
         def ratio(camera: Imaging) -> FloatArray:
             return np.array([series_strehl(residual, camera)])
@@ -76,8 +79,8 @@ def run(arguments: Namespace) -> Report:
     report = Report(data={"gain": arguments.gain, "target": arguments.target})
     what = f"Rehearsal for {arguments.target} on {source}; {imaging.label}"
     report.add_rows("loops", what, rows)
-    report.add_facts("The target beside the design", _difference_facts(found))
-    report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", found.checks)
+    report.add_facts("The target beside the design", _difference_facts(rehearsal))
+    report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", rehearsal.checks)
     if arguments.file is not None:
         report.notes += [
             "note: residuals are of means over frames, and hold the noise of the measurements.",
@@ -86,7 +89,7 @@ def run(arguments: Namespace) -> Report:
     if design.hardware is not None:
         report.notes += [f"note: {text}" for text in loop_differences(design.hardware, hardware)]
     if arguments.output is not None:
-        figure = simulation_figure(found.target, title=f"{design.method} in {arguments.target}")
+        figure = simulation_figure(rehearsal.target, title=f"{design.method} in {arguments.target}")
         report.note_written(save_figure(figure, arguments.output))
     return report
 
@@ -116,16 +119,16 @@ def _describe(
     )
 
 
-def _difference_facts(found: Rehearsal) -> Facts:
+def _difference_facts(rehearsal: Rehearsal) -> Facts:
     """Return how far the target is from the design."""
-    apart_nm = found.differences
+    apart_nm = rehearsal.differences
     rms_nm = float(np.sqrt(np.mean(np.sum(apart_nm**2, axis=1))))
     settled = "frames before, in which the loops settle"
     return facts(
         difference_rms_nm=fact(rms_nm, "difference of the commands", unit="nm rms"),
         difference_largest_nm=fact(float(np.max(np.abs(apart_nm))), "  largest", unit="nm"),
         frames=fact(len(apart_nm), "frames compared"),
-        settle_frames=fact(found.settle_frames, settled),
+        settle_frames=fact(rehearsal.settle_frames, settled),
     )
 
 
@@ -190,6 +193,6 @@ def _drawn(arguments: Namespace, design: Design) -> _Series:
     frames, alone = _FRAMES, config.hardware.own_sensor_alone()
     seed = integer(arguments.seed, "--seed", at_least=0)
     if arguments.frames is not None:
-        frames = integer(arguments.frames, "--frames", at_least=1, at_most=_MOST)
+        frames = integer(arguments.frames, "--frames", at_least=1)
     drawn = draw_disturbance(config.truth, alone, frames=frames, seed=seed)
     return f"{frames} frames of its own truth", drawn, config.hardware, imaging, None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from argparse import Namespace
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ import numpy as np
 from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import load_shown, loop_difference_notes, truth_at_sensor_gain
 from lbt_synth.cli.output import Report, require_figure, write_telemetry
-from lbt_synth.cli.progress import show_spinner
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
@@ -29,51 +29,47 @@ from lbt_synth.loop import (
     strehl,
 )
 from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_or_nan
-from lbt_synth.loop.simulation.run import READINGS, Drop, Segment, settling_frames
+from lbt_synth.loop.simulation.run import READINGS, Drop, settling_frames
 from lbt_synth.models import Truth
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.input_files import file_sha256
-from lbt_synth.storage.rows import Facts
 from lbt_synth.storage.words import count_text
 from lbt_synth.studies.robustness import run_failures
 from lbt_synth.validation import FloatArray
 
-_DROP = re.compile(
-    rf"(?P<unit>[^@]+)@(?P<start>[\d.]+)s?(\.\.(?P<end>[\d.]+)s?)?(:(?P<reading>{'|'.join(READINGS)}))?$"
-)
+_TIME = r"(\d+\.?\d*)s?"
+_DROP = re.compile(rf"([^@]+)@{_TIME}(?:\.\.{_TIME})?(?::({'|'.join(READINGS)}))?")
 _AFTER_S = 5.0  # that a run lasts beyond the last event, if --frames is not given
 
 
 def parse_drop(text: str) -> Drop:
     """Return what ``--drop SENSOR@START[..END][:READING]`` says."""
-    found = _DROP.match(text)
-    if found is None:
+    match = _DROP.fullmatch(text)
+    if match is None:
         raise ProblemError(
             f"--drop takes SENSOR@START..END, in seconds, and if need be one of "
             f"{', '.join(':' + word for word in READINGS)}; got {text!r}. Try m2@10s or "
             "wavefront@20s..20.2s:frozen."
         )
-    parts = found.groupdict()
-    try:
-        times = {k: float(parts[k.removesuffix("_s")] or "inf") for k in ("start_s", "end_s")}
-    except ValueError:
-        raise ProblemError(f"--drop takes times in seconds; got {text!r}.") from None
-    return Drop(unit=parts["unit"], **times, reading=parts["reading"] or READINGS[0])
+    unit, start, end, reading = match.groups()
+    ends = {"start_s": float(start), "end_s": float(end or "inf")}
+    return Drop(unit=unit, **ends, reading=reading or READINGS[0])
 
 
-_QUANTITIES = {  # of the table, by their keys: ratios are shown in percent, all others are rms
-    "strehl_exact": "Strehl ratio",
-    "residual_exact_nm": "residual",
-    "turbulence_nm": "  turbulence",
-    "vibration_nm": "  vibration",
-    "noise_nm": "  noise",
-    "within_nm": "  within frames",
-    "limit_nm": "  least of any controller",
-    "above_limit_percent": "  residual above it",
-    "command_rms": "commands",
+_RMS = "nm rms"
+_QUANTITIES = {  # of the table, by their keys: headings and units
+    "strehl_exact": ("Strehl ratio", "%"),
+    "residual_exact_nm": ("residual", _RMS),
+    "turbulence_nm": ("  turbulence", _RMS),
+    "vibration_nm": ("  vibration", _RMS),
+    "noise_nm": ("  noise", _RMS),
+    "within_nm": ("  within frames", _RMS),
+    "limit_nm": ("  least of any controller", _RMS),
+    "above_limit_percent": ("  residual above it", "%"),
+    "command_rms": ("commands", _RMS),
 }
 
 
@@ -96,24 +92,20 @@ def run(arguments: Namespace) -> Report:
         why = " ".join([str(error), *loop_difference_notes(config, design)])
         raise UnstableLoopError(why, spectral_radius=loop.radius_per_frame) from error
     settings = config.settings.simulation
-    segments: list[tuple[Segment, Facts]] = []
     sizes: dict[str, Any] = _choose_sizes(arguments, config, drops)
     # the same settling for all controllers, so that one seed is one weather
     settle = max(settings.settle_frames, settling_frames(loop.radius_per_frame))
-    with show_spinner("closing the loop", quiet=arguments.json):
-        if design.other_sensors:
-            settle = settings.settle_frames
-            simulation, segments = run_failures(design, config, truth, drops, **sizes)
-        else:
-            simulation = simulate(
-                estimator_form(design) if arguments.form == "estimator" else design.controller,
-                truth,
-                hardware=config.hardware,
-                **sizes,
-                settle_frames=settle,
-                stroke=arguments.stroke,
-            )
-        strehls = simulation.strehl(config.imaging)
+    title = design.method
+    if design.other_sensors:
+        settle = settings.settle_frames
+        simulation, segments = run_failures(design, config, truth, drops, **sizes)
+        places, exact_nm = [s for s, _ in segments], [row.exact_nm for _, row in segments]
+        draw = partial(sensor_failure_figure, segments=places, exact_nm=exact_nm)
+    else:
+        simulation, segments = _simulate(arguments, design, truth, config, settle, sizes), []
+        title += ": the first second above, mean spectrum of all runs below"
+        draw = partial(simulation_figure)
+    strehls = simulation.strehl(config.imaging)
     report = _describe_simulation(
         simulation, strehls, _exact_answers(loop, config, truth), design, config.imaging
     )
@@ -126,19 +118,27 @@ def run(arguments: Namespace) -> Report:
         report.notes.append("note: the exact answer above is with all sensors.")
     _add_clipped(report, simulation, arguments.stroke)
     if arguments.output is not None:
-        if segments:
-            places, exact_nm = [s for s, _ in segments], [row.exact_nm for _, row in segments]
-            figure = sensor_failure_figure(simulation, places, exact_nm, title=design.method)
-        else:
-            title = f"{design.method}: the first second above, mean spectrum of all runs below"
-            figure = simulation_figure(simulation, title=title)
-        report.note_written(save_figure(figure, arguments.output))
+        report.note_written(save_figure(draw(simulation, title=title), arguments.output))
     if arguments.telemetry is not None:
         recorded = _first_case(simulation, truth, config, design, arguments.gain)
         write_telemetry(
             report, arguments.telemetry, recorded, key="telemetry", what="telemetry of case 0"
         )
     return report
+
+
+def _simulate(
+    arguments: Namespace,
+    design: Design,
+    truth: Truth,
+    config: Config,
+    settle_frames: int,
+    sizes: dict[str, Any],
+) -> Simulation:
+    """Run the loop of its own sensor, in the form that was asked for."""
+    form = estimator_form(design) if arguments.form == "estimator" else design.controller
+    more: dict[str, Any] = {"settle_frames": settle_frames, "stroke": arguments.stroke, **sizes}
+    return simulate(form, truth, hardware=config.hardware, **more)
 
 
 def _add_clipped(report: Report, simulation: Simulation, stroke: float | None) -> None:
@@ -190,14 +190,14 @@ def _describe_simulation(
 ) -> Report:
     command_rms = float(np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1)))))
     cases, frames = simulation.residual_nm.shape[:2]
-    rms = [name for name in _QUANTITIES if name.endswith(("_nm", "_rms"))]
+    units = {name: unit for name, (_, unit) in _QUANTITIES.items() if name != "strehl_exact"}
     report = Report(
         data={
             "strehl": strehls,
             "residual_nm": simulation.rms_nm,
             **exact,
             "command_rms": command_rms,
-            "units": dict.fromkeys(["residual_nm", *rms], "nm rms") | {"above_limit_percent": "%"},
+            "units": {"residual_nm": _RMS, **units},
             "frames": frames,
             "wavelength_um": imaging.wavelength_um,
             "cases": cases,
@@ -209,19 +209,16 @@ def _describe_simulation(
         "residual_exact_nm": float(np.sqrt(np.mean(simulation.rms_nm**2))),
         "command_rms": command_rms,
     }
-    unit, factor = shown_unit("nm rms")
     rows = []
-    for name, heading in _QUANTITIES.items():
-        scale = factor if name in rms else 100.0 if name == "strehl_exact" else 1.0
-        pair = [value and scale * value for value in (simulated.get(name), exact.get(name))]
+    for name, (heading, raw) in _QUANTITIES.items():
+        unit, factor = shown_unit(raw)
+        factor = 100.0 if name == "strehl_exact" else factor
+        pair = [value and factor * value for value in (simulated.get(name), exact.get(name))]
         if pair != [None, None]:
-            rows.append((heading, *pair, unit if name in rms else "%"))
-    report.add_table(
-        f"{design.method} in the loop: {count_text(cases, 'run')} of {frames} frames; "
-        f"{imaging.label}",
-        ("quantity", "simulated", "exact", "unit"),
-        rows,
-    )
+            rows.append((heading, *pair, unit))
+    caption = f"{design.method} in the loop: {count_text(cases, 'run')} of {frames} frames"
+    headings = ("quantity", "simulated", "exact", "unit")
+    report.add_table(f"{caption}; {imaging.label}", headings, rows)
     return report
 
 
@@ -263,6 +260,8 @@ def _simulation_notes(
 def _first_case(
     simulation: Simulation, truth: Truth, config: Config, design: Design, gain_file: str
 ) -> Telemetry:
+    noise_nm = truth.noise_per_measurement(config.hardware.n_measurements).tolist()
+    noise = {f"noise_nm_{i}": value for i, value in enumerate(noise_nm, start=1)}
     return telemetry_from_simulation(
         simulation,
         config.hardware,
@@ -270,14 +269,5 @@ def _first_case(
         design=design,
         controller_digest=file_sha256(gain_file, GainFileError),
         imaging=config.imaging,
-        metadata={
-            "case": 0,
-            "cases": len(simulation.commands),
-            **{
-                f"noise_nm_{i}": float(noise_nm)
-                for i, noise_nm in enumerate(
-                    truth.noise_per_measurement(config.hardware.n_measurements), start=1
-                )
-            },
-        },
+        metadata={"case": 0, "cases": len(simulation.commands), **noise},
     )

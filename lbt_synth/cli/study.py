@@ -8,17 +8,16 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from lbt_synth import studies
-from lbt_synth.cli.engine import choose_engine, keep_finished
+from lbt_synth.cli.engine import choose_engine, run_in_parts
 from lbt_synth.cli.loop_inputs import load_shown
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import count_progress, show_spinner
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.grid import timed
-from lbt_synth.studies.study.run import PAGE, PRINT, StudyRun, output_paths, part_rows, replay_row
+from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, part_rows, replay_row
 from lbt_synth.studies.study.sample import evaluate_samples
 from lbt_synth.studies.study.statistics import summary_tables, worst_table
 from lbt_synth.validation import integer
@@ -34,8 +33,7 @@ def run(arguments: Namespace) -> Report:
     folder = Path(arguments.output)
     if arguments.pdf:
         require_weasyprint()
-    with show_spinner("reading the study, designing", quiet=arguments.json):
-        loaded = studies.load_study(arguments.study)
+    loaded = studies.load_study(arguments.study)
     load_shown(arguments, loaded.config)
     refuse_replacing(output_paths(folder, loaded), loaded.inputs)
     if arguments.dry_run:
@@ -46,7 +44,8 @@ def run(arguments: Namespace) -> Report:
 
 
 def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
-    run = _compute(loaded, folder, arguments)
+    with run_in_parts(arguments, folder, total=loaded.samples, what="samples") as engine:
+        run = studies.run_study(loaded, folder, **engine)
     names, columns = loaded.parameter_names, run.columns
     statistics = studies.study_statistics(columns, names, tuple(loaded.controllers))
     pages = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
@@ -94,23 +93,6 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
     )
 
 
-def _compute(loaded: studies.Study, folder: Path, arguments: Namespace) -> StudyRun:
-    """Run what is missing of a study."""
-    with choose_engine(arguments) as (executor, workers):
-        make_directory(folder)
-        with (
-            count_progress(total=loaded.samples, what="samples", quiet=arguments.json) as count,
-            keep_finished(folder),
-        ):
-            return studies.run_study(
-                loaded,
-                folder,
-                executor=executor,
-                workers=workers,
-                progress=count,
-            )
-
-
 def _sampling_notes(loaded: studies.Study) -> list[str]:
     if loaded.settings.sampling != "sobol" or loaded.samples & (loaded.samples - 1) == 0:
         return []
@@ -126,8 +108,7 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     if not local:
         with choose_engine(arguments) as (_, count):
             pass
-    with show_spinner("measuring a batch", quiet=arguments.json):
-        cost = _estimate(loaded, min(count, os.cpu_count() or 1) if local else count)
+    cost = _estimate(loaded, min(count, os.cpu_count() or 1) if local else count)
     if not local:
         where = f"{count} threads of {arguments.dask}, as quick as this one"
     parameters = {name: section.text for name, section in loaded.settings.parameters.items()}
@@ -172,8 +153,7 @@ def _estimate(loaded: studies.Study, at_once: int) -> Facts:
 def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
     if 0 <= arguments.row < loaded.samples:  # else it is refused
         make_directory(folder)
-    with show_spinner("replaying", quiet=arguments.json):
-        replay = replay_row(loaded, folder, arguments.row)
+    replay = replay_row(loaded, folder, arguments.row)
     stored, fresh, row = replay.stored, replay.fresh, arguments.row
     values = loaded.parameters_by_name(loaded.values(row, row + 1)[0])
     report = Report(

@@ -1,28 +1,27 @@
-"""Read a configuration file and build the objects that it describes."""
+"""Read a configuration file and build what it describes; templates of files to begin with."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
 
-from lbt_synth.config.plant_and_truth import (
+from lbt_synth.config.build import (
     build_atmosphere,
+    build_end_to_end_setup,
     build_plant,
     build_truth,
     measurement_noise_nm,
     reference_gain,
-    require_atmosphere,
     vibration_rms_nm,
 )
-from lbt_synth.config.schema import FileSection
-from lbt_synth.config.schema_errors import describe_error
-from lbt_synth.config.sensors import build_sensors, build_true_motions
+from lbt_synth.config.schema import FileSection, describe_error
 from lbt_synth.errors import ConfigError, FileError, ProblemError, name_file
 from lbt_synth.loop import Imaging
 from lbt_synth.methods.request import DesignRequest, design_request
@@ -30,7 +29,7 @@ from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, choice
 
 if TYPE_CHECKING:
     from lbt_synth.design import Design
@@ -38,6 +37,7 @@ if TYPE_CHECKING:
 
 Checked = TypeVar("Checked", bound=BaseModel)
 _LARGEST_BYTES = 2**17  # of a file; ruamel.yaml may read no more than 30 kB per second
+_FILES = resources.files(__package__)  # of templates and examples
 _MOST_ERROR_HZ, _USUAL_ERROR = 3.5, 0.175  # of frequencies, unless the file says
 _ERROR_STEPS = [step / 7 for step in range(-7, 8)]
 
@@ -96,9 +96,9 @@ class Config(Summarised):
     @property
     def errors_hz(self) -> list[float]:
         """Frequency errors of studies: those of the file, or of what it says of its vibrations."""
-        given = self.settings.robustness.errors_hz
-        if given is not None:
-            return given
+        errors_hz = self.settings.robustness.errors_hz
+        if errors_hz is not None:
+            return errors_hz
         lines = self.truth.lines_hz
         if not lines:
             return [0.0]
@@ -166,16 +166,14 @@ class Config(Summarised):
 
     def require_atmosphere(self, reason: str) -> Atmosphere:
         """Return the atmosphere; raise ConfigError with the reason if the file has none."""
-        with name_file(self.source):
-            require_atmosphere(self.settings, reason)
-        assert self.atmosphere is not None  # built from the section, which is there
+        if self.atmosphere is None:
+            text = f"{self.source}: the key atmosphere is missing: {reason}."
+            raise ConfigError(text, path="atmosphere")
         return self.atmosphere
 
     @property
     def end_to_end(self) -> EndToEndSetup:
         """The end-to-end simulation; ConfigError if the file does not describe one."""
-        from lbt_synth.config.end_to_end import build_end_to_end_setup
-
         with name_file(self.source):
             return build_end_to_end_setup(self.settings, self.hardware, self.truth)
 
@@ -262,9 +260,6 @@ def build_config(settings: FileSection, source: Path) -> Config:
         noise_nm = measurement_noise_nm(settings)
         plant = build_plant(settings, atmosphere, noise_nm)
         truth = build_truth(settings, atmosphere, noise_nm, plant)
-        plant = build_sensors(settings, plant)
-        if plant.hardware.suite.sensors:
-            truth = replace(truth, motions=build_true_motions(settings, plant))
     except ProblemError as error:
         raise ConfigError(f"{source}: {error}", path=getattr(error, "path", "")) from error
     except ArithmeticError as error:
@@ -288,3 +283,44 @@ def build_config(settings: FileSection, source: Path) -> Config:
         sensor_gain=reference_gain(settings),
         source=source,
     )
+
+
+def telescope_names() -> list[str]:
+    """Return the names of the telescopes that have a template, in alphabetical order."""
+    files = (_FILES / "telescopes").iterdir()
+    return sorted(file.name.removesuffix(".yaml") for file in files)
+
+
+def telescope_template(name: str) -> str:
+    """Return a commented configuration of a telescope, with published numbers and their sources.
+
+    Parameters
+    ----------
+    name : str
+        ``elt``, ``gemini``, ``generic``, ``keck``, ``lbt`` or ``vlt``. All numbers of ``generic``
+        are assumed.
+
+    Returns
+    -------
+    str
+        Text in YAML.
+
+    Raises
+    ------
+    ProblemError
+        If there is no such template.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> print(lbt.config.telescope_template("elt").splitlines()[8])
+      diameter_m: 38.5                  # [1]
+    """
+    choice(name, "name", telescope_names())
+    return (_FILES / "telescopes" / f"{name}.yaml").read_text(encoding="utf-8")
+
+
+def example_files() -> dict[str, str]:
+    """Return the texts of the examples of the documentation by the names of their files."""
+    files = (_FILES / "examples").iterdir()
+    return {file.name: file.read_text(encoding="utf-8") for file in files}

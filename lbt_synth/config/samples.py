@@ -1,120 +1,38 @@
-"""Samples of a configuration that differ only by numbers that its builders take as arrays.
-
-What a builder reads of a section in the ordinary way must be the same for all samples that are
-evaluated together. A number that it takes for each sample is read through ``per_sample``: of an
-ordinary section it is the number, of a section of samples an array. Builders thus declare what
-they depend on by reading it, and :class:`Reads` says which numbers of a configuration may differ.
-"""
+"""Numbers of a configuration by their paths, and the real loops of samples that differ by them."""
 
 from __future__ import annotations
 
-import difflib
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import replace
 from functools import lru_cache
-from typing import Annotated, Any, cast
+from typing import Any, cast
 
 import numpy as np
-from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from lbt_synth.config.build import (
+    measurement_noise_nm,
+    model_lines,
+    relative_gain,
+    true_vibrations_owner,
+    turbulence_sections,
+    vibration_numbers,
+)
+from lbt_synth.config.load import Config
 from lbt_synth.config.schema import FileSection
-from lbt_synth.config.section import Section
-from lbt_synth.errors import ConfigError
+from lbt_synth.errors import ConfigError, suggest_word
+from lbt_synth.loop import EnsembleVibration, LoopEnsemble
+from lbt_synth.loop.ensemble import ensemble_vibration
+from lbt_synth.models import Atmosphere, FrozenFlows
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import BoolArray, FloatArray
+from lbt_synth.validation import FloatArray
 
-_KEY = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
 Keys = tuple[str | int, ...]  # the path of a number, such as ("truth", "vibrations", 0, "rms_nm")
-
-
-@dataclass(frozen=True, slots=True)
-class Reads:
-    """What builders have read of a configuration, by its keys."""
-
-    per_sample: set[Keys] = field(default_factory=set)
-    shared: set[Keys] = field(default_factory=set)  # or the keys of a whole section or list
-
-    def take_arrays_at(self, keys: Keys) -> bool:
-        """Whether the builders read a number, and every one takes it for each sample."""
-        return keys in self.per_sample and not any(
-            keys[: length + 1] in self.shared for length in range(len(keys))
-        )
-
-
-class SampleView:
-    """A section of many samples, which records what builders read of it."""
-
-    def __init__(
-        self,
-        section: Section,
-        reads: Reads,
-        values: Mapping[Keys, FloatArray],
-        keys: Keys = (),
-        per_sample: bool = False,
-    ) -> None:
-        self._section, self._reads, self._values = section, reads, values
-        self._keys, self._per_sample = keys, per_sample
-
-    @property  # type: ignore[misc]
-    def __class__(self) -> Any:
-        return type(self._section)
-
-    @property
-    def per_sample(self) -> SampleView:
-        """The same section, each of whose numbers that differ is an array."""
-        return SampleView(self._section, self._reads, self._values, self._keys, per_sample=True)
-
-    def require_one_value(self) -> None:
-        """Record that the numbers of this section must not differ."""
-        self._reads.shared.add(self._keys)
-
-    def model_dump(self, *, exclude: Collection[str] = ()) -> dict[str, Any]:
-        """Read all keys of this section."""
-        return {n: getattr(self, n) for n in type(self._section).model_fields if n not in exclude}
-
-    def __getattr__(self, name: str) -> Any:
-        found = getattr(type(self._section), name, None)
-        if isinstance(found, property) and found.fget is not None:
-            return found.fget(self)
-        return self._read(getattr(self._section, name), (*self._keys, name))
-
-    def _read(self, value: Any, keys: Keys) -> Any:
-        if isinstance(value, Section):
-            return SampleView(value, self._reads, self._values, keys, self._per_sample)
-        if isinstance(value, list):
-            if any(isinstance(entry, Section) for entry in value):
-                return [self._read(entry, (*keys, i)) for i, entry in enumerate(value)]
-        elif self._per_sample:
-            self._reads.per_sample.add(keys)
-            return self._values.get(keys, value)
-        self._reads.shared.add(keys)
-        return value
-
-
-def accepted_by_schema(settings: FileSection, keys: Keys, values: FloatArray) -> BoolArray:
-    """Return which values (b,) the schema accepts for a number of a section."""
-    here: Any = settings
-    for key in keys[:-1]:
-        here = here[key] if isinstance(key, int) else getattr(here, key)
-    section: type[Section] = type(here)
-    accepted = np.ones(len(values), dtype=np.bool_)
-    try:
-        _list_adapter(section, str(keys[-1])).validate_python(values.tolist())
-    except ValidationError as error:
-        accepted[[int(entry["loc"][0]) for entry in error.errors(include_url=False)]] = False
-    return accepted
-
-
-@lru_cache(maxsize=64)
-def _list_adapter(section: type[Section], name: str) -> TypeAdapter[list[Any]]:
-    """Return the check of a list of values of one key."""
-    key = section.model_fields[name]
-    kind: Any = Annotated[(key.annotation, *key.metadata)] if key.metadata else key.annotation
-    rules = section.model_config
-    config = ConfigDict(strict=rules["strict"], allow_inf_nan=rules["allow_inf_nan"])
-    return TypeAdapter(list[kind], config=config)
+_KEY = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
+_WEATHER = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")  # keys of FrozenFlows
+_LINE = ("frequency_hz", "damping", "rms_nm", "rms_mas")
+_PYRAMID = ("photons", "read_noise_electrons", "modulation_lambda_over_d")
 
 
 @lru_cache(maxsize=256)
@@ -134,39 +52,25 @@ def parse_path(path: str) -> Keys:
 
 def find_number(content: Mapping[str, Any], path: str) -> float:
     """Return the number to which a path leads; refuse a path that leads to none."""
-    here: Any = content
-    parent: Any = {}
-    walked = ""
+    value: Any = content
+    place = "the configuration"
     for key in parse_path(path):
-        place = walked or "the configuration"
-        listed = isinstance(key, int)
-        if not isinstance(here, list if listed else dict):
-            says = "is no list" if listed else "has no keys"
-            raise ConfigError(f"{path}: {place} {says}; {_describe(here)}.")
-        if isinstance(key, int) and key >= len(here):
-            raise ConfigError(
-                f"{path}: {place} has {count_text(len(here), 'entry', 'entries')}, "
-                f"counted from 0; got [{key}]."
-            )
-        if isinstance(key, str) and key not in here:
-            close = difflib.get_close_matches(key, list(here), n=1, cutoff=0.6)
-            hint = f"did you mean {close[0]}? " if close else ""
-            raise ConfigError(
-                f"{path}: {place} has no {key}; {hint}there are {', '.join(sorted(here))}."
-            )
-        walked += f"[{key}]" if listed else f".{key}" if walked else str(key)
-        parent = here
-        here = parent[key]
-    if here is None:
-        entries = parent.items() if isinstance(parent, dict) else ()
-        there = [k for k, v in entries if type(v) in (int, float)]
-        others = f" Numbers that are set there: {', '.join(sorted(there))}." if there else ""
-        raise ConfigError(
-            f"{path} is not set in the configuration, so it cannot be varied.{others}"
-        )
-    if type(here) not in (int, float):
-        raise ConfigError(f"{path} must lead to a number of the configuration; {_describe(here)}.")
-    return cast(float, here)
+        if not isinstance(value, list if isinstance(key, int) else dict):
+            says = "is no list" if isinstance(key, int) else "has no keys"
+            raise ConfigError(f"{path}: {place} {says}; {_describe(value)}.")
+        if isinstance(key, int) and key >= len(value):
+            entries = count_text(len(value), "entry", "entries")
+            raise ConfigError(f"{path}: {place} has {entries}, counted from 0; got [{key}].")
+        if isinstance(key, str) and key not in value:
+            raise ConfigError(f"{path}: {place} has no {key}; {suggest_word(key, sorted(value))}")
+        step = f"[{key}]" if isinstance(key, int) else f".{key}"
+        place = step.removeprefix(".") if value is content else place + step
+        value = cast(Any, value)[key]
+    if value is None:
+        raise ConfigError(f"{path} is not set in the configuration, so it cannot be varied.")
+    if type(value) not in (int, float):
+        raise ConfigError(f"{path} must lead to a number of the configuration; {_describe(value)}.")
+    return cast(float, value)
 
 
 def _describe(value: Any) -> str:
@@ -184,12 +88,114 @@ def set_number(
 
     Missing sections on the way are added, missing lists copied. An integer stays one if it can.
     """
-    here: Any = content
-    whole: Any = full
+    section: Any = content
+    complete: Any = full
     for key in keys[:-1]:
-        whole = whole[key]
-        if isinstance(here, dict) and key not in here:
-            here[key] = deepcopy(whole) if isinstance(whole, list) else {}
-        here = here[key]
-    is_integer = isinstance(whole[keys[-1]], int) and value.is_integer()
-    here[keys[-1]] = int(value) if is_integer else value
+        complete = complete[key]
+        if isinstance(section, dict) and key not in section:
+            section[key] = deepcopy(complete) if isinstance(complete, list) else {}
+        section = section[key]
+    is_integer = isinstance(complete[keys[-1]], int) and value.is_integer()
+    section[keys[-1]] = int(value) if is_integer else value
+
+
+def _with_value(section: Any, keys: Keys, value: Any) -> Any:
+    """Return a section or list with another value at its keys, which is not checked."""
+    if not keys:
+        return value
+    first, rest = keys[0], keys[1:]
+    if isinstance(first, int):
+        inner = _with_value(section[first], rest, value)
+        return [*section[:first], inner, *section[first + 1 :]]
+    return section.model_copy(update={first: _with_value(getattr(section, first), rest, value)})
+
+
+def with_arrays(settings: FileSection, values: Mapping[Keys, FloatArray]) -> FileSection:
+    """Return settings with arrays (b,) for the numbers of samples that differ, unchecked."""
+    for keys, numbers in values.items():
+        settings = _with_value(settings, keys, numbers)
+    return settings
+
+
+def array_keys(settings: FileSection) -> set[Keys]:
+    """Return the keys of the numbers that :func:`build_ensemble` takes as arrays.
+
+    Samples that differ by any other number are different configurations.
+    """
+    truth, model, sensor = settings.truth, settings.model, settings.sensor
+    kinds = {section.kind for section in turbulence_sections(settings)}
+    if settings.true_turbulence != "model":
+        kinds = set()
+    keys: set[Keys] = {("loop", "delay_frames")}
+    if not isinstance(truth.sensor_gain, list):
+        keys.add(("truth", "sensor_gain"))
+        if not isinstance(model.sensor_gain, list):
+            keys.add(("model", "sensor_gain"))
+    if "ar2" not in kinds:  # which is fitted above the noise
+        if not isinstance(sensor.noise_nm, list):
+            keys |= {("sensor", "noise_nm"), ("sensor", "noise_mas")}
+        keys |= {("sensor", "pyramid", name) for name in _PYRAMID}
+    if kinds <= {"ar"}:
+        keys |= {("atmosphere", name) for name in _WEATHER}
+    for owner, vibrations in (("model", model.vibrations), ("truth", truth.vibrations)):
+        for i, line in enumerate(vibrations if isinstance(vibrations, list) else ()):
+            # the lines of a spread vibration are chosen for one frequency, damping and size
+            if getattr(line, "spread_hz", None) is None:
+                keys |= {(owner, "vibrations", i, name) for name in _LINE}
+    return keys
+
+
+def build_ensemble(
+    config: Config,
+    values: Mapping[Keys, FloatArray],
+    *,
+    delay_error_frames: FloatArray,
+    noise_factor: FloatArray,
+) -> LoopEnsemble:
+    """Build the real loops of b samples, which differ by some numbers of :func:`array_keys`.
+
+    The configuration is that of one of them. Their real delays less those of the configuration, and
+    their real noise over it, are (b,).
+    """
+    settings, flows = with_arrays(config.settings, values), None
+    delay = settings.loop.delay_frames + delay_error_frames
+    for extreme in (np.min(delay), np.max(delay)):
+        replace(config.hardware, delay_frames=float(extreme))  # refuses what no loop has
+    if settings.true_turbulence == "frozen_flow":
+        flows = _frozen_flows(settings, config.atmosphere)
+    noise = np.asarray(measurement_noise_nm(settings))
+    if not isinstance(settings.sensor.noise_nm, list):
+        noise = noise[..., None]
+    return LoopEnsemble(
+        sensor_gain=relative_gain(settings, config.sensor_gain),
+        delay_frames=delay,
+        noise_nm=noise * noise_factor[:, None],
+        turbulence=config.truth.turbulence if flows is None else flows,
+        vibrations=tuple(_ensemble_vibrations(config, settings)),
+        loops=len(noise_factor),
+    )
+
+
+def _ensemble_vibrations(config: Config, settings: FileSection) -> list[EnsembleVibration]:
+    """Return the vibrations of the samples; the lines of a spread one are the same for all."""
+    if true_vibrations_owner(settings) == "truth":
+        rows = vibration_numbers(settings, "truth")
+        return [EnsembleVibration(**numbers) for _, _, numbers in rows]
+    vibrations: list[EnsembleVibration] = []
+    lines = model_lines(config.settings)
+    for (*_, numbers), (section, _, spread) in zip(
+        vibration_numbers(settings, "model"), lines, strict=True
+    ):
+        one = section.spread_hz is None
+        vibrations += [EnsembleVibration(**numbers)] if one else map(ensemble_vibration, spread)
+    return vibrations
+
+
+def _frozen_flows(settings: FileSection, atmosphere: Atmosphere | None) -> FrozenFlows | None:
+    """Return the frozen flows of the samples, None if the weather does not differ."""
+    air = settings.atmosphere
+    if air is None or atmosphere is None:
+        return None
+    weather = {name: getattr(air, name) for name in _WEATHER}
+    differing = {name: values for name, values in weather.items() if np.ndim(values)}
+    return FrozenFlows(atmosphere=atmosphere, **differing) if differing else None

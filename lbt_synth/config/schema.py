@@ -2,136 +2,215 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_origin
 
-from pydantic import Discriminator, Field, Tag, create_model, model_validator
-
-from lbt_synth.config.section import Section
-from lbt_synth.config.sensor_sections import (
-    MotionSection,
-    OtherSensorSection,
-    SensorSection,
-    with_own_sensor,
+from pydantic import (
+    BaseModel,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    create_model,
+    model_validator,
 )
+
+from lbt_synth.errors import suggest_word
 from lbt_synth.methods import quantities as q
-from lbt_synth.methods.registry import all_methods
+from lbt_synth.methods.method import Section
+from lbt_synth.methods.registry import METHODS
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
+from lbt_synth.models.vibration import MOST_SECTIONS
+
+Matrix: TypeAlias = list[list[q.Entry]]
+_TAGS = (q.ONE, q.EACH)  # in the places of mistakes
+_SECTIONS = "how many equal resonances in series it is: a bump of steep flanks has 2 to 4"
+
+
+def _rule(mistake: Callable[[Any], str]) -> Any:
+    """Return a rule of a section, from a function that says what is wrong, or nothing."""
+
+    def check(section: Any) -> Any:
+        if text := mistake(section):
+            raise ValueError(text)
+        return section
+
+    return model_validator(mode="after")(check)
+
+
+def _count_given(section: Any, names: Iterable[str]) -> int:
+    return sum(getattr(section, name) is not None for name in names)
+
+
+def exactly_one(*names: str) -> Any:
+    """Return the rule that a section has exactly one of some keys."""
+    text = f"expected exactly one of {', '.join(names)}"
+    return _rule(lambda section: "" if _count_given(section, names) == 1 else text)
+
+
+def at_most_one(*names: str) -> Any:
+    """Return the rule that a section has at most one of some keys."""
+    text = f"expected at most one of {', '.join(names)}"
+    return _rule(lambda section: "" if _count_given(section, names) < 2 else text)
+
+
+def goes_with(name: str, other: str) -> Any:
+    """Return the rule that a key makes sense beside another one alone."""
+    text = f"{other} goes with {name}, and only with it"
+    return _rule(lambda s: text if _count_given(s, [name]) < _count_given(s, [other]) else "")
+
+
+def by_kind(**keys: tuple[str, ...]) -> Any:
+    """Return the rule which keys each kind has; those that end in a question mark may be absent."""
+    kinds: dict[str, list[str]] = {}
+    for kind, names in keys.items():
+        for name in names:
+            kinds.setdefault(name.rstrip("?"), []).append(kind)
+
+    def mistake(section: Any) -> str:
+        for name, having in kinds.items():
+            is_set = getattr(section, name) is not None
+            if is_set and section.kind not in having:
+                return f"{name} goes with kind: {' or '.join(having)}, and only with it"
+            if not is_set and name in keys[section.kind]:
+                return f"{name} is missing, which goes with kind: {section.kind}"
+        return ""
+
+    return _rule(mistake)
+
+
+def key(text: str, default: Any = ..., **limits: Any) -> Any:
+    """Return a key of a section: what it is, with its unit; its default; limits of its own."""
+    return Field(default, description=text, **limits)
 
 
 class TelescopeSection(Section):
     """The pupil."""
 
-    diameter_m: q.Metres = Field(le=1e3, description="diameter of the pupil [m]")
-    obstruction: float = Field(
-        default=0.0,
-        ge=0,
-        le=0.99,
-        description="central obstruction over the diameter",
-    )
+    diameter_m: q.Metres = key("diameter of the pupil [m]", le=1e3)
+    obstruction: float = key("central obstruction over the diameter", 0.0, ge=0, le=0.99)
 
 
 class AtmosphereSection(Section):
     """The turbulence; ``outer_scale_m: null`` is Kolmogorov."""
 
-    seeing_arcsec: q.Arcseconds = Field(description="seeing [arcsec]")
-    outer_scale_m: q.Metres | None = Field(description="outer scale [m], null for Kolmogorov")
-    wind_speed_m_s: q.MetresPerSecond = Field(description="wind speed [m/s]")
-    seeing_wavelength_um: q.Micrometres = Field(
-        default=0.5, description="wavelength of the seeing [um]"
+    seeing_arcsec: q.Arcseconds = key("seeing [arcsec]")
+    outer_scale_m: q.Metres | None = key("outer scale [m], null for Kolmogorov")
+    wind_speed_m_s: q.MetresPerSecond = key("wind speed [m/s]")
+    seeing_wavelength_um: q.Micrometres = key("wavelength of the seeing [um]", 0.5)
+
+
+class PyramidSection(Section):
+    """Pyramid sensor, from which the noise is computed."""
+
+    wavelength_um: q.Micrometres = key("sensing wavelength [um]")
+    modulation_lambda_over_d: q.Gain = key("modulation radius [lambda/D]")
+    subapertures_across: q.Count = key("subapertures over the diameter", le=1000)
+    photons: q.Ratio = key("photons per subaperture and frame")
+    read_noise_electrons: q.RatioFromZero = key("read noise per pixel [electrons]")
+
+
+class SensorSection(Section):
+    """Measurement noise: given, or from a pyramid."""
+
+    noise_nm: q.NanometresOrEach | None = key(
+        "noise per frame [nm rms], or one per measurement", None
     )
+    noise_mas: q.Milliarcseconds | None = key("noise per frame [mas]", None)
+    pyramid: PyramidSection | None = key("a pyramid, whose noise is computed", None)
+    matrix: Matrix | None = key("rows: measurements by modes (default: identity)", None)
+    _rules = exactly_one("noise_nm", "noise_mas", "pyramid")
+
+
+class MotionSection(Section):
+    """How a channel of an accelerometer moves with a vibration, at its frequency."""
+
+    motion_nm_per_nm: q.Ratio = key(
+        "motion at the channel per motion of the wavefront [nm per nm rms]"
+    )
+    phase_deg: float = key("phase of it against the wavefront's [deg]", 0.0, ge=-360, le=360)
+
+
+class OtherSensorSection(Section):
+    """A sensor beside the loop's own: a wavefront sensor of another rate, or an accelerometer."""
+
+    kind: Literal["wavefront", "accelerometer"] = key("wavefront or accelerometer", "wavefront")
+    rate_hz: q.Hertz = key("readings per second, a fraction of the frame rate [Hz]")
+    delay_frames: float = key("total delay, in periods of the sensor [frames]", ge=1, le=100)
+    noise_nm: q.NanometresOrEach | None = key(
+        "noise of a reading of a wavefront sensor [nm rms]", None
+    )
+    matrix: Matrix | None = key("rows: measurements by modes (default: identity)", None)
+    channels: list[str] | None = key(
+        "names of the channels of an accelerometer", None, min_length=1
+    )
+    noise_m_s2: q.AccelerationOrEach | None = key(
+        "noise of a reading of an accelerometer [m/s^2]", None
+    )
+    highpass_hz: q.Hertz | None = key("corner of an accelerometer's high pass [Hz]", None)
+    covariance: Matrix | None = key(
+        "covariance of the noise, in place of its size [nm^2, (m/s^2)^2]", None
+    )
+    _rules = by_kind(
+        wavefront=("noise_nm?", "matrix?", "covariance?"),
+        accelerometer=("channels", "noise_m_s2?", "highpass_hz?", "covariance?"),
+    )
+    _one_noise = exactly_one("noise_nm", "noise_m_s2", "covariance")
 
 
 class LocalLoopSection(Section):
     """The mirror's local position loop: its gains, or the frequency and damping they make."""
 
-    natural_frequency_hz: q.Hertz = Field(description="frequency of the mode itself [Hz]")
-    damping: q.RatioFromZero = Field(description="damping ratio of that mode")
-    bandwidth_hz: q.Hertz | None = Field(default=None, description="frequency with the loop [Hz]")
-    bandwidth_damping: q.Ratio | None = Field(
-        default=None, description="damping with the loop, 0.7"
-    )
-    proportional_per_s2: float | None = Field(
-        default=None, ge=0, le=1e12, description="position gain [1/s^2]"
-    )
-    derivative_per_s: q.RatioFromZero | None = Field(
-        default=None, description="velocity gain [1/s]"
-    )
-    feed_forward: q.RatioFromZero = Field(
-        default=1.0, description="feed-forward over holding force"
-    )
-    sampling_hz: q.Hertz = Field(
-        default=72_000.0, description="rate, whole multiple of the frame rate [Hz]"
-    )
-    delay_samples: q.Whole = Field(
-        default=1, description="computing delay of the local loop [samples]"
-    )
-    ramp_samples: q.Count = Field(default=1, description="samples over which a command is ramped")
-
-    @model_validator(mode="after")
-    def _require_one_kind_of_gains(self) -> LocalLoopSection:
-        gains = (self.proportional_per_s2 is not None, self.derivative_per_s is not None)
-        if gains[0] != gains[1] or gains[0] == (self.bandwidth_hz is not None):
-            raise ValueError(
-                "expected either bandwidth_hz (and bandwidth_damping), or both of "
-                "proportional_per_s2 and derivative_per_s"
-            )
-        if self.bandwidth_damping is not None and self.bandwidth_hz is None:
-            raise ValueError("bandwidth_damping goes with bandwidth_hz, and only with it")
-        return self
+    natural_frequency_hz: q.Hertz = key("frequency of the mode itself [Hz]")
+    damping: q.RatioFromZero = key("damping ratio of that mode")
+    bandwidth_hz: q.Hertz | None = key("frequency with the loop [Hz]", None)
+    bandwidth_damping: q.Ratio | None = key("damping with the loop, 0.7", None)
+    proportional_per_s2: float | None = key("position gain [1/s^2]", None, ge=0, le=1e12)
+    derivative_per_s: q.RatioFromZero | None = key("velocity gain [1/s]", None)
+    feed_forward: q.RatioFromZero = key("feed-forward over holding force", 1.0)
+    sampling_hz: q.Hertz = key("rate, whole multiple of the frame rate [Hz]", 72_000.0)
+    delay_samples: q.Whole = key("computing delay of the local loop [samples]", 1)
+    ramp_samples: q.Count = key("samples over which a command is ramped", 1)
+    _one_position_gain = exactly_one("bandwidth_hz", "proportional_per_s2")
+    _one_velocity_gain = exactly_one("bandwidth_hz", "derivative_per_s")
+    _of_bandwidth = goes_with("bandwidth_hz", "bandwidth_damping")
 
 
 class MirrorSection(Section):
     """Deformable mirror; ``modes`` counts the controlled ones, for modal designs and end to end."""
 
-    modes: q.Count | None = Field(default=None, description="number of controlled modes")
-    influence_matrix: list[list[q.Entry]] | None = Field(
-        default=None, description="rows: modes by commands (default: identity)"
-    )
-    local_loop: LocalLoopSection | None = Field(
-        default=None, description="position loop (default: it settles at once)"
-    )
+    modes: q.Count | None = key("number of controlled modes", None)
+    influence_matrix: Matrix | None = key("rows: modes by commands (default: identity)", None)
+    local_loop: LocalLoopSection | None = key("position loop (default: it settles at once)", None)
 
 
 class LoopSection(Section):
     """Timing, and how many axes there are."""
 
-    axes: int | None = Field(default=None, ge=1, le=2, description="number of axes (default 2)")
-    frame_rate_hz: q.Hertz = Field(ge=0.1, description="frame rate [Hz]")
-    delay_frames: float = Field(
-        default=2.0, ge=1, le=LONGEST_DELAY, description="total delay [frames]"
-    )
+    axes: int | None = key("number of axes (default 2)", None, ge=1, le=2)
+    frame_rate_hz: q.Hertz = key("frame rate [Hz]", ge=0.1)
+    delay_frames: float = key("total delay [frames]", 2.0, ge=1, le=LONGEST_DELAY)
 
 
 class _LineSection(Section):
     # which of axis and direction_deg is needed depends on the number of axes
-    axis: Literal["tip", "tilt", "both"] | None = Field(
-        default=None, description="tip, tilt or both"
+    axis: Literal["tip", "tilt", "both"] | None = key("tip, tilt or both", None)
+    direction_deg: q.Degrees | None = key("angle from tip to tilt [deg]", None)
+    frequency_hz: q.Hertz = key("frequency [Hz], below half the frame rate")
+    rms_nm: q.Nanometres | None = key("standard deviation [nm rms]", None)
+    rms_mas: q.Milliarcseconds | None = key("standard deviation [mas]", None)
+    frequency_error_hz: q.HertzFromZero | None = key(
+        "how far the true frequency may be off [Hz]; 0 where it is known", None
     )
-    direction_deg: q.Degrees | None = Field(
-        default=None, description="angle from tip to tilt [deg]"
+    frequency_error_percent: q.RatioFromZero | None = key(
+        "the same in percent of the frequency", None
     )
-    frequency_hz: q.Hertz = Field(description="frequency [Hz], below half the frame rate")
-    rms_nm: q.Nanometres | None = Field(default=None, description="standard deviation [nm rms]")
-    rms_mas: q.Milliarcseconds | None = Field(default=None, description="standard deviation [mas]")
-    frequency_error_hz: q.HertzFromZero | None = Field(
-        default=None, description="how far the true frequency may be off [Hz]; 0 where it is known"
+    accelerometers: dict[str, MotionSection] | None = key(
+        "accelerometer channels that move with it", None
     )
-    frequency_error_percent: q.RatioFromZero | None = Field(
-        default=None, description="the same in percent of the frequency"
-    )
-    accelerometers: dict[str, MotionSection] | None = Field(
-        default=None, description="accelerometer channels that move with it"
-    )
-
-    @model_validator(mode="after")
-    def _require_one_size_and_direction(self) -> _LineSection:
-        if (self.rms_nm is None) == (self.rms_mas is None):
-            raise ValueError("expected exactly one of rms_nm, rms_mas")
-        if self.axis is not None and self.direction_deg is not None:
-            raise ValueError("expected exactly one of axis, direction_deg")
-        if None not in (self.frequency_error_hz, self.frequency_error_percent):
-            raise ValueError("expected one of frequency_error_hz, frequency_error_percent")
-        return self
+    _one_size = exactly_one("rms_nm", "rms_mas")
+    _one_direction = at_most_one("axis", "direction_deg")
+    _one_error = at_most_one("frequency_error_hz", "frequency_error_percent")
 
     @property
     def largest_error_hz(self) -> float | None:
@@ -144,64 +223,37 @@ class _LineSection(Section):
 class VibrationSection(_LineSection):
     """A vibration of the model; ``spread_hz`` makes several ``lines`` of it."""
 
-    damping: q.Damping = Field(description="damping ratio")
-    spread_hz: q.Hertz | None = Field(default=None, description="half width of its interval [Hz]")
-    lines: int | None = Field(
-        default=None, ge=1, le=64, description="how many lines cover it (default 5)"
-    )
-
-    @model_validator(mode="after")
-    def _require_spread_of_lines(self) -> VibrationSection:
-        if self.lines is not None and self.spread_hz is None:
-            raise ValueError("lines goes with spread_hz, and only with it")
-        return self
+    damping: q.Damping = key("damping ratio; above 1 nothing oscillates")
+    spread_hz: q.Hertz | None = key("half width of its interval [Hz]", None)
+    lines: int | None = key("how many lines cover it (default 5)", None, ge=1, le=64)
+    sections: int = key(_SECTIONS, 1, ge=1, le=MOST_SECTIONS)
+    _of_spread = goes_with("spread_hz", "lines")
 
 
 class TrueVibrationSection(_LineSection):
     """A vibration of the truth: a sinusoid, a resonance with its damping, or one that drifts."""
 
-    kind: Literal["sinusoid", "resonance", "drift"] = Field(
-        description="sinusoid, resonance or drift"
+    kind: Literal["sinusoid", "resonance", "drift"] = key("sinusoid, resonance or drift")
+    damping: q.Damping | None = key("damping ratio of a resonance or a drift", None)
+    sections: int | None = key(_SECTIONS, None, ge=1, le=MOST_SECTIONS)
+    end_hz: q.Hertz | None = key("frequency at the end of a drift [Hz]", None)
+    duration_s: q.Seconds | None = key("duration of a drift [s]", None)
+    _rules = by_kind(
+        sinusoid=(), resonance=("damping", "sections?"), drift=("damping?", "end_hz", "duration_s")
     )
-    damping: q.Damping | None = Field(
-        default=None, description="damping ratio of a resonance or a drift"
+
+
+class TurbulenceSection(Section):
+    """Auto-regressive turbulence: from the atmosphere, or by its coefficients."""
+
+    kind: Literal["ar1", "ar2", "ar"] = key(
+        "first or second order from the atmosphere, or any by its coefficients"
     )
-    end_hz: q.Hertz | None = Field(default=None, description="frequency at the end of a drift [Hz]")
-    duration_s: q.Seconds | None = Field(default=None, description="duration of a drift [s]")
-
-    @model_validator(mode="after")
-    def _require_what_the_kind_needs(self) -> TrueVibrationSection:
-        if self.kind != "drift" and (self.kind == "resonance") != (self.damping is not None):
-            raise ValueError(
-                "damping goes with kind: resonance, and only with it or with kind: drift"
-            )
-        for given in (self.end_hz, self.duration_s):
-            if (self.kind == "drift") != (given is not None):
-                raise ValueError("end_hz and duration_s go with kind: drift, and only with it")
-        return self
-
-
-class Ar1Section(Section):
-    """AR1 turbulence, from the atmosphere."""
-
-    kind: Literal["ar1"] = Field(description="first order, from the atmosphere")
-
-
-class Ar2Section(Section):
-    """AR2 turbulence, fitted to the atmosphere's spectrum above the noise."""
-
-    kind: Literal["ar2"] = Field(description="second order, from the atmosphere")
-
-
-class ArSection(Section):
-    """Auto-regressive turbulence by its coefficients."""
-
-    kind: Literal["ar"] = Field(description="any order, by its coefficients")
-    coefficients: list[q.Entry] = Field(min_length=1, description="of past values, newest first")
-    driving_rms_nm: float = Field(ge=1e-6, le=1e6, description="rms of the driving noise [nm]")
-
-
-TurbulenceSection = Annotated[Ar1Section | Ar2Section | ArSection, Field(discriminator="kind")]
+    coefficients: list[q.Entry] | None = key("of past values, newest first", None, min_length=1)
+    driving_rms_nm: Annotated[float, Field(ge=1e-6, le=1e6)] | None = key(
+        "rms of the driving noise [nm]", None
+    )
+    _rules = by_kind(ar1=(), ar2=(), ar=("coefficients", "driving_rms_nm"))
 
 
 class ModelSection(Section):
@@ -211,47 +263,40 @@ class ModelSection(Section):
         Annotated[TurbulenceSection, Tag(q.ONE)]
         | Annotated[list[TurbulenceSection], Field(min_length=1), Tag(q.EACH)],
         Discriminator(q.tag_one_or_each),
-    ] = Field(description="model of the turbulence, or one per axis")
-    vibrations: list[VibrationSection] | None = Field(
-        default=None, min_length=1, description="the vibrations, if there are any"
+    ] = key("model of the turbulence, or one per axis")
+    vibrations: list[VibrationSection] | None = key(
+        "the vibrations, if there are any", None, min_length=1
     )
-    sensor_gain: q.GainOrEach = Field(
-        default=1.0, description="sensor gain that the design assumes, or one per measurement"
+    sensor_gain: q.GainOrEach = key(
+        "sensor gain that the design assumes, or one per measurement", 1.0
     )
 
 
 class TruthSection(Section):
     """What the real loop meets; ``vibrations: model`` takes those of the model."""
 
-    turbulence: Literal["frozen_flow", "model", "none"] | None = Field(
-        default=None,
-        description="spectrum of the turbulence",
+    turbulence: Literal["frozen_flow", "model", "none"] | None = key(
+        "spectrum of the turbulence", None
     )
     vibrations: Annotated[
         Annotated[Literal["model"], Tag(q.ONE)]
         | Annotated[list[TrueVibrationSection], Tag(q.EACH)],
         Discriminator(q.tag_one_or_each),
-    ] = Field(default=[], description="the vibrations, or model: those of the model")
-    sensor_gain: q.GainOrEach = Field(
-        default=1.0, description="real sensor gain, or one per measurement"
-    )
+    ] = key("the vibrations, or model: those of the model", [])
+    sensor_gain: q.GainOrEach = key("real sensor gain, or one per measurement", 1.0)
 
 
 class ImagingSection(Section):
     """The camera."""
 
-    wavelength_um: q.Micrometres = Field(
-        default=2.2, description="wavelength of the Strehl ratio [um]"
-    )
-    other_modes_strehl: q.Fraction = Field(
-        default=1.0, description="Strehl ratio of all other modes"
-    )
+    wavelength_um: q.Micrometres = key("wavelength of the Strehl ratio [um]", 2.2)
+    other_modes_strehl: q.Fraction = key("Strehl ratio of all other modes", 1.0)
 
 
 def _design_section() -> type[Section]:
     """Return the defaults of the synthesis: options of the methods, and their own sections."""
     fields: dict[str, Any] = {}
-    for method in all_methods().values():
+    for method in METHODS.values():
         for name in sorted(method.configurable):
             option = method.options.model_fields[name]
             fields[name] = (option.annotation, option)
@@ -269,93 +314,67 @@ else:
 class SimulationSection(Section):
     """Time-domain runs."""
 
-    frames: q.Count = Field(default=8000, ge=2, description="frames recorded")
-    cases: q.Count = Field(default=4, description="independent runs")
-    seed: int = Field(default=0, ge=0, lt=2**128, description="seed of the random series")
-    settle_frames: q.Whole = Field(default=2000, description="frames before those recorded")
+    frames: q.Count = key("frames recorded", 8000, ge=2)
+    cases: q.Count = key("independent runs", 4)
+    seed: int = key("seed of the random series", 0, ge=0, lt=2**128)
+    settle_frames: q.Whole = key("frames before those recorded", 2000)
 
 
 class RobustnessSection(Section):
     """The studies over a frequency error, a sensor gain and a delay error."""
 
-    errors_hz: Annotated[list[q.Shift], Field(min_length=1)] | None = Field(
-        default=None,
-        description="true frequency minus the assumed one, of the vibration that moves most [Hz] "
+    errors_hz: Annotated[list[q.Shift], Field(min_length=1)] | None = key(
+        "true frequency minus the assumed one, of the vibration that moves most [Hz] "
         "(default: 15 steps over the stated errors, or over 17.5 % and at most 3.5 Hz)",
+        None,
     )
-    hold: Literal["driving", "rms"] = Field(
-        default="driving",
-        description="what a shifted vibration keeps: its driving or its own rms",
+    hold: Literal["driving", "rms"] = key(
+        "what a shifted vibration keeps: its driving or its own rms", "driving"
     )
-    sensor_gains: list[q.Gain] = Field(
-        default=[x / 40 for x in range(10, 53)],
-        min_length=1,
-        description="real sensor gains of maps",
+    sensor_gains: list[q.Gain] = key(
+        "real sensor gains of maps", [x / 40 for x in range(10, 53)], min_length=1
     )
-    delay_errors_frames: list[q.Shift] = Field(
-        default=[0.0], min_length=1, description="real delay minus the design's [frames]"
+    delay_errors_frames: list[q.Shift] = key(
+        "real delay minus the design's [frames]", [0.0], min_length=1
     )
 
 
 class EndToEndSection(Section):
     """The end-to-end simulation; the other sections describe its system."""
 
-    pixels: int = Field(default=60, ge=8, le=10_000, description="pixels across the pupil")
-    frames: q.Count = Field(default=1600, ge=2, description="frames of the exposure")
-    settle_frames: q.Count = Field(default=400, ge=200, description="frames before it")
-    gain: q.RatioFromZero = Field(
-        default=0.5, description="integrator gain of every mode without a filter"
-    )
-    leak: float = Field(default=0.97, ge=0, le=1, description="leak of the integrators")
-    leak_from_mode: q.Count = Field(default=50, ge=2, description="first mode with a leak")
-    actuators_across: int = Field(
-        default=31, ge=3, le=1000, description="actuators across the mirror"
-    )
-    wind_direction_deg: q.Degrees = Field(
-        default=0.0, description="direction of the wind [deg]; 0 is along tip"
-    )
-    calibration_nm: q.Nanometres = Field(
-        default=20.0, description="amplitude of the calibration [nm]"
-    )
+    pixels: int = key("pixels across the pupil", 60, ge=8, le=10_000)
+    frames: q.Count = key("frames of the exposure", 1600, ge=2)
+    settle_frames: q.Count = key("frames before it", 400, ge=200)
+    gain: q.RatioFromZero = key("integrator gain of every mode without a filter", 0.5)
+    leak: float = key("leak of the integrators", 0.97, ge=0, le=1)
+    leak_from_mode: q.Count = key("first mode with a leak", 50, ge=2)
+    actuators_across: int = key("actuators across the mirror", 31, ge=3, le=1000)
+    wind_direction_deg: q.Degrees = key("direction of the wind [deg]; 0 is along tip", 0.0)
+    calibration_nm: q.Nanometres = key("amplitude of the calibration [nm]", 20.0)
 
 
 class FileSection(Section):
     """A whole configuration file; an identified system knows no telescope and no atmosphere."""
 
-    version: int = Field(ge=1, le=1, description="version of the layout: 1")
-    units: Literal["nm", "um", "mas", "urad"] | None = Field(
-        default=None, description="what commands show wavefronts in: nm (default), um, mas or urad"
+    version: int = key("version of the layout: 1", ge=1, le=1)
+    units: Literal["nm", "um", "mas", "urad"] | None = key(
+        "what commands show wavefronts in: nm (default), um, mas or urad", None
     )
-    telescope: TelescopeSection | None = Field(default=None, description="the pupil")
-    atmosphere: AtmosphereSection | None = Field(default=None, description="the turbulence")
-    sensor: SensorSection = Field(description="noise of the measurements")
-    sensors: dict[str, OtherSensorSection] | None = Field(
-        default=None, min_length=1, description="sensors beside the loop's own, by name"
+    telescope: TelescopeSection | None = key("the pupil", None)
+    atmosphere: AtmosphereSection | None = key("the turbulence", None)
+    sensor: SensorSection = key("noise of the measurements")
+    sensors: dict[str, OtherSensorSection] | None = key(
+        "sensors beside the loop's own, by name", None, min_length=1
     )
-    mirror: MirrorSection = Field(default=MirrorSection(), description="the deformable mirror")
-    loop: LoopSection = Field(description="timing, and the number of axes")
-    model: ModelSection = Field(description="what the design assumes")
-    truth: TruthSection = Field(default=TruthSection(), description="what the loop meets")
-    imaging: ImagingSection = Field(
-        default=ImagingSection(), description="the camera of the Strehl ratio"
-    )
-    design: DesignSection = Field(
-        default=DesignSection(), description="defaults of the methods of synthesis"
-    )
-    simulation: SimulationSection = Field(
-        default=SimulationSection(), description="time-domain runs"
-    )
-    robustness: RobustnessSection = Field(
-        default=RobustnessSection(), description="errors that studies try"
-    )
-    end_to_end: EndToEndSection = Field(
-        default=EndToEndSection(), description="the end-to-end simulation"
-    )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _move_own_sensor(cls, raw: Any) -> Any:
-        return with_own_sensor(raw)
+    mirror: MirrorSection = key("the deformable mirror", MirrorSection())
+    loop: LoopSection = key("timing, and the number of axes")
+    model: ModelSection = key("what the design assumes")
+    truth: TruthSection = key("what the loop meets", TruthSection())
+    imaging: ImagingSection = key("the camera of the Strehl ratio", ImagingSection())
+    design: DesignSection = key("defaults of the methods of synthesis", DesignSection())
+    simulation: SimulationSection = key("time-domain runs", SimulationSection())
+    robustness: RobustnessSection = key("errors that studies try", RobustnessSection())
+    end_to_end: EndToEndSection = key("the end-to-end simulation", EndToEndSection())
 
     @property
     def usual_turbulence(self) -> str:
@@ -388,3 +407,63 @@ def config_schema() -> dict[str, Any]:
     """
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {"$schema": dialect, **FileSection.model_json_schema(), "title": "lbt-synth"}
+
+
+def describe_error(
+    error: ValidationError, schema: type[BaseModel] = FileSection
+) -> tuple[str, str]:
+    """Return one sentence on the first mistake, and the path of its key."""
+    details = error.errors()
+    missing = [_key_path(d["loc"]) for d in details if d["type"] == "missing"]
+    # an unknown key says more than the missing one that it was meant to be
+    first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
+    kind, key, got, mentioned = first["type"], _key_path(first["loc"]), first["input"], 1
+    if kind == "extra_forbidden":
+        *sections, word = first["loc"]
+        text = f"unknown key {key}; {suggest_word(str(word), _list_keys(schema, sections))}"
+    elif kind == "missing":
+        mentioned = len(missing)
+        one = mentioned == 1
+        text = f"the key{'' if one else 's'} {', '.join(missing)} {'is' if one else 'are'} missing."
+    elif kind == "value_error":
+        text = f"{key}: {first['ctx']['error']}."
+    elif kind == "too_short" and key.endswith("vibrations"):
+        text = f"{key} is empty; leave the key out for a model without vibrations."
+    elif kind == "model_type":
+        text = f"{key} must be a mapping of keys; got {got!r}."
+    else:
+        text = f"{key}: {first['msg'][0].lower()}{first['msg'][1:]}; got {got!r}."
+    rest = len(details) - mentioned
+    after = "this one" if mentioned == 1 else "these"
+    return text + (f" ({rest} more after {after}.)" if rest else ""), key
+
+
+def _key_path(location: Iterable[int | str]) -> str:
+    """Return the path of a key, without the tags of what may stand there."""
+    words = [f"[{p}]" if isinstance(p, int) else f".{p}" for p in location if p not in _TAGS]
+    return "".join(words).removeprefix(".")
+
+
+def _list_keys(model: type[BaseModel], location: Iterable[int | str]) -> list[str]:
+    """Return the keys that the schema knows at a location."""
+    sections: list[type[BaseModel]] = [model]
+    named_by_file = False  # the next word is a name that the file chooses, a key of a mapping
+    for word in location:
+        if isinstance(word, int) or word in _TAGS or named_by_file:
+            named_by_file = False
+            continue
+        fields = [
+            field
+            for section in sections
+            for name, field in section.model_fields.items()
+            if word == (field.alias or name)
+        ]
+        named_by_file = any(get_origin(field.annotation) is dict for field in fields)
+        sections = [inner for field in fields for inner in _list_sections(field.annotation)]
+    return sorted({f.alias or name for s in sections for name, f in s.model_fields.items()})
+
+
+def _list_sections(annotation: Any) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for arg in getattr(annotation, "__args__", ()) for m in _list_sections(arg)]

@@ -1,23 +1,34 @@
-"""Write a configuration file: the values that were set, in schema order, with comments."""
+"""Write configuration files with comments: settings as they are, or an identified system."""
 
 from __future__ import annotations
 
 import io
+import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.error import YAMLError
 
-from lbt_synth.config.schema import FileSection
+from lbt_synth.config.schema import FileSection, describe_error
 from lbt_synth.errors import ProblemError
+from lbt_synth.identification import IdentifiedModel
+from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.models import ARModel
 from lbt_synth.storage.atomic_files import write_atomically
-from lbt_synth.validation import require_instance
+from lbt_synth.validation import number, require_instance
 
+_AXES = ("tip", "tilt")
+_NAME = "accelerometer"  # of the instrument that all channels make
+_DIRECTIONS = {(1.0, 0.0): "tip", (0.0, 1.0): "tilt"}
+RAISED = "raised to the least that a configuration has"
+_LEAST_NM = 1e-3  # of noise and lines in a configuration
+_KIND_COMMENTS = {"line": "", "broad": "broad; ", "turbulence": "part of the turbulence; "}
 _COLUMN = 40  # where comments begin
 _LONGEST_LINE = 10**9  # a list stays on its line
 
@@ -26,15 +37,15 @@ def config_text(settings: FileSection, comments: Mapping[str, str] | None = None
     """Return the YAML of a configuration; see :func:`save_config`."""
     require_instance(settings, FileSection)
     content = settings.model_dump(exclude_unset=True)
-    left = dict(comments or {})
-    head = left.pop("", "")
-    for key, comment in left.items():
+    unused = dict(comments or {})
+    head = unused.pop("", "")
+    for key, comment in unused.items():
         if comment.splitlines() not in ([comment], []):
             raise ProblemError(f"the comment on {key} must be one line; got {comment!r}.")
-    document = _commented(content, "", left)
-    if left:
+    document = _commented(content, "", unused)
+    if unused:
         raise ProblemError(
-            f"comments must be on keys that are written; got one on {next(iter(left))}, which is "
+            f"comments must be on keys that are written; got one on {next(iter(unused))}, which is "
             "not. Keys are paths such as model.vibrations[0].rms_nm."
         )
     text = _dump(document, head)
@@ -112,18 +123,18 @@ def _commented(value: Any, path: str, comments: dict[str, str]) -> Any:
     if isinstance(value, dict):
         section = CommentedMap()
         for key, inner in value.items():
-            own = f"{path}.{key}" if path else key
-            section[key] = _commented(inner, own, comments)
-            if comment := comments.pop(own, ""):
+            place = f"{path}.{key}" if path else key
+            section[key] = _commented(inner, place, comments)
+            if comment := comments.pop(place, ""):
                 section.yaml_add_eol_comment(comment, key, column=_COLUMN)
         return section
     if not isinstance(value, list):
         return value
     entries = CommentedSeq()
     for i, inner in enumerate(value):
-        own = f"{path}[{i}]"
-        entries.append(_commented(inner, own, comments))
-        if comment := comments.pop(own, ""):
+        place = f"{path}[{i}]"
+        entries.append(_commented(inner, place, comments))
+        if comment := comments.pop(place, ""):
             depth = path.count(".") + 1
             entries.yaml_set_comment_before_after_key(i, before=comment, indent=2 * depth)
     if not (value and isinstance(value[0], dict)):
@@ -142,3 +153,219 @@ def _dump(document: CommentedMap, head: str) -> str:
     yaml.width = _LONGEST_LINE
     yaml.dump(document, text)
     return text.getvalue()
+
+
+def identified_config(
+    model: IdentifiedModel,
+    *,
+    diameter_m: float | None = None,
+    obstruction: float | None = None,
+    wavelength_um: float = 2.2,
+    other_modes_strehl: float = 1.0,
+    title: str = "An identified system.",
+    accelerometers: AccelerometerTransfers | None = None,
+) -> tuple[FileSection, dict[str, str]]:
+    """Return the configuration of an identified system, the truth being the model.
+
+    Parameters
+    ----------
+    model : IdentifiedModel
+        What was identified, of one or two axes.
+    diameter_m : float, optional
+        Telescope diameter [m]; the identified values, in nm, do not depend on it.
+    obstruction : float, optional
+        Diameter of the central obstruction as a fraction of ``diameter_m``.
+    wavelength_um : float, optional
+        Imaging wavelength [um] of Strehl ratios.
+    other_modes_strehl : float, optional
+        Strehl ratio that all other modes leave.
+    title : str, optional
+        Comment at the top of the file.
+    accelerometers : AccelerometerTransfers, optional
+        How accelerometers move with the lines of the model; channels that show none are left out.
+
+    Returns
+    -------
+    settings : FileSection
+        The configuration, for :func:`save_config`.
+    comments : dict of str to str
+        Standard errors by the paths of the keys, for :func:`save_config`.
+
+    Raises
+    ------
+    ProblemError
+        If the model has another number of axes, or a value that no configuration accepts.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lbt_synth as lbt
+    >>> noise = 3 * np.random.default_rng(0).standard_normal((8192, 1))
+    >>> record = lbt.identification.loop_record(noise, frame_rate_hz=800, unit="nm")
+    >>> settings, comments = lbt.config.identified_config(lbt.identify(record))
+    >>> [round(value) for value in settings.sensor.noise_nm], comments["sensor.noise_nm"]
+    ([3], 'standard error 0.024 nm')
+    """
+    axes = tuple(model.axes)
+    if len(axes) not in (1, 2):
+        raise ProblemError(f"a configuration has one or two axes; got a model of {len(axes)}.")
+    comments = {
+        "": title,
+        "sensor.noise_nm": _error_comment("nm", [axis.noise_error_nm for axis in axes]),
+    }
+    content = _known_content(
+        len(axes), model.frame_rate_hz, model.delay_frames, diameter_m, obstruction
+    )
+    noises = [_raised(axis.noise_nm, "sensor.noise_nm", comments) for axis in axes]
+    content["sensor"] = {"noise_nm": noises}
+    if model.mirror is not None:
+        content["mirror"] = {"local_loop": asdict(model.mirror)}
+    vibrations = _vibration_sections(model, comments)
+    if accelerometers is not None and accelerometers.used:
+        delay = model.delay_frames
+        content["sensors"] = {_NAME: _accelerometer_section(accelerometers, delay, comments)}
+        _add_motions(vibrations, accelerometers, comments)
+    content["model"] = {"turbulence": []}
+    for index, (name, axis) in enumerate(zip(_AXES, axes, strict=False)):
+        turbulence = axis.turbulence
+        content["model"]["turbulence"].append(turbulence_content(turbulence))
+        comments[f"model.turbulence[{index}]"] = f"{name}, rms {turbulence.rms_nm:.4g} nm"
+    content["truth"] = {"turbulence": "model"}
+    if vibrations:
+        content["model"]["vibrations"] = vibrations
+        content["truth"]["vibrations"] = "model"
+    gains = [float(axis.sensor_gain) for axis in axes]
+    if any(gain != 1 for gain in gains):
+        content["model"]["sensor_gain"] = content["truth"]["sensor_gain"] = gains
+        comments["model.sensor_gain"] = _error_comment(
+            "", [axis.sensor_gain_error or 0.0 for axis in axes]
+        )
+    content["imaging"] = {"wavelength_um": wavelength_um}
+    if other_modes_strehl != 1:
+        content["imaging"]["other_modes_strehl"] = other_modes_strehl
+    return _validated(content), {key: text for key, text in comments.items() if text}
+
+
+def require_writable_facts(
+    axes: int,
+    frame_rate_hz: float | None,
+    delay_frames: float | None,
+    *,
+    diameter_m: float | None = None,
+    obstruction: float | None = None,
+    wavelength_um: float = 2.2,
+) -> None:
+    """Refuse facts that no configuration can hold, before a model is identified for it."""
+    rate_hz, delay = frame_rate_hz or 1.0, delay_frames or 1.0  # what is not known is found
+    content = _known_content(axes, rate_hz, delay, diameter_m, obstruction)
+    turbulence = {"kind": "ar", "coefficients": [0.9], "driving_rms_nm": 1.0}
+    content |= {"sensor": {"noise_nm": 1.0}, "model": {"turbulence": turbulence}}
+    _validated(content | {"imaging": {"wavelength_um": wavelength_um}})
+
+
+def _known_content(
+    axes: int,
+    frame_rate_hz: float,
+    delay_frames: float,
+    diameter_m: float | None,
+    obstruction: float | None,
+) -> dict[str, Any]:
+    """Return what a configuration says that is not identified."""
+    if obstruction is not None and diameter_m is None:
+        raise ProblemError(
+            "obstruction is a fraction of diameter_m, which is missing. Give both, or neither."
+        )
+    content: dict[str, Any] = {"version": 1}
+    if diameter_m is not None:
+        content["telescope"] = {"diameter_m": diameter_m}
+        if obstruction is not None:
+            content["telescope"]["obstruction"] = obstruction
+    content["loop"] = {"axes": axes} if axes == 1 else {}
+    content["loop"] |= {
+        "frame_rate_hz": number(frame_rate_hz, "frame_rate_hz", above=0),
+        "delay_frames": number(delay_frames, "delay_frames", at_least=1),
+    }
+    return content
+
+
+def _validated(content: dict[str, Any]) -> FileSection:
+    try:
+        return FileSection.model_validate(content)
+    except ValidationError as error:
+        raise ProblemError(
+            f"the model cannot be written as a configuration: {describe_error(error)[0]}"
+        ) from error
+
+
+def _raised(value_nm: float, path: str, comments: dict[str, str]) -> float:
+    """Return a size that a configuration can hold, with a comment where it is not as it was."""
+    if 0 <= value_nm < _LEAST_NM:
+        comments[path] = f"{RAISED}, from {value_nm:.2g} nm"
+    return float(max(value_nm, _LEAST_NM)) if value_nm >= 0 else float(value_nm)
+
+
+def _vibration_sections(model: IdentifiedModel, comments: dict[str, str]) -> list[dict[str, Any]]:
+    """Return all vibrations, tip first, and add their errors to ``comments``."""
+    sections: list[dict[str, Any]] = []
+    for line in model.parts:
+        path = f"model.vibrations[{len(sections)}]"
+        frequency_error = _error_comment("Hz", [line.frequency_error_hz])
+        comments[f"{path}.frequency_hz"] = _KIND_COMMENTS[line.kind] + frequency_error
+        comments[f"{path}.damping"] = _error_comment("", [line.damping_error])
+        comments[f"{path}.rms_nm"] = _error_comment("nm", [line.rms_error_nm])
+        entry: dict[str, Any] = {}
+        if len(model.axes) > 1 and line.direction in _DIRECTIONS:
+            entry["axis"] = _DIRECTIONS[line.direction]
+        elif len(model.axes) > 1:
+            entry["direction_deg"] = line.direction_deg
+            error = _error_comment("degrees", [line.direction_error_deg or 0.0])
+            comments[f"{path}.direction_deg"] = error
+        for key in ("frequency_hz", "damping"):
+            entry[key] = float(getattr(line, key))
+        entry["rms_nm"] = _raised(line.rms_nm, f"{path}.rms_nm", comments)
+        if line.sections > 1:
+            entry["sections"] = line.sections
+        sections.append(entry)
+    return sections
+
+
+def _accelerometer_section(
+    transfers: AccelerometerTransfers, delay_frames: float, comments: dict[str, str]
+) -> dict[str, Any]:
+    """Return the section of the channels that are used, and comment on their delay."""
+    age, path = transfers.loop_age(delay_frames), f"sensors.{_NAME}.delay_frames"
+    comments[path] = f"readings come {age - 1} frames after the wavefront's"
+    if age != transfers.age_frames:
+        apart = transfers.age_frames - 1
+        comments[path] = f"not known: the clocks were {apart} frames apart; give the real delay"
+    return {
+        "kind": "accelerometer",
+        "rate_hz": float(transfers.rate_hz),
+        "delay_frames": float(age + delay_frames - 1),
+        "channels": [row.channel for row in transfers.used],
+        "noise_m_s2": [float(row.noise_m_s2) for row in transfers.used],
+    }
+
+
+def _add_motions(
+    vibrations: list[dict[str, Any]], transfers: AccelerometerTransfers, comments: dict[str, str]
+) -> None:
+    """Add to each vibration how the channels that show it move with it, with errors."""
+    for row in transfers.transfers:
+        if not row.useful:
+            continue
+        moving = vibrations[row.line].setdefault("accelerometers", {})
+        values = {"motion_nm_per_nm": row.motion_nm_per_nm, "phase_deg": row.phase_deg}
+        moving[row.channel] = values
+        path = f"model.vibrations[{row.line}].accelerometers.{row.channel}"
+        comments[f"{path}.motion_nm_per_nm"] = _error_comment("", [row.motion_error_nm_per_nm])
+        comments[f"{path}.phase_deg"] = _error_comment("degrees", [row.phase_error_deg])
+
+
+def _error_comment(unit: str, errors: Sequence[float]) -> str:
+    """Return standard errors as a comment, empty if none is known."""
+    is_known = [math.isfinite(error) and error > 0 for error in errors]
+    if not any(is_known):
+        return ""
+    texts = [f"{e:.2g}" if ok else "not known" for e, ok in zip(errors, is_known, strict=True)]
+    return f"standard error {', '.join(texts)} {unit}".rstrip()

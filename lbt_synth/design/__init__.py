@@ -1,9 +1,4 @@
-"""Controllers by convex synthesis, each with a certificate.
-
-Each method takes a plant or an estimation problem and returns a design.
-The certificate is computed after the synthesis and does not trust the solver.
-A design that fails its certificate is never returned: the method raises.
-"""
+"""Controllers by convex synthesis, each returned with a certificate that trusts no solver."""
 
 import lazy_loader
 

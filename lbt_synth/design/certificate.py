@@ -1,14 +1,15 @@
-"""Certificates: checks of a design, computed from its matrices and not from its solver."""
+"""Claims of a design, and the certificate that checks them, computed from its matrices alone."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.errors import CertificateError, DimensionError, ProblemError
 from lbt_synth.linear import (
-    Controller,
     EstimationProblem,
     StateSpace,
     hinf_norm,
@@ -17,21 +18,17 @@ from lbt_synth.linear import (
 )
 from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
-from lbt_synth.linear.norms import HinfNorm
 from lbt_synth.linear.riccati.filtering import kalman_gains, kalman_riccati
-from lbt_synth.loop import ClosedLoop, close_loop
+from lbt_synth.loop import ClosedLoop
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
-from lbt_synth.models import LoopHardware
-from lbt_synth.storage.rows import column, row_table
+from lbt_synth.storage.rows import Column, column, row_table
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import FloatArray, frozen_copy, number, set_fields
 
-GAIN_TOLERANCE = 1e-6
-NORM_TOLERANCE = 1e-6
-ORIGIN_TOLERANCE = 1e-5
-RESIDUAL_TOLERANCE = 1e-8
-INFEASIBLE_TOLERANCE = 1e-9
-VARIANCE_TOLERANCE = 1e-6
+TOLERANCE = 1e-6  # relative, of norms, variances and gains: what two routes differ by at most
+ORIGIN_TOLERANCE = 1e-5  # of a filter from that of its equation, and of a bound that is reached
+RESIDUAL_TOLERANCE = 1e-8  # of a Lyapunov equation
+INFEASIBLE_TOLERANCE = 1e-9  # of a level beside what is proved of it
 LEVEL_SETS = "level sets on the symplectic pencil"
 BY_DISTURBANCES = "disturbances that no measurement shows"
 _GRID = 513  # frequencies from 0 to the Nyquist frequency
@@ -127,63 +124,24 @@ class Certificate(Summarised):
 
 
 def certify_filter(
-    problem: EstimationProblem,
-    gain_predictor: FloatArray,
-    *,
-    gamma: float | None = None,
-    least_variance: bool = False,
+    problem: EstimationProblem, gain_predictor: FloatArray, *, least_variance: bool = False
 ) -> Certificate:
-    """Check a predictor gain against its problem.
+    """Check a predictor gain (n, q) against its problem, and that its variance is the least.
 
-    Eigenvalues give the spectral radius, a Lyapunov equation and its adjoint the variance,
-    level sets and a frequency grid the norm. With ``gamma``, the norm must not exceed it.
-    With ``least_variance``, the covariance of the Lyapunov equation must reproduce the
-    gain, which proves that it is the Kalman gain.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-        The problem.
-    gain_predictor : (n, q) ndarray
-        Predictor gain.
-    gamma : float, optional
-        Level that the error norm must not exceed.
-    least_variance : bool, optional
-        Whether the design claims the least variance.
-
-    Returns
-    -------
-    Certificate
-        Passed or not; call ``require()`` on it.
-
-    Raises
-    ------
-    DimensionError
-        If the gain does not fit the problem.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> p = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> lbt.design.certify_filter(p, [[0.618033988749895]], least_variance=True).passed
-    True
-    >>> lbt.design.certify_filter(p, [[0.7]], least_variance=True).passed
-    False
+    That holds if the covariance of the Lyapunov equation reproduces the gain.
     """
     error, period = problem.error_system(gain_predictor), problem.period
     name = "spectral radius of the filter" + " over a period" * (period > 1)
     whole = error if period == 1 else error.lifted_compactly()
-    certificate, norm, P = _examine_error(whole, name)
-    if norm is None or P is None:
+    certificate, P = _examine_error(whole, name)
+    if P is None:
         return certificate
     checks = list(certificate.checks)
-    if gamma is not None:
-        checks.append(bound_check(norm.upper, gamma))
     if least_variance:
         covariances = P[None] if period == 1 else error.covariances()
         distance = variance_distance(problem, gain_predictor, covariances)
         how = "gain recomputed from the Lyapunov covariance"
-        checks.append(Check("distance from the least-variance gain", distance, GAIN_TOLERANCE, how))
+        checks.append(Check("distance from the least-variance gain", distance, TOLERANCE, how))
     powers = certificate.rms_per_output.reshape(period, -1) ** 2  # of all phases, one by one
     rms = frozen_copy(np.sqrt(powers.mean(axis=0)))
     return replace(certificate, checks=tuple(checks), rms_per_output=rms)
@@ -200,41 +158,29 @@ def variance_distance(
     return apart / size if size > 0 else apart
 
 
-def bound_check(norm: float, bound: float) -> Check:
-    """Check the norm of an estimation error against the bound that was asked for."""
-    name = "norm of the estimation error over its bound, less 1"
-    return Check(name, norm / bound - 1, NORM_TOLERANCE, LEVEL_SETS)
-
-
 def certify_error(
     error: StateSpace, *, stability: str = "spectral radius of the filter"
 ) -> Certificate:
-    """Certify a system from disturbance to estimation error.
-
-    The checks are stability, the variance by a Lyapunov equation and its adjoint, and the norm by
-    level sets and on a frequency grid. ``stability`` names the first check.
-    """
+    """Certify a system from disturbance to error; ``stability`` names the first check."""
     return _examine_error(error, stability)[0]
 
 
-def _examine_error(
-    error: StateSpace, stability: str = "spectral radius of the filter"
-) -> tuple[Certificate, HinfNorm | None, FloatArray | None]:
-    """Return the certificate of an error, with its norm and covariance if it is stable."""
+def _examine_error(error: StateSpace, stability: str) -> tuple[Certificate, FloatArray | None]:
+    """Return the certificate of an error, with its covariance if it is stable."""
     stable = _radius_check(stability, error.spectral_radius)
     if not stable.passed:
         infinite = frozen_copy(np.full(len(error.C), np.inf))
-        return Certificate(checks=(stable,), gamma=np.inf, rms_per_output=infinite), None, None
+        return Certificate(checks=(stable,), gamma=np.inf, rms_per_output=infinite), None
     P, variances, checks = _examine_variance(error)
     norm = hinf_norm(error)
     grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
     highest = float(np.max(largest_singular_values(error, grid)))
     above = (highest - _rounding(error)) / max(norm.upper, _TINY) - 1
     how = f"{_GRID} frequencies against level sets"
-    peak = Check("singular values above the norm", above, NORM_TOLERANCE, how)
+    peak = Check("singular values above the norm", above, TOLERANCE, how)
     rms = frozen_copy(np.sqrt(np.maximum(variances, 0)))
     certificate = Certificate(checks=(stable, *checks, peak), gamma=norm.value, rms_per_output=rms)
-    return certificate, norm, P
+    return certificate, P
 
 
 def _examine_variance(error: StateSpace) -> tuple[FloatArray, FloatArray, tuple[Check, ...]]:
@@ -263,7 +209,7 @@ def _examine_variance(error: StateSpace) -> tuple[FloatArray, FloatArray, tuple[
         Check(
             "variance, against its adjoint equation",
             apart,
-            VARIANCE_TOLERANCE,
+            TOLERANCE,
             "relative, two Lyapunov equations",
         ),
     )
@@ -334,38 +280,6 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
     return Check(name, above, INFEASIBLE_TOLERANCE, BY_DISTURBANCES)
 
 
-def certify_loop(hardware: LoopHardware, controller: Controller) -> Check:
-    """Check that the loop closed around a controller is stable at the nominal sensor gain.
-
-    Parameters
-    ----------
-    hardware : LoopHardware
-        Sensor, mirror and delay.
-    controller : Controller
-        The controller.
-
-    Returns
-    -------
-    Check
-        Passed if the spectral radius is below 1 by more than 1e-9.
-
-    Raises
-    ------
-    ProblemError
-        If the controller does not fit the loop.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> lbt.design.certify_loop(
-    ...     path, lbt.Controller(A=1.0, B=1.5, C=1.0, D=0.0, dt_s=1 / 800)
-    ... ).passed
-    False
-    """
-    return stability_check("spectral radius of the closed loop", close_loop(hardware, controller))
-
-
 def stability_check(name: str, loop: ClosedLoop) -> Check:
     """Check the largest modulus of a loop's poles, per frame."""
     return _radius_check(name, loop.radius_per_frame)
@@ -373,3 +287,36 @@ def stability_check(name: str, loop: ClosedLoop) -> Check:
 
 def _radius_check(name: str, radius: float) -> Check:
     return Check(name, radius, 1 - STABILITY_MARGIN, "eigenvalues")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Evidence:
+    """What is computed of a design from its matrices alone, once for all its claims."""
+
+    design: Any
+    certificate: Certificate  # checks that rest on no claim, stability first; norms of the error
+    kalman: Any = None  # the Kalman filter of a filter's problem
+
+
+def _made_of_it(evidence: Evidence, value: Any) -> Iterable[Check]:
+    """Check nothing more: the controller is made of the value, and a file is compared with it."""
+    return ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Claim(Column):
+    """A number, or one per mode, that a design says of itself: how it is printed and checked."""
+
+    # from the evidence and the value claimed to the checks of it
+    checks: Callable[[Evidence, Any], Iterable[Check]] = _made_of_it
+
+
+def measured_claim(name: str, heading: str) -> Claim:
+    """Return the claim of a number of the certificate, which is computed again [nm]."""
+
+    def checks(evidence: Evidence, value: float) -> Iterable[Check]:
+        measured = getattr(evidence.certificate, name)
+        apart = abs(measured / value - 1) if value > 0 else measured
+        yield Check(f"{heading}, against the one claimed", apart, TOLERANCE, "relative")
+
+    return Claim(name=name, heading=heading, unit="nm", checks=checks)

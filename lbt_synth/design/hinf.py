@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from lbt_synth.design.filter_design import FilterDesign, filter_design
@@ -19,12 +21,8 @@ from lbt_synth.linear.riccati.filtering import (
 )
 from lbt_synth.validation import choice, number
 
-# A level this close to the least one counts as the least one itself.
-_AT_LEAST = 1e-9
-_CONTRADICTION = 1e-9  # relative, what rounding may take from a proof
-_LARGEST_LMI = 20  # states; the inequality takes minutes beyond
-_GREATEST = 1e100
-_GREATEST_RATIO = 1e6
+AT_LEAST = 1e-9  # a level this close to the least one counts as the least one itself
+LARGEST_LMI = 20  # states; the inequality takes minutes beyond
 
 
 def hinf(
@@ -71,12 +69,8 @@ def hinf(
         If both bounds are given, or a value is out of its range.
     InfeasibleError
         If the bound is below the least gamma; the message names the least.
-    DetectabilityError
-        If no stable filter exists.
-    NumericalError
-        If the solver fails.
-    CertificateError
-        If the design does not pass its checks.
+    DetectabilityError, NumericalError, CertificateError
+        As :func:`kalman`.
 
     Examples
     --------
@@ -96,7 +90,7 @@ def hinf(
     start = kalman_riccati(problem)
     if route == "lmi":
         problem.require_one_phase("the inequality", "route='riccati'")
-    if route is None and problem.n_states <= _LARGEST_LMI and problem.reads_all:
+    if route is None and problem.n_states <= LARGEST_LMI and problem.reads_all:
         try:
             return _design(problem, start, "lmi", gamma, gamma_ratio)
         except (NumericalError, CertificateError):  # noise far below the signal
@@ -114,13 +108,13 @@ def checked_bounds(
             f"got gamma={gamma!r} and gamma_ratio={gamma_ratio!r}."
         )
     if gamma is not None:
-        gamma = number(gamma, "gamma", above=0, at_most=_GREATEST)
+        gamma = number(gamma, "gamma", above=0, at_most=1e100)
     if gamma_ratio is not None:
         gamma_ratio = number(
             gamma_ratio,
             "gamma_ratio",
             at_least=1,
-            at_most=_GREATEST_RATIO,
+            at_most=1e6,
             hint=f"At 1 the bound is the least one; far above it {far_above}.",
         )
     return gamma, gamma_ratio
@@ -134,13 +128,28 @@ def _design(
     gamma_ratio: float | None,
 ) -> FilterDesign:
     """Find the least gamma by one route, and the filter of the level asked for."""
-    synthesis = _LmiRoute(problem, start) if route == "lmi" else _RiccatiRoute(problem, start)
-    gains, witness = synthesis.least_gamma()
+    gains: FilterRiccati
+    lower, upper = _kalman_bracket(problem, start)
+    if route == "lmi":
+        from lbt_synth.linear.lmi.filters import hinf_lmi, least_gamma_lmi
+
+        scales: dict[str, Any] = {"coordinates": start.P, "scale": upper}
+        gains, witness = least_gamma_lmi(problem, **scales)
+
+        def central(gamma: float) -> FilterRiccati:
+            return hinf_lmi(problem, gamma, **scales)
+    else:
+        _, level, best = least_gamma(problem, lower=lower, upper=upper, start=start)
+        gains, witness = best, worst_invisible_disturbance(problem, best.P, level, start.P)
+
+        def central(gamma: float) -> FilterRiccati:
+            return _central(problem, start, gamma)
+
     least, infeasible = _verified_bracket(problem, start, gains, witness)
     requested = gamma if gamma is not None else least * (gamma_ratio or 1)
     require_reachable(requested, least)
-    if requested > least * (1 + _AT_LEAST):
-        gains = synthesis.central(requested)
+    if requested > least * (1 + AT_LEAST):
+        gains = central(requested)
     design = filter_design(
         problem,
         gains.gain_predictor,
@@ -152,60 +161,32 @@ def _design(
         gamma_infeasible=infeasible,
         witness=witness,
     )
-    if design.gamma < infeasible * (1 - _CONTRADICTION):
+    if design.gamma < infeasible * (1 - AT_LEAST):
         raise _contradiction_error(infeasible, design.gamma)
     return design
 
 
+def _central(problem: EstimationProblem, start: FilterRiccati, gamma: float) -> FilterRiccati:
+    """Return the filter of a level by the gamma-Riccati equation."""
+    solution = gamma_riccati(problem, gamma, start=start)
+    if solution is None:
+        raise InfeasibleError(
+            f"the gamma-Riccati equation has no stabilising solution at gamma = {gamma:.9g}. "
+            "Try a larger gamma.",
+            gamma=gamma,
+        )
+    return solution
+
+
 def require_reachable(gamma: float, least: float) -> None:
     """Refuse a level below the least one."""
-    if gamma < least * (1 - _AT_LEAST):
+    if gamma < least * (1 - AT_LEAST):
         raise InfeasibleError(
             f"gamma must be at least {least:.12g}, the least of this problem; got {gamma:.12g}. "
             "Try gamma_ratio=1.2.",
             gamma=gamma,
             gamma_least=least,
         )
-
-
-class _RiccatiRoute:
-    """Filters by the gamma-Riccati equation."""
-
-    def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
-        self.problem, self.start = problem, start
-
-    def least_gamma(self) -> tuple[FilterRiccati, Witness]:
-        lower, upper = _kalman_bracket(self.problem, self.start)
-        _, level, best = least_gamma(self.problem, lower=lower, upper=upper, start=self.start)
-        return best, worst_invisible_disturbance(self.problem, best.P, level, self.start.P)
-
-    def central(self, gamma: float) -> FilterRiccati:
-        solution = gamma_riccati(self.problem, gamma, start=self.start)
-        if solution is None:
-            raise InfeasibleError(
-                f"the gamma-Riccati equation has no stabilising solution at gamma = {gamma:.9g}. "
-                "Try a larger gamma.",
-                gamma=gamma,
-            )
-        return solution
-
-
-class _LmiRoute:
-    """Filters by linear matrix inequalities, in the coordinates of the Kalman filter."""
-
-    def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
-        self.problem, self.start = problem, start
-        self.scale = _kalman_bracket(problem, start)[1]
-
-    def least_gamma(self) -> tuple[FilterRiccati, Witness]:
-        from lbt_synth.linear.lmi.filters import least_gamma_lmi
-
-        return least_gamma_lmi(self.problem, coordinates=self.start.P, scale=self.scale)
-
-    def central(self, gamma: float) -> FilterRiccati:
-        from lbt_synth.linear.lmi.filters import hinf_lmi
-
-        return hinf_lmi(self.problem, gamma, coordinates=self.start.P, scale=self.scale)
 
 
 def _verified_bracket(
@@ -221,7 +202,7 @@ def _verified_bracket(
         )
     least = hinf_norm(error).upper
     infeasible = infeasible_level(problem, witness, start.P)
-    if infeasible > least * (1 + _CONTRADICTION):
+    if infeasible > least * (1 + AT_LEAST):
         raise _contradiction_error(infeasible, least)
     return least, min(infeasible, least)
 

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import ClassVar
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.polynomial.chebyshev import Chebyshev, chebpts2
+from scipy.optimize import brentq
 
-from lbt_synth.design.claims import Claim
-from lbt_synth.design.integrator_law import LAW_CLAIMS, PURE, IntegratorLaw
+from lbt_synth.design.certificate import LEVEL_SETS, TOLERANCE, Check, Claim, Evidence
 from lbt_synth.design.result import Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError, ProblemError
-from lbt_synth.linear import Controller
-from lbt_synth.loop import LoopEnsemble, close_loop, stable_sensor_gains
+from lbt_synth.linear import Controller, hinf_norm
+from lbt_synth.loop import ClosedLoop, LoopEnsemble, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import noise_covariance
 from lbt_synth.loop.ensemble import ensemble_vibration, residuals_from_matrices, textbook_matrices
+from lbt_synth.loop.margins import phase_margin_deg
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.vibration import stationary_vibrations
-from lbt_synth.validation import ComplexArray, FloatArray, number, require_instance
+from lbt_synth.validation import (
+    ComplexArray,
+    FloatArray,
+    Positive,
+    check_fields,
+    frozen_copy,
+    number,
+    require_instance,
+)
 
 TRIED_GAINS = 1e-4, 0.999  # range of gains that are tried, as fractions of the limit
 # A line far above the bandwidth leaves one minimum with its amplification and one without: the
@@ -28,8 +37,124 @@ _TRIALS = np.concatenate([np.geomspace(TRIED_GAINS[0], 0.1, 12), np.linspace(0.1
 _NODES = chebpts2(12)  # of the last search, in an interval from -1 to 1
 _CONVERGED = 1e-8  # last coefficients of a polynomial, over the range of its values
 _ROUNDS = 12
-_BISECTIONS = 27  # from a trial to the next one; 1e-9 of the gain
+_SPARE = 1e-9  # of a margin that is demanded, for the rounding of the gain that just keeps it
 _LEAST_GAIN = 1e-3  # as a part of that of a usual loop: two integrators are stable there or never
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IntegratorLaw:
+    """The control law ``gain (1 - c z^-1) / (1 - leak z^-1)^integrators``, and its demands.
+
+    Without a zero, ``c = 0``; else ``c = exp(-2 pi zero_hz / frame_rate)``. The defaults are the
+    pure integrator. One integrator with a zero is a PI controller of proportional gain
+    ``c gain`` and integral gain ``(1 - c) gain``. Two integrators with a zero are an integrator
+    with a lag compensator: below the zero the loop gain falls with the square of the frequency.
+
+    Parameters
+    ----------
+    leak : float, optional
+        Part of a command that is left after a frame, the pole of each integrator; 1 keeps all.
+    integrators : int, optional
+        Number of integrators, 1 or 2.
+    zero_hz : float, optional
+        Corner frequency of the zero [Hz].
+    phase_margin_deg : float, optional
+        Least phase margin of the loop [deg].
+    modulus_margin : float, optional
+        Least modulus margin of the loop.
+
+    Raises
+    ------
+    ProblemError
+        If a value is out of range.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> law = lbt.design.IntegratorLaw(leak=0.99, phase_margin_deg=45)
+    >>> round(lbt.integrator(path, law=law).gain, 3)
+    0.527
+    """
+
+    leak: Annotated[float, ("above", 0), ("at_most", 1)] = 1.0
+    integrators: Annotated[int, ("at_least", 1), ("at_most", 2)] = 1
+    zero_hz: Positive | None = None
+    phase_margin_deg: Annotated[float, ("above", 0), ("below", 180)] | None = None
+    modulus_margin: Annotated[float, ("above", 0), ("below", 1)] | None = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @property
+    def is_pure(self) -> bool:
+        """Whether it is one integrator without leak or zero."""
+        return (self.leak, self.integrators, self.zero_hz) == (1.0, 1, None)
+
+    @property
+    def demands(self) -> dict[str, float]:
+        """The margins that are demanded, by the name of their field."""
+        named = {name: getattr(self, name) for name in ("phase_margin_deg", "modulus_margin")}
+        return {name: least for name, least in named.items() if least is not None}
+
+    def changes(self) -> dict[str, Any]:
+        """Return the fields that are not those of the pure integrator."""
+        usual = asdict(IntegratorLaw())
+        return {name: value for name, value in asdict(self).items() if value != usual[name]}
+
+    def controller(self, hardware: LoopHardware, gain: float) -> Controller:
+        """Return the controller of a gain.
+
+        Raises
+        ------
+        ProblemError
+            If the zero is not below half the frame rate.
+        """
+        nyquist_hz = hardware.frame_rate_hz / 2
+        if self.zero_hz is not None and not self.zero_hz < nyquist_hz:
+            raise ProblemError(
+                f"zero_hz must be below half the frame rate, {nyquist_hz:g} Hz; "
+                f"got {self.zero_hz:g}."
+            )
+        c = 0.0 if self.zero_hz is None else float(np.exp(-np.pi * self.zero_hz / nyquist_hz))
+        a, reconstructor = self.leak, np.linalg.pinv(hardware.sensor @ hardware.influence)
+        D = 0.0
+        if self.integrators == 1:  # c may be above the leak: the zero is then a lead
+            A, B, C, D = [[a]], [[1.0]], [[1 - c / a]], c / a
+        else:
+            A, B, C = [[a, 0.0], [a - c, a]], [[1.0], [1.0]], [[0.0, 1.0]]
+        each = np.eye(len(reconstructor))
+        return Controller(
+            A=frozen_copy(np.kron(A, each)),
+            B=frozen_copy(np.kron(B, gain * reconstructor)),
+            C=frozen_copy(np.kron(C, each)),
+            D=frozen_copy(D * gain * reconstructor),
+            dt_s=hardware.dt_s,
+        )
+
+    def margins(self, loop: ClosedLoop) -> dict[str, float]:
+        """Return the margins of a stable loop that are demanded, by the names of the demands."""
+        found = {}
+        if self.phase_margin_deg is not None:
+            found["phase_margin_deg"] = phase_margin_deg(loop)
+        if self.modulus_margin is not None:
+            found["modulus_margin"] = 1 / hinf_norm(loop.output_sensitivity()).upper
+        return found
+
+
+PURE = IntegratorLaw()
+
+
+def _margin_claim(name: str, margin: str, unit: str, how: str) -> Claim:
+    """Return the claim of a margin that the loop keeps."""
+
+    def checks(evidence: Evidence, demanded: float) -> Iterator[Check]:
+        design = evidence.design
+        achieved = design.law.margins(close_loop(design.hardware, design.controller))[name]
+        label = f"{margin} demanded over achieved, less 1"
+        yield Check(label, demanded / achieved - 1, TOLERANCE, how)
+
+    return Claim(name=name, heading=f"{margin} demanded", unit=unit, checks=checks)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -39,7 +164,14 @@ class IntegratorDesign(Design):
     It claims its gain, what its law changes, and the margins that it keeps.
     """
 
-    CLAIMS: ClassVar[tuple[Claim, ...]] = LAW_CLAIMS
+    CLAIMS: ClassVar[tuple[Claim, ...]] = (
+        Claim(name="gain", heading="gain"),
+        Claim(name="leak", heading="left of a command after a frame"),
+        Claim(name="integrators", heading="integrators"),
+        Claim(name="zero_hz", heading="corner of the zero", unit="Hz"),
+        _margin_claim("phase_margin_deg", "phase margin", "deg", "each measurement broken in turn"),
+        _margin_claim("modulus_margin", "modulus margin", "", LEVEL_SETS),
+    )
 
     problem: LoopHardware
 
@@ -139,8 +271,7 @@ def _design_with_gain(
 def integrator_gain_limit(delay_frames: float) -> float:
     """Gain at which an integrator loop becomes unstable.
 
-    ``2 sin(pi / (2 (2 d - 1)))`` for a whole delay of d frames; for a fractional
-    one the limit is found numerically.
+    It is ``2 sin(pi / (2 (2 d - 1)))`` for a whole delay of d frames.
 
     Parameters
     ----------
@@ -163,17 +294,11 @@ def integrator_gain_limit(delay_frames: float) -> float:
     >>> [round(lbt.design.integrator_gain_limit(d), 3) for d in (2, 3, 4)]
     [1.0, 0.618, 0.445]
     """
-    hardware = LoopHardware(frame_rate_hz=1.0, delay_frames=delay_frames, modes=1)
-    d = hardware.delay_frames
-    if d == round(d):
-        return float(2 * np.sin(np.pi / (2 * (2 * d - 1))))
-    return _limit_above(hardware, 0.5 / d)  # stable: well below the limit of the next whole delay
+    return hardware_gain_limit(LoopHardware(frame_rate_hz=1.0, delay_frames=delay_frames, modes=1))
 
 
 def hardware_gain_limit(hardware: LoopHardware, law: IntegratorLaw = PURE) -> float:
     """Gain at which the loop of a law becomes unstable, with the dynamics of the mirror."""
-    if hardware.mirror is None and law.is_pure:
-        return integrator_gain_limit(hardware.delay_frames)
     single = hardware.single_mode()
     taps = single.mirror_taps
     mean_delay_frames = 1 + float(np.abs(np.arange(taps.size) @ taps))
@@ -189,12 +314,7 @@ def hardware_gain_limit(hardware: LoopHardware, law: IntegratorLaw = PURE) -> fl
                 f"frames without a zero_hz below {highest:.3g}; "
                 f"got {'none' if law.zero_hz is None else f'{law.zero_hz:g}'}."
             )
-    return _limit_above(single, gain, law)
-
-
-def _limit_above(hardware: LoopHardware, gain: float, law: IntegratorLaw = PURE) -> float:
-    """Return the gain limit of a loop that is stable with a given gain."""
-    return gain * stable_sensor_gains(hardware, law.controller(hardware, gain))[1]
+    return gain * stable_sensor_gains(single, law.controller(single, gain))[1]
 
 
 def _allowed_gains(hardware: LoopHardware, law: IntegratorLaw, trials: FloatArray) -> FloatArray:
@@ -204,11 +324,13 @@ def _allowed_gains(hardware: LoopHardware, law: IntegratorLaw, trials: FloatArra
     """
 
     def excess(log_gain: float) -> float:
-        """Return the least margin over its demand, less 1."""
+        """Return the least margin over its demand, less 1 and what rounding may take."""
         loop = close_loop(hardware, law.controller(hardware, float(np.exp(log_gain))))
         if not loop.is_stable:
             return -1.0
-        return min(found / law.demands[name] for name, found in law.margins(loop).items()) - 1
+        return (
+            min(found / law.demands[name] for name, found in law.margins(loop).items()) - 1 - _SPARE
+        )
 
     tried = np.log(trials)
     over = np.array([excess(trial) for trial in tried])
@@ -223,20 +345,10 @@ def _allowed_gains(hardware: LoopHardware, law: IntegratorLaw, trials: FloatArra
     last = int(kept[-1])
     outside = np.flatnonzero(over[:last] < 0)
     first = int(outside[-1]) + 1 if outside.size else 0
-    ends = [tried[first : last + 1]]
-    if first > 0:
-        ends.insert(0, _last_allowed(excess, tried[first], tried[first - 1]))
-    if last + 1 < tried.size:
-        ends.append(_last_allowed(excess, tried[last], tried[last + 1]))
-    return np.unique(np.concatenate(ends))
-
-
-def _last_allowed(excess: Callable[[float], float], inner: float, outer: float) -> FloatArray:
-    """Return the end of an interval between a point inside it and one outside, from inside."""
-    for _ in range(_BISECTIONS):
-        middle = (inner + outer) / 2
-        inner, outer = (middle, outer) if excess(middle) >= 0 else (inner, middle)
-    return np.array([inner])
+    sides = [(tried[first - 1], tried[first])] if first > 0 else []
+    sides += [(tried[last], tried[last + 1])] if last + 1 < tried.size else []
+    ends = [brentq(excess, *side, xtol=_SPARE / 100) for side in sides]
+    return np.unique(np.concatenate([tried[first : last + 1], ends]))
 
 
 def optimal_integrator(

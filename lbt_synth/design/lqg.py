@@ -25,13 +25,14 @@ from typing import ClassVar, NamedTuple, TypeAlias
 import numpy as np
 
 from lbt_synth.design.certificate import (
-    GAIN_TOLERANCE,
-    VARIANCE_TOLERANCE,
+    TOLERANCE,
     Check,
+    Claim,
+    Evidence,
     certify_error,
     certify_filter,
+    measured_claim,
 )
-from lbt_synth.design.claims import Claim, Evidence, measured_claim
 from lbt_synth.design.result import (
     MODEL_LIMITS,
     Design,
@@ -46,7 +47,7 @@ from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
-from lbt_synth.models.plant.parts import held_frames
+from lbt_synth.models.plant.assembly import held_frames
 from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.storage.rows import Column
 from lbt_synth.validation import (
@@ -57,7 +58,6 @@ from lbt_synth.validation import (
     require_instance,
 )
 
-_SQUARINGS = 60
 Vector: TypeAlias = FloatArray  # which may be empty
 
 
@@ -73,7 +73,7 @@ def _check_objective(evidence: Evidence, objective_nm: float) -> Iterator[Check]
     for name, value, claimed in pairs:
         apart = abs(value / claimed - 1) if claimed > 0 else value
         how = "relative, Lyapunov equation of the whole loop"
-        yield Check(name, apart, VARIANCE_TOLERANCE, how)
+        yield Check(name, apart, TOLERANCE, how)
 
 
 def _check_weight(evidence: Evidence, rho: float) -> Iterator[Check]:
@@ -96,7 +96,7 @@ def _check_weight(evidence: Evidence, rho: float) -> Iterator[Check]:
         size = max(float(np.linalg.norm(better)), 1e-300)
         worst = max(worst, float(np.linalg.norm(law - better)) / size)
     how = "gains recomputed from a Lyapunov equation"
-    yield Check("distance from the least-cost regulator", worst, GAIN_TOLERANCE, how)
+    yield Check("distance from the least-cost regulator", worst, TOLERANCE, how)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -185,23 +185,9 @@ class LqgDesign(Design):
         return np.concatenate([of_filter, np.linalg.eigvals(closed).astype(np.complex128)])
 
     def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
-        """System from w to the residual of the loop.
+        """System from w to the residual of the loop: states are estimation error, estimate, mirror.
 
-        Parameters
-        ----------
-        problem : EstimationProblem, optional
-            A TipTiltPlant of the same loop and as many states, with other disturbances; the
-            design's own by default.
-
-        Returns
-        -------
-        StateSpace
-            States: estimation error, estimate, mirror.
-
-        Raises
-        ------
-        ProblemError
-            If the other problem is no plant of as many states.
+        The other problem is a TipTiltPlant of as many states, or a ProblemError.
         """
         own = self.estimation
         real = own
@@ -251,12 +237,11 @@ def lqg_controller(
     """Make the controller from y(k) to u(k): the filter, and the states of mirror and delay."""
     hardware = plant.hardware
     full = replace(estimation_plant(plant), hardware=hardware).full()
-    n, (states, q) = full.n_states, gain_predictor.shape
-    law, gain = np.zeros((hardware.modes, n)), np.zeros((n, q))
-    law[:, :states], gain[:states] = gain_state, gain_predictor
+    states, law = len(gain_predictor), np.zeros((hardware.modes, full.n_states))
+    law[:, :states] = gain_state
     end = states + gain_mirror.size * hardware.n_commands
     law[:, states:end] = -np.kron(gain_mirror, hardware.influence)
-    return replace(full, L=law).controller(gain)
+    return full.controller(gain_predictor, hardware.projector @ law)
 
 
 def estimation_plant(plant: TipTiltPlant) -> TipTiltPlant:
@@ -330,14 +315,11 @@ def loop_variances(plant: TipTiltPlant, controller: Controller) -> tuple[float, 
 
 
 class Regulator(NamedTuple):
-    """Commands ``N u = gain_state x - gain_mirror m``, with the Riccati solution behind them.
-
-    ``weight`` is ``d^2 + rho + G'XG``; ``status`` and ``iterations`` are those of the equation.
-    """
+    """Commands ``N u = gain_state x - gain_mirror m``, with what their Riccati equation says."""
 
     gain_state: FloatArray
     gain_mirror: FloatArray
-    weight: float
+    weight: float  # ``d^2 + rho + G'XG``
     status: str
     iterations: int
 
@@ -366,12 +348,8 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
         If the plant is none of :func:`tip_tilt_plant`, or an argument is out of its range.
     DimensionError
         If the mirror does not reach every mode.
-    DetectabilityError
-        If no stable filter exists.
-    NumericalError
-        If a Riccati equation is not solved.
-    CertificateError
-        If the design does not pass its checks.
+    DetectabilityError, NumericalError, CertificateError
+        As :func:`kalman`.
 
     Examples
     --------
@@ -443,18 +421,9 @@ def _regulator(core: Response, pieces: Pieces, A: FloatArray, rho: float) -> Reg
     gain_mirror = (G @ X @ F + d @ h) / total
     closed = F - np.outer(G, gain_mirror)
     left = np.outer(d, gain_mirror) - h
-    crossed = _solve_stein(closed.T, A, np.einsum("gc,gan->acn", left, L))
+    # the solution of Y = closed' Y A + drive, in which the modes are drives
+    drives = np.einsum("gc,gan->cna", left, L).reshape(-1, L.shape[1])
+    stein = np.eye(len(drives)) - np.kron(closed.T, A.T)
+    crossed = np.linalg.solve(stein, drives).T.reshape(-1, *map(len, (F, A)))
     gain_state = (np.einsum("g,gan->an", d, L) - np.einsum("i,aij,jk->ak", G, crossed, A)) / total
     return Regulator(gain_state, gain_mirror, total, solved.route, solved.iterations)
-
-
-def _solve_stein(left: FloatArray, right: FloatArray, drive: FloatArray) -> FloatArray:
-    """Solve ``Y = left Y right + drive`` for a stack of drives, by squaring."""
-    Y = drive
-    for _ in range(_SQUARINGS):
-        step = left @ Y @ right
-        Y = Y + step
-        if np.max(np.abs(step)) <= 1e-18 * max(float(np.max(np.abs(Y))), 1e-300):
-            break
-        left, right = left @ left, right @ right
-    return np.asarray(Y)

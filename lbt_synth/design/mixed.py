@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from lbt_synth.design.filter_design import FilterDesign, filter_design
-from lbt_synth.design.hinf import hinf, require_reachable
+from lbt_synth.design.hinf import AT_LEAST, hinf, require_reachable
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
@@ -35,14 +35,10 @@ if TYPE_CHECKING:
 _Answer: TypeAlias = tuple[FloatArray, float, str]  # taps, level, what the solver said
 
 _DECADES = 4.0  # of gamma, over which a central filter is searched
-_SLACK = 4e-7  # by which a central filter may miss its norm
 _ROUNDS = 20
 _FIRST_GRID = 48
 _FINE_GRID = 1024
-_EXCESS = 4e-7  # by which the norm may exceed its bound; the certificate allows 1e-6
-_ROOM = 2e-7  # by which the bound at the frequencies is tightened
-_SAME = 1e-9
-_MOST_TAPS = 64
+_EXCESS = 4e-7  # by which a norm may exceed its bound; the certificate allows 1e-6
 _TAPS = 16
 _EDGE = 1e-5  # this close to the least gamma, its own filter is returned
 
@@ -94,10 +90,8 @@ def mixed(
         If not exactly one bound is given, or a value is out of its range.
     InfeasibleError
         If no filter meets the bound.
-    NumericalError
-        If the programme fails.
-    CertificateError
-        If the design does not pass its checks.
+    DetectabilityError, NumericalError, CertificateError
+        As :func:`kalman`.
 
     Examples
     --------
@@ -127,7 +121,7 @@ def mixed(
     least, best = hinf(problem, route="riccati"), kalman(problem)
     if rms is not None:
         bound = number(rms, "rms", above=0)
-        if bound < best.rms * (1 - _SAME):
+        if bound < best.rms * (1 - AT_LEAST):
             raise InfeasibleError(
                 f"rms must be at least {best.rms:.9g}, that of the Kalman filter; got {bound:.9g}."
             )
@@ -138,7 +132,7 @@ def mixed(
             return bound - deviation
 
         def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
-            return programme.minimize_level((bound * (1 - _ROOM)) ** 2, grid)
+            return programme.minimize_level((bound * (1 - _EXCESS / 2)) ** 2, grid)
     else:
         if gamma_ratio is not None:
             gamma = least.gamma_least * number(gamma_ratio, "gamma_ratio", at_least=1)
@@ -153,9 +147,9 @@ def mixed(
             return norm - bound
 
         def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
-            return programme.minimize_variance(bound * (1 - _ROOM), grid)
+            return programme.minimize_variance(bound * (1 - _EXCESS / 2), grid)
 
-    base = CentralFilters(problem, least).member(measure)
+    base = _central_member(problem, least, measure)
     if not problem.reads_all:  # no impulse response: the least variance among central filters
         return _central_design(
             base, least, method="mixed", gamma_requested=gamma, rms_requested=rms
@@ -167,7 +161,7 @@ def mixed(
 
 def require_taps(taps: int) -> int:
     """Return the length of the impulse response, checked."""
-    return integer(taps, "taps", at_least=1, at_most=_MOST_TAPS)
+    return integer(taps, "taps", at_least=1, at_most=64)
 
 
 def _complete_base(
@@ -283,8 +277,8 @@ def central_filter(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     bound = number(gamma, "gamma", above=0)
     least = hinf(problem, route="riccati")
     require_reachable(bound, least.gamma_least)
-    gains = CentralFilters(problem, least).member(lambda norm, _: norm - bound)
-    return _central_design(gains, least, method="hinf", gamma_requested=bound * (1 + _SLACK))
+    gains = _central_member(problem, least, lambda norm, _: norm - bound)
+    return _central_design(gains, least, method="hinf", gamma_requested=bound * (1 + _EXCESS))
 
 
 def _central_design(
@@ -304,36 +298,32 @@ def _central_design(
     )
 
 
-class CentralFilters:
-    """The central filters of a problem, from that of the least gamma to the Kalman filter."""
+def _central_member(
+    problem: EstimationProblem, least: FilterDesign, measure: Callable[[float, float], float]
+) -> FilterDesign | FilterRiccati:
+    """Return the central filter at which a rising measure of norm and deviation is zero.
 
-    def __init__(self, problem: EstimationProblem, least: FilterDesign) -> None:
-        self.problem, self.least = problem, least
-        self.start = kalman_riccati(problem)
+    The central filters go from that of the least gamma to the Kalman filter; where the measure does
+    not change its sign, it is one of these.
+    """
+    start = kalman_riccati(problem)
+    filters: dict[float, FilterDesign | FilterRiccati] = {0.0: least}
+    sizes = {0.0: measure(least.gamma, least.rms)}
 
-    def member(self, measure: Callable[[float, float], float]) -> FilterDesign | FilterRiccati:
-        """Return the filter at which a rising measure of norm and deviation is zero.
+    def size(decades: float) -> float:
+        level = least.gamma * 10**decades
+        solution = gamma_riccati(problem, level, start=start) if decades else None
+        if solution is not None:
+            error = problem.error_system(solution.gain_predictor)
+            variance = float(np.trace(np.mean(error.output_covariances(), axis=0)))
+            filters[decades] = solution
+            sizes[decades] = measure(float(hinf_norm(error)), float(np.sqrt(variance)))
+        return sizes.get(decades, sizes[0.0])
 
-        Where the measure does not change its sign it is one end of the family.
-        """
-        gains: dict[float, FilterDesign | FilterRiccati] = {0.0: self.least}
-        found = {0.0: measure(self.least.gamma, self.least.rms)}
-
-        def value(decades: float) -> float:
-            level = self.least.gamma * 10**decades
-            solution = gamma_riccati(self.problem, level, start=self.start) if decades else None
-            if solution is not None:
-                error = self.problem.error_system(solution.gain_predictor)
-                mean = np.mean(error.output_covariances(), axis=0)
-                variance = float(np.trace(mean))
-                gains[decades] = solution
-                found[decades] = measure(float(hinf_norm(error)), float(np.sqrt(variance)))
-            return found.get(decades, found[0.0])
-
-        if found[0.0] >= 0:
-            return gains[0.0]
-        if value(_DECADES) <= 0:
-            return self.start
-        brentq(value, 0.0, _DECADES, xtol=1e-9)
-        # the closest on the side of smaller norms
-        return gains[max(decades for decades, size in found.items() if size <= 0)]
+    if sizes[0.0] >= 0:
+        return least
+    if size(_DECADES) <= 0:
+        return start
+    brentq(size, 0.0, _DECADES, xtol=1e-9)
+    # the closest on the side of smaller norms
+    return filters[max(decades for decades, value in sizes.items() if value <= 0)]

@@ -9,29 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lbt_synth.design.certificate import Certificate
-from lbt_synth.design.fallbacks import Fallback
+from lbt_synth.design.filter_design import Fallback
+from lbt_synth.design.plain import from_plain, to_plain
 from lbt_synth.design.result import Design, SolverReport
 from lbt_synth.linear import Controller, EstimationProblem, Witness
-from lbt_synth.models import (
-    ARModel,
-    FullStatePlant,
-    LoopHardware,
-    PositionLoop,
-    TipTiltPlant,
-    Vibration,
-)
-from lbt_synth.models.plant.parts import PlantParts
+from lbt_synth.models import LoopHardware, SensorSuite, TipTiltPlant
+from lbt_synth.models.plant.assembly import PlantParts
 from lbt_synth.models.plant.tip_tilt import assemble
-from lbt_synth.models.sensor_suite import (
-    Accelerometer,
-    Motion,
-    Sensor,
-    SensorSuite,
-    WavefrontSensor,
-)
 from lbt_synth.validation import (
     FloatArray,
-    float_array,
     frozen_copy,
     integer,
     number,
@@ -42,13 +28,11 @@ from lbt_synth.validation import (
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]
 
-_SENSORS: dict[str, type[Sensor]] = {"wavefront": WavefrontSensor, "accelerometer": Accelerometer}
-_SENSOR_ARRAYS = ("noise_nm", "sensor_matrix", "noise_m_s2")
+_PLANT_MODELS = ("turbulence", "vibrations", "motions")
 _CHECK = ("name", "value", "limit", "computed_by")
 _PROBLEMS: dict[str, type[EstimationProblem | LoopHardware]] = {
     "problem": EstimationProblem,
     "plant": TipTiltPlant,
-    "full plant": FullStatePlant,
     "loop": LoopHardware,
 }
 
@@ -97,8 +81,8 @@ class DesignRecord:
             delay_frames=meta["delay_frames"],
             sensor_matrix=self.arrays["SENSOR"],
             influence_matrix=self.arrays["INFLUENCE"],
-            mirror=PositionLoop(**meta["mirror"]) if "mirror" in meta else None,
-            suite=SensorSuite(sensors=tuple(_unpack_sensor(part) for part in meta["sensors"])),
+            mirror=from_plain(meta.get("mirror")),
+            suite=SensorSuite(sensors=from_plain(meta["sensors"])),
         )
 
     def problem(self) -> EstimationProblem | LoopHardware:
@@ -107,30 +91,16 @@ class DesignRecord:
         if kind is LoopHardware:
             return self.hardware()
         if kind is not EstimationProblem:
-            return self._assembled_plant(full=kind is FullStatePlant)
+            return self._assembled_plant()
         fields: dict[str, Any] = {name: self.arrays[f"PLANT_{name}"] for name in "ABCDL"}
         return EstimationProblem(**fields, dt_s=self.meta["dt_s"])
 
-    def _assembled_plant(self, *, full: bool) -> EstimationProblem:
+    def _assembled_plant(self) -> TipTiltPlant:
         """Return the plant of loop, turbulence, vibrations and noise, with a filter's memory."""
-        hardware, meta = self.hardware(), self.meta
-        parts = PlantParts(
-            hardware=hardware,
-            turbulence=tuple(
-                ARModel(**model, frame_rate_hz=hardware.frame_rate_hz)
-                for model in meta["turbulence"]
-            ),
-            vibrations=tuple(
-                Vibration(**{**line, "direction": tuple(line["direction"])})
-                for line in meta["vibrations"]
-            ),
-            noise_factor=self.arrays["NOISE"],
-            motions=tuple(
-                {name: Motion(**motion) for name, motion in moved.items()}
-                for moved in meta["motions"]
-            ),
-        )
-        plant = assemble(parts).full() if full else assemble(parts)
+        models = {name: from_plain(self.meta[name]) for name in _PLANT_MODELS}
+        noise_factor = self.arrays["NOISE"]
+        parts = PlantParts(hardware=self.hardware(), noise_factor=noise_factor, **models)
+        plant = assemble(parts)
         memory = self.arrays["PLANT_L"][:, plant.n_states :]
         return plant.with_memory(memory) if memory.size else plant
 
@@ -170,18 +140,6 @@ def _unpack_parameters(name: str, record: DesignRecord) -> tuple[Controller, ...
     return tuple(record.controller(f"YOULA{mode + 1}_", D=direct) for mode in range(modes))
 
 
-def _pack_specifications(name: str, specifications: tuple[Any, ...]) -> DesignRecord:
-    from lbt_synth.design.shaping.specification import to_metadata
-
-    return DesignRecord(meta={name: [to_metadata(spec) for spec in specifications]})
-
-
-def _unpack_specifications(name: str, record: DesignRecord) -> tuple[Any, ...]:
-    from lbt_synth.design.shaping.specification import from_metadata
-
-    return tuple(from_metadata(spec) for spec in record.meta[name])
-
-
 def _pack_witness(name: str, witness: Witness | None) -> DesignRecord:
     if witness is None:
         return DesignRecord()
@@ -219,7 +177,10 @@ _CODECS = {  # by the type of the field
     "Witness | None": _Codec(_pack_witness, _unpack_witness),
     "tuple[Fallback, ...]": _Codec(_pack_fallbacks, _unpack_fallbacks),
     "tuple[Controller, ...]": _Codec(_pack_parameters, _unpack_parameters),
-    "tuple[Specification, ...]": _Codec(_pack_specifications, _unpack_specifications),
+    "tuple[Specification, ...]": _Codec(
+        lambda name, specifications: DesignRecord(meta={name: to_plain(specifications)}),
+        lambda name, record: from_plain(record.meta[name]),
+    ),
     "tuple[float, ...]": _Codec(
         lambda name, values: DesignRecord(meta={name: list(values)}),
         lambda name, record: tuple(number(v, name, above=0) for v in record.meta[name]),
@@ -278,9 +239,9 @@ def record_hardware(hardware: LoopHardware) -> DesignRecord:
             "phase": "nm rms wavefront",
         },
     }
-    meta["sensors"] = [_pack_sensor(sensor) for sensor in hardware.suite.sensors]
+    meta["sensors"] = to_plain(hardware.suite.sensors)
     if hardware.mirror is not None:
-        meta["mirror"] = asdict(hardware.mirror)
+        meta["mirror"] = to_plain(hardware.mirror)
     return DesignRecord({"SENSOR": hardware.sensor, "INFLUENCE": hardware.influence}, meta)
 
 
@@ -290,39 +251,11 @@ def record_problem(problem: EstimationProblem | LoopHardware) -> DesignRecord:
     if problem is getattr(problem, "hardware", None):
         return DesignRecord(meta=meta)
     arrays: Arrays = {f"PLANT_{name}": getattr(problem, name) for name in "ABCDL"}
-    plant: TipTiltPlant | None = getattr(problem, "reduced", None)
+    plant = problem if isinstance(problem, TipTiltPlant) else None
     if plant is not None:
-        meta["turbulence"] = [
-            {"coefficients": ar.coefficients.tolist(), "driving_rms_nm": ar.driving_rms_nm}
-            for ar in plant.turbulence
-        ]
-        meta["vibrations"] = [
-            {**asdict(line), "direction": list(line.direction)} for line in plant.vibrations
-        ]
-        meta["motions"] = [
-            {name: asdict(motion) for name, motion in moved.items()} for moved in plant.motions
-        ]
+        meta |= {name: to_plain(getattr(plant, name)) for name in _PLANT_MODELS}
         arrays["NOISE"] = plant.own_noise_factor
     return DesignRecord(arrays, meta)
-
-
-def _pack_sensor(sensor: Sensor) -> Meta:
-    packed: Meta = {"kind": next(name for name, kind in _SENSORS.items() if type(sensor) is kind)}
-    for name, value in asdict(sensor).items():
-        if value is not None:
-            packed[name] = list(value) if name == "channels" else np.asarray(value).tolist()
-    return packed
-
-
-def _unpack_sensor(packed: Meta) -> Sensor:
-    values = dict(packed)
-    kind = _SENSORS[values.pop("kind")]
-    for name in _SENSOR_ARRAYS:
-        if isinstance(values.get(name), list):
-            values[name] = float_array(values[name], name)
-    if "channels" in values:
-        values["channels"] = tuple(values["channels"])
-    return kind(**values)
 
 
 def certificate_record(certificate: Certificate) -> list[Meta]:

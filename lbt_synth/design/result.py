@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
-from lbt_synth.design.certificate import Certificate, stability_check
-from lbt_synth.design.claims import Claim, Evidence
+from lbt_synth.design.certificate import Certificate, Claim, Evidence, stability_check
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget
@@ -69,24 +68,12 @@ class SolverReport:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RowTable:
-    """A table that ``show`` prints of a design.
+    """A table that ``show`` prints of a design."""
 
-    Attributes
-    ----------
-    key : str
-        Name in JSON.
-    title : str
-        Line above the table.
-    rows : sequence
-        Rows made with :func:`lbt_synth.storage.rows.table_row`, all of one type.
-    notes : sequence of str
-        What the rows mean, and what they warn of.
-    """
-
-    key: str
+    key: str  # in JSON
     title: str
-    rows: Sequence[Any]
-    notes: Sequence[str] = ()
+    rows: Sequence[Any]  # made with :func:`lbt_synth.storage.rows.table_row`, all of one type
+    notes: Sequence[str] = ()  # what the rows mean, and what they warn of
 
 
 UNCERTIFIED = Certificate(checks=(), gamma=np.nan, rms_per_output=np.zeros(0))
@@ -154,7 +141,7 @@ class Design(Summarised, ABC):
     @property
     def plant(self) -> TipTiltPlant | None:
         """Plant that the design is for, with its models; None for one that is made of less."""
-        return getattr(self.problem, "reduced", None)
+        return self.problem if isinstance(self.problem, TipTiltPlant) else None
 
     @property
     def gamma(self) -> float:
@@ -258,15 +245,7 @@ class Design(Summarised, ABC):
         return Facts(columns, {**what, **self.claims, **self.derived()})
 
     def close(self, hardware: LoopHardware, *, sensor_gain: float = 1.0) -> ClosedLoop:
-        """Close a loop around the design, which is stable or not; with the sensors that it reads.
-
-        Parameters
-        ----------
-        hardware : LoopHardware
-            Sensor, mirror and delay.
-        sensor_gain : float, optional
-            Real gain of the loop's own sensor relative to its matrix.
-        """
+        """Close a loop around the design, stable or not, with the sensors that it reads."""
         if self.hardware is not None and self.other_sensors:
             hardware = replace(hardware, suite=self.hardware.suite)
         return close_loop(hardware, self, sensor_gain=sensor_gain)
@@ -303,23 +282,11 @@ class Design(Summarised, ABC):
         return np.linalg.eigvals(self.controller.A).astype(np.complex128)
 
     def to_control(self) -> Any:
-        """Return the controller as a ``control.StateSpace`` in the textbook form.
-
-        Returns
-        -------
-        control.StateSpace
-            ``u(k) = C x(k) + D y(k)``, the same input-output map.
-        """
+        """Return the controller as a ``control.StateSpace``, ``u(k) = C x(k) + D y(k)``."""
         return self.controller.to_statespace().to_control()
 
     def recertify(self) -> Certificate:
-        """Compute the certificate again from the matrices, and check each claim.
-
-        Returns
-        -------
-        Certificate
-            Passed or not.
-        """
+        """Compute the certificate again from the matrices, and check each claim; passed or not."""
         return self._conclude(self.examine())
 
     def _conclude(self, evidence: Evidence) -> Certificate:
@@ -362,10 +329,7 @@ def require_hardware(design: Design, what: str) -> LoopHardware:
 
 
 def model_limits(design: Design) -> Mapping[str, float | None]:
-    """Return the values of ``MODEL_LIMITS``: residual in the own model, limit, and how far above.
-
-    Both are in the image. They are None without a loop, and what cannot be computed is nan.
-    """
+    """Return residual and limit in the image of the own model, and how far above it is."""
     plant = design.plant
     if plant is None:
         return {}

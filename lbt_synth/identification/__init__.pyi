@@ -14,13 +14,8 @@ from .prediction.comparison import prediction_against_data as prediction_against
 from .prediction.residual import ResidualEstimate as ResidualEstimate
 from .prediction.residual import replayed_residual as replayed_residual
 from .records.from_file import load_record as load_record
-from .records.from_file import record_from_telemetry as record_from_telemetry
 from .records.from_series import loop_record as loop_record
-from .records.line_priors import LinePrior as LinePrior
-from .records.line_priors import accelerometer_lines as accelerometer_lines
-from .records.line_priors import load_lines as load_lines
 from .records.record import LoopRecord as LoopRecord
 from .records.record import SpectrumRecord as SpectrumRecord
-from .records.record import require_length as require_length
 from .stretches import split_halves as split_halves
 from .tracking import TrackingController as TrackingController

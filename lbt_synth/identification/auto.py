@@ -14,6 +14,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError, SynthesisError
@@ -24,12 +25,11 @@ from lbt_synth.identification.commands.verdict import (
     judge_fitted_gains,
     record_law,
 )
-from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, POSSIBLE_GAINS
+from lbt_synth.identification.fit.fitting import GAIN_STEP, PLAUSIBLE_GAINS, POSSIBLE_GAINS
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.fit.identify import OPEN_GAIN, identify
 from lbt_synth.identification.prediction.comparison import PredictionTable, compare_designs
 from lbt_synth.identification.prediction.residual import ResidualEstimate
-from lbt_synth.identification.records.line_priors import LinePrior
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
@@ -51,7 +51,6 @@ _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 _MISFIT = 1.5  # factor by which a gain may be off where the model leaves something out
-_STEP = 0.05  # of the logarithm of a gain, between gains that are tried: a loop hardly changes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,7 +85,7 @@ def design_from_record(
     method: str | None = None,
     gamma_ratio: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
-    announced: Sequence[LinePrior] = (),
+    announced: ArrayLike = (),
     imaging: Imaging | None = None,
     accept_record: bool = False,
     command_scale_known: bool = False,
@@ -343,8 +342,8 @@ def _running_gains(record: LoopRecord) -> tuple[float, float]:
     law = record_law(record)
     if law is None or law.kind == "none" or law.lag_frames < 0:
         return POSSIBLE_GAINS
-    gains, one = _gains_between(*POSSIBLE_GAINS), np.ones((1, record.axes))
-    ran = [could_have_run(CommandRepair(), gain * one, record, law) for gain in gains]
+    gains = _gains_between(*POSSIBLE_GAINS)
+    ran = [could_have_run(CommandRepair(), [gain], record, law) for gain in gains]
     if not any(ran):
         return POSSIBLE_GAINS
     beside = np.convolve(ran, [1, 1, 1], "same") > 0  # the limit is between two gains
@@ -353,7 +352,7 @@ def _running_gains(record: LoopRecord) -> tuple[float, float]:
 
 def _gains_between(start: float, end: float) -> FloatArray:
     """Return gains from one to another, both of them included."""
-    return np.geomspace(start, end, int(np.ceil(abs(np.log(end / start)) / _STEP)) + 1)
+    return np.geomspace(start, end, int(np.ceil(abs(np.log(end / start)) / GAIN_STEP)) + 1)
 
 
 def unstable_gains(

@@ -21,13 +21,13 @@ from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.fit.identify import axis_periodogram, find_axis
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
+from lbt_synth.identification.records.record import FEW
 from lbt_synth.linear.block_filtering import last_state
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.validation import FloatArray, float_array, number, require_instance
 
 _LEAST_FRAMES = 2 * SHORTEST_SEGMENT  # in a window: fewer are no spectrum
-_MOST_SPOILT = 0.01  # of the frames of a window; with more there is no fit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,9 +180,9 @@ class TrackingController:
         """Return the plant of the last window."""
         hw, window = self._hardware, np.array(self._past)
         share = float(np.mean(window[:, -1]))
-        if share > _MOST_SPOILT:
+        if share > FEW:
             raise ProblemError(
-                f"at most {100 * _MOST_SPOILT:g} % of a window's measurements may be missing; got "
+                f"at most {100 * FEW:g} % of a window's measurements may be missing; got "
                 f"{100 * share:.3g} %. The next window may have fewer."
             )
         axes = []
@@ -217,8 +217,7 @@ class TrackingController:
 def _plant_of(design: object) -> TipTiltPlant:
     """Return the plant of a filter; refuse a design that is none, or of another problem."""
     plant: TipTiltPlant | None = getattr(design, "plant", None)
-    same = plant is getattr(design, "problem", None)  # not so the full form of a plant
-    if plant is None or not same or not hasattr(design, "gain_filter"):
+    if plant is None or not hasattr(design, "gain_filter"):
         kind = getattr(design, "method", type(design).__name__)
         raise ProblemError(
             "only filters of a TipTiltPlant can take over in a running loop (kalman, hinf, mixed, "

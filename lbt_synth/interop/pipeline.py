@@ -10,32 +10,43 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 import lbt_synth
 from lbt_synth.design import Check, Design
-from lbt_synth.design.modal.per_mode import name_modes
-from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.design.modal.stack import name_modes
+from lbt_synth.design.result import require_hardware
+from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
-from lbt_synth.interop.proof import LOSS, NOISE, POLE, Written, prove_written
-from lbt_synth.linear.controller import RunningController
+from lbt_synth.interop.proof import FRAMES, LOSS, Written, prove_written, rehearsal_error
+from lbt_synth.linear.controller import as_controller
+from lbt_synth.loop import close_loop
 from lbt_synth.loop.simulation.disturbances import Disturbance
-from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
-from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.loop.simulation.run import (
+    Simulation,
+    SteppedController,
+    settling_frames,
+    simulate,
+)
+from lbt_synth.models import LoopHardware
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
 from lbt_synth.storage.rows import column, json_record, table_row
-from lbt_synth.validation import FloatArray, choice
+from lbt_synth.validation import FloatArray, choice, number, require_instance
 
 CERTIFICATE = ".certificate.json"  # added to the name of what is written: its certificate
-FRAMES = 2000
 # without *, \ and ? no text ends a comment, splices lines or makes a trigraph
 _UNSAFE = re.compile(r"[^A-Za-z0-9 ._,:;+\-=()<>%'/\[\]|]")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
+
+
+_MOST_SETTLING = 0.25  # part of the frames that the loops may settle in
 
 
 @table_row
@@ -266,50 +277,52 @@ def export(
     ...     np.load(file).tolist()
     [[0.5, 0.5, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
     """
-    own = target_named(target)
-    given = {"modes": modes, "other_gain": other_gain}
-    options |= {name: value for name, value in given.items() if value is not None}
-    if unknown := options.keys() - own.options.keys():
+    program = target_named(target)
+    mode_options = {"modes": modes, "other_gain": other_gain}
+    options |= {name: value for name, value in mode_options.items() if value is not None}
+    if unknown := options.keys() - program.options.keys():
         raise ProblemError(f"{min(unknown)} is no option of target {target}. Leave it out.")
-    settings = {**own.options, **options}
-    place = require_ending(path, f"a file for {target}", own.endings) if own.endings else Path(path)
+    settings = {**program.options, **options}
+    place = Path(path)
+    if program.endings:
+        place = require_ending(path, f"a file for {target}", program.endings)
     parts, count = mode_designs(
         design,
         target,
         modes=modes,
         other_gain=other_gain,
         hardware=hardware,
-        modal=modes is not None if own.modal is None else own.modal,
-        mixed=own.mixed,
-        reads_others=own.reads_others,
+        modal=modes is not None if program.modal is None else program.modal,
+        mixed=program.mixed,
+        reads_others=program.reads_others,
     )
     first = parts[0].design
     origin = _provenance_lines(first, gain_digest)
-    numbers = own.round([part.design for part in parts], **settings)
-    whole = own.join(numbers, parts, count)
+    numbers = program.round([part.design for part in parts], **settings)
+    file_numbers = program.join(numbers, parts, count)
     pairs = list(zip(parts, numbers, strict=True))
-    error = max(rehearsal_error(part.design, own.start(held, np.inf)) for part, held in pairs)
-    precision = settings.get("precision", own.arithmetic.precision)
-    files = own.write(place, whole, first, origin, gain_digest=gain_digest, **settings)
-    again = own.read(files, whole)
-    if not _is_same(again, whole):
+    error = max(rehearsal_error(part.design, program.start(held, np.inf)) for part, held in pairs)
+    precision = settings.get("precision", program.arithmetic.precision)
+    files = program.write(place, file_numbers, first, origin, gain_digest=gain_digest, **settings)
+    again = program.read(files, file_numbers)
+    if not _is_same(again, file_numbers):
         raise NumericalError(
             "the file must hold the numbers that are proved; what is read from it is another.",
             status="arithmetic",
         )
-    checks = _proved(own, pairs, error)
-    _require_proved(target, precision, checks, error, own.hint)
-    remarks = [own.remark(part.design, held) for part, held in pairs]
+    checks = _proved(program, pairs, error)
+    _require_proved(target, precision, checks, error, program.hint)
+    remarks = [program.remark(part.design, held) for part, held in pairs]
     notes = list(dict.fromkeys(filter(None, remarks)))
-    if own.contents:
+    if program.contents:
         make_directory(place, parents=False)
-    settings |= {"modes": count, "notes": notes, **own.facts(whole, **settings)}
+    settings |= {"modes": count, "notes": notes, **program.facts(file_numbers, **settings)}
     kept = {name: settings[name] for name in sorted(settings) if settings[name] is not None}
-    certificate = _certificate(files, target, own.arithmetic, checks, gain_digest, kept)
+    certificate = _certificate(files, target, program.arithmetic, checks, gain_digest, kept)
     return Exported(
         files=write_together(dict((*files.items(), *certificate.items()))),
         error=error,
-        start=lambda limit: own.start(again, limit),
+        start=lambda limit: program.start(again, limit),
         checks=checks,
         notes=tuple(notes),
     )
@@ -342,19 +355,19 @@ def _is_same(one: Any, other: Any) -> bool:
     if isinstance(one, Mapping):
         return one.keys() == other.keys() and all(_is_same(one[key], other[key]) for key in one)
     if is_dataclass(one):
-        names = (each.name for each in fields(one))
+        names = (entry.name for entry in fields(one))
         return all(_is_same(getattr(one, name), getattr(other, name)) for name in names)
     return bool(one == other)
 
 
 def _proved(
-    own: Target, pairs: Sequence[tuple[ModeDesign, Any]], error: float
+    program: Target, pairs: Sequence[tuple[ModeDesign, Any]], error: float
 ) -> tuple[Check, ...]:
     """Check the loop of each design with its numbers in the file."""
     checks: list[Check] = []
     controlled = sum(len(part.modes) for part, _ in pairs)
     for part, numbers in pairs:
-        proof = list(prove_written(part.design, own.computed(part.design, numbers)))
+        proof = list(prove_written(part.design, program.computed(part.design, numbers)))
         if part.design.other_sensors:
             how = "a run in which each sensor is missing for a while"
             name = "commands in a rehearsal, difference"
@@ -364,88 +377,6 @@ def _proved(
             proof = [replace(check, name=f"{check.name} ({modes})") for check in proof]
         checks += proof
     return tuple(checks)
-
-
-def rehearsal_error(design: Design, other: Any) -> float:
-    """Largest difference of commands from the controller's, over the largest command.
-
-    Both close the loop of the design around the same disturbance; without a loop they get noise.
-    One of several sensors gets the readings and commands of its loop, each missing for a while.
-    """
-    with np.errstate(all="ignore"):  # what overflows is found to be infinite
-        expected, readings = _own_commands(design)
-        try:
-            if readings is None:
-                commands = _rehearse(design, other)
-            else:
-                commands = _rehearse_sensors(design, other, expected, readings)
-        except ProblemError:
-            return float("inf")
-        size = float(np.max(np.abs(expected))) or 1.0
-        error = float(np.max(np.abs(commands - expected))) / size
-    return error if np.isfinite(error) else float("inf")
-
-
-def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
-    """Return the commands of the controller itself, and the readings of several sensors."""
-    if not design.other_sensors:
-        return _rehearse(design, design.controller.start()), None
-    plant, (starts, length) = design.problem, _absences(design)
-    rate = plant.hardware.frame_rate_hz
-    run = simulate(
-        design,
-        Truth(
-            turbulence=plant.turbulence,
-            vibrations=plant.vibrations,
-            motions=plant.motions,
-            noise_nm=np.linalg.norm(plant.own_noise_factor, axis=1),
-        ),
-        hardware=plant.hardware,
-        frames=(2 * len(starts) + 1) * length,
-        settle_frames=0,
-        drops=[
-            Drop(unit=unit, start_s=start / rate, end_s=(start + length) / rate)
-            for unit, start in starts.items()
-        ],
-    )
-    return run.commands[0], run.measurements[0]
-
-
-def _absences(design: Design) -> tuple[dict[str, int], int]:
-    """Return the first frame in which each sensor is missing, and for how many frames it is."""
-    hardware, period = design.problem.hardware, design.problem.period
-    units = tuple(hardware.suite.rows(hardware))
-    turns = 2 * len(units) + 1
-    length = period * int(np.ceil(FRAMES / turns / period))  # all are due at its begin
-    return {unit: (2 * i + 1) * length for i, unit in enumerate(units)}, length
-
-
-def _rehearse(design: Design, controller: SteppedController | RunningController) -> FloatArray:
-    """Return the commands (frames, m) of a controller that takes the place of a design's own."""
-    rng = np.random.default_rng(0)
-    hardware, q = design.hardware, design.controller.D.shape[1]
-    if hardware is None:
-        controller.reset()
-        return np.array([controller.step(y) for y in rng.standard_normal((FRAMES, q))])
-    total = rng.standard_normal((1, FRAMES, hardware.modes))
-    for k in range(1, FRAMES):
-        total[0, k] = POLE * total[0, k - 1] + np.sqrt(1 - POLE**2) * total[0, k]
-    noise = NOISE * rng.standard_normal((1, FRAMES, q))
-    disturbance = Disturbance(phase_nm=total, noise=noise, frame_means=True)
-    return np.asarray(simulate(controller, disturbance, hardware=hardware).commands[0])
-
-
-def _rehearse_sensors(
-    design: Design, source: Any, expected: FloatArray, readings: FloatArray
-) -> FloatArray:
-    """Return the commands (frames, m) of a source that is told what is new in each frame."""
-    (starts, length), commands = _absences(design), np.empty_like(expected)
-    applied = np.zeros_like(expected[0])
-    for k, y in enumerate(readings):
-        fresh = {unit: not 0 <= k - start < length for unit, start in starts.items()}
-        commands[k] = source.step(y, fresh, applied)
-        applied = expected[k]
-    return commands
 
 
 def _provenance_lines(design: Design, gain_digest: str | None) -> list[str]:
@@ -506,3 +437,114 @@ def _certificate(
     }
     text = json.dumps(certificate, indent=2, allow_nan=False) + "\n"
     return {first.with_name(first.name + CERTIFICATE): text.encode()}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rehearsal:
+    """A target and the design itself on the same series, after both loops have settled.
+
+    Attributes
+    ----------
+    target, design : Simulation
+        In the arithmetic of the target, and in double precision; commands are as they were applied.
+    settle_frames, stroke : int, float
+        Frames at the beginning that are left out; largest modulus of a command, or infinity.
+    checks : tuple of Check
+        The proof of what the target runs, as in its certificate.
+    """
+
+    target: Simulation
+    design: Simulation
+    settle_frames: int
+    stroke: float
+    checks: tuple[Check, ...]
+
+    @property
+    def differences(self) -> FloatArray:
+        """Commands of the target less those of the design, (frames, m)."""
+        return np.asarray(self.target.commands[0] - self.design.commands[0])
+
+    def clipped_frames(self, run: Simulation) -> int:
+        """Return the frames of a run in which a command reached the stroke."""
+        return int(np.sum(np.any(np.abs(run.commands[0]) >= self.stroke, axis=1)))
+
+
+def rehearse(
+    design: Design,
+    target: str,
+    disturbance: Disturbance,
+    *,
+    hardware: LoopHardware | None = None,
+    stroke: float | None = None,
+) -> Rehearsal:
+    """Run what is exported to a target in its arithmetic, and the design in double precision.
+
+    Both loops run frame by frame, on the same series.
+
+    Parameters
+    ----------
+    design : Design
+        The design.
+    target : str
+        Name of a target, whose export has its usual options.
+    disturbance : Disturbance
+        Phase and noise of one case. The pseudo-open-loop series of a record may stand for the
+        phase; its noise is then part of the residual, and ``frame_means`` keeps it out of what
+        moves within frames.
+    hardware : LoopHardware, optional
+        The loop; by default that of the design.
+    stroke : float, optional
+        Largest modulus of a command that the mirror applies; without a limit by default.
+
+    Returns
+    -------
+    Rehearsal
+        Both loops, on the frames after they have settled.
+
+    Raises
+    ------
+    ProblemError
+        If the target cannot hold the design, it reads several sensors, or sizes clash.
+    CertificateError
+        If the certificate that the design carries has a failed check.
+    UnstableLoopError
+        If the loop of the design is unstable.
+    NumericalError
+        If the export is refused, or the loop grows beyond all numbers in its arithmetic.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt, numpy as np
+    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.5)
+    >>> wave = lbt.loop.Disturbance(phase_nm=100 * np.sin(np.arange(2000.0)[:, None] / 50))
+    >>> run = lbt.interop.rehearse(slow, "dao", wave)
+    >>> bool(0 < np.max(np.abs(run.differences)) < 1e-3)
+    True
+    """
+    controller = as_controller(design)
+    path = require_hardware(design, "a rehearsal") if hardware is None else hardware
+    require_instance(disturbance, Disturbance, "disturbance")
+    cases, frames, n = disturbance.phase_nm.shape
+    if (cases, n) != (1, path.modes):
+        raise DimensionError(
+            f"phase_nm must be (frames, {path.modes}), of one case; got "
+            f"{disturbance.phase_nm.shape}."
+        )
+    limit = np.inf if stroke is None else number(stroke, "stroke", above=0, at_most=1e30)
+    loop = close_loop(path, controller, sensor_gain=disturbance.sensor_gain)
+    loop.require_stable()
+    settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * frames))
+    with TemporaryDirectory() as folder:
+        exported = export(target_named(target).path_in(Path(folder)), design, target)
+    run = partial(simulate, hardware=path, settle_frames=settle, stroke=stroke)
+    try:
+        with np.errstate(all="ignore"):  # what overflows is found to be infinite
+            runs = [run(c, disturbance) for c in (exported.start(limit), controller.start())]
+    except ProblemError as error:
+        raise NumericalError(
+            f"in the arithmetic of {target} the loop grows beyond all numbers: {error}",
+            status="arithmetic",
+        ) from error
+    return Rehearsal(
+        target=runs[0], design=runs[1], settle_frames=settle, stroke=limit, checks=exported.checks
+    )

@@ -7,28 +7,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design import Check, Design
-from lbt_synth.design.shaping.bounds import Attenuation, CommandRms
 from lbt_synth.design.shaping.channel import SingleModeLoop
-from lbt_synth.design.shaping.objectives import leaves
-from lbt_synth.design.shaping.specification import Demand, Specification
-from lbt_synth.design.shaping.uncertainty import (
+from lbt_synth.design.shaping.demands import (
+    Attenuation,
+    CommandRms,
+    Demand,
     LoopErrors,
     MirrorUncertainty,
     MovingSensorGain,
 )
+from lbt_synth.design.shaping.objectives import leaves
+from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
+from lbt_synth.linear.controller import RunningController
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import residual_budget
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
+from lbt_synth.loop.simulation.disturbances import Disturbance
+from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
 from lbt_synth.loop.stable_range import radii_by_gain
-from lbt_synth.models import ARModel, LoopHardware
+from lbt_synth.models import ARModel, LoopHardware, Truth
 from lbt_synth.validation import FloatArray
 
 ROUNDOFF = {"double": 2.0**-53, "single": 2.0**-24}  # largest relative error of an operation
@@ -36,6 +42,7 @@ LOSS = 0.01  # of residual and of margins, relative
 _SCENARIOS = (1.0, 0.7, 0.5, 0.358)  # sensor gains, where a design names none
 _STEP = 1.01  # ratio of neighbouring sensor gains
 _WIDEST = 10.0  # factor on the sensor gain, to either side
+FRAMES = 2000  # of a rehearsal
 POLE, NOISE = 0.99, 0.1  # of a reference disturbance of unit variance
 EIGENVALUES = "eigenvalues of the monodromy, per frame"
 
@@ -80,8 +87,8 @@ def sums_variance(
     """
 
     def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
-        own = measured.size - signals
-        terms = np.abs(whole) * np.concatenate([measured[own:], commands, measured[:own]])
+        direct = measured.size - signals
+        terms = np.abs(whole) * np.concatenate([measured[direct:], commands, measured[:direct]])
         sums = np.where(terms > 0, np.cumsum(terms, axis=1), 0.0)
         return np.asarray(roundoff**2 / 3 * np.sum(terms**2 + sums**2, axis=1))
 
@@ -148,8 +155,8 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
         return checks
     inside = (gain for gain in scenario_gains(design) if low <= gain <= high)
     checks += (_residual_check(design, hardware, written, gain) for gain in inside)
-    own, other = (close_loop(hardware, c) for c in (design.controller, controller))
-    before, after = (hinf_norm(loop.output_sensitivity()).value for loop in (own, other))
+    exact, other = (close_loop(hardware, c) for c in (design.controller, controller))
+    before, after = (hinf_norm(loop.output_sensitivity()).value for loop in (exact, other))
     change = written.response_change
     after += change(1.0) if change else 0.0
     checks.append(Check("modulus margin, loss", float(after / before) - 1, LOSS, "level sets"))
@@ -275,8 +282,8 @@ def _mode_of(loop: ClosedLoop, mode: int, rows: slice) -> SingleModeLoop:
     direct = [s.D[:, mode], s.D[:, n:] @ hardware.sensor[:, mode]]
     system = replace(s, B=np.stack(inputs, axis=1), C=s.C[rows], D=np.stack(direct, axis=1)[rows])
     one = hardware.single_mode()
-    own = replace(loop, system=system, hardware=one)
-    loops = {loop.sensor_gain: own}
+    mode_loop = replace(loop, system=system, hardware=one)
+    loops = {loop.sensor_gain: mode_loop}
     return SingleModeLoop(hardware=one, controller=loop.controller, in_frames=True, _loops=loops)
 
 
@@ -317,3 +324,85 @@ def _demand_change(demand: Demand, change: Callable[[float], float]) -> float:
     factor = demand.relative if isinstance(demand, MirrorUncertainty) else 1.0
     factor = 1 + demand.high if isinstance(demand, LoopErrors) else factor  # taps of two loops
     return factor * change(1.0)
+
+
+def rehearsal_error(design: Design, other: Any) -> float:
+    """Largest difference of commands from the controller's, over the largest command.
+
+    Both close the loop of the design around the same disturbance; without a loop they get noise.
+    One of several sensors gets the readings and commands of its loop, each missing for a while.
+    """
+    with np.errstate(all="ignore"):  # what overflows is found to be infinite
+        expected, readings = _own_commands(design)
+        try:
+            if readings is None:
+                commands = _rehearse(design, other)
+            else:
+                commands = _rehearse_sensors(design, other, expected, readings)
+        except ProblemError:
+            return float("inf")
+        size = float(np.max(np.abs(expected))) or 1.0
+        error = float(np.max(np.abs(commands - expected))) / size
+    return error if np.isfinite(error) else float("inf")
+
+
+def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
+    """Return the commands of the controller itself, and the readings of several sensors."""
+    if not design.other_sensors:
+        return _rehearse(design, design.controller.start()), None
+    plant, (starts, length) = design.problem, _absences(design)
+    rate = plant.hardware.frame_rate_hz
+    run = simulate(
+        design,
+        Truth(
+            turbulence=plant.turbulence,
+            vibrations=plant.vibrations,
+            motions=plant.motions,
+            noise_nm=np.linalg.norm(plant.own_noise_factor, axis=1),
+        ),
+        hardware=plant.hardware,
+        frames=(2 * len(starts) + 1) * length,
+        settle_frames=0,
+        drops=[
+            Drop(unit=unit, start_s=start / rate, end_s=(start + length) / rate)
+            for unit, start in starts.items()
+        ],
+    )
+    return run.commands[0], run.measurements[0]
+
+
+def _absences(design: Design) -> tuple[dict[str, int], int]:
+    """Return the first frame in which each sensor is missing, and for how many frames it is."""
+    hardware, period = design.problem.hardware, design.problem.period
+    units = tuple(hardware.suite.rows(hardware))
+    turns = 2 * len(units) + 1
+    length = period * int(np.ceil(FRAMES / turns / period))  # all are due at its begin
+    return {unit: (2 * i + 1) * length for i, unit in enumerate(units)}, length
+
+
+def _rehearse(design: Design, controller: SteppedController | RunningController) -> FloatArray:
+    """Return the commands (frames, m) of a controller that takes the place of a design's own."""
+    rng = np.random.default_rng(0)
+    hardware, q = design.hardware, design.controller.D.shape[1]
+    if hardware is None:
+        controller.reset()
+        return np.array([controller.step(y) for y in rng.standard_normal((FRAMES, q))])
+    total = rng.standard_normal((1, FRAMES, hardware.modes))
+    for k in range(1, FRAMES):
+        total[0, k] = POLE * total[0, k - 1] + np.sqrt(1 - POLE**2) * total[0, k]
+    noise = NOISE * rng.standard_normal((1, FRAMES, q))
+    disturbance = Disturbance(phase_nm=total, noise=noise, frame_means=True)
+    return np.asarray(simulate(controller, disturbance, hardware=hardware).commands[0])
+
+
+def _rehearse_sensors(
+    design: Design, source: Any, expected: FloatArray, readings: FloatArray
+) -> FloatArray:
+    """Return the commands (frames, m) of a source that is told what is new in each frame."""
+    (starts, length), commands = _absences(design), np.empty_like(expected)
+    applied = np.zeros_like(expected[0])
+    for k, y in enumerate(readings):
+        fresh = {unit: not 0 <= k - start < length for unit, start in starts.items()}
+        commands[k] = source.step(y, fresh, applied)
+        applied = expected[k]
+    return commands

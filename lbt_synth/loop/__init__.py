@@ -1,9 +1,4 @@
-"""The closed loop: stability, margins, exact residual and Strehl ratio.
-
-A controller, designed here or elsewhere, is closed around the sensor, the delay and the mirror.
-Residuals are exact integrals over spectra, not averages over a simulation.
-They can be compared with the least residual that any linear controller leaves.
-"""
+"""The loop around a controller: what it leaves, bears and does in time, exactly and simulated."""
 
 import lazy_loader
 

@@ -1,8 +1,6 @@
 from .budget import residual_budget as residual_budget
-from .budget import settling_error as settling_error
 from .closed_loop import ClosedLoop as ClosedLoop
 from .closed_loop import close_loop as close_loop
-from .closed_loop import youla_controller as youla_controller
 from .ensemble import EnsembleVibration as EnsembleVibration
 from .ensemble import LoopEnsemble as LoopEnsemble
 from .ensemble import ensemble_residuals as ensemble_residuals
@@ -20,5 +18,4 @@ from .stable_range import moving_gain as moving_gain
 from .stable_range import stable_sensor_gains as stable_sensor_gains
 from .strehl import Imaging as Imaging
 from .strehl import jitter_strehl as jitter_strehl
-from .strehl import series_strehl as series_strehl
 from .strehl import strehl as strehl

@@ -119,10 +119,7 @@ def residual_budget(
 
 
 def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
-    """Return the covariance of all readings in the first frame of a period, (q, q).
-
-    A plant's model is the truth. In that frame every sensor is read.
-    """
+    """Return the covariance (q, q) of all readings in the first frame of a period."""
     every = _evaluator(loop, loop.system, None, in_image=False)
     parts = [every.shaken(_noise_factor(loop, plant.own_noise_factor))]
     for mode, model in enumerate(plant.turbulence):
@@ -326,56 +323,14 @@ def resonance_edges(loop: ClosedLoop) -> FloatArray:
 def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
     """Position of a settled mirror less the real one, for the commands that a loop gives.
 
-    The paper's equation 1, ``phi_cor(k-1) = N u(k-2)`` (at its delay of two frames), is exact
-    for a mirror that settles at once; this is by how much it misses the position averaged
-    over the exposure. It is no residual: the loop corrects for part of it.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        The loop, with the real mirror in its hardware.
-    truth : Truth
-        Disturbances; its sensor gain must be the loop's.
-
-    Returns
-    -------
-    ResidualBudget
-        Covariances of the difference, by origin; ``rms_nm`` is its size.
-
-    Raises
-    ------
-    UnstableLoopError
-        If the loop is unstable or marginally stable.
-    ProblemError
-        If a vibration does not fit the loop, or the sensor gains differ.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> shell = lbt.models.PositionLoop.from_bandwidth(
-    ...     natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
-    ... )
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell)
-    >>> shake = lbt.Truth(
-    ...     turbulence=None,
-    ...     noise_nm=1.0,
-    ...     vibrations=(
-    ...         lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,)),
-    ...     ),
-    ... )
-    >>> loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3).controller)
-    >>> missed = lbt.loop.settling_error(loop, shake)
-    >>> 0 < missed.rms_nm < lbt.residual_budget(loop, shake).rms_nm
-    True
+    It is by how much the paper's equation 1, ``phi_cor(k-1) = N u(k-2)``, misses the position over
+    the exposure; no residual, as the loop corrects for part of it.
     """
     return residual_budget(replace(loop, system=_difference_loop(loop)), truth, frame_means=True)
 
 
 def _difference_loop(loop: ClosedLoop) -> StateSpace:
-    """Return the loop whose outputs are the settled mirror's position less the real one.
-
-    The real one is the phase less the residual.
-    """
+    """Return the loop to the settled mirror's position less the real one, phase less residual."""
     hardware, s, n = loop.hardware, loop.system, loop.hardware.modes
     if hardware.mirror is None:  # it leaves nothing, not even rounding
         return replace(s, C=0 * s.C[:n], D=0 * s.D[:n])

@@ -13,7 +13,7 @@ from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.controller import HasController, as_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response
-from lbt_synth.models.plant.readings import memory, other_exposures, own_exposure
+from lbt_synth.models.plant.assembly import memory, other_exposures, own_exposure
 from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.storage.rows import fact, fact_table, facts
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -85,13 +85,7 @@ class ClosedLoop(Summarised):
         return self.radius_per_frame < 1 - STABILITY_MARGIN
 
     def require_stable(self) -> None:
-        """Raise if the loop is unstable or marginally stable.
-
-        Raises
-        ------
-        UnstableLoopError
-            With the spectral radius.
-        """
+        """Raise UnstableLoopError if the loop is unstable or marginally stable."""
         if not self.is_stable:
             radius = self.radius_per_frame
             word = "a marginally stable" if radius < 1 + STABILITY_MARGIN else "an unstable"
@@ -321,38 +315,11 @@ def loop_matrices(
 def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controller:
     """Return the controller from y to u of a filter from the pseudo-open-loop ybar to u.
 
-    The path from command to measurement is known, and so is the measurement that there would be
-    without any correction, ``ybar(k) = y(k) + sensor_matrix influence_matrix (c[0] u(k-1) + c[1]
-    u(k-2) + ...)``, with the mirror's taps c (computed by its states where it has dynamics). Every
-    controller that stabilises the loop is a stable filter from ybar to u, the Youla parameter, and
-    the closed loop is affine in that filter (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans.
-    Autom. Control 21, 319 (1976), doi:10.1109/TAC.1976.1101223).
-
-    Parameters
-    ----------
-    hardware : LoopHardware
-        The loop; its sensor matrix is what the controller believes.
-    parameter : Controller
-        Stable filter from ybar(k) to u(k), in new-state form.
-
-    Returns
-    -------
-    Controller
-        In new-state form, with the mirror (its past commands, if it settles) as further states.
-
-    Raises
-    ------
-    DimensionError
-        If the filter does not fit the loop.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> last = lbt.Controller(A=0.0, B=1.0, C=1.0, D=0.0, dt_s=1 / 800)  # u(k) = ybar(k)
-    >>> controller = lbt.loop.youla_controller(path, last)
-    >>> bool(lbt.close_loop(path, controller).spectral_radius < 1e-3)
-    True
+    The measurement that there would be without any correction is known, ``ybar(k) = y(k) +
+    sensor_matrix influence_matrix (c[0] u(k-1) + c[1] u(k-2) + ...)`` with the mirror's taps c.
+    Every controller that stabilises the loop is a stable filter from it to u, in which the closed
+    loop is affine (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans. Autom. Control 21, 319
+    (1976), doi:10.1109/TAC.1976.1101223).
     """
     m, q = hardware.n_commands, hardware.n_measurements
     if (len(parameter.C), parameter.B.shape[1]) != (m, q):

@@ -228,7 +228,9 @@ class LoopEnsemble:
                 limit, got = f"the Nyquist frequency {nyquist:.6g} Hz", np.max(line.frequency_hz)
                 raise ProblemError(f"a vibration must lie below {limit}; got {got:.6g} Hz.")
             values = {name: getattr(line, name) for name in ("frequency_hz", "rms_nm", "damping")}
-            whole = {k: np.broadcast_to(v, (p,)) for k, v in values.items() if v is not None}
+            whole: dict[str, Any] = {
+                k: np.broadcast_to(v, (p,)) for k, v in values.items() if v is not None
+            }
             out.append(replace(line, **whole, direction=np.broadcast_to(line.direction, (p, n))))
         return out
 
@@ -392,20 +394,14 @@ def residuals_from_matrices(
 
 
 def textbook_matrices(controllers: Sequence[Controller]) -> tuple[FloatArray, ...]:
-    """Return controllers with equal numbers of states as balanced ``A, B, C, D``, textbook form.
-
-    Only in states of comparable units does an entry that is tiny beside the others do nothing.
-    """
+    """Return controllers of as many states as balanced ``A, B, C, D`` in textbook form."""
     systems = [controller.to_statespace() for controller in controllers]
     systems = [system.balanced() if system.n_states else system for system in systems]
     return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
 
 
 def _batches(stacks: list[LoopStack], stable: BoolArray) -> list[IntArray]:
-    """Split the stable loops of stacks into batches, by how near to instability they are.
-
-    Loops next to instability, which need short panels, are then together.
-    """
+    """Split the stable loops into batches; those next to instability need short panels."""
     poles = np.concatenate([stack.poles for stack in stacks], axis=1)
     order = np.argsort(np.max(np.abs(poles), axis=1), kind="stable")
     order = order[stable[stacks[0].loops[order]]]
@@ -422,8 +418,7 @@ def _of_part(
 ) -> FloatArray:
     """Covariances (k, 2, 2, n, n) from turbulence and from noise (k, q): of means, and within.
 
-    ``turbulence`` pairs each spectrum with its modes. All is of the whole loop: the covariances of
-    other parts are zero. What reaches equal parts alike is evaluated once.
+    They are of the whole loop; what reaches equal parts alike is evaluated once.
     """
     n = hardware.modes
     out = np.zeros((stack.loops.size, 2, 2, n, n))

@@ -27,9 +27,8 @@ from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_rule
 from lbt_synth.models import ARModel, FrozenFlows, ModalTurbulence, Spectrum
-from lbt_synth.models.ar_model import companions, densities
 from lbt_synth.models.mirror.frame_rate_system import Hold
-from lbt_synth.models.spectra import breakpoints_below, spectrum_density
+from lbt_synth.models.spectra import breakpoints_below, companions, densities, spectrum_density
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact, fact_table, facts
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -83,10 +82,7 @@ class Evaluator:
         entry: FloatArray,
         edges_hz: FloatArray,
     ) -> FloatArray:
-        """Return what phases of a density (f, k or 1) leave, one for each column of the entry.
-
-        The entries are (k or 1, n, w), the density [nm^2/Hz] that of the phase of all moments.
-        """
+        """Return what phases of a density (f, k or 1) leave by an entry (k or 1, n, w)."""
         nyquist, along = self.frame_rate_hz / 2, np.asarray(entry @ transpose(entry))
         edges = np.union1d(graded_edges(self.roots) * nyquist, edges_hz)
 
@@ -109,10 +105,7 @@ class Evaluator:
     def of_process(
         self, coefficients: FloatArray, driving_rms_nm: FloatArray, entry: FloatArray
     ) -> FloatArray:
-        """Return what processes of means over frames leave, one for each column of the entry.
-
-        There is one for each loop, or one for all: coefficients (k or 1, r), driving rms (k or 1,).
-        """
+        """Return what processes of means over frames leave by the columns of an entry."""
         rate = self.frame_rate_hz
         if self.hold is not None:
 
@@ -160,8 +153,7 @@ class Evaluator:
     def of_sinusoids(self, f: FloatArray, entry: ComplexArray) -> tuple[ComplexArray, FloatArray]:
         """Return amplitudes (k, n) that sinusoids leave, and covariances (k, n, n) within.
 
-        Each loop has its own frequency [cycles per frame], (k,). The entries (k or 1, n + q) are
-        complex amplitudes; the phases come first.
+        Frequencies [cycles per frame] are (k,), the entries (k or 1, n + q) complex amplitudes.
         """
         n, share = self.modes, np.ones((len(f), entry.shape[-1]))
         if self.in_image:
@@ -212,10 +204,7 @@ class Evaluator:
         return StateSpace(A=A, B=B, C=C, D=D, dt_s=1 / self.frame_rate_hz)
 
     def output_covariances(self) -> FloatArray:
-        """Return the covariances of the rows for white inputs, (k, r, r).
-
-        A small difference of large terms loses digits in a covariance; roots keep them.
-        """
+        """Return covariances (k, r, r) for white inputs, by roots where digits are lost."""
         if len(self.A) == self.phases:
             return self.system().output_covariances()
         drive = self.B @ transpose(self.B)
@@ -238,10 +227,7 @@ class Evaluator:
         return STILL if self.hold is None else self.hold
 
     def _pieces(self, f: FloatArray, entry: FloatArray) -> Iterator[tuple[float, ComplexArray]]:
-        """Yield the length of each piece of a hold, and what unit phases leave in it (n, w, f, k).
-
-        The frequencies are in cycles per frame.
-        """
+        """Yield the length of each piece of a hold, and what phases leave (n, w, f, k)."""
         share = np.sinc(f) if self.in_image else np.ones(f.size)
         rows = (self.response or self._response)(f, share, entry)
         if self.hold is None:
@@ -306,10 +292,7 @@ def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
 def power_within_frames(
     coefficients: FloatArray, driving_rms_nm: FloatArray, frame_rate_hz: float
 ) -> FloatArray:
-    """Power of processes of means over frames that moves within the frames [nm^2], (k,).
-
-    It is the integral of ``S (1 / sinc^2 - 1)``, on panels of each process around its own poles.
-    """
+    """Integral of ``S (1 / sinc^2 - 1)`` of processes: the power that moves within frames, (k,)."""
     poles = process_poles(coefficients)
     centre, width = np.abs(np.angle(poles)), np.maximum(1 - np.abs(poles), 1e-9)
     steps = np.concatenate([[0.0], 4.0 ** np.arange(_WIDENINGS)])

@@ -67,11 +67,7 @@ class BrokenLoop:
 
     @property
     def phase_deg(self) -> FloatArray:
-        """Phase without jumps [deg], (f,); between -270 and 90 at the lowest frequency.
-
-        It is nan where the response is zero but for rounding, as at half the frame rate for a
-        delay of half a frame.
-        """
+        """Phase without jumps [deg], (f,), first in -270 to 90; nan where all is rounding."""
         phase = np.full(self.response.size, np.nan)
         known = np.abs(self.response) > 1 / _LARGEST
         unwrapped = np.degrees(np.unwrap(np.angle(self.response[known])))
@@ -179,10 +175,7 @@ def _own_sensitivities(loop: ClosedLoop) -> dict[int, StateSpace]:
 
 
 def _crossings(sensitivity: StateSpace, *, real_part: float | None = None) -> Iterator[MarginPoint]:
-    """Yield where the response of a broken loop is real, or where its gain is one.
-
-    The gain of ``1 / S - 1`` is one where the real part of S is a half.
-    """
+    """Yield where a broken loop is real, or has a gain of one: where Re S is a half."""
     angles, values = crossings(sensitivity, real_part=real_part)
     with np.errstate(divide="ignore", invalid="ignore"):  # that of an integrator is inf
         responses = 1 / values - 1

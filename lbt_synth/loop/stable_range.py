@@ -66,7 +66,6 @@ _LONGEST = 100  # delay up to which it is sought [frames]
 # loop with a pole nearer to the unit circle does not count as stable.
 CIRCLE_LIMIT = 1 - 1e-7
 _WIDEST_MOVING = 100.0  # factor on the loop's gain beyond which no pyramid's optical gain lies
-_BISECTIONS = 10  # of the share of an interval: the ends are then exact to 1 % or better
 _NONE = np.zeros(0)
 # a loop of another gain, over the one assumed, and delay [frames], and taps of
 # ``z^-1 (M_d - g M_d')``, (t,)
@@ -74,7 +73,7 @@ LoopChange: TypeAlias = tuple[float, float, FloatArray]
 FRAGILE_FRAMES = 0.1  # of delay: what a camera's clock or a busy computer adds
 FRAGILE_DB = 2.0  # of the sensor gain: what the seeing changes within minutes
 _MOST = 10.0  # times these errors: one frame, and a factor of 10
-_HALVINGS = 12  # of that range, to 0.03 % of a frame
+_HALVINGS = 12  # of a range: to 0.03 % of a frame, and to 0.1 % of an end of gains
 _LEVEL = 1 - 1e-6  # of the real part, below which one is proved to stay
 
 
@@ -96,10 +95,7 @@ def parts_by_gain(
 
 
 def affine_parts(A0: FloatArray, A1: FloatArray) -> list[AffinePart]:
-    """Split matrices ``A0[t] + g A1[t]``, (N, n, n), into parts whose states act on one another.
-
-    They have the eigenvalues of the whole; equal parts are returned once.
-    """
+    """Split ``A0[t] + g A1[t]``, (N, n, n), into the different parts that act on themselves."""
     links = np.any((A0 != 0) | (A1 != 0), axis=0)
     label = component_labels(links, strong=True)
     parts = (np.ix_(range(len(A0)), label == i, label == i) for i in np.unique(label))
@@ -162,10 +158,7 @@ def stable_sensor_gains(
 
 
 def stable_range(parts: list[AffinePart], nominal: float) -> tuple[float, float]:
-    """Return the interval around a gain in which all parts are stable.
-
-    It is nan where they are not at the nominal gain, 0 and inf beyond a factor of 1e4.
-    """
+    """Return where all parts are stable: nan if nowhere, 0 and inf at open ends."""
     if not affine_radii(parts, np.array([nominal]))[0] < 1:
         return np.nan, np.nan
     ranges = np.array(
@@ -179,10 +172,7 @@ def stable_range(parts: list[AffinePart], nominal: float) -> tuple[float, float]
 
 
 def exact_range(part: AffinePart, nominal: float) -> tuple[float, float] | None:
-    """Return between which numbers a part that is stable at the nominal one stays stable.
-
-    It is None where the matrices repeat with a longer period or change by a higher rank.
-    """
+    """Return where a part stays stable; None for a longer period or a higher rank."""
     start, slope = part
     if len(start) > 1:
         return None
@@ -323,10 +313,7 @@ class MovingGain(Summarised):
 
 
 def circle_norm(loop: ClosedLoop, *, low: float, high: float) -> float:
-    """Return ``r ||T||_inf`` of an interval of gains, which proves it below ``CIRCLE_LIMIT``.
-
-    It is inf where the loop is not stable at the middle of the interval.
-    """
+    """Return ``r ||T||_inf`` of an interval of gains; inf if the middle is unstable."""
     middle = (low + high) / 2
     centred = close_loop(loop.hardware, loop.controller, sensor_gain=middle)
     if not centred.is_stable:
@@ -379,10 +366,7 @@ def moving_gain(loop: ClosedLoop) -> MovingGain:
         low, high = interval(share)
         return circle_norm(loop, low=low, high=high) < CIRCLE_LIMIT
 
-    proved, failed = (1.0, 1.0) if proves(1.0) else (0.0, 1.0)
-    for _ in range(_BISECTIONS if proved < failed else 0):
-        middle = (proved + failed) / 2
-        proved, failed = (middle, failed) if proves(middle) else (proved, middle)
+    proved = _largest_proved(proves, 1.0)
     low, high = interval(proved) if proved else (np.nan, np.nan)
     return MovingGain(
         constant_low=constant[0],
@@ -395,10 +379,7 @@ def moving_gain(loop: ClosedLoop) -> MovingGain:
 def loop_changes(
     hardware: LoopHardware, *, low: float, high: float, delay_frames: float
 ) -> list[LoopChange]:
-    """Return the loops that stand for all gains of an interval, and delays within an error.
-
-    The mirror settles at once if the delay has an error. A delay below one frame does not occur.
-    """
+    """Return the loops that stand for all gains of an interval, and delays within an error."""
     d, own = hardware.delay_frames, hardware.mirror_taps
     early, late = max(d - delay_frames, 1.0), d + delay_frames
     whole = np.arange(np.ceil(early), np.floor(late) + 1).tolist()
@@ -445,12 +426,17 @@ def errors_together(loop: ClosedLoop) -> float:
         systems = (append_taps(part, taps) for *_, taps in changes for part in parts)
         return all(largest_real_part(system, least=_LEVEL) < 1 for system in systems)
 
-    if is_proved(_MOST):
-        return _MOST
-    low, high = 0.0, _MOST
+    return _largest_proved(is_proved, _MOST)
+
+
+def _largest_proved(proves: Callable[[float], bool], most: float) -> float:
+    """Return the largest number up to ``most`` that is proved, as all below it, by bisection."""
+    if proves(most):
+        return most
+    low, high = 0.0, most
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        low, high = (middle, high) if is_proved(middle) else (low, middle)
+        low, high = (middle, high) if proves(middle) else (low, middle)
     return low
 
 

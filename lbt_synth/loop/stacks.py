@@ -106,10 +106,7 @@ class LoopStack:
         return (self.hold or STILL).positions(self.influence, commands, first)
 
     def _parts(self, z: ComplexArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Return the path of phases, and the rejection over its denominator, (n, n, f, k).
-
-        The path is to what commands do to the modes, at a gain of 1 and without the mirror.
-        """
+        """Return the path without the mirror, rejection and denominator, (n, n, f, k)."""
         controller = np.moveaxis(stacked_response(self.controllers, z), (2, 3), (0, 1))
         path = np.einsum("nm,mq...,qr->nr...", self.influence, controller, self.sensor)
         path = path / z[:, None]
@@ -188,10 +185,7 @@ def close_loops(
     sensor_gains: FloatArray,
     delay_frames: FloatArray,
 ) -> tuple[BoolArray, list[list[LoopStack]]]:
-    """Close the loops of controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each.
-
-    Return which of the p loops are stable, and by whole delay the stacks of all parts.
-    """
+    """Close loops of controllers (1 or p, ., .); return stability, and stacks by delay."""
     stable = np.ones(sensor_gains.size, dtype=np.bool_)
     parts, rest = split_into_parts(matrices, hardware)
     for A in rest:

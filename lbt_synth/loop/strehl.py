@@ -18,17 +18,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import j0, j1
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import DimensionError
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.evaluator import ResidualBudget
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
-    IntArray,
     Obstruction,
     Positive,
     check_fields,
-    matrix,
     real_array,
     semidefinite,
 )
@@ -82,10 +80,7 @@ class Imaging:
 
     @property
     def cycles_per_nm(self) -> float:
-        """Highest spatial frequency D/lambda, in cycles per nm of tilt wavefront.
-
-        An angle of theta is ``theta D / 4`` of wavefront, so that D cancels.
-        """
+        """Highest spatial frequency, in cycles per nm of tilt, ``D / 4`` of an angle."""
         return 4 / (self.wavelength_um * 1e3)
 
 
@@ -121,37 +116,34 @@ def strehl(budget: ResidualBudget, imaging: Imaging) -> Any:
     >>> round(lbt.strehl(still, lbt.Imaging(diameter_m=8.22, other_modes=0.84)), 12)
     0.84
     """
-    one = budget.noise_nm2.ndim == 2
-    gaussian, lines = budget.gaussian_nm2, budget.line_amplitudes_nm
-    if one:
-        gaussian, lines = gaussian[None], lines[None]
-    stable = np.broadcast_to(budget.stable, len(gaussian))
-    out = np.where(stable, 0.0, np.nan)
-    spread = jitter_spread_nm(gaussian[stable], lines[stable])
-    near = np.flatnonzero(stable)[spread <= widest_jitter_nm(imaging)]
-    out[near] = jitter_strehls(gaussian[near], imaging=imaging, line_amplitudes_nm=lines[near])
-    return float(out[0]) if one else out
+    stable = np.asarray(budget.stable)
+    out = np.full(stable.shape, np.nan)
+    lines = budget.line_amplitudes_nm[stable] if stable.ndim else budget.line_amplitudes_nm
+    jitter = budget.gaussian_nm2[stable] if stable.ndim else budget.gaussian_nm2
+    out[stable] = jitter_strehl(jitter, imaging=imaging, line_amplitudes_nm=lines)
+    return out if stable.ndim else float(out)
 
 
 def jitter_strehl(
     covariance_nm2: ArrayLike, *, imaging: Imaging, line_amplitudes_nm: ArrayLike = ()
-) -> float:
-    """Strehl ratio of Gaussian and sinusoidal jitter.
+) -> Any:
+    """Strehl ratio of Gaussian and sinusoidal jitter, or of many jitters.
 
     Parameters
     ----------
-    covariance_nm2 : (2, 2) or (1, 1) array_like
-        Covariance of the Gaussian jitter on the two axes [nm^2 rms wavefront].
+    covariance_nm2 : (2, 2), (1, 1) or (p, n, n) array_like
+        Covariance of the Gaussian jitter on the axes [nm^2 rms wavefront].
     imaging : Imaging
         The camera.
-    line_amplitudes_nm : (s, 2) or (s, 1) complex array_like, optional
+    line_amplitudes_nm : (s, n) or (p, s, n) complex array_like, optional
         Amplitude and phase of each sinusoid on each axis [nm]; the sinusoids
         must have different frequencies.
 
     Returns
     -------
-    float
-        Strehl ratio in [0, 1], the other modes included.
+    float or (p,) ndarray
+        Strehl ratio in [0, 1], the other modes included; 0 where the image moves by more than 160
+        times its width.
 
     Raises
     ------
@@ -165,47 +157,39 @@ def jitter_strehl(
     >>> round(lbt.loop.jitter_strehl([[300**2, 0], [0, 300**2]], imaging=camera), 3)
     0.379
     """
-    covariance = matrix(covariance_nm2, "covariance_nm2")
-    lines = np.asarray(line_amplitudes_nm, dtype=np.complex128).reshape(1, -1, len(covariance))
-    strehls = jitter_strehls(covariance[None], imaging=imaging, line_amplitudes_nm=lines)
-    return float(strehls[0])
-
-
-def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm: Any) -> FloatArray:
-    """Strehl ratios (p,) of jitters of covariances (p, n, n) and sinusoids (p, s, n)."""
     covariance = semidefinite(covariance_nm2, "covariance_nm2", stacked=True)
-    count, size, _ = covariance.shape
-    _require_axes(size)
     lines = np.asarray(line_amplitudes_nm, dtype=np.complex128)
     real_array(np.abs(lines), "line_amplitudes_nm")
-    if lines.ndim != 3 or (len(lines), lines.shape[2]) != (count, size):
+    alone, size = covariance.ndim == 2, covariance.shape[-1]
+    _require_axes(size)
+    lines = lines if lines.size else np.zeros((*covariance.shape[:-2], 0, size), np.complex128)
+    if (*lines.shape[:-2], lines.shape[-1]) != covariance.shape[:-1]:
+        counts = (*covariance.shape[:-2], "sinusoids", size)
         raise DimensionError(
-            f"line_amplitudes_nm must be ({count}, sinusoids, {size}); got {lines.shape}."
+            f"line_amplitudes_nm must be ({', '.join(map(str, counts))}); got {lines.shape}."
         )
-    spread, most = jitter_spread_nm(covariance, lines), widest_jitter_nm(imaging)
-    if np.any(spread > most):
-        raise ProblemError(
-            f"the jitter must stay below {most:.3g} nm; got {np.max(spread):.3g} nm. Check "
-            "the units."
-        )
-    if count == 0:
-        return np.empty(0)
-    turns = np.maximum(spread * imaging.cycles_per_nm / _TURNS, 1.0)
-    fineness = np.ceil(np.log2(turns)).astype(np.int64)
-    directions = np.minimum(
-        _directions(covariance, lines, imaging.cycles_per_nm), _DIRECTIONS << fineness
-    )
+    if alone:
+        covariance, lines = covariance[None], lines[None]
+    deviation = np.sqrt(np.max(np.diagonal(covariance, axis1=1, axis2=2), axis=1))
+    spread = (deviation + np.sum(np.abs(lines), axis=(1, 2))) * imaging.cycles_per_nm
+    out, near = np.zeros(len(spread)), spread <= _MOST_TURNS
+    if np.any(near):
+        out[near] = _integrated_otf(covariance[near], lines[near], spread[near], imaging)
+    return float(out[0]) if alone else out
+
+
+def _integrated_otf(
+    covariance: FloatArray, lines: ComplexArray, spread: FloatArray, imaging: Imaging
+) -> FloatArray:
+    """Return Strehl ratios (p,) of jitters of a spread (p,), in turns of phase over the pupil."""
+    fineness = np.ceil(np.log2(np.maximum(spread / _TURNS, 1.0))).astype(np.int64)
     # |f.a|^2 and f'Sf are quadratic forms of f
     forms = _quadratic_form(np.real(np.einsum("psi,psj->psij", lines, lines.conj())))
     widths = _quadratic_form(covariance)
-    # jitter along the axes is the same in all four quadrants
-    aligned = ~np.any(forms[..., 1], axis=1) & (widths[:, 1] == 0)
-    out = np.empty(count)
-    rules = np.column_stack([fineness, directions, aligned])
-    unique, own = np.unique(rules, axis=0, return_inverse=True)
-    for i, rule in enumerate(unique.tolist()):
-        members = np.flatnonzero(own.reshape(-1) == i)
-        squares, weight = _weighted_otf(imaging.obstruction, *rule)
+    out = np.empty(len(spread))
+    for level in np.unique(fineness).tolist():
+        members = np.flatnonzero(fineness == level)
+        squares, weight = _weighted_otf(imaging.obstruction, level)
         squares = squares * imaging.cycles_per_nm**2
         step = max(1, _POINT_CHUNK // weight.size)
         for start in range(0, len(members), step):
@@ -215,19 +199,8 @@ def jitter_strehls(covariance_nm2: Any, *, imaging: Imaging, line_amplitudes_nm:
                 if np.any(forms[part, line]):
                     turns_squared = np.maximum(forms[part, line] @ squares, 0)
                     factor = factor * j0(2 * np.pi * np.sqrt(turns_squared))
-            out[part] = imaging.other_modes * (factor @ weight)
+            out[part] = imaging.other_modes * np.minimum(factor @ weight, 1.0)
     return out
-
-
-def jitter_spread_nm(covariance_nm2: FloatArray, line_amplitudes_nm: ComplexArray) -> FloatArray:
-    """How far covariances (p, n, n) and sinusoids (p, s, n) of jitter move an image [nm], (p,)."""
-    deviation = np.sqrt(np.max(np.diagonal(covariance_nm2, axis1=1, axis2=2), axis=1))
-    return np.asarray(deviation + np.sum(np.abs(line_amplitudes_nm), axis=(1, 2)))
-
-
-def widest_jitter_nm(imaging: Imaging) -> float:
-    """Spread beyond which the integral is not evaluated [nm]; the image is gone long before."""
-    return _MOST_TURNS / imaging.cycles_per_nm
 
 
 def _quadratic_form(matrices: FloatArray) -> FloatArray:
@@ -237,55 +210,13 @@ def _quadratic_form(matrices: FloatArray) -> FloatArray:
     return np.stack([matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]], axis=-1)
 
 
-def _directions(covariance: FloatArray, lines: ComplexArray, cycles_per_nm: float) -> IntArray:
-    """Return how many directions of half a turn each jitter needs, (p,): a power of two.
-
-    The sum over N of them misses the harmonics from 2 N on: at most ``exp(growth - 4 N)``, where
-    ``exp(growth)`` bounds the integrand at angles with an imaginary part of 2. That is 1e-15 here.
-    """
-    variance, last = covariance[:, 0, 0], covariance[:, -1, -1]
-    two = covariance.shape[1] == 2
-    unequal = np.hypot(variance - last, 2 * covariance[:, 0, 1]) if two else variance
-    growth = (np.pi * cycles_per_nm) ** 2 * unequal * (np.cosh(4) - 1)
-    amplitudes = np.sum(np.linalg.norm(lines, axis=2), axis=1)
-    growth += 2 * np.pi * cycles_per_nm * amplitudes * np.sinh(2)
-    exponent = np.ceil(np.log2((growth - np.log(1e-15)) / 4))
-    return np.asarray(2 ** np.minimum(exponent, 30).astype(np.int64))
-
-
 def series_strehl(
     residual_nm: ArrayLike, imaging: Imaging, *, within_nm2: ArrayLike = 0.0
 ) -> float:
-    """Long-exposure Strehl ratio of a residual series, whatever its distribution.
+    """Long-exposure Strehl ratio of a residual series (frames, axes), whatever its distribution.
 
     It is the mean, over the frames, of the image of a star at its mean position. What moves within
     a frame counts by its variance: the star stands a deviation to either side on each axis.
-
-    Parameters
-    ----------
-    residual_nm : (frames, 2) or (frames, 1) array_like
-        Residual of the axes, frame by frame [nm rms wavefront].
-    imaging : Imaging
-        The camera.
-    within_nm2 : float or (axes,) array_like, optional
-        Variance that moves within a frame on each axis [nm^2]; none by default.
-
-    Returns
-    -------
-    float
-        Strehl ratio in [0, 1] about the mean position, the other modes included.
-
-    Raises
-    ------
-    ProblemError
-        If the series is not finite or has another shape.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> camera = lbt.Imaging(diameter_m=8.22, other_modes=0.9)
-    >>> round(lbt.loop.series_strehl([[5.0, 1.0]] * 10, camera), 12)
-    0.9
     """
     series = real_array(residual_nm, "residual_nm")
     if series.ndim != 2 or series.shape[0] == 0:
@@ -317,13 +248,8 @@ def _require_axes(size: int) -> None:
 
 
 @lru_cache(maxsize=32)
-def _weighted_otf(
-    obstruction: float, fineness: int, directions: int, quadrant: int
-) -> tuple[FloatArray, FloatArray]:
-    """Nodes as (fx^2, 2 fx fy, fy^2) [(D/lambda)^2], and OTF weights of sum 1.
-
-    The nodes fill half the plane; with ``quadrant``, a quarter of it.
-    """
+def _weighted_otf(obstruction: float, fineness: int) -> tuple[FloatArray, FloatArray]:
+    """Nodes in half the plane, (fx^2, 2 fx fy, fy^2) [(D/lambda)^2], and OTF weights of sum 1."""
     eps = obstruction
     kinks = {0.0, 0.02, 0.1, 0.3, eps, (1 - eps) / 2, (1 + eps) / 2, 1.0}
     edges = np.array(sorted(kinks))
@@ -331,18 +257,15 @@ def _weighted_otf(
         edges = np.sort(np.concatenate([edges, (edges[1:] + edges[:-1]) / 2]))
     radius, weight = gauss_panels(edges, 12)
     weight = weight * radius * annular_otf(radius, eps)
-    angle = np.pi * (np.arange(directions // 2 if quadrant else directions) + 0.5) / directions
+    directions = _DIRECTIONS << fineness
+    angle = np.pi * (np.arange(directions) + 0.5) / directions
     fx, fy = np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()
     weights = np.repeat(weight / (weight.sum() * angle.size), angle.size)
     return np.stack([fx**2, 2 * fx * fy, fy**2]), weights
 
 
 def annular_otf(radius: FloatArray, obstruction: float) -> FloatArray:
-    """Diffraction-limited transfer function of an annular pupil, at radius f lambda / D.
-
-    It is the autocorrelation of the annulus: the overlap of the two discs, less twice that of
-    disc and obstruction, plus that of the obstructions.
-    """
+    """Transfer function of an annular pupil at radius f lambda / D: the overlap of two annuli."""
     rho, eps = np.asarray(radius, dtype=np.float64), obstruction
     overlap = _lens(rho, 0.5, 0.5)
     if eps > 1e-8:  # the area of a smaller one is rounding

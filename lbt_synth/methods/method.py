@@ -1,8 +1,4 @@
-"""What a method of synthesis is: its name, its options, and what it does with a design.
-
-:class:`Section` is the base of all options and sections that people write: strict types, limits,
-no unknown keys.
-"""
+"""What a method of synthesis is: its name, its options, and what it does with a design."""
 
 from __future__ import annotations
 
@@ -19,33 +15,19 @@ if TYPE_CHECKING:
 
 
 class Section(BaseModel):
-    """Options or a section of a file: strict types, no unknown keys, read-only.
-
-    Examples
-    --------
-    >>> from pydantic import Field
-    >>> from lbt_synth.methods import Section
-    >>> class Leak(Section):
-    ...     leak_per_s: float = Field(gt=0, description="part of the command lost [1/s]")
-    >>> Leak(leak_per_s=5).leak_per_s
-    5.0
-    """
+    """Options or a section of a file: strict types, no unknown keys, read-only."""
 
     model_config = ConfigDict(
         extra="forbid", strict=True, allow_inf_nan=False, frozen=True, defer_build=True
     )
 
+    def arguments(self) -> dict[str, Any]:
+        """Return the options as arguments of the function that designs."""
+        return self.model_dump()
+
 
 class DesignInputs(Protocol):
-    """What a method designs for: a configuration, or a plant alone.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> config.design_defaults["gamma_ratio"], config.method_section("robust")
-    (1.2, None)
-    """
+    """What a method designs for: a configuration, or a plant alone."""
 
     @property
     def plant(self) -> TipTiltPlant:
@@ -80,64 +62,26 @@ class DesignInputs(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
-    """A method of synthesis, whole: all that the package knows of it stands here.
+    """A method of synthesis, whole: all that the package knows of it stands here."""
 
-    Attributes
-    ----------
-    name : str
-        As ``lbt-synth design --method`` and ``design:`` in a study call it.
-    title, label : str
-        In a sentence ("Kalman filter"), and in the legend of a figure ("Kalman").
-    options : type
-        A :class:`Section`: each option with its description, limits and default.
-    build : callable
-        From :class:`DesignInputs` and the options to a certified design.
-    design : str
-        The class of its designs, "module:class": its arrays, and its claims with their checks.
-    section : type or None
-        Section ``design.<name>`` of a configuration, a :class:`Section`.
-    plant_section : callable or None
-        From a plant alone, and the interval of relative sensor gains at which its design has to
-        be stable, or None, to a section with defaults; None if it takes a configuration.
-    exclusive : frozenset of str
-        Options of which at most one is given.
-    configurable : frozenset of str
-        Options whose default ``design`` in a configuration can give.
-    estimator : bool
-        Whether the design depends on the vibrations of the plant.
-    batched : bool
-        Whether a study designs it for many samples at once.
-    slow : bool
-        Whether a design takes many seconds; an automatic choice among methods leaves it out.
-    reference_rank : int or None
-        Rank among the methods that studies compare designs with; None if it is not one.
-    reference_options : mapping
-        Options that it has when designs are compared.
-    compared_options : mapping
-        Further ones where it stands for what a telescope would run, beside the limits.
-
-    Examples
-    --------
-    >>> from lbt_synth.methods import method_named
-    >>> sorted(method_named("mixed").exclusive)
-    ['gamma', 'gamma_ratio', 'rms']
-    """
-
-    name: str
-    title: str
-    label: str
-    options: type[Section]
-    build: Callable[[DesignInputs, Any], Design]
-    design: str
-    section: type[Section] | None = None
+    name: str  # as ``lbt-synth design --method`` and ``design:`` in a study call it
+    title: str  # in a sentence ("Kalman filter")
+    label: str  # in the legend of a figure ("Kalman")
+    options: type[Section]  # each with its description, limits and default
+    build: Callable[[DesignInputs, Any], Design]  # a certified design
+    design: str  # the class of its designs, "module:class", with its arrays, claims and checks
+    section: type[Section] | None = None  # ``design.<name>`` of a configuration
+    # from a plant alone, and an interval of relative sensor gains at which its design has to be
+    # stable, or None, to a section with defaults; None if it takes a configuration
     plant_section: Callable[[TipTiltPlant, tuple[float, float] | None], Section] | None = None
-    exclusive: frozenset[str] = frozenset()
-    configurable: frozenset[str] = frozenset()
-    estimator: bool = True
-    batched: bool = False
-    slow: bool = False
-    reference_rank: int | None = None
-    reference_options: Mapping[str, Any] = field(default_factory=dict)
+    exclusive: frozenset[str] = frozenset()  # options of which at most one is given
+    configurable: frozenset[str] = frozenset()  # those whose default a configuration can give
+    estimator: bool = True  # whether the design depends on the vibrations of the plant
+    batched: bool = False  # whether a study designs it for many samples at once
+    slow: bool = False  # whether it takes many seconds: an automatic choice leaves it out
+    reference_rank: int | None = None  # among those that studies compare designs with
+    reference_options: Mapping[str, Any] = field(default_factory=dict)  # when it is compared
+    # further ones where it stands for what a telescope would run, beside the limits
     compared_options: Mapping[str, Any] = field(default_factory=dict)
 
     @property

@@ -1,8 +1,4 @@
-"""Numbers that people write in files, with limits beyond which no telescope lies.
-
-A number outside them has a wrong unit or is a slip, and squares of it would overflow or vanish
-beside the others. Zero is allowed only where it means that something is not there.
-"""
+"""Numbers that people write in files, with limits beyond which a unit is wrong or a slip."""
 
 from __future__ import annotations
 
@@ -15,7 +11,7 @@ ONE, EACH = "one", "each"  # one value for all axes, or a list with one per axis
 Count: TypeAlias = Annotated[int, Field(ge=1, le=10**9)]
 Whole: TypeAlias = Annotated[int, Field(ge=0, le=10**9)]
 Fraction: TypeAlias = Annotated[float, Field(ge=1e-6, le=1)]
-Damping: TypeAlias = Annotated[float, Field(ge=1e-7, lt=1)]
+Damping: TypeAlias = Annotated[float, Field(ge=1e-7, le=1e6)]  # far above 1: a drift
 Metres: TypeAlias = Annotated[float, Field(ge=1e-2, le=1e6)]
 MetresPerSecond: TypeAlias = Annotated[float, Field(ge=1e-3, le=1e3)]
 Arcseconds: TypeAlias = Annotated[float, Field(ge=1e-2, le=100)]
@@ -31,8 +27,6 @@ Gain: TypeAlias = Annotated[float, Field(ge=1e-3, le=1e3)]
 Ratio: TypeAlias = Annotated[float, Field(ge=1e-6, le=1e6)]
 RatioFromZero: TypeAlias = Annotated[float, Field(ge=0, le=1e6)]
 Entry: TypeAlias = Annotated[float, Field(ge=-1e6, le=1e6)]
-
-
 Acceleration: TypeAlias = Annotated[float, Field(ge=1e-12, le=1e3)]
 
 

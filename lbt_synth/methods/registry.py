@@ -1,87 +1,250 @@
-"""The registry of the methods of synthesis: all of them, and each by name."""
+"""The methods of synthesis in one table, each found by its name."""
 
 from __future__ import annotations
 
 import difflib
-import pkgutil
-from functools import cache
-from importlib import import_module
+from collections.abc import Callable
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from lbt_synth import methods as folder
+from pydantic import Field
+
 from lbt_synth.errors import ProblemError
-from lbt_synth.methods.method import Method
+from lbt_synth.methods.method import DesignInputs, Method, Section
+from lbt_synth.methods.robust import ROBUST
+
+if TYPE_CHECKING:
+    from lbt_synth.design.integrator import IntegratorDesign
+    from lbt_synth.design.result import Design
+
+Horizon = Annotated[
+    int,
+    Field(
+        description="frames from the newest measurement to the estimate: the filter is for a loop "
+        "with a delay of loop.delay_frames + horizon - 1, at least 1 frame",
+        json_schema_extra={"instead": "Set loop.delay_frames in the configuration instead."},
+    ),
+]
+_FILTER = "lbt_synth.design.filter_design:FilterDesign"
+_BOUNDS = frozenset({"gamma", "gamma_ratio", "rms"})  # at most one is given
+_SIZES = {"gain", "phase_margin_deg", "modulus_margin"}  # what decides the gain of an integrator
 
 
-@cache
-def _methods_of_folder() -> dict[str, Method]:
-    modules = [
-        import_module(f"{folder.__name__}.{module.name}")
-        for module in pkgutil.iter_modules(folder.__path__)
-    ]
-    methods = [module.METHOD for module in modules if hasattr(module, "METHOD")]
-    return {method.name: method for method in sorted(methods, key=lambda method: method.name)}
+class KalmanOptions(Section):
+    """Options of the Kalman filter."""
+
+    route: Literal["riccati", "sdp"] = Field(default="riccati", description="solver")
+    horizon: Horizon = 1
 
 
-def all_methods() -> dict[str, Method]:
-    """Return the methods of synthesis."""
-    return dict(_methods_of_folder())
+class BoundOptions(Section):
+    """A bound on the H-infinity norm, and the horizon."""
+
+    gamma: float | None = Field(default=None, gt=0, description="bound of the H-infinity norm [nm]")
+    gamma_ratio: float = Field(
+        default=1.2,
+        ge=1,
+        le=1e9,
+        description="bound of the norm as a multiple of the least norm",
+        json_schema_extra={
+            "hint": "At 1 the bound is the least one; far above it the filter is the Kalman "
+            "filter.",
+            "slider": [1.0, 3.0],
+        },
+    )
+    horizon: Horizon = 1
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the options of which one is the bound: an absolute one, else the multiple."""
+        values = self.model_dump()
+        absolute = next((name for name in ("rms", "gamma") if values.get(name)), "gamma_ratio")
+        return {n: v for n, v in values.items() if n not in _BOUNDS or n == absolute}
+
+
+class HinfOptions(BoundOptions):
+    """Options of the H-infinity filter."""
+
+    route: Literal["lmi", "riccati"] | None = Field(
+        default=None, description="solver (default lmi up to 20 states, riccati beyond)"
+    )
+
+
+class MixedOptions(BoundOptions):
+    """Options of the mixed filter."""
+
+    rms: float | None = Field(
+        default=None,
+        gt=0,
+        description="bound of the estimation error [nm rms] instead, under which the norm is "
+        "minimised",
+    )
+    taps: int = Field(
+        default=16, ge=1, le=64, description="past innovations that the filter weighs"
+    )
+
+
+class LqgOptions(Section):
+    """Options of the LQG controller."""
+
+    command_weight: float = Field(
+        default=0.0,
+        ge=0,
+        le=1e12,
+        description="weight of the squared command beside the squared residual",
+    )
+
+
+class IntegratorOptions(Section):
+    """Options of the integrator."""
+
+    gain: float | None = Field(
+        default=None,
+        ge=1e-3,
+        le=1e3,
+        description="its gain (default: the best for the truth that keeps the margins)",
+    )
+    phase_margin_deg: float | None = Field(
+        default=None, gt=0, lt=180, description="least phase margin [deg]", examples=[45]
+    )
+    modulus_margin: float | None = Field(
+        default=None, gt=0, lt=1, description="least modulus margin", examples=[0.5]
+    )
+    leak: float = Field(
+        default=1.0, gt=0, le=1, description="part of a command that is left after a frame"
+    )
+    integrators: int = Field(
+        default=1, ge=1, le=2, description="how many in series; two need a zero"
+    )
+    zero_hz: float | None = Field(
+        default=None,
+        ge=1e-3,
+        le=1e6,
+        description="corner of a zero [Hz]: of a PI controller, or of the lag compensator of a "
+        "double integrator",
+    )
+
+
+def _filter_of(synthesis: str) -> Callable[[DesignInputs, Any], Design]:
+    """Return how a function "module:name" designs for the plant of the inputs."""
+
+    def build(inputs: DesignInputs, options: Any) -> Design:
+        design: Design = resolve_name(synthesis)(inputs.plant, **options.arguments())
+        return design
+
+    return build
+
+
+def _build_lqg(inputs: DesignInputs, options: LqgOptions) -> Design:
+    from lbt_synth.design.lqg import lqg
+
+    return lqg(inputs.plant.own_sensor_alone(), **options.arguments())
+
+
+def _build_integrator(inputs: DesignInputs, options: IntegratorOptions) -> IntegratorDesign:
+    from lbt_synth.design.integrator import IntegratorLaw, integrator, optimal_integrator
+
+    section: IntegratorOptions | None = inputs.method_section(INTEGRATOR.name)
+    chosen = options.model_dump(exclude_unset=True)
+    usual = {} if section is None else section.model_dump(exclude_unset=True)
+    if chosen.keys() & _SIZES:
+        usual = {name: value for name, value in usual.items() if name not in _SIZES}
+    values = usual | chosen
+    gain = values.pop("gain", None)
+    law = IntegratorLaw(**values)
+    if gain is None:
+        return optimal_integrator(inputs.hardware, inputs.truth, law=law)
+    return integrator(inputs.hardware, gain=gain, law=law)
+
+
+KALMAN = Method(
+    name="kalman",
+    title="Kalman filter",
+    label="Kalman",
+    design=_FILTER,
+    options=KalmanOptions,
+    build=_filter_of("lbt_synth.design.kalman:kalman"),
+    batched=True,
+    reference_rank=1,
+)
+HINF = Method(
+    name="hinf",
+    title="H-infinity filter",
+    label="H∞",
+    design=_FILTER,
+    options=HinfOptions,
+    build=_filter_of("lbt_synth.design.hinf:hinf"),
+    exclusive=_BOUNDS,
+    configurable=frozenset({"gamma_ratio"}),
+    reference_rank=2,
+    reference_options={"route": "riccati"},
+)
+MIXED = Method(
+    name="mixed",
+    title="mixed filter",
+    label="mixed",
+    design=_FILTER,
+    options=MixedOptions,
+    build=_filter_of("lbt_synth.design.mixed:mixed"),
+    exclusive=_BOUNDS,
+    configurable=frozenset({"gamma_ratio"}),
+    slow=True,
+)
+LQG = Method(
+    name="lqg",
+    title="LQG controller",
+    label="LQG",
+    options=LqgOptions,
+    build=_build_lqg,
+    design="lbt_synth.design.lqg:LqgDesign",
+    configurable=frozenset({"command_weight"}),
+)
+INTEGRATOR = Method(
+    name="integrator",
+    title="integrator",
+    label="integrator",
+    options=IntegratorOptions,
+    section=IntegratorOptions,
+    build=_build_integrator,
+    design="lbt_synth.design.integrator:IntegratorDesign",
+    estimator=False,
+    reference_rank=0,
+    compared_options={"phase_margin_deg": 45.0},  # one that a telescope would run
+)
+METHODS = {method.name: method for method in (HINF, INTEGRATOR, KALMAN, LQG, MIXED, ROBUST)}
 
 
 def method_named(name: str) -> Method:
-    """Return a method by its name.
-
-    Parameters
-    ----------
-    name : str
-        The name.
-
-    Returns
-    -------
-    Method
-        The method.
-
-    Raises
-    ------
-    ProblemError
-        If there is none of this name.
-
-    Examples
-    --------
-    >>> from lbt_synth.methods import method_named
-    >>> method_named("kalman").title
-    'Kalman filter'
-    """
-    methods = all_methods()
-    if name not in methods:
-        close = difflib.get_close_matches(name, methods, n=1)
+    """Return a method by its name; refuse a name that none has."""
+    if name not in METHODS:
+        close = difflib.get_close_matches(name, METHODS, n=1)
         hint = f" Did you mean {close[0]}?" if close else ""
-        raise ProblemError(f"method must be one of {', '.join(methods)}; got {name!r}.{hint}")
-    return methods[name]
+        raise ProblemError(f"method must be one of {', '.join(METHODS)}; got {name!r}.{hint}")
+    return METHODS[name]
 
 
 def option_names() -> list[str]:
     """Return the names of the options of all methods."""
-    return sorted({name for m in all_methods().values() for name in m.options.model_fields})
+    return sorted({name for m in METHODS.values() for name in m.options.model_fields})
 
 
 def design_title(name: str) -> str:
     """Return what sentences call a design with a name in ``Design.method``, else the name."""
-    return all_methods()[name].title if name in all_methods() else name
+    return METHODS[name].title if name in METHODS else name
 
 
 def design_label(name: str) -> str:
     """Return what figures call a design with a name in ``Design.method``, else the name."""
-    return all_methods()[name].label if name in all_methods() else name
+    return METHODS[name].label if name in METHODS else name
 
 
 def record_methods() -> list[str]:
     """Return the names of the methods that need no more than a plant identified from a record."""
-    return [n for n, m in all_methods().items() if m.estimator and not m.needs_options]
+    return [n for n, m in METHODS.items() if m.estimator and not m.needs_options]
 
 
 def gain_robust_method() -> str:
     """Return the name of the method that designs for a plant and an interval of sensor gains."""
-    return next(n for n, m in all_methods().items() if m.plant_section is not None)
+    return next(n for n, m in METHODS.items() if m.plant_section is not None)
 
 
 def default_method() -> str:
@@ -93,7 +256,7 @@ def reference_methods(*, estimators_only: bool = False) -> list[Method]:
     """Return the methods that studies compare designs with, in their order."""
     ranked = [
         (method.reference_rank, method.name, method)
-        for method in all_methods().values()
+        for method in METHODS.values()
         if method.reference_rank is not None and (method.estimator or not estimators_only)
     ]
     return [method for *_, method in sorted(ranked, key=lambda entry: entry[:2])]

@@ -1,7 +1,4 @@
-"""A method of synthesis with its options, as a command or a study asks for it.
-
-:class:`PlantInputs` lets a study or a record, which have a plant alone, build it.
-"""
+"""A method of synthesis with its options, as a command, a study or a record asks for it."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ from pydantic import ValidationError
 
 from lbt_synth.errors import ProblemError, suggest_word
 from lbt_synth.methods.method import DesignInputs, Method, Section
-from lbt_synth.methods.registry import all_methods, method_named
+from lbt_synth.methods.registry import METHODS, method_named
 
 if TYPE_CHECKING:
     from lbt_synth.design.result import Design
@@ -96,7 +93,7 @@ def design_request(
 
 def option_owners(option: str) -> list[str]:
     """Return the names of the methods that take an option."""
-    return [m.name for m in all_methods().values() if option in m.options.model_fields]
+    return [m.name for m in METHODS.values() if option in m.options.model_fields]
 
 
 def _describe_stranger(option: str, method: Method, called: str, words: Wording) -> str:

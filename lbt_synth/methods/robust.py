@@ -1,56 +1,151 @@
-"""The method of the robust controller, which the section ``design.robust`` describes."""
+"""The robust controller: the section ``design.robust`` of a configuration, and its design."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from lbt_synth.errors import ConfigError, ProblemError, name_key
 from lbt_synth.methods.method import DesignInputs, Method, Section
-from lbt_synth.methods.robust_section import Axis, BandSection, RobustSection
+from lbt_synth.methods.quantities import (
+    Gain,
+    Hertz,
+    HertzFromZero,
+    Milliarcseconds,
+    Nanometres,
+    Ratio,
+    RatioFromZero,
+)
 from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
 
 if TYPE_CHECKING:
     from lbt_synth.design.loop_shaping import ShapedDesign
-    from lbt_synth.design.shaping.specification import Demand
+    from lbt_synth.design.shaping import VibrationBand
+    from lbt_synth.design.shaping.demands import Demand
     from lbt_synth.models import Spectrum, TipTiltPlant, Vibration
 
-T = TypeVar("T")
+Axis: TypeAlias = Literal["tip", "tilt", "both"]
 _KEY = "design.robust"
 _AXES: dict[Axis, int] = {"tip": 0, "tilt": 1}
 _MOST_BANDS = 6  # around lines of a plant
 _BAND = 0.02  # half width of such a band, over its frequency
 _PLANT_FUNCTIONS = 30  # of the parameter for a plant, which is not reduced: that takes longer
 _GAIN_BAND, _GAIN_MARGIN, _GAIN_FUNCTIONS = 0.003, 0.25, 60  # if only the gain is uncertain
+_PLAIN = {"moving_gain", "modulus_margin", "delay_error_frames", "functions", "pole"}
+_PLAIN |= {"states", "loss"}  # options that robust takes as they are
+
+
+class _Ends(Section):
+    """The ends of a band."""
+
+    low_hz: HertzFromZero = Field(description="lower end of the band [Hz]")
+    high_hz: Hertz = Field(description="upper end of the band [Hz]")
+
+
+class BandSection(_Ends):
+    """A band in which a vibration may be anywhere."""
+
+    rms_nm: Nanometres | None = Field(default=None, description="standard deviation [nm rms]")
+    rms_mas: Milliarcseconds | None = Field(default=None, description="standard deviation [mas]")
+    axis: Axis = Field(default="both", description="tip, tilt or both")
+    damping: float | None = Field(default=None, ge=0, lt=1, description="damping ratio")
+
+    @model_validator(mode="after")
+    def _require_one_size(self) -> BandSection:
+        if (self.rms_nm is None) == (self.rms_mas is None):
+            raise ValueError("expected exactly one of rms_nm, rms_mas")
+        return self
+
+
+class AttenuationSection(_Ends):
+    """One step of a mask on the rejection."""
+
+    at_most: Ratio = Field(description="largest modulus of the rejection in it")
+    sensor_gain: Gain | None = Field(default=None, description="real sensor gain at which it holds")
+
+
+class MirrorUncertaintySection(_Ends):
+    """Relative uncertainty of the mirror in a band."""
+
+    relative: Ratio = Field(description="relative error of the mirror's response")
+
+
+class RobustSection(Section):
+    """The robust design: bands of vibrations, sensor gains, demands."""
+
+    bands: list[BandSection] = Field(
+        min_length=1, description="bands with a vibration anywhere in them"
+    )
+    turbulence: Literal["frozen_flow", "model"] | None = Field(
+        default=None, description="frozen_flow or model (default: as the truth)"
+    )
+    sensor_gain: list[Gain] | None = Field(
+        default=None,
+        min_length=2,
+        max_length=2,
+        description="[low, high]: stable for every real sensor gain between",
+    )
+    moving_gain: bool = Field(
+        default=False, description="stable while the gain moves in sensor_gain, at any speed"
+    )
+    scenarios: list[Gain] | None = Field(
+        default=None,
+        min_length=1,
+        description="real sensor gains whose residuals are minimised together",
+    )
+    modulus_margin: float = Field(
+        default=0.45,
+        ge=1e-3,
+        lt=1,
+        description="least modulus margin at model.sensor_gain",
+        json_schema_extra={"slider": [0.2, 0.8]},
+    )
+    noise_peak: Ratio | None = Field(
+        default=None, description="largest amplification of noise at any frequency"
+    )
+    delay_error_frames: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="stable for delay errors up to this [frames], late or early, at every gain of "
+        "sensor_gain (default: 0.1 where the mirror settles at once, else 0)",
+    )
+    command_stroke_nm: Nanometres | None = Field(
+        default=None, description="largest rms of the commands [nm]"
+    )
+    command_step_nm: Nanometres | None = Field(
+        default=None, description="largest rms of their steps [nm]"
+    )
+    attenuation: list[AttenuationSection] = Field(
+        default=[], description="upper bounds on the rejection"
+    )
+    mirror_uncertainty: list[MirrorUncertaintySection] = Field(
+        default=[], description="errors of the mirror for which the loop stays stable"
+    )
+    functions: int = Field(default=60, ge=1, le=1000, description="functions of the long parameter")
+    pole: float = Field(default=0.7, ge=0, lt=1, description="common pole of these functions")
+    states: int | None = Field(
+        default=20, ge=2, le=1000, description="largest number of states per axis; null: any"
+    )
+    loss: RatioFromZero = Field(
+        default=0.1, description="largest relative increase of the residual for fewer states"
+    )
 
 
 def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
     """Design the controller; the section's sensor gains are real, the design's are relative."""
-    from lbt_synth.design.robust import robust
+    from lbt_synth.design.loop_shaping import robust
 
-    section: RobustSection | None = inputs.method_section(METHOD.name)
+    section: RobustSection | None = inputs.method_section(ROBUST.name)
     if section is None:
         raise ConfigError(
             f"the key {_KEY} is missing: the robust design needs its bands at least. "
             "lbt_robust.yaml of lbt-synth init --examples has it.",
             path=_KEY,
         )
-    assumed = inputs.sensor_gain
-    arguments: dict[str, Any] = {
-        name: getattr(section, name)
-        for name in (
-            "moving_gain",
-            "modulus_margin",
-            "delay_error_frames",
-            "functions",
-            "pole",
-            "states",
-            "loss",
-        )
-    }
+    assumed, arguments = inputs.sensor_gain, section.model_dump(include=_PLAIN)
     if section.sensor_gain is not None:
         low, high = section.sensor_gain
         if not low <= assumed <= high:
@@ -64,10 +159,13 @@ def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
         arguments["scenarios"] = tuple(gain / assumed for gain in section.scenarios)
     with name_key(_KEY):
         spectrum = _choose_spectrum(inputs, section)
-        bands = _build_bands(inputs, section)
-        demands = _list_demands(inputs, section, spectrum)
-        plant = inputs.plant.own_sensor_alone()
-        return robust(plant, bands=bands, turbulence=spectrum, demands=demands, **arguments)
+        return robust(
+            inputs.plant.own_sensor_alone(),
+            bands=_build_bands(inputs, section),
+            turbulence=spectrum,
+            demands=_list_demands(inputs, section, spectrum),
+            **arguments,
+        )
 
 
 def _choose_spectrum(inputs: DesignInputs, section: RobustSection) -> Spectrum | None:
@@ -83,93 +181,73 @@ def _choose_spectrum(inputs: DesignInputs, section: RobustSection) -> Spectrum |
     return inputs.atmosphere
 
 
-def _build_bands(inputs: DesignInputs, section: RobustSection) -> list[Any]:
+def _build_bands(inputs: DesignInputs, section: RobustSection) -> list[list[VibrationBand]]:
     """Return the bands, one list per mode."""
     from lbt_synth.design.shaping import VibrationBand
 
     modes = inputs.hardware.modes
-    out: list[list[Any]] = [[] for _ in range(modes)]
+    bands: list[list[VibrationBand]] = [[] for _ in range(modes)]
     for i, band in enumerate(section.bands):
-        rms_nm = inputs.size_nm(band, f"{_KEY}.bands[{i}]")
-        axis = _AXES.get(band.axis)
+        key = f"{_KEY}.bands[{i}]"
+        rms_nm, axis = inputs.size_nm(band, key), _AXES.get(band.axis)
         if axis is not None and modes != 2:
-            key = f"{_KEY}.bands[{i}].axis"
-            raise ConfigError(f"{key}: this loop has {modes} axes: leave axis out.", path=key)
+            raise ConfigError(
+                f"{key}.axis: this loop has {modes} axes: leave axis out.", path=f"{key}.axis"
+            )
+        ends = {"low_hz": band.low_hz, "high_hz": band.high_hz}
         for mode in range(modes) if axis is None else (axis,):
             damping = _model_damping(inputs, band, mode) if band.damping is None else band.damping
-            entry = {"low_hz": band.low_hz, "high_hz": band.high_hz, "rms_nm": rms_nm}
-            entry["damping"] = damping
-            out[mode].append(_build_entry(inputs, f"bands[{i}]", VibrationBand, entry))
-    return out
+            with name_key(key):
+                bands[mode].append(VibrationBand(**ends, rms_nm=rms_nm, damping=damping))
+    return bands
 
 
 def _model_damping(inputs: DesignInputs, band: BandSection, mode: int) -> float:
     """Return the largest damping of the model's vibrations of a mode in a band, 0 without one."""
-    found = (
+    dampings = (
         line.damping
         for line in inputs.plant.vibrations
         if band.low_hz <= line.frequency_hz <= band.high_hz and line.direction[mode]
     )
-    return max(found, default=0.0)
-
-
-def _build_entry(
-    inputs: DesignInputs, name: str, kind: Callable[..., T], values: Mapping[str, Any]
-) -> T:
-    """Build one entry of a list; an error names its key."""
-    key = f"{_KEY}.{name}"
-    nyquist_hz = inputs.hardware.frame_rate_hz / 2
-    if values["high_hz"] > nyquist_hz:
-        raise ConfigError(
-            f"{key}: must lie below the Nyquist frequency {nyquist_hz:.6g} Hz; got up to "
-            f"{values['high_hz']:g} Hz.",
-            path=key,
-        )
-    with name_key(key):
-        return kind(**values)
+    return max(dampings, default=0.0)
 
 
 def _list_demands(
     inputs: DesignInputs, section: RobustSection, spectrum: Spectrum | None
 ) -> list[Demand]:
-    from lbt_synth.design.shaping import Attenuation, MirrorUncertainty, NoisePeak
-
-    out: list[Demand] = []
-    if section.noise_peak is not None:
-        out.append(NoisePeak(at_most=section.noise_peak))
-    for i, step in enumerate(section.attenuation):
-        gain = 1.0 if step.sensor_gain is None else step.sensor_gain / inputs.sensor_gain
-        entry = step.model_dump() | {"sensor_gain": gain}
-        out.append(_build_entry(inputs, f"attenuation[{i}]", Attenuation, entry))
-    for i, part in enumerate(section.mirror_uncertainty):
-        name = f"mirror_uncertainty[{i}]"
-        out.append(_build_entry(inputs, name, MirrorUncertainty, part.model_dump()))
-    return out + _list_command_bounds(inputs, section, spectrum)
-
-
-def _list_command_bounds(
-    inputs: DesignInputs, section: RobustSection, spectrum: Spectrum | None
-) -> list[Demand]:
+    """Return the demands of the section, those on commands under the turbulence of the design."""
     from lbt_synth.design.loop_shaping import noise_per_mode
-    from lbt_synth.design.shaping import CommandRms
+    from lbt_synth.design.shaping import Attenuation, CommandRms, MirrorUncertainty, NoisePeak
     from lbt_synth.models.spectra import spectrum_key
 
-    given = ((section.command_stroke_nm, False), (section.command_step_nm, True))
-    bounds = [(bound, rate) for bound, rate in given if bound is not None]
+    demands: list[Demand] = []
+    if section.noise_peak is not None:
+        demands.append(NoisePeak(at_most=section.noise_peak))
+    for i, step in enumerate(section.attenuation):
+        gain = 1.0 if step.sensor_gain is None else step.sensor_gain / inputs.sensor_gain
+        with name_key(f"{_KEY}.attenuation[{i}]"):
+            demands.append(Attenuation(**{**step.model_dump(), "sensor_gain": gain}))
+    for i, error in enumerate(section.mirror_uncertainty):
+        with name_key(f"{_KEY}.mirror_uncertainty[{i}]"):
+            demands.append(MirrorUncertainty(**error.model_dump()))
+    bounds = {False: section.command_stroke_nm, True: section.command_step_nm}
     models = inputs.plant.turbulence
-    if bounds and spectrum is None and len({spectrum_key(model) for model in models}) > 1:
-        raise ConfigError(
-            f"{_KEY}: bounds on the commands hold under one turbulence for all axes, but "
-            "model.turbulence has one per axis. Leave command_stroke_nm and command_step_nm "
-            "out, or give one model.",
-            path=_KEY,
+    for rate, bound in bounds.items():
+        if bound is None:
+            continue
+        if spectrum is None and len({spectrum_key(model) for model in models}) > 1:
+            raise ConfigError(
+                f"{_KEY}: bounds on the commands hold under one turbulence for all axes, but "
+                "model.turbulence has one per axis. Leave command_stroke_nm and command_step_nm "
+                "out, or give one model.",
+                path=_KEY,
+            )
+        noise_nm = float(max(noise_per_mode(inputs.hardware, inputs.plant.own_sensor_alone().R)))
+        turbulence = models[0] if spectrum is None else spectrum
+        demands.append(
+            CommandRms(at_most_nm=bound, rate=rate, turbulence=turbulence, noise_nm=noise_nm)
         )
-    bound_commands = partial(
-        CommandRms,
-        turbulence=models[0] if spectrum is None else spectrum,
-        noise_nm=float(max(noise_per_mode(inputs.hardware, inputs.plant.own_sensor_alone().R))),
-    )
-    return [bound_commands(at_most_nm=bound, rate=rate) for bound, rate in bounds]
+    return demands
 
 
 def _plant_section(
@@ -203,10 +281,9 @@ def _plant_section(
         raise ProblemError("a robust controller is for vibrations; the plant has none.")
     if sensor_gains is None:
         return RobustSection(bands=bands, functions=_PLANT_FUNCTIONS, states=None)
-    gains = [min(sensor_gains[0], 1.0), max(sensor_gains[1], 1.0)]
     return RobustSection(
         bands=bands,
-        sensor_gain=gains,
+        sensor_gain=[min(sensor_gains[0], 1.0), max(sensor_gains[1], 1.0)],
         modulus_margin=_GAIN_MARGIN,
         functions=_GAIN_FUNCTIONS,
         states=None,
@@ -221,7 +298,7 @@ def _axis(line: Vibration) -> Axis:
     return shaken[0] if len(shaken) == 1 else "both"
 
 
-METHOD = Method(
+ROBUST = Method(
     name="robust",
     title="robust controller",
     label="robust",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, cast
 
 import numpy as np
 
@@ -109,26 +109,24 @@ class LoopHardware(Summarised):
             n = influence.shape[0]
         if n < 1 or (influence is not None and influence.shape[1] < 1):
             raise ProblemError(f"a loop needs at least one mode and one command; got {n} modes.")
-        given = {"sensor_matrix": sensor, "influence_matrix": influence}
-        for name, value in given.items():
+        matrices = {"sensor_matrix": sensor, "influence_matrix": influence}
+        for name, value in matrices.items():
             if value is not None and not np.any(value):
                 raise ProblemError(f"{name} must respond to something; got only zeros.")
-            given[name] = frozen_copy(np.eye(n)) if value is None else value
-        check_fields(self, modes=n, **given)
+            matrices[name] = frozen_copy(np.eye(n)) if value is None else value
+        check_fields(self, modes=n, **matrices)
         if self.mirror is not None:
             _ = self.mirror_system  # refuses a mirror that does not fit the frame rate
 
     @property
     def sensor(self) -> FloatArray:
         """Sensor matrix (q, n)."""
-        assert self.sensor_matrix is not None  # set by __post_init__
-        return self.sensor_matrix
+        return cast("FloatArray", self.sensor_matrix)  # set by __post_init__
 
     @property
     def influence(self) -> FloatArray:
         """Influence matrix N (n, m)."""
-        assert self.influence_matrix is not None  # set by __post_init__
-        return self.influence_matrix
+        return cast("FloatArray", self.influence_matrix)
 
     @property
     def projector(self) -> FloatArray:

@@ -78,12 +78,13 @@ def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
     poles = np.where(
         damping < 1, 2 * decay * np.cos(frequency * root), np.exp(-slow) + np.exp(-fast)
     )
-    return np.stack([poles, -(decay**2)], axis=-1)
+    squares = decay**2
+    # what rounding hides is nothing: a coefficient of 1e-37 has states that no solver can scale
+    squares = np.where(squares < np.finfo(float).eps, 0.0, squares)
+    return np.stack([poles, 0.0 - squares], axis=-1)
 
 
-def unit_density(
-    frequency: float, damping: float, s: FloatArray, sections: int = 1
-) -> FloatArray:
+def unit_density(frequency: float, damping: float, s: FloatArray, sections: int = 1) -> FloatArray:
     """Spectrum of unit variance of a resonance, or of some in series, (f,) as s is."""
     b, p, _ = recursion(frequency, damping)
     size = s * ((p - 2) / 2)
@@ -121,7 +122,7 @@ def section_drives(frequency: float, damping: float, sections: int) -> FloatArra
     """Return the driving deviations of processes of 1, 2, ... sections of unit variance, (m,)."""
     drive = coefficients(frequency, damping)[2]
     variances = [series_variance(frequency, damping, m)[0] for m in range(1, sections + 1)]
-    return np.sqrt(drive ** np.arange(1, sections + 1) / np.array(variances))
+    return np.asarray(np.sqrt(drive ** np.arange(1, sections + 1) / np.array(variances)))
 
 
 def resonance_densities(
@@ -136,9 +137,11 @@ def resonance_densities(
     The slopes are those of the logarithm by the logarithms of frequency and damping ratio; s is
     (f,). Those of several sections have their number in ``sections`` (c,), all 1 by default.
     """
-    each = [recursion(*pair) for pair in zip(frequency.tolist(), damping.tolist(), strict=True)]
-    b, p = np.array([row[:2] for row in each]).T[..., None]
-    by_b, by_p = np.array([row[2] for row in each]).transpose(1, 0, 2)  # by the logarithms
+    recursions = [
+        recursion(*pair) for pair in zip(frequency.tolist(), damping.tolist(), strict=True)
+    ]
+    b, p = np.array([row[:2] for row in recursions]).T[..., None]
+    by_b, by_p = np.array([row[2] for row in recursions]).transpose(1, 0, 2)  # by the logarithms
     half, wide = (2 - p) / 2, s * (1 - s / 4)
     near = s * -half
     near += b

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.models.turbulence.atmosphere import ARCSEC_RAD
-from lbt_synth.models.turbulence.zernike import noll_orders
-from lbt_synth.validation import FloatArray, frozen_copy, number
+from lbt_synth.validation import FloatArray, frozen_copy, number, one_or_each
 
 
 def nm_per_mas(diameter_m: float) -> float:
@@ -72,13 +72,13 @@ def illuminated_subapertures(across: float, obstruction: float = 0.0) -> float:
 
 def pyramid_tilt_noise_nm(
     *,
-    photons: float,
-    read_noise_electrons: float,
-    modulation_lambda_over_d: float,
+    photons: float | FloatArray,
+    read_noise_electrons: float | FloatArray,
+    modulation_lambda_over_d: float | FloatArray,
     subapertures: float,
     wavelength_um: float,
     diameter_m: float,
-) -> float:
+) -> float | FloatArray:
     """Compute the noise of the tip (or tilt) measurement, per frame [nm rms wavefront].
 
     Slope variance of a quad cell in one subaperture,
@@ -89,7 +89,7 @@ def pyramid_tilt_noise_nm(
 
     Parameters
     ----------
-    photons, read_noise_electrons, modulation_lambda_over_d : float
+    photons, read_noise_electrons, modulation_lambda_over_d : float or (b,) array_like
         Photons per subaperture and frame; read noise [electrons rms per pixel]; modulation radius
         [lambda/D].
     subapertures, wavelength_um, diameter_m : float
@@ -97,7 +97,7 @@ def pyramid_tilt_noise_nm(
 
     Returns
     -------
-    float
+    float or (b,) ndarray
         Noise [nm rms wavefront].
 
     Raises
@@ -121,16 +121,17 @@ def pyramid_tilt_noise_nm(
     ... )
     15.5
     """
-    n = number(photons, "photons", above=0)
-    read = number(read_noise_electrons, "read_noise_electrons", at_least=0)
-    modulation = number(modulation_lambda_over_d, "modulation_lambda_over_d", above=0)
+    n = one_or_each(photons, "photons", above=0)
+    read = one_or_each(read_noise_electrons, "read_noise_electrons", at_least=0)
+    modulation = one_or_each(modulation_lambda_over_d, "modulation_lambda_over_d", above=0)
     count = number(subapertures, "subapertures", above=0)
     wavelength = number(wavelength_um, "wavelength_um", above=0)
     diameter = number(diameter_m, "diameter_m", above=0)
     slope_variance = (n + 4 * read**2) / n**2
     mas = np.degrees(wavelength * 1e-6 / diameter) * 3600e3  # lambda / D
     noise_mas = np.pi * modulation * mas / 2 * np.sqrt(slope_variance / count)
-    return float(noise_mas * nm_per_mas(diameter))
+    noise_nm = noise_mas * nm_per_mas(diameter)
+    return noise_nm if np.ndim(noise_nm) else float(noise_nm)
 
 
 def pyramid_modal_noise_nm(

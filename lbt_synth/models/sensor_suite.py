@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 OWN_SENSOR = "wavefront"
 LONGEST_PERIOD = 1000  # frames of the loop per reading
 LONGEST_DELAY = 100  # of a sensor [its periods]
-_WHOLE = 1e-9
+WHOLE = 1e-9  # relative amount by which a ratio of rates may miss a whole number
 
 
 def noise_factor(noise_nm: Any, q: int) -> FloatArray:
@@ -116,8 +116,10 @@ class WavefrontSensor:
     sensor_matrix: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        given = None if self.sensor_matrix is None else matrix(self.sensor_matrix, "sensor_matrix")
-        check_fields(self, sensor_matrix=given)
+        response = (
+            None if self.sensor_matrix is None else matrix(self.sensor_matrix, "sensor_matrix")
+        )
+        check_fields(self, sensor_matrix=response)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -238,7 +240,7 @@ def period_frames(sensor: Sensor, hardware: LoopHardware) -> int:
     """Return the frames of the loop from one reading of a sensor to the next."""
     ratio = hardware.frame_rate_hz / sensor.rate_hz
     period = round(ratio)
-    if not 1 <= period <= LONGEST_PERIOD or abs(ratio - period) > _WHOLE * ratio:
+    if not 1 <= period <= LONGEST_PERIOD or abs(ratio - period) > WHOLE * ratio:
         raise ProblemError(
             f"the frame rate {hardware.frame_rate_hz:.6g} Hz must be a whole multiple (up to "
             f"{LONGEST_PERIOD}) of the rate of sensor {sensor.name}; got {sensor.rate_hz:.6g} Hz. "
@@ -251,13 +253,13 @@ def _age(sensor: Sensor, hardware: LoopHardware, *, least: int) -> float:
     """Return the age of the oldest frame that a reading averages; the newest is at least so old."""
     period, late = period_frames(sensor, hardware), hardware.delay_frames - 1
     age = sensor.delay_frames * period - late
-    if age - period + 1 < least - _WHOLE:
+    if age - period + 1 < least - WHOLE:
         raise ProblemError(
             f"the delay of sensor {sensor.name} must be at least "
             f"{(period + late + least - 1) / period:.4g} of its frames, so that its exposure has "
             f"ended when it is read; got {sensor.delay_frames:g}."
         )
-    return float(round(age)) if abs(age - round(age)) < _WHOLE * period else age
+    return float(round(age)) if abs(age - round(age)) < WHOLE * period else age
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -312,7 +314,7 @@ class SensorSuite:
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of all accelerometer channels."""
-        return tuple(name for each in self.accelerometers for name in each.channels)
+        return tuple(name for sensor in self.accelerometers for name in sensor.channels)
 
     def period(self, hardware: LoopHardware) -> int:
         """Return the common period of all sensors [frames of the loop]."""
@@ -341,7 +343,7 @@ class SensorSuite:
     def marked(self, units: tuple[str, ...], hardware: LoopHardware) -> BoolArray:
         """Return which measurements some sensors or channels give, (q,)."""
         rows = self.rows(hardware)
-        out = np.zeros(max(own.stop for own in rows.values()), dtype=np.bool_)
+        out = np.zeros(max(place.stop for place in rows.values()), dtype=np.bool_)
         for unit in units:
             if unit not in rows:
                 raise ProblemError(
@@ -352,7 +354,7 @@ class SensorSuite:
 
     def noise_factor(self, own: FloatArray, modes: int) -> FloatArray:
         """Return the square root of all noise, from that of the loop's own sensor, (q, q)."""
-        return np.asarray(block_diag(own, *(each.noise_factor(modes) for each in self.sensors)))
+        return np.asarray(block_diag(own, *(sensor.noise_factor(modes) for sensor in self.sensors)))
 
     def read(self, hardware: LoopHardware) -> BoolArray:
         """Return which measurements are read in each frame of the common period, (N, q)."""

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, TypeAlias
 
 import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.disturbance_facts import disturbance_facts
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.sensor_suite import Motions
-from lbt_synth.models.spectra import Spectrum, spectrum_key
+from lbt_synth.models.spectra import ARModel, Spectrum, spectrum_key
 from lbt_synth.models.vibration import (
     DriftingVibration,
     SinusoidalVibration,
@@ -20,7 +19,8 @@ from lbt_synth.models.vibration import (
     Vibration,
     stationary_vibrations,
 )
-from lbt_synth.storage.rows import fact_table
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
@@ -31,6 +31,64 @@ from lbt_synth.validation import (
     number,
     one_or_each,
 )
+
+_DIGITS = ".4g"
+_MOST_LINES = 6  # vibrations that are listed, the strongest
+
+
+@table_row
+class DisturbanceFacts:
+    """Turbulence, vibrations and noise, in words."""
+
+    turbulence: str = column("turbulence")
+    vibrations: str = column("vibrations")
+    noise_nm: str = column("noise per frame")
+    sensor_gain: float | None = column("sensor gain over the assumed one")
+
+
+def disturbance_facts(
+    turbulence: Iterable[Spectrum | None],
+    vibrations: Sequence[TrueVibration],
+    noise_nm: FloatArray,
+    sensor_gain: float | None = None,
+) -> DisturbanceFacts:
+    """Return the facts of disturbances; what axes have in common is said once."""
+    return DisturbanceFacts(
+        turbulence=_join(_spectrum_text(spectrum) for spectrum in turbulence),
+        vibrations=_vibrations_text(vibrations),
+        noise_nm=_join(nm_text(noise, _DIGITS) for noise in np.ravel(noise_nm)),
+        sensor_gain=sensor_gain,
+    )
+
+
+def _join(texts: Iterable[str]) -> str:
+    return ", ".join(dict.fromkeys(texts))
+
+
+def _spectrum_text(spectrum: Spectrum | None) -> str:
+    if spectrum is None:
+        return "none"
+    if isinstance(spectrum, ARModel):
+        return f"AR{spectrum.order} {nm_text(spectrum.rms_nm, _DIGITS)}"
+    rms_nm = getattr(spectrum, "tilt_rms_nm", None)
+    size = f" {nm_text(rms_nm, _DIGITS)}" if isinstance(rms_nm, float) else ""
+    return f"{type(spectrum).__name__}{size}"
+
+
+def _vibrations_text(vibrations: Sequence[TrueVibration]) -> str:
+    """Return size and frequency of the strongest vibrations, by frequency."""
+    strongest = sorted(vibrations, key=lambda line: -line.rms_nm)[:_MOST_LINES]
+    texts = sorted((_frequency(line), line.rms_nm) for line in strongest)
+    more = len(vibrations) - len(strongest)
+    listed = [
+        f"{nm_text(rms_nm, _DIGITS)} at {frequency_hz:.4g} Hz" for frequency_hz, rms_nm in texts
+    ]
+    return ", ".join(listed + ([f"{more} more"] if more else []))
+
+
+def _frequency(line: TrueVibration) -> float:
+    return line.start_hz if isinstance(line, DriftingVibration) else line.frequency_hz
+
 
 # spectra with the modes that have them, vibrations, and a root of the covariance of the noise
 Entering: TypeAlias = tuple[
@@ -98,8 +156,8 @@ class Truth(Summarised):
     motions: Motions = ()
 
     def __post_init__(self) -> None:
-        given = self.turbulence
-        parts = tuple(given) if isinstance(given, Sequence) else (given,)
+        turbulence = self.turbulence
+        parts = tuple(turbulence) if isinstance(turbulence, Sequence) else (turbulence,)
         if not parts:
             raise DimensionError(
                 "turbulence must be one spectrum, or one per mode; got an empty sequence. For no "
@@ -120,7 +178,7 @@ class Truth(Summarised):
         noise = one_or_each(self.noise_nm, "noise_nm", at_least=0)
         check_fields(
             self,
-            turbulence=parts if isinstance(given, Sequence) else given,
+            turbulence=parts if isinstance(turbulence, Sequence) else turbulence,
             vibrations=tuple(self.vibrations),
             noise_nm=float(noise) if noise.ndim == 0 else noise,
             frequency_errors_hz=self._checked_errors(),
@@ -237,11 +295,11 @@ class Truth(Summarised):
 
         Equal AR models are one spectrum. Spectra for another number of modes are a DimensionError.
         """
-        found: dict[object, tuple[Spectrum, list[int]]] = {}
+        groups: dict[object, tuple[Spectrum, list[int]]] = {}
         for mode, spectrum in enumerate(self.turbulence_per_mode(modes)):
             if spectrum is not None:
-                found.setdefault(spectrum_key(spectrum), (spectrum, []))[1].append(mode)
-        return tuple((spectrum, tuple(own)) for spectrum, own in found.values())
+                groups.setdefault(spectrum_key(spectrum), (spectrum, []))[1].append(mode)
+        return tuple((spectrum, tuple(members)) for spectrum, members in groups.values())
 
     def noise_per_measurement(self, measurements: int) -> FloatArray:
         """Return the standard deviation of the noise on each measurement, (q,) [nm].

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.ar_model import ARModel, variance_ratios
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.resonance_spectrum import coefficient_rows
+from lbt_synth.models.spectra import ARModel, variance_ratios
 from lbt_synth.validation import (
     FloatArray,
     Positive,
@@ -27,6 +27,7 @@ from lbt_synth.validation import (
 )
 
 MOST_SECTIONS = 4  # of a bump: the coefficients of more in series lose too many digits
+_MOST_LINES = 64  # that cover one vibration; each has two states
 _UNIT = 1e-15  # rounding of a length of one
 
 
@@ -182,6 +183,26 @@ def _series_coefficients(one: FloatArray, sections: int) -> FloatArray:
             longer[..., lag : lag + product.shape[-1]] += factor[..., lag : lag + 1] * product
         product = longer
     return -product[..., 1:]
+
+
+def spread_lines(
+    line: Vibration, half_width_hz: float, lines: int, *, name: str = "half_width_hz"
+) -> list[Vibration]:
+    """Split a vibration into lines at the mid-points of equal parts of an interval.
+
+    They have its direction and decay rate, and together its variance.
+    """
+    half = number(
+        half_width_hz,
+        name,
+        above=0,
+        below=line.frequency_hz,
+        hint="All frequencies must stay above 0 Hz.",
+    )
+    count = integer(lines, "lines", at_least=1, at_most=_MOST_LINES)
+    places = line.frequency_hz + half * ((2 * np.arange(count) + 1) / count - 1)
+    rms_nm = line.rms_nm / float(np.sqrt(count))
+    return [replace(line.at_frequency(f), rms_nm=rms_nm) for f in places.tolist()]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

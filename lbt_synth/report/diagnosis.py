@@ -3,104 +3,81 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lbt_synth.identification import Diagnosis
 from lbt_synth.identification.diagnosis.rows import law_facts
 from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
-from lbt_synth.report.draw import Figure, drawing
+from lbt_synth.report.draw import draw_bars
 from lbt_synth.report.figures import identification_figure
-from lbt_synth.report.page.html import (
-    Block,
-    Chart,
-    Notice,
-    Page,
-    chart,
-    creation_time,
-    paragraph,
-    read_source,
-    source_section,
-    time_text,
-)
+from lbt_synth.report.page.html import Block, Chart, Notice, Page, chart, new_page, paragraph
 from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
 
-_ROW_IN = 0.42  # height of a category
-_SIGMAS = 2.0
+_SIGMAS = 2.0  # of an interval that holds 95 %
+_RESIDUAL = {"label": "residual", "unit": "nm rms", "low": 0}
 
 
-def _residual_charts(found: Diagnosis) -> list[Chart]:
+def _residual_charts(diagnosis: Diagnosis) -> list[Chart]:
     """Return bars of the residuals on unseen data, and of the parts of the disturbance."""
     charts = []
-    if rows := found.residuals:
-        values = np.array([row.replayed_nm for row in rows])
-        errors = _SIGMAS * np.array([row.replayed_error_nm for row in rows])
-        promised = np.array([row.model_nm for row in rows])
-        names = [row.name for row in rows]
-        intervals = {"data": (values - errors, values + errors)}
-        figure = _draw_bars(names, {"data": values, "model": promised}, intervals)
+    if rows := diagnosis.residuals:
+        values, errors, promised = np.array(
+            [(row.replayed_nm, _SIGMAS * row.replayed_error_nm, row.model_nm) for row in rows]
+        ).T
+        bars, intervals = (
+            {"data": values, "model": promised},
+            {"data": (values - errors, values + errors)},
+        )
+        figure = draw_bars(_RESIDUAL, [row.name for row in rows], bars, intervals)
         charts.append(chart("residuals", figure))
-    if costs := found.costs:
-        columns = {"loop that ran": "running_nm", "best design": "best_nm"}
+    if costs := diagnosis.costs:
         bars = {
-            name: np.array([getattr(row, field) for row in costs])
-            for name, field in columns.items()
+            "loop that ran": np.array([row.running_nm for row in costs]),
+            "best design": np.array([row.best_nm for row in costs]),
         }
-        figure = _draw_bars([row.part for row in costs], bars, {})
-        best = found.best or "none"
-        charts.append(chart("costs", figure, best=best))
+        figure = draw_bars(_RESIDUAL, [row.part for row in costs], bars, {})
+        charts.append(chart("costs", figure, best=diagnosis.best or "none"))
     return charts
 
 
-def _draw_bars(
-    names: Sequence[str],
-    bars: Mapping[str, ArrayLike],
-    intervals: Mapping[str, tuple[ArrayLike, ArrayLike]],
-) -> Figure:
-    with drawing([_ROW_IN * max(len(names), 2)]) as (panel,):
-        panel.set_axes({"label": "residual", "unit": "nm rms", "low": 0}, {})
-        panel.bars(names, bars, intervals)
-    return panel.figure
-
-
-def _spectrum_charts(found: Diagnosis) -> list[Chart]:
+def _spectrum_charts(diagnosis: Diagnosis) -> list[Chart]:
     """Return the chart of the identified model."""
-    if found.model is None:
+    if diagnosis.model is None:
         return []
-    designs = {} if found.best_design is None else {found.best: found.best_design}
-    figure = identification_figure(found.model, designs=designs)
+    designs = {} if diagnosis.best_design is None else {diagnosis.best: diagnosis.best_design}
+    figure = identification_figure(diagnosis.model, designs=designs)
     return [chart("identification", figure)]
 
 
-def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
+def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, list[Table]]:
     """Return the tables of a diagnosis by their sections, without those of what is not known."""
-    record, health = found.record, found.record.health
+    record, health = diagnosis.record, diagnosis.record.health
     text = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
     if health.jitter_frames is not None:
         text += f", clock jitter {health.jitter_frames:.2g} frames rms"
-    channels = [row_table(f"Record: {text}. {health.summary()}", found.channels)]
+    channels = [row_table(f"Record: {text}. {health.summary()}", diagnosis.channels)]
     # what a correction lacks is a consequence of other faults, and of the beginning
-    if faults := [each for each in health.findings if each.kind != NOT_KNOWN]:
+    if faults := [finding for finding in health.findings if finding.kind != NOT_KNOWN]:
         channels.append(row_table("Faults", faults))
-    commands, law = found.commands, found.law
+    commands, law = diagnosis.commands, diagnosis.law
     loop = {
         "How the commands reach the measurements": commands and [commands.facts()],
         "Control law in use, from y to u": law and [law_facts(law)],
-        "Loop": found.loop and [found.loop],
+        "Loop": diagnosis.loop and [diagnosis.loop],
     }
-    best = f" (best design: {found.best})" if found.best else ""
+    best = f" (best design: {diagnosis.best})" if diagnosis.best else ""
     unseen = "Residual on the second half of the record, by models of the first"
     residuals = {
-        f"What each part leaves by the model of the first half{best}": found.costs,
-        f"{unseen}; {found.imaging.label}": found.residuals,
+        f"What each part leaves by the model of the first half{best}": diagnosis.costs,
+        f"{unseen}; {diagnosis.imaging.label}": diagnosis.residuals,
     }
-    lines = [] if found.model is None else model_tables(found.model)[1:]
+    lines = [] if diagnosis.model is None else model_tables(diagnosis.model)[1:]
     return {
         "record": channels,
         "loop": [row_table(caption, rows) for caption, rows in loop.items() if rows],
@@ -109,38 +86,34 @@ def diagnosis_tables(found: Diagnosis) -> dict[str, list[Table]]:
     }
 
 
-def diagnosis_page(found: Diagnosis, files: Sequence[str | os.PathLike[str]] = ()) -> Page:
+def diagnosis_page(diagnosis: Diagnosis, files: Sequence[str | os.PathLike[str]] = ()) -> Page:
     """Return the page of a diagnosis.
 
     ``files`` are those of the record and of the given design, whose digests the page gives.
     """
-    roles = ("record", "gain file")
-    read = [read_source(Path(file), role)[0] for file, role in zip(files, roles, strict=False)]
-    name = read[0][0] if read else found.record.source or "a record"
-    record, tables = found.record, diagnosis_tables(found)
-    disturbance: list[Block] = [*tables["disturbance"], *_spectrum_charts(found)]
-    sections: dict[str, tuple[str, Sequence[Block]]] = {
-        "verdict": ("Verdict", _verdict_blocks(found, tables["verdict"])),
-        "record": ("Record", tables["record"]),
-        "loop": ("Loop that ran", (paragraph("law"), *tables["loop"])),
-        "disturbance": ("Disturbance", disturbance or ["No model was identified."]),
-        **source_section(read),
-    }
-    return Page(
-        title=f"Diagnosis of {name}",
-        subtitle=f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz, "
-        f"{count_text(record.axes, 'axis', 'axes')}. Made "
-        f"{time_text(creation_time())}.",
-        sections=sections,
+    record, tables = diagnosis.record, diagnosis_tables(diagnosis)
+    name = Path(files[0]).name if files else record.source or "a record"
+    duration = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
+    disturbance: list[Block] = [*tables["disturbance"], *_spectrum_charts(diagnosis)]
+    return new_page(
+        f"Diagnosis of {name}",
+        f"{duration}, {count_text(record.axes, 'axis', 'axes')}",
+        {
+            "Verdict": _verdict_blocks(diagnosis, tables["verdict"]),
+            "Record": tables["record"],
+            "Loop that ran": (paragraph("law"), *tables["loop"]),
+            "Disturbance": disturbance or ["No model was identified."],
+        },
+        sources=list(zip(files, ("record", "gain file"), strict=False)),
     )
 
 
-def _verdict_blocks(found: Diagnosis, tables: Sequence[Table]) -> list[Block]:
-    state, *rest = found.verdict
+def _verdict_blocks(diagnosis: Diagnosis, tables: Sequence[Table]) -> list[Block]:
+    state, *rest = diagnosis.verdict
     return [
-        Notice(text=state, tone=found.findings[0].tone),
+        Notice(text=state, tone=diagnosis.findings[0].tone),
         " ".join(rest),
         *tables,
-        *_residual_charts(found),
-        *(Notice(text=f"{note[0].upper()}{note[1:]}") for note in found.notes),
+        *_residual_charts(diagnosis),
+        *(Notice(text=f"{note[0].upper()}{note[1:]}") for note in diagnosis.notes),
     ]

@@ -37,7 +37,7 @@ FIGURE_ENDINGS = (".png", ".pdf", ".svg")
 
 # Okabe and Ito's palette, in an order that also darkens and lightens in grey
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-_GREY = "#404040"
+GREY = "#404040"
 # Lengths of strokes and gaps, in widths of the line
 _DASHES: tuple[tuple[float, ...], ...] = (
     (),
@@ -55,6 +55,8 @@ _BLANK: dict[str, Any] = {
     "hatch": "////",
     "linewidth": 0,
 }
+_BAR_IN = 0.24  # height of a bar
+_HIGHEST_IN = 7.5  # of a panel that fits a sheet of paper
 PANEL_IN = 2.1  # height of a panel, unless it says another
 _WIDTH_IN = 7.0  # of a figure
 _LETTER_IN = 0.068  # width of a letter at 8 points, generously
@@ -62,16 +64,14 @@ _AROUND_IN = 0.55  # below and above the axes of a panel
 _FLAG_IN = 0.15  # width of an upright text
 _LONGEST = {"name": 60, "category": 36}  # letters in a legend, and beside bars
 _ROOM = 0.04  # around what is drawn, as a part of its extent
-_MOST_RATIO = 1e8  # of the ends of a logarithmic scale: a zero must not stretch it
 _FEW_DECADES = 150  # ratio of the ends below which a logarithmic scale has ticks at 2 and 5, too
-_STEPS = (1, 2, 5, 10)  # of ticks within a decade
+_MOST_RATIO = 1e8  # of the ends of a logarithmic scale: a zero must not stretch it
 _CONTOURS = 6  # of a map, about, at round values
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def colour(look: int | None) -> str:
     """Colour of a look, as #rrggbb; None is grey."""
-    return _GREY if look is None else _COLOURS[look % len(_COLOURS)]
+    return GREY if look is None else _COLOURS[look % len(_COLOURS)]
 
 
 def dashes(look: int | None) -> tuple[float, ...]:
@@ -219,16 +219,15 @@ def _draw_legend(figure: Figure, panels: Sequence[Panel], height: float) -> None
 
 def _draw_colour_bar(panels: Sequence[Panel], *, below: bool) -> bool:
     """Draw one colour bar for all maps, and return whether there are any."""
-    from matplotlib.colors import LogNorm
-    from matplotlib.ticker import FuncFormatter
-
     mapped = [panel for panel in panels if panel.image is not None]
     if not mapped:
         return False
     image, places = mapped[0].image, [panel.axes for panel in mapped]
+    lowest, highest = zip(*(panel.image.get_clim() for panel in mapped), strict=True)
+    for panel in mapped:  # one scale for all
+        panel.image.set_clim(min(lowest), max(highest))
+        panel.draw_contours()
     style: dict[str, Any] = {"location": "bottom", "shrink": 0.6, "aspect": 40} if below else {}
-    if isinstance(image.norm, LogNorm):
-        style["format"] = FuncFormatter(tick_text)
     bar = mapped[0].figure.colorbar(image, ax=places, **style)
     bar.set_label(mapped[0].image_text)
     bar.outline.set_visible(False)
@@ -246,13 +245,13 @@ class Panel:
         self.axes = axes
         self.image: Any = None  # of a map
         self.image_text = ""
+        self._levels: tuple[FloatArray, FloatArray, Any] | None = None  # of contours
         self.series: list[Series] = []
         self.title_lines = 0
         self._title = ""
         self._axis: dict[str, dict[str, Any]] = {}
-        self._heights: list[FloatArray] = []  # of curves
-        self._flags: tuple[FloatArray, FloatArray, Sequence[str]] | None = None
-        self.is_equal = self._stands = False
+        self._flags: tuple[FloatArray, FloatArray, Sequence[str]] = np.zeros(0), np.zeros(0), ()
+        self.is_equal = False
         axes.margins(x=0, y=_ROOM)
         self.set_axes({}, {})
 
@@ -267,8 +266,7 @@ class Panel:
         """Name the axes, before anything is drawn.
 
         Each has a label, and may have a unit ("-" of a pure number), ends (low, high), and a
-        logarithmic scale (log), on which nothing is drawn that is not positive. What is beyond an
-        end is not drawn; a low or high end of y moves out where a curve runs along it.
+        logarithmic scale (log), on which nothing is drawn that is not positive.
         """
         for name, axis in (("x", x), ("y", y)):
             unit, factor = shown_unit(axis.get("unit", ""))
@@ -282,7 +280,7 @@ class Panel:
             }
             getattr(self.axes, f"set_{name}scale")("log" if axis.get("log") else "linear")
         self._title = title
-        self.is_equal = self._stands = equal
+        self.is_equal = equal
 
     def _shown(self, name: str, values: ArrayLike) -> FloatArray:
         """Return values of an axis in the unit that is shown."""
@@ -310,7 +308,6 @@ class Panel:
         style = line_style(**look)
         label = f"_{name}" if quiet else _label(name)
         (line,) = self.axes.plot(along, up, drawstyle=step, label=label, **style)
-        self._heights.append(up)
         if "marker" in style:
             self.axes.margins(x=_ROOM)
         if error is not None:
@@ -326,18 +323,11 @@ class Panel:
         self.series.append(Series(panel=title, heading=heading, name=name, x=x, y=y))
 
     def area(
-        self,
-        name: str,
-        x: ArrayLike,
-        low: ArrayLike,
-        high: ArrayLike,
-        *,
-        look: int | None = 0,
+        self, name: str, x: ArrayLike, low: ArrayLike, high: ArrayLike, *, look: int | None = 0
     ) -> None:
         """Shade the area between two curves, (n,) each."""
         along, least, most = self._shown("x", x), self._shown("y", low), self._shown("y", high)
         self.axes.fill_between(along, least, most, label=_label(name), **_fill_style(look))
-        self._stands = True
         if name:
             self._note(f"{name}, from", along, least)
             self._note(f"{name}, to", along, most)
@@ -347,7 +337,7 @@ class Panel:
         place = self._shown(axis, [at])
         draw = self.axes.axvline if axis == "x" else self.axes.axhline
         strokes = _DASHES[dash]
-        style = {"color": _GREY, "linewidth": 1.0, "linestyle": (0, strokes) if strokes else "-"}
+        style = {"color": GREY, "linewidth": 1.0, "linestyle": (0, strokes) if strokes else "-"}
         draw(place[0], zorder=1.6, label=_label(name), **style)
 
     def span(
@@ -384,7 +374,6 @@ class Panel:
         self.axes.margins(x=_ROOM)
         self.axes.tick_params(axis="y", length=0)
         self.axes.grid(visible=False, axis="y")
-        self._stands = True
 
     def flags(self, x: ArrayLike, y: ArrayLike, texts: Sequence[str]) -> None:
         """Write upright texts along the upper edge, each with a line down to its point; x rises."""
@@ -398,70 +387,63 @@ class Panel:
         label: str,
         unit: str = "",
         *,
-        ends: tuple[float, float],
         log: bool = False,
         contours: bool = False,
         blank: str = "no value",
     ) -> None:
         """Draw values (ny, nx) over a grid of increasing centres, nan hatched as ``blank``.
 
-        ``ends`` are those of the colours; contours are lines of equal, round values.
+        Contours are lines of equal, round values.
         """
-        from matplotlib.colors import ListedColormap, LogNorm, Normalize
+        from matplotlib.colors import LogNorm, Normalize
 
         along, up = self._shown("x", x), self._shown("y", y)
         edges, shown = (_cell_edges(along), _cell_edges(up)), np.ma.masked_invalid(values)
         self.axes.grid(visible=False)
         self.axes.margins(0)
+        ends = (np.nanmin(values), np.nanmax(values)) if shown.count() else (0.0, 1.0)
         norm = (LogNorm if log else Normalize)(*ends)
         self.image = self.axes.pcolormesh(*edges, shown, cmap="viridis", norm=norm, rasterized=True)
         self.image_text = f"{label} [{unit}]" if unit else label
         if contours and min(values.shape) > 1 and np.ptp(shown.compressed()) > 0:
-            shades = {"cmap": ListedColormap(["white", "black"]), "norm": Normalize(*ends)}
-            lines = self.axes.contour(along, up, shown, _CONTOURS, linewidths=0.8, **shades)
-            self.axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
+            self._levels = along, up, shown
         if np.any(np.isnan(values)):  # what no cell covers
             self.axes.patch.set(**_BLANK)
             corner = [edges[0][0]] * 2, edges[1][0], edges[1][0]
             self.axes.fill_between(*corner, label=_label(blank), **_BLANK)
-        self._stands = True
         for place, row in zip(up, values, strict=True):
             self._note(f"{label} at {self._axis['y']['text']} {place:g}", along, row)
 
-    def _limits(self, name: str) -> tuple[float, float]:
-        """Return the ends of the scale of an axis: those that are given, else those of the data."""
-        log, (first, last) = self._axis[name]["log"], self._axis[name]["ends"]
-        low, high = getattr(self.axes, f"get_{name}lim")()
-        if log:
-            low = max(low, high / _MOST_RATIO)
-        low, high = low if first is None else first, high if last is None else last
-        if first is not None and high <= low:  # all values are below the end that is given
-            high = 2 * low if log else low + 1
-        if log or name == "x" or self._stands:  # areas and bars stand on an end
-            return low, high
-        room = _ROOM * (high - low)
-        heights = np.concatenate([np.zeros(0), *self._heights])
-        low -= room * (first is not None and bool(np.any(np.isclose(heights, low))))
-        high += room * (last is not None and bool(np.any(np.isclose(heights, high))))
-        return low, high
+    def draw_contours(self) -> None:
+        """Draw lines of equal, round values over a map, light where it is dark."""
+        from matplotlib.colors import ListedColormap
+
+        if self._levels is not None:
+            style = {"cmap": ListedColormap(["white", "black"]), "norm": self.image.norm}
+            lines = self.axes.contour(*self._levels, _CONTOURS, linewidths=0.8, **style)
+            self.axes.clabel(lines, fmt="%g", fontsize=7, inline_spacing=3)
 
     def finish(self) -> None:
         """Set the scales and their ticks, and write the title."""
-        from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
+        from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
         for name, place in (("x", self.axes.xaxis), ("y", self.axes.yaxis)):
-            low, high = self._limits(name)
-            getattr(self.axes, f"set_{name}lim")(low, high)
-            if self._axis[name]["log"]:
-                factors = (1, 2, 5) if high < _FEW_DECADES * low else (1,)
-                decades, equal_steps = LogLocator(subs=factors), MaxNLocator(7, steps=_STEPS)
-                place.set_major_locator(equal_steps if high < 10 * low else decades)
-                place.set_major_formatter(FuncFormatter(tick_text))
+            axis = self._axis[name]
+            (first, last), (low, high) = axis["ends"], getattr(self.axes, f"get_{name}lim")()
+            low, high = low if first is None else first, high if last is None else last
+            if axis["log"]:
+                low = max(low, high / _MOST_RATIO)
+                subs = (1, 2, 5) if high < _FEW_DECADES * low else (1,)
+                linear, decades = MaxNLocator(7, steps=[1, 2, 5, 10]), LogLocator(subs=subs)
+                place.set_major_locator(linear if high < 10 * low else decades)
+                place.set_major_formatter("{x:g}")
                 place.set_minor_locator(NullLocator())
-            place.set_label_text(self._axis[name]["text"], parse_math=False)
+            if first is not None and high <= low:  # all values are below the end that is given
+                high = low + 1
+            getattr(self.axes, f"set_{name}lim")(low, high)
+            place.set_label_text(axis["text"], parse_math=False)
         width_in = self.axes.get_window_extent().width / self.axes.figure.dpi
-        if self._flags is not None:
-            self._draw_flags(width_in)
+        self._draw_flags(width_in)
         letters = max(12, int(width_in / _LETTER_IN))
         lines = textwrap.wrap(shorten(self._title, 3 * letters), letters)
         self.title_lines = len(lines)
@@ -469,8 +451,9 @@ class Panel:
 
     def _draw_flags(self, width_in: float) -> None:
         """Draw upright texts without overlaps on axes of a width."""
-        assert self._flags is not None
         x, y, texts = self._flags
+        if not texts:
+            return
         points = self.axes.transData.transform(np.column_stack((x, y)))
         across = self.axes.transAxes.inverted().transform(points)[:, 0]
         places = spread_labels(across, _FLAG_IN / width_in)
@@ -488,15 +471,6 @@ class Panel:
                 color="0.15",
                 arrowprops={**line, "shrinkA": 0, "shrinkB": 0},
             )
-
-
-def tick_text(value: float, _: object = None) -> str:
-    """Return the text of a tick of a logarithmic scale: 0.01, 5, 200, 10⁻⁶, 2·10⁵."""
-    if value == 0 or 0.999e-3 <= value <= 1.001e4:
-        return f"{value:g}"
-    power = int(np.floor(np.log10(value) + 1e-9))
-    factor, raised = f"{value / 10.0**power:.6g}", f"10{str(power).translate(_RAISED)}"
-    return raised if factor == "1" else f"{factor}·{raised}"
 
 
 def shorten(text: str, most: int) -> str:
@@ -567,6 +541,20 @@ def line_style(
 
 def _fill_style(look: int | None) -> dict[str, Any]:
     return {"color": colour(look), "alpha": _SHADE, "linewidth": 0}
+
+
+def draw_bars(
+    axis: Mapping[str, Any],
+    categories: Sequence[str],
+    bars: Mapping[str, ArrayLike],
+    intervals: Mapping[str, tuple[ArrayLike, ArrayLike]],
+) -> Figure:
+    """Draw bars of each name along an axis, one per category, and intervals around some."""
+    height_in = 0.2 + _BAR_IN * max(2, len(categories) * len(bars))
+    with drawing([min(height_in, _HIGHEST_IN)]) as (panel,):
+        panel.set_axes(axis, {})
+        panel.bars(categories, bars, intervals)
+    return panel.figure
 
 
 def count_columns(panels: int) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -15,20 +16,16 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.methods.request import fixed_design
-from lbt_synth.report.draw import PANEL_IN, drawing
+from lbt_synth.report.draw import PANEL_IN, draw_bars, drawing
 from lbt_synth.report.page.html import (
     Block,
     Chart,
     Notice,
     Page,
-    Sections,
     chart,
-    creation_time,
+    new_page,
     paragraph,
-    read_source,
-    source_section,
     survival_blocks,
-    time_text,
 )
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, duration_text, listing_text
@@ -51,7 +48,6 @@ from lbt_synth.validation import FloatArray
 
 _POINTS = 400  # of a cumulative distribution
 _BINS = 30  # of a histogram, and along either axis of a map, at most
-_WITHIN = 1, 99  # percentiles at the edges of a map; its outermost cells hold what is beyond
 _PER_CELL = 8  # samples in a cell of a map on average, at least
 _MOST_FAILURES = 10  # that are listed
 _PARAMETERS = 5  # of a worst sample: with row and Strehl ratio, they fill a sheet
@@ -101,8 +97,8 @@ def study_page(
     >>> columns = dict(zip(study.parameter_names, study.values(0, 2).T))
     >>> columns |= {f"kalman.{name}": [1.0, 0.5] for name in ("strehl", "residual_nm")}
     >>> columns["kalman.stable"] = [1, 1]
-    >>> found = lbt.studies.study_statistics(columns, study.parameter_names, ["kalman"])
-    >>> lbt.report.study_page(study, columns, found).title
+    >>> statistics = lbt.studies.study_statistics(columns, study.parameter_names, ["kalman"])
+    >>> lbt.report.study_page(study, columns, statistics).title
     'Robustness study study.yaml'
     """
     samples = {
@@ -114,29 +110,22 @@ def study_page(
     }
     names = short_names(statistics.parameters)
     varying = sum(np.ptp(column) > 0 for column in values.values())
-    reading = [paragraph(name) for name in ("intervals", "indices")]
-    made = time_text(creation_time())
-    return Page(
-        title=f"Robustness study {study.source.name}",
-        subtitle=(
-            f"{statistics.samples} samples of {varying} parameters, "
-            f"{count_text(len(statistics.controllers), 'controller')}. Made {made}."
-        ),
-        sections={
-            "summary": ("Summary", _summary_blocks(study, statistics, samples)),
-            "samples": ("What was sampled", _samples_blocks(study, values, names)),
-            "controllers": ("Controllers", _controllers_blocks(study, statistics, failures)),
-            "dependence": (
-                "What the Strehl ratio depends on",
-                _dependence_blocks(statistics, samples, values, names),
+    return new_page(
+        f"Robustness study {study.source.name}",
+        f"{statistics.samples} samples of {varying} parameters, "
+        f"{count_text(len(statistics.controllers), 'controller')}",
+        {
+            "Summary": _summary_blocks(study, statistics, samples),
+            "What was sampled": _samples_blocks(study, values, names),
+            "Controllers": _controllers_blocks(study, statistics, failures),
+            "What the Strehl ratio depends on": _dependence_blocks(
+                statistics, samples, values, names
             ),
-            "worst": (
-                "Worst samples",
-                _worst_blocks(study, statistics, columns, names, os.fspath(folder)),
-            ),
-            "reading": ("How to read the figures", reading),
-            **_origin_section(study, statistics, computing_s),
+            "Worst samples": _worst_blocks(study, statistics, columns, names, os.fspath(folder)),
+            "How to read the figures": [paragraph(name) for name in ("intervals", "indices")],
         },
+        sources=list(zip_longest(study.inputs, ("study", "configuration"), fillvalue="gain file")),
+        facts=[_origin_table(study, statistics, computing_s)],
     )
 
 
@@ -156,32 +145,36 @@ def _summary_blocks(
     study: Study, statistics: StudyStatistics, samples: Mapping[str, Samples]
 ) -> list[Block]:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
-    unstable = [controller for controller in statistics.controllers if controller.unstable]
-    failed = [controller for controller in statistics.controllers if controller.failed]
-    warnings = []
-    if statistics.samples < study.samples:
-        warnings.append(paragraph("incomplete", done=statistics.samples, samples=study.samples))
-    if unstable:
-        parts = ", ".join(
-            f"{controller.controller} in {controller.unstable} of {controller.samples} "
-            f"({percent(controller.unstable_share.value, 2)} %)"
-            for controller in unstable
+    unstable = ", ".join(
+        f"{one.controller} in {one.unstable} of {one.samples} "
+        f"({percent(one.unstable_share.value, 2)} %)"
+        for one in statistics.controllers
+        if one.unstable
+    )
+    failed = ", ".join(f"{c.controller} {c.failed}" for c in statistics.controllers if c.failed)
+    done, whole = statistics.samples, study.samples
+    blocks: list[Block] = [
+        Notice(text=text, tone=tone)
+        for text, tone, is_so in (
+            (paragraph("incomplete", done=done, samples=whole), "bad", done < whole),
+            (f"Unstable loops: {unstable}.", "bad", unstable),
+            (f"Evaluations that failed, and are in none of the figures: {failed}.", "bad", failed),
+            (
+                "Every controller is stable in every sample, and none failed.",
+                "good",
+                done and not unstable and not failed,
+            ),
         )
-        warnings.append(f"Unstable loops: {parts}.")
-    if failed:
-        parts = ", ".join(f"{controller.controller} {controller.failed}" for controller in failed)
-        warnings.append(f"Evaluations that failed, and are in none of the figures: {parts}.")
-    blocks: list[Block] = [Notice(text=text, tone="bad") for text in warnings]
-    if not unstable and not failed and statistics.samples:
-        text = "Every controller is stable in every sample, and none failed."
-        blocks.append(Notice(text=text, tone="good"))
-    blocks += [
+        if is_so
+    ]
+    return [
+        *blocks,
         _verdict_text(statistics.controllers),
         *survival_blocks(_design_margins(study, statistics)),
         strehl_table(statistics),
         residual_table(statistics),
+        *_distribution_chart(samples),
     ]
-    return [*blocks, *_distribution_chart(samples)]
 
 
 def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, LoopMargins]:
@@ -220,28 +213,24 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
 
 def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names) -> list[Block]:
     """Show the parameters and their histograms."""
-    distributions = {name: section.text for name, section in study.settings.parameters.items()}
-    rows = tuple(
+    settings = study.settings
+    texts = {name: section.text for name, section in settings.parameters.items()}
+    rows = [
         (
             names[name],
             name,
-            distributions.get(name, ""),
-            *(f"{value:.4g}" for value in np.percentile(column, (0, 50, 100))),
+            texts.get(name, ""),
+            *(f"{q:.4g}" for q in np.quantile(c, (0, 0.5, 1))),
         )
-        for name, column in values.items()
-    )
-    table = Table(
-        caption="Parameters",
-        headings=("parameter", "its place", "distribution", "least", "median", "greatest"),
-        rows=rows,
-        words=(1, 2),
-    )
-    settings = study.settings
-    opening = (
+        for name, c in values.items()
+    ]
+    headings = ("parameter", "its place", "distribution", "least", "median", "greatest")
+    return [
         f"{study.samples} samples (sampling: {settings.sampling}, seed: {settings.seed}, "
-        f"evaluation: {settings.evaluation})."
-    )
-    return [opening, table, *_histogram_chart(values, names)]
+        f"evaluation: {settings.evaluation}).",
+        Table(caption="Parameters", headings=headings, rows=tuple(rows), words=(1, 2)),
+        *_histogram_chart(values, names),
+    ]
 
 
 def _controllers_blocks(
@@ -305,22 +294,13 @@ def _worst_blocks(
     return [opening, *tables, (caption, "\n".join(dict.fromkeys(commands)))]
 
 
-def _origin_section(study: Study, statistics: StudyStatistics, computing_s: float) -> Sections:
-    """Name the files and programs that the page was made from."""
-    rows = [
+def _origin_table(study: Study, statistics: StudyStatistics, computing_s: float) -> Table:
+    rows = (
         ("samples with results", f"{statistics.samples} of {study.samples}"),
         ("digest of the study", study.digest),
         ("computing time, of all processes together", duration_text(computing_s)),
-    ]
-    about = Table(caption="Study", headings=("what", "value"), rows=tuple(rows), words=(1,))
-    sources, texts = [], {}
-    for place, path in enumerate(study.inputs):
-        role = ("study", "configuration", "gain file")[min(place, 2)]
-        source, content = read_source(path, role)
-        sources.append(source)
-        if role != "gain file":
-            texts[f"{role.capitalize()} {source[0]}"] = content.decode("utf-8-sig", "replace")
-    return source_section(sources, texts=texts, about=about)
+    )
+    return Table(caption="Study", headings=("what", "value"), rows=rows, words=(1,))
 
 
 def _distribution_chart(samples: Mapping[str, Samples]) -> list[Chart]:
@@ -376,11 +356,9 @@ def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]
         bars[one.controller] = np.maximum(value, 0)
         low, high = np.maximum((value - 2 * error, value + 2 * error), 0)
         intervals[one.controller] = low, high
-    height_in = min(max(0.8, 0.24 * len(statistics.ranked) * len(bars) + 0.2), 7.5)  # fits a sheet
-    with drawing([height_in]) as (panel,):
-        panel.set_axes({"label": "variance explained by itself", "unit": "%", "low": 0}, {})
-        panel.bars([names[name] for name in statistics.ranked], bars, intervals)
-    return [chart("sensitivity", panel.figure)]
+    listed = [names[name] for name in statistics.ranked]
+    axis = {"label": "variance explained by itself", "unit": "%", "low": 0}
+    return [chart("sensitivity", draw_bars(axis, listed, bars, intervals))]
 
 
 def _map_charts(
@@ -398,12 +376,10 @@ def _map_charts(
         strehl, kept = (samples[one.controller][name] for name in ("strehl", "evaluated"))
         places = parameters[first][kept], parameters[second][kept]
         x, y, mean = binned_map(*places, strehl[kept])
-        low, high = (100 * float(end(mean)) for end in (np.nanmin, np.nanmax))
-        ends = 5 * float(np.floor(low / 5)), 5 * float(np.floor(high / 5)) + 5
         with drawing([2.6]) as (panel,):
             panel.set_axes({"label": names[first]}, {"label": names[second]})
             label: dict[str, Any] = {"label": "mean Strehl ratio", "unit": "%"}
-            panel.map(x, y, 100 * mean, ends=ends, blank="no sample", **label)
+            panel.map(x, y, 100 * mean, blank="no sample", **label)
         facts = {"x": names[first], "y": names[second], "x_path": first, "y_path": second}
         facts["controller"] = one.controller
         charts.append(chart(f"map-{place + 1}", panel.figure, group="study-map", **facts))
@@ -436,15 +412,13 @@ def binned_map(
 
 
 def _cells(values: FloatArray, cells: int) -> tuple[FloatArray, FloatArray]:
-    """Return the centres of the cells along one axis, and their edges."""
-    ordered = np.sort(values)
-    if is_list(ordered):
+    """Return the centres of the cells along one axis, and their edges.
+
+    A list has a cell for each value, other values have cells of equal width.
+    """
+    if is_list(np.sort(values)):
         centres = np.unique(values)
         inner = (centres[:-1] + centres[1:]) / 2
-    else:
-        low, high = np.percentile(ordered, _WITHIN)
-        if not low < high:
-            low, high = ordered[0], ordered[-1]
-        edges = np.linspace(low, high, cells + 1)
-        centres, inner = (edges[:-1] + edges[1:]) / 2, edges[1:-1]
-    return centres, np.concatenate(([ordered[0] - 1], inner, [ordered[-1] + 1]))
+        return centres, np.concatenate(([centres[0] - 1], inner, [centres[-1] + 1]))
+    edges = np.linspace(values.min(), values.max(), cells + 1)
+    return (edges[:-1] + edges[1:]) / 2, edges

@@ -28,8 +28,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.interop import EndToEndSetup, calibrate
 from lbt_synth.interop.specula.optics import specula_version
 from lbt_synth.loop import Imaging, close_loop
-from lbt_synth.methods.hinf import METHOD as HINF
-from lbt_synth.methods.kalman import METHOD as KALMAN
+from lbt_synth.methods.registry import HINF, KALMAN
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import (
     ARModel,

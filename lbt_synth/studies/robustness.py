@@ -33,13 +33,12 @@ from lbt_synth.loop import (
     ensemble_residuals,
     loop_margins,
     residual_budget,
-    settling_error,
     simulate,
 )
+from lbt_synth.loop.budget import settling_error
 from lbt_synth.loop.ensemble import ensemble_vibration
 from lbt_synth.loop.simulation.run import Drop, Segment, run_segments
-from lbt_synth.methods.mixed import METHOD as MIXED
-from lbt_synth.methods.registry import record_methods, reference_methods
+from lbt_synth.methods.registry import MIXED, record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import LoopHardware, SinusoidalVibration, TipTiltPlant, Truth, Vibration
 from lbt_synth.models.loop_hardware import LONGEST_DELAY

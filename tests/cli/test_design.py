@@ -132,7 +132,7 @@ def test_an_infeasible_file_names_what_clashes(small, tmp_path, capsys):
         (
             SMALL
             + "    mirror_uncertainty:\n      - {low_hz: 3.0, high_hz: 600.0, relative: 0.5}\n",
-            "design.robust.mirror_uncertainty[0]: must lie below the Nyquist",
+            "design.robust: a band must lie below the Nyquist frequency 400 Hz; got 3 to 600 Hz",
         ),
         (SMALL.replace("rms_mas: 10.0", "rms: 10.0"), "unknown key design.robust.bands[0].rms"),
         (

@@ -127,6 +127,10 @@ def test_a_spectrum(tmp_path, capsys):
     config = lbt.load_config(tmp_path / "m.yaml")
     assert config.hardware.frame_rate_hz == 1000
     assert config.plant.vibrations[0].frequency_hz == pytest.approx(52, abs=0.3)
+    stated = ("--kind", "spectrum", "--noise-nm", 7, "-o", tmp_path / "n.yaml", "--no-figure")
+    status, _, error = run(capsys, "identify", file, *options, *stated)
+    assert (status, error) == (0, "")
+    assert np.diag(lbt.load_config(tmp_path / "n.yaml").plant.R) == pytest.approx(49)
     status, _, error = run(
         capsys, "auto", file, "-o", tmp_path / "t.fits", *options, "--kind", "spectrum"
     )
@@ -134,17 +138,12 @@ def test_a_spectrum(tmp_path, capsys):
     assert "got a spectrum" in error
 
 
-def test_accelerometers_and_lists_announce_lines(tmp_path, capsys, recorded_loop, recorded_night):
-    run_, _, _ = recorded_loop
-    rng = np.random.default_rng(2)
-    shake = np.diff(run_.total_nm[0][:, 0], n=2, prepend=[0, 0])
-    sensors = np.column_stack([shake, rng.standard_normal(len(shake))])
-    sensors[:, 0] += 0.1 * np.std(shake) * rng.standard_normal(len(shake))
-    np.save(tmp_path / "a.npy", sensors)
-    (tmp_path / "lines.txt").write_text("31.0 0.1\n")
+def test_lists_announce_lines(tmp_path, capsys, recorded_night):
+    (tmp_path / "plain.txt").write_text("31.0 0.1\n")
+    (tmp_path / "named.csv").write_text("error_hz,frequency_hz\n0.1,31.0\n,77\n")
     for options in (
-        ("--accelerometers", tmp_path / "a.npy"),
-        ("--lines-file", tmp_path / "lines.txt"),
+        ("--lines-file", tmp_path / "plain.txt"),
+        ("--lines-file", tmp_path / "named.csv"),
         ("--lines-hz", 31, 77),
     ):
         status, text, error = run(
@@ -161,6 +160,23 @@ def test_accelerometers_and_lists_announce_lines(tmp_path, capsys, recorded_loop
         (line,) = json.loads(text)["axes"][0]["vibrations"]
         assert line["announced"]
         assert line["frequency_hz"] == pytest.approx(LINE_HZ, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "frequency_hz,error_hz\n20,0.1\n,0.2\n",
+        "f_hz,frequency_hz\n20,20\n",
+        "error_hz\n20\n",
+        "1,2,3\n",
+    ],
+)
+def test_lists_of_lines_that_are_refused(tmp_path, capsys, recorded_night, text):
+    (tmp_path / "lines.csv").write_text(text)
+    options = ("-o", tmp_path / "m.yaml", "--lines-file", tmp_path / "lines.csv")
+    status, _, error = run(capsys, "identify", recorded_night, *options)
+    assert status == 2
+    assert "must have a frequency_hz in each row" in error
 
 
 def test_accelerometers_are_compared_with_the_lines_of_the_model(

@@ -8,7 +8,7 @@ from support.night import LINE_HZ
 from support.recorded_loops import RATE
 
 import lbt_synth as lbt
-from lbt_synth.config.templates import example_files, telescope_names
+from lbt_synth.config.load import example_files, telescope_names
 
 
 @pytest.fixture

@@ -83,7 +83,6 @@ def test_modal_knows_the_local_loop(capsys):
     ("arguments", "words"),
     [
         (("--modes", 1), "modes must be at least 2"),
-        (("--modes", 30_000), "modes must be at most 20000"),
         (("--modes", 3, "-o", "x.txt"), "must end in .csv"),
         (("--modes", "many"), "invalid int"),
     ],

@@ -25,7 +25,7 @@ def test_a_mistyped_option_is_named(capsys, words, message) -> None:
 
 
 def test_a_mistyped_command_is_suggested(capsys):
-    views = "known are init, design, "  # of plot, and no word is near
+    views = "known are init, completion, "  # of plot, and no word is near
     near = "did you mean design?"
     for words, hint in ((("desgn",), near), (("bode",), views)):
         status, out, error = run(capsys, *words)

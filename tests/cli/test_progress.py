@@ -8,12 +8,11 @@ from lbt_synth.cli import progress
 
 
 def show_all(quiet):
-    with progress.show_spinner("thinking", quiet=quiet):
-        pass
-    with progress.count_progress(total=8, what="runs", quiet=quiet) as count:
-        count(3)
-    seen = progress.track_progress(range(2), total=2, what="rows", quiet=quiet)
-    assert list(seen) == [0, 1]
+    with progress.show_progress("thinking", quiet=quiet):
+        with progress.count_progress(total=8, what="runs") as count:
+            count(3)
+        seen = progress.track_progress(range(2), total=2, what="rows")
+        assert list(seen) == [0, 1]
 
 
 @pytest.mark.parametrize(("terminal", "quiet"), [(False, False), (False, True), (True, True)])

@@ -121,7 +121,7 @@ def test_the_run_reaches_beyond_the_last_event(capsys, config_file, sensors_file
     [
         (("--drop", "m3@1s"), "must be one of wavefront, slow, m1, m2"),
         (("--drop", "m2"), "--drop takes SENSOR@START..END"),
-        (("--drop", "m2@1.2.3s"), "times in seconds"),
+        (("--drop", "m2@1.2.3s"), "in seconds"),
         (("--drop", "m2@5s", "--frames", 1000), "--frames must reach beyond"),
         (("--stroke", 100), "--stroke goes with"),
         (("--telemetry", "t.fits"), "--telemetry goes with"),

@@ -4,7 +4,7 @@ import pytest
 from ruamel.yaml import YAML
 
 import lbt_synth as lbt
-from lbt_synth.config.templates import example_files, telescope_names, telescope_template
+from lbt_synth.config.load import example_files, telescope_names, telescope_template
 
 SCHEMA = lbt.config.config_schema()
 SECTIONS = [SCHEMA, *SCHEMA["$defs"].values()]

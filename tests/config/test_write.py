@@ -1,15 +1,22 @@
 """Configurations that are written, and read again."""
 
+from dataclasses import astuple, replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.identified_models import ONE_AXIS
+from support.identified_models import ONE_AXIS, SHELL, TILT, TIP, TWO, Line, Model, save_identified
 from support.plants import ROOT
 
 import lbt_synth as lbt
 from lbt_synth.config.schema import FileSection
-from lbt_synth.config.write import config_text
+from lbt_synth.config.write import RAISED, config_text, require_writable_facts
+from lbt_synth.identification.accelerometers.transfers import (
+    AccelerometerTransfers,
+    ChannelRow,
+    TransferRow,
+)
 
 
 @pytest.mark.parametrize("name", ["lbt.yaml", "lbt_robust.yaml", "lbt_slow_mirror.yaml"])
@@ -89,3 +96,209 @@ def test_only_configurations_are_written(tmp_path):
     settings, _ = lbt.config.identified_config(ONE_AXIS)
     with pytest.raises(lbt.errors.OutputError, match="cannot write"):
         lbt.config.save_config(tmp_path / "none" / "a.yaml", settings)
+
+
+@pytest.mark.parametrize(
+    "model", [TWO, ONE_AXIS, replace(TWO, mirror=SHELL), replace(TWO, delay_frames=2.4)]
+)
+def test_what_was_identified_is_what_is_read(tmp_path, model):
+    config = lbt.load_config(save_identified(tmp_path, model))
+    plant = config.plant
+    assert config.atmosphere is None
+    assert config.imaging.diameter_m is None
+    assert plant.hardware.modes == len(model.axes)
+    assert plant.hardware.delay_frames == model.delay_frames
+    if model.mirror is None:
+        assert plant.hardware.mirror is None
+    else:
+        assert astuple(plant.hardware.mirror) == astuple(model.mirror)
+    gains = [axis.sensor_gain for axis in model.axes]
+    np.testing.assert_array_equal(plant.hardware.sensor, np.diag(gains))
+    for own, axis in zip(plant.turbulence, model.axes, strict=True):
+        np.testing.assert_array_equal(own.coefficients, axis.turbulence.coefficients)  # all digits
+        assert own.driving_rms_nm == axis.turbulence.driving_rms_nm
+    noise = [axis.noise_nm for axis in model.axes]
+    np.testing.assert_allclose(np.sqrt(np.diag(plant.R)), noise, rtol=1e-14)
+    lines = [(i, line) for i, axis in enumerate(model.axes) for line in axis.parts]
+    assert len(plant.vibrations) == len(lines)
+    for made, (i, line) in zip(plant.vibrations, lines, strict=True):
+        assert made.direction == tuple(np.eye(len(model.axes))[i])
+        assert (made.frequency_hz, made.damping, made.rms_nm) == (
+            line.frequency_hz,
+            line.damping,
+            line.rms_nm,
+        )
+    truth = config.truth
+    assert truth.turbulence_per_mode(len(model.axes)) == plant.turbulence
+    assert truth.vibrations == plant.vibrations
+    assert truth.noise_per_measurement(len(noise)).tolist() == noise
+    assert truth.sensor_gain == 1.0
+
+
+def test_a_line_of_both_axes_is_written_once_with_its_direction(tmp_path):
+    angle = np.radians(-34.2)
+    line = Line(
+        frequency_hz=31.0,
+        damping=0.004,
+        rms_nm=60.0,
+        direction=(np.cos(angle), np.sin(angle)),
+        direction_error_deg=0.8,
+    )
+    share = replace(line, rms_nm=60 * np.cos(angle))  # of tip: no line of its own
+    model = replace(TWO, axes=(replace(TIP, parts=(share, *TIP.parts)), TILT), shared=(line,))
+    file = save_identified(tmp_path, model)
+    made = lbt.load_config(file).plant.vibrations
+    assert [one.frequency_hz for one in made] == [20.123456789, 47.0, 13.7, 31.0]
+    assert made[-1].direction == pytest.approx(line.direction, abs=1e-15)
+    assert made[-1].rms_nm == 60
+    (row,) = [row for row in file.read_text().splitlines() if "direction_deg" in row]
+    assert float(row.split("#")[0].split(":")[1]) == pytest.approx(-34.2)
+    assert row.endswith("# standard error 0.8 degrees")
+
+
+def test_drifts_and_bumps_are_written(tmp_path):
+    """A drift was refused after the fit: its damping ratio is far above 1."""
+    drift = Line(frequency_hz=18.0, damping=300.0, rms_nm=50.0)
+    bump = Line(frequency_hz=42.0, damping=0.17, rms_nm=30.0, sections=4)
+    made = lbt.load_config(
+        save_identified(tmp_path, Model(axes=(replace(TIP, parts=(drift, bump)),)))
+    )
+    assert [(line.damping, line.sections) for line in made.plant.vibrations] == [
+        (300, 1),
+        (0.17, 4),
+    ]
+    assert made.truth.vibrations == made.plant.vibrations
+    assert lbt.kalman(made.plant).certificate.passed
+
+
+def test_the_residual_of_the_kalman_filter_is_the_estimation_error(tmp_path):
+    """The truth is the model: an exact check of the whole chain."""
+    config = lbt.load_config(save_identified(tmp_path, TWO))
+    design = lbt.kalman(config.plant)
+    loop = lbt.close_loop(config.hardware, design.controller)
+    budget = lbt.residual_budget(loop, config.truth, frame_means=True)
+    limit = lbt.loop.least_residual(config.hardware, config.truth, frame_means=True)
+    assert budget.rms_nm == pytest.approx(design.rms, rel=1e-8)
+    assert limit.rms_nm == pytest.approx(design.rms, rel=1e-6)
+
+
+def test_standard_errors_stand_beside_their_numbers(tmp_path):
+    text = save_identified(tmp_path, TWO, title="Night of tests.\nSecond line.").read_text()
+    assert text.startswith("# Night of tests.\n# Second line.\nversion: 1\n")
+    rows = {
+        row.split(":")[0].strip(): row for row in text.splitlines() if "#" in row and ":" in row
+    }
+    assert "[15.5, 9.25]" in rows["noise_nm"]
+    assert rows["noise_nm"].endswith("# standard error 0.12, 0.12 nm")
+    assert rows["sensor_gain"].endswith("# standard error 0.011, not known")
+    assert "20.123456789 " in text
+    assert "# standard error 0.01 Hz" in text
+    assert "# standard error 0.0004" in text
+    assert "# standard error 1.5 nm" in text
+    assert "# tip, rms" in text
+    # a gain of 1 that was not estimated is not worth a key
+    assert "sensor_gain" not in save_identified(tmp_path, ONE_AXIS).read_text()
+
+
+def test_a_telescope_is_written_where_it_is_known(tmp_path):
+    camera = {"diameter_m": 8.22, "obstruction": 0.11, "wavelength_um": 1.65}
+    config = lbt.load_config(save_identified(tmp_path, TWO, **camera, other_modes_strehl=0.8))
+    for name, value in camera.items():
+        assert getattr(config.imaging, name) == value
+    assert config.imaging.other_modes == 0.8
+
+
+def test_quiet_axes_have_no_vibrations(tmp_path):
+    calm = Model(axes=(replace(TIP, parts=()), replace(TILT, parts=())))
+    config = lbt.load_config(save_identified(tmp_path, calm))
+    assert config.plant.vibrations == ()
+    assert config.truth.vibrations == ()
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "text"),
+    [
+        (Model(axes=()), {}, "one or two axes; got a model of 0"),
+        (Model(axes=(TIP, TILT, TIP)), {}, "one or two axes; got a model of 3"),
+        (TWO, {"obstruction": 0.1}, "diameter_m, which is missing"),
+        (TWO, {"diameter_m": -1.0}, "telescope.diameter_m"),
+        (TWO, {"wavelength_um": float("nan")}, "imaging.wavelength_um"),
+        (replace(TWO, delay_frames=float("nan")), {}, "delay_frames"),
+        (replace(TWO, delay_frames=None), {}, "delay_frames"),
+        (Model(axes=(replace(TIP, noise_nm=-1.0),)), {}, "sensor.noise_nm"),
+        (Model(axes=(replace(TIP, sensor_gain=-1.0),)), {}, "model.sensor_gain"),
+        (
+            Model(axes=(replace(TIP, parts=(Line(frequency_hz=3, damping=0.0, rms_nm=1),)),)),
+            {},
+            r"model.vibrations\[0\].damping",
+        ),
+    ],
+)
+def test_models_that_no_configuration_can_hold(model, options, text):
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        lbt.config.identified_config(model, **options)
+
+
+@pytest.mark.parametrize(("age", "delay"), [(0, 1.0), (4, 5.0), (-3, 2.0), (500, 2.0)])
+def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
+    """One channel shows the second line; the other adds nothing. A clock that is off gets age 1."""
+    row = TransferRow(
+        channel="m1",
+        line=1,
+        frequency_hz=47.0,
+        motion_nm_per_nm=1.5,
+        motion_error_nm_per_nm=0.02,
+        phase_deg=-170.25,
+        phase_error_deg=0.5,
+        coherence=0.9,
+        chance=1e-9,
+        useful=True,
+    )
+    names = ("m1", "m2")
+    found = AccelerometerTransfers(
+        transfers=(row, replace(row, channel="m2", line=0, useful=False)),
+        channels=tuple(ChannelRow(channel=name, noise_m_s2=2e-4, verdict="") for name in names),
+        shift_frames=age - 1,
+        shift_error_frames=0.1,
+        age_frames=age,
+        rate_hz=1000.0,
+    )
+    path = save_identified(tmp_path, TWO, accelerometers=found)
+    plant = lbt.load_config(path).plant
+    (sensor,) = plant.hardware.suite.sensors
+    assert (sensor.channels, sensor.delay_frames) == (("m1",), delay)
+    assert sensor.noise_m_s2.tolist() == [2e-4]
+    motions = [
+        {name: (each.size, each.phase_deg) for name, each in m.items()} for m in plant.motions
+    ]
+    assert motions == [{}, {"m1": (1.5, -170.25)}, *[{}] * (len(motions) - 2)]
+    assert "standard error 0.02" in path.read_text()
+    assert ("give the real delay" in path.read_text()) == (age in (-3, 500))
+    # readings of the frame itself have not ended when a loop of less than two frames acts
+    assert found.loop_age(1.5) == (age if 0 < age < 100 else 1)
+
+
+def test_what_is_less_than_a_configuration_holds_is_raised_to_its_least():
+    parts = (Line(frequency_hz=3, damping=0.1, rms_nm=0.0), *TIP.parts)
+    model = Model(axes=(replace(TIP, noise_nm=2e-4, parts=parts),))
+    settings, comments = lbt.config.identified_config(model)
+    assert settings.sensor.noise_nm == [1e-3]
+    assert settings.model.vibrations[0].rms_nm == 1e-3
+    assert comments["sensor.noise_nm"] == f"{RAISED}, from 0.0002 nm"
+    assert comments["model.vibrations[0].rms_nm"] == f"{RAISED}, from 0 nm"
+
+
+@pytest.mark.parametrize(
+    ("facts", "text"),
+    [
+        ({"obstruction": 0.1}, "diameter_m, which is missing"),
+        ({"diameter_m": 1e9}, "telescope.diameter_m"),
+        ({"delay_frames": 1e9}, "loop.delay_frames"),
+        ({"wavelength_um": -1.0}, "imaging.wavelength_um"),
+    ],
+)
+def test_facts_that_no_configuration_can_hold_are_known_before_a_fit(facts, text):
+    known = {"frame_rate_hz": 500.0, "delay_frames": None}
+    require_writable_facts(1, **known)
+    with pytest.raises(lbt.errors.ProblemError, match=text):
+        require_writable_facts(1, **(known | facts))

@@ -171,13 +171,6 @@ def test_memory_that_does_not_fit(plant):
         lbt_axis_plant(modes=2).with_memory(np.ones((2, 3)))
 
 
-def test_a_plant_with_its_commands_as_states(plant):
-    design = lbt.mixed(plant.full(), gamma_ratio=1.1, taps=4)
-    same = lbt.mixed(plant, gamma_ratio=1.1, taps=4)
-    assert design.rms == pytest.approx(same.rms, rel=1e-7)
-    assert lbt.close_loop(design.hardware, design.controller).is_stable
-
-
 def test_a_plant_with_memory_is_not_assembled_again(plant):
     design = lbt.mixed(plant, gamma_ratio=1.1, taps=4)
     for again in (

@@ -1,11 +1,16 @@
-"""Gain files of filters of several sensors: what they hold, and what they refuse."""
+"""Records of designs: each claim and each array counts, and what is altered is refused."""
 
 import numpy as np
 import pytest
+from support.gain_file_edits import ORIGINALS, original
 from support.gain_files import edited_file
 
 import lbt_synth as lbt
+from lbt_synth.design.record import DesignRecord, rebuild_design, record_design
 from lbt_synth.errors import GainFileError
+from lbt_synth.files.gain_file.store import require_agreement
+
+FACTOR = 1.001
 
 
 def scale_array(name):
@@ -62,3 +67,35 @@ def test_gains_of_readings_that_are_not_due_are_refused(sensors_design, tmp_path
     path = edited_file(tmp_path / "sensors.npz", sensors_design, change)
     with pytest.raises(GainFileError, match="GAIN_PREDICTOR is not what"):
         lbt.load_gain(path)
+
+
+def complaint(design, record):
+    """What is said of a record that was changed: a contradiction, or the checks that fail."""
+    try:
+        rebuilt = rebuild_design(type(design), record)
+        require_agreement(record, record_design(rebuilt))
+    except (ValueError, lbt.errors.LbtSynthError) as error:
+        return str(error)
+    return ", ".join(check.name for check in rebuilt.recertify().checks if not check.passed)
+
+
+def times(value):
+    """A claim times the factor: a number, or one of each mode."""
+    return [FACTOR * part for part in value] if isinstance(value, list) else FACTOR * value
+
+
+@pytest.mark.parametrize("name", ORIGINALS)
+def test_each_claim_and_each_array_counts(name):
+    """Times 1.001: a named check fails, or the file contradicts itself."""
+    design = original(name)
+    record = record_design(design)
+    assert complaint(design, record) == ""
+    for key, array in record.arrays.items():
+        if np.any(array):
+            changed = DesignRecord({**record.arrays, key: FACTOR * array}, record.meta)
+            assert complaint(design, changed), key
+    assert record.meta["claims"]
+    for key, value in record.meta["claims"].items():
+        claims = {**record.meta["claims"], key: times(value)}
+        changed = DesignRecord(record.arrays, {**record.meta, "claims": claims})
+        assert complaint(design, changed), key

@@ -26,8 +26,8 @@ from lbt_synth.identification.auto import (
     unstable_gains,
 )
 from lbt_synth.identification.prediction.residual import estimate_residual
-from lbt_synth.methods import method_named, registry
-from lbt_synth.methods.registry import default_method, gain_robust_method
+from lbt_synth.methods import registry
+from lbt_synth.methods.registry import default_method, gain_robust_method, method_named
 
 DRIFT_HZ = 500.0
 TITLES = {name: method_named(name).title for name in ("kalman", "hinf", "lqg")}
@@ -176,7 +176,7 @@ def test_slow_methods_are_not_tried(monkeypatch):
     usual = method_named(default_method())
     for slow in (False, True):
         newcomer = replace(usual, name="newcomer", slow=slow)
-        monkeypatch.setitem(registry._methods_of_folder(), "newcomer", newcomer)
+        monkeypatch.setitem(registry.METHODS, "newcomer", newcomer)
         assert ("newcomer" in quick_methods()) is not slow
 
 

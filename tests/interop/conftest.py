@@ -4,7 +4,7 @@ import pytest
 from support.exports import lbt_config, lbt_designs
 
 import lbt_synth as lbt
-from lbt_synth.interop import pipeline
+from lbt_synth.interop import proof
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def designs():
 @pytest.fixture
 def short_rehearsal(monkeypatch):
     """Rehearse few frames, in tests that do not look at what is found there."""
-    monkeypatch.setattr(pipeline, "FRAMES", 100)
+    monkeypatch.setattr(proof, "FRAMES", 100)
 
 
 @pytest.fixture(scope="session")

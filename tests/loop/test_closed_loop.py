@@ -10,6 +10,7 @@ from support.lqg import shell
 from support.plants import ROOT, lbt_axis_plant
 
 import lbt_synth as lbt
+from lbt_synth.loop.closed_loop import youla_controller
 
 
 @given(gain=st.floats(0.2, 1.5))
@@ -71,7 +72,7 @@ def test_the_closed_loop_is_affine_in_the_filter(delay, feedthrough):
         D=rng.normal(size=(2, 3)) if feedthrough else np.zeros((2, 3)),
         dt_s=1 / 800,
     )
-    loop = lbt.close_loop(path, lbt.loop.youla_controller(path, parameter))
+    loop = lbt.close_loop(path, youla_controller(path, parameter))
     assert loop.is_stable
     f = np.array([0.0, 3.0, 20.0, 150.0, 400.0])
     z = np.exp(2j * np.pi * f / 800)[:, None, None]
@@ -86,7 +87,7 @@ def test_a_filter_of_another_size_is_refused():
     with pytest.raises(
         lbt.errors.DimensionError, match="map 2 measurements to 2 commands; got 1 to 1"
     ):
-        lbt.loop.youla_controller(path, lbt.Controller(A=0.0, B=1.0, C=1.0, D=0.0, dt_s=1 / 800))
+        youla_controller(path, lbt.Controller(A=0.0, B=1.0, C=1.0, D=0.0, dt_s=1 / 800))
 
 
 @pytest.mark.parametrize("delay", [1.0, 1.4, 2.0, 2.5])
@@ -107,7 +108,7 @@ def test_the_loop_with_a_moving_mirror_is_affine_in_the_filter(delay, feedthroug
         D=rng.normal(size=(2, 2)) * feedthrough,
         dt_s=1 / 800,
     )
-    loop = lbt.close_loop(path, lbt.loop.youla_controller(path, parameter))
+    loop = lbt.close_loop(path, youla_controller(path, parameter))
     assert loop.is_stable
     f = np.array([0.0, 3.0, 20.0, 150.0, 400.0])
     z = np.exp(2j * np.pi * f / 800)[:, None, None]

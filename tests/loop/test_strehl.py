@@ -9,7 +9,7 @@ from scipy.special import j0, jv
 
 import lbt_synth as lbt
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.loop.strehl import annular_otf, jitter_strehls
+from lbt_synth.loop.strehl import annular_otf, series_strehl
 
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
 
@@ -92,8 +92,7 @@ def test_large_jitter_stays_between_zero_and_one():
         np.zeros((2, 2)), imaging=camera, line_amplitudes_nm=[[10_000, 10_000j]]
     )
     assert abs(circle) < 1e-4
-    with pytest.raises(lbt.errors.ProblemError, match="the jitter must stay below"):
-        lbt.loop.jitter_strehl(np.eye(2) * 1e12, imaging=camera)
+    assert lbt.loop.jitter_strehl(np.eye(2) * 1e12, imaging=camera) == 0  # the image is gone
 
 
 def test_one_axis_is_the_second_one_still():
@@ -110,7 +109,7 @@ def test_series_of_an_exact_sinusoid():
     exact = lbt.loop.jitter_strehl(
         np.zeros((2, 2)), imaging=CAMERA, line_amplitudes_nm=[[700, -300j]]
     )
-    assert lbt.loop.series_strehl(series, CAMERA) == pytest.approx(exact, abs=1e-5)
+    assert series_strehl(series, CAMERA) == pytest.approx(exact, abs=1e-5)
 
 
 @pytest.mark.parametrize(("amplitude_nm", "wavelength_um"), [(4000.0, 0.5), (16000.0, 1.65)])
@@ -121,14 +120,14 @@ def test_series_of_a_large_sinusoid(amplitude_nm, wavelength_um):
     exact = lbt.loop.jitter_strehl(
         np.zeros((2, 2)), imaging=camera, line_amplitudes_nm=[[amplitude_nm, 0]]
     )
-    assert lbt.loop.series_strehl(series, camera) == pytest.approx(exact, rel=1e-6)
+    assert series_strehl(series, camera) == pytest.approx(exact, rel=1e-6)
 
 
 @given(st.floats(0, 1e6), st.floats(0, 0.9))
 def test_a_star_that_jumps_between_two_places(jump_nm, obstruction):
     """The image of an annular pupil at its distance, by Bessel functions."""
     camera = lbt.Imaging(diameter_m=8.22, obstruction=obstruction)
-    found = lbt.loop.series_strehl([[jump_nm, 0.0], [-jump_nm, 0.0]], camera)
+    found = series_strehl([[jump_nm, 0.0], [-jump_nm, 0.0]], camera)
     u = np.pi * camera.cycles_per_nm * jump_nm
     discs = [jv(0, w) + jv(2, w) for w in (u, obstruction * u)]  # 2 J1(w) / w
     expected = ((discs[0] - obstruction**2 * discs[1]) / (1 - obstruction**2)) ** 2
@@ -143,9 +142,9 @@ def test_a_star_that_jumps_between_two_places(jump_nm, obstruction):
         lambda: lbt.loop.jitter_strehl([[1, 0], [0, -1]], imaging=CAMERA),
         lambda: lbt.loop.jitter_strehl([[np.nan]], imaging=CAMERA),
         lambda: lbt.loop.jitter_strehl([[1.0]], imaging=CAMERA, line_amplitudes_nm=[[np.inf]]),
-        lambda: lbt.loop.series_strehl(np.zeros((10, 3)), CAMERA),
-        lambda: lbt.loop.series_strehl(np.zeros(10), CAMERA),
-        lambda: lbt.loop.series_strehl([[np.nan, 1]], CAMERA),
+        lambda: series_strehl(np.zeros((10, 3)), CAMERA),
+        lambda: series_strehl(np.zeros(10), CAMERA),
+        lambda: series_strehl([[np.nan, 1]], CAMERA),
         lambda: lbt.Imaging(diameter_m=8, other_modes=1.2),
     ],
 )
@@ -164,7 +163,7 @@ def test_strehl_in_nm_does_not_know_the_diameter(diameter, x, y, wavelength):
     series = np.outer(np.sin(np.arange(50)), [x, y])
     for found in (
         [lbt.loop.jitter_strehl(np.diag([x**2, y**2]), imaging=c) for c in cameras],
-        [lbt.loop.series_strehl(series, c) for c in cameras],
+        [series_strehl(series, c) for c in cameras],
     ):
         assert found[0] == found[1]
     angle = 4 * x / (wavelength * 1e3)  # in lambda / D, of the definition by angles
@@ -199,7 +198,7 @@ def dense_strehl(covariance, lines, imaging):
     return imaging.other_modes * float(weight @ factor.mean(axis=1) / weight.sum())
 
 
-def test_fewer_directions_lose_nothing():
+def test_many_jitters_are_integrated_as_each_of_them():
     rng = np.random.default_rng(5)
     count = 300
     roots = 10 ** rng.uniform(0, 3, (count, 1, 1)) * rng.standard_normal((count, 2, 2))
@@ -213,7 +212,7 @@ def test_fewer_directions_lose_nothing():
     small = (small + np.abs(lines).sum(axis=(1, 2))) * DIMMER_CAMERA.cycles_per_nm < 5
     assert small.sum() > 200
     covariances, lines = covariances[small], lines[small]
-    found = jitter_strehls(covariances, imaging=DIMMER_CAMERA, line_amplitudes_nm=lines)
+    found = lbt.loop.jitter_strehl(covariances, imaging=DIMMER_CAMERA, line_amplitudes_nm=lines)
     for i in range(len(found)):
         assert found[i] == pytest.approx(
             dense_strehl(covariances[i], lines[i], DIMMER_CAMERA), abs=1e-13
@@ -228,9 +227,11 @@ def test_many_jitters_of_wrong_sizes():
     with pytest.raises(
         lbt.errors.DimensionError, match=r"must be \(3, sinusoids, 2\); got \(2, 1, 2\)"
     ):
-        jitter_strehls(
+        lbt.loop.jitter_strehl(
             np.zeros((3, 2, 2)), imaging=DIMMER_CAMERA, line_amplitudes_nm=np.zeros((2, 1, 2))
         )
     indefinite = np.stack([np.eye(2), np.diag([1, -1])])
     with pytest.raises(lbt.errors.DefinitenessError, match="least eigenvalue of -1"):
-        jitter_strehls(indefinite, imaging=DIMMER_CAMERA, line_amplitudes_nm=np.zeros((2, 0, 2)))
+        lbt.loop.jitter_strehl(
+            indefinite, imaging=DIMMER_CAMERA, line_amplitudes_nm=np.zeros((2, 0, 2))
+        )

@@ -13,8 +13,7 @@ from support.configs import write_config
 from support.plants import ROOT
 
 import lbt_synth as lbt
-from lbt_synth.config.schema import FileSection
-from lbt_synth.config.schema_errors import describe_error
+from lbt_synth.config.schema import FileSection, describe_error
 
 EXAMPLES = [
     YAML(typ="safe", pure=True).load(path.read_text())

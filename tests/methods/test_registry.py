@@ -1,9 +1,7 @@
-"""All that the package knows of a method of synthesis stands in its module."""
+"""All that the package knows of a method of synthesis stands in the table."""
 
 import ast
 import json
-import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +12,10 @@ from support.design_reports import SMALL
 from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
-from lbt_synth import methods
-from lbt_synth.methods import method_named, registry
 from lbt_synth.methods.registry import (
-    all_methods,
+    METHODS,
     design_label,
+    method_named,
     reference_methods,
 )
 
@@ -27,18 +24,14 @@ BUILT_IN = ("hinf", "integrator", "kalman", "lqg", "mixed", "robust")
 
 
 @pytest.fixture
-def leaky(tmp_path, monkeypatch):
-    """The method of a file that is put into the folder of methods."""
-    shutil.copy(leaky_method.__file__, tmp_path / "leaky.py")
-    monkeypatch.setattr(methods, "__path__", [*methods.__path__, str(tmp_path)])
-    registry._methods_of_folder.cache_clear()
-    yield method_named("leaky")
-    registry._methods_of_folder.cache_clear()
-    del sys.modules["lbt_synth.methods.leaky"]
+def leaky(monkeypatch):
+    """The method of a file that is added to the table."""
+    monkeypatch.setitem(METHODS, "leaky", leaky_method.METHOD)
+    return method_named("leaky")
 
 
 def test_methods_by_name(leaky):
-    assert tuple(name for name in all_methods() if name != "leaky") == BUILT_IN
+    assert tuple(name for name in METHODS if name != "leaky") == BUILT_IN
     assert leaky.title == leaky_method.METHOD.title
     assert [m.name for m in reference_methods()] == ["integrator", "kalman", "hinf"]
     assert [m.name for m in reference_methods(estimators_only=True)] == ["kalman", "hinf"]
@@ -58,7 +51,7 @@ def config():
     return lbt.load_config(CONFIG)
 
 
-def test_every_command_takes_a_method_of_the_folder(leaky, tmp_path, capsys, monkeypatch):
+def test_every_command_takes_a_method_of_the_table(leaky, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("small.yaml").write_text(SMALL)
     gain, small = "leaky.fits", "small.yaml"
@@ -102,7 +95,7 @@ parameters:
 """
 
 
-def test_a_study_takes_a_method_of_the_folder(leaky, tmp_path, capsys):
+def test_a_study_takes_a_method_of_the_table(leaky, tmp_path, capsys):
     study = tmp_path / "study.yaml"
     study.write_text(STUDY.format(config=CONFIG, leak=5.0))
     status, _, error = run(capsys, "study", study, "-o", tmp_path / "out")
@@ -117,7 +110,7 @@ def test_a_study_takes_a_method_of_the_folder(leaky, tmp_path, capsys):
 
 
 def test_no_other_file_names_a_method():
-    """A method's name stands in its module, and in the design that it makes."""
+    """A method's name stands in the table, and in the design that it makes."""
     known = {"design", "methods"}
     named = {
         str(path.relative_to(ROOT)): sorted(found)

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from types import ModuleType
 
+import mpmath
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import trapezoid
+from scipy.linalg import solve_discrete_lyapunov
 from support.eris import eris_example, eris_record
 
 import lbt_synth as lbt
@@ -62,3 +67,43 @@ def test_parts_of_the_disturbance_are_the_file(seen, example):
         assert whole.psd(f) == pytest.approx(column.psd(f), rel=1e-12)
         moved = example.disturbance(seen, shift_hz=0.5).lines[i]
         assert moved.psd(f + 0.5) == pytest.approx(met.lines[i].psd(f), rel=1e-9, abs=1e-9)
+
+
+@given(poles=st.lists(st.floats(-0.95, 0.95), min_size=1, max_size=5))
+def test_variance_against_a_lyapunov_equation(poles):
+    coefficients = -np.poly(poles)[1:]
+    model = lbt.models.ARModel(coefficients=coefficients, driving_rms_nm=3.0, frame_rate_hz=1)
+    drive = np.zeros((len(poles), len(poles)))
+    drive[0, 0] = 9.0
+    expected = solve_discrete_lyapunov(model.companion, drive)[0, 0]
+    assert model.rms_nm**2 == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "damping", "rate_hz"),
+    [(0.1, 1e-4, 2000), (0.5, 1e-6, 10_000), (0.2, 1e-5, 3000), (0.1, 1e-3, 2000)],
+)
+def test_slow_lines_have_the_rms_they_claim(frequency_hz, damping, rate_hz):
+    """By the closed form of order 2, in 50 digits, from the same coefficients."""
+    line = lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=100)
+    model = line.ar_model(rate_hz)
+    with mpmath.workdps(50):
+        a1, a2, drive = (mpmath.mpf(float(v)) for v in (*model.coefficients, model.driving_rms_nm))
+        variance = drive**2 * (1 - a2) / ((1 + a2) * ((1 - a2) ** 2 - a1**2))
+        assert float(mpmath.sqrt(variance)) == pytest.approx(100, rel=1e-8)
+    assert model.rms_nm == pytest.approx(100, rel=1e-12)
+
+
+def test_ar_spectrum_integrates_to_its_variance():
+    model = lbt.Vibration(frequency_hz=40, damping=0.05, rms_nm=7.0).ar_model(800)
+    f = np.linspace(0, 400, 400_001)
+    assert trapezoid(model.psd(f), f) == pytest.approx(49.0, rel=1e-6)
+
+
+def test_processes_that_are_not_stationary_are_refused():
+    for a1, a2, words in (
+        (1.972279, 0.996863, "Check the signs"),  # erratum 1 of the paper: + A2
+        (1.9, -1.0, "no finite variance"),  # rounding leaves its poles inside the unit circle
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match=words):
+            lbt.models.ARModel(coefficients=[a1, a2], driving_rms_nm=1, frame_rate_hz=500)

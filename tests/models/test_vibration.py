@@ -14,6 +14,8 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
 from lbt_synth.models.vibration import checked_direction
 
+PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+
 
 def test_vibration_of_the_lbt():
     model = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=1.0).ar_model(800)
@@ -50,9 +52,6 @@ def test_retuned_vibration_holds_what_it_is_told():
 def test_direction_becomes_a_unit_vector():
     line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=1, direction=(3, 4))
     assert line.direction == pytest.approx((0.6, 0.8))
-
-
-PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
 
 
 def drawn(line, *, frames, cases=1, zero_frame=0, seed=0):

@@ -21,11 +21,11 @@ def page():
 
 def test_sections_and_charts(page):
     assert list(page.sections) == [
-        "verdict",
-        "record",
-        "loop",
-        "disturbance",
-        "sources",
+        "Verdict",
+        "Record",
+        "Loop that ran",
+        "Disturbance",
+        "Files and versions",
     ]
     assert [chart.key for chart in page.charts] == ["residuals", "costs", "identification"]
     residuals, costs, spectra = page.charts
@@ -69,7 +69,7 @@ def test_what_is_wrong_comes_first_and_loudly(tmp_path):
         "The commands are not those that the mirror followed: they have the opposite sign.",
     )
     assert page.charts == []
-    assert list(page.sections)[:3] == ["verdict", "record", "loop"]
+    assert list(page.sections)[:3] == ["Verdict", "Record", "Loop that ran"]
 
 
 def test_names(tmp_path):

@@ -38,61 +38,51 @@ def served(config, *gains, folder):
         assert process.wait(20) == 0
 
 
-def await_state(browser, name, value, *, within_s=60):
-    """Wait until the page says that it has come so far."""
-    end = time.monotonic() + within_s
-    while browser.execute_script(f"return document.documentElement.dataset.{name}") != str(value):
-        assert time.monotonic() < end, browser.get_log("browser")
-        time.sleep(0.05)
-
-
-MOVE = """
-const [id, part, final, done] = arguments, root = document.documentElement;
-const knob = document.getElementById(id);
-knob.value = Math.round(part * Number(knob.max));
-const start = performance.now();
-const times = {};
-const watch = new MutationObserver(() => {
-  for (const name of ["shown", "whole"])
-    if (root.dataset[name] === wanted && !(name in times)) times[name] = performance.now() - start;
-  if ("whole" in times) { watch.disconnect(); done([times.shown ?? times.whole, times.whole]); }
-});
-const wanted = String(Number(root.dataset.asked || 0) + 1 + Number(final));
-watch.observe(root, { attributes: true });
-knob.dispatchEvent(new Event("input"));
-// slow designs are made when a slider is released
-if (final || root.dataset.asked !== wanted) knob.dispatchEvent(new Event("change"));
+MODEL = "Bokeh.documents[0].get_model_by_name"
+READY = f"return Boolean(window.Bokeh && Bokeh.documents[0] && {MODEL}('verdict'))"
+SET = f"""
+const [name, field, part, final] = arguments, widget = {MODEL}(name);
+const value = field === "value" && typeof part === "number"
+  ? widget.start + part * (widget.end - widget.start) : part;
+widget.value = value;
+if (final) widget.value_throttled = value;
 """
 
 
-def move(browser, key, part, *, final=False):
-    """Move a slider to a part of its range; return the milliseconds to its curves, and to all."""
-    return browser.execute_async_script(MOVE, key, part, final)
+def text_of(browser, name):
+    """Return what a part of the page says."""
+    return browser.execute_script(f"return {MODEL}(arguments[0]).text", name)
+
+
+def await_true(condition, *, within_s=60):
+    """Wait until something is so."""
+    end = time.monotonic() + within_s
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def await_verdict(browser):
+    """Wait until the page has said what it thinks of its design, and return that."""
+    await_true(lambda: browser.execute_script(READY.replace("Boolean", "!!")))
+    await_true(lambda: text_of(browser, "verdict") not in ("", "Designing …"))
+    return text_of(browser, "verdict")
+
+
+def move(browser, key, part, *, final=True):
+    """Move a slider to a part of its range and release it; return the verdict, a new one."""
+    said = text_of(browser, "verdict")
+    browser.execute_script(SET, key, "value", part, final)
+    await_true(lambda: text_of(browser, "verdict") not in (said, "", "Designing …"))
+    return text_of(browser, "verdict")
 
 
 def choose(browser, method):
-    """Choose a method, and wait for the verdict on its design."""
-    select(browser, method)
-    await_state(browser, "judged", asked(browser))
+    """Choose a method, and return the verdict on its design."""
+    return move(browser, "method", method, final=False)
 
 
-def select(browser, method):
-    browser.execute_script(
-        "const [name, chosen] = arguments, menu = document.getElementById(name);"
-        "menu.value = chosen; menu.dispatchEvent(new Event('change'))",
-        "method",
-        method,
-    )
-
-
-def reset(browser):
-    """Put all sliders back, and wait for the verdict."""
-    before = asked(browser)
-    browser.execute_script("document.getElementById('controls').reset()")
-    await_state(browser, "asked", before + 1)
-    await_state(browser, "judged", before + 1)
-
-
-def asked(browser):
-    """Return the number of the last wish."""
-    return int(browser.execute_script("return document.documentElement.dataset.asked || 0"))
+def press(browser, name):
+    """Press a button."""
+    event = "new (Bokeh.require('core/bokeh_events').ButtonClick)()"
+    browser.execute_script(f"{MODEL}(arguments[0]).trigger_event({event})", name)

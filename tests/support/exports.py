@@ -7,7 +7,7 @@ import numpy as np
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
-from lbt_synth.design.claims import Evidence
+from lbt_synth.design.certificate import Evidence
 from lbt_synth.validation import set_fields
 
 

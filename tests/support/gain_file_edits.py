@@ -74,7 +74,6 @@ def sensors_original(*, bounded):
 
 ORIGINALS = {
     "kalman": lambda: lbt.kalman(odd_plant()),
-    "full": lambda: lbt.kalman(odd_plant().full()),
     "bare": lambda: lbt.kalman(bare_problem()),
     "hinf": lambda: lbt.hinf(odd_plant(), gamma_ratio=1.2, route="riccati"),
     "least": lambda: lbt.hinf(lbt_axis_plant(modes=2), gamma_ratio=1, route="riccati"),

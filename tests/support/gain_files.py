@@ -16,7 +16,6 @@ def every_design():
     return {
         "kalman": lbt.kalman(plant),
         "hinf": lbt.hinf(plant, gamma_ratio=1.3, route="riccati"),
-        "full": lbt.kalman(plant.full()),
         "bare": lbt.kalman(bare),
         "sensors": lbt.kalman(example_plant((FAST, SLOW))),
         "sensors_hinf": lbt.hinf(example_plant((SLOW,)), gamma_ratio=1.3),

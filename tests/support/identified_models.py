@@ -20,6 +20,7 @@ class Line:
     kind: str = "line"
     direction: tuple | None = None
     direction_error_deg: float | None = None
+    sections: int = 1
     direction_deg = lbt.identification.IdentifiedLine.direction_deg
 
 

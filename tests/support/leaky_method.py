@@ -4,10 +4,10 @@ import numpy as np
 from pydantic import Field
 
 from lbt_synth.design import Check, Design, SolverReport
-from lbt_synth.design.claims import Claim
+from lbt_synth.design.certificate import Claim
 from lbt_synth.design.result import with_certificate
 from lbt_synth.linear import Controller
-from lbt_synth.methods import Method, Section
+from lbt_synth.methods.method import Method, Section
 
 
 class LeakyOptions(Section):
@@ -53,7 +53,7 @@ METHOD = Method(
     label="leaky",
     options=LeakyOptions,
     build=build,
-    design="lbt_synth.methods.leaky:LeakyDesign",
+    design="support.leaky_method:LeakyDesign",
     estimator=False,
     configurable=frozenset({"gain"}),
 )

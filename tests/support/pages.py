@@ -78,9 +78,9 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
             panel.set_axes(
                 {"label": "error", "unit": "Hz"}, {"label": "gain", "unit": "-"}, title=title
             )
-            ends, gains = (float(title == "other"), 30.0), np.array([0.2, 0.4, 0.7, 1.0, 1.4])
+            gains = np.array([0.2, 0.4, 0.7, 1.0, 1.4])
             more = {"log": title == "other", "contours": True, "blank": "unstable"}
-            panel.map(np.arange(6.0), gains, values, "ratio", "%", ends=ends, **more)
+            panel.map(np.arange(6.0), gains, values, "ratio", "%", **more)
     words = {"caption": "Two maps.", "alt": "Values rise to the upper right."}
     maps = Chart(key="maps", title="Maps", figure=panels[0].figure, **words)
     turn = np.linspace(0, 2 * np.pi, 61)
@@ -108,21 +108,17 @@ def whole_page(name: str = "first") -> Page:
         headings=("quantity", *(f"design {i}" for i in range(8))),
         rows=(("value", *(str(i) for i in range(8))),),
     )
+    sections = {
+        f"Summary of {name}": (
+            f"Words of {name}. " * 20,
+            Notice(text=f"{name} is bad", tone="bad"),
+            Notice(text="note", tone="note"),
+            table,
+            wide,
+        ),
+        "Charts": every_mark(name),
+        "Listing": ((name, f"a: 1\n\tb: {name}\n" + 200 * "x"),),
+    }
     return Page(
-        title=f"Page of {name}",
-        subtitle=f"about {name}",
-        sections={
-            "summary": (
-                f"Summary of {name}",
-                (
-                    f"Words of {name}. " * 20,
-                    Notice(text=f"{name} is bad", tone="bad"),
-                    Notice(text="note", tone="note"),
-                    table,
-                    wide,
-                ),
-            ),
-            "charts": ("Charts", every_mark(name)),
-            "listing": ("Listing", ((name, f"a: 1\n\tb: {name}\n" + 200 * "x"),)),
-        },
+        title=f"Page of {name}", subtitle=f"about {name}", sections=sections, digests={}, made=""
     )

@@ -1,9 +1,4 @@
-"""Control of hundreds of modes.
-
-The reconstructor takes slopes to modes.
-Every mode gets an integrator gain or a Kalman filter, designed and certified in one call.
-Their loop is closed exactly, and in long simulations.
-"""
+"""Control of many modes, each by a filter or an integrator of its own."""
 
 import lazy_loader
 

@@ -14,15 +14,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from lbt_synth.design.modal.banks import Bank
-from lbt_synth.design.modal.per_mode import mode_indices, number_per_mode
 from lbt_synth.design.modal.reconstructor import Reconstructor
+from lbt_synth.design.modal.stack import Bank, mode_indices, number_per_mode
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear import Controller
-from lbt_synth.linear.controller import RunningController
 from lbt_synth.loop.simulation.run import SteppedController
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, float_array, real_array, require_instance
+from lbt_synth.validation import (
+    FloatArray,
+    IntArray,
+    float_array,
+    real_array,
+    require_instance,
+)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -73,13 +77,10 @@ class MixedController:
     filtered: Sequence[int] = (0, 1)
     leak: Any = 1.0
     reconstructor: Reconstructor | None = None
-    _running: SteppedController | None = field(init=False, repr=False)  # one filter
-    _stacks: tuple[Bank, ...] = field(init=False, repr=False)  # or a filter for each mode
-    _states: list[FloatArray] = field(init=False, repr=False)
-    _modes: np.ndarray = field(init=False, repr=False)
-    _gain: FloatArray = field(init=False, repr=False)
-    _leak: FloatArray = field(init=False, repr=False)
-    _command: FloatArray = field(init=False, repr=False)
+    _banks: tuple[Bank, ...] = field(init=False, repr=False)  # all that is linear
+    _states: list[FloatArray] = field(init=False, repr=False)  # of the banks
+    _running: SteppedController | None = field(init=False, repr=False)  # a filter that is not
+    _modes: IntArray = field(init=False, repr=False)  # those of the filter
 
     def __post_init__(self) -> None:
         gains = real_array(self.gains, "gains")
@@ -90,22 +91,20 @@ class MixedController:
         self.leak = number_per_mode(self.leak, "leak", n, zero=True, at_most=1)
         if self.reconstructor is not None:
             require_instance(self.reconstructor, Reconstructor)
-            own = self.reconstructor.n_modes
-            if own != n:
+            if (modes := self.reconstructor.n_modes) != n:
                 raise DimensionError(
-                    f"gains must be one per mode of the reconstructor, {own}; got {n}."
+                    f"gains must be one per mode of the reconstructor, {modes}; got {n}."
                 )
-        self._gain, self._leak = np.array(self.gains), np.array(self.leak)
-        self._modes, self._running, self._stacks = np.zeros(0, dtype=np.intp), None, ()
+        self._modes, self._running, self._banks = np.zeros(0, dtype=np.intp), None, ()
         if self.filter is not None:
             self._modes = mode_indices(self.filtered, "filtered", n)
-            stack = getattr(self.filter, "banks", None)
-            if stack is not None:
-                self._stacks = self._stacked_filters(stack())
-            else:
-                self._running = _start_filter(self.filter, self._modes.size)
-            self._gain[self._modes] = self._leak[self._modes] = 0.0
-        self.filtered = tuple(int(i) for i in self._modes)
+            self._banks, self._running = _filter_parts(self.filter, self._modes)
+        self.filtered = tuple(self._modes.tolist())
+        rest = np.setdiff1d(np.arange(n), self._modes)
+        if rest.size:  # an integrator each
+            leak, gain = self.leak[rest, None, None], self.gains[rest, None, None]
+            one = np.ones_like(gain)
+            self._banks = (Bank(rest[:, None], leak, gain, one, 0 * one), *self._banks)
         self.reset()
 
     @property
@@ -116,9 +115,8 @@ class MixedController:
     @property
     def dt_s(self) -> float | None:
         """Sampling period of the filter [s]; None where nothing says it."""
-        if isinstance(self._running, RunningController):
-            return float(self._running.controller.dt_s)
-        return getattr(self.filter, "dt_s", None)
+        holder = self.filter if hasattr(self.filter, "dt_s") else _controller_of(self.filter)
+        return getattr(holder, "dt_s", None)
 
     @property
     def hardware(self) -> LoopHardware | None:
@@ -132,8 +130,7 @@ class MixedController:
 
     def reset(self) -> None:
         """Set all integrators and the filter to zero."""
-        self._command = np.zeros(self.gains.size)
-        self._states = [np.zeros((len(bank.A), bank.A.shape[-1], 1)) for bank in self._stacks]
+        self._states = [np.zeros((len(bank.A), bank.A.shape[-1], 1)) for bank in self._banks]
         if self._running is not None:
             self._running.reset()
 
@@ -171,12 +168,7 @@ class MixedController:
                 "y must be finite; got NaN or an infinite value. The state is as before: hold the "
                 "last command, or reset()."
             )
-        command = self._leak * self._command
-        command += self._gain * measured
-        for i, bank in enumerate(self._stacks):
-            entry = measured[bank.modes][..., None]
-            self._states[i] = bank.A @ self._states[i] + bank.B @ entry
-            command[bank.modes] = (bank.C @ self._states[i] + bank.D @ entry)[..., 0]
+        command = np.zeros(self.gains.size)
         if self._running is not None:
             own = float_array(self._running.step(measured[self._modes]), "the filter's commands")
             if own.shape != self._modes.shape:
@@ -190,31 +182,20 @@ class MixedController:
                     "integrators are as before, the filter has stepped: reset()."
                 )
             command[self._modes] = own
-        self._command = command
-        return command.copy()
+        for i, bank in enumerate(self._banks):
+            entry = measured[bank.modes][..., None]
+            self._states[i] = bank.A @ self._states[i] + bank.B @ entry
+            command[bank.modes] = (bank.C @ self._states[i] + bank.D @ entry)[..., 0]
+        return command
 
     def banks(self) -> tuple[Bank, ...]:
-        """Return the controllers of single modes and the filter as banks, without a reconstructor.
-
-        Raises
-        ------
-        ProblemError
-            If the filter is no linear controller of this package.
-        """
-        kept = np.setdiff1d(np.arange(self.n_modes), self._modes)
-        one = np.ones((kept.size, 1, 1))
-        leak, gain = self._leak[kept, None, None], self._gain[kept, None, None]
-        out = [Bank(kept[:, None], leak, gain, one, np.zeros_like(one))] if kept.size else []
-        out += self._stacks
-        if isinstance(self._running, RunningController) and self._running.form == "plain":
-            k = self._running.controller
-            out.append(Bank(self._modes[None], k.A[None], k.B[None], k.C[None], k.D[None]))
-        elif self._running is not None:
+        """Return integrators and filter as banks; one that is only stepped is a ProblemError."""
+        if self._running is not None:
             raise ProblemError(
                 "only a filter with matrices (a design or a Controller) makes a linear "
                 f"controller; got {type(self._running).__name__}."
             )
-        return tuple(out)
+        return self._banks
 
     def as_controller(self, dt_s: float | None = None) -> Controller:
         """Return the same map as one linear controller, for exact analysis.
@@ -263,31 +244,33 @@ class MixedController:
         C = np.hstack([chosen.T @ C for chosen, _, _, C, _ in each])
         return Controller(A=A, B=B, C=C, D=D, dt_s=1.0 if period is None else period)
 
-    def _stacked_filters(self, banks: Sequence[Bank]) -> tuple[Bank, ...]:
-        """Return the filters of a stack for the modes that they control."""
-        modes = sum(bank.modes.size for bank in banks)
-        if modes != self._modes.size:
+
+def _controller_of(given: Any) -> Any:
+    """Return the controller of a design, or of one that runs; anything else as it is."""
+    return getattr(given, "controller", given)
+
+
+def _filter_parts(given: Any, modes: IntArray) -> tuple[tuple[Bank, ...], SteppedController | None]:
+    """Return a filter as banks for its modes, or as an object to step."""
+    if hasattr(given, "banks"):
+        banks = given.banks()
+        if (count := sum(bank.modes.size for bank in banks)) != modes.size:
             raise DimensionError(
-                f"the filters must be for the {self._modes.size} filtered modes; got {modes}."
+                f"the filters must be for the {modes.size} filtered modes; got {count}."
             )
-        return tuple(bank.for_modes(self._modes) for bank in banks)
-
-
-def _start_filter(given: Any, modes: int) -> SteppedController:
-    """Return the filter as an object to step, of as many inputs and outputs as modes."""
-    running = given if isinstance(given, SteppedController) else getattr(given, "controller", given)
-    if isinstance(running, Controller):
-        running = running.start()
-    if not isinstance(running, SteppedController):
+        return tuple(bank.for_modes(modes) for bank in banks), None
+    controller = _controller_of(given)
+    if isinstance(controller, Controller):
+        A, B, C, D = (getattr(controller, name) for name in "ABCD")
+        if D.shape != (modes.size, modes.size):
+            raise DimensionError(
+                f"the filter must map the {modes.size} filtered modes to as many commands; got "
+                f"{D.shape[-1]} measurements and {D.shape[-2]} commands."
+            )
+        return (Bank(modes[None], A[None], B[None], C[None], D[None]),), None
+    if not isinstance(given, SteppedController):
         raise ProblemError(
             "filter must be a design, a Controller, an object with step(y) and reset(), or None; "
             f"got {type(given).__name__}."
         )
-    if isinstance(running, RunningController) and running.form == "plain":
-        D = running.controller.D
-        if D.shape != (modes, modes):
-            raise DimensionError(
-                f"the filter must map the {modes} filtered modes to as many commands; got "
-                f"{D.shape[1]} measurements and {D.shape[0]} commands."
-            )
-    return running
+    return (), given

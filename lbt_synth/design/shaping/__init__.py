@@ -1,9 +1,4 @@
-"""Specifications of a closed loop that are convex in the Youla parameter.
-
-A specification has one objective and any number of demands.
-Each term is a finite conic programme on a grid of frequencies.
-Each is evaluated again, exactly and between the grid points, before a design is returned.
-"""
+"""Objectives and demands of a loop that is shaped by convex programmes."""
 
 import lazy_loader
 

@@ -14,11 +14,8 @@ denominator above it is, at any gain::
 
     (p + (1 - p) z^-1) (1 - (1 - g) T) phi - z^-(j + 1) Q (g z^-1 phi + w)
 
-The functions Phi are orthonormal and have given poles: the states of a cascade of all-pass
-sections driven by one input span everything with the sections' poles (the Takenaka-Malmquist
-functions; B. Ninness, F. Gustafsson, IEEE Trans. Autom. Control 42, 515 (1997),
-doi:10.1109/9.566661). With all poles at zero they are the taps of an impulse response, with one
-repeated real pole the Laguerre functions.
+The functions Phi are orthonormal: the Laguerre functions of one repeated real pole, which are the
+taps of an impulse response where it is zero, or fewer that span a part of their states.
 """
 
 from __future__ import annotations
@@ -26,11 +23,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import null_space, solve_discrete_lyapunov
+from scipy.linalg import solve_discrete_lyapunov, toeplitz
 
-from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, StateSpace
-from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
+from lbt_synth.loop import ClosedLoop, close_loop
+from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
@@ -63,44 +60,33 @@ class Basis:
         C = coefficients[None, :]
         return Controller(A=self.A, B=self.B, C=C, D=np.zeros((1, 1)), dt_s=self.dt_s)
 
+    def truncated(
+        self, coefficients: FloatArray, size: int, frequency_hz: FloatArray, weight: FloatArray
+    ) -> tuple[Basis, FloatArray]:
+        """Return a few functions, and coefficients, that are close to a parameter where it counts.
 
-def orthonormal_basis(poles: ComplexArray, *, dt_s: float) -> Basis:
-    """Return the orthonormal functions with given poles, (n,)."""
-    given = np.atleast_1d(np.asarray(poles, dtype=np.complex128))
-    radius = float(np.max(np.abs(given)))
-    if not radius < 1:
-        raise ProblemError(f"poles must lie inside the unit circle; got a modulus of {radius:.9g}.")
-    tiny = 1e-13
-    chosen = sorted((p for p in given if p.imag >= -tiny), key=abs)
-    A, B = np.zeros((0, 0)), np.zeros((0, 1))
-    C, D = np.zeros((1, 0)), np.ones((1, 1))  # of the all-pass so far
-    for pole in chosen:
-        a, b, c, d = _all_pass(pole if pole.imag > tiny else complex(pole.real))
-        corner = np.zeros((len(A), len(a)))
-        A = np.block([[A, corner], [b @ C, a]])
-        B = np.vstack([B, b @ D])
-        C, D = np.hstack([d @ C, c]), d @ D
-    if len(A) != given.size:
-        raise ProblemError("complex poles must come in conjugate pairs; one of them does not.")
-    return Basis(A=frozen_copy(A), B=frozen_copy(B), dt_s=dt_s)
+        The states are balanced inputs already, so that those kept are the axes of which a weighted
+        output shows most: a balanced truncation (D. F. Enns, Proc. 23rd IEEE Conf. Decision and
+        Control, 127 (1984), doi:10.1109/CDC.1984.272286). The functions are stable.
+        """
+        C, D = np.eye(self.size), np.zeros((self.size, 1))
+        dual = StateSpace(A=self.A.T, B=coefficients[:, None], C=C, D=D, dt_s=self.dt_s)
+        seen = weight[:, None] * dual.frequency_response(frequency_hz)[:, :, 0]
+        axes = np.linalg.eigh(np.real(seen.conj().T @ seen))[1][:, -size:]
+        A, B = axes.T @ self.A @ axes, axes.T @ self.B
+        root = np.linalg.cholesky(solve_discrete_lyapunov(A, B @ B.T))
+        inverse = np.linalg.inv(root)
+        few = Basis(A=frozen_copy(inverse @ A @ root), B=frozen_copy(inverse @ B), dt_s=self.dt_s)
+        return few, coefficients @ axes @ root
 
 
 def laguerre_basis(size: int, pole: float, *, dt_s: float) -> Basis:
     """Return Laguerre functions: one real pole, repeated; taps where it is zero."""
-    return orthonormal_basis(np.full(size, complex(pole)), dt_s=dt_s)
-
-
-def _all_pass(pole: complex) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """All-pass section of a real pole or of a conjugate pair: an orthogonal ``[A B; C D]``."""
-    if pole.imag == 0:
-        a, b = np.array([[pole.real]]), np.array([[np.sqrt((1 - pole.real) * (1 + pole.real))]])
-    else:
-        companion = np.array([[2 * pole.real, -(abs(pole) ** 2)], [1.0, 0.0]])
-        entry = np.array([[1.0], [0.0]])
-        root = np.linalg.cholesky(solve_discrete_lyapunov(companion, entry @ entry.T))
-        a, b = np.linalg.solve(root, companion @ root), np.linalg.solve(root, entry)
-    last = null_space(np.hstack([a, b])).T
-    return a, b, np.asarray(last[:, :-1]), np.asarray(last[:, -1:])
+    k = np.arange(size)
+    powers = (-pole) ** np.arange(size)
+    A = toeplitz(np.append(pole, (1 - pole**2) * powers[:-1]), np.where(k == 0, pole, 0.0))
+    B = np.sqrt(1 - pole**2) * powers[:, None]
+    return Basis(A=frozen_copy(A), B=frozen_copy(B), dt_s=dt_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

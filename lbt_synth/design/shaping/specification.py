@@ -7,27 +7,31 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeAlias, get_args
+from typing import Any, get_args
 
 import numpy as np
 
 from lbt_synth.design.certificate import Check
-from lbt_synth.design.shaping.bounds import Attenuation, Bound, CommandRms
+from lbt_synth.design.plain import to_plain
 from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, held_fraction, mode_loop
+from lbt_synth.design.shaping.demands import (
+    Attenuation,
+    CommandRms,
+    Demand,
+    LoopErrors,
+    MovingSensorGain,
+)
 from lbt_synth.design.shaping.frequencies import Grid, distinct_bands, first_grid
 from lbt_synth.design.shaping.objectives import (
     ResidualVariance,
     Term,
-    Total,
     VibrationBand,
-    Worst,
     leaves,
     require_term,
     spectrum_of,
 )
-from lbt_synth.design.shaping.uncertainty import LoopErrors, MovingSensorGain, Uncertainty
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import Constraint, Function
@@ -42,16 +46,13 @@ from lbt_synth.loop.least_residuals.residual_limit import (
 )
 from lbt_synth.models import (
     ARModel,
-    Atmosphere,
     LoopHardware,
     Spectrum,
-    TabulatedSpectrum,
     Truth,
 )
 from lbt_synth.models.spectra import SumSpectrum
 from lbt_synth.validation import BoolArray, FloatArray, sequence, set_fields
 
-Demand: TypeAlias = Bound | Uncertainty
 _ZERO = 1e-12  # of an entry, over the largest of its matrix
 
 
@@ -96,7 +97,7 @@ class Specification:
             if not isinstance(demand, Demand):
                 known = ", ".join(kind.__name__ for kind in get_args(Demand))
                 raise ProblemError(f"a demand must be one of {known}; got {type(demand).__name__}.")
-        written = [to_metadata(demand) for demand in demands]
+        written = [to_plain(demand) for demand in demands]
         for index, demand in enumerate(demands):
             if written[index] in written[:index]:
                 raise ProblemError(f"each demand must be given once; got twice {demand.label!r}.")
@@ -116,7 +117,7 @@ class Specification:
     @property
     def key(self) -> str:
         """Text that equal specifications share."""
-        return json.dumps(to_metadata(self))
+        return json.dumps(to_plain(self))
 
     @property
     def bands_hz(self) -> tuple[tuple[float, float], ...]:
@@ -130,13 +131,7 @@ class Specification:
         return tuple(spectrum for spectrum in found if spectrum is not None)
 
     def require_fitting(self, hardware: LoopHardware) -> None:
-        """Refuse bands beyond the Nyquist frequency, and models of another frame rate.
-
-        Raises
-        ------
-        ProblemError
-            Naming the band or the rate.
-        """
+        """Refuse bands beyond the Nyquist frequency, and models of another frame rate."""
         nyquist = hardware.frame_rate_hz / 2
         for low, high in self.bands_hz:
             if high > nyquist:
@@ -160,40 +155,6 @@ class Specification:
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check each demand on the real loop."""
         return tuple(check for demand in self.demands for check in demand.checks(loop))
-
-
-_KINDS: dict[str, type[Any]] = {
-    kind.__name__: kind
-    for kind in (
-        *get_args(Demand),
-        *(Specification, ResidualVariance, VibrationBand, Total, Worst),
-        *(Atmosphere, ARModel, TabulatedSpectrum),
-    )
-}
-
-
-def to_metadata(value: Any) -> Any:
-    """Return a specification, or a part of it, as plain values for JSON."""
-    name = type(value).__name__
-    if name in _KINDS:
-        named = {f.name: to_metadata(getattr(value, f.name)) for f in fields(value)}
-        return {"kind": name, **named}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, list | tuple):
-        return [to_metadata(v) for v in value]
-    return value
-
-
-def from_metadata(data: Any) -> Any:
-    """Rebuild what :func:`to_metadata` wrote; an unknown kind raises KeyError."""
-    if isinstance(data, dict):
-        values = dict(data)
-        kind = _KINDS[values.pop("kind")]
-        return kind(**{key: from_metadata(v) for key, v in values.items()})
-    if isinstance(data, list):
-        return tuple(from_metadata(v) for v in data)
-    return data
 
 
 def violated_demands(

@@ -30,7 +30,7 @@ from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import agree, frozen_copy, number, real_array, require_instance, text
 
 SCHEMA = "lbt_synth gain file"
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 CONVENTION = (
     "x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k): the output is read from the new state. "
     "y(k) = SENSOR phi_res(k-1) + noise; phi_cor(k) = INFLUENCE u(k-delay_frames+1), or the "

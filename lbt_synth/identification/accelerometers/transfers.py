@@ -21,7 +21,7 @@ from scipy.signal import detrend
 from scipy.signal.windows import tukey
 from scipy.special import gammaincc
 
-from lbt_synth.design.fallbacks import MOST_UNITS
+from lbt_synth.design.filter_design import MOST_UNITS
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.accelerometers.readings import fill_missing
 from lbt_synth.identification.fit.identified_model import (

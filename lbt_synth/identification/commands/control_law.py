@@ -11,15 +11,14 @@ laws apart is in their increments.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 from operator import itemgetter
-from typing import Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.records.faults import MAD, find_saturated
+from lbt_synth.identification.records.faults import MAD, SURPRISING, find_saturated
 from lbt_synth.linear import Controller
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
@@ -44,22 +43,16 @@ LawKind: TypeAlias = Literal[
 AxisKind: TypeAlias = Literal["diagonal", "swapped", "general", "zero"]
 _LAGS = range(-4, 5)  # frames by which the first measurement may be late
 _ROWS_PER_VALUE = 16  # of each coefficient: a law from fewer frames explains its own noise
-_EXACT = 1e-6  # part of the increments' variance that single precision leaves of an exact law
-_SURE = 0.05  # part that rounded or filtered measurements leave of a law whose lag counts
-FOLLOWED = 0.1  # least coherence of an axis that follows its measurements; other nights have 0.02
-SHORT_ORDER, _LONG_ORDER = 3, 32  # past commands: integrators, and filters of turbulence and lines
 _MOST_ROWS = 16_000  # frames of a regression: more move no law, and take seconds
+SHORT_ORDER, _LONG_ORDER = 3, 32  # past commands: integrators, and filters of turbulence and lines
+_EXACT = 1e-6  # part of the increments' variance that single precision leaves of an exact law
+_SMALL = 0.05  # part of the variance, or of the largest element, which rounding may make
+_SPARE = 0.2  # of the logarithm of what the richest law leaves, which a simple one may lack
+# least coherence of an axis that follows its measurements, where other nights have 0.02; and part
+# of the frames that follow no law, of which more are a law of their own
+FOLLOWED = 0.1
 _ADDS_UP = 0.2  # distance from 1 of the pole of an integrator, a leaky one included
-SIGMAS = 4.0  # standard errors within which two numbers are the same
-_TOLERANCE = 0.05  # of the largest element or the residual, which counts as nothing
-_ALIKE = 3.0  # times the residual of a law, within which a simpler one explains as much
-_SPARE = 0.2  # of what the richest law explains, which a simple one may leave unexplained
-_ODD = 8.0  # deviations from the law of a frame that follows another one
-_MOST_ODD = 0.1  # of the frames: more of them are a law of their own
 
-# measurements and commands (frames, axes), and the frames (frames,) that are measured, that are
-# commanded, and whose command is a result of the law
-_Series: TypeAlias = tuple[FloatArray, FloatArray, BoolArray, BoolArray, BoolArray]
 # weights of past commands (axes, order) and measurements (axes, lags, axes), and the errors of the
 # first of these, (axes,), and of the sums of the others over their lags, (axes, axes)
 _Coefficients: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -119,7 +112,7 @@ class ControlLaw:
     @property
     def is_sure(self) -> bool:
         """Whether it explains so much that its lag counts."""
-        return self.kind != "none" and self.residual < _SURE
+        return self.kind != "none" and self.residual < _SMALL
 
     @property
     def adds_up(self) -> bool:
@@ -152,7 +145,7 @@ class ControlLaw:
     def axis_lags(self) -> IntArray:
         """Lag of the first measurement that counts for each axis [frames], (axes,)."""
         size = np.linalg.norm(self.taps, axis=2)
-        counts = size > _TOLERANCE * np.max(size, axis=1, keepdims=True)
+        counts = size > _SMALL * np.max(size, axis=1, keepdims=True)
         return np.asarray(self.lag_frames + np.argmax(counts, axis=1))
 
 
@@ -199,111 +192,110 @@ def fit_control_law(
     y = matrix(measurements, "measurements")
     why = f"to match measurements {y.shape}"
     u = matrix(commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
-    good = np.ones(len(y), dtype=np.bool_) if usable is None else np.array(usable)
-    moved = good if commanded is None else np.array(commanded)
-    for flags in (good, moved):
+    measured = np.ones(len(y), dtype=np.bool_) if usable is None else np.array(usable)
+    moved = np.array(measured if commanded is None else commanded)
+    for flags in (measured, moved):
         if flags.dtype != np.bool_ or flags.shape != (len(y),):
             raise DimensionError(
                 f"usable must be {len(y)} truth values, one per frame; got {flags.dtype} "
                 f"{flags.shape}."
             )
-    free = moved.copy()
     for column in u.T:
-        free &= ~find_saturated(column, free)
-    series = y, u, good, free, np.ones(len(y), dtype=np.bool_)
+        moved &= ~find_saturated(column, moved)
+    series = _Series(y, u, measured, moved, np.ones(len(y), dtype=np.bool_))
     law = _search(series)
     for _ in range(2):  # jumps hide the other frames that do not follow the law
         odd = _odd_frames(series, law)
         if odd.any():
-            series = *series[:4], series[4] & ~odd
+            series = series._replace(lawful=series.lawful & ~odd)
             law = _search(series)
     return law
 
 
+class _Series(NamedTuple):
+    """What laws are fitted to."""
+
+    y: FloatArray  # (frames, axes)
+    u: FloatArray  # (frames, axes)
+    measured: BoolArray  # (frames,)
+    commanded: BoolArray  # (frames,)
+    lawful: BoolArray  # (frames,), whose command is a result of the law
+
+    def rows(self, order: int, lags: range) -> IntArray:
+        """Return the frames k at which all values of a law are good."""
+        frames = len(self.u)
+        start, stop = max(order, 1, lags[-1]), min(frames, frames + lags[0])
+        if stop <= start:
+            return np.zeros(0, dtype=np.int64)
+        good = self.lawful[start:stop].copy()
+        for lag in range(max(order, 1) + 1):
+            good &= self.commanded[start - lag : stop - lag]
+        for lag in lags:
+            good &= self.measured[start - lag : stop - lag]
+        return start + np.flatnonzero(good)
+
+
 def _odd_frames(series: _Series, law: ControlLaw) -> BoolArray:
     """Return the frames that are far from a law, or jump where there is none, if they are few."""
-    y, u, *_ = series
-    lags = range(law.lag_frames, law.lag_frames + law.taps.shape[1])
-    rows = _rows(series, law.order, lags)
+    u, lags = series.u, range(law.lag_frames, law.lag_frames + law.taps.shape[1])
+    rows = series.rows(law.order, lags)
     past = np.ones((u.shape[1], 1)) if law.kind == "none" else law.past
-    rest = u[rows].copy()
-    for j in range(past.shape[1]):
-        rest -= past[:, j] * u[rows - 1 - j]
-    for index, lag in enumerate(lags):
-        rest -= y[rows - lag] @ law.taps[:, index].T
+    rest = u[rows] - sum(past[:, j] * u[rows - 1 - j] for j in range(past.shape[1]))
+    rest = rest - sum(series.y[rows - lag] @ law.taps[:, i].T for i, lag in enumerate(lags))
     rest = np.abs(rest - np.median(rest, axis=0))
     floor = np.sqrt(_EXACT) * np.median(np.abs(u[rows] - u[rows - 1]), axis=0)
-    beyond = np.any(rest > np.maximum(_ODD * MAD * np.median(rest, axis=0), floor), axis=1)
+    beyond = np.any(
+        rest > np.maximum(2 * SURPRISING * MAD * np.median(rest, axis=0), floor), axis=1
+    )
     odd = np.zeros(len(u), dtype=np.bool_)
-    if np.mean(beyond) < _MOST_ODD:
+    if np.mean(beyond) < FOLLOWED:
         odd[rows[beyond]] = True
     return odd
-
-
-def _rows(series: _Series, order: int, lags: range) -> IntArray:
-    """Return the frames k at which all values of a law are good."""
-    _, u, measured, commanded, followed = series
-    start, stop = max(order, 1, lags[-1]), min(len(u), len(u) + lags[0])
-    if stop <= start:
-        return np.zeros(0, dtype=np.int64)
-    good = followed[start:stop].copy()
-    for lag in range(max(order, 1) + 1):
-        good &= commanded[start - lag : stop - lag]
-    for lag in lags:
-        good &= measured[start - lag : stop - lag]
-    return start + np.flatnonzero(good)
 
 
 def _search(series: _Series) -> ControlLaw:
     """Return the shortest law that explains as much as a long one."""
     for order in (SHORT_ORDER, _LONG_ORDER):
-        regression = _regression(series, order)
-        if not regression.moving:
-            return _describe(regression, None)
-        shape = _simplest_shape(regression, _LAGS)
-        if regression.residual(shape) < _EXACT:
-            break
-    law = _describe(regression, shape)
-    if law.exact:
-        return law
+        regression = _Regression(series, order)
+        law = regression.describe(regression.simplest_shape(_LAGS))
+        if law.exact or not regression.moving:
+            return law
     # among laws nearly as good the one that knows least of the future: the sensor's answer to
     # commands may explain more, later and with the other sign
     for first in range(0, law.lag_frames, -1):
-        later = _describe(regression, _simplest_shape(regression, range(first, _LAGS.stop)))
-        if later.kind == "none":
-            continue
-        if later.residual < _ALIKE * law.residual or not law.is_sure:
+        later = regression.describe(regression.simplest_shape(range(first, _LAGS.stop)))
+        if later.kind != "none" and (later.residual < _enough(law.residual) or not law.is_sure):
             return later
     return law
 
 
-def _regression(series: _Series, order: int) -> _Regression:
-    """Return the regression of laws of an order, or of the most that the frames allow."""
-    y, u, *_ = series
-    while True:
-        lags = range(_LAGS[0], _LAGS[-1] + order + 1)
-        rows = _rows(series, order, lags)
-        needed = _ROWS_PER_VALUE * (order + u.shape[1] * len(lags))
-        if rows.size >= needed:
-            return _Regression(y, u, rows, order, lags)
-        if order <= 1:
-            raise ProblemError(
-                f"the control law needs {needed} frames whose neighbours are good; got "
-                f"{rows.size} of {len(u)}. Give a longer record, or one with fewer holes."
-            )
-        order //= 2
+def _enough(residual: float) -> float:
+    """Return what a simple law may leave where a rich one leaves a residual."""
+    return float(residual ** (1 - _SPARE))
 
 
 class _Regression:
     """Triangular factor of the increments and of all that may explain them."""
 
-    def __init__(
-        self, y: FloatArray, u: FloatArray, rows: IntArray, order: int, lags: range
-    ) -> None:
-        """Factorise some frames, evenly spread."""
+    def __init__(self, series: _Series, order: int) -> None:
+        """Factorise laws of an order, or of the most that the frames allow, evenly spread."""
+        y, u = series.y, series.u
+        self.axes = u.shape[1]
+        while True:
+            lags = range(_LAGS[0], _LAGS[-1] + order + 1)
+            rows = series.rows(order, lags)
+            needed = _ROWS_PER_VALUE * (order + self.axes * len(lags))
+            if rows.size >= needed:
+                break
+            if order <= 1:
+                raise ProblemError(
+                    f"the control law needs {needed} frames whose neighbours are good; got "
+                    f"{rows.size} of {len(u)}. Give a longer record, or one with fewer holes."
+                )
+            order //= 2
         if rows.size > _MOST_ROWS:
             rows = rows[np.linspace(0, rows.size - 1, _MOST_ROWS).astype(np.int64)]
-        self.order, self.lags, self.axes, self.rows = order, lags, u.shape[1], rows.size
+        self.order, self.lags, self.rows = order, lags, rows.size
         increments = np.diff(u, axis=0, prepend=u[:1])
         parts = [increments[rows], u[rows - 1]]
         parts += [increments[rows - lag] for lag in range(1, order)]
@@ -336,53 +328,99 @@ class _Regression:
         residual = float(unexplained @ unexplained) / self.rows
         return weights * self.scale[axis] / self.scale[chosen], residual
 
-    def residuals(self, shape: _Shape) -> list[float]:
-        """Return the part of the increments' variance that a law leaves of each moving axis."""
-        return [self.solve(i, self.columns(i, shape), shape[0])[1] for i in self.moving]
+    def residuals(self, shape: _Shape) -> FloatArray:
+        """Return the part of the increments' variance that a law leaves, (axes,); 1 at rest."""
+        out = np.ones(self.axes)
+        for axis in self.moving:
+            _, out[axis] = self.solve(axis, self.columns(axis, shape), shape[0])
+        return out
 
     def residual(self, shape: _Shape) -> float:
-        """Return the mean of that over the axes."""
-        return float(np.mean(self.residuals(shape)))
+        """Return the mean of that over the moving axes."""
+        return float(np.mean(self.residuals(shape)[self.moving or slice(None)]))
 
     def coherence(self, shape: _Shape) -> FloatArray:
         """Return the part of what past commands leave that a law explains, of each axis (axes,).
 
         Corrected for the number of coefficients; zero where commands do not move.
         """
-        out = np.zeros(self.axes)
+        out, after = np.zeros(self.axes), self.residuals(shape)
         used = shape[0] + self.axes * len(shape[1])
-        for axis, after in zip(self.moving, self.residuals(shape), strict=True):
+        for axis in self.moving:
             past = self.columns(axis, (self.order, self.lags))[: self.order]
             _, before = self.solve(axis, past, self.order)
             if before > 0:
-                ratio = after / before * (self.rows - self.order) / (self.rows - used)
+                ratio = after[axis] / before * (self.rows - self.order) / (self.rows - used)
                 out[axis] = max(0.0, 1 - float(ratio))
         return out
 
-    def most_residual(self, lags: range = _LAGS) -> float:
-        """Return what a simple law may leave, to explain as much as the richest one."""
-        richest = self.residual((self.order, range(lags[0], self.lags.stop)))
-        return min(_ALIKE * richest, richest + _SPARE * (1 - richest)) + _EXACT**2
+    def simplest_shape(self, lags: range) -> _Shape:
+        """Return the shortest law that explains as much as the richest one.
 
-    def no_coefficients(self, shape: _Shape) -> _Coefficients:
-        """Return the coefficients of commands that do not move."""
-        axes, (order, lags) = self.axes, shape
-        taps = np.zeros((axes, len(lags), axes))
-        return np.zeros((axes, order)), taps, np.zeros(axes), np.zeros((axes, axes))
+        Of up to three states each order and number of taps is tried, beyond them orders that
+        double. First and last taps that explain nothing are left out.
+        """
+        most = _enough(self.residual((self.order, range(lags[0], self.lags.stop)))) + _EXACT**2
+        tried = [(p, taps) for p in range(SHORT_ORDER + 1) for taps in range(max(p - 1, 0), p + 1)]
+        while tried[-1][0] < self.order:
+            tried.append((min(2 * tried[-1][0], self.order),) * 2)
+        for order, taps in tried:
+            shapes = [(order, range(lag, lag + taps + 1)) for lag in lags]
+            residuals = [self.residual(shape) for shape in shapes]
+            residual, shape = min(zip(residuals, shapes, strict=True), key=itemgetter(0))
+            if residual <= most:
+                break
+        for early, late in ((1, 0), (0, -1)):
+            while len(shape[1]) > 1:
+                shorter = shape[0], range(shape[1].start + early, shape[1].stop + late)
+                if self.residual(shorter) > (1 + _SMALL) * residual + _EXACT**2:
+                    break
+                shape = shorter
+        return shape
 
-    def coefficients(self, shape: _Shape) -> _Coefficients:
+    def describe(self, shape: _Shape) -> ControlLaw:
+        """Return the law of a shape, in words."""
+        coherence = self.coherence(shape)
+        residual, moving = self.residual(shape), self.moving
+        if np.max(coherence) < FOLLOWED:
+            shape, moving = (0, range(1)), []
+        past, taps, past_error, sum_error = self.coefficients(shape, moving)
+        poles = _poles(past)
+        kind = _kind(poles, past_error) if moving else "none"
+        # at low frequencies, but for the poles at 1
+        others = poles[:, 2 if kind == "double integrator" else 1 :]
+        scale = np.prod(abs(1 - others), axis=1)[:, None]
+        gain, error = np.sum(taps, axis=1) / scale, sum_error / scale
+        gain[abs(gain) < _EXACT * np.max(abs(gain))] = 0.0
+        axes_kind, signs = classify_matrix(gain, error)
+        return ControlLaw(
+            kind=kind,
+            lag_frames=shape[1].start,
+            gain=read_only(gain),
+            gain_error=read_only(error),
+            axes_kind=axes_kind,
+            signs=signs,
+            poles=read_only(poles),
+            past=read_only(past),
+            taps=read_only(taps),
+            residual=residual,
+            axis_coherence=read_only(coherence),
+        )
+
+    def coefficients(self, shape: _Shape, moving: list[int]) -> _Coefficients:
         """Return the coefficients of a law, zeros where commands do not move."""
-        order, lags = shape
-        past, taps, past_error, sum_error = self.no_coefficients(shape)
-        for axis in self.moving:
+        axes, (order, lags) = self.axes, shape
+        past, past_error = np.zeros((axes, order)), np.zeros(axes)
+        taps, sum_error = np.zeros((axes, len(lags), axes)), np.zeros((axes, axes))
+        for axis in moving:
             chosen = self.columns(axis, shape)
             weights, unexplained = self.solve(axis, chosen, order)
-            taps[axis] = weights[order:].reshape(len(lags), self.axes)
+            taps[axis] = weights[order:].reshape(len(lags), axes)
             inverse = np.linalg.pinv(self.factor[:, chosen])
             scale = self.scale[axis] / self.scale[chosen]
             spare = max(self.rows - len(chosen), 1)
             half = scale[:, None] * inverse * np.sqrt(unexplained * self.rows / spare)
-            sums = half[order:].reshape(len(lags), self.axes, -1).sum(axis=0)
+            sums = half[order:].reshape(len(lags), axes, -1).sum(axis=0)
             sum_error[axis] = np.linalg.norm(sums, axis=1)
             if order:
                 steps = np.append(weights[1:order], 0.0)  # of the increments before
@@ -392,77 +430,6 @@ class _Regression:
         return past, taps, past_error, sum_error
 
 
-def _simplest_shape(regression: _Regression, lags: range) -> _Shape:
-    """Return the shortest law that explains as much as the richest one.
-
-    Of up to three states each order and number of taps is tried, beyond them orders that double.
-    """
-    most = regression.most_residual(lags)
-    tried = [
-        (order, taps)
-        for order, taps in product(range(SHORT_ORDER + 1), repeat=2)
-        if order - 1 <= taps <= order
-    ]
-    order = SHORT_ORDER
-    while order < regression.order:
-        order = min(2 * order, regression.order)
-        tried.append((order, order))
-    for order, taps in tried:
-        shapes = [(order, range(lag, lag + taps + 1)) for lag in lags]
-        residuals = [regression.residual(candidate) for candidate in shapes]
-        residual, shape = min(zip(residuals, shapes, strict=True), key=itemgetter(0))
-        if residual <= most:
-            break
-    return _without_idle_taps(regression, residual, shape)
-
-
-def _without_idle_taps(regression: _Regression, residual: float, shape: _Shape) -> _Shape:
-    """Return the law without the first and last taps that explain nothing."""
-    most = (1 + _TOLERANCE) * residual + _EXACT**2
-    for early, late in ((1, 0), (0, -1)):
-        while len(shape[1]) > 1:
-            shorter = shape[0], range(shape[1].start + early, shape[1].stop + late)
-            if regression.residual(shorter) > most:
-                break
-            shape = shorter
-    return shape
-
-
-def _describe(regression: _Regression, shape: _Shape | None) -> ControlLaw:
-    """Return the law of a shape, in words; that of commands that do not move for none."""
-    axes = regression.axes
-    coherence, residual = np.zeros(axes), 1.0
-    if shape is not None:
-        coherence, residual = regression.coherence(shape), regression.residual(shape)
-    if shape is None or np.max(coherence) < FOLLOWED:
-        shape = 0, range(1)
-        past, taps, past_error, sum_error = regression.no_coefficients(shape)
-        kind: LawKind = "none"
-    else:
-        past, taps, past_error, sum_error = regression.coefficients(shape)
-        kind = _kind(shape[0], _poles(past), past_error)
-    poles = _poles(past)
-    # at low frequencies, but for the poles at 1
-    others = poles[:, 2 if kind == "double integrator" else 1 :]
-    scale = np.prod(abs(1 - others), axis=1)[:, None]
-    gain, error = np.sum(taps, axis=1) / scale, sum_error / scale
-    gain[abs(gain) < _EXACT * np.max(abs(gain))] = 0.0
-    axes_kind, signs = classify_matrix(gain, error)
-    return ControlLaw(
-        kind=kind,
-        lag_frames=shape[1].start,
-        gain=read_only(gain),
-        gain_error=read_only(error),
-        axes_kind=axes_kind,
-        signs=signs,
-        poles=read_only(poles),
-        past=read_only(past),
-        taps=read_only(taps),
-        residual=residual,
-        axis_coherence=read_only(coherence),
-    )
-
-
 def _poles(past: FloatArray) -> ComplexArray:
     """Return the poles of each axis, (axes, order), the one nearest 1 first."""
     roots = [np.roots(np.append(1.0, -row)).astype(np.complex128) for row in past]
@@ -470,13 +437,13 @@ def _poles(past: FloatArray) -> ComplexArray:
     return np.array([row[np.argsort(abs(row - 1), kind="stable")] for row in padded])
 
 
-def _kind(order: int, poles: ComplexArray, past_error: FloatArray) -> LawKind:
-    """Return the word for a law."""
+def _kind(poles: ComplexArray, past_error: FloatArray) -> LawKind:
+    """Return the word for a law with poles (axes, order)."""
+    order, distance = poles.shape[1], abs(poles - 1)
     if order == 0:
         return "proportional"
-    distance = abs(poles - 1)
     if order == 1:
-        is_pure = np.all(distance <= np.maximum(_EXACT, SIGMAS * past_error)[:, None])
+        is_pure = np.all(distance <= np.maximum(_EXACT, SURPRISING * past_error)[:, None])
         return "pure integrator" if is_pure else "leaky integrator"
     if order == 2 and np.all(distance < _ADDS_UP):
         return "double integrator"
@@ -491,8 +458,8 @@ def classify_matrix(values: ArrayLike, errors: ArrayLike = 0.0) -> tuple[AxisKin
     other.
     """
     g = square(values, "values")
-    doubt = SIGMAS * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
-    small = _TOLERANCE * np.max(np.abs(g), initial=0.0)
+    doubt = SURPRISING * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
+    small = _SMALL * np.max(np.abs(g), initial=0.0)
     least = np.where(np.isfinite(doubt), np.maximum(doubt, small), np.inf)
     g = np.where(np.abs(g) <= least, 0.0, g)
     on, off = np.diag(g), (g - np.diag(np.diag(g))).sum(axis=1)
@@ -512,28 +479,18 @@ def law_controller(law: ControlLaw, frame_rate_hz: float) -> Controller:
     """
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     if law.kind == "none" or law.lag_frames < 0:
-        why = (
-            "the commands do not follow from the measurements"
-            if law.kind == "none"
-            else f"its commands know measurements of {-law.lag_frames} frames later"
-        )
-        raise ProblemError(f"a controller needs a law that can run; got one where {why}.")
-    axes, lags = len(law.gain), law.taps.shape[1]
-    one, last = np.eye(axes), law.lag_frames + lags - 1
+        raise ProblemError(f"a controller needs a law that can run; got {law.name}{law.lag_text}.")
+    axes, last = len(law.gain), law.lag_frames + law.taps.shape[1] - 1
     slots = max(law.order, 1)  # of u(k-1), u(k-2), ...; then last of y(k-1), y(k-2), ...
-    # each slot moves to the next one of its kind
-    shift = np.eye(slots + last, k=-1)
+    shift = np.eye(slots + last, k=-1)  # each slot moves to the next one of its kind
     shift[slots : slots + 1] = 0.0
-    A = np.asarray(np.kron(shift, one), dtype=np.float64)
-    B = np.zeros((len(A), axes))
+    A = np.asarray(np.kron(shift, np.eye(axes)), dtype=np.float64)
+    taps = np.concatenate([np.zeros((axes, law.lag_frames, axes)), law.taps], axis=1)
     for j in range(law.order):
         A[:axes, axes * j : axes * (j + 1)] = np.diag(law.past[:, j])
-    for lag in range(law.lag_frames, last + 1):
-        if lag:
-            column = axes * (slots + lag - 1)
-            A[:axes, column : column + axes] += law.taps[:, lag - law.lag_frames]
-        else:
-            B[:axes] += law.taps[:, 0]
+    A[:axes, axes * slots :] = taps[:, 1:].reshape(axes, -1)
+    B = np.zeros((len(A), axes))
+    B[:axes] = taps[:, 0]
     if last:
-        B[axes * slots : axes * (slots + 1)] = one
+        B[axes * slots : axes * (slots + 1)] = np.eye(axes)
     return Controller(A=A, B=B, C=np.eye(axes, len(A)), D=np.zeros((axes, axes)), dt_s=1 / rate)

@@ -12,8 +12,6 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, integer, number, read_only, real_array, set_fields
 
-_MOST_SHIFT = 100
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommandRepair:
@@ -58,8 +56,7 @@ class CommandRepair:
         given = self.scale if isinstance(self.scale, Sequence) else (self.scale,)
         scales = tuple(number(scale, "command_scale", above=0) for scale in given)
         set_fields(self, scale=scales[0] if len(set(scales)) == 1 else scales)
-        shift = integer(self.shift_frames, "command_shift_frames", at_least=-_MOST_SHIFT)
-        number(shift, "command_shift_frames", at_most=_MOST_SHIFT)
+        integer(self.shift_frames, "command_shift_frames")
         if any(sign not in (-1, 1) for sign in self.sign):
             raise ProblemError(f"command_sign must be 1 or -1, per axis; got {list(self.sign)}.")
         real_array(self.matrix, "command_matrix")
@@ -146,10 +143,7 @@ def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
     """
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to repair.")
-    commands = np.array(record.commands)
-    good = np.ones(record.frames, dtype=np.bool_)
-    if record.commanded is not None:
-        good = np.array(record.commanded)
+    commands, good = np.array(record.commands), np.array(record.commanded)
     if repair.increments:
         commands = np.cumsum(commands, axis=0)
         good &= np.logical_and.accumulate(good)
@@ -160,5 +154,4 @@ def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
         unknown = slice(0, repair.shift_frames) if late else slice(repair.shift_frames, None)
         commands[unknown], good[unknown] = 0.0, False
     commands = commands @ repair.turn(record.axes).T
-    repaired = replace(record, commands=read_only(commands), commanded=read_only(good))
-    return repaired if record.delay_frames is None else repaired.with_delay(record.delay_frames)
+    return replace(record, commands=read_only(commands), commanded=read_only(good), bridges=None)

@@ -7,12 +7,12 @@ not ask for the repair. The law alone decides on records that are too short for 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,12 +22,10 @@ from lbt_synth.identification.commands.coarse_spectrum import (
     MOST_SHIFT_FRAMES,
     SEGMENT_S,
     CoarseRecord,
-    dispersion,
 )
 from lbt_synth.identification.commands.control_law import (
     FOLLOWED,
     SHORT_ORDER,
-    SIGMAS,
     ControlLaw,
     classify_matrix,
     fit_control_law,
@@ -38,9 +36,16 @@ from lbt_synth.identification.commands.repair import (
     axes_repair,
     repair_commands,
 )
-from lbt_synth.identification.fit.fitting import GAINS, PLAUSIBLE_GAINS, Search, cost
+from lbt_synth.identification.fit.fitting import (
+    GAINS,
+    PLAUSIBLE_GAINS,
+    TYPICAL_GAIN,
+    Search,
+    cost,
+)
 from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components
 from lbt_synth.identification.fit.periodogram import loop_periodogram
+from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
@@ -52,19 +57,16 @@ from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_ins
 AS_GIVEN = "as given"
 _FIND = "find the commands that belong to these measurements"
 _GIVEN = CommandRepair()
-_ODD = 10.0  # nats by which what no law asks for must be likelier, by the model of the fit as well
-_SURPRISING = 3 * CLEAR  # nats by which a repair must be likelier that a law with errors denies
-_ABSURD = 3e4  # scale of commands without a law, which are rather of another night
-_WRONG_GAIN = 2.0  # factor beyond a given or plausible gain, which a coarse one does not reach
-_WORST_CONDITION = 100.0  # of the gain of a law: beyond, it has no inverse
-_FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
-_HIDES = 0.01  # part of their changes that commands leave unexplained, which moves a gain by 10 %
-_USUAL_GAIN = 0.7  # of a sensor, by whose distance units are told apart
 _COARSE = 1.5  # factor by which a coarse gain may be wrong
+_ODD = CLEAR / 2  # nats that what no law asks for must add, by the model of the fit as well
+_SURPRISING = 3 * CLEAR  # nats that overrule a law with errors
+_WRONG_GAIN = 2.0  # factor beyond a given or plausible gain, which a coarse one does not reach
+_FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
+_LITTLE = 0.01  # of the gain of a law, which has no inverse; or of the changes of commands, which
+# moves a gain by 10 % if the law leaves them
 _LINES = 10  # at most, of a fit that tells gains apart: more of them take minutes
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
-_RAN = np.array([[0.3], [0.7], [1.0]])  # gains at which a loop may have run
-_ANY = np.geomspace(1.0, 1e-6, 19)[:, None]  # gains of a loop that may be of no sensor
+_ANY = np.geomspace(1.0, 1e-6, 19)  # gains of a loop that may be of no sensor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,7 +74,6 @@ class CommandVerdict:
     """How the commands of a record reach its measurements."""
 
     explanation: str  # the best one, in words; "as given" if that is what was given
-    accepted: bool  # whether a model may be fitted
     repair: CommandRepair = _GIVEN  # without options where nothing is wrong or nothing helps
     delay_frames: float | None = None  # delay that fits, where another was given
     # log-likelihood above that of the record as given; 0 where the law alone decides
@@ -80,6 +81,11 @@ class CommandVerdict:
     gain: FloatArray  # (axes,), coarse sensor gain; nan where the coarse spectrum does not show it
     law: ControlLaw | None  # None where too few frames show it
     notes: tuple[str, ...] = ()  # what to look at although the record is accepted
+
+    @property
+    def accepted(self) -> bool:
+        """Whether a model may be fitted."""
+        return self.explanation == AS_GIVEN
 
     @property
     def options(self) -> str:
@@ -151,52 +157,50 @@ def explain_commands(
     delay = record.hardware.delay_frames  # refuses a record without one
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
-    gains = None if sensor_gain is None else record.known_gains(sensor_gain)
-    law, moves = record_law(record), _moving_axes(record.commands[record.usable])
-    if moves.any() and not moves.all():
-        one = replace(
-            record, measurements=record.measurements[:, moves], commands=record.commands[:, moves]
-        )
-        return _explain_moving(one, moves, law, gains)
-    refuse = partial(CommandVerdict, accepted=False, gain=np.full(record.axes, np.nan), law=law)
+    known = None if sensor_gain is None else record.known_gains(sensor_gain)
+    shown = record_law(record)
+    commands = record.commands[record.usable]
+    still = np.all(commands == commands[:1], axis=0)
+    if still.any() and not still.all():
+        return _explain_moving(record, record.commands, still, shown, known)
+    law = None if shown is None or shown.kind == "none" else shown
+    refuse = partial(CommandVerdict, gain=np.full(record.axes, np.nan), law=shown)
     sure = law if law is not None and law.is_sure else None
     if sure is not None and (doubt := _doubt_law(sure)):
         return refuse(explanation=doubt)
-    late = 0 if sure is None else sure.lag_frames
-    early, lag = max(-late, 0), max(late, 0)
+    lag = 0 if sure is None else sure.lag_frames
+    early, lag = max(-lag, 0), max(lag, 0)
     if early:  # corrections that follow from the future have no likelihood: they are moved first
         record = repair_commands(record, CommandRepair(shift_frames=early))
         law = None if sure is None else replace(sure, lag_frames=0)
     coarse = CoarseRecord(record)
     if not coarse.stretches:
-        return _explain_by_law(refuse, record, law, early)
+        return replace(refuse(explanation=AS_GIVEN), **_explain_by_law(record, law, early))
     plausible = PLAUSIBLE_GAINS
-    if gains is not None:
-        plausible = float(np.min(gains)) / _WRONG_GAIN, float(np.max(gains)) * _WRONG_GAIN
+    if known is not None:
+        plausible = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
     choice = _choose(coarse, law, lag)
     scale = np.ones(record.axes)
     if not choice.unrelated.any():
         scale = _scale(coarse, law, choice, plausible)
     if doubt := _doubt_choice(record, law, choice, scale):
         return refuse(explanation=doubt)
-    repair = choice.repair
-    off = repair.shift_frames and repair.shift_frames + lag
-    repair = replace(repair, shift_frames=early or (-lag if repair.shift_frames else 0))
+    off = choice.repair.shift_frames and choice.repair.shift_frames + lag
+    shift = early or (-lag if choice.repair.shift_frames else 0)
+    repair = replace(choice.repair, shift_frames=shift, scale=tuple(scale))
     words = repair.words()
     if off:
         words.append(f"the total delay is {delay + off:g} frames, not {delay:g}")
     if np.any(scale != 1):
         words.append(wrong_scale(scale, choice.gain))
-    shown = choice.gain / scale
-    hidden = (shown <= plausible[0] / _WRONG_GAIN) | (shown >= plausible[1] * _WRONG_GAIN)
-    return CommandVerdict(
+    gain = choice.gain / scale
+    hidden = (gain <= plausible[0] / _WRONG_GAIN) | (gain >= plausible[1] * _WRONG_GAIN)
+    return refuse(
         explanation=" and ".join(words) or AS_GIVEN,
-        accepted=not words,
-        repair=replace(repair, scale=tuple(scale)),
+        repair=repair,
         delay_frames=delay + off if off else None,
-        nats=max(choice.nats, 0.0),
-        gain=frozen_copy(np.where(hidden, np.nan, shown)),
-        law=law if not early else sure,
+        nats=choice.nats,
+        gain=frozen_copy(np.where(hidden, np.nan, gain)),
         notes=() if words else _note_law(delay, lag, _unexplained(law)),
     )
 
@@ -205,14 +209,17 @@ def _doubt_choice(
     record: LoopRecord, law: ControlLaw | None, choice: _Choice, scale: FloatArray
 ) -> str:
     """Return what the best repair and scale leave wrong, in words; empty if there is nothing."""
-    lawless = law is None or law.kind == "none"
-    if choice.unrelated.all() or (lawless and np.max(abs(np.log(scale))) > np.log(_ABSURD)):
+    if choice.unrelated.all():
         return "they have nothing to do with the measurements, as if of another night"
     if choice.unrelated.any():
         axis = int(np.argmax(choice.unrelated))
         return f"those of axis {axis} have nothing to do with its measurements"
-    if choice.repair == _GIVEN and (doubt := _doubt_running(record, law, choice.gain)):
-        return doubt
+    ran = law is None or not law.exact or law.order > SHORT_ORDER or choice.repair != _GIVEN
+    if not ran and law is not None and not could_have_run(_GIVEN, _ANY, record, law):
+        return (
+            "a loop with the law that they follow is unstable at any sensor gain. Check what the "
+            "series are"
+        )
     if np.any(scale < 1) and (hiding := _unexplained(law)):
         return (
             f"{hiding}, which hides the sensor gain. Record more digits, cut the record, or give "
@@ -223,7 +230,7 @@ def _doubt_choice(
 
 def _unexplained(law: ControlLaw | None) -> str:
     """Return in words that the commands follow their law in part only; empty if they do."""
-    if law is None or law.kind == "none" or law.residual < _HIDES:
+    if law is None or law.residual < _LITTLE:
         return ""
     return (
         f"their law leaves {100 * law.residual:.2g} % of their changes unexplained: they are "
@@ -251,45 +258,41 @@ def record_law(record: LoopRecord) -> ControlLaw | None:
     """Return the control law of a closed-loop record; None where the frames are too few."""
     if record.commands is None:
         return None
-    measured = record.usable if record.measured is None else record.measured
     with suppress(ProblemError):
         return fit_control_law(
-            record.measurements, record.commands, usable=measured, commanded=record.commanded
+            record.measurements,
+            record.commands,
+            usable=record.measured,
+            commanded=record.commanded,
         )
     return None
 
 
 def _explain_moving(
-    record: LoopRecord, moves: BoolArray, law: ControlLaw | None, known: FloatArray | None
+    record: LoopRecord,
+    commands: FloatArray,
+    still: BoolArray,
+    law: ControlLaw | None,
+    known: FloatArray | None,
 ) -> CommandVerdict:
-    """Explain the commands of the axis that moves, of a record of it; the other loop was open."""
-    verdict = explain_commands(record, sensor_gain=None if known is None else known[moves].tolist())
-    gain = np.full(moves.size, np.nan)
-    gain[moves] = verdict.gain
-    note = f"the commands of axis {int(np.argmin(moves))} stand still: its loop was open"
+    """Explain the commands (frames, axes) of the axis that moves; the other loop was open."""
+    one = replace(record, measurements=record.measurements[:, ~still], commands=commands[:, ~still])
+    verdict = explain_commands(one, sensor_gain=None if known is None else known[~still].tolist())
+    gain = np.full(still.size, np.nan)
+    gain[~still] = verdict.gain
+    note = f"the commands of axis {int(np.argmax(still))} stand still: its loop was open"
     return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
 
 
-def _explain_by_law(
-    refuse: Callable[..., CommandVerdict], record: LoopRecord, law: ControlLaw | None, early: int
-) -> CommandVerdict:
-    """Return the verdict on commands whose likelihood no stretch is long enough to tell."""
-    repair = _GIVEN
-    if law is not None and law.exact:
-        repairs = list_repairs(record.axes, record.hardware.delay_frames)
-        ordinary = [repair for repair in repairs if not _is_unusual(repair, law, 0)]
-        repair = ordinary[0] if ordinary else _GIVEN
-    repair = replace(repair, shift_frames=early)
+def _explain_by_law(record: LoopRecord, law: ControlLaw | None, early: int) -> dict[str, Any]:
+    """Return what differs in the verdict where no stretch is long enough for a likelihood."""
+    repairs = list_repairs(record.axes, record.hardware.delay_frames)
+    ordinary = [r for r in repairs if law is not None and law.exact and not _is_unusual(r, law, 0)]
+    repair = replace(next(iter(ordinary), _GIVEN), shift_frames=early)
     if repair.options:
-        return refuse(explanation=f"by their law {' and '.join(repair.words())}", repair=repair)
+        return {"explanation": f"by their law {' and '.join(repair.words())}", "repair": repair}
     note = "the commands were not tested: no stretch of usable frames is long enough"
-    return refuse(explanation=AS_GIVEN, accepted=True, notes=(note,))
-
-
-def _moving_axes(commands: FloatArray) -> BoolArray:
-    """Return the axes whose commands (frames, axes) move, (axes,); all of no frames."""
-    moves = np.ptp(commands, axis=0) > 0 if commands.size else np.ones(commands.shape[1])
-    return np.asarray(moves, dtype=np.bool_)
+    return {"notes": (note,)}
 
 
 def _doubt_law(law: ControlLaw) -> str:
@@ -301,11 +304,11 @@ def _doubt_law(law: ControlLaw) -> str:
             f"those of axis {late} follow their measurements {frames} later than those of axis "
             f"{1 - late}; move one of them"
         )
-    steady = np.linalg.norm(np.sum(law.taps, axis=1), axis=1)
     largest = np.sum(np.linalg.norm(law.taps, axis=2), axis=1)
-    if law.order <= 1 and np.all(_WORST_CONDITION * steady < largest):
+    steady = np.sum(law.taps, axis=1) / largest[:, None]
+    if law.order <= 1 and np.max(abs(steady)) < _LITTLE:
         return "they follow from the changes of the measurements, as if both had been exchanged"
-    if np.all(followed) and np.linalg.cond(law.gain / largest[:, None]) > _WORST_CONDITION:
+    if np.all(followed) and np.linalg.cond(steady) > 1 / _LITTLE:
         return "those of both axes follow the same measurements: one axis was recorded twice"
     return ""
 
@@ -325,24 +328,22 @@ def list_repairs(
     shifts += [-lag] if lag > MOST_SHIFT_FRAMES else []
     out += [CommandRepair(shift_frames=k) for k in shifts]
     out.append(CommandRepair(increments=True))
-    general = law is not None and law.is_sure and law.axes_kind == "general"
-    if law is not None and general and np.linalg.cond(law.gain) < _WORST_CONDITION:
+    if law is not None and law.is_sure and law.axes_kind == "general":
         # what undoes the gain of the law: a turn, and all of it
-        U, _, Vh = np.linalg.svd(law.gain)
-        inverse = np.linalg.inv(law.gain)
-        for undoing in ((U @ Vh).T, inverse / np.sqrt(abs(np.linalg.det(inverse)))):
-            out.append(CommandRepair(matrix=tuple(undoing.ravel().tolist())))
+        U, s, Vh = np.linalg.svd(law.gain)
+        if s[-1] > _LITTLE * s[0]:
+            for undone in (np.ones(2), np.sqrt(s[0] * s[1]) / s):
+                matrix = (Vh.T * undone) @ U.T
+                out.append(CommandRepair(matrix=tuple(matrix.ravel().tolist())))
     return out
 
 
 class _Choice(NamedTuple):
-    """The best repair of the commands, and how clear it is."""
+    """The best repair of the commands."""
 
     repair: CommandRepair
     gain: FloatArray  # (axes,), of the sensor with it
     nats: float  # by which it is likelier than the record as given
-    contrast: float
-    clear: float  # nats that decide
     unrelated: BoolArray  # (axes,), of commands that follow no law and do not reach the axis
 
 
@@ -350,30 +351,25 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
     """Return the repair that law and likelihood ask for."""
     record = coarse.record
     repairs = list_repairs(record.axes, record.hardware.delay_frames, law, lag)
-    axis_contrast, gain, misfit = coarse.compare(repairs)
-    contrast = axis_contrast.sum(axis=0)
-    spread = np.array([dispersion(value) for value in misfit])
-    penalty, asked = _penalties(repairs, gain, record, law, lag, spread)
+    contrasts, gain = coarse.compare(repairs)
+    contrasts, unrelated = contrasts[:, :-1], contrasts[:, -1]
+    contrast = contrasts.sum(axis=0)
+    penalty, asked = _penalties(repairs, gain, record, law, lag)
     best = int(np.argmin(contrast + penalty))
-    clear = CLEAR * float(spread[best])
-    nats = contrast[0] - contrast[best]
+    nats = contrast[0] - contrast
     if asked[best]:
-        is_shown = penalty[0] >= _SURPRISING or nats >= clear / 2
+        is_shown = penalty[0] >= _SURPRISING or nats[best] >= CLEAR / 2
     else:
         is_shown = (
-            nats >= clear and _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] >= _ODD
+            nats[best] >= CLEAR and _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] >= _ODD
         )
-    if not is_shown:
-        best = 0
-    saved = coarse.unrelated() - np.min(axis_contrast, axis=1)
+    best = best if is_shown else 0
     followed = np.zeros(record.axes) if law is None else law.axis_coherence
     return _Choice(
         repairs[best],
         gain[:, best],
-        float(contrast[0] - contrast[best]),
-        float(contrast[best]),
-        clear,
-        (followed < FOLLOWED) & (saved < CLEAR * spread[best]),
+        max(float(nats[best]), 0.0),
+        (followed < FOLLOWED) & (unrelated - np.min(contrasts, axis=1) < CLEAR),
     )
 
 
@@ -383,38 +379,35 @@ def _penalties(
     record: LoopRecord,
     law: ControlLaw | None,
     lag: int,
-    spread: FloatArray,
 ) -> tuple[FloatArray, BoolArray]:
     """Return the nats that repairs (n,) cost because of the laws they make, and which the law asks.
 
     A loop that would have been unstable has not run. A law that is not exact overrules no clear
     likelihood.
     """
-    unusual = np.array([_is_unusual(repair, law, lag) for repair in repairs])
+    odd = np.array([_is_unusual(repair, law, lag) for repair in repairs])
     impossible = np.zeros(len(repairs), dtype=np.bool_)
     if law is not None and law.is_sure:
-        for i, (repair, gain) in enumerate(zip(repairs, gains.T, strict=True)):
-            tried = np.vstack([gain, 0.3 * gain, _RAN * np.ones(record.axes)])
-            impossible[i] = not could_have_run(repair, tried, record, law)
+        for i, repair in enumerate(repairs):
+            impossible[i] = not could_have_run(
+                repair, [gains[:, i], TYPICAL_GAIN, *PLAUSIBLE_GAINS], record, law
+            )
         impossible &= not impossible.all()
-    odd = unusual | impossible
+    odd |= impossible
     asked = ~odd & odd[0]
     refuted = np.array(odd if asked.any() else impossible)
     # a slow computer has a lag, and a matrix may couple axes on purpose: the sensor tells
     is_plausible = np.all(np.clip(gains[:, 0], *PLAUSIBLE_GAINS) == gains[:, 0])
     if is_plausible and law is not None and law.order > 0:
         refuted[0] = False
-    surprise = np.inf if law is not None and law.exact else _SURPRISING * spread
-    cost_of_odd = np.where(refuted, surprise, _ODD * odd)
-    fraction = (record.hardware.delay_frames % 1 > 0) & (np.arange(len(repairs)) > 0)
-    nameless = fraction | [bool(repair.matrix) for repair in repairs]
-    return np.asarray(cost_of_odd + _ODD * nameless), asked
+    surprise = np.inf if law is not None and law.exact else _SURPRISING
+    return np.where(refuted, surprise, _ODD * odd), asked
 
 
 def _is_unusual(repair: CommandRepair, law: ControlLaw | None, lag: int) -> bool:
     """Return whether a repair makes the control law one that no one would run."""
     shift = repair.shift_frames
-    if law is None or law.kind == "none":
+    if law is None:
         return shift != 0
     if shift:
         return shift != -lag or lag == 0
@@ -428,9 +421,9 @@ def _is_unusual(repair: CommandRepair, law: ControlLaw | None, lag: int) -> bool
 
 
 def could_have_run(
-    repair: CommandRepair, gains: FloatArray, record: LoopRecord, law: ControlLaw
+    repair: CommandRepair, gains: Iterable[FloatArray | float], record: LoopRecord, law: ControlLaw
 ) -> bool:
-    """Return whether the recorded law would have been stable at any gains (n, axes)."""
+    """Return whether the recorded law would have been stable at any gain, of all or each axis."""
     if repair.increments:
         return True  # another law computes the positions
     controller = law_controller(law, record.frame_rate_hz)
@@ -439,7 +432,8 @@ def could_have_run(
         delay_frames=max(record.hardware.delay_frames + repair.shift_frames, 1.0),
         influence_matrix=repair.turn(record.axes),
     )
-    paths = (replace(path, sensor_matrix=np.diag(gain)) for gain in gains)
+    one = np.ones(record.axes)
+    paths = (replace(path, sensor_matrix=np.diag(gain * one)) for gain in gains)
     return any(_moving_radius(path, controller) < 1 for path in paths)
 
 
@@ -455,22 +449,6 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     )
     moves = np.min(abs(poles[:, None] - others), axis=1) > _HIDDEN
     return float(np.max(abs(poles[moves]))) if moves.any() else np.inf
-
-
-def _doubt_running(record: LoopRecord, law: ControlLaw | None, gains: FloatArray) -> str:
-    """Return that no loop has run with the law of these commands at any gain, in words.
-
-    ``gains`` (axes,) are the likeliest ones.
-    """
-    if law is None or not law.exact or law.order > SHORT_ORDER:
-        return ""
-    tried = np.vstack([gains, 0.3 * gains, 0.1 * gains, *(_ANY * np.ones(record.axes))])
-    if could_have_run(_GIVEN, tried, record, law):
-        return ""
-    return (
-        "a loop with the law that they follow is unstable at any sensor gain. Check what the "
-        "series are"
-    )
 
 
 def _fit(
@@ -506,33 +484,30 @@ def _fit(
 def _scale(
     coarse: CoarseRecord, law: ControlLaw | None, choice: _Choice, plausible: tuple[float, float]
 ) -> FloatArray:
-    """Return the factors (axes,) of commands that make implausible gains plausible ones."""
+    """Return the factors (axes,) of commands that make implausible gains plausible ones.
+
+    Wide resonances that the coarse spectrum lacks move its gains: the fit decides, of commands that
+    are scaled by these.
+    """
     low, high = plausible
-    one, inside = np.ones(choice.gain.size), np.geomspace(low, high, 8)
+    one = np.ones(choice.gain.size)
     if np.all((choice.gain >= low) & (choice.gain <= high)):
         return one
-    plausible_contrasts = coarse.profile(choice.repair, np.tile(inside, (one.size, 1)))
-    if np.sum(np.min(plausible_contrasts, axis=1)) - choice.contrast < choice.clear:
-        return one
-    # wide resonances that the coarse spectrum lacks move its gains: the fit decides, of commands
-    # that are scaled by these
     scaled = replace(choice.repair, scale=tuple(choice.gain))
     free, ratios = _fit(coarse, scaled)
     gains = np.where(np.isfinite(ratios), ratios, 1.0) * choice.gain
     if np.all((gains >= low) & (gains <= high)):
         return one
-    scale = likely_factors(gains, plausible)
     if law is not None and law.is_sure:
-        if not could_have_run(choice.repair, inside[:, None] * one, coarse.record, law):
-            return scale
+        plausible_gains = np.geomspace(low, high, 8)
+        if not could_have_run(choice.repair, plausible_gains, coarse.record, law):
+            return likely_factors(gains, plausible)
         if np.mean(np.log(gains)) < np.log(low):
             return one  # commands that are too large come from a law that is too strong
-    fitted = float(np.mean(np.log(gains)))
-    tried = (low, float(np.clip(_USUAL_GAIN, low, high)), high)
-    for gain in sorted(tried, key=lambda gain: abs(np.log(gain) - fitted)):
-        if _fit(coarse, scaled, gain / choice.gain)[0] - free < choice.clear:
-            return one  # a plausible gain is nearly as likely
-    return scale
+    nearest = np.clip(gains, low, high)
+    if _fit(coarse, scaled, nearest / choice.gain)[0] - free < CLEAR:
+        return one  # plausible gains are nearly as likely
+    return likely_factors(gains, plausible)
 
 
 def likely_factors(gains: FloatArray, plausible: tuple[float, float]) -> FloatArray:
@@ -553,7 +528,7 @@ def likely_factors(gains: FloatArray, plausible: tuple[float, float]) -> FloatAr
 def _likely_factor(gain: float, plausible: tuple[float, float]) -> float:
     """Return the factor between units that makes a gain plausible; another one if none does."""
     low, high = plausible
-    usual = float(np.clip(_USUAL_GAIN, low, high))
+    usual = float(np.clip(TYPICAL_GAIN, low, high))
     for margin in (1.0, _COARSE):
         fits = [f for f in _FACTORS if low / margin <= gain / f <= high * margin]
         if fits:
@@ -566,11 +541,10 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
 
     The fit shows gains beyond the plausible ones where the coarse model leaves them open.
     """
-    accepted = not np.all(gains - SIGMAS * errors > PLAUSIBLE_GAINS[1])
+    accepted = not np.all(gains - SURPRISING * errors > PLAUSIBLE_GAINS[1])
     scale = np.ones(gains.size) if accepted else likely_factors(gains, PLAUSIBLE_GAINS)
     return CommandVerdict(
         explanation=AS_GIVEN if accepted else wrong_scale(scale, gains),
-        accepted=accepted,
         repair=CommandRepair(scale=tuple(scale)),
         gain=frozen_copy(gains / scale),
         law=None,

@@ -17,7 +17,6 @@ from lbt_synth.errors import LbtSynthError
 from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
 from lbt_synth.identification.diagnosis.rows import (
-    FEW,
     ChannelRow,
     CostRow,
     disturbance_costs,
@@ -37,11 +36,11 @@ from lbt_synth.identification.prediction.comparison import (
     compare_designs,
 )
 from lbt_synth.identification.prediction.residual import MUCH, gather
-from lbt_synth.identification.records.record import LoopRecord, require_length
+from lbt_synth.identification.records.record import FEW, LoopRecord, require_length
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging
-from lbt_synth.methods.registry import all_methods, reference_methods
+from lbt_synth.methods.registry import METHODS, reference_methods
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts
 from lbt_synth.storage.words import listing_text
@@ -240,7 +239,7 @@ def _compare(
     first, _ = split_halves(record.stretches(), record.frames)
     fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
     half = identify(record, **{**options, **fixed})
-    robust = [m for m in all_methods().values() if m.plant_section is not None]
+    robust = [m for m in METHODS.values() if m.plant_section is not None]
     names = [m.name for m in (*reference_methods(estimators_only=True), *robust)]
     table, designs = compare_designs(
         record, half, {name: {} for name in names}, others=given, running=running, imaging=imaging

@@ -16,7 +16,7 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedModel,
 )
 from lbt_synth.identification.records.from_series import TREND, end_scatters
-from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.records.record import FEW, LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, jitter_strehl, loop_margins, residual_budget
 from lbt_synth.loop.budget import line_covariance
@@ -37,7 +37,6 @@ from lbt_synth.validation import BoolArray, FloatArray
 
 AXES = ("tip", "tilt")
 DEAD = "dead"
-FEW = 0.01  # of the frames, that may have a fault
 _NOISIER = 3.0  # times the other axis, from frame to frame: turbulence and lines are more alike
 _WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel
 _WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers", "held": "held"}
@@ -68,14 +67,13 @@ class ChannelRow:
 
 def judge_channels(record: LoopRecord) -> tuple[ChannelRow, ...]:
     """Return what is known of each channel of a record, the measurements first."""
-    everywhere = np.ones(record.frames, dtype=np.bool_)
     channels = [
-        ("measurements", record.measurements, record.measured, record.usable),
-        ("commands", record.commands, record.commanded, everywhere),
+        ("measurements", record.measurements, record.measured),
+        ("commands", record.commands, record.commanded),
     ]
     return tuple(
-        _judge_channel(record, series, axis, values, usable if good is None else good)
-        for series, values, good, usable in channels
+        _judge_channel(record, series, axis, values, good)
+        for series, values, good in channels
         if values is not None
         for axis in range(record.axes)
     )

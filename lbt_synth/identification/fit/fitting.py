@@ -42,11 +42,13 @@ GAINS: dict[str, Any] = {"above": 1e-4, "below": 1e4}  # of a sensor
 PLAUSIBLE_GAINS = (0.2, 1.25)  # of a sensor whose commands are in the unit of its measurements
 POSSIBLE_GAINS = (0.08, 2.5)  # of a sensor at all, with light lost or commands at half their size
 GAIN_ERROR = 0.5  # of the logarithm of a sensor gain, before the data say more
+GAIN_STEP = 0.05  # of the logarithm of a gain: nearer ones are as good as the same
 TYPICAL_GAIN = 0.7  # of a sensor, before the data say more
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
 _COLOURED = 9.0  # the same of a colour of the noise, which a wrong gain can explain, too
 _WORTH = 1e-3  # of the innovations' variance, by which a line upon a bump must lower it
 _FAR = 2.0  # half widths of a section from the middle of a bump: what lies beyond is not upon it
+_SEED = 0.01  # of the lowest density: noise from which a fit begins at least
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
 _LOWEST = 0.1  # bins: a component below is a slope without a frequency
 _SHIFTS = np.arange(-2, 2.01, 0.25)  # bins by which a narrow line is moved
@@ -67,7 +69,7 @@ _DAMPING: dict[Kind, tuple[float, float]] = {
 _FINE = 0.02  # of a frequency: a smooth spectrum does not change in such a band
 _WIDEST_HZ, _SHARE = 3.0, 0.1  # of a group, and of what it holds of a line
 _BINS, _SIDELOBES = 10, 64  # on either side of a line that stay single; of a line as narrow as bins
-_SMEARED = 3  # bins: a narrower line has the sidelobes of the taper
+RESOLVED = 3  # bins: a narrower line has the sidelobes of the taper, a wider one flanks of its own
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -171,7 +173,7 @@ class Search:
         size = np.maximum(step, np.minimum(_FINE * f, _WIDEST_HZ))
         for line in spectrum.lines:
             centre, half_width = self.place(line)
-            fine = _SIDELOBES if half_width < _SMEARED * step else _BINS
+            fine = _SIDELOBES if half_width < RESOLVED * step else _BINS
             reach = fine * step + _WIDEST_HZ / _SHARE / 2  # beyond, this limit is wider
             near = slice(*np.searchsorted(f, [centre - reach, centre + reach]))
             away = np.maximum(np.abs(f[near] - centre) - fine * step, 0)
@@ -196,6 +198,8 @@ def fit(
     minus a margin.
     """
     data, bound = search.merge(start), float("inf")
+    if len(start.axes) == 1:
+        start = _with_noise(data, start)
     if better_than is not None:
         bound = contrast(data, better_than.spectrum) + margin
     model = minimise(data, start, search.priors(start), bound=bound, accuracy=accuracy)
@@ -207,6 +211,13 @@ def fit(
     if len(inside.components) < len(start.components):
         return fit(search, inside, better_than=better_than, margin=margin, accuracy=accuracy)
     return replace(model, contrast=contrast(search.data, model.spectrum))
+
+
+def _with_noise(data: LoopPeriodogram, spectrum: SpectrumModel) -> SpectrumModel:
+    """Return a model with at least some noise: where it is nothing, it has no slope."""
+    lowest = float(np.min(density(data, spectrum))) * data.frame_rate_hz / 2
+    least = float(np.log(_SEED * lowest))
+    return spectrum.with_background(log_noise=max(spectrum.background.log_noise, least))
 
 
 def refit(search: Search, start: SpectrumModel) -> FittedModel | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import count
 from typing import Any
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.fitting import (
     GAIN_ERROR,
+    GAIN_STEP,
     LOWEST_LINE_HZ,
     MOST_LINES,
     PLAUSIBLE_GAINS,
@@ -45,19 +47,17 @@ from lbt_synth.identification.fit.physical_parameters import (
 )
 from lbt_synth.identification.fit.shared_lines import couple_axes
 from lbt_synth.identification.fit.whittle import FittedModel
-from lbt_synth.identification.records.line_priors import LinePrior
+from lbt_synth.identification.records.faults import RARE
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
-from lbt_synth.validation import FloatArray, number, real_array, require_instance
+from lbt_synth.validation import FloatArray, number, one_or_each, real_array, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
 _UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be coloured
-_NOT_WHITE = 1e-3  # probability of white innovations below which a note says so
 OPEN_GAIN = 0.3  # relative error of a gain that a record leaves open
 _POOR_GAIN = 0.1  # relative error from which a note says so
-_ROUGH_GAIN = 0.05  # relative error from which other gains are tried
 _AMBIGUOUS = 2.0  # times the error of a fit to more data: it had rivals
 _LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0  # of the periodograms in a density
 
@@ -68,7 +68,8 @@ def identify(
     frame_rate_hz: float | None = None,
     delay_frames: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
-    announced: Sequence[LinePrior] = (),
+    noise_nm: float | Sequence[float] | None = None,
+    announced: ArrayLike = (),
     lowest_line_hz: float = LOWEST_LINE_HZ,
     most_lines: int = MOST_LINES,
     stretches: StretchesLike | None = None,
@@ -96,8 +97,11 @@ def identify(
         Total delay of that loop [frames], if the record does not have it; 2 by default.
     sensor_gain : float or one per axis, optional
         Known sensor gain; like ``stretches`` and ``start`` for series alone.
-    announced : sequence of LinePrior, optional
-        Lines that are known beforehand, for instance from accelerometers.
+    noise_nm : float or one per axis, optional
+        Noise per frame of the sensor of the loop to design for [nm], for spectra alone: those of
+        wind shake or of a simulation have none.
+    announced : (lines,) or (lines, 2) array_like, optional
+        Frequencies of lines that are known beforehand [Hz], alone or with their standard errors.
     lowest_line_hz : float, optional
         A resonance below is a part of the turbulence [Hz].
     most_lines : int, optional
@@ -139,19 +143,23 @@ def identify(
     >>> lbt.kalman(found.plant()).certificate.passed
     True
     """
-    for line in announced:
-        require_instance(line, LinePrior)
+    lines = real_array(announced, "announced")
+    lines = np.column_stack([lines, 0 * lines]) if lines.ndim == 1 else lines
+    if lines.ndim != 2 or lines.shape[1] != 2:
+        raise DimensionError(f"announced must be (lines,) or (lines, 2); got {lines.shape}.")
     if start is not None:
         require_instance(start, IdentifiedModel)
     options: dict[str, Any] = {
-        "announced": [(line.frequency_hz, line.frequency_error_hz) for line in announced],
+        "announced": lines.tolist(),
         "lowest_line_hz": lowest_line_hz,
         "most_lines": most_lines,
     }
     if isinstance(record, SpectrumRecord):
         _refuse_of_series(sensor_gain=sensor_gain, stretches=stretches, start=start)
-        return _identify_spectra(record, frame_rate_hz, delay_frames, options)
+        return _identify_spectra(record, frame_rate_hz, delay_frames, noise_nm, options)
     require_instance(record, LoopRecord)
+    if noise_nm is not None:
+        raise ProblemError("noise_nm is for spectra; the noise of a series is found in it.")
     _check_record(record, frame_rate_hz, delay_frames, start)
     gains: list[float | None] = [None] * record.axes
     if sensor_gain is not None:
@@ -343,7 +351,7 @@ def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[st
             )
     for i, axis in enumerate(axes):
         test = axis.whiteness
-        if test.p_value < _NOT_WHITE or test.correlation_p_value < _NOT_WHITE:
+        if min(test.p_value, test.correlation_p_value) < RARE:
             yield (
                 f"warning: the innovations of axis {i} are not white (p = {test.p_value:.2g}, "
                 f"{test.correlation_p_value:.2g}): the model leaves something out, such as noise "
@@ -356,9 +364,15 @@ def _identify_spectra(
     record: SpectrumRecord,
     frame_rate_hz: float | None,
     delay_frames: float | None,
+    noise_nm: float | Sequence[float] | None,
     options: dict[str, Any],
 ) -> IdentifiedModel:
     """Identify each spectrum, between 0 and the Nyquist frequency of the loop."""
+    stated = np.zeros(record.axes)  # 0 where it is that of the spectrum
+    if noise_nm is not None:
+        noise = np.atleast_1d(real_array(noise_nm, "noise_nm"))
+        one = noise[0] if noise.size == 1 else noise
+        stated += one_or_each(one, "noise_nm", record.axes, above=0)
     rate = frame_rate_hz if frame_rate_hz is not None else record.frame_rate_hz
     if rate is None:
         raise ProblemError(
@@ -369,6 +383,10 @@ def _identify_spectra(
     f, densities = record.frequency_hz[inside], record.density_nm2_hz[inside].T
     options |= {"frame_rate_hz": rate, "averages": record.averages}
     axes = [identify_spectrum(f, density, **options) for density in densities]
+    axes = [
+        replace(axis, noise_nm=noise, noise_error_nm=0.0) if noise else axis
+        for axis, noise in zip(axes, stated.tolist(), strict=True)
+    ]
     left = int(np.sum(record.frequency_hz >= rate / 2))
     notes = [f"{left} frequencies beyond {rate / 2:g} Hz were left out"] if left else []
     notes += [
@@ -443,7 +461,7 @@ def _is_clear(model: FittedModel, start: IdentifiedAxis | None) -> bool:
     turbulence, narrow = model.spectrum.components[0], [c.is_narrow for c in model.spectrum.lines]
     plain = all(narrow) and not background.colour and turbulence.damping_ratio < OVERDAMPED
     low, high = PLAUSIBLE_GAINS
-    return low <= background.gain <= high and (compared or (plain and error < _ROUGH_GAIN))
+    return low <= background.gain <= high and (compared or (plain and error < GAIN_STEP))
 
 
 def refit_axis(axis: IdentifiedAxis, search: Search, error: float, note: str) -> IdentifiedAxis:

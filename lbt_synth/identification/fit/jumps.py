@@ -16,9 +16,8 @@ from lbt_synth.validation import FloatArray, IntArray
 _LARGE = 12.0  # standard deviations of the change of a correction
 _UNLIKELY = 8.0  # standard deviations of the innovations
 _EDGE = 0.06  # of a stretch, at either end, where the taper hides jumps
-_CLUSTER = 20  # frames within which outliers are one jump
 _AROUND = 3  # frames left out on either side
-_SAME_JUMP = 50  # frames within which the axes have one jump
+_SAME_JUMP = 50  # frames within which outliers, and the axes, have one jump
 _MOST_JUMPS = 20  # at which a record is cut
 
 
@@ -76,7 +75,7 @@ def find_correction_jumps(corrections: FloatArray, stretches: Stretches) -> list
 def _largest_of_clusters(size: FloatArray, far: IntArray, start: int) -> list[Jump]:
     """Return the largest of each cluster of differences that are too large."""
     out = []
-    for place in np.split(far, 1 + np.flatnonzero(np.diff(far) > _CLUSTER)):
+    for place in np.split(far, 1 + np.flatnonzero(np.diff(far) > _SAME_JUMP)):
         if place.size:
             best = int(place[np.argmax(size[place])])
             out.append((start + 1 + best, float(size[best])))

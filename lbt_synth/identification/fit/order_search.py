@@ -17,7 +17,7 @@ import numpy as np
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
-from lbt_synth.identification.fit.fitting import GAINS, TYPICAL_GAIN, Search
+from lbt_synth.identification.fit.fitting import GAIN_STEP, GAINS, TYPICAL_GAIN, Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import SEARCHED
 from lbt_synth.identification.fit.spectrum_model import (
@@ -27,6 +27,7 @@ from lbt_synth.identification.fit.spectrum_model import (
     damping_parameter,
 )
 from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
+from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
 from lbt_synth.models.vibration import MOST_SECTIONS
 from lbt_synth.validation import FloatArray
 
@@ -37,7 +38,7 @@ _MOST_SLOW = 2  # parts of the turbulence beside the first
 _COLOUR = 0.3  # of the noise, where a fit begins
 _MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz] and damping: starts of a fit
-_CROSSINGS_HZ = (1.0, 3.0, 10.0, 30.0, 100.0)  # where a drift beside turbulence may meet the noise
+_CROSSINGS_HZ = np.geomspace(1.0, 100.0, 5)  # where a drift beside turbulence may meet the noise
 OVERDAMPED = 3.0  # damping ratio of turbulence that may stand for a drift
 _SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
 _WIDEST_LINE = 0.98  # damping ratio
@@ -45,11 +46,8 @@ _BANDS = 80  # of the background
 _WIDEST = 0.3  # of its frequency: a band that is tried, and the damping ratio of a new component
 _NARROWEST = 1e-4  # damping ratio of a new component
 _BESIDE = 0.08  # of its frequency: lines that are nearer may be one bump
-_SEEN = 3.0  # bins: a line of that half width shows the shape of its flanks
-_ROUGH = 2.0  # prices: a bump that is less likely before it is fitted is none, but for one of many
-_TO_HALF = 2 * float(np.log(2))  # square of a Gaussian's half width at half height over its variance
-_OTHER_GAINS = (0.4, 0.9)  # of a sensor, from which models that are as likely are sought
-_SAME_GAIN = 0.05  # of a logarithm: nearer gains have the same optimum
+_TO_HALF = 2 * float(np.log(2))  # square of a Gaussian's half width over its variance
+_OTHER_GAINS = (0.4, 0.9, 1.1)  # of a sensor, from which models that are as likely are sought
 _AS_LIKELY = 5.0  # log-likelihood by which one of two gains is excluded
 
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
@@ -81,7 +79,7 @@ def find_rivals(
     """
     model, rivals = models[0], list(models)
     for gain in _OTHER_GAINS if other_gains else ():
-        if abs(np.log(gain) - model.spectrum.background.log_gain) >= _SAME_GAIN:
+        if abs(np.log(gain) - model.spectrum.background.log_gain) >= GAIN_STEP:
             with suppress(NumericalError):
                 held = find_components(replace(search, gain=gain), rounds=FEW_ROUNDS)
                 rivals += _settled([fitting.fit(search, held.spectrum)])
@@ -109,9 +107,9 @@ def _settled(models: Sequence[FittedModel | None]) -> list[FittedModel]:
 
 
 def _cost_of_noise(search: Search, model: FittedModel) -> float:
-    """Return the cost of a model in which wide resonances count twice."""
-    spare = sum(not c.is_narrow for c in model.spectrum.lines)
-    return fitting.cost(search, model) + search.price * spare
+    """Return the cost of a model in which wide resonances count twice, and narrower ones less."""
+    widths = [c.damping_ratio / WIDE_DAMPING for c in model.spectrum.lines]
+    return fitting.cost(search, model) + search.price * sum(min(1.0, w**4) for w in widths)
 
 
 def find_components(
@@ -318,7 +316,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
         first, counts = components[cluster[0]], {2, MOST_SECTIONS}
         groups = [cluster]
         if len(cluster) == 1:
-            if search.place(first)[1] < _SEEN * search.data.step_hz:
+            if search.place(first)[1] < fitting.RESOLVED * search.data.step_hz:
                 continue
             counts = {first.sections - 1, first.sections + 1} & set(range(1, MOST_SECTIONS + 1))
         elif len(cluster) > 2:
@@ -328,7 +326,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
             others = (c for i, c in enumerate(components) if i not in group)
             bump = _bump([components[i] for i in group], sections)
             trial = replace(spectrum, components=(*others, bump))
-            if len(group) > 2 or contrast(data, trial) < whole + _ROUGH * search.price:
+            if len(group) > 1 or contrast(data, trial) < whole + search.price:
                 yield trial
 
 

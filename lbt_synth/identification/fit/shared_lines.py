@@ -39,12 +39,12 @@ from lbt_synth.identification.fit.whittle import (
     part_density,
     spectral_matrix,
 )
+from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import FloatArray
 
-_APART = 4.0  # standard errors between frequencies that differ
 _UNFITTED = 10.0  # log-likelihood that a fit may add to a line that the axes share
 _HARDLY = 2.0  # the same of one that a single axis shows
 _COHERENT = 0.5  # squared coherence of lines that are worth a fit all the same
@@ -225,7 +225,9 @@ def _find_pairs(
         near = {}
         for row in rows:
             its_centre, its_half = search.place(row[2])
-            reach = max(_APART * centre * float(np.hypot(error, row[3])), 0.5 * (half + its_half))
+            reach = max(
+                SURPRISING * centre * float(np.hypot(error, row[3])), 0.5 * (half + its_half)
+            )
             if row[1] != axis and abs(its_centre - centre) <= reach:
                 near[row[2]] = abs(its_centre - centre)
         partner = min(near, key=near.__getitem__, default=None)

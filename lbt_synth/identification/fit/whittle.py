@@ -57,12 +57,11 @@ from lbt_synth.validation import FloatArray, IntArray
 DIFFERENCE = 1e-4  # of a logarithm
 WIDE = 30.0  # half width above which a line is not smeared
 _FAR = 400.0  # distance beyond which no line is smeared
-_NOTHING = 0.003  # change of the logarithm of a line that is neglected
+_NOTHING = 0.003  # of a line: a change that is neglected, and what is left between lobes
 _NARROWEST = 1e-9
 _WIDTHS = 72
 _LOBES = 64.0  # distance up to which single lobes are resolved
 _STEP = 0.1
-_VALLEY = 0.003  # of the mean over a lobe, the least between lobes
 _GROWTH = 1.03  # of the steps beyond, where lobes are averaged
 _SAMPLES = 4096  # of the taper
 
@@ -106,7 +105,7 @@ def _table() -> tuple[FloatArray, FloatArray, FloatArray]:
     at, mean = decaying @ waves, (decaying * np.sinc(t)) @ waves  # the mean over a lobe
     # of the taper itself, not of its samples
     at, mean = (each * np.sinc(grid / _SAMPLES) ** 2 for each in (at, mean))
-    at = np.maximum(at, _VALLEY * mean)  # no fit crosses the zeros between lobes
+    at = np.maximum(at, _NOTHING * mean)  # no fit crosses the zeros between lobes
     blend = np.clip((grid - _LOBES / 2) / (_LOBES / 2), 0, 1)
     k = np.maximum(at * (1 - blend) + mean * blend, 1e-14)
     knots = np.log(widths)

@@ -20,7 +20,6 @@ from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.prediction.residual import (
-    SURPRISING,
     ResidualEstimate,
     check_series,
     estimate_residual,
@@ -31,11 +30,18 @@ from lbt_synth.identification.prediction.residual import (
     replay,
     settled_test,
 )
+from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
-from lbt_synth.loop import Imaging, close_loop, jitter_strehl, residual_budget, youla_controller
+from lbt_synth.loop import (
+    Imaging,
+    close_loop,
+    jitter_strehl,
+    residual_budget,
+)
+from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import PlantInputs, design_request

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from scipy.fft import rfft
 
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.stretches import (
     Stretches,
     StretchesLike,
@@ -36,7 +37,6 @@ from lbt_synth.validation import (
     require_instance,
 )
 
-SURPRISING = 4.0  # standard errors of a residual that chance does not explain
 MUCH = 1.25  # ratio of residuals that no error excuses: that of a line that beats is too large
 _ERRORS = 2.0  # standard errors by which one residual is clearly above another
 _LEAST_SHARE = 0.02  # of the measured variance: 1 % of the rms, less than conditions change by
@@ -156,7 +156,7 @@ class ResidualEstimate:
             return float("nan")
         values, vectors = np.linalg.eigh(self.covariance_nm2)
         covariance = vectors * np.maximum(values, 0.0) @ vectors.T
-        return jitter_strehl(covariance, imaging=imaging)
+        return float(jitter_strehl(covariance, imaging=imaging))
 
     @property
     def text(self) -> str:

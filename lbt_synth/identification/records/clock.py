@@ -1,4 +1,4 @@
-"""The clock of a record: its rows on a regular grid of frames, by times or frame counters."""
+"""The clock of a record: its rows on a regular grid of frames, by frame counters or times."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.validation import FloatArray, IntArray, number, real_array
 
 _SAME_RATE = 1e-4  # by which a stated rate may differ from that of the times: a cheap clock
-_MOST_HOLES = 9  # missing frames over those that are there
+_MOST_HOLES = 9  # missing frames over those that are there; more fill the memory
 _CLEAR = 0.45  # of a frame, by which the steps of complete rows may differ
-_LEAST_GAP = 0.1  # of a frame, between the latest and the earliest row of a frame
+_NARROW = 0.1  # of a frame, or of the steps: what is less is jitter, or chance
 _COARSE = 0.02  # of a frame: times in smaller steps are not rounded, but jitter
-_ROWS_PER_STAMP = 5  # of times that are too coarse to be used beside a rate
 _FEW = 3  # odd steps that show an order
-_MOST_UNEVEN = 0.1  # of the steps, of no frame or of several, before the times count as rounded
 
 
 class Clock(NamedTuple):
@@ -36,72 +34,66 @@ def build_clock(
     times_s: ArrayLike | None = None,
     frame_numbers: ArrayLike | None = None,
 ) -> Clock:
-    """Lay rows on a regular grid, by their times (rows,) or frame numbers (rows,)."""
-    rate = None
-    if frame_rate_hz is not None:
-        rate = number(frame_rate_hz, "frame_rate_hz", above=0)
-    notes: list[str] = []
-    frame = np.arange(rows)
+    """Lay rows on a regular grid, by their frame numbers (rows,) or times (rows,).
+
+    Times that stand still, or whose steps are longer than a frame, are not used beside a rate.
+    """
+    rate = None if frame_rate_hz is None else number(frame_rate_hz, "frame_rate_hz", above=0)
     times = None if times_s is None else _check_rising(times_s, "times_s", rows)
+    frame = np.arange(rows)
     if frame_numbers is not None:
         frame = _frames_from_counter(_check_rising(frame_numbers, "frame_numbers", rows))
-    if times is not None and rows > 1:
-        if rate is not None and _tell_nothing(times, rate):
-            times, notes = None, ["the times do not tell frames apart and were not used"]
-        elif frame_numbers is None:
-            frame = _frames_from_times(times, rate)
-    if times is not None and rows > 1:
-        rate_of_times = _fit_rate(times, frame)
+    notes: list[str] = []
+    times = times if rows > 1 else None
+    if times is not None and rate is not None and _tell_nothing(times, rate):
+        times, notes = None, ["the times do not tell frames apart and were not used"]
+    if times is None:
         if rate is None:
-            rate = rate_of_times
-            notes.append(f"frame rate {rate:.9g} Hz, from the times")
-        else:
-            notes += _compare_rates(rate, rate_of_times, times, frame)
+            raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
+        return Clock(rate, frame, notes)
+    if frame_numbers is None:
+        frame = _frames_from_times(times, rate)
+    rate_of_times, off = _fit_rate(times, frame)
     if rate is None:
-        raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
-    return Clock(rate, frame, notes, None if times is None else _jitter(times, frame))
+        rate, notes = rate_of_times, [f"frame rate {rate_of_times:.9g} Hz, from the times"]
+    else:
+        notes = _compare_rates(rate, rate_of_times, int(frame[-1]), float(np.ptp(off)))
+    return Clock(rate, frame, notes, float(np.std(off)) if rows > 2 else None)
 
 
 def _tell_nothing(times: FloatArray, rate: float) -> bool:
-    """Return whether times stand still, or rise by many frames at once, as whole seconds do.
+    """Return whether rows share times that stand still or rise by frames at once, as seconds do.
 
-    Their number of rows must be that of the rate.
+    The number of rows must be that of the rate.
     """
-    stamps = int(np.count_nonzero(np.diff(times) > 0))
-    if not stamps:
-        return True
-    apart = abs(float(times[-1] - times[0]) * rate / len(times) - 1)
-    return stamps * _ROWS_PER_STAMP < len(times) and apart <= 1 / stamps
+    frames, stamps = float(times[-1] - times[0]) * rate, int(np.sum(np.diff(times) > 0))
+    if not frames or stamps == len(times) - 1:
+        return not frames
+    is_complete = abs(frames - (len(times) - 1)) <= frames / stamps
+    return is_complete and _step(times, rate) > 1
 
 
-def _jitter(times: FloatArray, frame: IntArray) -> float | None:
-    """Return the rms distance of times from the closest grid of their frames [frames]."""
-    if len(times) < 3 or frame[-1] == 0:
-        return None
-    t, n = times - times.mean(), frame - frame.mean()
-    slope = float(n @ t) / float(n @ n)
-    return float(np.sqrt(np.mean((t / slope - n) ** 2))) if slope > 0 else None
+def _compare_rates(rate: float, rate_of_times: float, frames: int, loose: float) -> list[str]:
+    """Note how far a stated rate is from that of the times; refuse a contradiction.
 
-
-def _compare_rates(rate: float, found: float, times: FloatArray, frame: IntArray) -> list[str]:
-    """Note how far a stated rate is from that of the times; refuse a contradiction."""
-    span = max(int(frame[-1]), 1)
-    loose = float(np.ptp((times - times[0]) * found - frame))  # rounding, jitter
-    apart = abs(found / rate - 1) * span
-    if apart > 1 + _SAME_RATE * span + loose:
+    ``loose`` frames are what rounding and jitter move the times by.
+    """
+    apart = abs(rate_of_times / rate - 1) * frames
+    if apart > 1 + _SAME_RATE * frames + loose:
         raise ProblemError(
-            f"frame_rate_hz must be that of the times, {found:.9g} Hz; got {rate:.9g} Hz: "
+            f"frame_rate_hz must be that of the times, {rate_of_times:.9g} Hz; got {rate:.9g} Hz: "
             f"{apart:.3g} frames apart over the record. Leave it away, or leave the times away."
         )
     if apart > 0.5 + loose:
         return [
-            f"frame rate {rate:.9g} Hz, as stated; by the times {found:.9g} Hz, {apart:.3g} "
-            "frames apart over the record"
+            f"frame rate {rate:.9g} Hz, as stated; by the times {rate_of_times:.9g} Hz, "
+            f"{apart:.3g} frames apart over the record"
         ]
     return []
 
 
 def _check_rising(values: ArrayLike, name: str, rows: int) -> FloatArray:
+    """Return the times or counters of all rows; refuse those that run backwards."""
     out = real_array(values, name)
     if out.shape != (rows,):
         raise DimensionError(
@@ -118,6 +110,7 @@ def _check_rising(values: ArrayLike, name: str, rows: int) -> FloatArray:
 
 
 def _frames_from_counter(numbers: FloatArray) -> IntArray:
+    """Return the frame of each row, from 0, by a counter."""
     if not np.array_equal(numbers, np.round(numbers)):
         raise ProblemError("frame_numbers must be whole numbers; got fractions.")
     steps = np.diff(numbers)
@@ -131,8 +124,17 @@ def _frames_from_counter(numbers: FloatArray) -> IntArray:
     return np.asarray(numbers - numbers[0], dtype=np.int64)
 
 
+def _require_few_holes(frames: float, rows: int) -> None:
+    """Refuse a record that would be nearly all holes."""
+    if frames > (1 + _MOST_HOLES) * rows:
+        raise ProblemError(
+            f"{frames - rows:.15g} of {frames:.15g} frames would be missing between the first row "
+            "and the last; cut the record where it was interrupted."
+        )
+
+
 def _frames_from_times(times: FloatArray, rate: float | None) -> IntArray:
-    """Return the frame of each row, from 0."""
+    """Return the frame of each row, from 0, by times."""
     steps = np.diff(times)
     rising = steps[steps > 0]
     if rising.size == 0:
@@ -143,15 +145,6 @@ def _frames_from_times(times: FloatArray, rate: float | None) -> IntArray:
         # no frame is missing, whatever the rate is: that is compared afterwards
         return np.arange(len(times))
     return _lay_by_steps(times, period) if rate is None else _lay_by_rate(times, rate)
-
-
-def _require_few_holes(frames: float, rows: int) -> None:
-    """Refuse a record that would be nearly all holes."""
-    if frames > (1 + _MOST_HOLES) * rows:
-        raise ProblemError(
-            f"{frames - rows:.15g} of {frames:.15g} frames would be missing between the first row "
-            "and the last; cut the record where it was interrupted."
-        )
 
 
 def _lay_by_steps(times: FloatArray, period: float) -> IntArray:
@@ -166,10 +159,9 @@ def _lay_by_steps(times: FloatArray, period: float) -> IntArray:
             f"{steps[k]:.3g} frames after the one before. Give frame_rate_hz, a counter of frames, "
             "or leave the times away."
         )
-    rate = _fit_rate(times, np.arange(len(times)))
-    spread = float(np.ptp((times - times[0]) * rate - np.arange(len(times))))
+    rate, off = _fit_rate(times, np.arange(len(times)))
     odd = int(np.sum(counts != 1)) if _quantum(times) > _COARSE * period else 0
-    if odd >= _FEW and (odd > _MOST_UNEVEN * len(times) or spread < 1.2 * rate * period):
+    if odd >= _FEW and (odd > _NARROW * len(times) or np.ptp(off) < 1.2 * rate * period):
         raise ProblemError(
             f"the steps in time are those of missing or repeated frames at {1 / period:.6g} Hz, or "
             f"of no such frame at {rate:.6g} Hz: the times may be rounded. Give frame_rate_hz."
@@ -180,25 +172,17 @@ def _lay_by_steps(times: FloatArray, period: float) -> IntArray:
 def _lay_by_rate(times: FloatArray, rate: float) -> IntArray:
     """Lay rows on the grid of a known rate, where one layout alone explains their times.
 
-    Rounded to a quantum, the times of a layout stay within the quantum of a straight line. Each gap
+    Rounded to a step, the times of a layout stay within the step of a straight line. Each gap
     among the parts of a frame at which rows come may be the one where frames begin.
     """
-    place = (times - times[0]) * rate
-    step = _quantum(times) * rate
-    if abs(step - 1) * len(times) < _LEAST_GAP:
-        step = 0.0  # the times of a whole number of frames are exact
-    slack = 1e-6 + 16 * rate * float(np.spacing(np.max(np.abs(times))))
-    layouts: list[FloatArray] = []
-    if step >= 1:
-        rows = np.arange(len(times), dtype=np.float64)
-        layouts = [rows] if _is_complete(place - rows, step - slack) else []
+    place, step = (times - times[0]) * rate, _step(times, rate)
+    slack = _slack(times, rate)
     parts = np.sort(place % 1)
     gaps = np.diff(np.append(parts, parts[0] + 1))
-    wide = np.flatnonzero(gaps > 1 - step + slack)
-    if not wide.size:  # what lies in the middle may be rounded up and down
-        wide = np.flatnonzero(gaps > 1 - step - slack)
+    wide = np.flatnonzero(gaps > 1 - step - slack)
     if step <= _COARSE:
-        wide = np.flatnonzero(gaps == max(np.max(gaps), _LEAST_GAP))
+        wide = np.flatnonzero(gaps == max(np.max(gaps), _NARROW))
+    layouts: list[FloatArray] = []
     for k in wide if step < 1 else ():
         frame = np.floor(place - (parts[k] + gaps[k] / 2))
         frame -= frame[0]
@@ -216,6 +200,17 @@ def _lay_by_rate(times: FloatArray, rate: float) -> IntArray:
     return np.asarray(layouts[0], dtype=np.int64)
 
 
+def _step(times: FloatArray, rate: float) -> float:
+    """Return the step to which times are rounded [frames]; 0 of exact ones, in whole frames."""
+    step = _quantum(times) * rate
+    return 0.0 if abs(step - 1) * len(times) < _slack(times, rate) else step
+
+
+def _slack(times: FloatArray, rate: float) -> float:
+    """Return what double precision leaves open of times [frames]."""
+    return 1e-6 + 16 * rate * float(np.spacing(np.max(np.abs(times))))
+
+
 def _quantum(times: FloatArray) -> float:
     """Return the quantum of the steps in time, the smallest difference between two of them."""
     noise = 8 * float(np.spacing(np.max(np.abs(times))))
@@ -225,22 +220,14 @@ def _quantum(times: FloatArray) -> float:
     return float(times[-1] - times[0]) / float(np.sum(counts))
 
 
-def _is_complete(away: FloatArray, limit: float) -> bool:
-    """Whether rounding alone explains how far rows are from a grid, and no missing frame does.
+def _fit_rate(times: FloatArray, frame: IntArray) -> tuple[float, FloatArray]:
+    """Return the rate by a straight line through times and frames, to nine digits.
 
-    The ends of the record aside, where rounding may hide one.
+    And how far each time is from that line [frames], (rows,).
     """
-    high, low = np.maximum.accumulate, np.minimum.accumulate
-    top = np.maximum(high(away)[:-1], high(away[::-1])[::-1][1:] - 1)
-    bottom = np.minimum(low(away)[:-1], low(away[::-1])[::-1][1:] - 1)
-    end = 1 + len(away) // 16
-    return bool(np.ptp(away) <= limit and not np.any((top - bottom)[end:-end] <= limit))
-
-
-def _fit_rate(times: FloatArray, frame: IntArray) -> float:
-    """Return the rate by a straight line through times and frames, to nine digits."""
     t, n = times - times.mean(), frame - frame.mean()
     slope = float(n @ t)
     if not slope > 0:
         raise ProblemError("times_s must rise; all rows have the same time.")
-    return float(f"{float(n @ n) / slope:.9g}")
+    rate = float(n @ n) / slope
+    return float(f"{rate:.9g}"), rate * t - n

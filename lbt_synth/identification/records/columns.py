@@ -122,8 +122,10 @@ ROLES = {
         "framecounter frame_id counter count index"
     ),
     "frequency": "f freq freqs frequency frequencies",
-    "density": "psd psds density power power_density spectrum spectra",
-    "amplitude": "asd amplitude_density amplitude_spectrum",
+    "density": (
+        "psd psds density power power_density spectrum spectra asd amplitude_density "
+        "amplitude_spectrum"
+    ),
 }
 FACTS = {
     "frame_rate_hz": (
@@ -136,7 +138,7 @@ FACTS = {
     "averages": "averages navg n_averages",
     "unit": "unit units bunit",
 }
-OF_AXES = ("measurements", "open_loop", "commands", "density", "amplitude")
+OF_AXES = ("measurements", "open_loop", "commands", "density")
 _AXES = {"0": 0, "1": 1, "2": 2, "tip": 0, "tilt": 1, "x": 0, "y": 1}
 
 

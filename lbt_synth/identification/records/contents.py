@@ -1,6 +1,6 @@
-"""What a file of series holds: columns and facts of FITS, NPY, NPZ and text tables.
+"""What a file of series holds, and which of its columns make a record.
 
-The columns of a file that make a record, by their names or as they were chosen.
+Columns and facts come from FITS, NPY, NPZ and text tables.
 """
 
 from __future__ import annotations
@@ -31,23 +31,13 @@ from lbt_synth.validation import choice, integer, sequence
 FITS = (".fits", ".fit", ".fts")
 TEXTS = (".csv", ".tsv", ".txt", ".dat")
 ENDINGS = (*FITS, ".npy", ".npz", *TEXTS)
-_SUFFIXES = {  # of numbers that are texts
-    "frame_rate_hz": ("hz",),
-    "delay_frames": ("frames", "frame"),
-    "diameter_m": ("m",),
-}
 _GAPS = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
 _DELIMITERS = (";", "\t", ",", "|")  # else blanks
-_DELAY_CARD = "DELAY"
-_IN_FRAMES = ("[frame]", "[frames]")  # the unit of a card, where the FITS standard has it
-# The roles that give the series of each kind of record, and what is needed beside it.
-_SERIES = {
-    "closed_loop": ("measurements",),
+KINDS = {  # and the roles that make a record of each, the first that of its series
+    "closed_loop": ("measurements", "commands"),
     "open_loop": ("open_loop",),
-    "spectrum": ("density", "amplitude"),
+    "spectrum": ("density", "frequency"),
 }
-_BESIDE = {"closed_loop": "commands", "spectrum": "frequency"}
-KINDS = tuple(_SERIES)
 CLOCKS = ("frame_numbers", "times")
 
 Roles = dict[str, list[Column]]
@@ -94,10 +84,8 @@ class Contents:
 
 
 def _parse_fact(fact: str, text: str) -> float:
-    word = text.strip().lower()
-    for suffix in _SUFFIXES.get(fact, ()):
-        word = word.removesuffix(suffix)
-    return float(word)
+    """Return the number of a text, which may have the unit that the name of the fact ends with."""
+    return float(text.strip().lower().removesuffix(fact.rpartition("_")[2]))
 
 
 @contextmanager
@@ -116,12 +104,7 @@ def name_in_errors(path: Path) -> Iterator[None]:
 def read_contents(path: Path) -> Contents:
     """Return what a file holds."""
     require_ending(path, "a record", ENDINGS, TelemetryError)
-    return parse_contents(path, read_bytes(path, TelemetryError))
-
-
-def parse_contents(path: Path, content: bytes) -> Contents:
-    """Return what the content of a file holds."""
-    ending, out = path.suffix.lower(), Contents()
+    content, ending, out = read_bytes(path, TelemetryError), path.suffix.lower(), Contents()
     read = {**dict.fromkeys(FITS, _read_fits), ".npy": _read_numpy, ".npz": _read_numpy}
     with name_in_errors(path):
         try:
@@ -142,25 +125,13 @@ def _read_fits(out: Contents, content: bytes) -> None:
         for place, unit in enumerate(units):
             name = unit.name if unit.name and unit.name != "PRIMARY" else ""
             for card in unit.header.cards:
-                _add_card(out, card, name or f"HDU {place}")
+                fact = recognise_fact(str(card.keyword))
+                if fact not in (None, "unit") and not isinstance(card.value, bool):
+                    out.add_fact(fact, card.value, f"{card.keyword} of {name or f'HDU {place}'}")
             if isinstance(unit, fits.BinTableHDU | fits.TableHDU):
                 _add_table(out, unit)
             elif unit.is_image and unit.data is not None:
                 out.add_array(name, unit.data, str(unit.header.get("BUNIT", "")) or None)
-
-
-def _add_card(out: Contents, card: Any, where: str) -> None:
-    fact = recognise_fact(str(card.keyword))
-    if card.keyword == _DELAY_CARD:
-        if card.comment.lower().startswith(_IN_FRAMES):
-            fact = "delay_frames"
-        else:
-            out.notes.append(
-                f"{_DELAY_CARD} of the header was not taken: its comment does not say that it is "
-                "in frames, as [frames] does"
-            )
-    if fact not in (None, "unit") and not isinstance(card.value, bool):
-        out.add_fact(fact, card.value, f"{card.keyword} of {where}")
 
 
 def _add_table(out: Contents, unit: Any) -> None:
@@ -175,65 +146,54 @@ def _add_table(out: Contents, unit: Any) -> None:
 
 
 def _read_numpy(out: Contents, content: bytes) -> None:
+    """Add arrays, each field of structured ones, and single numbers and texts as facts."""
     for name, array in read_numpy(content).items():
-        _add_named(out, name, array)
-
-
-def _add_named(out: Contents, name: str, array: npt.NDArray[Any]) -> None:
-    """Add an array, each field of a structured one, or a number or text as a fact."""
-    fact = recognise_fact(name)
-    if array.dtype.names:
-        for field_name in array.dtype.names:
-            out.add_array(field_name, array[field_name])
-    elif array.size == 1 and (array.ndim == 0 or array.dtype.kind in "US" or fact is not None):
-        if fact is None:
+        fact = recognise_fact(name)
+        if array.dtype.names:
+            for field_name in array.dtype.names:
+                out.add_array(field_name, array[field_name])
+        elif array.size == 1 and fact is not None:
+            out.add_fact(fact, array.item(), name)
+        elif array.ndim == 0 or (array.size == 1 and array.dtype.kind in "US"):
             out.notes.append(f"not used: {name}, a single value")
         else:
-            out.add_fact(fact, array.item(), name)
-    else:
-        out.add_array(name, array)
+            out.add_array(name, array)
 
 
 def _read_text(out: Contents, content: bytes) -> None:
+    """Add the columns of a text table, and the facts in its comments."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise TelemetryError("it is not UTF-8 text.") from error
-    rows: list[tuple[int, str]] = []  # number of each line, from 1, and its text
-    above = ""  # the last comment before the table, which may have the names
-    for number, raw in enumerate(text.splitlines(), start=1):
-        line = raw.strip("\r\n ")
-        if line.startswith("#"):
-            comment = line.lstrip("#").strip()
-            above = above if rows else comment
-            _add_comment(out, comment)
-        elif line:
-            rows.append((number, line))
+    lines = [(n, line.strip("\r\n ")) for n, line in enumerate(text.splitlines(), start=1)]
+    rows = [(n, line) for n, line in lines if line and line[0] != "#"]
     if not rows:
         raise TelemetryError("it has no rows.")
+    comments = [(n, line.lstrip("#").strip()) for n, line in lines if line[:1] == "#"]
+    for _, comment in comments:
+        _add_comment(out, comment)
     sign = next((sign for sign in _DELIMITERS if sign in rows[0][1]), None)
-    names = _split_heading(rows[0][1], sign)
     sample = "".join(line for _, line in rows[1:20])
     if sign in (";", "\t") and "," in sample and "." not in sample:
         out.notes.append("commas were taken for decimal points")
-        rows = [(number, line.replace(",", ".")) for number, line in rows]
-    if None in map(_parse_number, _split_heading(rows[0][1], sign)):
+        rows = [(n, line.replace(",", ".")) for n, line in rows]
+    names = _split_cells(rows[0][1], sign)
+    if None in map(_parse_number, names):
         rows = rows[1:]
-    else:
-        cells = _split_heading(above, sign)
-        named = len(cells) == len(names) and all(
-            cell and _parse_number(cell) is None for cell in cells
-        )
-        names = cells if named else [""] * len(names)
-    if not rows:
-        raise TelemetryError("it has a heading and no rows.")
-    _add_table_of_text(out, rows, names, sign)
+        if not rows:
+            raise TelemetryError("it has a heading and no rows.")
+    else:  # the last comment before the table may have the names
+        above = _split_cells(next((c for n, c in comments[::-1] if n < rows[0][0]), ""), sign)
+        named = len(above) == len(names) and all(c and _parse_number(c) is None for c in above)
+        names = above if named else [""] * len(names)
+    _add_rows(out, rows, names, sign)
 
 
-def _add_table_of_text(
+def _add_rows(
     out: Contents, rows: list[tuple[int, str]], names: list[str], sign: str | None
 ) -> None:
-    """Add the columns of rows of a text; leave out those of texts that no role needs."""
+    """Add the columns of numbered rows; leave out those of texts that no role needs."""
     lines, columns = [line for _, line in rows], [parse_column(name, np.empty(0)) for name in names]
     with suppress(ValueError):  # the quick way, which knows no gaps
         numbers = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
@@ -241,14 +201,14 @@ def _add_table_of_text(
             pairs = zip(columns, numbers.T, strict=True)
             out.columns += [replace(column, values=values) for column, values in pairs]
             return
-    table = (
-        [line.split() for line in lines] if sign is None else [*csv.reader(lines, delimiter=sign)]
-    )
-    for (number, _), cells in zip(rows, table, strict=True):
-        if len(cells) != len(names):
-            raise TelemetryError(f"line {number} must have {len(names)} cells; got {len(cells)}.")
-    for at, (column, cells) in enumerate(zip(columns, zip(*table, strict=True), strict=True)):
-        values = [_parse_number(cell) for cell in cells]
+    table = [line.split() for line in lines] if sign is None else csv.reader(lines, delimiter=sign)
+    cells = []
+    for (n, _), row in zip(rows, table, strict=True):
+        if len(row) != len(names):
+            raise TelemetryError(f"line {n} must have {len(names)} cells; got {len(row)}.")
+        cells.append(row)
+    for at, (column, texts) in enumerate(zip(columns, zip(*cells, strict=True), strict=True)):
+        values = [_parse_number(text) for text in texts]
         if None not in values:
             out.columns.append(replace(column, values=np.array(values, dtype=np.float64)))
         elif column.name and column.role is None:  # as a remark or a date
@@ -257,10 +217,8 @@ def _add_table_of_text(
             bad = values.index(None)
             raise TelemetryError(
                 f"cell {at + 1} of line {rows[bad][0]} must be a number; got "
-                f"{cells[bad].strip()!r}."
+                f"{texts[bad].strip()!r}."
             )
-    if not out.columns:
-        raise TelemetryError(f"each cell of a column must be a number; got {lines[0]!r}.")
 
 
 def _add_comment(out: Contents, comment: str) -> None:
@@ -274,12 +232,14 @@ def _add_comment(out: Contents, comment: str) -> None:
             out.add_fact(fact, value, f"the comment {key}")
 
 
-def _split_heading(line: str, sign: str | None) -> list[str]:
+def _split_cells(line: str, sign: str | None) -> list[str]:
+    """Return the cells of a line."""
     cells = line.split() if sign is None else next(csv.reader([line], delimiter=sign), [])
     return [cell.strip().strip('"') for cell in cells]
 
 
 def _parse_number(cell: str) -> float | None:
+    """Return the number in a cell, nan of a gap, None of a text."""
     try:
         return float(cell)
     except ValueError:
@@ -298,32 +258,27 @@ def select_series(
     Those of a role with axes are in the order of the axes, of another role there is one; the first
     role is that of the measurements or densities.
     """
-    there, notes = contents.columns, contents.notes
+    notes = contents.notes
     notes += [f"{why}; it was left out" for why in contents.left_out]
-    if not there:
+    if not contents.columns:
         raise ProblemError(f"the file holds no series of numbers{_left_out(contents)}.")
-    roles = _assign_roles(there, columns) or _assign_by_kind(there, kind, notes)
+    roles = _assign_roles(contents.columns, columns) or _assign_by_kind(contents, kind)
     kind = _find_kind(roles, contents) if kind is None else kind
     if kind == "open_loop" and "open_loop" not in roles and "measurements" in roles:
-        roles["open_loop"] = own = roles["measurements"]
-        if len({each.axis for each in own} - {None}) < len(own) and _are_two_axes(own):
-            roles["open_loop"] = number_axes(own)
-    role = _series_role(roles, kind)
-    if role is None:
-        needed = [role for role in (_SERIES[kind][0], _BESIDE.get(kind)) if role is not None]
+        series = roles["measurements"]
+        named = len({column.axis for column in series} - {None}) == len(series)
+        roles["open_loop"] = number_axes(series) if _are_axes(series) and not named else series
+    needed = KINDS[kind]
+    if not all(role in roles for role in needed):
         raise ProblemError(
             f"a record of kind {kind} needs columns of {' and '.join(needed)}"
             + _how_to_choose(contents, *needed)
         )
-    clocks = () if kind == "spectrum" else CLOCKS
-    chosen = {
-        each: _choose_axes(roles[each], each, axes)
-        for each in (role, _BESIDE.get(kind), *clocks)
-        if each in roles
-    }
-    notes += [f"{each.replace('_', ' ')}: {join_names(own)}" for each, own in chosen.items()]
-    used = {id(column.values) for own in chosen.values() for column in own}
-    if unused := [column for column in there if id(column.values) not in used]:
+    clocks = [role for role in CLOCKS if role in roles and kind != "spectrum"]
+    chosen = {role: _choose_columns(roles[role], role, axes) for role in [*needed, *clocks]}
+    notes += [f"{role.replace('_', ' ')}: {join_names(of)}" for role, of in chosen.items()]
+    used = {id(column.values) for of in chosen.values() for column in of}
+    if unused := [column for column in contents.columns if id(column.values) not in used]:
         notes.append(f"not used: {join_names(unused)}")
     if kind == "open_loop" and "commands" in roles:
         notes.append("commands were left out: the record is of an open loop")
@@ -333,12 +288,6 @@ def select_series(
 def number_axes(columns: Sequence[Column]) -> list[Column]:
     """Return columns numbered as axes, in their order."""
     return [replace(column, axis=axis) for axis, column in enumerate(columns)]
-
-
-def _series_role(found: Roles, kind: str) -> str | None:
-    """Return the role that gives the series of a record, None where something is missing."""
-    role = next((role for role in _SERIES[kind] if role in found), None)
-    return role if _BESIDE.get(kind, role) in found else None
 
 
 def _assign_roles(columns: Sequence[Column], chosen: Mapping[str, Any] | None) -> Roles:
@@ -352,18 +301,15 @@ def _assign_roles(columns: Sequence[Column], chosen: Mapping[str, Any] | None) -
     out: Roles = {}
     for role, wanted in chosen.items():
         choice(role, "a key of columns", tuple(ROLES))
-        each = (wanted,) if isinstance(wanted, str | int) else sequence(wanted, "columns")
-        out[role] = number_axes([hit for one in each for hit in _find_columns(columns, one)])
-    taken = [id(column.values) for own in out.values() for column in own]
+        keys = (wanted,) if isinstance(wanted, str | int) else sequence(wanted, "columns")
+        out[role] = number_axes([hit for key in keys for hit in _find_columns(columns, key)])
+    taken = [id(column.values) for of in out.values() for column in of]
     if len(set(taken)) < len(taken):
         raise ProblemError("a column was chosen twice in columns.")
-    fixed = set(chosen)
-    if fixed & {"density", "amplitude"}:
-        fixed |= {"density", "amplitude"}
     for column in columns:
-        if column.role is not None and column.role not in fixed and id(column.values) not in taken:
+        if column.role is not None and column.role not in chosen and id(column.values) not in taken:
             out.setdefault(column.role, []).append(column)
-    return {role: own for role, own in out.items() if own}
+    return {role: of for role, of in out.items() if of}
 
 
 def _find_columns(columns: Sequence[Column], wanted: Any) -> list[Column]:
@@ -383,29 +329,32 @@ def _find_columns(columns: Sequence[Column], wanted: Any) -> list[Column]:
     return [columns[number]]
 
 
-def _assign_by_kind(columns: Sequence[Column], kind: str | None, notes: list[str]) -> Roles:
+def _assign_by_kind(contents: Contents, kind: str | None) -> Roles:
     """Return the roles of columns that only the kind of the record tells."""
+    columns = contents.columns
     if kind == "spectrum" and len(columns) > 1:
-        notes.append("the first column was taken for the frequencies, the others for densities")
+        contents.notes.append(
+            "the first column was taken for the frequencies, the others for densities"
+        )
         return {"frequency": [columns[0]], "density": number_axes(columns[1:])}
-    if kind == "open_loop" and (len(columns) == 1 or _are_two_axes(columns)):
+    if kind == "open_loop" and (len(columns) == 1 or _are_axes(columns)):
         return {"open_loop": number_axes(columns)}
     return {}
 
 
-def _are_two_axes(columns: Sequence[Column]) -> bool:
+def _are_axes(columns: Sequence[Column]) -> bool:
     """Return whether two columns are the series of two axes: none rises all the time as a clock."""
     return len(columns) == 2 and not any(np.all(np.diff(column.values) > 0) for column in columns)
 
 
-def _find_kind(found: Roles, contents: Contents) -> str:
+def _find_kind(roles: Roles, contents: Contents) -> str:
     """Return the kind of record that the names tell."""
-    kinds = [kind for kind in KINDS if _series_role(found, kind) is not None]
+    kinds = [kind for kind, needed in KINDS.items() if all(role in roles for role in needed)]
     if len(kinds) == 1:
         return kinds[0]
     if kinds:
         raise ProblemError(f"the file holds more than one record; say kind: {' or '.join(kinds)}.")
-    if "measurements" in found:
+    if "measurements" in roles:
         raise ProblemError(
             "the file has measurements and no commands. Residuals of a closed loop need its "
             "commands: give the file that has them, or choose their columns. If the loop was "
@@ -418,38 +367,37 @@ def _find_kind(found: Roles, contents: Contents) -> str:
     )
 
 
-def _choose_axes(found: list[Column], role: str, axes: Sequence[int] | None) -> list[Column]:
+def _choose_columns(columns: list[Column], role: str, axes: Sequence[int] | None) -> list[Column]:
     """Return the columns of the axes, in the order that their names tell."""
     of_axes = role in OF_AXES
-    named_axes = {column.axis for column in found if column.axis is not None and of_axes}
-    if len(found) > 1 and len(named_axes) < len(found):
+    named_axes = {column.axis for column in columns if column.axis is not None and of_axes}
+    if len(columns) > 1 and len(named_axes) < len(columns):
         raise ProblemError(
-            f"{join_names(found)} are all named as {role}"
+            f"{join_names(columns)} are all named as {role}"
             f"{', and not each of an axis of its own' if of_axes else ''}; choose by "
             f"columns={{'{role}': ...}}."
         )
     if not of_axes:
-        return found
-    ordered = sorted(found, key=lambda column: column.axis or 0)
-    return [ordered[i] for i in choose_axes(axes, "axes", len(found), f"columns of {role}")]
+        return columns
+    ordered = sorted(columns, key=lambda column: column.axis or 0)
+    return [ordered[i] for i in choose_axes(axes, len(columns), f"columns of {role}")]
 
 
-def choose_axes(given: Any, name: str, count: int, what: str) -> list[int]:
+def choose_axes(axes: Sequence[int] | None, count: int, what: str) -> list[int]:
     """Return the numbers of one or two axes among some series: those given, or all."""
-    if given is None:
-        if count > 2:
-            raise ProblemError(
-                f"there are {count} {what}; say which are tip and tilt: {name}=(0, 1) for the "
-                "first two."
-            )
+    if axes is None and count <= 2:
         return list(range(count))
-    axes = [integer(axis, name, at_least=0) for axis in sequence(given, name)]
-    if not 1 <= len(axes) <= 2 or len(set(axes)) < len(axes) or max(axes) >= count:
+    if axes is None:
         raise ProblemError(
-            f"{name} must be one or two different numbers below {count}, the number of {what}; "
-            f"got {list(given)}."
+            f"there are {count} {what}; say which are tip and tilt: axes=(0, 1) for the first two."
         )
-    return axes
+    chosen = [integer(axis, "axes", at_least=0) for axis in sequence(axes, "axes")]
+    if not 1 <= len(chosen) <= 2 or len(set(chosen)) < len(chosen) or max(chosen) >= count:
+        raise ProblemError(
+            f"axes must be one or two different numbers below {count}, the number of {what}; got "
+            f"{chosen}."
+        )
+    return chosen
 
 
 def join_names(columns: Sequence[Column]) -> str:
@@ -463,6 +411,7 @@ def _left_out(contents: Contents) -> str:
 
 
 def _how_to_choose(contents: Contents, *roles: str) -> str:
+    """Return which columns there are, and how to choose, as the end of a sentence."""
     wanted = ", ".join(f"'{role}': ..." for role in roles)
     return (
         f"; got {join_names(contents.columns)}{_left_out(contents)}. Choose by "

@@ -11,18 +11,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
+from scipy.special import ndtri
 
+from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.storage.rows import column, percent_column, table_row
 from lbt_synth.validation import BoolArray, FloatArray, IntArray
 
 _SHORTEST_RUN = 5  # equal values, a stuck sensor
-_RARE = 1e-3  # runs of chance allowed in a record
+SURPRISING = 4.0  # standard errors that chance does not explain: 0.006 %
+RARE = 1e-3  # chance of what a good record may show, and is noted
 _MANY_RUNS = 100  # needed to compute a chance
-_SAME_LEVEL = 1e-9  # of the range
 _LIMIT_RATIO = 4  # of values at an end of the range over those at each of as many next levels
 _OUTLIER = 6.5  # standard deviations of the second difference: 1e-4 clean frames in a million
-MAD = 1.482602218505602  # standard deviation of a normal law over its median deviation
-_BLOCK = 256  # frames of a local scale
+MAD = 1 / float(ndtri(0.75))  # standard deviation of a normal law over its median deviation
+_BLOCK = SHORTEST_SEGMENT  # frames of a local scale
 
 
 def runs(flags: BoolArray) -> IntArray:
@@ -37,12 +40,6 @@ def mark(stretches: IntArray, frames: int) -> BoolArray:
     for start, stop in stretches:
         out[start:stop] = True
     return out
-
-
-def _neighbours(values: FloatArray | BoolArray) -> FloatArray:
-    """Return the larger of the two values beside each, 0 beyond the ends."""
-    padded = np.pad(values.astype(np.float64), 1)
-    return np.asarray(np.maximum(padded[:-2], padded[2:]))
 
 
 def equal_runs(series: FloatArray, good: BoolArray) -> IntArray:
@@ -65,7 +62,7 @@ def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
     many = longer[1:] >= _MANY_RUNS
     chances = longer[2:][many[:-1]] / longer[1:-1][many[:-1]]
     chance = max(float(np.max(chances, initial=0.0)), np.finfo(float).tiny)
-    least = np.inf if chance >= 1 else 1 + np.log(_RARE / len(series)) / np.log(chance)
+    least = np.inf if chance >= 1 else 1 + np.log(RARE / len(series)) / np.log(chance)
     return mark(stretches[lengths >= max(least, _SHORTEST_RUN)], len(series))
 
 
@@ -73,14 +70,14 @@ def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
     """Find frames at an end of the range that is reached far more often than values beside it.
 
     The end of a sinusoid's range is reached often, too, but not by a factor of 4 more often
-    than the next values; an end that is cut off is.
+    than the next values; an end that is cut off is. Zeros are those of an open loop.
     """
-    out = np.zeros(len(series), dtype=np.bool_)
+    good, out = good & (series != 0), np.zeros(len(series), dtype=np.bool_)
     values = series[good]
     span = float(np.ptp(values)) if values.size else 0.0
     if span == 0:
         return out
-    tolerance = _SAME_LEVEL * span
+    tolerance = float(np.finfo(np.float32).eps) * span  # levels as single precision has them
     for sign in (1.0, -1.0):
         end = float(np.max(sign * values))
         upper = sign * values[sign * values > end - 0.25 * span]
@@ -108,38 +105,31 @@ def find_outliers(series: FloatArray, good: BoolArray) -> BoolArray:
     value cannot raise the median. A strong sinusoid stays below its own scale.
     """
     good, out = good.copy(), np.zeros(len(series), dtype=np.bool_)
+    if len(series) < 3:
+        return out
     steps = np.abs(np.diff(series))[good[1:] & good[:-1]]
-    rising = steps[steps > 0]
-    smallest = float(rising.min()) / 2 if rising.size else 0.0
+    smallest = float(np.min(steps[steps > 0], initial=np.inf)) / 2
+    smallest = smallest if np.isfinite(smallest) else 0.0
+    bend = np.abs(np.pad(series[:-2] - 2 * series[1:-1] + series[2:], 1))
     while True:
-        bend, valid = _second_difference(series, good)
+        valid = np.pad(good[:-2] & good[1:-1] & good[2:], 1)
         if not valid.any():
             break
-        size = np.abs(bend)
+        size = np.where(valid, bend, 0.0)
         scale = np.maximum(_local_scale(size, valid), smallest)
-        outliers = valid & (size > _OUTLIER * scale) & (size >= 0.9 * _neighbours(size))
+        outliers = valid & (size > _OUTLIER * scale) & (size >= 0.9 * maximum_filter1d(size, 3))
         if not outliers.any():
             break
         # a frame at an edge has no second difference: it may be the one that bends its neighbour
-        outliers |= good & ~valid & (_neighbours(outliers) > 0)
+        outliers |= good & ~valid & maximum_filter1d(outliers, 3)
         out |= outliers
         good &= ~outliers
     if out.any():  # frames between outliers that are too few to be judged
-        beside = _neighbours(out) > 0
+        beside = maximum_filter1d(out, 3)
         stretches = runs(good)
         few = np.array([b - a < 3 and beside[a:b].any() for a, b in stretches], dtype=np.bool_)
         out |= mark(stretches[few], len(series))
     return out
-
-
-def _second_difference(series: FloatArray, good: BoolArray) -> tuple[FloatArray, BoolArray]:
-    """Return second differences, and where they are defined: between two good frames."""
-    bend = np.zeros(len(series))
-    valid = np.zeros(len(series), dtype=np.bool_)
-    if len(series) > 2:
-        valid[1:-1] = good[:-2] & good[1:-1] & good[2:]
-        bend[1:-1] = np.where(valid[1:-1], series[:-2] - 2 * series[1:-1] + series[2:], 0.0)
-    return bend, valid
 
 
 def _local_scale(size: FloatArray, valid: BoolArray) -> FloatArray:
@@ -154,7 +144,7 @@ def _local_scale(size: FloatArray, valid: BoolArray) -> FloatArray:
     local = np.full(blocks, global_scale)
     if enough.any():
         local[enough] = np.maximum(global_scale, MAD * np.nanmedian(table[enough], axis=1))
-    return np.repeat(np.maximum(local, _neighbours(local)), _BLOCK)[:frames]
+    return np.repeat(maximum_filter1d(local, 3), _BLOCK)[:frames]
 
 
 def fill(series: FloatArray, good: BoolArray) -> FloatArray:
@@ -187,14 +177,8 @@ class RecordHealth:
     usable: int  # frames that count as data
     findings: tuple[Finding, ...] = ()  # empty for a clean record
     notes: tuple[str, ...] = ()  # how a file was read, what was repaired, what changes with time
-    bridged: int = 0  # frames that were interpolated
     # rms distance of the rows' times from the regular grid; None without times
     jitter_frames: float | None = None
-
-    @property
-    def clean(self) -> bool:
-        """Whether nothing was found that spoils a frame."""
-        return not any(finding.spoils for finding in self.findings)
 
     def summary(self) -> str:
         """Return one line: how many frames are usable, and why the others are not."""

@@ -1,4 +1,4 @@
-"""Records from telemetry and from files of any origin."""
+"""Records from files of any origin, from telemetry, and from a second file with the commands."""
 
 from __future__ import annotations
 
@@ -7,36 +7,41 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 from zipfile import ZipFile
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError, TelemetryError
 from lbt_synth.files import Telemetry, load_telemetry
-from lbt_synth.identification.records.columns import Column, unit_name
+from lbt_synth.identification.records.columns import Column, seconds_per, unit_name
 from lbt_synth.identification.records.contents import (
+    CLOCKS,
     FITS,
     KINDS,
     Contents,
     choose_axes,
     name_in_errors,
+    number_axes,
     read_contents,
     select_series,
 )
-from lbt_synth.identification.records.from_series import build_record, join_commands
+from lbt_synth.identification.records.from_columns import FACTS, build_loop, build_spectrum
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import read_cards
 from lbt_synth.storage.input_files import LARGEST_TEXT_BYTES, open_input
-from lbt_synth.validation import FloatArray, choice, require_instance
+from lbt_synth.validation import FloatArray, IntArray, choice
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of this package, and of the AOT standard
 _TELEMETRY_ARRAYS = {"META", "COMMANDS", "MEASURE"}
+_FOREIGN = "timing"  # key of metadata in telemetry of other programs
+_CONDITION = float(np.finfo(np.float64).eps ** -0.5)  # beyond, an inverse is half rounding
+_SAME_TIME = 0.25  # of a step, within which two rows are of one frame
 
 
 def load_record(
-    path: str | os.PathLike[str],
+    source: str | os.PathLike[str] | Telemetry,
     *,
     kind: str | None = None,
     frame_rate_hz: float | None = None,
@@ -51,32 +56,32 @@ def load_record(
     columns: Mapping[str, Any] | None = None,
     commands: str | os.PathLike[str] | None = None,
 ) -> LoopRecord | SpectrumRecord:
-    r"""Read what a loop recorded: FITS, NPY, NPZ or CSV.
+    r"""Read what a loop recorded: FITS, NPY, NPZ, CSV, or telemetry.
 
-    Telemetry of this package and of the AOT standard is recognised. In other files, series are
-    found by the names of columns, arrays and HDUs, rates and units by names and headers, as
-    the page on records lists them. What the file does not tell has to be given; the notes of
-    ``health`` say how the file was read.
+    Telemetry of this package and of the AOT standard is recognised; its measurements and commands
+    become modes by its matrices. In other files, series are found by the names of columns, arrays
+    and HDUs, rates and units by names and headers, as the page on records lists them. What the
+    source does not tell has to be given; the notes of ``health`` say how it was read.
 
     Parameters
     ----------
-    path : path-like
-        File that ends in .fits, .fit, .fts, .npy, .npz, .csv, .tsv, .txt or .dat.
+    source : path-like or Telemetry
+        Telemetry, or a file that ends in .fits, .fit, .fts, .npy, .npz, .csv, .tsv, .txt or .dat.
     kind : {"closed_loop", "open_loop", "spectrum"}, optional
         Residual measurements with commands; the (pseudo-)open-loop series itself; or a power
         spectrum. By default what the names tell.
     frame_rate_hz, unit, command_unit : optional
-        As for :func:`loop_record`, where the file does not tell them; a contradiction is refused.
+        As for :func:`loop_record`, where the source does not tell them; a contradiction is refused.
         The unit of a spectrum is nm^2/Hz or nm/sqrt(Hz) and so on.
     delay_frames, diameter_m, obstruction, mirror : optional
-        As for :func:`loop_record`; the delay also in place of that of the file.
+        As for :func:`loop_record`; the delay also in place of that of the source.
     averages : int, optional
         Periodograms that were averaged in a spectrum.
     axes : sequence of int, optional
         Which columns of several, or which modes of telemetry, are the axes; from 0.
     columns : mapping, optional
         What names do not tell: names or numbers (from 0) of columns under "measurements",
-        "open_loop", "commands", "times", "frame_numbers", "frequency", "density" or "amplitude".
+        "open_loop", "commands", "times", "frame_numbers", "frequency" or "density".
     commands : path-like, optional
         Another file, with the commands. Rows are matched by the frame counters of both files,
         or else by the times of both; without a common clock, row by row.
@@ -103,9 +108,6 @@ def load_record(
     >>> seen.frame_rate_hz, seen.usable.tolist(), seen.measurements[0].round(2).tolist()
     (1000.0, [False, True, False], [29.89])
     """
-    source = Path(path)
-    if kind is not None:
-        choice(kind, "kind", KINDS)
     given: dict[str, Any] = {
         "frame_rate_hz": frame_rate_hz,
         "delay_frames": delay_frames,
@@ -114,28 +116,41 @@ def load_record(
         "diameter_m": diameter_m,
         "obstruction": obstruction,
         "mirror": mirror,
-        "source": str(source),
     }
-    with name_in_errors(source):
-        if is_telemetry(source):
-            if kind not in (None, "closed_loop") or columns is not None or commands is not None:
-                raise ProblemError(
-                    "telemetry holds measurements and commands: kind must be closed_loop "
-                    "or left out, and neither columns nor commands may be given. Choose its modes "
-                    "with axes."
-                )
-            if averages is not None:
-                raise ProblemError("averages are only for a spectrum; this file is telemetry.")
-            return record_from_telemetry(load_telemetry(source), axes=axes, **given)
-        contents = read_contents(source)
+    if kind is not None:
+        choice(kind, "kind", tuple(KINDS))
+    of_telemetry = kind in (None, "closed_loop") and columns is None and commands is None
+    if isinstance(source, Telemetry):
+        _require_series(of_telemetry, averages)
+        return _telemetry_record(source, axes=axes, source=source.name or "telemetry", **given)
+    path = Path(source)
+    given["source"] = str(path)
+    with name_in_errors(path):
+        if _is_telemetry(path):
+            _require_series(of_telemetry, averages)
+            return _telemetry_record(load_telemetry(path), axes=axes, **given)
+        contents = read_contents(path)
         if commands is not None:
-            command_file = Path(commands)
-            join_commands(contents, read_contents(command_file), command_file)
-        kind, chosen = select_series(contents, kind=kind, axes=axes, columns=columns)
-        return build_record(kind, chosen, contents, averages=averages, **given)
+            _join_commands(contents, Path(commands))
+        kind, roles = select_series(contents, kind=kind, axes=axes, columns=columns)
+        if kind == "spectrum":
+            return build_spectrum(roles, contents, averages=averages, **given)
+        _require_series(True, averages)
+        return build_loop(roles, contents, **given)
 
 
-def is_telemetry(path: Path) -> bool:
+def _require_series(of_telemetry: bool, averages: int | None) -> None:
+    """Refuse what telemetry and series do not take."""
+    if not of_telemetry:
+        raise ProblemError(
+            "telemetry holds measurements and commands: kind must be closed_loop or left out, and "
+            "neither columns nor commands may be given. Choose its modes with axes."
+        )
+    if averages is not None:
+        raise ProblemError("averages are only for a spectrum; got a record of series.")
+
+
+def _is_telemetry(path: Path) -> bool:
     """Whether a file is telemetry of this package or of the AOT standard."""
     try:
         if path.suffix.lower() in FITS:
@@ -151,101 +166,32 @@ def is_telemetry(path: Path) -> bool:
     return {Path(name).stem for name in names} >= _TELEMETRY_ARRAYS
 
 
-_FACTS = ("frame_rate_hz", "delay_frames", "diameter_m", "obstruction")
-_FOREIGN = "timing"  # key of metadata in telemetry of other programs
-_CONDITION = 1e8
-
-
-def record_from_telemetry(
-    telemetry: Telemetry,
-    *,
-    axes: Sequence[int] | None = None,
-    frame_rate_hz: float | None = None,
-    delay_frames: float | None = None,
-    mirror: PositionLoop | None = None,
-    unit: str | None = None,
-    command_unit: str | None = None,
-    diameter_m: float | None = None,
-    obstruction: float | None = None,
-    source: str | None = None,
+def _telemetry_record(
+    telemetry: Telemetry, *, axes: Sequence[int] | None, mirror: PositionLoop | None, **given: Any
 ) -> LoopRecord:
-    """Make a record of tip and tilt from telemetry.
+    """Make a record of tip and tilt; ``given`` are facts, None where the telemetry has to tell.
 
-    Measurements become modes by the inverse of the interaction matrix, commands by the
-    influence matrix, where there are such. A matrix of gains alone, one for each mode, is no
-    mixture: these measurements stay as they were recorded, and the sensor gain of the record is
-    what they show of a unit of phase.
-
-    Parameters
-    ----------
-    telemetry : Telemetry
-        What the loop recorded.
-    axes : sequence of int, optional
-        Tip and tilt among the modes, from 0; all, where there are one or two.
-    frame_rate_hz, unit, command_unit : optional
-        As for :func:`loop_record`, of modes, where the telemetry does not tell them; another
-        frame rate is refused.
-    delay_frames, diameter_m, obstruction, mirror : optional
-        As for :func:`loop_record`, where they are not known, or in place of the telemetry's.
-    source : str, optional
-        Where it is from; by default the name of the system.
-
-    Returns
-    -------
-    LoopRecord
-        Series in nm, and the faults that were found.
-
-    Raises
-    ------
-    ProblemError
-        If it is not known which modes are tip and tilt, slopes come without a reconstructor, or a
-        unit or rate is unknown or contradicted.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> lazy = lbt.integrator(path, gain=0.5)
-    >>> shake = lbt.Truth(
-    ...     turbulence=None,
-    ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100),),
-    ... )
-    >>> run = lbt.simulate(lazy.controller, shake, hardware=path, frames=200)
-    >>> seen = lbt.identification.record_from_telemetry(
-    ...     lbt.files.telemetry_from_simulation(run, path)
-    ... )
-    >>> error = seen.pseudo_open_loop()[3:] - run.total_nm[0, 2:-1]  # no noise
-    >>> bool(abs(error).max() < 1e-9)
-    True
+    Measurements become modes by the inverse of the interaction matrix, commands by the influence
+    matrix, where there are such. A matrix of gains alone, one for each mode, is no mixture: these
+    measurements stay as they were recorded, and the sensor gain of the record is what they show of
+    a unit of phase.
     """
-    require_instance(telemetry, Telemetry)
     n = telemetry.modes
-    chosen = choose_axes(axes, "axes", n, "modes")
-    facts = {name: value for name in _FACTS if (value := getattr(telemetry, name)) is not None}
+    chosen = choose_axes(axes, n, "modes")
+    facts = {name: value for name in FACTS if (value := getattr(telemetry, name)) is not None}
     contents = Contents(facts={name: {"the telemetry": value} for name, value in facts.items()})
-    columns = {role: _modal_columns(telemetry, role, chosen, contents.notes) for role in _MATRICES}
+    roles = {role: _modal_columns(telemetry, role, chosen, contents.notes) for role in _MATRICES}
     if telemetry.times_s is not None:
-        columns["times"] = [Column(name="times_s", values=telemetry.times_s, unit="s")]
+        roles["times"] = [Column(name="times_s", values=telemetry.times_s, unit="s")]
     if max(n, telemetry.measurements.shape[1], telemetry.commands.shape[1]) > len(chosen):
         contents.notes.append(f"axes are modes {', '.join(map(str, chosen))} of {n}")
     if _FOREIGN in telemetry.metadata:
         contents.notes.append(
             "of another program: that y(k) is of the exposure of frame k-1 is taken for granted"
         )
-    record = build_record(
-        "closed_loop",
-        columns,
-        contents,
-        frame_rate_hz=frame_rate_hz,
-        delay_frames=delay_frames,
-        mirror=telemetry.mirror if mirror is None else mirror,
-        unit=unit,
-        command_unit=command_unit,
-        diameter_m=diameter_m,
-        obstruction=obstruction,
-        source=(telemetry.name or "telemetry") if source is None else source,
-    )
-    return replace(cast(LoopRecord, record), imaging_wavelength_um=telemetry.imaging_wavelength_um)
+    mirror = telemetry.mirror if mirror is None else mirror
+    record = build_loop(roles, contents, mirror=mirror, **given)
+    return replace(record, imaging_wavelength_um=telemetry.imaging_wavelength_um)
 
 
 def _modal_columns(seen: Telemetry, role: str, chosen: list[int], notes: list[str]) -> list[Column]:
@@ -307,3 +253,87 @@ _MATRICES = {  # from what was recorded to modes
     "measurements": (_inverse_response, "the inverse of the interaction matrix"),
     "commands": (_influence, "the influence matrix"),
 }
+
+
+def _join_commands(contents: Contents, path: Path) -> None:
+    """Add the commands of another file, in place of those of the first."""
+    other = read_contents(path)
+    named = [column for column in other.columns if column.role == "commands"] or [
+        column for column in other.columns if column.role in (None, "measurements")
+    ]
+    if not named:
+        raise TelemetryError(f"{path} holds no commands.", path=path)
+    named = _lay_beside(contents, other, named, path)
+    if len(named) > 1 and any(column.axis is None for column in named):
+        named = number_axes(named)
+    columns = [column for column in contents.columns if column.role != "commands"]
+    if not any(column.role in ("measurements", "open_loop") for column in columns):
+        plain = number_axes([column for column in columns if column.role is None])
+        columns = [column for column in columns if column.role is not None]
+        columns += [replace(column, role="measurements") for column in plain]
+    contents.columns = columns + [replace(column, role="commands") for column in named]
+    # a unit is that of its own file
+    contents.facts["command_unit"] = other.facts.pop("unit", {})
+    for fact, places in other.facts.items():
+        for where, value in places.items():
+            contents.facts.setdefault(fact, {})[f"{where} in {path.name}"] = value
+    contents.notes += [f"commands are from {path}", *other.notes]
+
+
+def _lay_beside(
+    contents: Contents, other: Contents, commands: list[Column], path: Path
+) -> list[Column]:
+    """Return the commands in the rows of the measurements, NaN where there are none.
+
+    Rows are matched by the counters of both files, or else by their times. Without a common clock
+    both files must have equally many rows.
+    """
+    sizes = [{len(column.values) for column in columns} for columns in (contents.columns, commands)]
+    for role in CLOCKS:
+        clocks = [c for file in (contents, other) for c in file.columns if c.role == role]
+        if len(clocks) == 2 and [{len(clock.values)} for clock in clocks] == sizes:
+            units = [seconds_per(clock.unit) if role == "times" else 1.0 for clock in clocks]
+            one, two = (unit * clock.values for unit, clock in zip(units, clocks, strict=True))
+            row = _match_rows(one, two, role, path)
+            if not np.array_equal(row, np.arange(len(two))):
+                contents.notes.append(
+                    f"commands were laid beside the measurements by {clocks[1].name}: "
+                    f"{int(np.sum(row >= 0))} of {len(row)} rows have one"
+                )
+            return [replace(c, values=np.where(row < 0, np.nan, c.values[row])) for c in commands]
+    rows = sorted(set.union(*sizes))
+    if len(rows) > 1:
+        raise TelemetryError(
+            f"{path} must have as many frames as the measurements; got "
+            f"{', '.join(map(str, rows))}. Or give both files a counter of frames, or times.",
+            path=path,
+        )
+    if any(column.role in CLOCKS for column in (*contents.columns, *other.columns)):
+        contents.notes.append(
+            "the files have no clock in common: rows of the same number were taken for one frame"
+        )
+    return commands
+
+
+def _match_rows(one: FloatArray, other: FloatArray, role: str, path: Path) -> IntArray:
+    """Return the row of the second clock for each row of the first, -1 where there is none."""
+    steps = np.diff(one), np.diff(other)
+    if np.array_equal(one, other) and np.all(steps[0] >= 0):
+        return np.arange(len(one))
+    if not (np.all(steps[0] >= 0) and np.all(steps[1] > 0)):  # no gap does
+        raise TelemetryError(
+            f"the {role} of both files must rise from row to row to be matched, without gaps.",
+            path=path,
+        )
+    tolerance = _SAME_TIME * min(map(np.median, steps)) if role == "times" else 0.0
+    row = np.searchsorted((other[1:] + other[:-1]) / 2, one, side="right")
+    row = np.where(np.abs(other[row] - one) <= tolerance, row, -1)
+    if np.mean(row >= 0) < 0.5:
+        raise TelemetryError(
+            f"only {int(np.sum(row >= 0))} of {len(one)} measurements have a command in {path} by "
+            f"their {role}; they go from {one[0]:.12g} to {one[-1]:.12g} and from {other[0]:.12g} "
+            f"to {other[-1]:.12g}. Give files of the same frames, or leave the {role} away in one "
+            "of them if the rows do belong together.",
+            path=path,
+        )
+    return row

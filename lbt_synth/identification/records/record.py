@@ -1,11 +1,8 @@
-"""A record of tip and tilt: measurements, commands, and the frames that are usable.
-
-A record that consists of power spectra of tip and tilt.
-"""
+"""Records of tip and tilt: measurements with commands and their usable frames, or spectra."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
@@ -13,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
-from lbt_synth.identification.records.faults import RecordHealth, findings_in, merge_notes, runs
+from lbt_synth.identification.records.faults import Finding, RecordHealth, findings_in, runs
 from lbt_synth.models import LoopHardware, PositionLoop, TabulatedSpectrum
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import (
@@ -33,12 +30,11 @@ from lbt_synth.validation import (
     set_fields,
 )
 
-BRIDGED_FRAMES = 3
-_BRIDGED_FRACTION = 0.01
+BRIDGED_FRAMES = 3  # of a hole, over which a slow phase is a cubic
+FEW = 0.01  # of the frames, that may have a fault or be bridged: they move no result
 NOT_KNOWN = "correction not known"
 _Delay: TypeAlias = Annotated[float, ("at_least", 1), ("at_most", 100)]
-
-_LEAST_FRAMES = 1024  # half of which, two segments, show a model to be tested on the others
+_LEAST_FRAMES = 4 * SHORTEST_SEGMENT  # half of which show a model to be tested on the others
 LEAST_SECONDS = 2.0  # slower turbulence moves no filter by much
 
 
@@ -50,8 +46,9 @@ class LoopRecord:
 
         y(k) = gain (phi_tot(k-1) - c(k)) + w(k),   c(k) = taps[0] u(k-1) + taps[1] u(k-2) + ...
 
-    :func:`loop_record`, :func:`record_from_telemetry` and :func:`load_record` make records and
-    find their faults; this class takes its arguments unchanged.
+    :func:`loop_record` and :func:`load_record` make records and find their faults; this class takes
+    its arguments unchanged. A frame is usable if its measurement is good, and every command in its
+    correction.
 
     Parameters
     ----------
@@ -65,17 +62,21 @@ class LoopRecord:
         Total delay [frames].
     mirror : PositionLoop, optional
         Dynamics of the mirror; one that settles at once by default.
-    usable : (frames,) bool array_like
-        False where a frame is missing or spoilt: the values there are finite fillers.
-    health : RecordHealth
-        What was found.
+    measured, commanded : (frames,) bool array_like
+        Frames whose measurement, and whose command, is good: the others hold finite fillers.
+    faults : tuple of Finding, optional
+        What was found in the series.
+    notes : tuple of str, optional
+        How they were read, and what changes with time.
+    jitter_frames : float, optional
+        Rms distance of the times of the rows from the regular grid [frames].
     diameter_m, obstruction, imaging_wavelength_um : float, optional
         Telescope diameter [m], its central obstruction as a fraction of it, and the wavelength of
         the image [um].
     source : str, optional
         Where it is from.
-    measured, commanded : (frames,) bool array_like, optional
-        Frames whose measurement, and whose command, is good: with the delay they make ``usable``.
+    bridges : (frames,) bool array_like, optional
+        Frames whose pseudo-open loop was interpolated, which are usable.
 
     Raises
     ------
@@ -105,14 +106,17 @@ class LoopRecord:
     commands: FloatArray | None = None
     delay_frames: _Delay | None = None
     mirror: PositionLoop | None = None
-    usable: BoolArray
-    health: RecordHealth
+    measured: BoolArray
+    commanded: BoolArray
+    faults: tuple[Finding, ...] = ()
+    notes: tuple[str, ...] = ()
+    jitter_frames: float | None = None
     diameter_m: Positive | None = None
     obstruction: Obstruction | None = None
     imaging_wavelength_um: Positive | None = None
     source: str = ""
-    measured: BoolArray | None = None
-    commanded: BoolArray | None = None
+    bridges: BoolArray | None = None
+    usable: BoolArray = field(init=False)
 
     def __post_init__(self) -> None:
         y = matrix(self.measurements, "measurements")
@@ -125,17 +129,41 @@ class LoopRecord:
             why = f"to match measurements {y.shape}"
             u = matrix(self.commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
             set_fields(self, commands=u)
-        for name in ("usable", "measured", "commanded"):
-            if (given := getattr(self, name)) is not None:
-                flags = read_only(np.array(given))
+        for name in ("measured", "commanded", "bridges"):
+            if (value := getattr(self, name)) is not None:
+                flags = read_only(np.array(value))
                 if flags.dtype != np.bool_ or flags.shape != (len(y),):
                     raise DimensionError(
                         f"{name} must be {len(y)} truth values, one per frame; got {flags.dtype} "
                         f"{flags.shape}."
                     )
                 set_fields(self, **{name: flags})
+        usable = self.measured & ~self.unknown_corrections()
+        if self.bridges is not None:
+            usable |= self.bridges
+        set_fields(self, usable=read_only(usable))
+
+    def unknown_corrections(self) -> BoolArray:
+        """Return the frames whose correction contains a spoilt command, or one from before."""
+        unknown = np.zeros(self.frames, dtype=np.bool_)
         if self.delay_frames is not None:
-            _ = self.mirror_taps  # refuses a mirror that does not fit the rate
+            taps = self.mirror_taps  # refuses a mirror that does not fit the rate
+            if self.commands is not None:
+                spoilt = np.convolve(~self.commanded, [0, *(taps != 0)])
+                unknown = np.asarray(spoilt[: self.frames] > 0)
+                unknown[: len(taps)] = True
+        return unknown
+
+    @property
+    def health(self) -> RecordHealth:
+        """What was found in the record."""
+        return RecordHealth(
+            frames=self.frames,
+            usable=int(np.sum(self.usable)),
+            findings=self.faults + findings_in(self.unknown_corrections(), NOT_KNOWN, "frames"),
+            notes=self.notes,
+            jitter_frames=self.jitter_frames,
+        )
 
     @property
     def frames(self) -> int:
@@ -217,76 +245,44 @@ class LoopRecord:
     def with_delay(self, delay_frames: float, *, mirror: PositionLoop | None = None) -> LoopRecord:
         """Return the same record of a loop with another total delay [frames], at least 1.
 
-        The mirror is that of the record by default. Frames are those usable then; bridged ones are
-        not.
+        The mirror is that of the record by default. Bridged frames are not usable any more.
         """
         mirror = self.mirror if mirror is None else mirror
-        path = LoopHardware(
-            frame_rate_hz=self.frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
-        )
-        measured = self.usable if self.measured is None else self.measured
-        findings = tuple(finding for finding in self.health.findings if finding.kind != NOT_KNOWN)
-        usable = measured
-        if self.commands is not None:
-            spoilt = [False] * self.frames if self.commanded is None else ~self.commanded
-            unknown = np.convolve(spoilt, [0, *(path.mirror_taps != 0)])[: self.frames] > 0
-            unknown[: len(path.mirror_taps)] = True  # commands before the record
-            usable = measured & ~unknown
-            findings += findings_in(unknown, NOT_KNOWN, "frames")
-        health = replace(self.health, usable=int(np.sum(usable)), findings=findings, bridged=0)
-        return replace(
-            self,
-            delay_frames=path.delay_frames,
-            mirror=mirror,
-            usable=usable,
-            measured=measured,
-            health=health,
-        )
+        return replace(self, delay_frames=delay_frames, mirror=mirror, bridges=None)
 
-    def bridged(
-        self,
-        most: int = BRIDGED_FRAMES,
-        *,
-        most_fraction: float = _BRIDGED_FRACTION,
-        sensor_gain: ArrayLike = 1.0,
-    ) -> LoopRecord:
-        """Return the record with short holes interpolated, a note and a count in its health.
+    def bridged(self, *, sensor_gain: ArrayLike = 1.0) -> LoopRecord:
+        """Return the record with short holes interpolated, and a note.
 
         The pseudo-open-loop measurement for this sensor gain is interpolated through the two frames
         on either side (a cubic, or a straight line where there are fewer), the shortest holes
-        first: those of at most ``most`` frames, up to ``most_fraction`` of the record.
+        first: those of at most 3 frames, up to 1 % of the record.
         """
-        longest = integer(most, "most", at_least=1)
-        fraction = number(most_fraction, "most_fraction", at_least=0, at_most=1)
-        series, usable = self.pseudo_open_loop(sensor_gain), self.usable.copy()
+        series, bridges = self.pseudo_open_loop(sensor_gain), np.zeros(self.frames, dtype=np.bool_)
         holes = runs(~self.usable)
         holes = holes[(holes[:, 0] > 0) & (holes[:, 1] < self.frames)]
         lengths = holes[:, 1] - holes[:, 0]
         order = np.argsort(lengths, kind="stable")
-        chosen = order[
-            (lengths[order] <= longest) & (np.cumsum(lengths[order]) <= fraction * self.frames)
-        ]
+        short = order[lengths[order] <= BRIDGED_FRAMES]
+        chosen = short[np.cumsum(lengths[short]) <= FEW * self.frames]
+        if not chosen.size or self.bridges is not None:
+            return self
         for start, stop in holes[chosen]:
             series[start:stop] = _interpolate_hole(series, self.usable, int(start), int(stop))
-            usable[start:stop] = True
-        count = int(np.sum(lengths[chosen]))
-        if not count:
-            return self
-        new = (usable & ~self.usable)[:, None]
-        back = self.known_gains(sensor_gain) * (series - self.corrections())
-        note = f"{count} frames in {len(chosen)} holes of at most {longest} were interpolated"
-        if unbridged := int(np.sum(lengths <= longest)) - len(chosen):
-            note += f"; {unbridged} more such holes were left, beyond {100 * fraction:g} %"
-        health = replace(
-            self.health,
-            usable=int(np.sum(usable)),
-            bridged=self.health.bridged + count,
-            notes=merge_notes(self.health.notes, [note]),
+            bridges[start:stop] = True
+        note = (
+            f"{np.sum(bridges)} frames in {len(chosen)} holes of at most {BRIDGED_FRAMES} were "
+            "interpolated"
         )
-        # a measurement that was replaced is none of another delay
-        measured = (self.usable if self.measured is None else self.measured) & ~new[:, 0]
-        y = np.where(new, back, self.measurements)
-        return replace(self, measurements=y, usable=usable, measured=measured, health=health)
+        if beyond := len(short) - len(chosen):
+            note += f"; {beyond} more such holes were left, beyond {100 * FEW:g} %"
+        y = self.known_gains(sensor_gain) * (series - self.corrections())
+        return replace(
+            self,
+            measurements=np.where(bridges[:, None], y, self.measurements),
+            measured=self.measured & ~bridges,  # a replaced measurement is none of another delay
+            bridges=bridges,
+            notes=(*self.notes, note),
+        )
 
 
 def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: int) -> FloatArray:
@@ -302,37 +298,9 @@ def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: i
 def require_length(
     record: LoopRecord, *, frames: int = _LEAST_FRAMES, seconds: float = LEAST_SECONDS
 ) -> int:
-    """Refuse a record that is too short for a model to be found.
+    """Return the usable frames in stretches of at least 256; refuse a record with too few.
 
-    Parameters
-    ----------
-    record : LoopRecord
-        The record.
-    frames : int, optional
-        Usable frames that are needed, in stretches of at least 256. Those at the start of a record,
-        whose commands came before it, count.
-    seconds : float, optional
-        The same as a time [s].
-
-    Returns
-    -------
-    int
-        Usable frames in stretches of at least 256.
-
-    Raises
-    ------
-    ProblemError
-        If there are too few frames; it says how many there are and are needed, and which faults
-        were found.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> brief = lbt.identification.loop_record([[1.0], [2.5], [2.0]], frame_rate_hz=800, unit="nm")
-    >>> lbt.identification.require_length(brief)  # doctest: +ELLIPSIS
-    Traceback (most recent call last):
-        ...
-    lbt_synth.errors.ProblemError: the record needs 1600 usable frames (2 s at 800 Hz) in ...
+    Frames at the start of a record, whose commands came before it, count.
     """
     rate = record.frame_rate_hz
     needed = integer(frames, "frames", at_least=1)

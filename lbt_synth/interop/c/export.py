@@ -229,12 +229,12 @@ def _describe_units(terms: SourceTerms) -> list[dict[str, Any]]:
             "name": comment_text(unit),
             "identifier": word,
             "bit": 1 << i,
-            "rows": list(range(own.start, own.stop)),
-            "first": own.start,
-            "last": own.stop - 1,
-            "every": len(terms.read) // np.count_nonzero(terms.read[:, own.start]),
+            "rows": list(range(rows.start, rows.stop)),
+            "first": rows.start,
+            "last": rows.stop - 1,
+            "every": len(terms.read) // np.count_nonzero(terms.read[:, rows.start]),
         }
-        for i, (word, (unit, own)) in enumerate(zip(words, terms.rows.items(), strict=True))
+        for i, (word, (unit, rows)) in enumerate(zip(words, terms.rows.items(), strict=True))
     ]
 
 
@@ -282,14 +282,14 @@ def _written_out(terms: SourceTerms, prefix: str) -> dict[str, Any]:
 
     out: dict[str, Any] = {"errors": []}
     start = f"    const {prefix}_real u{{}} ="
-    transition, known = terms.transition, [*states, *applied]
+    transition, predicting = terms.transition, [*states, *applied]
     if terms.masked:
         names, line = columns(G=s, J=m), "        error[count++] ="
-        out["errors"] = sums(names, terms.innovation, known, line, begin="y[{}]")
+        out["errors"] = sums(names, terms.innovation, predicting, line, begin="y[{}]")
     else:
         transition = np.concatenate([transition, terms.gains[NONE]], axis=2)
     names = columns(A=s, L=m, B=q)
-    out["states"] = sums(names, transition, [*known, *readings], start)
+    out["states"] = sums(names, transition, [*predicting, *readings], start)
     new = [f"state->x[{j}]" if terms.masked else f"n{j}" for j in range(s)]
     out["commands"] = sums(columns(C=s, D=q), terms.command[None], [*new, *readings], start)
     named = {kind: sorted(numbers) for kind, numbers in used.items()}
@@ -326,7 +326,7 @@ def _tables(terms: SourceTerms) -> dict[str, Any]:
             count += sum(map(len, columns))
             gains += [(f"phase {phase}, missing {mask}", column) for column in columns]
         first.append(begins)
-    places = [own.start for own in terms.rows.values()]
+    places = [rows.start for rows in terms.rows.values()]
     due = map(str, (terms.read[:, places] @ (1 << np.arange(len(places)))).tolist())
     return {"gains": gains, "count": count, "due": list(due), "first": first, "sets": len(sets)}
 

@@ -75,10 +75,10 @@ class SourceTerms:
         """Return the controller that the terms make where its own commands are applied."""
         (s, *_), K = self.sizes, np.zeros((*self.transition.shape[:2], self.read.shape[1]))
         K[:, : self.gains[missing].shape[1]] = self.gains[missing]
-        whole = self.transition + K @ self.innovation
+        corrected = self.transition + K @ self.innovation
         states, through = np.hsplit(self.command, [s])
         return Controller(
-            A=whole[:, :, :s] + whole[:, :, s:] @ states,
+            A=corrected[:, :, :s] + corrected[:, :, s:] @ states,
             B=K,
             C=states,
             D=through,
@@ -103,10 +103,13 @@ def source_terms(design: Design, *, form: str = "plain") -> SourceTerms:
     if form == "plain":
         return controller_terms(design.controller)
     require_hardware(design, "the estimator form")  # a bare filter has no commands to be applied
-    own = estimator_form(design)
-    inputs = np.hstack([own.B, own.applied])
-    D = np.zeros((len(own.C), inputs.shape[1]))
-    return controller_terms(Controller(A=own.A, B=inputs, C=own.C, D=D, dt_s=own.dt_s), len(own.C))
+    estimator = estimator_form(design)
+    inputs = np.hstack([estimator.B, estimator.applied])
+    D = np.zeros((len(estimator.C), inputs.shape[1]))
+    return controller_terms(
+        Controller(A=estimator.A, B=inputs, C=estimator.C, D=D, dt_s=estimator.dt_s),
+        len(estimator.C),
+    )
 
 
 def controller_terms(controller: Controller, applied: int = 0) -> SourceTerms:
@@ -131,11 +134,10 @@ def _filter_terms(design: Any) -> SourceTerms:
     plant = design.problem
     full = plant.full()
     n, s, m = plant.n_states, full.n_states, plant.hardware.n_commands
-    A, _, C, _ = full.stacks()
     transition = np.zeros((plant.period, s, s + m))
-    transition[:, :, :s], transition[:, :, s:] = A, full.B_known
+    transition[:, :, :s], transition[:, :, s:] = full.A, full.B_known
     predicted = np.zeros((plant.period, plant.n_measurements, s + m))
-    predicted[:, :, :s], predicted[:, :, s:] = C, full.D_known
+    predicted[:, :, :s], predicted[:, :, s:] = full.C, full.D_known
     filters = {(): design.gain_predictor} | {f.missing: f.gains for f in design.fallbacks}
     states = design.controller.stacks()[2][0]
     return SourceTerms(
@@ -177,7 +179,7 @@ class RunningSource:
     ) -> FloatArray:
         """Take y(k), what is new (all), and the applied u(k-1) (its own); return u(k)."""
         rows, read = self._terms.rows, self._terms.read[self._phase]
-        due = frozenset(unit for unit, own in rows.items() if read[own.start])
+        due = frozenset(unit for unit, place in rows.items() if read[place.start])
         new = frozenset(
             unit
             for unit in due
@@ -189,8 +191,8 @@ class RunningSource:
         used = np.concatenate([np.r_[rows[unit]] for unit in rows if unit in new] or [[]])
         used = used.astype(np.intp)
         transition, innovation = (matrix[self._phase] for matrix in self._matrices[:2])
-        given = self._last if applied is None else np.asarray(applied, dtype=self._dtype)
-        signals = np.concatenate([self._state, given])
+        last = self._last if applied is None else np.asarray(applied, dtype=self._dtype)
+        signals = np.concatenate([self._state, last])
         measured: NDArray[Any] = np.zeros(len(read), dtype=self._dtype)
         measured[used] = y[used]
         errors = _added(np.hstack([measured[:, None], innovation * signals]))
@@ -312,8 +314,8 @@ def read_source(text: str, like: SourceTerms) -> SourceTerms:
 
 
 def _numbers(text: str) -> FloatArray:
-    found = _NUMBER.findall(text)
-    return np.array([float.fromhex(v) if "x" in v else float(v) for v in found])
+    texts = _NUMBER.findall(text)
+    return np.array([float.fromhex(v) if "x" in v else float(v) for v in texts])
 
 
 def _read_gains(
@@ -326,10 +328,10 @@ def _read_gains(
     for i, rows in enumerate(like.rows.values()):
         read[:, rows] = (due >> i & 1 > 0)[:, None]
     first = tables["first"].astype(int).reshape(period, -1)
-    out, whole = {}, replace(like, read=read)
+    out, terms = {}, replace(like, read=read)
     for missing in like.gains:
         mask = sum(1 << units.index(unit) for unit in missing)
-        gains, due_now = np.zeros((period, n, read.shape[1])), used_readings(whole, missing)
+        gains, due_now = np.zeros((period, n, read.shape[1])), used_readings(terms, missing)
         for phase in range(period):
             used = due_now[phase]
             start, count = first[phase, mask], n * int(np.count_nonzero(used))

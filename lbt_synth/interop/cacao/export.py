@@ -34,7 +34,8 @@ from lbt_synth.interop.proof import (
     scenario_gains,
 )
 from lbt_synth.linear import StateSpace, hinf_norm
-from lbt_synth.loop import ClosedLoop, close_loop, youla_controller
+from lbt_synth.loop import ClosedLoop, close_loop
+from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import open_fits
 from lbt_synth.validation import FloatArray, integer, number
@@ -155,11 +156,11 @@ class PredictiveFilter:
                 loop, s, _ = self.at(gain)
                 G = self.gains(gain)
                 pol = replace(s, B=np.hstack([s.B @ G, s.B]), D=np.hstack([s.D @ G, s.D]))
-                seen, left = (
+                seen, residual = (
                     mode_variances(self.design, one, every)
                     for one in (replace(loop, system=pol), loop)
                 )
-                sizes[gain] = float(np.sqrt(np.sum(seen))), float(np.sqrt(np.min(left)))
+                sizes[gain] = float(np.sqrt(np.sum(seen))), float(np.sqrt(np.min(residual)))
         return sizes
 
     def fewest_steps(self, loss: float) -> int:
@@ -180,8 +181,8 @@ class PredictiveFilter:
     def _is_enough(self, steps: int, loss: float) -> bool:
         norm = self.cut_norm(steps)
         return (norm <= loss and self.small_gain(norm) < 1) and all(
-            self.residual_nm(gain, norm) <= _ROOM * loss * own
-            for gain, (_, own) in self.sizes_nm.items()
+            self.residual_nm(gain, norm) <= _ROOM * loss * least_nm
+            for gain, (_, least_nm) in self.sizes_nm.items()
         )
 
     def cut_norm(self, steps: int, taps: FloatArray | None = None) -> float:
@@ -269,11 +270,11 @@ def _round(
     limit = number(loss, "loss", above=0, at_most=LOSS)
     filters = [predictive_filter(design) for design in designs]
     if steps is None:
-        count = max(2, *(whole.fewest_steps(limit) for whole in filters))
+        count = max(2, *(one.fewest_steps(limit) for one in filters))
     else:
         count = integer(steps, "steps", at_least=2)
     delay = filters[0].hardware.delay_frames
-    cubes = (-whole.taps(count).swapaxes(0, 1).astype(np.float32) for whole in filters)
+    cubes = (-one.taps(count).swapaxes(0, 1).astype(np.float32) for one in filters)
     return [(cube, delay) for cube in cubes]
 
 

@@ -1,34 +1,361 @@
 """The target dao: the matrix that Durham's dao real-time computers load, one column per mode.
 
 Per mode ``u(k) = b_0 y(k) + .. + b_M y(k-M) + a_1 u(k-1) + .. + a_M u(k-M)``, in rows b, then a.
+
+Poles close to z = 1 make both polynomials nearly vanish there, so that each rounding moves the loop
+by much. A robust design that this breaks is made again: a common factor with roots far from there
+makes the polynomials larger, from it the coefficients move until what the loop leaves, rounding
+included, is least, and last they are rounded one by one.
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag
+from scipy.optimize import least_squares
+from scipy.signal import sos2tf, tf2sos
 
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
+from lbt_synth.design.shaping.channel import Channel, laguerre_basis
+from lbt_synth.design.shaping.objectives import ResidualVariance, leaves, spectrum_of
+from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.files.telemetry.time_filters import is_significant, transfer_function
-from lbt_synth.interop.dao.refit import DirectFormLoop, make_again, mode_loops
 from lbt_synth.interop.modes import ModeDesign
 from lbt_synth.interop.pipeline import Arithmetic, Target
-from lbt_synth.interop.proof import ROUNDOFF, Written, prove_written, sums_variance
+from lbt_synth.interop.proof import (
+    LOSS,
+    ROUNDOFF,
+    Written,
+    demanded_gains,
+    prove_written,
+    sums_variance,
+)
 from lbt_synth.linear import Controller
+from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import fits_bytes, open_fits
-from lbt_synth.validation import FloatArray, frozen_copy, integer
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, integer
 
-_Matrix: TypeAlias = NDArray[np.float32]
+# Mean square of the relative error of an operation. The error is uniform within half a step, and a
+# step is 2^-24 to 2^-23 of the number: of normal numbers of any size the mean square is at most
+# 0.544 of what it would be if all steps were the widest, of a sinusoid 0.66.
+ROUNDING = 2 / 3 * ROUNDOFF["single"] ** 2 / 3
+_RADIUS = 0.92  # of the roots that are added, and largest square of one that the search moves
+_ROOM = 2e-3  # of each limit, for what lies between the nodes
+_SEARCHES = 19  # at most, each with other weights of the scenarios
+_EVALUATIONS = 60  # of one search
+_HASTE = 12  # power of its residual with which a scenario gains weight
+_STEEP = 5.0  # weight of what exceeds a limit
+_LINE = 0.3  # weight of a vibration's mean power; its largest is a limit
+_GAINS = 25  # sensor gains at which a step must be stable
+_ORDERS = 100  # in which the coefficients are rounded; the best one counts
+
+
 _NEGLIGIBLE = 1e-13  # of the largest coefficient; single precision has no use for less
 _SIGN = "actuators = -M2V u; y and u in the units of the mode, with the mirror's sign"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DirectFormLoop:
+    """One mode, whose controller is ``c = (b_0 .. b_M, a_1 .. a_M)``, in S scenarios.
+
+    With the path L and ``b = sum b_j z^-j``, ``a = 1 - sum a_i z^-i``, ``p = a + g L b`` at the
+    sensor gain g, the loop leaves ``a / p`` of the phase and ``L b / p`` of the noise.
+    """
+
+    powers: ComplexArray  # (F, M + 1), z^-j at each node
+    path: ComplexArray  # (F,)
+    path_taps: FloatArray  # of the path, in powers of z^-1
+    shares: FloatArray  # (F,) of the frequencies that a node stands for; their sum is 1
+    gains: tuple[float, ...]  # (S,) sensor gain of each scenario
+    phase_nm2: FloatArray  # (S, F) power of turbulence and skirts at each node
+    noise_nm2: FloatArray  # (S, F)
+    line_nm: FloatArray  # (S, F) rms of the vibration that may be there, or 0
+    spread_nm2: FloatArray  # (S, F) its power, spread evenly over its band
+    low: float  # ends of the sensor gains for which the loop is to be stable
+    high: float
+
+    def polynomials(self, c: FloatArray, sensor_gain: float) -> tuple[ComplexArray, ...]:
+        """Return a, b and p at the nodes, (F,) each."""
+        M = c.size // 2
+        b, a = self.powers @ c[: M + 1], 1 - self.powers[:, 1:] @ c[M + 1 :]
+        return a, b, a + sensor_gain * self.path * b
+
+    def slopes(self) -> tuple[ComplexArray, ComplexArray]:
+        """Return the slopes of a and of L b, (F, 2 M + 1) each."""
+        of_a = np.hstack([np.zeros_like(self.powers), -self.powers[:, 1:]])
+        of_b = np.hstack([self.path[:, None] * self.powers, np.zeros_like(self.powers[:, 1:])])
+        return of_a, of_b
+
+    def residuals_nm(self, c: FloatArray, *, rounding: bool = False) -> FloatArray:
+        """Return the rms of the residual in each scenario, in exact or in rounded arithmetic."""
+        variances = []
+        for s, gain in enumerate(self.gains):
+            a, b, p = self.polynomials(c, gain)
+            variance = self.phase_nm2[s] @ np.abs(a / p) ** 2
+            variance += self.noise_nm2[s] @ np.abs(self.path * b / p) ** 2
+            variance += np.max(self.line_nm[s] * np.abs(a / p)) ** 2
+            if rounding:
+                variance += self.sums_nm2(c, gain) * (self.shares @ np.abs(self.path / p) ** 2)
+            variances.append(variance)
+        return np.sqrt(variances)
+
+    def rounding_matrix(self, c: FloatArray, s: int) -> FloatArray:
+        """Return V: ``c' V c`` is the variance of the rounding of products and sums [nm^2]."""
+        gain = self.gains[s]
+        a, b, p = self.polynomials(c, gain)
+        memory = np.hstack([self.powers * (a / p)[:, None], self.powers[:, 1:] * (b / p)[:, None]])
+        phase = self.phase_nm2[s] + self.spread_nm2[s]
+        size = np.sqrt(gain**2 * phase + self.noise_nm2[s])[:, None] * memory
+        moments = (size.conj().T @ size).real
+        index = np.arange(c.size)
+        after = c.size - np.maximum(np.maximum.outer(index, index), 1)  # sums that hold both terms
+        variance: FloatArray = ROUNDING * (moments * after + np.diag(np.diag(moments)))
+        return variance
+
+    def sums_nm2(self, c: FloatArray, sensor_gain: float) -> float:
+        """Return the variance of the sums' rounding at a sensor gain, in units of measurements."""
+        return float(c @ self.rounding_matrix(c, self.gains.index(sensor_gain)) @ c)
+
+    def radius(self, c: FloatArray) -> float:
+        """Return the largest spectral radius over the sensor gains."""
+        M, extra = c.size // 2, self.path_taps.size - 1
+        gains = np.append(np.geomspace(self.low, self.high, _GAINS), 1.0)
+        a = np.concatenate([[1.0], -c[M + 1 :], np.zeros(extra)])
+        p = a + gains[:, None] * np.convolve(self.path_taps, c[: M + 1])
+        companion = np.tile(np.eye(M + extra, k=-1), (gains.size, 1, 1))
+        companion[:, 0] = -p[:, 1:] / p[:, :1]
+        return float(np.max(np.abs(np.linalg.eigvals(companion))))
+
+    @property
+    def bounded_gains(self) -> list[float]:
+        """Sensor gains at which the sensitivity has limits."""
+        return sorted({1.0, self.low, self.high, *self.gains})
+
+
+def mode_loops(design: Design, order: int) -> list[DirectFormLoop]:
+    """Return the loop of each mode of a shaped design, the same for equal ones; none of others."""
+    if not design.mode_specifications:
+        return []
+    hardware = require_hardware(design, "dao")
+    keys = list(zip(design.first_equal_modes, np.diag(hardware.sensor).tolist(), strict=True))
+    loops = {
+        (mode, sensor): mode_loop(hardware, design.mode_specifications[mode], order, sensor)
+        for mode, sensor in set(keys)
+    }
+    return [loops[key] for key in keys]
+
+
+def mode_loop(
+    hardware: LoopHardware, specification: Specification, order: int, sensor: float = 1.0
+) -> DirectFormLoop:
+    """Return the loop of one mode of a shaped design, at the frequencies that it was shaped at."""
+    single = hardware.single_mode()
+    channel = Channel(hardware=single, basis=laguerre_basis(1, 0.0, dt_s=single.dt_s))
+    grid = specification.grid(channel, fineness=2)
+    more = [grid.points_hz, *(grid.within(*band) for band in specification.bands_hz)]
+    f = np.concatenate([grid.nodes_hz, *more])
+    width = np.concatenate([grid.weights_hz, np.zeros(f.size - grid.nodes_hz.size)])
+    terms = leaves(specification.objective)
+    gains = tuple(sorted({term.sensor_gain for term in terms}, reverse=True))
+    phase, noise, line, spread = np.zeros((4, len(gains), f.size))
+    for term in terms:
+        s, spectrum = gains.index(term.sensor_gain), spectrum_of(term, single.frame_rate_hz)
+        phase[s] += 0.0 if spectrum is None else width * spectrum.psd(f)
+        if isinstance(term, ResidualVariance):
+            noise[s] += width / channel.nyquist_hz * term.noise_nm**2
+        else:
+            covered = (f >= term.low_hz) & (f <= term.high_hz)
+            line[s] = np.hypot(line[s], np.where(covered, term.rms_nm, 0.0))
+            evenly = np.where(covered, width, 0.0)
+            spread[s] += term.rms_nm**2 * evenly / np.sum(evenly)
+    low, high = demanded_gains([specification])
+    taps = sensor * np.concatenate([[0.0], single.mirror_taps])
+    powers = np.exp(-2j * np.pi * np.outer(f * single.dt_s, np.arange(max(order + 1, taps.size))))
+    return DirectFormLoop(
+        powers=powers[:, : order + 1],
+        path=powers[:, : taps.size] @ taps,
+        path_taps=taps,
+        shares=width / channel.nyquist_hz,
+        gains=gains,
+        phase_nm2=phase,
+        noise_nm2=noise,
+        line_nm=line,
+        spread_nm2=spread,
+        low=low,
+        high=high,
+    )
+
+
+def make_again(design: Design, exact: FloatArray) -> NDArray[np.float32]:
+    """Return a shaped design's matrix made again; without b_0 or at odd order the rounded one."""
+    order, rounded = len(exact) // 2, exact.astype(np.float32)
+    if order % 2 or not exact[0].all():
+        return rounded
+    made: dict[DirectFormLoop, NDArray[np.float32]] = {}
+    for mode, loop in enumerate(mode_loops(design, order)):
+        if loop not in made:
+            made[loop] = round_together(loop, refit(loop, exact[:, mode]))
+        rounded[:, mode] = made[loop]
+    return rounded
+
+
+def refit(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
+    """Return coefficients (2 M + 1,), M even, whose loop leaves least, rounding included."""
+    allowed_nm, limits = loop.residuals_nm(exact), _limits(loop, exact)
+    theta, weights = _sections(_widened(exact)), np.ones(len(loop.gains))
+    for _ in range(_SEARCHES):
+        theta = _search(loop, theta, np.sqrt(weights) / allowed_nm, limits)
+        lost = loop.residuals_nm(_coefficients(theta), rounding=True) / allowed_nm
+        if np.max(lost) < 1 + LOSS / 4:  # the rest is for the rounded coefficients
+            break
+        weights *= lost**_HASTE
+        weights /= np.mean(weights)
+    return _coefficients(theta)
+
+
+def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float32]:
+    """Round coefficients in the best of many orders; the rest makes up for each in p."""
+    of_a, of_b = loop.slopes()
+    seen = np.concatenate(
+        [(of_a + g * of_b) / loop.polynomials(exact, g)[2][:, None] for g in loop.bounded_gains]
+    )
+    used = np.flatnonzero(exact)
+    step = np.spacing(np.abs(exact[used]).astype(np.float32)).astype(np.float64)
+    triangle = np.linalg.qr(np.concatenate([seen.real, seen.imag])[:, used] * step)[1]
+    steps, rng = exact[used] / step, np.random.default_rng(0)
+    least, best = np.inf, steps
+    for _ in range(_ORDERS):
+        order = rng.permutation(used.size)
+        R, wanted, nearest = np.linalg.qr(triangle[:, order])[1], steps[order], np.zeros(used.size)
+        for k in range(used.size - 1, -1, -1):
+            made_up = R[k, k + 1 :] @ (wanted[k + 1 :] - nearest[k + 1 :]) / R[k, k]
+            nearest[k] = np.round(wanted[k] + made_up)
+        miss = float(np.linalg.norm(R @ (nearest - wanted)))
+        if miss < least:
+            least, best = miss, nearest[np.argsort(order)]
+    rounded = np.zeros(exact.size, dtype=np.float32)
+    rounded[used] = best * step
+    return rounded
+
+
+def _widened(exact: FloatArray) -> FloatArray:
+    """Multiply both polynomials by a factor with roots away from z = 1, up to the order."""
+    M = exact.size // 2
+    b, a = np.trim_zeros(exact[: M + 1], "b"), np.r_[1.0, -np.trim_zeros(exact[M + 1 :], "b")]
+    spare = M + 1 - max(b.size, a.size)
+    angles = np.linspace(np.pi / 2, np.pi, spare // 2, endpoint=False)
+    roots = _RADIUS * np.concatenate(
+        [np.exp(1j * angles), np.exp(-1j * angles), [-1] * (spare % 2)]
+    )
+    factor, wide = np.poly(roots).real, np.zeros(2 * M + 1)
+    b, a = np.convolve(b, factor), np.convolve(a, factor)
+    wide[: b.size], wide[M + 1 : M + a.size] = b, -a[1:]
+    return wide
+
+
+def _limits(loop: DirectFormLoop, exact: FloatArray) -> dict[float, FloatArray]:
+    """Return what the sensitivity of the design does not exceed: in the bands, and everywhere."""
+    limits = {}
+    for gain in loop.bounded_gains:
+        a, _, p = loop.polynomials(exact, gain)
+        S = np.abs(a / p)
+        limits[gain] = np.full(S.size, np.max(S) if gain in (1.0, loop.low, loop.high) else np.inf)
+        for line in (loop.line_nm[s] for s, g in enumerate(loop.gains) if g == gain):
+            if np.any(band := line > 0):
+                limits[gain][band] = np.max((line * S)[band]) / line[band]
+    return limits
+
+
+def _search(
+    loop: DirectFormLoop,
+    theta: FloatArray,
+    shares: FloatArray,
+    limits: dict[float, FloatArray],
+) -> FloatArray:
+    """Descend from theta; a step to a loop that is unstable at any sensor gain is not taken."""
+    M, upper = theta.size // 2, np.full(theta.size, np.inf)
+    second = np.r_[1:M:2, M + 2 : 2 * M + 1 : 2]
+    upper[second] = np.maximum(_RADIUS, theta[second] + _ROOM)
+
+    def errors(x: FloatArray) -> FloatArray:
+        stable = loop.radius(_coefficients(x)) < 1
+        return _rows(loop, shares, limits, x)[0] + (0.0 if stable else np.inf)
+
+    def slopes(x: FloatArray) -> FloatArray:
+        return _rows(loop, shares, limits, x)[1]
+
+    return np.asarray(
+        least_squares(
+            errors,
+            theta,
+            jac=slopes,
+            bounds=(-np.inf, upper),
+            x_scale="jac",
+            max_nfev=_EVALUATIONS,
+            ftol=1e-5,
+            xtol=1e-12,
+        ).x
+    )
+
+
+def _rows(
+    loop: DirectFormLoop, shares: FloatArray, limits: dict[float, FloatArray], theta: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the errors, by the weights of a nanometre and limits of S, and their Jacobian."""
+    c, (of_a, of_b) = _coefficients(theta), loop.slopes()
+    blocks: list[tuple[FloatArray | ComplexArray, FloatArray | ComplexArray]] = []
+
+    def below(size: FloatArray, slope: FloatArray) -> None:
+        over = np.maximum(size - 1 + _ROOM, 0.0)
+        blocks.append((_STEEP * over, _STEEP * (over > 0)[:, None] * slope))
+
+    for gain, limit in limits.items():
+        a, b, p = loop.polynomials(c, gain)
+        S, T, dp = a / p, loop.path * b / p, of_a + gain * of_b
+        dS, dT = (of_a - S[:, None] * dp) / p[:, None], (of_b - T[:, None] * dp) / p[:, None]
+        below(np.abs(S) / limit, ((S.conj() / np.abs(S) / limit)[:, None] * dS).real)
+        for end in (loop.low, loop.high) if gain == 1 else ():
+            below((1 - end) * T.real, (1 - end) * dT.real)  # or the loop at it is unstable
+        for s in (s for s, g in enumerate(loop.gains) if g == gain):
+            size = shares[s] * np.sqrt(loop.phase_nm2[s] + _LINE * loop.spread_nm2[s])
+            blocks.append((size * S, size[:, None] * dS))
+            size = shares[s] * np.sqrt(loop.noise_nm2[s])
+            blocks.append((size * T, size[:, None] * dT))
+            V = loop.rounding_matrix(c, s)  # its own slopes are left out
+            sums = np.sqrt(c @ V @ c)
+            entry = shares[s] * np.sqrt(loop.shares) * loop.path / p
+            blocks.append((entry * sums, entry[:, None] * (V @ c / sums - sums * dp / p[:, None])))
+    # slopes in theta: each coefficient is linear in each number of theta
+    moved = np.array([_coefficients(theta + unit) - c for unit in np.eye(theta.size)]).T
+    errors, slopes = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    return np.concatenate([errors.real, errors.imag]), np.vstack([slopes.real, slopes.imag]) @ moved
+
+
+def _sections(c: FloatArray) -> FloatArray:
+    """Return theta: the quadratic sections of a, the factor of b, the sections of b."""
+    M = c.size // 2
+    sections = tf2sos(c[: M + 1], np.r_[1.0, -c[M + 1 :]])
+    b = sections[:, 1:3] / sections[:, :1]
+    return np.concatenate([sections[:, 4:].ravel(), c[:1], b.ravel()])
+
+
+def _coefficients(theta: FloatArray) -> FloatArray:
+    M = theta.size // 2
+    ones, sections_b = np.ones((M // 2, 1)), theta[M + 1 :].reshape(-1, 2)
+    b, a = sos2tf(np.hstack([ones, sections_b, ones, theta[:M].reshape(-1, 2)]))
+    return np.concatenate([theta[M] * b, -a[1:]])
+
+
+_Matrix: TypeAlias = NDArray[np.float32]
 
 
 def direct_form_rows(controller: Controller, order: int) -> FloatArray:

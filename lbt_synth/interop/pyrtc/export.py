@@ -103,7 +103,7 @@ class PolFilter:
         A[:, n:] += np.kron(self.taps, entry[:, :m])
         C = np.zeros((m, len(A)))
         C[:, n : n + m] = np.eye(m)  # the command sent, in the new state
-        whole = Controller(A=A, B=entry[:, :m] @ R, C=C, D=np.zeros((m, m)), dt_s=s.dt_s)
+        controller = Controller(A=A, B=entry[:, :m] @ R, C=C, D=np.zeros((m, m)), dt_s=s.dt_s)
 
         def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
             """Bound the rounding of the signal, of its product, of the sum and of the command."""
@@ -117,8 +117,8 @@ class PolFilter:
             ]
             return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.concatenate(squares))
 
-        entered = replace(whole, B=entry, D=np.zeros((m, 2 * m)))
-        return Written(controllers={frozenset(): whole}, entry=entered, variance=variance)
+        entered = replace(controller, B=entry, D=np.zeros((m, 2 * m)))
+        return Written(controllers={frozenset(): controller}, entry=entered, variance=variance)
 
 
 class InnerLoop:
@@ -174,7 +174,7 @@ def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> 
     A, B, C, D = (np.ascontiguousarray(matrix) for matrix in (own.A, own.B, own.C, own.D))
     own = replace(own, A=A, B=B @ response, C=C, D=D @ response)
     modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=m)
-    whole = close_loop(modal, own).commanding()
+    commanding = close_loop(modal, own).commanding()
     delay = max(1, int(hardware.delay_frames + 0.5))
     taps = np.zeros(max(delay, len(hardware.mirror_taps)))
     taps[: len(hardware.mirror_taps)] = hardware.mirror_taps
@@ -183,7 +183,7 @@ def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> 
         delay_frames=delay,
         response=response,
         taps=taps,
-        system=replace(whole, B=whole.B[:, m:], D=whole.D[:, m:]),
+        system=replace(commanding, B=commanding.B[:, m:], D=commanding.D[:, m:]),
     )
 
 

@@ -90,15 +90,15 @@ class SimulatedTelescope:
         self._signal.write(signal, frame_id=frame)
         while True:
             try:
-                found = self._corrector.read_after_publication(seen, timeout=_ANSWER_SECONDS)
+                answer = self._corrector.read_after_publication(seen, timeout=_ANSWER_SECONDS)
             except TimeoutError:
                 raise ProblemError(
                     f"pyRTC's loop must answer within {_ANSWER_SECONDS:g} s; it sent no command. "
                     "Start it, and read its log."
                 ) from None
-            if found.frame_id == frame:
-                return -np.asarray(found.payload[: measured.size], dtype=np.float64)
-            seen = found.count
+            if answer.frame_id == frame:
+                return -np.asarray(answer.payload[: measured.size], dtype=np.float64)
+            seen = answer.count
 
 
 class GainFilePredictor:
@@ -183,8 +183,8 @@ class GainFilePredictor:
             unit="nm",
         )
         method = self._design.method
-        known = method if method in record_methods() else None
-        self._take(design_from_record(record, method=known).design)
+        named = method if method in record_methods() else None
+        self._take(design_from_record(record, method=named).design)
         self.fitted = True
         return self
 

@@ -15,8 +15,14 @@ from lbt_synth.design import Design
 from lbt_synth.design.modal import MixedController
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.interop.specula.calibration import Calibration, cache_directory, calibrate
-from lbt_synth.interop.specula.optics import EndToEndSystem, Modes, Optics
+from lbt_synth.interop.specula.optics import (
+    Calibration,
+    EndToEndSystem,
+    Modes,
+    Optics,
+    cache_directory,
+    calibrate,
+)
 from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
 from lbt_synth.loop.simulation.run import SteppedController, run_frames
@@ -112,8 +118,8 @@ class EndToEndRun:
         y, phase = self.measurements[1:, modes], self.residual_nm[:-1, modes]
         power = np.sum(phase**2, axis=axis)
         gain = np.asarray(np.sum(y * phase, axis=axis) / power)
-        left = np.mean((y - gain * phase) ** 2, axis=axis)
-        return gain, np.asarray(np.sqrt(left / power)), np.asarray(np.sqrt(left))
+        rest = np.mean((y - gain * phase) ** 2, axis=axis)
+        return gain, np.asarray(np.sqrt(rest / power)), np.asarray(np.sqrt(rest))
 
     @property
     def tip_tilt_gain(self) -> float:

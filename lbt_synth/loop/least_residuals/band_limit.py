@@ -182,10 +182,7 @@ class _Band:
     def bounds(
         self, prediction: Prediction, added: FloatArray, worst: float
     ) -> tuple[float, float]:
-        """Lower bound [nm^2] of a density, and how far its filter's worst case is above it.
-
-        ``worst`` is the largest ``|P|^2 / Phi`` over the band.
-        """
+        """Lower bound [nm^2] of a density, and how far above it its filter's worst case is."""
         total = float(self.quadrature @ added)
         sigma2 = self.reference * np.exp(prediction.mean_log)
         rejection = prediction.error_power(self.x) / (self.base + added)

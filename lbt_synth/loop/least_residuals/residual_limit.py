@@ -23,7 +23,7 @@ from lbt_synth.models import (
     Truth,
     Vibration,
 )
-from lbt_synth.models.plant.readings import other_exposures
+from lbt_synth.models.plant.assembly import other_exposures
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
@@ -167,10 +167,7 @@ def truth_modes(
     in_image: bool,
     noise_nm2: FloatArray | None = None,
 ) -> tuple[FloatArray, list[ModeSpectrum]]:
-    """Decouple the modes of a truth, as :func:`decoupled_modes`.
-
-    ``noise_nm2`` (q, q) is that of the loop's own sensor by default.
-    """
+    """Decouple the modes of a truth; noise (q, q) is that of the own sensor by default."""
     require_instance(hardware, LoopHardware)
     require_instance(truth, Truth)
     lines, sinusoids = [], []

@@ -137,11 +137,7 @@ def draw_disturbance(
     zero_frame: int = 0,
     frame_means: bool = False,
 ) -> Disturbance:
-    """Draw the phase and the noise of all sensors of a loop.
-
-    Phase, noise and the readings of the other sensors have a random stream each. Resonances that
-    accelerometers of the loop see are continuous oscillators.
-    """
+    """Draw the phase and the noise of all sensors of a loop, each from a random stream."""
     rng, noise_rng, other_rng = np.random.default_rng(seed).spawn(3)
     size = {"frames": frames, "cases": cases}
     others = bool(hardware.suite.sensors)
@@ -177,11 +173,10 @@ def draw_phase(
 ) -> tuple[FloatArray, list[DrawnLine]]:
     """Draw the mean phase over each frame, (cases, frames, n) [nm], and each vibration.
 
-    Each part has its own random stream: a truth with one more vibration keeps its turbulence.
-    So has each mode where the modes have different spectra. Time 0 of a vibration that drifts is
-    frame ``zero_frame``. Resonances are AR2 processes; with ``oscillators`` those that channels
-    of the truth see are continuous oscillators. With ``frame_means`` spectra, and the rms of lines,
-    are those of the numbers that frames have.
+    Each part has its own random stream: a truth with one more vibration keeps its turbulence. Time
+    0 of a vibration that drifts is frame ``zero_frame``. With ``oscillators``, resonances that
+    channels of the truth see are continuous, others AR2 processes. With ``frame_means`` spectra,
+    and the rms of lines, are those of the numbers that frames have.
     """
     n = hardware.modes
     turbulence_rng, *line_rngs = rng.spawn(1 + len(truth.vibrations))
@@ -232,10 +227,9 @@ def _draw_line(
 
 
 def run_oscillator(seen: SeenVibration, line: Vibration, drive: FloatArray) -> FloatArray:
-    """Return mean positions and readings of a line, (cases, frames, 1 + c).
+    """Return mean positions and readings of a line, (cases, frames, 1 + c), by its drive.
 
-    The drive is (cases, 1 + frames, inputs), as that of a drawn line. Exposures that begin
-    before the first frame see the oscillator at rest there.
+    Exposures that begin before the first frame see the oscillator at rest there.
     """
     A, B, C, _ = seen.stacks()
     state = line.rms_nm * seen.still @ drive[:, 0, :2].T
@@ -257,11 +251,7 @@ def draw_others(
     cases: int,
     zero_frame: int,
 ) -> FloatArray:
-    """Draw noise and accelerations in the readings of the other sensors, (cases, frames, q).
-
-    What a wavefront sensor reads of the residual is no part of them. The lines are those of
-    :func:`draw_phase`, whose time 0 is frame ``zero_frame``.
-    """
+    """Draw noise and accelerations in the readings of the other sensors, (cases, frames, q)."""
     suite = hardware.suite
     factors = [sensor.noise_factor(hardware.modes) for sensor in suite.sensors]
     drawn = [rng.standard_normal((cases, frames, len(factor))) @ factor.T for factor in factors]
@@ -299,9 +289,7 @@ def _acceleration(
 ) -> FloatArray:
     """Return what a channel reads of a sinusoid, (cases, frames) [m/s^2].
 
-    A line that drifts counts with its frequency of the moment. That of one with a damping is an
-    approximation, good for a narrow line: its mean acceleration is not only ``-w^2`` times its mean
-    position.
+    That of a line which drifts and has a damping is an approximation, good for a narrow line.
     """
     if isinstance(line, DriftingVibration):
         frequency_hz = line.frequency_hz_at(time_s)

@@ -21,7 +21,7 @@ from lbt_synth.loop.closed_loop import ClosedLoop, close_loop, reads_others
 from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
 from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
-from lbt_synth.models.plant.readings import memory, other_exposures, own_exposure
+from lbt_synth.models.plant.assembly import memory, other_exposures, own_exposure
 from lbt_synth.storage.summaries import Summarised
 from lbt_synth.validation import FloatArray, choice, frozen_copy, integer, number, require_instance
 
@@ -239,10 +239,7 @@ def _started(
     hardware: LoopHardware,
     sensor_gain: float,
 ) -> tuple[SteppedController | RunningController, LoopHardware, ClosedLoop | None]:
-    """Return a controller that runs, the hardware with what it reads, and its loop if it is linear.
-
-    Other objects that step read the loop's own sensor.
-    """
+    """Return a running controller, the hardware that it reads, and a linear loop."""
     alone = hardware.own_sensor_alone()
     if isinstance(controller, EstimatorForm):
         return controller.start(), alone, None
@@ -298,10 +295,7 @@ def _record(
 def _held_squares(
     disturbance: Disturbance, commands: FloatArray, hardware: LoopHardware
 ) -> FloatArray:
-    """Return the mean square of the residual over the hold that begins in each frame.
-
-    It is (cases, frames, n); before the first command arrives the mirror is flat.
-    """
+    """Return the mean square (cases, frames, n) of the residual over each hold."""
     system, hold, m = hardware.mirror_system, hardware.mirror_system.hold, commands.shape[2]
     pieces, moving = disturbance.over_holds(hold)
     A, B, _ = system.core.repeated(m)
@@ -366,10 +360,7 @@ def _step(
     stroke: float,
     events: Mapping[int, Segment],
 ) -> FloatArray:
-    """Run the loop frame by frame; return ``phi_res, u, y``, (cases, frames, n + m + q).
-
-    Cases run side by side in a controller of ours, one after the other in others.
-    """
+    """Run the loop frame by frame; return ``phi_res, u, y``, (cases, frames, n + m + q)."""
     total, noise = disturbance.phase_nm, disturbance.noise_of(hardware.n_readings)
     together = isinstance(controller, RunningController)
     if len(total) > 1 and not together:

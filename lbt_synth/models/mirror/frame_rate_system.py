@@ -19,9 +19,9 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.state_space import balancing_scales
 from lbt_synth.models.mirror.position_loop import PositionLoop
+from lbt_synth.models.sensor_suite import WHOLE
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, set_fields
 
-_WHOLE = 1e-9  # relative amount by which the ratio of the rates may miss an integer
 _NOTHING = 1e-14  # a leading tap of at most this counts as zero
 _TAIL = 1e-15  # the taps end where at most this is left of the step response
 _MOST_TAPS = 4000
@@ -203,7 +203,7 @@ def samples_per_frame(loop: PositionLoop, frame_rate_hz: float) -> int:
             "loop at all."
         )
     samples = round(ratio)
-    if samples < 1 or abs(ratio - samples) > _WHOLE * ratio:
+    if samples < 1 or abs(ratio - samples) > WHOLE * ratio:
         counts = [n for n in (int(ratio) + 1, int(ratio)) if n > 0]
         fitting = " and ".join(f"{loop.sampling_hz / n:.9g}" for n in counts)
         raise ProblemError(
@@ -275,9 +275,11 @@ def _integrals(loop: PositionLoop, ways: FloatArray, ends: FloatArray) -> FloatA
     """
     per_sample = loop.position_integral(1.0) @ ways
     before = np.vstack([np.zeros(ways.shape[2]), np.cumsum(per_sample, axis=0)])
-    whole = np.minimum(ends.astype(np.int64), len(ways) - 1)
-    parts = [loop.position_integral(end - i) @ ways[i] for i, end in zip(whole, ends, strict=True)]
-    return np.asarray(before[whole] + np.array(parts))
+    started = np.minimum(ends.astype(np.int64), len(ways) - 1)
+    parts = [
+        loop.position_integral(end - i) @ ways[i] for i, end in zip(started, ends, strict=True)
+    ]
+    return np.asarray(before[started] + np.array(parts))
 
 
 def _taps(core: Response) -> FloatArray:
@@ -290,8 +292,8 @@ def _taps(core: Response) -> FloatArray:
             f"of {radius:.9g} per frame. Raise the bandwidth or the damping of its local loop."
         )
     taps = core.impulse(frames)
-    left = np.cumsum(np.abs(taps[::-1]))[::-1]
-    taps = taps[: max(int(np.sum(left > _TAIL)), 1)]
+    rest = np.cumsum(np.abs(taps[::-1]))[::-1]
+    taps = taps[: max(int(np.sum(rest > _TAIL)), 1)]
     return np.asarray(taps / taps.sum())
 
 

@@ -165,7 +165,7 @@ class PositionLoop:
             If a value is out of its range, the loop would lower stiffness or damping, or it
             is unstable.
         """
-        own = 2 * np.pi * number(natural_frequency_hz, "natural_frequency_hz", above=0)
+        natural = 2 * np.pi * number(natural_frequency_hz, "natural_frequency_hz", above=0)
         air = number(damping, "damping", at_least=0)
         bandwidth = number(
             bandwidth_hz,
@@ -177,14 +177,14 @@ class PositionLoop:
         ratio = number(
             bandwidth_damping,
             "bandwidth_damping",
-            at_least=air * own / wanted * (1 - 1e-12),
+            at_least=air * natural / wanted * (1 - 1e-12),
             hint="The air film alone damps more than that.",
         )
         return cls(
             natural_frequency_hz=natural_frequency_hz,
             damping=damping,
-            proportional_per_s2=wanted**2 - own**2,
-            derivative_per_s=max(2 * ratio * wanted - 2 * air * own, 0.0),
+            proportional_per_s2=wanted**2 - natural**2,
+            derivative_per_s=max(2 * ratio * wanted - 2 * air * natural, 0.0),
             **options,
         )
 

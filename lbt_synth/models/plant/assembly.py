@@ -12,12 +12,183 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lbt_synth.models.ar_model import padded_coefficients
-from lbt_synth.models.plant.parts import PlantParts, held_frames
-from lbt_synth.models.plant.readings import memory, other_exposures
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.resonance_spectrum import coefficients, section_drives
-from lbt_synth.validation import FloatArray
+from lbt_synth.models.sensor_suite import WHOLE, Motions, checked_motions, period_frames
+from lbt_synth.models.spectra import ARModel, padded_coefficients
+from lbt_synth.models.vibration import Vibration, checked_direction
+from lbt_synth.validation import FloatArray, set_fields
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlantParts:
+    """Loop, turbulence, vibrations and noise, which fit each other."""
+
+    hardware: LoopHardware  # with the sensor gain that the design assumes in its sensor matrix
+    turbulence: tuple[ARModel, ...]  # one per mode
+    vibrations: tuple[Vibration, ...]
+    noise_factor: FloatArray  # (q, q): square root of the noise covariance of the loop's own sensor
+    motions: Motions = ()  # of the channels that each vibration moves; of none by default
+
+    def __post_init__(self) -> None:
+        n, rate = self.hardware.modes, self.hardware.frame_rate_hz
+        if len(self.turbulence) != n:
+            raise DimensionError(
+                f"turbulence must be one ARModel, or one per mode ({n}); got "
+                f"{len(self.turbulence)}."
+            )
+        for model in self.turbulence:
+            if not np.isclose(model.frame_rate_hz, rate, rtol=1e-9):
+                raise ProblemError(
+                    f"the turbulence model must be sampled at the frame rate {rate:.6g} Hz; got "
+                    f"{model.frame_rate_hz:.6g} Hz."
+                )
+        for line in self.vibrations:
+            checked_direction(line, self.hardware)
+        lines = len(self.vibrations)
+        motions = self.motions if any(self.motions) else ({},) * lines
+        set_fields(self, motions=checked_motions(motions, self.hardware.suite, lines))
+        for line, motion in zip(self.vibrations, self.motions, strict=True):
+            if line.sections > 1 and motion:
+                raise ProblemError(
+                    f"a bump of {line.sections} sections moves no channel of an accelerometer; got "
+                    f"the motion of {', '.join(motion)} with that at {line.frequency_hz:.6g} Hz. "
+                    "Try sections=1, or leave the motion out."
+                )
+
+    @property
+    def order(self) -> int:
+        """Largest order of a turbulence model."""
+        return max(model.order for model in self.turbulence)
+
+    @property
+    def sections(self) -> int:
+        """Number of resonances, those of a bump each counted."""
+        return sum(line.sections for line in self.vibrations)
+
+    @property
+    def size(self) -> int:
+        """Number of states of the plant of the loop's own sensor."""
+        blocks = self.order + held_frames(self.hardware)
+        return 2 * self.sections + blocks * self.hardware.modes
+
+
+def held_frames(hardware: LoopHardware) -> int:
+    """Return how many frames of the total phase the state of a plant holds."""
+    return max(int(np.ceil(hardware.delay_frames)), 2) - 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Exposure:
+    """Readings of a sensor: the mean of a signal over a period, some frames ago."""
+
+    response: FloatArray  # (q, n)
+    age_frames: float  # of the oldest frame that a reading averages
+    period: int  # frames from one reading to the next; readings are in frames 0, period, ...
+
+
+def own_exposure(hardware: LoopHardware) -> Exposure:
+    """Return the readings of the loop's own sensor: the residual of the last frame."""
+    return Exposure(response=hardware.sensor, age_frames=1.0, period=1)
+
+
+def other_exposures(hardware: LoopHardware) -> list[Exposure]:
+    """Return the readings of the other wavefront sensors of a loop."""
+    return [
+        Exposure(
+            response=sensor.response(hardware.modes),
+            age_frames=sensor.age_frames(hardware),
+            period=period_frames(sensor, hardware),
+        )
+        for sensor in hardware.suite.wavefront
+    ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Memory:
+    """System from a signal to the readings of sensors, of samples before, at each phase."""
+
+    A: FloatArray  # (N, h, h); nothing is remembered where there is no sensor, h = 0
+    B: FloatArray  # (N, h, n)
+    C: FloatArray  # (N, q, h)
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[2])
+
+
+def memory(exposures: list[Exposure], modes: int, period: int) -> Memory:
+    """Return the system from a signal s(k) (n,) to the readings in frame k, of s before k.
+
+    An exposure ends in frame e with the mean of the frames since the last end; the sum of a period
+    that has begun and the readings that wait are its states. Where an exposure ends within a frame,
+    that frame counts for both exposures, in part.
+    """
+    blocks = [_exposure_memory(exposure, modes, period) for exposure in exposures]
+    states = [block[0].shape[1] for block in blocks]
+    rows = [block[2].shape[1] for block in blocks]
+    A, B = np.zeros((period, sum(states), sum(states))), np.zeros((period, sum(states), modes))
+    C = np.zeros((period, sum(rows), sum(states)))
+    x = y = 0
+    for (a, b, c), n, q in zip(blocks, states, rows, strict=True):
+        A[:, x : x + n, x : x + n], B[:, x : x + n], C[:, y : y + q, x : x + n] = a, b, c
+        x, y = x + n, y + q
+    return Memory(A=A, B=B, C=C)
+
+
+def _exposure_memory(
+    exposure: Exposure, modes: int, period: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return A, B, C of the memory of one sensor, with states [sum, newest reading, older...]."""
+    frames, age = exposure.period, int(np.floor(exposure.age_frames + WHOLE))
+    late = exposure.age_frames - age  # by which the exposure ends before its last frame does
+    late = 0.0 if late < WHOLE else late
+    held = 1 + (age - frames) // frames  # readings that wait when one is taken
+    sums = int(frames > 1 or late > 0)  # states before the readings
+    size = sums + held
+    ends = (frames - age - 1) % frames  # frame of the period in which an exposure ends
+    A, B = np.zeros((period, size, size)), np.zeros((period, size))
+    for t in range(period):
+        if t % frames == ends:
+            B[t, sums] = (1 - late) / frames
+            A[t, sums + 1 :, sums:-1] = np.eye(held - 1)
+            if sums:
+                A[t, 1, 0], B[t, 0] = 1.0, late / frames
+        else:
+            A[t], B[t, :sums] = np.eye(size), 1 / frames
+    C = np.zeros((len(exposure.response), size * modes))
+    C[:, -modes:] = exposure.response
+    identity = np.eye(modes)
+    stack = np.broadcast_to(C, (period, *C.shape))
+    return np.asarray(np.kron(A, identity)), np.asarray(np.kron(B[:, :, None], identity)), stack
+
+
+def known_states(hardware: LoopHardware) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return A, B, C, D of what commands make: the mirror's states, and corrections that wait.
+
+    They are stacks (N, ...). In frame k they are driven by u(k-1), so that the corrections
+    remembered are those before k - 1, and the reading adds the one of k - 1. The measurements are
+    those of all sensors.
+    """
+    waiting = memory(other_exposures(hardware), hardware.modes, hardware.period)
+    mirror = hardware.mirror_system.whole
+    A_m, B_m, C_m = mirror.repeated(hardware.n_commands)
+    position, direct = hardware.influence @ C_m, mirror.D * hardware.influence
+    period, v, w = len(waiting.A), len(A_m), waiting.n_states
+    last = np.roll(np.arange(period), 1)  # the phase before
+    A, B = np.zeros((period, v + w, v + w)), np.zeros((period, v + w, hardware.n_commands))
+    A[:, :v, :v], B[:, :v] = A_m, B_m
+    A[:, v:, v:], A[:, v:, :v] = waiting.A[last], waiting.B[last] @ position
+    B[:, v:] = waiting.B[last] @ direct
+    q0, q1 = hardware.n_measurements, waiting.C.shape[1]
+    C = np.zeros((period, hardware.n_readings, v + w))
+    D = np.zeros((period, hardware.n_readings, hardware.n_commands))
+    C[:, :q0, :v], C[:, q0 : q0 + q1] = -hardware.sensor @ position, -waiting.C @ A[:, v:]
+    D[:, :q0], D[:, q0 : q0 + q1] = -hardware.sensor @ direct, -waiting.C @ B[:, v:]
+    return A, B, C, D
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -33,8 +204,8 @@ class PlantMatrices:
 
 def plant_matrices(parts: PlantParts) -> PlantMatrices:
     """Return the matrices of a plant from its parts."""
-    own = _own_matrices(parts)
-    return _with_other_sensors(own, parts) if parts.hardware.suite.sensors else own
+    alone = _own_matrices(parts)
+    return _with_other_sensors(alone, parts) if parts.hardware.suite.sensors else alone
 
 
 def _own_matrices(parts: PlantParts) -> PlantMatrices:
@@ -101,7 +272,7 @@ def _companion(coefficients: FloatArray) -> FloatArray:
     return A
 
 
-def _with_other_sensors(own: PlantMatrices, parts: PlantParts) -> PlantMatrices:
+def _with_other_sensors(alone: PlantMatrices, parts: PlantParts) -> PlantMatrices:
     """Add to the plant of the own sensor what the others remember and read."""
     hardware, period = parts.hardware, parts.hardware.period
     # the plant's state is that of the frame in which u(k) acts: older readings by so many frames
@@ -111,22 +282,22 @@ def _with_other_sensors(own: PlantMatrices, parts: PlantParts) -> PlantMatrices:
         for exposure in other_exposures(hardware)
     ]
     waiting = memory(late, hardware.modes, period)
-    shaken = _shaken_plant(own, parts, ahead)
+    shaken = _shaken_plant(alone, parts, ahead)
     newest = 2 * parts.sections + parts.order * hardware.modes
-    total = own.A[newest : newest + hardware.modes]  # total(k) from x(k): it is held in x(k+1)
+    total = alone.A[newest : newest + hardware.modes]  # total(k) from x(k): it is held in x(k+1)
     n, w = shaken.A.shape[1], waiting.n_states
-    to_own = np.hstack([shaken.to_own, np.zeros((len(own.A), w))])
+    to_own = np.hstack([shaken.to_own, np.zeros((len(alone.A), w))])
     A = np.zeros((period, n + w, n + w))
     A[:, :n, :n], A[:, n:, n:] = shaken.A, waiting.A
     A[:, n:] += waiting.B @ (total @ to_own)
-    q0, q1, q2 = len(own.C), waiting.C.shape[1], len(shaken.C)
+    q0, q1, q2 = len(alone.C), waiting.C.shape[1], len(shaken.C)
     C = np.zeros((period, q0 + q1 + q2, n + w))
-    C[:, :q0], C[:, q0 : q0 + q1, n:], C[:, q0 + q1 :, :n] = own.C @ to_own, waiting.C, shaken.C
+    C[:, :q0], C[:, q0 : q0 + q1, n:], C[:, q0 + q1 :, :n] = alone.C @ to_own, waiting.C, shaken.C
     noise = hardware.suite.noise_factor(parts.noise_factor, hardware.modes)
     drives = shaken.B.shape[1]
     B, D = np.zeros((n + w, drives + len(noise))), np.zeros((len(noise), drives + len(noise)))
     B[:n, :drives], D[:, drives:] = shaken.B, noise
-    return PlantMatrices(A=A, B=B, C=C, D=D, L=own.L @ to_own)
+    return PlantMatrices(A=A, B=B, C=C, D=D, L=alone.L @ to_own)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -139,23 +310,23 @@ class _ShakenPlant:
     to_own: FloatArray  # (n0, n): to the states of the loop's own plant, older samples left out
 
 
-def _shaken_plant(own: PlantMatrices, parts: PlantParts, ahead: int) -> _ShakenPlant:
+def _shaken_plant(alone: PlantMatrices, parts: PlantParts, ahead: int) -> _ShakenPlant:
     """Put the oscillators that accelerometers see in the place of their vibrations."""
     hardware, motions, suite = parts.hardware, parts.motions, parts.hardware.suite
-    q0, period = len(own.C), hardware.period
+    q0, period = len(alone.C), hardware.period
     seen = [j for j, motion in enumerate(motions) if motion]
     lines = [
         seen_vibration(parts.vibrations[j], motions[j], suite.accelerometers, hardware, ahead=ahead)
         for j in seen
     ]
-    kept = np.delete(np.arange(len(own.A)), [*seen, *(parts.sections + j for j in seen)])
-    drives = np.delete(np.arange(own.B.shape[1] - q0), seen)
+    kept = np.delete(np.arange(len(alone.A)), [*seen, *(parts.sections + j for j in seen)])
+    drives = np.delete(np.arange(alone.B.shape[1] - q0), seen)
     size, width = len(kept) + sum(s.n_states for s in lines), len(drives)
-    to_own, C = np.zeros((len(own.A), size)), np.zeros((len(suite.channels), size))
+    to_own, C = np.zeros((len(alone.A), size)), np.zeros((len(suite.channels), size))
     to_own[kept, : len(kept)] = np.eye(len(kept))
     A = np.zeros((period, size, size))
     B = np.zeros((size, width + sum(s.B.shape[-1] for s in lines)))
-    B[: len(kept), :width] = own.B[np.ix_(kept, drives)]
+    B[: len(kept), :width] = alone.B[np.ix_(kept, drives)]
     row = len(kept)
     for j, line in zip(seen, lines, strict=True):
         line_A, line_B, line_C, _ = line.stacks()
@@ -166,5 +337,5 @@ def _shaken_plant(own: PlantMatrices, parts: PlantParts, ahead: int) -> _ShakenP
         channels = [i for i, name in enumerate(suite.channels) if name in motions[j]]
         C[channels, states] = line_C[0, 1:]
         row, width = states.stop, width + moved
-    A[:, : len(kept)] = own.A[kept] @ to_own
+    A[:, : len(kept)] = alone.A[kept] @ to_own
     return _ShakenPlant(A=A, B=B, C=C, to_own=to_own)

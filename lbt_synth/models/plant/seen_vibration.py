@@ -80,42 +80,8 @@ def seen_vibration(
 ) -> SeenVibration:
     """Return a line and what each channel that it moves reads of it, in the channels' order.
 
-    Parameters
-    ----------
-    line : Vibration
-        The line, whose rms is that of the oscillator's position.
-    motion : mapping
-        :class:`Motion` of each channel that the line moves.
-    accelerometers : sequence of Accelerometer
-        The instruments.
-    hardware : LoopHardware
-        The loop.
-    ahead : int, optional
-        Frames by which the newest frame of the state comes after that of the readings.
-
-    Returns
-    -------
-    SeenVibration
-        The process, of the common period of the accelerometers that see the line.
-
-    Raises
-    ------
-    ProblemError
-        If the line is not below the Nyquist frequency, or a delay is too short.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.models.plant.seen_vibration import seen_vibration
-    >>> line = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=500)
-    >>> mirror = lbt.models.Accelerometer(
-    ...     name="mirror", rate_hz=800, delay_frames=1, channels=("m1",), noise_m_s2=1e-3
-    ... )
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> seen = seen_vibration(line, {"m1": lbt.models.Motion(size=1)}, (mirror,), path)
-    >>> position_nm, reading_m_s2 = np.sqrt(np.diag(seen.output_covariances()[0]))
-    >>> round(float(position_nm), 2), round(float(reading_m_s2), 4)
-    (495.43, 0.083)
+    The newest frame of the state comes ``ahead`` frames after that of the readings; the period is
+    the common one of the accelerometers that see the line.
     """
     require_below_nyquist(line.frequency_hz, hardware.frame_rate_hz)
     exposures = [
@@ -222,8 +188,8 @@ def _sampled(angle: float, damping: float) -> tuple[FloatArray, FloatArray]:
     The oscillator has the angular frequency ``angle``, the force a unit density.
     """
     rates = np.array([[0.0, 1.0, 0.0], [-(angle**2), -2 * damping * angle, 0.0], [1.0, 0.0, 0.0]])
-    whole = np.zeros((6, 6))
-    whole[:3, :3], whole[3:, 3:], whole[1, 4] = -rates, rates.T, 1.0
-    both = expm(whole)
+    generator = np.zeros((6, 6))
+    generator[:3, :3], generator[3:, 3:], generator[1, 4] = -rates, rates.T, 1.0
+    both = expm(generator)
     transition = both[3:, 3:].T
     return transition, np.asarray(np.linalg.cholesky(symmetrise(transition @ both[:3, 3:])))

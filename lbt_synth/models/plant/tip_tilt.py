@@ -23,27 +23,70 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem
 from lbt_synth.linear.estimation_problem import LONGEST_HORIZON
-from lbt_synth.models.ar_model import ARModel
-from lbt_synth.models.disturbance_facts import disturbance_facts
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.mirror.position_loop import PositionLoop
-from lbt_synth.models.plant.assembly import plant_matrices
-from lbt_synth.models.plant.full_state import FullStatePlant
-from lbt_synth.models.plant.parts import PlantParts
-from lbt_synth.models.plant.readings import known_states
+from lbt_synth.models.plant.assembly import PlantParts, known_states, plant_matrices
 from lbt_synth.models.sensor_suite import Motions, SensorSuite, noise_factor
-from lbt_synth.models.truth import Entering
-from lbt_synth.models.vibration import Vibration
+from lbt_synth.models.spectra import ARModel
+from lbt_synth.models.truth import Entering, disturbance_facts
+from lbt_synth.models.vibration import Vibration, spread_lines
 from lbt_synth.storage.rows import fact_table
 from lbt_synth.storage.summaries import Summary
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     FloatArray,
-    frozen_copy,
     integer,
     one_or_each,
     require_instance,
 )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FullForm:
+    """The paper's full form of a plant: with the mirror's states, past commands if it settles.
+
+    ``x(k+1) = A x(k) + B_known u(k-1) + B w(k)``, ``y(k) = C x(k) + D_known u(k-1) + D w(k)``;
+    ``L`` is the paper's F. Where sensors have a longer period, all but D and L are stacks of a
+    matrix for each phase.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    L: FloatArray
+    B_known: FloatArray
+    D_known: FloatArray  # zero from a delay of two frames up
+    dt_s: float
+
+    @property
+    def n_states(self) -> int:
+        """Number of states n."""
+        return int(self.L.shape[1])
+
+    def controller(self, gain_predictor: FloatArray, to_command: FloatArray) -> Controller:
+        """Return the controller ``u(k) = to_command x_hat(k+1 | k)``, in new-state form.
+
+        The past command u(k-1) is ``to_command x_hat(k | k-1)`` and needs no state of its own. The
+        known input has no error, so that the gain is over the reduced state, (r, q).
+        """
+        gain = self._padded(gain_predictor)
+        applied = self.B_known - gain @ self.D_known
+        A = self.A - gain @ self.C + applied @ to_command
+        D = np.zeros((len(to_command), gain.shape[-1]))
+        return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s, applied=applied)
+
+    def estimator(self, gain_predictor: FloatArray) -> Controller:
+        """Return the estimator of z from ``[y(k), u(k-1)]``, in new-state form."""
+        gain = self._padded(gain_predictor)
+        B = np.concatenate([gain, self.B_known - gain @ self.D_known], axis=-1)
+        D = np.zeros((len(self.L), B.shape[-1]))
+        return Controller(A=self.A - gain @ self.C, B=B, C=self.L, D=D, dt_s=self.dt_s)
+
+    def _padded(self, gain: FloatArray) -> FloatArray:
+        """Return a gain over the reduced state as one over all states."""
+        shape = (*gain.shape[:-2], self.n_states - gain.shape[-2], gain.shape[-1])
+        return np.concatenate([gain, np.zeros(shape)], axis=-2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,7 +128,7 @@ class TipTiltPlant(EstimationProblem):
         facts = disturbance_facts(self.turbulence, self.vibrations, deviations)
         return Summary(tables=[fact_table("Plant", self.hardware.facts(), facts)])
 
-    def full(self) -> FullStatePlant:
+    def full(self) -> FullForm:
         """Return the same plant with the mirror's states, which are past commands if it settles.
 
         Examples
@@ -101,36 +144,31 @@ class TipTiltPlant(EstimationProblem):
         """
         A_known, B_known, C_known, D_known = known_states(self.hardware)
         (A, B, C, _), n, past = self.stacks(), self.n_states, A_known.shape[-1]
-        whole = np.zeros((self.period, n + past, n + past))
-        whole[:, :n, :n], whole[:, n:, n:] = A, A_known
+        A_full = np.zeros((self.period, n + past, n + past))
+        A_full[:, :n, :n], A_full[:, n:, n:] = A, A_known
         entry = np.concatenate([np.zeros((self.period, n, B_known.shape[-1])), B_known], axis=1)
-        single = self.period == 1
-        return FullStatePlant(
-            A=whole,
-            B=np.concatenate([B, np.zeros((self.period, past, B.shape[-1]))], axis=1),
-            C=np.concatenate([C, C_known], axis=2),
+        stacks = {
+            "A": A_full,
+            "B": np.concatenate([B, np.zeros((self.period, past, B.shape[-1]))], axis=1),
+            "C": np.concatenate([C, C_known], axis=2),
+            "B_known": entry,  # u(k-1) is the input
+            "D_known": D_known,
+        }
+        return FullForm(
+            **{name: stack[0] if self.period == 1 else stack for name, stack in stacks.items()},
             D=self.D,
             L=np.hstack([self.L, np.zeros((len(self.L), past))]),
-            read=self.read,
-            B_known=frozen_copy(entry[0] if single else entry),  # u(k-1) is the input
-            D_known=frozen_copy(D_known[0] if single else D_known),
-            reduced=self,
             dt_s=self.dt_s,
         )
-
-    @property
-    def reduced(self) -> TipTiltPlant:
-        """The plant itself: a full form has its reduced form by this name."""
-        return self
 
     def controller(self, gain_predictor: FloatArray) -> Controller:
         """Return the controller from y(k) to u(k), the known input included, in new-state form.
 
         Its states are those of the reduced estimator, to which the gain (n, q) belongs, and the
-        mirror's.
+        mirror's; ``u(k) = N^+ L x_hat(k+1 | k)``.
         """
         full = self.full()
-        return full.controller(self._padded(gain_predictor, full))
+        return full.controller(self.checked_gain(gain_predictor), self.hardware.projector @ full.L)
 
     def estimator(self, gain_predictor: FloatArray) -> Controller:
         """Estimator of z from ``[y(k), u(k-1)]``, whatever gave that command, in new-state form.
@@ -138,8 +176,7 @@ class TipTiltPlant(EstimationProblem):
         The known input is removed exactly, so the estimation error does not depend on it. The
         predictor gain is over the reduced state, (n, q).
         """
-        full = self.full()
-        return full.estimator(self._padded(gain_predictor, full))
+        return self.full().estimator(self.checked_gain(gain_predictor))
 
     def ahead(self, frames: int) -> TipTiltPlant:
         """Plant of the estimate of ``z(k + frames)`` from y up to k: a loop of another delay.
@@ -267,12 +304,6 @@ class TipTiltPlant(EstimationProblem):
         require_instance(suite, SensorSuite, "suite")
         hardware = replace(self.hardware, suite=suite)
         return assemble(replace(self.parts(), hardware=hardware, motions=motions))
-
-    def _padded(self, gain_predictor: FloatArray, full: FullStatePlant) -> FloatArray:
-        """Gain over the full state; the known input has no error and needs no gain."""
-        gain = self.checked_gain(gain_predictor)
-        shape = (*gain.shape[:-2], full.n_states - self.n_states, gain.shape[-1])
-        return np.concatenate([gain, np.zeros(shape)], axis=-2)
 
 
 def tip_tilt_plant(
@@ -403,3 +434,53 @@ def retuned_plant(
 def with_vibrations(plant: TipTiltPlant, vibrations: Sequence[Vibration]) -> TipTiltPlant:
     """Return a plant with other vibrations, all else being the same."""
     return assemble(replace(plant.parts(), vibrations=tuple(vibrations)))
+
+
+def spread_plant(plant: TipTiltPlant, *, half_width_hz: float, lines: int = 5) -> TipTiltPlant:
+    """Return a plant whose vibrations have a distribution of frequencies.
+
+    Each vibration becomes several of the same direction, decay rate and rms. Their sum has the mean
+    spectrum of the plants with one of these frequencies each, so :func:`kalman` of the result has
+    the least variance on average over the distribution.
+
+    Parameters
+    ----------
+    plant : TipTiltPlant
+        The plant.
+    half_width_hz : float
+        The frequencies are the mid-points of equal parts of [f - h, f + h], for each f [Hz].
+    lines : int, optional
+        Number of parts, at most 64.
+
+    Returns
+    -------
+    TipTiltPlant
+        The plant, with as many vibrations for each one.
+
+    Raises
+    ------
+    ProblemError
+        If there is no vibration, or a frequency leaves (0, Nyquist).
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
+    >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
+    >>> plant = lbt.tip_tilt_plant(
+    ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
+    ... )
+    >>> spread = lbt.models.spread_plant(plant, half_width_hz=1.0, lines=4)
+    >>> [line.frequency_hz for line in spread.vibrations]
+    [19.25, 19.75, 20.25, 20.75]
+    """
+    parts = plant.parts()  # refuses the memory of a mixed filter
+    if not plant.vibrations:
+        raise ProblemError(
+            "a frequency prior needs a plant with a vibration; got one without any. Try "
+            "tip_tilt_plant(..., vibrations=[Vibration(...)])."
+        )
+    shares = [spread_lines(line, half_width_hz, lines) for line in plant.vibrations]
+    spread = tuple(line for share in shares for line in share)
+    motions = tuple(motion for motion in plant.motions for _ in range(lines))
+    return assemble(replace(parts, vibrations=spread, motions=motions))

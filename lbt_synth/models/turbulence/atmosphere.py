@@ -3,24 +3,36 @@
 Sources: R. J. Noll, J. Opt. Soc. Am. 66, 207 (1976), doi:10.1364/JOSA.66.000207
 (Zernike filter functions); J.-M. Conan, G. Rousset, P.-Y. Madec, J. Opt. Soc.
 Am. A 12, 1559 (1995), doi:10.1364/JOSAA.12.001559 (temporal spectra under
-Taylor's hypothesis).
+Taylor's hypothesis). The spectrum scales with ``seeing^(5/3)`` and is a function of ``f D / V``,
+so that of many flows only each outer scale needs a table. Over an octave of the outer scale, a
+polynomial interpolates the logarithm of the spectrum.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import factorial
+from typing import Any
 
 import numpy as np
+from numpy.polynomial import chebyshev
 from numpy.polynomial.polynomial import polyval
 from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline, PPoly
 from scipy.special import j0, j1
 
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.validation import FloatArray, Obstruction, Positive, check_fields, real_array
+from lbt_synth.validation import (
+    FloatArray,
+    IntArray,
+    Obstruction,
+    Positive,
+    check_fields,
+    positive,
+    real_array,
+)
 
 ARCSEC_RAD = np.pi / 180 / 3600
 LOWEST = 1e-4  # spectra are constant below this frequency, in units of V / D
@@ -28,6 +40,10 @@ TAIL = np.linspace(12, 120, 400)  # last knots of spectra, in these units
 _AT_ONCE = 10  # frequencies of a spectrum that are integrated together, in the cache
 _SERIES = [(-1) ** k / (factorial(k) * factorial(k + 2)) for k in range(8)]  # of J_2
 _VON_KARMAN = 0.0228956  # phase spectrum constant, Noll's 0.023 to more digits
+
+
+_PER_LOOP = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")
+_TERMS = 12  # of the polynomial over an octave of the outer scale
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -198,3 +214,139 @@ def tilt_spline(scale_ratio: float, obstruction: float) -> LogSpline:
             density.append(4 * spectrum @ wy)
     knots = np.log(np.concatenate([slow, fast]))
     return LogSpline(spline=CubicSpline(knots, np.log(np.concatenate(density))))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrozenFlows:
+    """Frozen von Karman layers, one per loop, over the telescope of one atmosphere.
+
+    Parameters
+    ----------
+    atmosphere : Atmosphere
+        The telescope, and the default values.
+    seeing_arcsec, wind_speed_m_s, outer_scale_m : (p,) array_like, optional
+        Seeing [arcsec], wind speed [m/s] and outer scale [m] of each loop, or one number for
+        all; those of the atmosphere by default.
+
+    Raises
+    ------
+    ProblemError
+        If a value is not above 0.
+    DimensionError
+        If they are not lists of the same length.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> air = lbt.Atmosphere(
+    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
+    ... )
+    >>> flows = lbt.models.FrozenFlows(atmosphere=air, seeing_arcsec=[0.8, 1.6])
+    >>> (flows.psd([5.0]) / air.psd([5.0])).round(4).ravel().tolist()
+    [1.0, 3.1748]
+    """
+
+    atmosphere: Atmosphere
+    seeing_arcsec: Any = None
+    wind_speed_m_s: Any = None
+    outer_scale_m: Any = None
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        given = {}
+        for name in _PER_LOOP:
+            value = getattr(self, name)
+            value = getattr(self.atmosphere, name) if value is None else value
+            if value is None:  # Kolmogorov
+                continue
+            given[name] = np.atleast_1d(positive(value, name))
+        try:
+            arrays = np.broadcast_arrays(*given.values())
+        except ValueError as error:
+            shapes = ", ".join(f"{name} {value.shape}" for name, value in given.items())
+            raise DimensionError(
+                f"seeing, wind and outer scale must be lists of the same length; got {shapes}."
+            ) from error
+        if arrays[0].ndim != 1:
+            raise DimensionError(f"they must be lists, one number per loop; got {arrays[0].shape}.")
+        check_fields(self, **dict(zip(given, arrays, strict=True)))
+
+    def __len__(self) -> int:
+        """Return the number of loops p."""
+        return int(self.seeing_arcsec.size)
+
+    def take(self, rows: IntArray) -> FrozenFlows:
+        """Return the flows of some loops."""
+        arrays = {name: getattr(self, name) for name in _PER_LOOP}
+        return replace(self, **{n: value[rows] for n, value in arrays.items() if value is not None})
+
+    def psd(self, frequency_hz: ArrayLike) -> FloatArray:
+        """One-sided temporal power spectra (p, f) of one axis [nm^2/Hz] at frequencies (f,) [Hz].
+
+        A frequency that is not a finite number above 0 raises a ProblemError.
+        """
+        shapes, which, factors = self.factored_psd(frequency_hz)
+        return np.asarray(shapes[which] * factors[:, None])
+
+    def factored_psd(self, frequency_hz: ArrayLike) -> tuple[FloatArray, IntArray, FloatArray]:
+        """Shapes (u, f) of the spectra, which of them each loop has, and its factor, (p,) each.
+
+        Spectra of the same wind and outer scale have one shape. For the frequencies see
+        :meth:`psd`.
+        """
+        frequency = real_array(frequency_hz, "frequency_hz")
+        if frequency.ndim != 1 or np.any(frequency <= 0):
+            raise ProblemError("frequency_hz must be a list of frequencies above 0 Hz.")
+        air = self.atmosphere
+        crossing_s = air.diameter_m / self.wind_speed_m_s
+        # pairs as complex numbers, which are sorted several times faster
+        unique, which = np.unique(crossing_s + 1j * self._scale_ratio, return_inverse=True)
+        x = np.log(frequency) + np.log(unique.real[:, None])
+        values = np.empty(x.shape)
+        ratios = np.unique(unique.imag)
+        if len(ratios) <= _TERMS:  # a polynomial needs as many tables
+            for ratio in ratios:
+                rows = unique.imag == ratio
+                values[rows] = tilt_spline(float(ratio), air.obstruction)(x[rows])
+        else:
+            _interpolate_over_scales(x, unique.imag, air.obstruction, values)
+        return np.exp(values), which.reshape(-1), self._strength * crossing_s
+
+    @property
+    def _strength(self) -> FloatArray:
+        seeing = self.seeing_arcsec / self.atmosphere.seeing_arcsec
+        return np.asarray(tilt_strength_nm2(self.atmosphere) * seeing ** (5 / 3))
+
+    @property
+    def _scale_ratio(self) -> FloatArray:
+        if self.outer_scale_m is None:
+            return np.zeros(len(self))
+        return np.asarray(self.atmosphere.diameter_m / self.outer_scale_m)
+
+
+def _interpolate_over_scales(
+    x: FloatArray, scale_ratio: FloatArray, obstruction: float, values: FloatArray
+) -> None:
+    """Fill in the logarithms of spectra that each have their own outer scale."""
+    octave = np.floor(np.log2(scale_ratio))
+    for number in np.unique(octave):
+        knots, coefficients = _octave_splines(int(number), obstruction)
+        rows = np.flatnonzero(octave == number)
+        place = 2 * (np.log2(scale_ratio[rows]) - number) - 1
+        for row, terms in zip(rows, chebyshev.chebvander(place, _TERMS - 1), strict=True):
+            spline = PPoly(coefficients @ terms, knots)
+            values[row] = LogSpline(spline=spline)(x[row])
+
+
+@lru_cache(maxsize=16)
+def _octave_splines(octave: int, obstruction: float) -> tuple[FloatArray, FloatArray]:
+    """Knots, and spline coefficients (4, intervals, terms), over one octave of outer scales.
+
+    The coefficients are polynomials in the logarithm of the diameter over the outer scale.
+    """
+    nodes = chebyshev.chebpts1(_TERMS)
+    ratios = 2.0 ** (octave + (nodes + 1) / 2)
+    splines = [tilt_spline(float(ratio), obstruction).spline for ratio in ratios]
+    inverse = np.linalg.inv(chebyshev.chebvander(nodes, _TERMS - 1))
+    stacked = np.stack([spline.c for spline in splines], axis=-1)
+    return splines[0].x, stacked @ inverse.T

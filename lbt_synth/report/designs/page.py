@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -14,13 +14,8 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.loop.simulation.run import Drop
 from lbt_synth.models.sensor_suite import OWN_SENSOR
-from lbt_synth.report.designs.report import DesignReport, summary_table, verdict
-from lbt_synth.report.draw import (
-    Figure,
-    count_columns,
-    drawing,
-    square_in,
-)
+from lbt_synth.report.designs.report import DesignAssessment, DesignReport, summary_table, verdict
+from lbt_synth.report.draw import Figure, count_columns, drawing, square_in
 from lbt_synth.report.figures.loops import (
     FREQUENCY,
     draw_bode,
@@ -29,13 +24,19 @@ from lbt_synth.report.figures.loops import (
     draw_steps,
     sigma_curves,
 )
-from lbt_synth.report.figures.records import SPECTRUM, TIME, run_spectra, sensor_failure_figure
+from lbt_synth.report.figures.records import (
+    SERIES_S,
+    SPECTRUM,
+    TIME,
+    run_spectra,
+    sensor_failure_figure,
+)
 from lbt_synth.report.figures.studies import (
     FREQUENCY_ERROR,
+    SENSOR_GAIN,
     limits_figure,
     robustness_map_figure,
     strehl_axis,
-    strehl_ends,
 )
 from lbt_synth.report.page.html import (
     Block,
@@ -43,22 +44,15 @@ from lbt_synth.report.page.html import (
     Notice,
     Page,
     chart,
-    creation_time,
+    new_page,
     paragraph,
-    read_source,
-    require_letters,
-    source_section,
     survival_blocks,
-    time_text,
 )
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies.limits import TruthComparison, compare_in_truth
 from lbt_synth.studies.robustness import run_failures
-
-_PANELS = 6  # of one figure that has a panel per design: they fit a sheet
-_EXCERPT = 400  # frames of a simulated series
 
 
 def design_page(report: DesignReport, *, title: str | None = None) -> Page:
@@ -79,7 +73,9 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
     Raises
     ------
     ProblemError
-        If the title is empty, or cannot be shown.
+        If the title is empty.
+    FileError
+        If the configuration or a gain file cannot be read again.
 
     Examples
     --------
@@ -94,24 +90,27 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
     heading = f"Controllers for {source}" if title is None else title.strip()
     if not heading:
         raise ProblemError("title must hold at least one letter; got an empty text.")
-    require_letters(heading, "title")
-    count, names = len(report.assessments), listing_text(report.names)
-    sections: dict[str, tuple[str, Sequence[Block]]] = {
-        "summary": ("Summary", _summary_blocks(report)),
-        "transfer": ("Transfer functions", _transfer_blocks(report)),
-        "errors": ("Robustness", _robustness_charts(report)),
-        "dynamics": ("Dynamics", _dynamics_charts(report)),
-        "simulation": ("Simulation", _simulation_blocks(report)),
-        "certificates": ("Certificates", _certificate_blocks(report)),
-        **source_section(
-            report.files, versions=report.versions, texts={source: report.config_text}
-        ),
-    }
-    return Page(
-        title=heading,
-        subtitle=f"{count_text(count, 'design')}: {names}. Made {time_text(report.made)}.",
-        sections=sections,
+    return new_page(
+        heading,
+        f"{count_text(len(report.assessments), 'design')}: {listing_text(report.names)}",
+        {
+            "Summary": _summary_blocks(report),
+            "Transfer functions": _transfer_blocks(report),
+            "Robustness": _robustness_charts(report),
+            "Dynamics": _dynamics_charts(report),
+            "Simulation": _simulation_blocks(report),
+            "Certificates": _certificate_blocks(report),
+        },
+        sources=_sources(report.config, report.gain_files),
     )
+
+
+def _sources(
+    config: Config, gain_files: Mapping[str, str | os.PathLike[str]]
+) -> list[tuple[str | os.PathLike[str], str]]:
+    """Return the files that designs came from, and what each is."""
+    gains = [(path, f"gain file of {name}") for name, path in gain_files.items()]
+    return [(config.source, "configuration"), *gains]
 
 
 def _summary_blocks(report: DesignReport) -> list[Block]:
@@ -205,37 +204,26 @@ def _robustness_charts(report: DesignReport) -> list[Chart]:
     if report.stable:
         figure = limits_figure(report.limits, over_errors=True)
         charts = [_strehl_chart(report), chart("limits", figure)]
-    ends = strehl_ends([one.map for one in report.assessments])
-    for number, batch in _sheets(report.assessments):
-        maps = {one.name: one.map for one in batch}
-        figure = robustness_map_figure(maps, real_gain=report.real_gain, ends=ends)
-        charts.append(chart(f"map{number}", figure))
-    return charts
-
-
-def _sheets(items: Sequence[Any]) -> Iterator[tuple[str, Sequence[Any]]]:
-    """Yield the items of figures that each fit a sheet of paper, and the end of their keys."""
-    for start in range(0, len(items), _PANELS):
-        number = f"-{start // _PANELS + 1}" if start else ""
-        yield number, items[start : start + _PANELS]
+    maps = {one.name: one.map for one in report.assessments}
+    figure = robustness_map_figure(maps, real_gain=report.real_gain)
+    return [*charts, chart("map", figure)]
 
 
 def _strehl_chart(report: DesignReport) -> Chart:
     """Strehl ratio over the frequency error, or the sensor gain for a truth without vibrations."""
     by_gain = report.errors_hz.size == 1
+    drawn = report.assessments if by_gain else report.stable
+    curves = {
+        one.name: (one.map.sensor_gains, 100 * one.map.strehl[0, :, 0])
+        if by_gain
+        else (report.errors_hz, 100 * one.strehls)
+        for one in drawn
+    }
+    axis = strehl_axis(np.concatenate([percents for _, percents in curves.values()]))
     with drawing([2.5]) as (panel,):
-        worst = np.concatenate([100 * one.curve.strehl[0, 0] for one in report.stable] or [[0.0]])
-        y_axis = strehl_axis(worst) | ({"low": 0.0} if by_gain else {})
-        panel.set_axes(
-            {"label": "sensor gain", "unit": "-"} if by_gain else FREQUENCY_ERROR, y_axis
-        )
-        for one in report.assessments:
-            x, percents = one.curve.errors_hz, 100 * one.curve.strehl[0, 0]
-            if by_gain:
-                x, percents = one.map.sensor_gains, 100 * one.map.strehl[0, :, 0]
-            draw_design(
-                panel, report.names, one.name, x, percents if by_gain or one.stable else None
-            )
+        panel.set_axes(SENSOR_GAIN if by_gain else FREQUENCY_ERROR, axis)
+        for name in report.names:
+            draw_design(panel, report.names, name, *curves.get(name, ((), None)))
         if by_gain:
             panel.rule("real sensor gain", report.real_gain, dash=3)
     key = "sensor-gain" if by_gain else "robustness"
@@ -244,15 +232,7 @@ def _strehl_chart(report: DesignReport) -> Chart:
 
 def _dynamics_charts(report: DesignReport) -> list[Chart]:
     """Poles, and step responses."""
-    poles = [
-        (one.loop.system.poles, np.linalg.eigvals(one.design.controller.A))
-        for one in report.assessments
-    ]
-    reach = 1.06 * max(1.0, *(float(np.max(np.abs(values))) for pair in poles for values in pair))
-    charts = [
-        chart(f"poles{number}", _draw_poles(batch, reach))
-        for number, batch in _sheets(list(zip(report.assessments, poles, strict=True)))
-    ]
+    charts = [chart("poles", _draw_poles(report.assessments))]
     if not report.stable:
         return charts
     loops = {one.name: one.loop for one in report.stable}
@@ -260,22 +240,25 @@ def _dynamics_charts(report: DesignReport) -> list[Chart]:
     return [*charts, chart("step", draw_steps(loops), frame=frame)]
 
 
-def _draw_poles(designs: Sequence[Any], reach: float) -> Figure:
+def _draw_poles(designs: Sequence[DesignAssessment]) -> Figure:
     """Draw the poles of the closed loop and of the controller of each design."""
-    columns = count_columns(len(designs))
-    turn = np.exp(1j * np.linspace(0, 2 * np.pi, 361))
+    poles = [(one.loop.system.poles, np.linalg.eigvals(one.design.controller.A)) for one in designs]
+    reach = 1.06 * max(
+        1.0, float(np.max(np.abs(np.concatenate([p for both in poles for p in both]))))
+    )
+    columns, turn = count_columns(len(designs)), np.exp(1j * np.linspace(0, 2 * np.pi, 361))
     real, imaginary = (
         {"label": f"{part} part", "unit": "-", "low": -reach, "high": reach}
         for part in ("real", "imaginary")
     )
+    points: dict[str, Any] = {"line": False, "filled": False, "size": 6.0}
     with drawing([square_in(columns)] * len(designs), columns=columns) as panels:
-        for panel, (one, (loop, controller)) in zip(panels, designs, strict=True):
+        for panel, one, (loop, controller) in zip(panels, designs, poles, strict=True):
             title = one.name if one.stable else f"{one.name}: unstable"
             panel.set_axes(real, imaginary, title=title, equal=True)
             panel.curve("unit circle", turn.real, turn.imag, look=None, width=1.0, numbers=False)
-            points: dict[str, Any] = {"line": False, "filled": False, "size": 6.0}
-            own = {"look": 1, "marker": "o", **points}
-            panel.curve("controller alone", controller.real, controller.imag, **own)
+            rings = {"look": 1, "marker": "o", **points}
+            panel.curve("controller alone", controller.real, controller.imag, **rings)
             panel.curve("closed loop", loop.real, loop.imag, look=0, marker="x", **points)
     return panels[0].figure
 
@@ -287,30 +270,28 @@ def _simulation_blocks(report: DesignReport) -> list[Block]:
     if not runs:
         return ["No loop is stable, so none was simulated."]
     rate_hz, frames = runs[0][1].frame_rate_hz, runs[0][1].residual_nm.shape[1]
-    time_s = np.arange(min(frames, _EXCERPT)) / rate_hz
-    reach = 1.05 * max(float(np.max(np.abs(run.residual_nm[0, :_EXCERPT, 0]))) for _, run in runs)
+    shown = min(frames, int(SERIES_S * rate_hz))
+    time_s = np.arange(shown) / rate_hz
+    reach = 1.05 * max(float(np.max(np.abs(run.residual_nm[0, :shown, 0]))) for _, run in runs)
     residual = {"label": "residual", "unit": "nm", "low": -reach, "high": reach}
-    text = f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}."
-    series: list[Block] = []
-    spectra: list[Block] = []
-    for number, batch in _sheets(runs):
-        with drawing([0.95] * len(batch)) as panels:
-            for panel, (one, run) in zip(panels, batch, strict=True):
-                panel.set_axes(TIME, residual, title=one.name)
-                style: dict[str, Any] = {"look": report.names.index(one.name), "dash": 0}
-                y = run.residual_nm[0, :_EXCERPT, 0]
-                panel.curve("residual", time_s, y, quiet=True, width=0.9, **style)
-        series.append(chart(f"series{number}", panels[0].figure, duration=f"{time_s[-1]:.2f}"))
-        columns = count_columns(len(batch))
-        with drawing([2.2] * len(batch), columns=columns) as panels:
-            for panel, (one, run) in zip(panels, batch, strict=True):
-                panel.set_axes(FREQUENCY, SPECTRUM, title=one.name)
-                f, opened, left, exact = run_spectra(run, one.loop, report.config.truth)
-                panel.curve("before the correction", f, opened, look=None, width=0.8)
-                panel.curve("residual, simulated", f, left, look=5, dash=0)
-                panel.curve("residual, exact", f, exact, look=1, width=1.4)
-        spectra.append(chart(f"spectra{number}", panels[0].figure))
-    return [text, *series, *spectra]
+    with drawing([0.95] * len(runs)) as series:
+        for panel, (one, run) in zip(series, runs, strict=True):
+            panel.set_axes(TIME, residual, title=one.name)
+            style: dict[str, Any] = {"look": report.names.index(one.name), "dash": 0}
+            y = run.residual_nm[0, :shown, 0]
+            panel.curve("residual", time_s, y, quiet=True, width=0.9, **style)
+    with drawing([2.2] * len(runs), columns=count_columns(len(runs))) as spectra:
+        for panel, (one, run) in zip(spectra, runs, strict=True):
+            panel.set_axes(FREQUENCY, SPECTRUM, title=one.name)
+            f, opened, simulated, exact = run_spectra(run, one.loop, report.config.truth)
+            panel.curve("before the correction", f, opened, look=None, width=0.8)
+            panel.curve("residual, simulated", f, simulated, look=5, dash=0)
+            panel.curve("residual, exact", f, exact, look=1, width=1.4)
+    return [
+        f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}.",
+        chart("series", series[0].figure, duration=f"{time_s[-1]:.2f}"),
+        chart("spectra", spectra[0].figure),
+    ]
 
 
 _AWAY_S = 1.0  # that each sensor is missing, and that all are there again
@@ -328,31 +309,23 @@ def sensors_page(
     The truth of the configuration must be stationary. The page gives the digests of the files that
     designs came from.
     """
-    source, content = read_source(config.source, "configuration")
-    text = content.decode("utf-8-sig", errors="replace")
-    gains = [read_source(file, f"gain file of {name}")[0] for name, file in gain_files.items()]
-    files = [source, *gains]
     compared = compare_in_truth(designs, config)
     opening = _truth_blocks(config, compared, ("phase_margin_deg",))
     if compared.limit is not None:
         least = nm_text(compared.limit.rms_nm, ".1f", unit="nm rms")
         opening.insert(0, f"No controller of the loop's own sensor alone leaves less than {least}.")
-    sections: dict[str, tuple[str, Sequence[Block]]] = {"summary": ("Summary", opening)}
+    sections: dict[str, Sequence[Block]] = {"Summary": opening}
     for number, (name, design) in enumerate(designs.items(), start=1):
         failures = design.tables()[0]
-        blocks: tuple[Block, ...] = (
+        sections[f"Design {name}"] = (
             fact_table(name, design.facts()),
             row_table(failures.title, failures.rows),
             _failure_chart(config, name, design, f"failures-{number}"),
             row_table("Certificate, computed again", design.recertify().checks),
         )
-        sections[f"design-{number}"] = (name, blocks)
-    page = Page(
-        title=title or f"Several sensors for {config.source.name}",
-        subtitle=f"{listing_text(list(designs))}. Made {time_text(creation_time())}.",
-        sections={**sections, **source_section(files, texts={source[0]: text})},
-    )
-    return page, compared
+    heading = title or f"Several sensors for {config.source.name}"
+    sources = _sources(config, gain_files)
+    return new_page(heading, listing_text(list(designs)), sections, sources=sources), compared
 
 
 def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart:

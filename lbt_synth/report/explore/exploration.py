@@ -21,16 +21,17 @@ from lbt_synth.linear import hinf_norm, largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.method import Method, Section
-from lbt_synth.methods.registry import all_methods, default_method, design_title, method_named
+from lbt_synth.methods.registry import METHODS, default_method, design_title, method_named
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Vibration
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.report.designs.report import frequency_errors, require_compatible
 from lbt_synth.report.figures.loops import frequency_grid
-from lbt_synth.report.figures.records import exact_spectrum
+from lbt_synth.report.figures.records import SEGMENT, exact_spectrum
 from lbt_synth.storage.display_unit import nm_text, shown_unit
 from lbt_synth.storage.rows import fact, facts, row_table
 from lbt_synth.storage.tables import Table
+from lbt_synth.storage.words import count_text
 from lbt_synth.studies import robustness_map
 from lbt_synth.studies.limits import compare_in_truth
 from lbt_synth.validation import ComplexArray, FloatArray
@@ -64,10 +65,14 @@ class Knob:
         """The unit that people see, and the factor to it."""
         return shown_unit(self.unit)
 
+    def acts_on(self, method: str) -> bool:
+        """Whether it changes the designs of a method."""
+        return self.methods is None or method in self.methods
+
 
 def list_knobs(config: Config) -> tuple[Knob, ...]:
     """Return what can be moved in a configuration: the loop and the sky, then the design."""
-    own = (knob for method in all_methods().values() for knob in _method_knobs(method, config))
+    own = (knob for method in METHODS.values() for knob in _method_knobs(method, config))
     return (*_loop_knobs(config), *_model_knobs(config), *own)
 
 
@@ -80,15 +85,8 @@ def shift_range_hz(config: Config) -> tuple[float, float]:
 def _loop_knobs(config: Config) -> Iterator[Knob]:
     """Yield the knobs of what the real loop meets."""
     delay, gain = config.settings.loop.delay_frames, config.truth.sensor_gain * config.sensor_gain
-    yield Knob(
-        "delay",
-        "total delay",
-        "frames",
-        1.0,
-        max(6.0, delay),
-        delay,
-        _setter("loop", "delay_frames"),
-    )
+    edit, most = _setter("loop", "delay_frames"), max(6.0, delay)
+    yield Knob("delay", "total delay", "frames", 1.0, most, delay, edit)
     yield Knob("gain", "real sensor gain", "", gain / 5, 2.5 * gain, gain, _scale_sensor_gain)
     noise_nm = float(np.sqrt(np.mean(np.square(config.noise_nm))))
     if noise_nm > 0:
@@ -117,7 +115,7 @@ def _model_knobs(config: Config) -> Iterator[Knob]:
     lines = config.settings.model.vibrations
     if not lines:
         return
-    filters = [method for method in all_methods().values() if method.estimator]
+    filters = [method for method in METHODS.values() if method.estimator]
     methods = frozenset(method.name for method in filters)
     damping = float(np.exp(np.mean(np.log([line.damping for line in lines]))))
     knob = _factor_knob("damping", "assumed damping", "", damping, 10.0, _scale_damping)
@@ -260,13 +258,12 @@ def _true_lines(config: Config, content: Content) -> list[Content]:
 
 
 _POINTS, _NEAR_A_LINE = 240, 28  # frequencies of a curve: in all, and on each side of a line
-_SHIFTS = 15
-_SEGMENT = 2048  # frames of a segment of the spectrum
+_SHIFTS = 15  # of the true lines, for which a Strehl ratio is computed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Shown:
-    """A design on the page: first its curves, then what it leaves; nan in an unstable loop."""
+    """What the page shows of a design; nan in an unstable loop."""
 
     frequency_hz: FloatArray  # (f,)
     error_nm: FloatArray | None  # (f,): norm of the estimation error; None without an estimate
@@ -275,10 +272,12 @@ class Shown:
     spectrum_nm2_hz: FloatArray  # (f,): of the residual, sum over the axes
     broken: ComplexArray  # (q, f): loop gain of each measurement, the others closed
     poles: ComplexArray  # of the closed loop
-    # residual [nm rms], Strehl ratio and modulus margin where the true lines are now
-    left: tuple[float, float, float] | None = None
-    shift_hz: FloatArray | None = None  # (s,): by which the true lines are moved from the start
-    strehls: FloatArray | None = None  # (s,): Strehl ratio there, in [0, 1]
+    shift_hz: FloatArray  # (s,): by which the true lines are moved from the start
+    strehls: FloatArray  # (s,): Strehl ratio there, in [0, 1]
+    # where the true lines are now
+    residual_nm: float
+    strehl: float
+    modulus: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -300,7 +299,6 @@ class View:
     shift_hz: float  # of the true lines
     design: Design
     shown: Mapping[str, Shown]
-    is_whole: bool = False  # whether what the designs leave is that of this view
 
     @property
     def name(self) -> str:
@@ -322,7 +320,7 @@ def moved_knobs(
     return {
         knob: min(max(float(values[knob.key]), knob.low), knob.high)
         for knob in knobs
-        if knob.key in values and (knob.methods is None or method in knob.methods)
+        if knob.key in values and knob.acts_on(method)
     }
 
 
@@ -351,38 +349,37 @@ def fulfil(
     return build_config(settings, config.source), request
 
 
-def quick_view(
+def new_view(
     exploration: Exploration,
     method: str | None = None,
     values: Mapping[str, float] = MappingProxyType({}),
-    before: View | None = None,
 ) -> View:
-    """Design, and return the view with its curves; the view before lends what is not yet known."""
+    """Design, and return what the page shows of the design and of those to compare with."""
     name, knobs = method or default_method(), exploration.knobs
     config, request = fulfil(name, values, knobs, exploration.config)
     shifts = (v for knob, v in moved_knobs(name, values, knobs).items() if knob.key == SHIFT)
-    design, label = config.design(request), request.method.label
-    own = f"{label} by the sliders" if label in exploration.designs else label
-    shown = {
-        name: loop_curves(one, config) for name, one in {own: design, **exploration.designs}.items()
-    }
-    if before is not None:
-        shown = {
-            name: replace(one, left=last.left, shift_hz=last.shift_hz, strehls=last.strehls)
-            for (name, one), last in zip(shown.items(), before.shown.values(), strict=True)
-        }
+    design, label, shift_hz = config.design(request), request.method.label, next(shifts, 0.0)
+    if label in exploration.designs:
+        label += " by the sliders"
     return View(
         values=values,
         config=config,
         request=request,
-        shift_hz=next(shifts, 0.0),
+        shift_hz=shift_hz,
         design=design,
-        shown=shown,
+        shown={
+            name: show_design(each, config, exploration.config, shift_hz)
+            for name, each in {label: design, **exploration.designs}.items()
+        },
     )
 
 
-def loop_curves(design: Design, config: Config) -> Shown:
-    """Return the curves of a design in the loop of a configuration."""
+def show_design(design: Design, config: Config, start: Config, shift_hz: float) -> Shown:
+    """Return what a design does in the loop of a configuration.
+
+    The true lines have moved there by a shift from where they are at the start, and move on for the
+    Strehl ratio over their shift.
+    """
     hardware, truth = config.hardware, config.truth
     loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     density = {"points": _POINTS, "near": _NEAR_A_LINE}
@@ -391,6 +388,17 @@ def loop_curves(design: Design, config: Config) -> Shown:
     response = loop.system.frequency_response(grid)
     returned = response[:, n + m :, n:].diagonal(axis1=1, axis2=2).T
     stable, nothing = loop.is_stable, np.full(grid.size, np.nan)
+    lines = {name: getattr(start.truth, name) for name in ("vibrations", "frequency_errors_hz")}
+    shifts = np.unique(np.append(np.linspace(*shift_range_hz(start), _SHIFTS), shift_hz))
+    image = robustness_map(
+        design,
+        replace(truth, **lines),
+        config.imaging,
+        hardware=hardware,
+        errors_hz=shifts,
+        sensor_gains=[truth.sensor_gain],
+    )
+    now = int(np.searchsorted(shifts, shift_hz))
     return Shown(
         frequency_hz=grid,
         error_nm=largest_singular_values(design.error_system(), grid)
@@ -398,41 +406,15 @@ def loop_curves(design: Design, config: Config) -> Shown:
         else None,
         rejection=spectral_norms(response[:, :n, :n]) if stable else nothing,
         noise_transfer=spectral_norms(response[:, :n, n:]) if stable else nothing,
-        spectrum_nm2_hz=exact_spectrum(loop, truth, grid, _SEGMENT) if stable else nothing,
+        spectrum_nm2_hz=exact_spectrum(loop, truth, grid, SEGMENT) if stable else nothing,
         broken=1 / returned - 1,
         poles=loop.system.poles,
+        shift_hz=shifts,
+        strehls=image.strehl[0, 0],
+        residual_nm=float(image.residual_nm[0, 0, now]),
+        strehl=float(image.strehl[0, 0, now]),
+        modulus=1 / float(hinf_norm(loop.output_sensitivity())) if stable else np.nan,
     )
-
-
-def whole_view(exploration: Exploration, view: View) -> View:
-    """Return a view with what its designs leave."""
-    designs = (view.design, *exploration.designs.values())
-    shown = {
-        name: complete(one, design, view, exploration.config)
-        for (name, one), design in zip(view.shown.items(), designs, strict=True)
-    }
-    return replace(view, shown=shown, is_whole=True)
-
-
-def complete(one: Shown, design: Design, view: View, start: Config) -> Shown:
-    """Return a design with what it leaves if the true lines move from where they are at start."""
-    hardware, config = view.config.hardware, view.config
-    lines = {n: getattr(start.truth, n) for n in ("vibrations", "frequency_errors_hz")}
-    truth = replace(config.truth, **lines)
-    shifts = np.unique(np.append(np.linspace(*shift_range_hz(start), _SHIFTS), view.shift_hz))
-    grid = robustness_map(
-        design,
-        truth,
-        config.imaging,
-        hardware=hardware,
-        errors_hz=shifts,
-        sensor_gains=[truth.sensor_gain],
-    )
-    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    now = int(np.searchsorted(shifts, view.shift_hz))
-    modulus = 1 / float(hinf_norm(loop.output_sensitivity())) if loop.is_stable else np.nan
-    left = float(grid.residual_nm[0, 0, now]), float(grid.strehl[0, 0, now]), modulus
-    return replace(one, left=left, shift_hz=shifts, strehls=grid.strehl[0, 0])
 
 
 def explored_table(shown: Mapping[str, Shown]) -> Table:
@@ -440,12 +422,11 @@ def explored_table(shown: Mapping[str, Shown]) -> Table:
     rows = [
         facts(
             design=fact(name, "design"),
-            residual_nm=fact(one.left[0], "residual", unit="nm", format=".1f", missing="unstable"),
-            strehl=fact(one.left[1], "Strehl ratio", unit="%", scale=100, format=".2f"),
-            modulus=fact(one.left[2], "modulus margin", format=".3f"),
+            residual=fact(one.residual_nm, "residual", unit="nm", format=".1f", missing="unstable"),
+            strehl=fact(one.strehl, "Strehl ratio", unit="%", scale=100, format=".2f"),
+            modulus=fact(one.modulus, "modulus margin", format=".3f"),
         )
         for name, one in shown.items()
-        if one.left is not None
     ]
     return row_table("", rows)
 
@@ -461,13 +442,17 @@ def describe_moves(exploration: Exploration, view: View) -> str:
 
 def judge(view: View) -> str:
     """Return the verdict on the design of a view, in sentences."""
-    compared = compare_in_truth({view.name: view.design}, view.config)
+    config, controller = view.config, view.design.controller
+    # the design knows the loop, but for its real sensor gain
+    nominal, gain = loop_margins(close_loop(config.hardware, controller)), config.truth.sensor_gain
+    low, high, now = (config.sensor_gain * g for g in (nominal.gain_low, nominal.gain_high, gain))
+    checks = count_text(len(view.design.certificate.checks), "check")
+    certified = f"certified ({checks}), and stable for sensor gains of {low:.3g} to {high:.3g}"
+    compared = compare_in_truth({view.name: view.design}, config)
     own, *others = compared.rows
-    passed = f"All {len(view.design.certificate.checks)} checks of its certificate passed."
     if not own.stable:
-        return f"{view.name} is UNSTABLE in this loop. {passed}"
-    hardware, gain = view.config.hardware, view.config.truth.sensor_gain
-    margins = loop_margins(close_loop(hardware, view.design.controller, sensor_gain=gain))
+        return f"{view.name} is {certified}; at {now:.3g} this loop is UNSTABLE."
+    margins = loop_margins(close_loop(config.hardware, controller, sensor_gain=gain))
     residual, strehl = nm_text(own.residual_nm, ".1f", unit="nm rms"), 100 * own.strehl
     sentences = [f"{view.name} leaves {residual}, Strehl ratio {strehl:.1f} %"]
     if compared.limit is not None:
@@ -482,5 +467,5 @@ def judge(view: View) -> str:
     )
     sentences.append(f"it {margins.survival.removesuffix('.')}")
     sentences += [f"WARNING: {text.removesuffix('.')}" for text in margins.fragilities]
-    sentences += compared.warnings[view.name]
-    return ". ".join(text[0].upper() + text[1:] for text in sentences) + f". {passed}"
+    sentences += [*compared.warnings[view.name], f"it is {certified}"]
+    return "".join(f"{text[0].upper()}{text[1:]}. " for text in sentences).strip()

@@ -1,4 +1,4 @@
-"""The page of sliders: its figures, and the server, with one session per open page.
+"""The page of sliders: widgets and figures of Bokeh, and the server, with a session per open page.
 
 Scales of figures move in steps, so that curves move in them; designs are made in threads.
 """
@@ -6,41 +6,48 @@ Scales of figures move in steps, so that curves move in them; designs are made i
 from __future__ import annotations
 
 import errno
-import json
 import socket
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
 from functools import partial
-from importlib.resources import files
+from html import escape
 from itertools import count
 from pathlib import Path
-from queue import SimpleQueue
-from threading import Thread
 from typing import Any, TypeAlias
 
 import numpy as np
-from bokeh.core.properties import String
-from bokeh.model import DataModel
-from bokeh.models import ColumnDataSource, GridBox, HoverTool, PlainText, Range1d
+from bokeh.layouts import column, row
+from bokeh.models import (
+    Button,
+    ColumnDataSource,
+    CustomJSTickFormatter,
+    Div,
+    HoverTool,
+    PlainText,
+    Range1d,
+    Select,
+    Slider,
+)
 from bokeh.plotting import figure as new_figure
 from bokeh.server.server import Server
 
 from lbt_synth.config.write import config_text
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.methods.registry import all_methods
-from lbt_synth.report.draw import colour, dashes
+from lbt_synth.methods.registry import METHODS
+from lbt_synth.report.draw import GREY, colour, dashes
 from lbt_synth.report.explore.exploration import (
     Exploration,
+    Knob,
     Shown,
     View,
     describe_moves,
     explored_table,
     judge,
-    quick_view,
-    whole_view,
+    new_view,
 )
 from lbt_synth.report.figures.studies import strehl_axis
 from lbt_synth.report.page.html import creator_name, words
@@ -52,25 +59,24 @@ Ends: TypeAlias = tuple[tuple[float, float], tuple[float, float]]  # of the scal
 # curves by the names of designs, abscissae of rules, and the scales
 Numbers: TypeAlias = tuple[dict[str, tuple[FloatArray, FloatArray]], Sequence[float], Ends]
 _REACH = 3.0  # of the plane of a loop gain, to each side of -1
-_FAR = 9.0  # outside that plane; a canvas takes no larger numbers
-_ROOM = 0.05  # decades above the highest curve
-_GREY = "#404040"
-# of each figure: what is on its axes, and which of them are logarithmic
-_AXES = {
-    "explore-rejection": ("frequency [Hz]", "\u03c3\u0304, phase to residual [-]", "xy"),
-    "explore-noise": ("frequency [Hz]", "\u03c3\u0304, noise to residual [-]", "xy"),
-    "explore-nyquist": ("real part [-]", "imaginary part [-]", ""),
-    "explore-spectrum": ("frequency [Hz]", "power spectrum [{nm²/Hz}]", "xy"),
-    "explore-strehl": ("frequency error [Hz]", "Strehl ratio [%]", ""),
-    "explore-poles": ("real part [-]", "imaginary part [-]", ""),
-    "explore-sigma": ("frequency [Hz]", "\u03c3\u0304, disturbances to error [{nm}]", "xy"),
+_FAR = 3 * _REACH  # outside that plane; a canvas takes no larger numbers
+_DECADES = 4  # of a logarithmic scale of ordinates
+# of each figure: what is on its axes, with units of wavefronts in braces; those over frequency show
+# a field of a design on logarithmic scales
+_FIELDS = {
+    "explore-rejection": "rejection",
+    "explore-noise": "noise_transfer",
+    "explore-spectrum": "spectrum_nm2_hz",
+    "explore-sigma": "error_nm",
 }
-_STYLE = {
-    "axis_label_text_font_size": "13px",
-    "axis_label_text_font_style": "normal",
-    "major_label_text_font_size": "12px",
-    "axis_line_color": "#808080",
-    "minor_tick_line_color": None,
+_AXES = {
+    "explore-rejection": ("frequency [Hz]", "\u03c3\u0304, phase to residual [-]"),
+    "explore-noise": ("frequency [Hz]", "\u03c3\u0304, noise to residual [-]"),
+    "explore-nyquist": ("real part [-]", "imaginary part [-]"),
+    "explore-spectrum": ("frequency [Hz]", "power spectrum [{nm²/Hz}]"),
+    "explore-strehl": ("frequency error [Hz]", "Strehl ratio [%]"),
+    "explore-poles": ("real part [-]", "imaginary part [-]"),
+    "explore-sigma": ("frequency [Hz]", "\u03c3\u0304, disturbances to error [{nm}]"),
 }
 
 
@@ -78,43 +84,32 @@ def explore_numbers(
     shown: Mapping[str, Shown], lines_hz: Sequence[float], shift_hz: float
 ) -> dict[str, Numbers]:
     """Return what each figure shows of designs, with true lines and where the slider stands."""
-    density, error = shown_unit("nm²/Hz")[1], shown_unit("nm")[1]
     numbers: dict[str, Numbers] = {}
-    for key, field, factor, decades in (
-        ("explore-rejection", "rejection", 1.0, 4),
-        ("explore-noise", "noise_transfer", 1.0, 2),
-        ("explore-spectrum", "spectrum_nm2_hz", density, 4),
-        ("explore-sigma", "error_nm", error, 2),
-    ):
+    factors = {"spectrum_nm2_hz": shown_unit("nm²/Hz")[1], "error_nm": shown_unit("nm")[1]}
+    for key, field in _FIELDS.items():
         curves = {
-            name: (one.frequency_hz, factor * getattr(one, field))
+            name: (one.frequency_hz, factors.get(field, 1.0) * getattr(one, field))
             for name, one in shown.items()
             if getattr(one, field) is not None
         }
         values = np.concatenate([np.ones(1), *(y for _, y in curves.values())])
-        high = float(10.0 ** np.ceil(np.log10(np.nanmax(values)) + _ROOM))
+        high = float(10.0 ** np.ceil(np.log10(1.1 * np.nanmax(values))))
         grid = next(iter(shown.values())).frequency_hz
-        ends = (float(grid[0]), float(grid[-1])), (high / 10**decades, high)
+        ends = (float(grid[0]), float(grid[-1])), (high / 10**_DECADES, high)
         numbers[key] = curves, lines_hz, ends
-    numbers["explore-nyquist"] = (
-        {name: _loop_gains(one) for name, one in shown.items()},
-        (),
-        ((-1.0 - _REACH, -1.0 + _REACH), (-_REACH, _REACH)),
-    )
+    plane = (-1.0 - _REACH, -1.0 + _REACH), (-_REACH, _REACH)
+    gains = {name: _loop_gains(one) for name, one in shown.items()}
+    numbers["explore-nyquist"] = gains, (), plane
     poles = {name: (one.poles.real, one.poles.imag) for name, one in shown.items()}
     numbers["explore-poles"] = poles, (), ((-1.2, 1.2), (-1.2, 1.2))
-    strehls = {
-        name: (one.shift_hz, 100 * one.strehls)
-        for name, one in shown.items()
-        if one.shift_hz is not None and one.strehls is not None
-    }
-    percents = np.concatenate([np.zeros(0), *(y for _, y in strehls.values())])
+    strehls = {name: (one.shift_hz, 100 * one.strehls) for name, one in shown.items()}
+    percents = np.concatenate([y for _, y in strehls.values()])
     low = strehl_axis(percents)["low"]
     high = np.nanmax(percents) if np.isfinite(percents).any() else 100.0
-    shifts = np.concatenate([np.array([shift_hz]), *(x for x, _ in strehls.values())])
+    shifts = np.concatenate([x for x, _ in strehls.values()])
     across = float(np.min(shifts)) - 1e-9, float(np.max(shifts)) + 1e-9
     numbers["explore-strehl"] = strehls, [shift_hz], (across, (low, high + 0.04 * (high - low)))
-    return {key: numbers[key] for key in _AXES}
+    return numbers
 
 
 def _loop_gains(one: Shown) -> tuple[FloatArray, FloatArray]:
@@ -125,139 +120,79 @@ def _loop_gains(one: Shown) -> tuple[FloatArray, FloatArray]:
 
 
 class LivePanel:
-    """A place for a figure, which is made again only where its designs are others."""
+    """A figure with the curves of all designs, the rules across them, and what they mean."""
 
     def __init__(self, key: str) -> None:
-        self.root = GridBox(name=key, sizing_mode="stretch_width")
-        self._key = key
-        self._texts = [
-            text.format_map({unit: shown_unit(unit)[0] for unit in ("nm", "nm²/Hz")})
-            for text in _AXES[key][:2]
-        ]
-        self._log = _AXES[key][2]
-        self._designs: object = None
-        self._ends: Ends | None = None
-        self._sources: list[ColumnDataSource] = []
+        units = {unit: shown_unit(unit)[0] for unit in ("nm", "nm²/Hz")}
+        self._is_log, self._is_points = key in _FIELDS, key == "explore-poles"
+        square, scale = (
+            key in ("explore-nyquist", "explore-poles"),
+            "log" if self._is_log else "linear",
+        )
+        self.figure = figure = new_figure(
+            name=key,
+            title=words()[key]["title"],
+            **({"width": 330} if square else {"sizing_mode": "stretch_width"}),
+            height=330 if square else 300,
+            x_axis_type=scale,
+            y_axis_type=scale,
+            x_range=Range1d(),
+            y_range=Range1d(),
+            tools="box_zoom,pan,wheel_zoom,reset",
+            toolbar_location="above",
+            min_border_left=64,  # figures above each other are in line
+        )
+        # a finger scrolls the page
+        figure.toolbar.update(logo=None, active_drag=None, active_scroll=None)
+        for axis, text in zip((figure.xaxis[0], figure.yaxis[0]), _AXES[key], strict=True):
+            axis.axis_label = PlainText(text=text.format_map(units))
+        self.rules = ColumnDataSource({"at": []})
+        self.curves = ColumnDataSource({name: [] for name in ("x", "y", "name", "colour", "look")})
+        figure.vspan(x="at", source=self.rules, line_color=GREY, line_dash="4 5")
+        if self._is_points:
+            marks = figure.scatter(
+                "x", "y", marker="look", size=8, fill_color=None, **_MARKS, source=self.curves
+            )
+            turn = np.linspace(0, 2 * np.pi, 181)
+            figure.line(np.cos(turn), np.sin(turn), line_color=GREY)
+        else:
+            marks = figure.multi_line("x", "y", line_dash="look", **_MARKS, source=self.curves)
+        if key == "explore-rejection":
+            figure.hspan(y=[1.0], line_color=GREY)
+        elif key == "explore-nyquist":
+            figure.scatter([-1.0], [0.0], marker="cross", size=13, line_color=GREY)
+        tips = [("", "@name"), ("x", "$snap_x{%.4g}"), ("y", "$snap_y{%.4g}")]
+        formats = dict.fromkeys(("$snap_x", "$snap_y"), "printf")
+        figure.add_tools(HoverTool(renderers=[marks], tooltips=tips, formatters=formats))
+        caption = Div(text=escape(words()[key]["caption"]), sizing_mode="stretch_width")
+        self.root = column(figure, caption, sizing_mode="stretch_width")
 
     def show(self, numbers: Numbers, looks: Mapping[str, int]) -> None:
         """Show curves in the looks of their designs."""
         curves, rules, ends = numbers
-        groups: dict[bytes, list[str]] = {}  # curves of the same abscissae are sent together
-        for name, (x, _) in curves.items():
-            groups.setdefault(x.tobytes(), []).append(name)
-        columns = [{"at": np.array(rules)}] if len(rules) else []
-        for names in groups.values():
-            ordinates = {f"y{i}": self._drawn(curves[name][1]) for i, name in enumerate(names)}
-            columns.append({"x": curves[names[0]][0], **ordinates})
-        designs = [[(name, looks[name]) for name in names] for names in groups.values()]
-        if [bool(rules), *designs] != self._designs:
-            self._designs, self._ends = [bool(rules), *designs], None
-            self._sources = [ColumnDataSource(one) for one in columns]
-            self.root.children = [(self._new_figure(designs, bool(rules)), 0, 0)]
-        else:
-            for source, new in zip(self._sources, columns, strict=True):
-                old = source.data
-                if not all(np.array_equal(old[n], new[n], equal_nan=True) for n in new):
-                    source.data = new
-        if ends != self._ends:
-            self._ends, figure = ends, self.root.children[0][0]
-            for scale, (start, end) in zip((figure.x_range, figure.y_range), ends, strict=True):
-                scale.update(start=start, end=end)
-
-    def _drawn(self, y: FloatArray) -> FloatArray:
-        return np.where(y > 0, y, np.nan) if "y" in self._log else y
-
-    def _new_figure(self, designs: Sequence[Sequence[tuple[str, int]]], ruled: bool) -> Any:
-        square = self._key in ("explore-nyquist", "explore-poles")
-        size = {"aspect_ratio": 1.0, "max_width": 460} if square else {"height": 300}
-        figure = new_figure(
-            **{f"{n}_axis_type": "log" if n in self._log else "linear" for n in "xy"},
-            x_range=Range1d(),
-            y_range=Range1d(),
-            sizing_mode="stretch_width",
-            tools="box_zoom,pan,wheel_zoom,reset",
-            toolbar_location="above",
-            min_border_left=64,  # figures above each other are in line
-            min_border_right=12,
-            **size,
-        )
-        # a finger scrolls the page
-        figure.toolbar.update(logo=None, active_drag=None, active_scroll=None)
-        figure.grid.grid_line_color = "#e0e0e0"
-        figure.outline_line_color = None
-        for axis, text in zip((figure.xaxis[0], figure.yaxis[0]), self._texts, strict=True):
-            axis.update(axis_label=PlainText(text=text), **_STYLE)
-        remaining = iter(self._sources)
-        if ruled:
-            dash = "6 3" if self._key == "explore-strehl" else "4 5"
-            style = {"line_color": _GREY, "line_width": 1.2, "line_dash": dash}
-            figure.vspan(x="at", source=next(remaining), **style)
-        curves = []
-        for group, source in zip(designs, remaining, strict=True):
-            for i, (name, look) in enumerate(group):
-                curves.append(self._new_curve(figure, source, f"y{i}", look))
-                curves[-1].name = f"design {name}"
-        self._draw_guides(figure)
-        tips = [("", "$name")]
-        tips += [(t, f"$snap_{n}{{%.4g}}") for t, n in zip(self._texts, "xy", strict=True)]
-        formats = {f"$snap_{n}": "printf" for n in "xy"}
-        figure.add_tools(HoverTool(renderers=curves, tooltips=tips, formatters=formats))
-        return figure
-
-    def _new_curve(self, figure: Any, source: ColumnDataSource, y: str, look: int) -> Any:
-        shade, place = colour(look), {"x": "x", "y": y, "source": source}
-        if self._key == "explore-poles":
-            markers = ("circle", "square", "triangle", "diamond", "cross", "x")
-            style = {"size": 8, "line_width": 1.5, "fill_color": None, "line_color": shade}
-            return figure.scatter(**place, marker=markers[look % len(markers)], **style)
-        strokes = [max(1, round(2.4 * stroke)) for stroke in dashes(look)]
-        return figure.line(**place, line_color=shade, line_width=2, line_dash=strokes)
-
-    def _draw_guides(self, figure: Any) -> None:
-        """Draw what the curves are compared with."""
-        thin = {"line_color": _GREY, "line_width": 1.2}
-        if self._key == "explore-rejection":
-            figure.hspan(y=[1.0], **thin)
-        elif self._key == "explore-nyquist":
-            figure.scatter([-1.0], [0.0], marker="cross", size=13, line_color=_GREY)
-        elif self._key == "explore-poles":
-            turn = np.linspace(0, 2 * np.pi, 181)
-            figure.line(np.cos(turn), np.sin(turn), **thin)
+        self.rules.data = {"at": np.array(rules)}
+        x = [x for x, _ in curves.values()]
+        y = [np.where(y > 0, y, np.nan) if self._is_log else y for _, y in curves.values()]
+        name, number = list(curves), [looks[name] for name in curves]
+        look = list(map(_strokes, number))
+        if self._is_points:  # a row for each
+            counts = [places.size for places in x]
+            name, number = (np.repeat(column, counts).tolist() for column in (name, number))
+            x, y = list(np.concatenate(x)), list(np.concatenate(y))
+            look = [_MARKERS[one % len(_MARKERS)] for one in number]
+        shades = list(map(colour, number))
+        self.curves.data = {"x": x, "y": y, "name": name, "colour": shades, "look": look}
+        places = self.figure.x_range, self.figure.y_range
+        for scale, (start, end) in zip(places, ends, strict=True):
+            scale.update(start=start, end=end)
 
 
-class Lane:
-    """Runs one piece of work after another in a thread; newer work replaces what still waits.
+_MARKS: dict[str, Any] = {"line_color": "colour", "line_width": 2}
+_MARKERS = ("circle", "square", "triangle", "diamond", "cross", "x")
 
-    The thread shows wavefronts in the unit of its maker, and ends with the program, even in the
-    middle of its work.
-    """
 
-    def __init__(self) -> None:
-        self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self._thread = Thread(target=copy_context().run, args=(self._run,), daemon=True)
-        self._thread.start()
-
-    def submit(self, work: Callable[[], None]) -> None:
-        """Run a piece of work, instead of any that waits."""
-        self._queue.put(work)
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether newer work waits for the one that runs."""
-        return not self._queue.empty()
-
-    def close(self) -> None:
-        """Drop what waits, and end after what runs."""
-        self._queue.put(None)
-
-    def _run(self) -> None:
-        while True:
-            work = self._queue.get()
-            while not self._queue.empty():
-                work = self._queue.get()
-            if work is None:
-                return
-            work()
+def _strokes(look: int) -> str:
+    return " ".join(f"{2.4 * stroke:.0f}" for stroke in dashes(look)) or "solid"
 
 
 _ENDINGS = (".yaml", ".fits", ".sh")
@@ -289,19 +224,38 @@ def save_view(
     return [config, gain, script], commands
 
 
-_QUICK_S = 0.3  # a design that takes longer is made when a slider is released, in its own lane
-_MOST_KEPT = 5
-_SWITCH_S = 0.0005  # after which a thread that computes lets another go on
+def knob_slider(knob: Knob) -> Slider:
+    """Return the slider of a knob, which stands at the logarithm of a value that has one."""
+    unit, factor = knob.shown
+    low, high, value = (_place(knob, value) for value in (knob.low, knob.high, knob.value))
+    code = "return `${Number((factor * (log ? 10 ** tick : tick)).toPrecision(4))} ${unit}`"
+    form = CustomJSTickFormatter(code=code, args={"factor": factor, "log": knob.log, "unit": unit})
+    return Slider(
+        name=knob.key,
+        title=knob.label,
+        start=low,
+        end=high,
+        value=value,
+        step=(high - low) / 200,
+        format=form,
+    )
+
+
+def _place(knob: Knob, value: float) -> float:
+    return float(np.log10(value)) if knob.log else value
+
+
+def _value(knob: Knob, place: float) -> float:
+    """Return the value at a place of a slider, with four digits, as the slider shows it."""
+    return float(f"{10**place if knob.log else place:.4g}")
+
+
+_QUICK_S = 0.3  # a design that takes longer is made when a slider is released
+_THREADS = 3  # of a page: for a slow design, a quick one, and a verdict
 _UNUSED_MS = 3_600_000  # after which the session of a page that sleeps is dropped
-
-
-class Exchange(DataModel):  # type: ignore[misc]  # bokeh has no types
-    """What a page and its session tell each other, as JSON."""
-
-    wish = String("")
-    answer = String("")
-    verdict = String("")
-    saved = String("")
+_SWITCH_S = 0.0005  # after which a thread that computes lets another go on; Python's 5 ms stutter
+_GRID = {"display": "grid", "grid-template-columns": "repeat(auto-fill, minmax(330px, 1fr))"}
+_HEAD = '{% block preamble %}<meta name="viewport" content="width=device-width">{% endblock %}'
 
 
 class Session:
@@ -312,88 +266,97 @@ class Session:
     ) -> None:
         self._document, self._exploration, self._view = document, exploration, first
         self._folder, self._saved = folder, saved  # the files that all pages wrote
-        self._number = 0
+        self._asked = self._number = 0  # of the last wish, and of what is shown
         self._seconds: dict[str, float] = {}  # of the processor for the last design of a method
         self._kept: dict[str, Shown] = {}
-        self._quick, self._slow, self._third = Lane(), Lane(), Lane()
-        self._exchange = Exchange(name="exchange")
-        keys = explore_numbers(first.shown, (), 0.0)
-        self._panels = {key: LivePanel(key) for key in keys}
-        for panel in self._panels.values():
-            document.add_root(panel.root)
-        next(iter(self._panels.values())).root.tags = [self._exchange]
-        self._show_view(0, first)
-        self._exchange.on_change("wish", lambda _, __, new: self._hear(json.loads(new)))
-        self._third.submit(partial(self._form_verdict, 0, first))
+        self._threads = ThreadPoolExecutor(_THREADS)
+        self._sliders = {knob: knob_slider(knob) for knob in exploration.knobs}
+        methods = [(method.name, method.title) for method in METHODS.values()]
+        name = first.request.method.name
+        self._method = Select(name="method", title="Method", value=name, options=methods)
+        self._verdict, self._facts, self._files = (
+            Div(name=name, sizing_mode="stretch_width") for name in ("verdict", "facts", "saved")
+        )
+        self._panels = {key: LivePanel(key) for key in _AXES}
+        buttons = [Button(name=label.lower(), label=label) for label in ("Keep", "Save", "Reset")]
+        for button, action in zip(buttons, (self._keep, self._save, self._reset), strict=True):
+            button.on_click(action)
+        self._method.on_change("value", lambda _, __, ___: self._ask(final=True))
+        for slider in self._sliders.values():
+            slider.on_change("value", lambda _, __, ___: self._ask(final=False))
+            slider.on_change("value_throttled", lambda _, __, ___: self._ask(final=True))
+        controls = column(
+            self._method,
+            *self._sliders.values(),
+            row(*buttons),
+            self._files,
+            width=320,
+            styles={"position": "sticky", "top": "0"},
+        )
+        wide = {"sizing_mode": "stretch_width"}
+        figures = row(*(panel.root for panel in self._panels.values()), styles=_GRID, **wide)
+        curves = column(self._verdict, self._facts, figures, styles={"flex": "1 1 330px"}, **wide)
+        document.add_root(row(controls, curves, styles={"flex-wrap": "wrap"}, **wide))
+        document.template, document.title = _HEAD, f"Explore {exploration.config.source.name}"
         document.on_session_destroyed(self._close)
-        here = files("lbt_synth.report")
-        style, script, template = (
-            (here / name).read_text(encoding="utf-8")
-            for name in ("explore/page.css", "explore/page.js", "explore/page.html.jinja")
-        )
-        document.template = template
-        document.title = f"Explore {exploration.config.source.name}"
-        document.template_variables.update(
-            {
-                "heading": document.title,
-                "charts": [{"key": key, **words()[key]} for key in keys],
-                "knobs": exploration.knobs,
-                "methods": {m.name: m.title for m in all_methods().values()},
-                "method": first.request.method.name,
-                "folder": str(folder),
-                "style": (here / "page/page.css").read_text(encoding="utf-8") + style,
-                "script": script,
-            }
-        )
+        self._hide_sliders()
+        self._show(0, first)
+        self._submit(0, self._judge, first)
 
-    def _hear(self, message: Mapping[str, Any]) -> None:
-        """Do what the page asks for."""
-        match message["do"]:
-            case "design":
-                method, number = str(message["method"]), int(message["number"])
-                quick = self._seconds.get(method, _QUICK_S) < _QUICK_S
-                lane = self._quick if quick else self._slow
-                wish = number, method, dict(message["values"]), bool(message["final"])
-                lane.submit(partial(self._work, lane, *wish))
-            case "keep":
-                self._keep()
-            case "drop":
-                self._kept.pop(str(message["name"]), None)
-                self._show_view(self._number, self._view)
-            case "save":
-                self._save()
+    def _submit(self, number: int, work: Callable[..., None], *arguments: Any) -> None:
+        """Work on a wish in a thread, in the unit of this one; say what fails."""
 
-    def _work(
-        self, lane: Lane, number: int, method: str, values: Mapping[str, float], final: bool
-    ) -> None:
-        """Design in a thread: show the curves first, then what they leave, then the verdict."""
-        exploration, start = self._exploration, time.thread_time()
-        try:
-            view = quick_view(exploration, method, values, self._view)
-            self._seconds[method] = time.thread_time() - start
-            self._later(self._show_view, number, view)
-            if lane.is_waiting:
-                return
-            view = whole_view(exploration, view)
-            self._later(self._show_view, number, view)
-        except Exception as error:
-            self._later(self._complain, number, error)
-            return
-        if final:
-            self._third.submit(partial(self._form_verdict, number, view))
+        def run() -> None:
+            try:
+                work(number, *arguments)
+            except Exception as error:  # the curves stay those of the last design
+                self._later(self._say, number, str(error) or repr(error))
 
-    def _form_verdict(self, number: int, view: View) -> None:
-        try:
-            text = judge(view)
-        except LbtSynthError as error:
-            text = str(error)
-        self._later(self._say_verdict, number, text)
+        self._threads.submit(copy_context().run, run)
 
     def _later(self, action: Callable[..., None], *arguments: Any) -> None:
         """Run an action on the document from any thread."""
         self._document.add_next_tick_callback(partial(action, *arguments))
 
-    def _show_view(self, number: int, view: View) -> None:
+    def _hide_sliders(self) -> None:
+        for knob, slider in self._sliders.items():
+            slider.visible = knob.acts_on(self._method.value)
+
+    def _ask(self, *, final: bool) -> None:
+        """Design anew; a slow method waits until the slider is released."""
+        method = self._method.value
+        if not final and self._seconds.get(method, 0.0) > _QUICK_S:
+            return
+        self._hide_sliders()
+        self._asked += 1
+        self._verdict.text = "Designing …"
+        values = {
+            knob.key: _value(knob, slider.value)
+            for knob, slider in self._sliders.items()
+            if slider.value != _place(knob, knob.value)
+        }
+        self._submit(self._asked, self._work, method, values, final)
+
+    def _work(self, number: int, method: str, values: Mapping[str, float], final: bool) -> None:
+        """Design in a thread, unless there is a newer wish; then show it, and form a verdict."""
+        if number < self._asked:
+            return
+        start = time.thread_time()
+        view = new_view(self._exploration, method, values)
+        self._seconds[method] = time.thread_time() - start
+        self._later(self._show, number, view)
+        if final:
+            self._judge(number, view)
+
+    def _judge(self, number: int, view: View) -> None:
+        self._later(self._say, number, judge(view))
+
+    def _say(self, number: int, text: str) -> None:
+        """Say what is to be said of the last wish."""
+        if number == self._asked:
+            self._verdict.text = escape(text)
+
+    def _show(self, number: int, view: View) -> None:
         """Show a view, unless a newer one is shown."""
         if number < self._number:
             return
@@ -403,68 +366,47 @@ class Session:
         lines_hz = view.config.truth.lines_hz
         for key, numbers in explore_numbers(shown, lines_hz, view.shift_hz).items():
             self._panels[key].show(numbers, looks)
-        table = explored_table(shown)
-        self._answer(
-            number=number,
-            whole=view.is_whole,
-            slow=self._seconds.get(view.request.method.name, 0.0) > _QUICK_S,
-            headings=table.headings,
-            rows=[[cell.text for cell in row] for row in table.cells()],
-            legend=[
-                {
-                    "name": name,
-                    "colour": colour(look),
-                    "dashes": " ".join(f"{2 * stroke:g}" for stroke in dashes(look)),
-                    "kept": name in self._kept,
-                }
-                for look, name in enumerate(shown)
-            ],
-        )
-
-    def _answer(self, **content: Any) -> None:
-        self._exchange.answer = json.dumps(content)
-
-    def _complain(self, number: int, error: Exception) -> None:
-        """Say why a wish has no design; the curves stay those of the last one."""
-        if number < self._number:
-            return
-        self._number = number
-        known = isinstance(error, LbtSynthError)
-        self._answer(
-            number=number, error=str(error) if known else f"{type(error).__name__}: {error}"
-        )
-
-    def _say_verdict(self, number: int, text: str) -> None:
-        if number == self._number:
-            self._exchange.verdict = json.dumps({"number": number, "text": text})
+        self._facts.text = table_html(shown)
 
     def _keep(self) -> None:
         """Keep the curves of the design that is shown."""
-        exploration = self._exploration
-        view = self._view if self._view.is_whole else whole_view(exploration, self._view)
-        moves = describe_moves(exploration, view)
+        view = self._view
+        moves = describe_moves(self._exploration, view)
         name = f"{view.name}, {moves}" if moves else f"{view.name}, kept"
-        self._kept.pop(name, None)
-        if len(self._kept) == _MOST_KEPT:
-            del self._kept[next(iter(self._kept))]
         self._kept[name] = view.shown[view.name]
-        self._show_view(self._number, view)
+        self._show(self._number, view)
 
     def _save(self) -> None:
         try:
             paths, commands = save_view(self._exploration, self._view, self._folder)
         except LbtSynthError as error:
-            self._exchange.saved = json.dumps({"time": time.time(), "error": str(error)})
+            self._files.text = escape(str(error))
             return
         self._saved.extend(paths)
-        names = [str(path) for path in paths]
-        self._exchange.saved = json.dumps(
-            {"time": time.time(), "files": names, "commands": commands}
-        )
+        lines = [f"Written: {', '.join(map(str, paths))}. The commands that make them:", *commands]
+        self._files.text = "".join(f"<p>{escape(line)}</p>" for line in lines)
+
+    def _reset(self) -> None:
+        """Put the sliders back, and drop the curves that were kept."""
+        self._kept.clear()
+        for knob, slider in self._sliders.items():
+            slider.value = _place(knob, knob.value)
+        self._ask(final=True)
 
     def _close(self, _: Any) -> None:
-        for lane in (self._quick, self._slow, self._third):
-            lane.close()
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+
+def table_html(shown: Mapping[str, Shown]) -> str:
+    """Return what designs leave as a table of HTML, with the line that each is drawn in."""
+    table = explored_table(shown)
+    lines = ["".join(f"<th scope='col'>{escape(text)}</th>" for text in table.headings)]
+    for look, (name, *cells) in enumerate(table.cells()):
+        line = f"stroke='{colour(look)}' stroke-width='2' stroke-dasharray='{_strokes(look)}'"
+        swatch = f"<svg width='34' height='9'><path d='M0 5H34' {line}/></svg>"
+        rest = "".join(f"<td align='right'>{escape(cell.text)}</td>" for cell in cells)
+        lines.append(f"<th scope='row' align='left'>{swatch} {escape(name.text)}</th>{rest}")
+    return f"<table cellpadding='4'>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
 
 def serve(

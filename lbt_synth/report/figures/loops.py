@@ -20,7 +20,6 @@ from lbt_synth.validation import ComplexArray, FloatArray, choice
 
 FREQUENCY = {"label": "frequency", "unit": "Hz", "log": True}
 _DECADES = 3.6  # of frequency that are drawn, below half the frame rate
-_DEEPEST = 1e5  # below the highest value: a zero at the Nyquist frequency is no scale
 _POINTS = 1200  # of a grid of frequencies
 _LOWEST_DB, _HIGHEST_DB = -40.0, 60.0
 _REACH = 2.5  # of a Nyquist plot from its centre
@@ -48,40 +47,38 @@ def loop_figure(
 ) -> Figure:
     """Draw a view of the loops of designs.
 
+    Loops are broken at each measurement in turn, the others closed; axes that respond alike are one
+    curve. A loop that is unstable is named and not drawn.
+
     Parameters
     ----------
     designs : mapping of str to Design
         Designs by the name they get in the legend. Each needs a loop, but for ``"sigma"``.
     kind : {"sigma", "bode", "nyquist", "nichols", "step"}
         ``"sigma"``: largest singular values of the estimation error, the rejection and the noise
-        transfer, a panel each, the vibration frequencies marked. Axes that do not mix have a curve
-        each; of others the largest singular value is that of the worst direction.
-        ``"bode"``: gain and phase over frequency, with the margins; the phase has no jumps and
-        includes the delay.
-        ``"nyquist"``: the complex plane, a panel for each design. Around -1 are the circles of
-        the modulus margin and of the disk margin of all axes at once; no loop enters them.
-        ``"nichols"``: gain over phase. A loop that stays outside a contour has its modulus margin.
-        ``"step"``: residual and command after a step of the wavefront, in two panels.
-        Loops are broken at each measurement in turn, the others closed; axes that respond alike
-        are one curve.
+        transfer, a panel each, the vibration frequencies marked; axes that do not mix have a curve
+        each. ``"bode"``: gain and phase over frequency, with the margins; the phase has no jumps
+        and includes the delay. ``"nyquist"``: the complex plane, a panel for each design, with the
+        circles of the modulus and of the disk margin, which no loop enters. ``"nichols"``: gain
+        over phase; a loop outside a contour has its modulus margin. ``"step"``: residual and
+        command after a step of the wavefront, in two panels.
     sensor_gain : float, optional
         Real sensor gain, relative to the one of each design.
     unit_weights : bool, optional
-        Draw the estimation error against disturbances of unit size, as the paper
-        does, instead of the weighted ones of each design.
+        Draw the estimation error against disturbances of unit size, as Agapito et al. (2008) do,
+        instead of the weighted ones of each design.
     axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
+        Your own matplotlib axes, one per panel; by default a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure
-        A loop that is unstable at this sensor gain is named and not drawn.
+        The figure.
 
     Raises
     ------
     ProblemError
-        If there is no design, one has no loop, there is no such view,
-        or ``axes`` are not one per panel.
+        If there is no design or no such view, a design has no loop, or ``axes`` do not fit.
 
     Examples
     --------
@@ -126,15 +123,12 @@ def closed_loops(
 
 
 def frequency_grid(
-    rate_hz: float,
-    special_hz: Sequence[float] = (),
-    *,
-    points: int = _POINTS,
-    near: int = 60,
+    rate_hz: float, special_hz: Sequence[float] = (), *, points: int = _POINTS, near: int = 60
 ) -> FloatArray:
-    """Logarithmic grid up to Nyquist, denser around special frequencies and below Nyquist.
+    """Logarithmic grid below Nyquist, denser around special frequencies and towards Nyquist.
 
-    It has so many points, and so many more near each special one, on either side of it.
+    It has so many points, and so many more near each special one, on either side of it. Nyquist
+    itself is left out: a zero there is no scale.
     """
     nyquist = rate_hz / 2
     grids = [np.geomspace(nyquist / 10**_DECADES, nyquist, points)]
@@ -142,7 +136,7 @@ def frequency_grid(
         spread = np.geomspace(1e-4, 0.2, near)
         grids += [centre * (1 + spread), centre * (1 - spread), np.array([centre])]
     grid = np.unique(np.concatenate(grids))
-    return grid[(grid > 0) & (grid <= nyquist)]
+    return grid[(grid > 0) & (grid < nyquist)]
 
 
 def draw_design(
@@ -235,10 +229,7 @@ def draw_sigma(
     ]
     with drawing([PANEL_IN] * len(drawn), axes=axes) as panels:
         for panel, (number, label, of, norms) in zip(panels, drawn, strict=True):
-            values = np.concatenate([np.zeros(1), *(y for _, y in norms.values() if y is not None)])
-            floor = float(np.max(values)) / _DEEPEST
-            low = floor if np.any(values[1:] < floor) and floor > 0 else None
-            y_axis = {"label": f"\u03c3\u0304, {label}", "unit": of, "log": True, "low": low}
+            y_axis = {"label": f"\u03c3\u0304, {label}", "unit": of, "log": True}
             panel.set_axes(FREQUENCY, y_axis, title=title if number == 1 else "")
             for name, (f, norm) in norms.items():
                 is_unstable = number > 0 and name in loops and not loops[name].is_stable
@@ -298,8 +289,8 @@ def draw_bode(loops: Loops, *, axes: OwnAxes = None) -> Figure:
     """Draw gain and phase of broken loops, with their margins."""
     opened = open_loops(loops)
     points = [None if broken is None else loop_points(broken) for *_, broken in opened]
-    gains = np.concatenate([np.zeros(1), *(each[1] for each in points if each)])
-    phases = np.concatenate([[-180.0, -90.0], *(each[2] for each in points if each)])
+    gains = np.concatenate([np.zeros(1), *(curve[1] for curve in points if curve)])
+    phases = np.concatenate([[-180.0, -90.0], *(curve[2] for curve in points if curve)])
     y_axis = {
         "label": "loop gain",
         "unit": "dB",
@@ -310,13 +301,13 @@ def draw_bode(loops: Loops, *, axes: OwnAxes = None) -> Figure:
         above.set_axes(FREQUENCY, y_axis)
         below.set_axes(FREQUENCY, {"label": "phase", "unit": "deg"})
         above.rule("", 0.0, "y", dash=1)
-        for each, curves in zip(opened, points, strict=True):
+        for drawn, curves in zip(opened, points, strict=True):
             if curves is None:
-                _draw_opened(above, each, [], [])
+                _draw_opened(above, drawn, [], [])
                 continue
             f, gain, phase, _ = curves
-            _draw_opened(above, each, f, np.maximum(gain, 2 * _LOWEST_DB))  # a zero is far below
-            _draw_opened(below, each, f, phase)
+            _draw_opened(above, drawn, f, np.maximum(gain, 2 * _LOWEST_DB))  # a zero is far below
+            _draw_opened(below, drawn, f, phase)
         for at in _critical_phases(float(np.nanmin(phases)), float(np.nanmax(phases))):
             below.rule("", at, "y", dash=1)
         for broken in (broken for *_, broken in opened if broken is not None):
@@ -385,8 +376,8 @@ def _draw_nichols(loops: Loops, *, axes: OwnAxes = None) -> Figure:
     x_axis = {"label": "phase", "unit": "deg", "low": lowest, "high": highest}
     with drawing([2 * PANEL_IN], axes=axes) as (panel,):
         panel.set_axes(x_axis, {"label": "loop gain", "unit": "dB", "high": 40.0})
-        for each, curve in zip(opened, curves, strict=True):
-            _draw_opened(panel, each, *curve)
+        for drawn, curve in zip(opened, curves, strict=True):
+            _draw_opened(panel, drawn, *curve)
         for broken in (broken for *_, broken in opened if broken is not None):
             for _, ends in _phase_marks(broken):
                 _mark(panel, "phase margin", ends, [0.0, 0.0], "o")
@@ -439,7 +430,7 @@ def design_steps(loops: Loops, *, frames: int = SHOWN_FRAMES) -> dict[str, list[
         unlike: list[LoopStep] = []
         for axis in range(loop.hardware.modes if loop.is_stable else 0):
             step = step_response(loop, axis=axis, frames=frames)
-            if not any(np.allclose(step.residual, each.residual) for each in unlike):
+            if not any(np.allclose(step.residual, other.residual) for other in unlike):
                 unlike.append(step)
         steps[name] = unlike
     return steps

@@ -23,7 +23,7 @@ from lbt_synth.validation import FloatArray, require_instance
 
 TIME = {"label": "time", "unit": "s"}
 SPECTRUM = {"label": "power spectrum", "unit": "nm²/Hz", "log": True}
-_SERIES_S = 1.0  # of a series, in which single oscillations are seen
+SERIES_S = 1.0  # of a series, in which single oscillations are seen
 _WINDOW_S = 0.1  # over which the size of the residual is averaged
 _BANDS = 240  # of equal ratio over which the periodogram is averaged
 _KOLMOGOROV = 1.6276  # Kolmogorov's statistic at 1 %
@@ -37,7 +37,7 @@ def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None)
     """
     _, frames, n = run.residual_nm.shape
     names = _NAMES if n <= 2 else [f"mode {i}" for i in range(1, n + 1)]
-    shown = min(frames, int(np.ceil(_SERIES_S * run.frame_rate_hz)))
+    shown = min(frames, int(np.ceil(SERIES_S * run.frame_rate_hz)))
     time = np.arange(shown) / run.frame_rate_hz
     with drawing([PANEL_IN, PANEL_IN], axes=axes) as (series, spectra):
         series.set_axes(TIME, {"label": "residual", "unit": "nm"}, title=title)
@@ -67,10 +67,10 @@ def sensor_failure_figure(
     _, frames, n = run.residual_nm.shape
     time = np.arange(frames) / run.frame_rate_hz
     window = max(int(_WINDOW_S * run.frame_rate_hz), 1)
-    whole = frames // window * window
-    power = np.mean(np.sum(run.residual_nm[:, :whole] ** 2, axis=2), axis=0)
+    end = frames // window * window
+    power = np.mean(np.sum(run.residual_nm[:, :end] ** 2, axis=2), axis=0)
     rms_nm = np.sqrt(power.reshape(-1, window).mean(axis=1))
-    centres = time[:whole].reshape(-1, window).mean(axis=1)
+    centres = time[:end].reshape(-1, window).mean(axis=1)
     failures = [segment for segment in segments if segment.text]
     looks = {text: 3 + i for i, text in enumerate(dict.fromkeys(s.text for s in failures))}
     with drawing([PANEL_IN, PANEL_IN]) as (series, size):
@@ -105,7 +105,7 @@ def identification_figure(
     designs : mapping of str to Controller or Design, optional
         Controllers whose predicted residual is drawn, by name.
     axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
+        Your own matplotlib axes, one per panel; by default a new figure.
 
     Returns
     -------
@@ -119,8 +119,7 @@ def identification_figure(
     Raises
     ------
     ProblemError
-        If the model is none, or a design does not fit its loop,
-        or ``axes`` are not one per panel.
+        If the model is none, a design does not fit its loop, or ``axes`` are not one per panel.
     UnstableLoopError
         If the loop of a design is unstable.
 
@@ -128,10 +127,8 @@ def identification_figure(
     --------
     >>> import numpy as np
     >>> import lbt_synth as lbt
-    >>> rng = np.random.default_rng(0)
-    >>> record = lbt.identification.loop_record(
-    ...     np.cumsum(rng.standard_normal((4096, 1)), axis=0), frame_rate_hz=500, unit="nm"
-    ... )
+    >>> drift = np.cumsum(np.random.default_rng(0).standard_normal((4096, 1)), axis=0)
+    >>> record = lbt.identification.loop_record(drift, frame_rate_hz=500, unit="nm")
     >>> len(lbt.report.figures.identification_figure(lbt.identify(record)).axes)
     3
     """
@@ -164,28 +161,30 @@ def _predicted_residuals(
     model: IdentifiedModel, designs: Mapping[str, Controller | Design]
 ) -> dict[str, list[FloatArray]]:
     """Densities of the residual that each design would leave on each axis, (f,) each."""
-    out: dict[str, list[FloatArray]] = {}
-    for name, thing in designs.items():
-        controller = as_controller(thing)
+    residuals: dict[str, list[FloatArray]] = {}
+    for name, design in designs.items():
+        controller = as_controller(design)
         if not isinstance(controller, Controller):
             raise ProblemError(
-                f"designs must be Controllers or Designs; got {type(thing).__name__} for {name!r}."
+                f"designs must be Controllers or Designs; got {type(design).__name__} for {name!r}."
             )
         loop = close_loop(model.hardware, controller)
         loop.require_stable()
-        out[name] = []
-        for i, axis in enumerate(model.axes):
-            f = axis.frequency_hz
-            rejected = np.abs(loop.sensitivity(f))[:, i] ** 2
-            passed = np.abs(loop.noise_transfer(f))[:, i] ** 2
-            density = np.zeros(f.size)
-            for j, other in enumerate(model.axes):
-                white = _noise_density(other)
-                phase = np.interp(f, other.frequency_hz, other.fitted_nm2_hz) - white
-                density += rejected[:, j] * phase
-                density += passed[:, j] * white * other.sensor_gain**2
-            out[name].append(density)
-    return out
+        residuals[name] = [_residual_density(model, loop, i) for i in range(len(model.axes))]
+    return residuals
+
+
+def _residual_density(model: IdentifiedModel, loop: ClosedLoop, i: int) -> FloatArray:
+    """Density of the residual of an axis, of the phase and the noise of all axes, (f,)."""
+    f = model.axes[i].frequency_hz
+    rejected = np.abs(loop.sensitivity(f)[:, i]) ** 2
+    passed = np.abs(loop.noise_transfer(f)[:, i]) ** 2
+    density = np.zeros(f.size)
+    for j, axis in enumerate(model.axes):
+        white = _noise_density(axis)
+        phase = np.interp(f, axis.frequency_hz, axis.fitted_nm2_hz) - white
+        density += rejected[:, j] * phase + passed[:, j] * white * axis.sensor_gain**2
+    return density
 
 
 def _noise_density(axis: IdentifiedAxis) -> float:
@@ -280,7 +279,7 @@ def _draw_innovations(panel: Panel, axis: IdentifiedAxis, frequency: dict[str, o
     panel.curve("excess", test.frequency_hz, excess, width=1.0, quiet=True)
 
 
-_SEGMENT = 2048  # frames of a segment of the spectra, at most
+SEGMENT = 2048  # frames of a segment of the spectra, at most
 
 
 def run_spectra(
@@ -291,7 +290,7 @@ def run_spectra(
     They are by Welch's method, means over the runs and sums over the axes [nm^2/Hz], (f,). The
     exact one is by the transfer functions, with the window's image of each sinusoid.
     """
-    length = min(run.residual_nm.shape[1], _SEGMENT)
+    length = min(run.residual_nm.shape[1], SEGMENT)
     spectra = []
     for series in (run.total_nm, run.residual_nm):
         f, density = welch(series, run.frame_rate_hz, nperseg=length, detrend=False, axis=1)
@@ -328,8 +327,8 @@ def exact_spectrum(
             total += share * gain * line.ar_model(rate).psd(inside)
             continue
         seen_nm = np.sinc(line.frequency_hz / rate) * line.amplitude_nm
-        left = seen_nm * loop.sensitivity([line.frequency_hz])[0] @ direction
-        power = float(np.sum(np.abs(left) ** 2)) / 2
+        residual = seen_nm * loop.sensitivity([line.frequency_hz])[0] @ direction
+        power = float(np.sum(np.abs(residual) ** 2)) / 2
         offset = 2 * np.pi * (frequency_hz - line.frequency_hz) / rate
         _, image = freqz(get_window("hann", length), worN=np.abs(offset))
         window = np.abs(image)  # whose squares sum up to 3/8 of its length

@@ -13,16 +13,17 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.interop import EndToEndRun
 from lbt_synth.methods.registry import design_label
 from lbt_synth.models import LoopHardware
-from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, count_columns, drawing
+from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, count_columns, drawing
 from lbt_synth.report.figures.loops import draw_design
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts
 from lbt_synth.studies import RobustnessMap, RobustnessRow
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES
-from lbt_synth.validation import real_array, require_instance
+from lbt_synth.validation import positive, require_instance
 
 FREQUENCY_ERROR = {"label": "frequency error, truth less design", "unit": "Hz"}
+SENSOR_GAIN = {"label": "sensor gain", "unit": "-"}
 SHORT_FREQUENCY_ERROR = {"label": "frequency error", "unit": "Hz"}  # of narrow panels
 _POINTS: dict[str, Any] = {"marker": "own", "size": 4.0}
 _RINGS: dict[str, Any] = {"line": False, "marker": "own", "filled": False, "size": 9.0}
@@ -34,44 +35,34 @@ def robustness_figure(
     *,
     axes: OwnAxes = None,
 ) -> Figure:
-    """Strehl ratio over the error of the model's vibration frequency.
+    """Draw the Strehl ratio over the error of the model's vibration frequency.
 
     Parameters
     ----------
     rows : sequence of RobustnessRow
-        Rows of :func:`lbt_synth.studies.robustness`.
+        Rows of :func:`lbt_synth.studies.robustness`; unstable ones are marked at the bottom.
     published : mapping, optional
         For each method, pairs (error [Hz], Strehl ratio [%]) drawn as open markers.
     axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
+        Your own matplotlib axes, one; by default a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure
-        One panel; unstable rows are left out of the line and marked at the bottom.
+        One panel.
 
     Raises
     ------
     ProblemError
-        If there are no rows,
-        or ``axes`` are not one per panel.
+        If there are no rows, or ``axes`` are not one.
 
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> row = lbt.studies.RobustnessRow(
-    ...     error_hz=0.0,
-    ...     method="kalman",
-    ...     strehl=0.8,
-    ...     residual_nm=40.0,
-    ...     vibration_nm=10.0,
-    ...     turbulence_nm=20.0,
-    ...     noise_nm=30.0,
-    ...     within_nm=15.0,
-    ...     stable=True,
-    ...     gamma=190.0,
-    ... )
-    >>> len(lbt.report.figures.robustness_figure([row]).axes)
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> parts = config.plant, config.truth, config.imaging
+    >>> rows = list(lbt.studies.robustness(*parts, errors_hz=[0]))
+    >>> len(lbt.report.figures.robustness_figure(rows).axes)
     1
     """
     if not rows:
@@ -81,16 +72,15 @@ def robustness_figure(
     with drawing([2.5], axes=axes) as (panel,):
         panel.set_axes(FREQUENCY_ERROR, strehl_axis([*strehls, *papers]))
         for look, method in enumerate(dict.fromkeys(row.method for row in rows)):
-            own = sorted((r for r in rows if r.method == method), key=lambda r: r.error_hz)
-            label, errors = design_label(method), np.array([r.error_hz for r in own])
-            stable = np.array([r.stable for r in own])
+            entries = sorted((r for r in rows if r.method == method), key=lambda r: r.error_hz)
+            label, errors = design_label(method), np.array([r.error_hz for r in entries])
+            stable = np.array([r.stable for r in entries])
             if stable.any():
-                y = np.where(stable, [100 * r.strehl for r in own], np.nan)
+                y = np.where(stable, [100 * r.strehl for r in entries], np.nan)
                 panel.curve(label, errors, y, look=look, **_POINTS)
             if not stable.all():
-                x = errors[~stable]
-                zeros = np.zeros(x.size)
-                panel.curve(f"{label}: unstable", x, zeros, look=look, line=False, marker="x")
+                lost, name = errors[~stable], f"{label}: unstable"
+                panel.curve(name, lost, 0 * lost, look=look, line=False, marker="x")
             if published is not None and method in published:
                 x, y = np.array(published[method], dtype=float).T
                 panel.curve(f"{label}, paper", x, y, look=look, **_RINGS | {"size": 7.0})
@@ -108,24 +98,18 @@ def strehl_axis(percents: ArrayLike) -> dict[str, Any]:
 
 
 def robustness_map_figure(
-    maps: Mapping[str, RobustnessMap],
-    *,
-    real_gain: float | None = None,
-    ends: tuple[float, float] | None = None,
-    axes: OwnAxes = None,
+    maps: Mapping[str, RobustnessMap], *, real_gain: float | None = None, axes: OwnAxes = None
 ) -> Figure:
     """Draw the Strehl ratio of designs over frequency error and sensor gain.
 
     Parameters
     ----------
     maps : mapping of str to RobustnessMap
-        Maps of :func:`robustness_map` by the names of their designs.
+        Maps of :func:`lbt_synth.studies.robustness_map` by the names of their designs.
     real_gain : float, optional
         Sensor gain that is marked.
-    ends : (float, float), optional
-        Ends of the one scale of colours [%]; by default those of the maps.
     axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
+        Your own matplotlib axes, one per panel; by default a new figure.
 
     Returns
     -------
@@ -136,23 +120,17 @@ def robustness_map_figure(
     Raises
     ------
     ProblemError
-        If there is no map, or the maps have different delay errors,
-        or ``axes`` are not one per panel.
+        If there is no map, their delay errors differ, or ``axes`` are not one per panel.
 
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> found = lbt.studies.robustness_map(
-    ...     lbt.integrator(path, gain=0.5),
-    ...     lbt.Truth(turbulence=None),
-    ...     lbt.Imaging(diameter_m=8.22),
-    ...     errors_hz=[0],
-    ...     sensor_gains=[1, 3],
-    ... )
-    >>> len(
-    ...     lbt.report.figures.robustness_map_figure({"integrator": found}).axes
-    ... )  # one panel and the colour bar
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> slow = lbt.integrator(config.hardware, gain=0.5)
+    >>> errors = {"errors_hz": [0], "sensor_gains": [1, 3]}
+    >>> map = lbt.studies.robustness_map(slow, config.truth, config.imaging, **errors)
+    >>> figure = lbt.report.figures.robustness_map_figure({"slow": map})
+    >>> len(figure.axes)  # one panel and the colour bar
     2
     """
     if not maps:
@@ -164,51 +142,26 @@ def robustness_map_figure(
                 f"the maps must have the same delay errors {delays.tolist()}; got "
                 f"{grid.delay_errors_frames.tolist()} for {name}."
             )
-    ends = ends or strehl_ends(maps.values())
     columns = min(len(maps), 3) if len(delays) > 1 else count_columns(len(maps))
     # the long name of the axis does not fit three columns
     x_axis = FREQUENCY_ERROR if columns < 3 else SHORT_FREQUENCY_ERROR
     heights = [2.3] * (len(delays) * len(maps))
     with drawing(heights, columns=columns, axes=axes) as panels:
-        remaining = iter(panels)
-        for row, delay in enumerate(delays):
-            late = f", delay error {delay:+g} frames" if len(delays) > 1 or delay != 0 else ""
-            for name, grid in maps.items():
-                panel = next(remaining)
-                y_axis = {"label": "sensor gain", "unit": "-"}
-                panel.set_axes(x_axis, y_axis, title=f"{name}{late}")
-                _draw_map(panel, grid, row, ends, real_gain)
+        drawn = [(row, *named) for row in range(len(delays)) for named in maps.items()]
+        for panel, (row, name, grid) in zip(panels, drawn, strict=True):
+            late = f", delay error {delays[row]:+g} frames" if np.any(delays) else ""
+            panel.set_axes(x_axis, SENSOR_GAIN, title=f"{name}{late}")
+            across, up = np.argsort(grid.errors_hz), np.argsort(grid.sensor_gains)
+            errors_hz, gains = grid.errors_hz[across], grid.sensor_gains[up]
+            values = 100 * grid.strehl[row][np.ix_(up, across)]
+            scale: dict[str, Any] = {"contours": True, "blank": "unstable loop"}
+            panel.map(errors_hz, gains, values, "Strehl ratio", "%", **scale)
+            if real_gain is not None and gains[0] <= real_gain <= gains[-1]:
+                panel.rule("real sensor gain", real_gain, "y", dash=1)
+            for edge in grid.band_hz or ():
+                if errors_hz[0] < edge < errors_hz[-1]:
+                    panel.rule("edge of the design's band", edge, dash=2)
     return panels[0].figure
-
-
-def _draw_map(
-    panel: Panel,
-    grid: RobustnessMap,
-    row: int,
-    ends: tuple[float, float],
-    real_gain: float | None,
-) -> None:
-    """Draw the map of a design at one delay error, with the real gain and the design's band."""
-    across, up = np.argsort(grid.errors_hz), np.argsort(grid.sensor_gains)
-    errors_hz, gains = grid.errors_hz[across], grid.sensor_gains[up]
-    values = 100 * grid.strehl[row][np.ix_(up, across)]
-    scale: dict[str, Any] = {"ends": ends, "contours": True, "blank": "unstable loop"}
-    panel.map(errors_hz, gains, values, "Strehl ratio", "%", **scale)
-    if real_gain is not None and gains[0] <= real_gain <= gains[-1]:
-        panel.rule("real sensor gain", real_gain, "y", dash=1)
-    for edge in grid.band_hz or ():
-        if errors_hz[0] < edge < errors_hz[-1]:
-            panel.rule("edge of the design's band", edge, dash=2)
-
-
-def strehl_ends(maps: Sequence[RobustnessMap] | Any) -> tuple[float, float]:
-    """Return the ends [%] of one colour scale for several maps of Strehl ratios."""
-    values = 100 * np.concatenate([grid.strehl.ravel() for grid in maps])
-    values = values[np.isfinite(values)]
-    if not values.size:
-        return 0.0, 100.0
-    low, high = float(values.min()), float(values.max())
-    return (low, high) if high - low > 1 else (low - 0.5, high + 0.5)
 
 
 def limits_figure(study: LimitStudy, *, over_errors: bool = False, axes: OwnAxes = None) -> Figure:
@@ -243,15 +196,14 @@ def limits_figure(study: LimitStudy, *, over_errors: bool = False, axes: OwnAxes
 _NAMES = dict(
     zip(FAMILIES, ("least variance at this norm", "central H∞ filter of this norm"), strict=True)
 )
-_GAINS = (1e-2, 1e2)  # sensor gains that a trade-off shows
 
 
 def tradeoff_figure(points: Sequence[Facts], *, axes: OwnAxes = None) -> Figure:
     """Draw deviation and stable sensor gains over the norm of the estimation error.
 
     Above, the standard deviation; below, if there are loops, the interval of sensor gains for which
-    each is stable. An end of it that is 0, or beyond what is shown, has no line: the shaded area
-    goes on to the edge. Norms that no filter reaches are shaded.
+    each is stable. An end of it that is 0 has no line: the shaded area goes on to the edge. Norms
+    that no filter reaches are shaded.
     """
     if not points:
         raise ProblemError("a trade-off figure needs at least one point; got none.")
@@ -264,21 +216,20 @@ def tradeoff_figure(points: Sequence[Facts], *, axes: OwnAxes = None) -> Figure:
     shown_gains = {"label": "sensor gains with a stable loop", "unit": "-", "log": True}
     with drawing([2.3] * (1 + loops), axes=axes) as panels:
         panels[0].set_axes(x_axis, {"label": "estimation error, rms", "unit": unit})
-        ends = [end for p in points for end in (p.gain_low, p.gain_high)]
-        drawn = [end for end in ends if _GAINS[0] < end < _GAINS[1]]
-        edges = min([1.0, *drawn]) / 2, 2 * max([1.0, *drawn])
+        ends = [end for p in points for end in (p.gain_low, p.gain_high) if 0 < end < np.inf]
+        edges = min([1.0, *ends]) / 2, 2 * max([1.0, *ends])
         if loops:
             panels[1].set_axes(x_axis, shown_gains | {"low": edges[0], "high": edges[1]})
         for look, family in enumerate(dict.fromkeys(point.family for point in points)):
-            own = sorted((p for p in points if p.family == family), key=lambda p: p.gamma)
-            gamma, name = np.array([p.gamma for p in own]), _NAMES.get(family, family)
-            panels[0].curve(name, gamma, [p.rms for p in own], look=look, **_POINTS)
+            entries = sorted((p for p in points if p.family == family), key=lambda p: p.gamma)
+            gamma, name = np.array([p.gamma for p in entries]), _NAMES.get(family, family)
+            panels[0].curve(name, gamma, [p.rms for p in entries], look=look, **_POINTS)
             if not loops:
                 continue
-            interval = np.array([(p.gain_low, p.gain_high) for p in own]).T
+            interval = np.array([(p.gain_low, p.gain_high) for p in entries]).T
             panels[1].area("", gamma, *np.clip(interval, *edges), look=look)
             for gains in interval:
-                inside = np.where((gains > _GAINS[0]) & (gains < _GAINS[1]), gains, np.nan)
+                inside = np.where((gains > 0) & (gains < np.inf), gains, np.nan)
                 panels[1].curve(name, gamma, inside, look=look, **_POINTS)
         least = min(point.rms for point in points)
         panels[0].curve("Kalman", [max(norms)], [least], look=None, **_RINGS)
@@ -307,7 +258,7 @@ def modal_figure(
     turbulence_nm : (n,) array_like, optional
         Turbulence of each mode [nm rms], before any correction.
     axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes to draw on, one per panel; by default a new figure.
+        Your own matplotlib axes, one per panel; by default a new figure.
 
     Returns
     -------
@@ -317,8 +268,7 @@ def modal_figure(
     Raises
     ------
     ProblemError
-        If there is no controller, a value is not finite or not positive, or lengths differ,
-        or ``axes`` are not one per panel.
+        If there is no controller, a value is not positive, or lengths or ``axes`` do not fit.
 
     Examples
     --------
@@ -329,19 +279,14 @@ def modal_figure(
     if not residuals_nm:
         raise ProblemError("a modal figure needs the residuals of a controller; got none.")
     others = {"turbulence_nm": turbulence_nm, "gains": gains}
-    curves = {
-        name: real_array(values, name)
-        for name, values in (*residuals_nm.items(), *others.items())
-        if values is not None
-    }
+    given = (*residuals_nm.items(), *others.items())
+    curves = {name: positive(values, name) for name, values in given if values is not None}
     count = curves[next(iter(residuals_nm))].size
     for name, curve in curves.items():
         if curve.shape != (count,) or not count:
             raise DimensionError(
                 f"{name} must have {count} modes, one number per mode; got shape {curve.shape}."
             )
-        if np.any(curve <= 0):
-            raise ProblemError(f"{name} must be above 0; got {curve.min():.6g}.")
     modes = np.arange(1.0, count + 1)
     label = "mode, in Noll's order from tip on"
     x_axis = {"label": label, "log": True, "low": 1, "high": max(count, 2)}
@@ -359,10 +304,6 @@ def modal_figure(
         for name in residuals_nm:
             draw_design(panels[-1], list(residuals_nm), name, modes, curves[name], step=step)
     return panels[0].figure
-
-
-_MOST_POINTS = 4000
-_SHOWN_TAP = 5e-3  # taps after the last one of this size are not drawn
 
 
 def mirror_figure(
@@ -387,15 +328,13 @@ def mirror_figure(
     if time_ms[-1] < end_ms:  # it has decayed: the rest is its final position
         time_ms = np.append(time_ms, end_ms)
     position = np.append(step.position, 1.0)[: time_ms.size]
-    shown = np.flatnonzero(time_ms <= end_ms)
-    shown = shown[:: max(1, shown.size // _MOST_POINTS)]
+    shown = time_ms <= end_ms
     taps = hardware.mirror_taps
     ideal = replace(hardware, mirror=None).mirror_taps
-    count = max(int(np.flatnonzero(np.abs(taps) > _SHOWN_TAP)[-1]) + 1, ideal.size)
-    label = "time since the command arrived"
+    count = max(np.trim_zeros(taps.round(2), "b").size, ideal.size)  # of half a percent and more
+    time = {"label": "time since the command arrived", "unit": "ms", "low": 0, "high": end_ms}
     with drawing([2.4, 2.4], columns=2, axes=axes) as (response, weights):
-        x_axis = {"label": label, "unit": "ms", "low": 0, "high": end_ms}
-        response.set_axes(x_axis, {"label": "position / final position"})
+        response.set_axes(time, {"label": "position / final position"})
         response.span("", 1 - tolerance, 1 + tolerance, "y")
         response.curve("this mirror", time_ms[shown], position[shown])
         for k in range(1, int(end_ms / frame_ms) + 1):
@@ -428,8 +367,7 @@ def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
         title = f"{run.system.imaging_wavelength_um:g} µm, Strehl ratio {100 * run.strehl:.1f} %"
         image.set_axes(x_axis, y_axis, title=title, equal=True)
         values = np.maximum(run.psf / run.psf.max(), _FAINTEST)
-        ends = (_FAINTEST, 1.0)
-        image.map(position_mas, position_mas, values, "intensity / peak", ends=ends, log=True)
+        image.map(position_mas, position_mas, values, "intensity / peak", log=True)
         x_axis = {"label": "mode (1 tip, 2 tilt)", "log": True}
         y_axis = {"label": "residual", "unit": "nm rms", "log": True}
         modes.set_axes(x_axis, y_axis, title="all modes")
@@ -452,14 +390,11 @@ def end_to_end_table_figure(entries: Sequence[Facts]) -> Figure:
     with drawing([2.3] * len(methods), columns=len(methods)) as panels:
         for panel, method in zip(panels, methods, strict=True):
             panel.set_axes(x_axis, y_axis, title=design_label(method))
-            error, paper, modal, strehl, scatter = np.array(
-                [
-                    (e.error_hz, e.paper, e.modal, e.strehl, e.scatter)
-                    for e in rows
-                    if e.method == method
-                ],
-                dtype=float,
-            ).T
+            names = ("error_hz", "paper", "modal", "strehl", "scatter")
+            entries = [e for e in rows if e.method == method]
+            error, paper, modal, strehl, scatter = (
+                np.array([getattr(e, name) for e in entries], dtype=float) for name in names
+            )
             if not np.isnan(paper[0]):  # it published none of its own integrator
                 panel.curve("Agapito et al. 2008", error, paper, look=3, **_POINTS)
             panel.curve("modal, measured optical gain", error, modal, look=1)

@@ -12,7 +12,6 @@ import os
 import platform
 import re
 import tomllib
-import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -22,7 +21,6 @@ from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -39,9 +37,8 @@ from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import choice
 
 _MOST_NAMED = 8  # curves of a panel whose ranges are told
-_DISTRIBUTIONS = ("numpy", "scipy", "matplotlib")
-_WRITING_DIRECTIONS = ("LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI")
-Source: TypeAlias = tuple[str, str, str]  # a file's name, what it is, and its SHA-256
+_PROGRAMS = ("numpy", "scipy", "matplotlib", "cvxpy", "clarabel")
+_LISTED = ("configuration", "study")  # what is a text for people
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,30 +66,23 @@ class Chart:
 
 Listing: TypeAlias = tuple[str, str]  # a caption, and a text as it is in a file, line by line
 Block: TypeAlias = str | Notice | Listing | Table | Chart  # a text is a paragraph
-# by their anchors: headings, and what is in them
-Sections: TypeAlias = Mapping[str, tuple[str, Sequence[Block]]]
+Sections: TypeAlias = Mapping[str, Sequence[Block]]  # by their headings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Page:
-    """A whole page, for the screen or for paper; a section without blocks is left out."""
+    """A page, for the screen or for paper."""
 
     title: str  # Its heading
     subtitle: str  # A line below, such as what it is about and when it was made
     sections: Sections
-
-    def __post_init__(self) -> None:
-        kept = {key: section for key, section in self.sections.items() if section[1]}
-        object.__setattr__(self, "sections", kept)
-        keys = [*kept, *(chart.key for chart in self.charts)]
-        repeated = sorted({key for key in keys if keys.count(key) > 1})
-        if repeated:
-            raise ProblemError(f"keys of a page must be unique; got {', '.join(repeated)} twice.")
+    digests: Mapping[str, str]  # SHA-256 of the files that it was made from, by their names
+    made: str  # When
 
     @property
     def blocks(self) -> list[Block]:
         """All blocks, in their order."""
-        return [block for _, blocks in self.sections.values() for block in blocks]
+        return [block for blocks in self.sections.values() for block in blocks]
 
     @property
     def charts(self) -> list[Chart]:
@@ -114,14 +104,9 @@ def words() -> dict[str, dict[str, str]]:
 def chart(key: str, figure: Figure, *, group: str = "", **facts: object) -> Chart:
     """Return a chart with the words of its key, or of another group, and facts filled in.
 
-    A key that ends in a number is that of a continuation, with the words of the first one. Its
-    words for those who do not see it say from where to where its curves reach.
+    Its words for those who do not see it say from where to where its curves reach.
     """
-    name, _, number = key.rpartition("-")
-    own = words().get(group or key) or words()[name]
-    texts = {name: text.format(**facts) for name, text in own.items()}
-    if not group and number.isdigit():
-        texts["title"] += " (continued)"
+    texts = {name: text.format(**facts) for name, text in words()[group or key].items()}
     texts["alt"] += "".join(f" {text}." for text in _ranges(figure))
     return Chart(key=key, figure=figure, **texts)
 
@@ -155,43 +140,55 @@ def paragraph(name: str, /, **facts: object) -> str:
     return words()["paragraphs"][name].format(**facts)
 
 
-def read_source(path: str | os.PathLike[str], role: str) -> tuple[Source, bytes]:
-    """Read a file that a page is made from, and return its name, role and digest with its bytes."""
-    source = Path(path)
-    require_letters(source.name, f"name of the {role}")
-    content = read_bytes(source, FileError)
-    return (source.name, role, hashlib.sha256(content).hexdigest()), content
+def new_page(
+    title: str,
+    about: str,
+    sections: Sections,
+    *,
+    sources: Sequence[tuple[str | os.PathLike[str], str]] = (),
+    facts: Sequence[Table] = (),
+) -> Page:
+    """Return a page; the last section says from which files it was made, and by which programs.
+
+    A section without blocks is left out. Each source is a file and what it is; configurations and
+    studies are listed. ``facts`` are tables above them.
+    """
+    made, rows, listings = creation_time(), [], []
+    for path, role in sources:
+        name, content = Path(path).name, read_bytes(Path(path), FileError)
+        rows.append((name, role, hashlib.sha256(content).hexdigest()))
+        if role in _LISTED:
+            text = content.decode("utf-8-sig", errors="replace")
+            listings.append((f"{role.capitalize()} {name}", text))
+    read = Table(
+        caption="Files that were read",
+        headings=("file", "what it is", "SHA-256"),
+        rows=tuple(rows),
+        words=(1, 2),
+    )
+    programs = Table(
+        caption="Made with", headings=("program", "version"), rows=program_versions(), words=(1,)
+    )
+    files: list[Block] = [*facts, *([read] if rows else []), programs, *listings]
+    kept: Sections = {**sections, "Files and versions": files}
+    return Page(
+        title=title,
+        subtitle=f"{about}. Made {made}.",
+        sections={heading: blocks for heading, blocks in kept.items() if blocks},
+        digests={name: digest for name, _, digest in rows},
+        made=made,
+    )
 
 
-def require_letters(text: str, what: str) -> str:
-    """Refuse a text that no page can show as it is."""
-    for letter in text:
-        if (
-            unicodedata.category(letter) in ("Cc", "Cs")
-            or unicodedata.bidirectional(letter) in _WRITING_DIRECTIONS
-            or letter in "\ufffe\uffff"
-        ):
-            raise ProblemError(
-                f"{what} must be of letters that a page can show; got {text!a}. Choose another."
-            )
-    return text
-
-
-def creation_time() -> datetime:
-    """Return the time, in UTC: that of SOURCE_DATE_EPOCH if it is set, else now."""
-    given = os.environ.get("SOURCE_DATE_EPOCH")
-    if given is None:
-        return datetime.now(UTC).replace(microsecond=0)
+def creation_time() -> str:
+    """Return the time as 2026-11-21 17:05:09 UTC: that of SOURCE_DATE_EPOCH if it is set."""
+    epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
-        return datetime.fromtimestamp(int(given), UTC)
+        moment = datetime.now(UTC) if epoch is None else datetime.fromtimestamp(int(epoch), UTC)
     except (ValueError, OverflowError, OSError) as error:
         raise ProblemError(
-            f"SOURCE_DATE_EPOCH must be a number of seconds since 1970; got {given!r}."
+            f"SOURCE_DATE_EPOCH must be a number of seconds since 1970; got {epoch!r}."
         ) from error
-
-
-def time_text(moment: datetime) -> str:
-    """Return a time as a text: 2026-11-21 17:05:09 UTC."""
     return moment.strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
@@ -200,36 +197,15 @@ def creator_name() -> str:
     return f"lbt_synth {lbt_synth.__version__}"
 
 
-def program_versions(extra: Sequence[str] = ()) -> tuple[tuple[str, str], ...]:
-    """Return name and version of the programs that make a page, and of ``extra`` ones."""
+def program_versions() -> tuple[tuple[str, str], ...]:
+    """Return name and version of the programs that make a page."""
     installed = [("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())]
-    for name in (*_DISTRIBUTIONS, *extra):
+    for name in _PROGRAMS:
         try:
             installed.append((name, version(name)))
         except PackageNotFoundError:
             installed.append((name, "not installed"))
     return tuple(installed)
-
-
-def source_section(
-    sources: Sequence[Source] = (),
-    *,
-    versions: Sequence[tuple[str, str]] | None = None,
-    texts: Mapping[str, str] = MappingProxyType({}),
-    about: Table | None = None,
-) -> Sections:
-    """Return the last section of a page: what it was made from, and by which programs.
-
-    Texts are listed under their captions.
-    """
-    headings = ("file", "what it is", "SHA-256")
-    read = Table(
-        caption="Files that were read", headings=headings, rows=tuple(sources), words=(1, 2)
-    )
-    programs = tuple(program_versions() if versions is None else versions)
-    made = Table(caption="Made with", headings=("program", "version"), rows=programs, words=(1,))
-    tables = [*([] if about is None else [about]), *([read] if sources else []), made]
-    return {"sources": ("Files and versions", (*tables, *texts.items()))}
 
 
 _COLUMNS = 6  # that fit a sheet of paper beside the first one of a table
@@ -261,7 +237,8 @@ def page_html(page: Page) -> bytes:
     }
     template = environment.from_string((here / "page.html.jinja").read_text(encoding="utf-8"))
     style = (here / "page.css").read_text(encoding="utf-8")
-    return template.render(page=page, creator=creator_name(), style=style).encode()
+    text = template.render(page=page, creator=creator_name(), style=style)
+    return text.encode(errors="backslashreplace")  # of names of files that are no text
 
 
 def print_text(text: str) -> str:

@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.config import save_config
-from lbt_synth.config.ensemble import EXPECTED_ERRORS
+from lbt_synth.config.build import turbulence_sections
 from lbt_synth.config.load import validate_sections
-from lbt_synth.config.plant_and_truth import turbulence_sections
-from lbt_synth.config.schema import Ar2Section, FileSection
+from lbt_synth.config.schema import FileSection
 from lbt_synth.config.write import turbulence_content
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
@@ -30,6 +29,7 @@ from lbt_synth.storage.atomic_files import (
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies.grid import Failure, Result, Sweep, refuse
 from lbt_synth.studies.study.sample import (
+    EXPECTED_ERRORS,
     are_evaluated_together,
     evaluate_row,
     evaluate_samples,
@@ -264,7 +264,7 @@ def _row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, 
         content["sensor"]["noise_nm"] = np.asarray(truth.noise_nm).tolist()
         assumed_nm = ", ".join(f"{value:.12g}" for value in np.ravel(config.noise_nm))
         comments["sensor.noise_nm"] = f"designs assume {assumed_nm} ({NOISE_FACTOR})"
-        if any(isinstance(section, Ar2Section) for section in turbulence_sections(config.settings)):
+        if any(section.kind == "ar2" for section in turbulence_sections(config.settings)):
             # keep what was fitted above the noise that designs assume
             sections = [turbulence_content(model) for model in config.plant.turbulence]
             same = all(section == sections[0] for section in sections)

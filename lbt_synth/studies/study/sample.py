@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import cast
 
 import numpy as np
 
-from lbt_synth.config import Config, ensemble
-from lbt_synth.config.ensemble import EXPECTED_ERRORS, Samples
-from lbt_synth.config.samples import Reads
+from lbt_synth.config.samples import Keys, array_keys, build_ensemble
 from lbt_synth.design import Design
-from lbt_synth.errors import CertificateError
+from lbt_synth.errors import CertificateError, LbtSynthError
+from lbt_synth.linear import solve_dare
+from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop import ClosedLoop, simulate
 from lbt_synth.loop.ensemble import residuals_from_matrices, textbook_matrices
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.methods.request import DesignRequest, fixed_design
+from lbt_synth.models import TipTiltPlant
 from lbt_synth.studies.grid import Failure, Result, loop_columns, residual_columns
 from lbt_synth.studies.study.study import (
     DELAY_ERROR,
@@ -30,6 +31,9 @@ from lbt_synth.studies.study.study import (
 )
 from lbt_synth.validation import FloatArray, IntArray
 
+# errors that refuse a sample; LinAlgError is a ValueError
+EXPECTED_ERRORS = (LbtSynthError, ArithmeticError, ValueError)
+_DELAY: Keys = ("loop", "delay_frames")  # which decides the states of a filter
 _AGREEMENT = 1e-5  # relative, of a sample evaluated both ways; below 1 absolute
 
 
@@ -83,52 +87,65 @@ def _evaluate_groups(
     """Yield what could be evaluated together: rows, and their columns."""
     if not are_evaluated_together(study, controller):
         return
-    fixed = None  # the matrices of one design for all
-    if (design := fixed_design(controller)) is not None:
-        fixed = textbook_matrices([design.controller])
-    reads = ensemble.read_config(study.config, designs=fixed is None)
-    for rows in _find_groups(study, values, reads):
-        try:
-            config, hardware, _ = make_sample(study, values[rows[0]])
-            if fixed is None and not ensemble.has_independent_axes(config):
-                continue
-            samples = _stack_samples(study, config, values[rows], reads)
-            accepted = ensemble.accepted_samples(samples)
-            if not accepted.size:
-                continue
-            samples = samples.take(accepted)
-            with np.errstate(over="raise", divide="raise", invalid="raise"):
-                matrices = ensemble.kalman_matrices(samples) if fixed is None else fixed
-                loops = ensemble.build_ensemble(samples)
-                residuals = residuals_from_matrices(matrices, hardware, loops, in_image=True)
-            columns = residual_columns(residuals, config.imaging)
-        except EXPECTED_ERRORS:
-            continue  # one of them fails; evaluating them one by one finds which
-        yield rows[accepted], columns
+    design = fixed_design(controller)
+    keys = array_keys(study.config.settings) - ({_DELAY} if design is None else set())
+    for rows in _find_groups(study, values, keys):
+        with suppress(*EXPECTED_ERRORS):
+            yield rows, _evaluate_group(study, design, values[rows], keys)
+            continue
+        accepted = _accepted_rows(study, values, rows)  # without the one that fails
+        with suppress(*EXPECTED_ERRORS, IndexError):  # none may make a sample
+            yield accepted, _evaluate_group(study, design, values[accepted], keys)
 
 
-def _find_groups(study: Study, values: FloatArray, reads: Reads) -> Iterator[IntArray]:
-    """Yield the indices of samples that differ by numbers that builders take as arrays only."""
-    apart = [
-        i
-        for i, places in enumerate(study.places.values())
-        if not all(map(reads.take_arrays_at, places))
-    ]
+def _evaluate_group(
+    study: Study, design: Design | None, values: FloatArray, keys: set[Keys]
+) -> dict[str, FloatArray]:
+    """Return the columns of samples that differ by numbers of some keys only."""
+    config, hardware, _ = make_sample(study, values[0])
+    by_name = dict(zip(study.parameter_names, values.T, strict=True))
+    places = [(place, by_name[name]) for name, each in study.places.items() for place in each]
+    with np.errstate(over="raise", divide="raise", invalid="raise"):
+        if design is None:
+            matrices = _kalman_matrices([make_sample(study, row)[0].plant for row in values])
+        else:
+            matrices = textbook_matrices([design.controller])
+        loops = build_ensemble(
+            config,
+            {place: numbers for place, numbers in places if place in keys},
+            delay_error_frames=by_name.get(DELAY_ERROR, np.zeros(len(values))),
+            noise_factor=by_name.get(NOISE_FACTOR, np.ones(len(values))),
+        )
+        residuals = residuals_from_matrices(matrices, hardware, loops, in_image=True)
+    return residual_columns(residuals, config.imaging)
+
+
+def _accepted_rows(study: Study, values: FloatArray, group: IntArray) -> IntArray:
+    """Return the rows of a group that make a sample."""
+    accepted = []
+    for row in group.tolist():
+        with suppress(*EXPECTED_ERRORS):
+            make_sample(study, values[row])
+            accepted.append(row)
+    return np.array(accepted, dtype=np.intp)
+
+
+def _kalman_matrices(plants: list[TipTiltPlant]) -> tuple[FloatArray, ...]:
+    """Design a Kalman filter for each plant, all at once; A, B, C, D in textbook form."""
+    A, C, Q, R = (np.stack([getattr(plant, name) for plant in plants]) for name in "ACQR")
+    gains = transpose(solve_dare(transpose(A), transpose(C), Q, R).gain_feedback)
+    filters = [plant.controller(gain) for plant, gain in zip(plants, gains, strict=True)]
+    systems = [controller.to_statespace() for controller in filters]
+    return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
+
+
+def _find_groups(study: Study, values: FloatArray, keys: set[Keys]) -> Iterator[IntArray]:
+    """Yield the indices of samples that differ by numbers of some keys only."""
+    places = enumerate(study.places.values())
+    apart = [i for i, numbers in places if not keys.issuperset(numbers)]
     _, which, counts = np.unique(values[:, apart], axis=0, return_inverse=True, return_counts=True)
     for group in np.flatnonzero(counts >= min(2, len(values))):
         yield np.flatnonzero(which.reshape(-1) == group)
-
-
-def _stack_samples(study: Study, config: Config, values: FloatArray, reads: Reads) -> Samples:
-    """Return the samples of a group of rows of ``Study.values``; one configuration is given."""
-    by_name = dict(zip(study.parameter_names, values.T, strict=True))
-    places = [(keys, by_name[name]) for name, each in study.places.items() for keys in each]
-    return Samples(
-        config=config,
-        values={keys: numbers for keys, numbers in places if reads.take_arrays_at(keys)},
-        delay_error_frames=by_name.get(DELAY_ERROR, np.zeros(len(values))),
-        noise_factor=by_name.get(NOISE_FACTOR, np.ones(len(values))),
-    )
 
 
 def _require_agreement(

@@ -30,8 +30,8 @@ from lbt_synth.errors import (
 )
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.loop import ClosedLoop
-from lbt_synth.methods import method_named
 from lbt_synth.methods.method import Section
+from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import DesignRequest, Wording, design_request, fixed_design
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.studies.grid import RESIDUALS

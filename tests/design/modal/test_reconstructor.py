@@ -18,9 +18,6 @@ def test_inverse_is_that_of_numpy(q, n, seed):
     assert np.allclose(made.matrix, np.linalg.pinv(D, rcond=1e-14), rtol=1e-6, atol=1e-9)
     if n <= q:
         assert np.allclose(made.matrix @ D, np.eye(n), atol=1e-7)
-        assert made.condition_number == made.condition_number_full
-    else:
-        assert made.condition_number_full == np.inf
 
 
 def test_truncation_leaves_out_the_weakest():
@@ -36,7 +33,6 @@ def test_truncation_leaves_out_the_weakest():
     ):
         assert cut.kept == 3
         assert cut.condition_number == pytest.approx(8)
-        assert cut.condition_number_full == pytest.approx(800)
         assert np.allclose(cut.singular_values, values)
         expected = right[:, :3] / values[:3] @ left[:, :3].T
         assert np.allclose(cut.matrix, expected)

@@ -1,9 +1,7 @@
-"""Orthonormal functions with given poles."""
+"""Orthonormal functions, and a mode of the loop."""
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support.shaping import (
     RATE,
 )
@@ -13,44 +11,32 @@ from lbt_synth.design.shaping.channel import (
     Channel,
     laguerre_basis,
     mode_loop,
-    orthonormal_basis,
 )
 
 
-@settings(max_examples=30, deadline=None)
-@given(
-    st.lists(st.floats(-0.95, 0.99), max_size=4),
-    st.lists(st.tuples(st.floats(0.05, 0.999), st.floats(0.01, 3.1)), min_size=1, max_size=5),
-)
-def test_a_basis_is_orthonormal_and_has_its_poles(real, pairs):
-    upper = np.array([r * np.exp(1j * a) for r, a in pairs])
-    poles = np.concatenate([upper, upper.conj(), np.array(real, dtype=complex)])
-    basis = orthonormal_basis(poles, dt_s=1.0)
-    np.testing.assert_allclose(
-        basis.A @ basis.A.T + basis.B @ basis.B.T, np.eye(len(poles)), atol=1e-9
-    )
-    # the characteristic polynomial: the poles themselves are ill-conditioned where they repeat
-    np.testing.assert_allclose(np.poly(basis.A), np.poly(poles).real, atol=1e-8)
-
-
-def test_taps_and_laguerre_functions_are_special_cases():
-    f = np.array([0.0, 3.0, 77.0, 400.0])
+@pytest.mark.parametrize("pole", [0.0, 0.6, -0.3, 0.95])
+def test_laguerre_functions_are_orthonormal_and_have_one_pole(pole):
+    basis = laguerre_basis(6, pole, dt_s=1 / RATE)
+    np.testing.assert_allclose(basis.A @ basis.A.T + basis.B @ basis.B.T, np.eye(6), atol=1e-14)
+    f, k = np.array([0.0, 3.0, 77.0, 400.0]), np.arange(6)
     z = np.exp(2j * np.pi * f / RATE)[:, None]
-    taps = laguerre_basis(5, 0.0, dt_s=1 / RATE).response(f)
-    np.testing.assert_allclose(np.abs(taps), 1, atol=1e-12)
-    np.testing.assert_allclose(taps**2, (z ** -np.arange(5)) ** 2, atol=1e-12)  # but for signs
-    a, k = 0.6, np.arange(5)
-    expected = np.sqrt(1 - a * a) * z / (z - a) * ((1 - a * z) / (z - a)) ** k
-    found = laguerre_basis(5, a, dt_s=1 / RATE).response(f)
-    np.testing.assert_allclose(np.abs(found), np.abs(expected), atol=1e-12)
+    expected = np.sqrt(1 - pole**2) * z / (z - pole) * ((1 - pole * z) / (z - pole)) ** k
+    np.testing.assert_allclose(basis.response(f), expected, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("poles", "message"), [([1.0], "inside the unit circle"), ([0.5 + 0.1j], "conjugate pairs")]
-)
-def test_a_basis_refuses_poles_that_are_none(poles, message):
-    with pytest.raises(lbt.errors.ProblemError, match=message):
-        orthonormal_basis(np.array(poles, dtype=complex), dt_s=1.0)
+def test_a_parameter_of_few_poles_is_truncated_to_itself():
+    """Even where it is weighted: what is left out is zero at every frequency."""
+    basis, f = laguerre_basis(80, 0.5, dt_s=1 / RATE), np.linspace(0, RATE / 2, 600)
+    z = np.exp(2j * np.pi * np.arange(4096) / 4096)[:, None]
+    pair = 0.9 * np.exp(0.3j)
+    target = z * (z + 0.3) / ((z - pair) * (z - pair.conjugate()))
+    responses = basis.response(np.arange(4096) * RATE / 4096)
+    coefficients = np.real(responses.conj().T @ target[:, 0]) / 4096
+    few, shorter = basis.truncated(coefficients, 2, f, 1 / (1 + (f / 30) ** 2))
+    np.testing.assert_allclose(few.A @ few.A.T + few.B @ few.B.T, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(np.sort_complex(few.poles), [pair.conjugate(), pair], atol=1e-6)
+    found, wanted = few.response(f) @ shorter, basis.response(f) @ coefficients
+    np.testing.assert_allclose(found, wanted, atol=1e-6 * np.abs(wanted).max())
 
 
 @pytest.mark.parametrize("sensor_gain", [1.0, 0.6])

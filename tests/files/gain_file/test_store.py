@@ -273,7 +273,7 @@ def test_another_layout_is_refused_with_the_way_to_make_the_file_again(tmp_path,
         document["meta"].update(schema_version=version, library_version="0.2.0")
 
     said = (
-        f"layout version {version}, of lbt_synth 0.2.0; this version reads 4. Design it again "
+        f"layout version {version}, of lbt_synth 0.2.0; this version reads 5. Design it again "
         "with lbt-synth design CONFIG --method METHOD -o FILE."
     )
     with pytest.raises(lbt.errors.SchemaVersionError, match=said):

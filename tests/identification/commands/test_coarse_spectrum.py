@@ -37,22 +37,15 @@ def test_a_matrix_mixes_the_axes(coarse) -> None:
 
 
 def test_the_record_as_given_is_the_likeliest(coarse) -> None:
-    axis_contrast, gain, misfit = coarse.compare(list_repairs(2, 2.0))
-    contrast = axis_contrast.sum(axis=0)
+    axis_contrast, gain = coarse.compare(list_repairs(2, 2.0))
+    contrast = axis_contrast.sum(axis=0)[:-1]
     assert np.all(contrast[1:] > contrast[0] + 5)
     np.testing.assert_allclose(gain[:, 0], 0.7, rtol=0.1)
-    assert misfit[0] < 2
 
 
-def test_other_gains_are_less_likely(coarse) -> None:
-    given = CommandRepair()
-    least, gain, _ = coarse.compare([given])
-    more = coarse.profile(given, np.array([[0.35, 0.7, 1.4]] * 2)) - least
-    assert np.all(more > -0.5)
-    assert np.all(more[:, [0, 2]] > 25)
-    own = coarse.profile(given, gain) - least
-    np.testing.assert_allclose(own, 0, atol=0.02)  # what fits end within
-    assert np.sum(coarse.unrelated()) > np.sum(least) + 100
+def test_commands_that_do_not_reach_the_measurements_are_less_likely(coarse) -> None:
+    contrast, _ = coarse.compare([CommandRepair()])
+    assert np.sum(contrast[:, 1]) > np.sum(contrast[:, 0]) + 100
 
 
 def white(seed: int, n: int = 1) -> np.ndarray:
@@ -83,15 +76,14 @@ def test_a_mean_slope_does_not_show() -> None:
 
 
 def test_the_contrast_of_white_noise_lies_between_its_bounds() -> None:
-    axis = axis_of(white(2)[:, 0], white(3))
-    (contrast,), _, (misfit,) = axis.fit_profile(np.zeros(1))
+    axis = axis_of(white(2)[:, 0], 0 * white(3))
+    (contrast,), _ = axis.fit_guesses(np.ones((1, 1)))
     power, count = axis.bands.measured, axis.bands.count
     rest = np.sum(axis.peaks.count * (np.log(axis.peaks.measured) + 1))
     least = np.sum(count * (np.log(power) + 1)) + rest
     mean = np.average(power, weights=count)
     only_noise = np.sum(count) * (np.log(mean) + 1) + rest
     assert least < contrast <= only_noise + 0.1
-    assert misfit == pytest.approx(1.0, abs=0.4)
 
 
 def test_bands_are_as_wide_beside_a_peak_at_the_lowest_frequencies() -> None:
@@ -118,27 +110,11 @@ def test_the_right_correction_is_found_with_its_gain() -> None:
         u[k] = u[k - 1] + 0.5 * y[k]
     guesses = np.column_stack([np.roll(u, 2), 1e-3 * np.roll(u, 2), np.roll(u, 3), -np.roll(u, 2)])
     starts = np.array([[0.3, 1.0], [300.0, 1000.0], [0.3, 1.0], [0.3, 1.0]])
-    contrast, gain, _ = axis_of(y, guesses).fit_guesses(starts)
+    contrast, gain = axis_of(y, guesses).fit_guesses(starts)
     assert gain[0] == pytest.approx(0.6, rel=0.1)
     assert gain[1] == pytest.approx(1000 * gain[0], rel=0.01)
     assert contrast[1] == pytest.approx(contrast[0], abs=0.5)
     assert np.all(contrast[2:] > contrast[0] + 100)
-
-
-def test_derivatives_of_the_contrast() -> None:
-    rng = np.random.default_rng(6)
-    t = np.arange(FRAMES) / RATE
-    y = white(7)[:, 0] + 4 * np.sin(2 * np.pi * 33 * t)
-    fit, rows = axis_of(y, white(8)), np.zeros(1, dtype=np.intp)
-    theta = fit._begin(np.array([0.4]), rows)
-    theta = theta + 0.01 * rng.standard_normal(theta.shape)
-    gradient = fit._derivatives(theta, rows, free=True)[0][0]
-    steps = 1e-5 * np.eye(theta.size)
-    numeric = [
-        (fit._contrast(theta + h, rows)[0] - fit._contrast(theta - h, rows)[0])[0] / 2e-5
-        for h in steps
-    ]
-    np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-3 * np.max(abs(gradient)))
 
 
 @pytest.mark.parametrize("rate_hz", [1e-3, 0.8, 10.0])

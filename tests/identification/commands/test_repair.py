@@ -62,7 +62,6 @@ def test_repairs_that_are_refused() -> None:
         (lambda: CommandRepair(sign=(2,)), "command_sign must be 1 or -1"),
         (lambda: CommandRepair(scale=0.0), "command_scale must be above 0"),
         (lambda: CommandRepair(scale=(1.0, -2.0)), "command_scale must be above 0"),
-        (lambda: CommandRepair(shift_frames=101), "command_shift_frames must be at most 100"),
         (lambda: CommandRepair(matrix=(1.0, np.nan, 0.0, 1.0)), "command_matrix"),
         (lambda: CommandRepair(scale=(5.0, 4.0)).turn(1), "command_scale must be one number, or 1"),
         (lambda: repair(one, swap_axes=True), "need two axes"),

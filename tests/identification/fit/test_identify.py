@@ -29,7 +29,6 @@ from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.identification.fit import identify
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.order_search import find_rivals
-from lbt_synth.identification.records.faults import RecordHealth
 
 RATE = 1000.0
 
@@ -541,7 +540,7 @@ def test_the_limit_of_lines_is_kept_and_noted() -> None:
     [
         ({"sensor_gain": 1e300}, "sensor_gain must be"),
         ({"sensor_gain": "x"}, "sensor_gain must be an array of numbers"),
-        ({"announced": [31.0]}, "LinePrior"),
+        ({"announced": [[31.0, 0.1, 0.0]]}, "announced must be"),
         ({"start": 3}, "IdentifiedModel"),
         ({"stretches": [(2, 4000), (3000, 5000)]}, "in order, apart"),
         ({"stretches": [(0, 4000)]}, "usable"),
@@ -560,8 +559,8 @@ def test_a_dead_axis_is_named() -> None:
     record = lbt.identification.LoopRecord(
         frame_rate_hz=RATE,
         measurements=y,
-        usable=np.ones(6000, dtype=bool),
-        health=RecordHealth(frames=6000, usable=6000),
+        measured=np.ones(6000, dtype=bool),
+        commanded=np.ones(6000, dtype=bool),
     )
     with pytest.raises(ProblemError, match="axis 1 of the record is constant"):
         lbt.identify(record)
@@ -603,6 +602,22 @@ def test_a_spectrum_takes_no_options_of_series(option, model):
     given = {"start": model} if "start" in option else option
     with pytest.raises(lbt.errors.ProblemError, match="is for series of a loop"):
         lbt.identify(plain, frame_rate_hz=1000, **given)
+
+
+def test_the_noise_of_a_spectrum_without_any_is_stated():
+    """A spectrum of wind shake has none, and no filter is designed for that."""
+    f = np.arange(0.5, 400, 0.5)
+    shake = 3000 / (1 + (f / 1.5) ** 2) ** 2 + 16 / np.pi / ((f - 18) ** 2 + 0.16)
+    spectrum = lbt.identification.SpectrumRecord(frequency_hz=f, density_nm2_hz=shake[:, None])
+    stated = lbt.identify(spectrum, frame_rate_hz=1000, noise_nm=5.0)
+    assert stated.axes[0].noise_nm == 5.0
+    design = lbt.kalman(stated.plant())
+    assert design.certificate.passed
+    assert stated.truth().noise_nm.tolist() == [5.0]
+    with pytest.raises(lbt.errors.ProblemError, match="noise_nm must be above 0"):
+        lbt.identify(spectrum, frame_rate_hz=1000, noise_nm=0.0)
+    with pytest.raises(lbt.errors.ProblemError, match="noise_nm is for spectra"):
+        lbt.identify(spliced_record((0,), frames=4096), noise_nm=5.0)
 
 
 def test_known_lines_are_found(model):

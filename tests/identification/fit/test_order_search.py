@@ -105,7 +105,7 @@ def test_a_smooth_bump_is_one_component(seed: int) -> None:
     (bump,) = bump_of(smooth, seed).lines
     assert bump.sections > 1
     assert np.exp(bump.log_power) == pytest.approx(2.0 * 8 * 1.0645, rel=0.1)
-    line = 60 / np.pi * 0.05 / ((f - 41) ** 2 + 0.05**2)
+    line = 20 / np.pi * 0.05 / ((f - 41) ** 2 + 0.05**2)
     assert sorted(c.sections > 1 for c in bump_of(smooth + line, seed).lines) == [False, True]
 
 

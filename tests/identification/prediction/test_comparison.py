@@ -326,7 +326,7 @@ def test_the_controller_of_the_predictor_gives_its_residual(delay, gain, mirror,
     for i, tap in enumerate(path.mirror_taps):
         wanted[1 + i :] -= tap * commands[: len(z) - 1 - i]
     np.testing.assert_allclose(found.measured_nm, wanted[400:], rtol=0, atol=1e-8)
-    assert lbt.design.certify_loop(path, controller).passed
+    assert lbt.close_loop(path, controller).is_stable
 
 
 def test_ar_processes_are_predicted_as_in_closed_form():

@@ -371,7 +371,7 @@ def test_the_league_of_designs_and_rivals(monkeypatch, capsys):
     names = ("best integrator", "least squares, 32 taps", "Kalman")
     entries = {name: league["ENTRIES"][name] for name in names}
     monkeypatch.setitem(league["play"].__globals__, "ENTRIES", entries)
-    short = replace(short_record(), usable=np.arange(9000) < 600)
+    short = replace(short_record(), measured=np.arange(9000) < 600)
     league["play"]({"night": short_record(), "brief": short}, 2)
     failure, _, heading, *rows = capsys.readouterr().out.splitlines()
     assert failure.startswith("brief is not in the table: ")

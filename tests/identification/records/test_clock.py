@@ -11,6 +11,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import loop_record
 
 RATE = 1000.0
+NOT_USED = "the times do not tell frames apart and were not used"
 
 
 @pytest.mark.parametrize("by", ["times", "numbers", "both"])
@@ -167,6 +168,9 @@ def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, q
         # never without a reason: times as coarse as frames
         assert quantum * rate > 0.7
         return
+    if NOT_USED in seen.health.notes:
+        assert quantum * rate > 1
+        return
     ends = [k for k in lost if not frames // 8 < k < frames - frames // 8 and k < frames]
     if quantum * rate > 0.9 and ends:
         return  # rounding may hide a frame at the ends
@@ -185,11 +189,11 @@ def test_a_lost_frame_of_exact_times_is_still_found():
 
 
 def test_a_lost_frame_that_rounding_hides_is_refused():
-    kept = np.delete(np.arange(40_000), [17_000])
-    for rate in (1003, 2000):
+    for rate, lost in ((1003, 3), (2000, 4)):  # more than a step of the times hides
+        kept = np.delete(np.arange(40_000), 17_000 + np.arange(lost))
         times = np.floor(kept / rate * 1e3 + 1e-6) / 1e3
         with pytest.raises(ProblemError, match="cannot tell which frames are missing"):
-            loop_record(noise(39_999), frame_rate_hz=rate, times_s=times, unit="nm")
+            loop_record(noise(len(kept)), frame_rate_hz=rate, times_s=times, unit="nm")
     # and so it is where the rate is not quite that of the times
     kept = np.delete(np.arange(4000), [1700])
     with pytest.raises(ProblemError, match="cannot tell which frames are missing"):
@@ -200,7 +204,14 @@ def test_a_lost_frame_that_rounding_hides_is_refused():
         loop_record(noise(300), frame_rate_hz=999, times_s=times, unit="nm")
 
 
-@pytest.mark.parametrize("times", [np.zeros(3000), np.floor(np.arange(3000) / RATE)])
+@pytest.mark.parametrize(
+    "times",
+    [
+        np.zeros(3000),
+        np.floor(np.arange(3000) / RATE),
+        np.floor(np.arange(3000) / RATE * 50 / 3) / 50 * 3,
+    ],
+)
 def test_stamps_that_tell_no_frame_apart_are_not_used_beside_a_rate(times):
     kept = np.delete(np.arange(3001), [1700])
     for counter in (None, kept):
@@ -208,7 +219,7 @@ def test_stamps_that_tell_no_frame_apart_are_not_used_beside_a_rate(times):
             noise(3000), frame_rate_hz=RATE, times_s=times, frame_numbers=counter, unit="nm"
         )
         assert seen.frames == 3000 + (counter is not None)
-        assert "the times do not tell frames apart and were not used" in seen.health.notes
+        assert NOT_USED in seen.health.notes
     with pytest.raises(ProblemError, match="must rise"):
         loop_record(noise(3000), times_s=np.zeros(3000), unit="nm")
 
@@ -217,3 +228,10 @@ def test_whole_seconds_of_another_rate_are_refused():
     times = np.floor(np.arange(30_000) / RATE)
     with pytest.raises(ProblemError):
         loop_record(noise(30_000), frame_rate_hz=1300, times_s=times, unit="nm")
+
+
+def test_one_row_has_no_rate_of_its_own():
+    seen = loop_record([[1.0]], frame_rate_hz=RATE, times_s=[5.0], unit="nm")
+    assert (seen.frame_rate_hz, seen.health.notes) == (RATE, ())
+    with pytest.raises(ProblemError, match="frame rate is not known"):
+        loop_record([[1.0]], times_s=[5.0], unit="nm")

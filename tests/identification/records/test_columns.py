@@ -9,7 +9,7 @@ NAMES = {
     "y_tip [nm]": ("measurements", 0, "nm"),
     "y_tip_nm": ("measurements", 0, "nm"),
     "psd (nm^2/Hz)": ("density", None, "nm^2/Hz"),
-    "asd [nm/sqrt(Hz)]": ("amplitude", None, "nm/sqrt(Hz)"),
+    "asd [nm/sqrt(Hz)]": ("density", None, "nm/sqrt(Hz)"),
     "psd_nm^2/Hz": ("density", None, "nm^2/Hz"),
     "y [mas (rms)]": ("measurements", None, "mas (rms)"),
     "y nm]": (None, None, None),

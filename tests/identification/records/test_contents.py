@@ -3,6 +3,7 @@
 Columns chosen by their names, their axes, or the call.
 """
 
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from support.record_files import csv, hdus, image, write_csv
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.records.contents import parse_contents
+from lbt_synth.identification.records.contents import read_contents
 
 RATE = 500.0
 
@@ -131,33 +132,6 @@ def test_a_name_and_a_header_of_two_units(tmp_path, series):
     assert lbt.load_record(same).axes == 1
 
 
-@pytest.mark.parametrize(
-    ("comment", "delay"),
-    [
-        ("[ms] readout after end of frame", None),
-        ("[s] in frames of 2 ms", None),
-        ("after the end of the frame", None),
-        ("[frames] of the loop", 2.5),
-        ("[frame]", 2.5),
-        ("total, in frames", None),
-        ("(frames)", None),
-    ],
-)
-def test_delays_that_are_in_frames(tmp_path, series, comment, delay):
-    y = series[0][:, 0]
-    path = table(
-        tmp_path / "a.fits",
-        fits.Column("Y", "D", array=y, unit="nm"),
-        fits.Column("U", "D", array=y, unit="nm"),
-        FPS=RATE,
-        DELAY=(2.5, comment),
-    )
-    seen = lbt.load_record(path)
-    assert seen.delay_frames == delay
-    said = "DELAY of the header was not taken: its comment does not say that it is in frames"
-    assert any(note.startswith(said) for note in seen.health.notes) is (delay is None)
-
-
 def test_facts_in_arrays_and_texts(tmp_path, series):
     path = tmp_path / "a.npz"
     y, u = series
@@ -184,9 +158,17 @@ def test_broken_archives_do_not_speak_of_pickles(tmp_path):
             assert "pickle" not in str(caught.value)
 
 
+def contents_of(text):
+    """What a text table holds."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.csv"
+        path.write_text(text, newline="")
+        return read_contents(path)
+
+
 def table_of(text):
     """Names of the columns of a text table, its values, and notes."""
-    found = parse_contents(Path("a.csv"), text.encode())
+    found = contents_of(text)
     values = np.column_stack([column.values for column in found.columns])
     return [column.name for column in found.columns], values, found.notes
 
@@ -195,7 +177,7 @@ def test_gaps_and_comments_of_text_tables():
     names, values, _ = table_of("# mode: closed\ntime_s, y_nm\n0.000, 3.5\n0.001, \n")
     assert names == ["time_s", "y_nm"]
     assert np.array_equal(values, [[0.0, 3.5], [0.001, np.nan]], equal_nan=True)
-    found = parse_contents(Path("a.csv"), b"# mode: closed\n# frame_rate_hz: 500\ny_nm\n1.0\n2.0\n")
+    found = contents_of("# mode: closed\n# frame_rate_hz: 500\ny_nm\n1.0\n2.0\n")
     assert list(found.facts) == ["frame_rate_hz"]  # the other comment says nothing that is known
     assert list(found.facts["frame_rate_hz"]) == ["the comment frame_rate_hz"]
 

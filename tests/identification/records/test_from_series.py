@@ -1,101 +1,14 @@
-"""Commands from a second file, matched by counters and times.
-
-Records from arrays: gaps, units, commands, and what is refused.
-"""
+"""Records from arrays: gaps, units, commands, and what is refused."""
 
 import numpy as np
 import pytest
-from support.record_files import csv
 from support.records import SHELL, findings, kinds, ran
 
 import lbt_synth as lbt
-from lbt_synth.errors import ProblemError, TelemetryError
-from lbt_synth.identification import loop_record, require_length
+from lbt_synth.identification import loop_record
+from lbt_synth.identification.records.record import require_length
 
-RATE = 500.0
-RATE_2 = 1000.0
-
-
-def test_commands_from_another_file(tmp_path, series):
-    y, u = series
-    np.save(tmp_path / "y.npy", y)
-    np.save(tmp_path / "u.npy", u)
-    seen = lbt.load_record(
-        tmp_path / "y.npy", commands=tmp_path / "u.npy", frame_rate_hz=RATE, unit="nm"
-    )
-    assert np.array_equal(seen.measurements, y)
-    assert np.array_equal(seen.commands, u)
-    assert f"commands are from {tmp_path / 'u.npy'}" in seen.health.notes
-    np.save(tmp_path / "v.npy", u[:-1])
-    with pytest.raises(TelemetryError, match="as many frames as the measurements; got 59, 60"):
-        lbt.load_record(tmp_path / "y.npy", commands=tmp_path / "v.npy", unit="nm")
-    with pytest.raises(TelemetryError, match="cannot read .*w.npy: No such file"):
-        lbt.load_record(tmp_path / "y.npy", commands=tmp_path / "w.npy", unit="nm")
-
-
-FRAMES = 60
-
-
-def test_two_files_are_laid_beside_each_other_by_their_counters(tmp_path, series):
-    y, u = series[0][:, 0], series[1][:, 0]
-    mine = csv(tmp_path / "y.csv", frame=np.arange(10, 70), y_nm=y)
-    theirs = csv(tmp_path / "u.csv", frame=np.arange(60), u_nm=u)
-    seen = lbt.load_record(mine, commands=theirs, frame_rate_hz=RATE, delay_frames=2)
-    assert np.array_equal(seen.measurements[:50, 0], y[:50])
-    assert np.array_equal(seen.commands[:50, 0], u[10:])
-    # commands 60 ... 69 are not there: y(k) holds u(k-2)
-    assert np.flatnonzero(~seen.usable).tolist() == [0, 1, *range(52, 60)]
-    assert any("by frame: 50 of 60 rows have one" in note for note in seen.health.notes)
-    longer = csv(tmp_path / "l.csv", frame=np.arange(70), u_nm=np.append(u, u[:10]))
-    seen = lbt.load_record(mine, commands=longer, frame_rate_hz=RATE, delay_frames=2)
-    assert np.array_equal(seen.commands[:, 0], np.append(u, u[:10])[10:])
-    far = csv(tmp_path / "f.csv", frame=np.arange(500, 560), u_nm=u)
-    with pytest.raises(TelemetryError, match="only 0 of 60 measurements have a command"):
-        lbt.load_record(mine, commands=far, frame_rate_hz=RATE)
-    twice = csv(tmp_path / "t.csv", frame=np.arange(60) // 2 * 2, u_nm=u)
-    with pytest.raises(TelemetryError, match="must rise from row to row to be matched"):
-        lbt.load_record(mine, commands=twice, frame_rate_hz=RATE)
-    back = csv(tmp_path / "b.csv", frame=np.arange(60)[::-1], u_nm=u)
-    with pytest.raises(TelemetryError, match="of both files must rise, without gaps"):
-        lbt.load_record(mine, commands=back, frame_rate_hz=RATE)
-
-
-def test_two_files_are_laid_beside_each_other_by_their_times(tmp_path, series):
-    y, u = series[0][:, 0], series[1][:, 0]
-    mine = csv(tmp_path / "y.csv", time_s=np.arange(60) / RATE + 0.02, y_nm=y)
-    theirs = csv(tmp_path / "u.csv", time_ms=np.arange(60) * 1e3 / RATE + 0.1, u_nm=u)
-    seen = lbt.load_record(mine, commands=theirs, delay_frames=2)
-    assert np.array_equal(seen.commands[:50, 0], u[10:])
-    assert seen.frame_rate_hz == pytest.approx(RATE)
-    between = csv(tmp_path / "b.csv", time_ms=np.arange(60) * 1e3 / RATE + 1.0, u_nm=u)
-    with pytest.raises(TelemetryError, match="only 0 of 60 measurements have a command"):
-        lbt.load_record(mine, commands=between)
-    bare = csv(tmp_path / "n.csv", u_nm=u)
-    seen = lbt.load_record(mine, commands=bare)
-    assert np.array_equal(seen.commands[:, 0], u)
-    assert any("no clock in common" in note for note in seen.health.notes)
-    short = csv(tmp_path / "s.csv", u_nm=u[:-1])
-    with pytest.raises(TelemetryError, match="as many frames as the measurements; got 59, 60"):
-        lbt.load_record(mine, commands=short)
-
-
-def test_both_files_tell_facts_and_each_its_own_unit(tmp_path, series):
-    y, u = series[0][:, 0], series[1][:, 0]
-    mine = csv(tmp_path / "y.csv", ("unit = mas", "diameter_m = 8.0"), y=y)
-    slow = csv(tmp_path / "u.csv", ("frame_rate_hz = 250", "delay_frames = 2"), u_nm=u)
-    with pytest.raises(ProblemError, match=r"must be that of .* in u\.csv, 250; got 500"):
-        lbt.load_record(mine, commands=slow, frame_rate_hz=RATE)
-    seen = lbt.load_record(mine, commands=slow)
-    assert (seen.frame_rate_hz, seen.delay_frames) == (250.0, 2.0)
-    assert np.allclose(seen.measurements[:, 0], lbt.models.nm_per_mas(8.0) * y)
-    assert np.allclose(seen.commands[:, 0], u)
-    silent = csv(tmp_path / "v.csv", u=u)
-    with pytest.raises(ProblemError, match="nothing tells the unit of u; give command_unit"):
-        lbt.load_record(mine, commands=silent, frame_rate_hz=RATE)
-    with pytest.raises(ProblemError, match="command_unit must be one of nm, .*'V'.*volts .* scale"):
-        lbt.load_record(mine, commands=silent, frame_rate_hz=RATE, command_unit="V")
-    seen = lbt.load_record(mine, commands=silent, frame_rate_hz=RATE, command_unit="um")
-    assert np.allclose(seen.commands[:, 0], 1e3 * u)
+RATE = 1000.0
 
 
 def test_gaps_of_every_kind():
@@ -103,13 +16,12 @@ def test_gaps_of_every_kind():
     y[100, 0] = np.nan
     y[200:203, 1] = np.inf
     y[500:540, 0] = y[500, 0]
-    seen = loop_record(y, frame_rate_hz=RATE_2, unit="nm")
+    seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert findings(seen) == [
         ("not finite", "measurements", 0, 1, 100, True),
         ("stuck", "measurements", 0, 40, 500, True),
         ("not finite", "measurements", 1, 3, 200, True),
     ]
-    assert not seen.health.clean
     assert seen.health.usable == np.sum(seen.usable) == 2000 - 44
     assert seen.stretches() == ((0, 100), (101, 200), (203, 500), (540, 2000))
     assert np.all(np.isfinite(seen.measurements))
@@ -125,7 +37,7 @@ def test_masked_and_absurd_values_are_gaps():
     y[30] = -3e105
     masked = np.ma.masked_array(y, mask=np.arange(100)[:, None] == 50)
     for unit in ("nm", "m"):
-        seen = loop_record(masked, frame_rate_hz=RATE_2, unit=unit)
+        seen = loop_record(masked, frame_rate_hz=RATE, unit=unit)
         assert np.flatnonzero(~seen.usable).tolist() == [20, 30, 50]
         assert np.all(np.abs(seen.measurements) < 1e11)
 
@@ -133,7 +45,7 @@ def test_masked_and_absurd_values_are_gaps():
 def test_a_dead_axis_leaves_nothing():
     y = np.random.default_rng(0).standard_normal((5000, 2))
     y[:, 1] = 0.0
-    seen = loop_record(y, frame_rate_hz=RATE_2, unit="nm")
+    seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert not seen.usable.any()
     assert kinds(seen) == {("stuck", "measurements", 1)}
     with pytest.raises(
@@ -143,12 +55,12 @@ def test_a_dead_axis_leaves_nothing():
 
 
 def test_clipped_commands_spoil_open_loops_are_reported():
-    path = lbt.LoopHardware(frame_rate_hz=RATE_2)
+    path = lbt.LoopHardware(frame_rate_hz=RATE)
     run = ran(path, frames=3000, noise_nm=5)
     u = np.clip(run.commands[0], -250, None)
     u[1000:1100] = 0.0
     u[2000:2050, 0] = u[2000, 0]
-    seen = loop_record(run.measurements[0], u, frame_rate_hz=RATE_2, delay_frames=2, unit="nm")
+    seen = loop_record(run.measurements[0], u, frame_rate_hz=RATE, delay_frames=2, unit="nm")
     assert kinds(seen, spoils=False) == {("loop open", "commands", None), ("held", "commands", 0)}
     count = {f.kind: (f.count, f.first_frame) for f in seen.health.findings if not f.spoils}
     assert count == {"loop open": (100, 1000), "held": (50, 2000)}
@@ -162,7 +74,7 @@ def test_clipped_commands_spoil_open_loops_are_reported():
 
 def test_an_open_loop_with_zero_commands():
     y = np.random.default_rng(0).standard_normal((200, 2))
-    seen = loop_record(y, 0 * y, frame_rate_hz=RATE_2, delay_frames=2, unit="nm")
+    seen = loop_record(y, 0 * y, frame_rate_hz=RATE, delay_frames=2, unit="nm")
     assert ("loop open", "commands", None, 200, 0, False) in findings(seen)
     assert seen.usable[2:].all()
     assert np.array_equal(seen.pseudo_open_loop(), y)
@@ -171,7 +83,7 @@ def test_an_open_loop_with_zero_commands():
 def test_a_scatter_that_changes_is_said():
     y = np.random.default_rng(0).standard_normal((4000, 2))
     y[:, 1] *= np.linspace(1, 6, 4000)
-    seen = loop_record(y, frame_rate_hz=RATE_2, unit="nm")
+    seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
     (note,) = seen.health.notes
     assert note.startswith("axis 1 is not stationary: the rms difference of two frames is 2")
     assert seen.usable.all()
@@ -192,16 +104,16 @@ def test_a_scatter_that_changes_is_said():
 )
 def test_units(unit, factor):
     y = np.array([1.0, 2.0, -1.0])
-    seen = loop_record(y / factor, frame_rate_hz=RATE_2, unit=unit, diameter_m=8.22)
+    seen = loop_record(y / factor, frame_rate_hz=RATE, unit=unit, diameter_m=8.22)
     assert seen.measurements[:, 0] == pytest.approx(y, rel=1e-5)
     if unit in ("mas", "arcsec", "urad", "rad"):
         with pytest.raises(lbt.errors.ProblemError, match="give diameter_m"):
-            loop_record(y, frame_rate_hz=RATE_2, unit=unit)
+            loop_record(y, frame_rate_hz=RATE, unit=unit)
 
 
 def test_commands_may_have_a_unit_of_their_own():
     y = np.random.default_rng(0).standard_normal((30, 1))
-    seen = loop_record(y, y, frame_rate_hz=RATE_2, unit="nm", command_unit="um")
+    seen = loop_record(y, y, frame_rate_hz=RATE, unit="nm", command_unit="um")
     assert np.allclose(seen.commands, 1e3 * y)
 
 
@@ -228,6 +140,6 @@ def test_commands_may_have_a_unit_of_their_own():
 )
 def test_arrays_that_are_refused(change, words):
     y = np.random.default_rng(0).standard_normal((30, 2))
-    fields = {"measurements": y, "commands": y, "frame_rate_hz": RATE_2, "unit": "nm"}
+    fields = {"measurements": y, "commands": y, "frame_rate_hz": RATE, "unit": "nm"}
     with pytest.raises(lbt.errors.ProblemError, match=words):
         loop_record(**{**fields, **change})

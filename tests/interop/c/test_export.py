@@ -20,7 +20,8 @@ from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.interop import pipeline
 from lbt_synth.interop.c import export as c_export
 from lbt_synth.interop.c.terms import RunningSource, source_terms
-from lbt_synth.interop.pipeline import rehearsal_error, target_named, target_names
+from lbt_synth.interop.pipeline import target_named, target_names
+from lbt_synth.interop.proof import rehearsal_error
 from lbt_synth.linear.controller import RunningController
 from lbt_synth.loop.simulation.run import Drop
 

@@ -18,8 +18,7 @@ from lbt_synth.interop.c.terms import (
     read_source,
     source_terms,
 )
-from lbt_synth.interop.pipeline import rehearsal_error
-from lbt_synth.interop.proof import prove_written
+from lbt_synth.interop.proof import prove_written, rehearsal_error
 from lbt_synth.linear import estimator_form
 
 KINDS = {"double": np.float64, "single": np.float32}

@@ -14,6 +14,7 @@ from support.periodic_problems import lifted_problem, random_periodic_problem, r
 from support.plants import lbt_axis_plant, random_problem
 
 import lbt_synth as lbt
+from lbt_synth.design.certificate import certify_filter
 from lbt_synth.errors import DetectabilityError, InfeasibleError, NumericalError
 from lbt_synth.linear import EstimationProblem, infeasible_level
 from lbt_synth.linear.infeasibility_proof import worst_invisible_disturbance
@@ -239,7 +240,7 @@ def test_a_slow_line_of_little_damping_is_no_line_without_any(numbers):
     plant = slow_line(*numbers)
     found = lbt.linear.kalman_riccati(plant)
     assert found.P == pytest.approx(doubled(plant), rel=5e-6)  # scipy's is off by up to 4e-5
-    certificate = lbt.design.certify_filter(plant, found.gain_predictor, least_variance=True)
+    certificate = certify_filter(plant, found.gain_predictor, least_variance=True)
     assert certificate.passed
 
 

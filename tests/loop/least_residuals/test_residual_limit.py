@@ -12,6 +12,7 @@ from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.design.result import model_limits
+from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 
 
@@ -240,7 +241,7 @@ def test_no_design_passes_the_limit(gain, delay, noise, seed, frame_means):
         dt_s=1 / RATE,
     )
     loop = lbt.close_loop(
-        hardware, lbt.loop.youla_controller(hardware, parameter), sensor_gain=truth.sensor_gain
+        hardware, youla_controller(hardware, parameter), sensor_gain=truth.sensor_gain
     )
     assume(loop.is_stable)
     left = lbt.residual_budget(loop, truth, frame_means=frame_means)

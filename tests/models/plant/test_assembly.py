@@ -10,7 +10,7 @@ from support.sensor_loops import AIR, FAST, LINES, MOTIONS, SLOW, example_plant,
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
-from lbt_synth.models.plant.readings import Exposure, memory, other_exposures, own_exposure
+from lbt_synth.models.plant.assembly import Exposure, memory, other_exposures, own_exposure
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 SEEING = Accelerometer(

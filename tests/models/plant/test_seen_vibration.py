@@ -15,6 +15,14 @@ PATH = LoopHardware(frame_rate_hz=RATE_HZ, delay_frames=2, modes=1)
 LAGS = 4
 
 
+# Filters of wavefront and accelerometer against the limit of the continuous oscillator: that of a
+# Kalman filter of an oscillator that is kicked within each frame, and what the loop leaves of it.
+# Neither comes from the package.
+RMS_NM, NOISE_NM = 563.6, 77.5
+# almost none: 3e-9 of the least residual's power
+AIR = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=2e-4, frame_rate_hz=RATE_HZ)
+
+
 def mirror(**changes):
     facts = {"name": "mirror", "rate_hz": RATE_HZ, "delay_frames": 1, "noise_m_s2": 1e-3}
     return Accelerometer(**(facts | {"channels": ("a", "v")} | changes))
@@ -113,14 +121,6 @@ def test_lines_above_the_nyquist_frequency_are_refused():
     line = lbt.Vibration(frequency_hz=401, damping=0.05, rms_nm=500)
     with pytest.raises(ProblemError, match="below the Nyquist frequency"):
         seen_vibration(line, {}, (), PATH)
-
-
-# Filters of wavefront and accelerometer against the limit of the continuous oscillator: that of a
-# Kalman filter of an oscillator that is kicked within each frame, and what the loop leaves of it.
-# Neither comes from the package.
-RMS_NM, NOISE_NM = 563.6, 77.5
-# almost none: 3e-9 of the least residual's power
-AIR = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=2e-4, frame_rate_hz=RATE_HZ)
 
 
 def designed(frequency_hz, damping, noise, age):

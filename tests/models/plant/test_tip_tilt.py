@@ -2,11 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_lyapunov
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.models import ARModel
 from lbt_synth.models.plant.tip_tilt import retuned_plant
+
+RATE = 800
 
 
 def slow(pole=0.98, drive=50.0):
@@ -121,3 +124,146 @@ def test_sizes_that_clash_are_named():
             lbt.EstimationProblem(**(good | {name: np.ones(size)}))
     with pytest.raises(lbt.errors.DefinitenessError, match="Every measurement needs noise"):
         lbt.EstimationProblem(A=0.5, B=[[1.0]], C=1.0, D=[[0.0]], L=1.0)
+
+
+def slow_full_state(pole=0.98, drive=50.0):
+    return lbt.models.ARModel(coefficients=[pole], driving_rms_nm=drive, frame_rate_hz=800)
+
+
+def test_full_form_is_the_papers():
+    """Two modes, one vibration on each: 2p + 2n + m = 10, equations 5 to 7."""
+    lines = [
+        lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=500, direction=(1, 0)),
+        lbt.Vibration(frequency_hz=27, damping=0.02, rms_nm=300, direction=(0, 1)),
+    ]
+    rng = np.random.default_rng(1)
+    sensor, influence = rng.standard_normal((3, 2)), rng.standard_normal((2, 2))
+    plant = lbt.tip_tilt_plant(
+        frame_rate_hz=800,
+        turbulence=slow_full_state(),
+        vibrations=lines,
+        noise_nm=2.0,
+        sensor_matrix=sensor,
+        influence_matrix=influence,
+    )
+    full = plant.full()
+    a = np.array([line.ar_model(800).coefficients for line in lines])
+    A1, minus_A2 = np.diag(a[:, 0]), np.diag(a[:, 1])
+    I, Z = np.eye(2), np.zeros((2, 2))
+    expected = np.block(
+        [
+            [A1, minus_A2, Z, Z, Z],
+            [I, Z, Z, Z, Z],
+            [Z, Z, 0.98 * I, Z, Z],
+            [I, Z, I, Z, Z],
+            [Z, Z, Z, Z, Z],
+        ]
+    )
+    assert np.array_equal(full.A, expected)
+    assert np.all(np.linalg.eigvals(minus_A2) < 0)
+    assert np.array_equal(full.B_known, np.vstack([Z, Z, Z, Z, I]))
+    assert np.array_equal(full.L, np.hstack([I, Z, I, Z, Z]))
+    assert np.allclose(
+        full.C, np.hstack([sensor @ m for m in (Z, Z, Z, I, -influence)]), rtol=1e-15
+    )
+    assert not np.any(full.D_known)
+
+
+@pytest.mark.parametrize("delay", [1, 1.3, 2, 2.5, 3, 4])
+@pytest.mark.parametrize("design", [lbt.kalman, lambda p: lbt.hinf(p, gamma_ratio=1.2)])
+def test_full_and_reduced_form_give_the_same_controller(delay, design):
+    plant = lbt_axis_plant(delay_frames=delay)
+    form, n = plant.full(), plant.n_states
+    matrices = {name: getattr(form, name) for name in "ABCDL"}
+    reduced, full = design(plant), design(lbt.EstimationProblem(**matrices, dt_s=plant.dt_s))
+    scale = np.abs(reduced.gain_predictor).max()
+    assert np.allclose(full.gain_predictor[:n], reduced.gain_predictor, atol=1e-7 * scale)
+    assert np.allclose(full.gain_predictor[n:], 0, atol=1e-7 * scale)
+    whole = form.controller(full.gain_predictor, plant.hardware.projector @ form.L)
+    f = np.geomspace(0.1, 400, 50)
+    one, other = (c.to_statespace().frequency_response(f) for c in (reduced.controller, whole))
+    assert np.allclose(one, other, rtol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def plant():
+    return lbt_axis_plant()
+
+
+def test_the_spectrum_is_the_mean_of_the_moved_ones(plant):
+    spread = lbt.models.spread_plant(plant, half_width_hz=1.0, lines=4)
+    line = plant.vibrations[0]
+    f = np.concatenate([np.linspace(0, 400, 300), np.linspace(18, 22, 300)])
+    moved = [line.at_frequency(g).ar_model(RATE).psd(f) for g in (19.25, 19.75, 20.25, 20.75)]
+    total = sum(part.ar_model(RATE).psd(f) for part in spread.vibrations)
+    np.testing.assert_allclose(total, np.mean(moved, axis=0), rtol=1e-11)
+    assert np.hypot.reduce([v.rms_nm for v in spread.vibrations]) == pytest.approx(line.rms_nm)
+    for part in spread.vibrations:
+        assert part.damping * part.frequency_hz == pytest.approx(0.2)
+        assert part.direction == line.direction
+    assert lbt.kalman(spread).certificate.passed
+
+
+def test_the_prior_filter_is_the_best_on_average(plant):
+    """Of the filters at hand it has the least mean variance over the frequencies of the prior."""
+    frequencies = [19.2, 19.6, 20.0, 20.4, 20.8]
+    spread = lbt.models.spread_plant(plant, half_width_hz=1.0)
+    assert [line.frequency_hz for line in spread.vibrations] == pytest.approx(frequencies)
+    line = plant.vibrations[0]
+    plants = [
+        lbt.tip_tilt_plant(
+            frame_rate_hz=RATE,
+            turbulence=plant.turbulence,
+            vibrations=[line.at_frequency(f)],
+            noise_nm=15.5,
+            modes=1,
+        )
+        for f in frequencies
+    ]
+
+    def mean(design):
+        return np.mean([error_variance(truth, design) for truth in plants])
+
+    best = lbt.kalman(spread)
+    assert mean(best) == pytest.approx(best.rms**2, rel=1e-8)
+    for other in (lbt.kalman(plant), lbt.hinf(plant, route="riccati"), lbt.kalman(plants[0])):
+        assert mean(other) > 1.005 * best.rms**2
+
+
+def error_variance(truth, design):
+    """Variance of the prediction error of a filter in another plant, from both states at once."""
+    model, gain = design.problem, design.gain_predictor
+    zero = np.zeros((len(truth.A), len(model.A)))
+    A = np.block([[truth.A, zero], [gain @ truth.C, model.A - gain @ model.C]])
+    B = np.vstack([truth.B, gain @ truth.D])
+    C = np.hstack([truth.L, -model.L])
+    return float(np.trace(C @ solve_discrete_lyapunov(A, B @ B.T) @ C.T))
+
+
+def test_one_line_at_the_centre_is_the_plant_itself(plant):
+    np.testing.assert_allclose(
+        lbt.models.spread_plant(plant, half_width_hz=1.0, lines=1).A, plant.A, rtol=1e-12
+    )
+    two = lbt_axis_plant(modes=2)
+    assert len(lbt.models.spread_plant(two, half_width_hz=1.0, lines=3).vibrations) == 6
+
+
+def test_priors_that_cannot_be(plant):
+    common = {
+        "frame_rate_hz": RATE,
+        "turbulence": plant.turbulence[0],
+        "noise_nm": 15.5,
+        "modes": 1,
+    }
+    line = plant.vibrations[0].retuned(399.0, frame_rate_hz=RATE)
+    none, fast = (lbt.tip_tilt_plant(vibrations=v, **common) for v in (None, [line]))
+    for wrong, arguments, text in (
+        (none, {"half_width_hz": 1.0}, "needs a plant with a vibration"),
+        (plant, {"half_width_hz": 0.0}, "half_width_hz must be above 0"),
+        (plant, {"half_width_hz": 20.0}, "half_width_hz must be below 20; got 20. All"),
+        (plant, {"half_width_hz": 1.0, "lines": 0}, "lines must be at least 1"),
+        (plant, {"half_width_hz": 1.0, "lines": 65}, "lines must be at most 64"),
+        (fast, {"half_width_hz": 9.0}, "below the Nyquist frequency"),
+    ):
+        with pytest.raises(lbt.errors.ProblemError, match=text):
+            lbt.models.spread_plant(wrong, **arguments)

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.integrate import quad, trapezoid
+from scipy.special import gamma, jv
 
 import lbt_synth as lbt
+from lbt_synth.models.turbulence.ar_models import noll_orders, zernike_variances
+
+SITE = {"seeing_arcsec": 0.8, "wind_speed_m_s": 20, "diameter_m": 8.22}
+SITE_MODAL = {"seeing_arcsec": 0.8, "wind_speed_m_s": 20, "diameter_m": 8.22}
+RATE = 800.0
 
 
 def test_le_roux_pole():
@@ -76,3 +83,107 @@ def test_noise_that_hides_the_turbulence_is_named():
             lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=noise_nm)
     loud = lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=1e4)
     assert loud.rms_nm == pytest.approx(air.tilt_rms_nm, rel=1e-5)
+
+
+def kolmogorov(air: lbt.Atmosphere, n: int) -> float:
+    """Closed form, Noll (1976) eq. 25 with all digits of its constant [nm^2]."""
+    power, order = 14 / 3, n + 1
+    bessel = gamma(power) * gamma(order + (1 - power) / 2)
+    bessel /= 2**power * gamma((1 + power) / 2) ** 2 * gamma(order + (1 + power) / 2)
+    ratio = air.diameter_m / air.fried_parameter_m
+    radians = 8 * np.pi * (n + 1) * 0.0228956 * (np.pi * ratio) ** (5 / 3) * bessel
+    return float(radians * (air.seeing_wavelength_um * 1e3 / (2 * np.pi)) ** 2)
+
+
+def test_variances_are_nolls_closed_form():
+    air = lbt.Atmosphere(outer_scale_m=None, **SITE)
+    found = zernike_variances(air, 36)
+    expected = [kolmogorov(air, n) for n in range(1, 37)]
+    assert np.allclose(found, expected, rtol=1e-6)
+    # Noll's table IV: a tilt has 0.448 (D/r0)^(5/3) rad^2, a defocus 0.0232
+    unit = (air.diameter_m / air.fried_parameter_m) ** (5 / 3) * (500 / (2 * np.pi)) ** 2
+    assert np.allclose(found[:2] / unit, [0.448, 0.0232], rtol=3e-3)
+
+
+def test_variances_with_an_outer_scale():
+    air = lbt.Atmosphere(outer_scale_m=22, **SITE)
+    found = zernike_variances(air, 36)
+    assert found[0] == pytest.approx(air.tilt_rms_nm**2, rel=1e-7)
+    scale = kolmogorov(air, 5) / kolmogorov_integral(air, 5, None)
+    assert found[4] == pytest.approx(scale * kolmogorov_integral(air, 5, 22.0), rel=1e-5)
+    assert np.all(np.diff(found) < 0)
+
+
+def kolmogorov_integral(air, n, outer):
+    inner = 0 if outer is None else outer**-2
+
+    def density(x):
+        f = x / (np.pi * air.diameter_m)
+        return f * (f**2 + inner) ** (-11 / 6) * (jv(n + 1, x) / x) ** 2
+
+    return (
+        sum(quad(density, a, a + 5, epsabs=0, epsrel=1e-9)[0] for a in range(1, 300, 5))
+        + quad(density, 1e-6, 1, epsrel=1e-9)[0]
+    )
+
+
+def test_nolls_order():
+    radial, azimuthal = noll_orders(20)
+    # Noll's table I, j = 2 to 21
+    assert radial.tolist() == [1] * 2 + [2] * 3 + [3] * 4 + [4] * 5 + [5] * 6
+    assert azimuthal.tolist() == [1, 1, 0, 2, 2, 1, 1, 3, 3, 0, 2, 2, 4, 4, 1, 1, 3, 3, 5, 5]
+    with pytest.raises(lbt.errors.ProblemError, match="modes must be at least 1"):
+        noll_orders(0)
+
+
+def test_modes_of_a_telescope():
+    air = lbt.Atmosphere(outer_scale_m=22, **SITE_MODAL)
+    modes = lbt.models.modal_turbulence(air, modes=30, frame_rate_hz=800)
+    tilt = lbt.models.ar1_turbulence(air, frame_rate_hz=800)
+    assert modes.coefficients[0, 0] == tilt.coefficients[0]
+    assert modes.rms_nm[1] == pytest.approx(tilt.rms_nm, rel=1e-7)
+    radial, _ = noll_orders(30)
+    assert np.allclose(
+        np.log(modes.coefficients[:, 0]) / np.log(tilt.coefficients[0]), (radial + 1) / 2
+    )
+    # the spectra hold the variances
+    f = np.linspace(0, 400, 200_001)
+    assert np.allclose(trapezoid(modes.psd(f), f, axis=1), modes.rms_nm**2, rtol=1e-3)
+    with pytest.raises(lbt.errors.ProblemError, match="expected an Atmosphere"):
+        lbt.models.modal_turbulence(800, modes=3, frame_rate_hz=800)
+    with pytest.raises(lbt.errors.ProblemError, match="frame_rate_hz"):
+        lbt.models.modal_turbulence(air, modes=3, frame_rate_hz=-1)
+
+
+def test_arrays_are_the_single_models():
+    models = [
+        lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=3.0, frame_rate_hz=RATE),
+        lbt.models.ARModel(coefficients=[1.9, -0.92], driving_rms_nm=1.0, frame_rate_hz=RATE),
+    ]
+    air = lbt.models.ModalTurbulence.of(models)
+    assert (air.n_modes, air.order) == (2, 2)
+    assert np.allclose(air.rms_nm, [m.rms_nm for m in models], rtol=1e-13)
+    f = np.geomspace(0.1, 400, 7)
+    assert np.allclose(air.psd(f), [m.psd(f) for m in models], rtol=1e-12)
+    assert air.model(1).coefficients.tolist() == [1.9, -0.92]
+
+
+def test_bad_arrays_are_refused():
+    ok = {"coefficients": [[0.9], [0.8]], "driving_rms_nm": [1, 1], "frame_rate_hz": 800}
+    for change, error, words in (
+        ({"coefficients": [[0.9], [1.0]]}, lbt.errors.ProblemError, "modulus 1 in mode 1"),
+        ({"coefficients": np.zeros((0, 1))}, lbt.errors.DimensionError, "at least one of each"),
+        ({"driving_rms_nm": [1]}, lbt.errors.DimensionError, r"shape \(2,\)"),
+        ({"driving_rms_nm": [1, 0]}, lbt.errors.ProblemError, "above 0"),
+        ({"frame_rate_hz": 0}, lbt.errors.ProblemError, "frame_rate_hz"),
+    ):
+        with pytest.raises(error, match=words):
+            lbt.models.ModalTurbulence(**(ok | change))
+    air = lbt.models.ModalTurbulence(**ok)
+    with pytest.raises(lbt.errors.ProblemError, match="at most 1; got 2"):
+        air.model(2)
+    with pytest.raises(lbt.errors.ProblemError, match="one ARModel a mode"):
+        lbt.models.ModalTurbulence.of([])
+    slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=500)
+    with pytest.raises(lbt.errors.ProblemError, match="same frame rate"):
+        lbt.models.ModalTurbulence.of([air.model(0), slow])

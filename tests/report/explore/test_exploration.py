@@ -1,7 +1,5 @@
 """From a wish to what the page shows."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from support.configs import AR, change_key, write_config
@@ -12,18 +10,16 @@ import lbt_synth as lbt
 from lbt_synth.linear import largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.report.explore.exploration import (
-    complete,
     describe_moves,
     explore,
     explored_table,
     fulfil,
     judge,
     list_knobs,
-    loop_curves,
     moved_knobs,
-    quick_view,
+    new_view,
     shift_range_hz,
-    whole_view,
+    show_design,
 )
 from lbt_synth.report.figures.records import exact_spectrum
 from lbt_synth.storage.display_unit import own_display_unit, show_in
@@ -36,23 +32,14 @@ def exploration():
 
 
 def test_a_view_begins_with_its_own_design(exploration):
-    view = quick_view(exploration)
-    assert list(view.shown) == ["Kalman", "old"]
+    view = new_view(exploration)
     assert view.name == "Kalman"
-    assert not view.is_whole
-    assert all(one.left is None for one in view.shown.values())
-    whole = whole_view(exploration, view)
-    assert whole.is_whole
-    assert [row[0] for row in explored_table(whole.shown).rows] == ["Kalman", "old"]
-    after = quick_view(exploration, "hinf", {"gain": 0.7}, whole)
-    lent = [one.left for one in after.shown.values()]
-    assert lent == [one.left for one in whole.shown.values()]
-    assert not after.is_whole
+    assert [row[0] for row in explored_table(view.shown).rows] == ["Kalman", "old"]
 
 
 def test_names_are_unique(exploration):
     again = explore(exploration.config, {"Kalman": lbt.kalman(exploration.config.plant)})
-    assert list(quick_view(again).shown) == ["Kalman by the sliders", "Kalman"]
+    assert list(new_view(again).shown) == ["Kalman by the sliders", "Kalman"]
 
 
 def test_a_design_for_another_loop_is_refused(exploration):
@@ -64,7 +51,7 @@ def test_a_design_for_another_loop_is_refused(exploration):
 
 
 def test_the_verdict(exploration):
-    view = quick_view(exploration)
+    view = new_view(exploration)
     budget = lbt.residual_budget(
         lbt.close_loop(view.config.hardware, view.design.controller), view.config.truth
     )
@@ -72,20 +59,29 @@ def test_the_verdict(exploration):
     assert text.startswith(f"Kalman leaves {budget.rms_nm:.1f} nm rms, Strehl ratio 82.7 %")
     assert "above the least of any linear controller" in text
     assert "Margins: modulus 0." in text
-    assert text.endswith("checks of its certificate passed.")
-    unstable = quick_view(exploration, "kalman", {"gain": 2.4})
-    assert judge(unstable).startswith("Kalman is UNSTABLE in this loop.")
+    low, high = lbt.loop.stable_sensor_gains(view.config.hardware, view.design.controller)
+    certified = f"certified (10 checks), and stable for sensor gains of {low:.3g} to {high:.3g}"
+    assert text.endswith(f"It is {certified}.")
+    unstable = new_view(exploration, "kalman", {"gain": 2.4})
+    assert judge(unstable) == f"Kalman is {certified}; at 2.4 this loop is UNSTABLE."
+
+
+def test_a_thin_delay_margin_is_a_warning(exploration):
+    high = lbt.loop_margins(
+        lbt.close_loop(exploration.config.hardware, new_view(exploration).design.controller)
+    ).gain_high
+    assert "WARNING: " in judge(new_view(exploration, "kalman", {"gain": 0.99 * high}))
 
 
 def test_moves_in_words(exploration):
     wish = "hinf", {"delay": 2.5, "hinf-gamma_ratio": 1.3, "robust-band": 1.0}
-    moved = quick_view(exploration, *wish)
+    moved = new_view(exploration, *wish)
     assert describe_moves(exploration, moved) == "total delay 2.5 frames, gamma ratio 1.3"
-    assert describe_moves(exploration, quick_view(exploration)) == ""
+    assert describe_moves(exploration, new_view(exploration)) == ""
 
 
 def test_wavefronts_in_another_unit(exploration):
-    view = quick_view(exploration, "kalman", {"noise": 20.0})
+    view = new_view(exploration, "kalman", {"noise": 20.0})
     with own_display_unit():
         show_in("mas", 10.0)
         assert describe_moves(exploration, view) == "measurement noise 2 mas"
@@ -104,8 +100,8 @@ def test_a_value_stays_within_reach_of_its_slider(config):
     knobs = list_knobs(config)
     after, _ = fulfil("kalman", {"delay": 99.0, "magic": 1.0}, knobs, config)
     assert after.hardware.delay_frames == 6.0
-    assert quick_view(explore(config, {}), "kalman", {"shift": -9.0}).shift_hz == -3.5
-    assert quick_view(explore(config, {}), "kalman").shift_hz == 0.0
+    assert new_view(explore(config, {}), "kalman", {"shift": -9.0}).shift_hz == -3.5
+    assert new_view(explore(config, {}), "kalman").shift_hz == 0.0
 
 
 def test_sliders_of_other_methods_do_not_count(config):
@@ -129,16 +125,10 @@ def at(start, **values):
     return fulfil("kalman", values, list_knobs(start), start)[0]
 
 
-def left_by(design, config, start, shift_hz):
-    """What a design leaves in a loop whose true lines moved by a shift."""
-    view = SimpleNamespace(config=config, shift_hz=shift_hz)
-    return complete(loop_curves(design, config), design, view, start)
-
-
 def test_curves_are_those_of_the_loop(start):
     design = lbt.kalman(start.plant)
     loop = lbt.close_loop(start.hardware, design.controller)
-    found = loop_curves(design, start)
+    found = show_design(design, start, start, 0.0)
     grid = found.frequency_hz
     np.testing.assert_allclose(found.rejection, spectral_norms(loop.sensitivity(grid)))
     np.testing.assert_allclose(found.noise_transfer, spectral_norms(loop.noise_transfer(grid)))
@@ -153,12 +143,12 @@ def test_curves_are_those_of_the_loop(start):
 def test_performance_is_that_of_the_budget(start):
     design, shift = lbt.kalman(start.plant), 1.3
     config = at(start, shift=shift, gain=0.8)
-    found = left_by(design, config, start, shift)
+    found = show_design(design, config, start, shift)
     loop = lbt.close_loop(config.hardware, design.controller, sensor_gain=0.8)
     budget = lbt.residual_budget(loop, config.truth)
-    assert found.left[0] == pytest.approx(budget.rms_nm, rel=1e-6)
-    assert found.left[1] == pytest.approx(lbt.strehl(budget, config.imaging), rel=1e-6)
-    assert found.left[2] == pytest.approx(lbt.loop_margins(loop).modulus, rel=1e-6)
+    assert found.residual_nm == pytest.approx(budget.rms_nm, rel=1e-6)
+    assert found.strehl == pytest.approx(lbt.strehl(budget, config.imaging), rel=1e-6)
+    assert found.modulus == pytest.approx(lbt.loop_margins(loop).modulus, rel=1e-6)
     still = at(start, gain=0.8)
     there = lbt.strehl(lbt.residual_budget(loop, still.truth), config.imaging)
     assert float(found.strehls[found.shift_hz == 0][0]) == pytest.approx(there, rel=1e-6)
@@ -167,17 +157,16 @@ def test_performance_is_that_of_the_budget(start):
 
 def test_an_unstable_loop_has_poles_only(start):
     design, config = lbt.kalman(start.plant), at(start, gain=2.4)
-    found = loop_curves(design, config)
+    found = show_design(design, config, start, 0.0)
     assert np.all(np.isnan(found.rejection))
     assert np.all(np.isnan(found.spectrum_nm2_hz))
     assert max(abs(found.poles)) > 1
-    left = left_by(design, config, start, 0.0)
-    assert np.isnan(left.left).all()
-    assert np.isnan(left.strehls).all()
+    assert np.isnan([found.residual_nm, found.strehl, found.modulus]).all()
+    assert np.isnan(found.strehls).all()
 
 
 def test_an_integrator_estimates_nothing(start):
-    assert loop_curves(start.design("integrator", gain=0.3), start).error_nm is None
+    assert show_design(start.design("integrator", gain=0.3), start, start, 0.0).error_nm is None
 
 
 def test_the_knobs_of_a_configuration(tmp_path):

@@ -10,7 +10,6 @@ from support.figures import legend
 import lbt_synth as lbt
 from lbt_synth.report.figures.loops import (
     closed_loops,
-    draw_sigma,
     frequency_grid,
     sigma_curves,
 )
@@ -165,24 +164,15 @@ def test_empty_figures_are_refused():
             empty()
 
 
-def test_a_zero_at_the_nyquist_frequency_is_no_scale():
-    f = np.geomspace(1, 400, 50)
-    zero = np.abs(1 - f / 400) + 1e-17
-    for y, lowest in ((zero, 1e-5 * zero.max()), (f, 400**-0.04)):
-        (axes,) = draw_sigma({"a": (f, y, None, None)}, {}, []).axes
-        assert axes.get_ylim()[0] == pytest.approx(lowest)
-
-
 @pytest.mark.parametrize("near", [28, 60])
 def test_a_grid_is_fine_around_lines_and_below_nyquist(near):
     grid = frequency_grid(800, (20.0, 390.0), points=240, near=near)
     assert np.all(np.diff(grid) > 0)
-    assert (grid[0], grid[-1]) == (pytest.approx(400 / 10**3.6), 400)
-    assert 20.0 in grid
+    assert (grid[0], grid[-1]) == pytest.approx((400 / 10**3.6, 400 * (1 - 1e-4)))
+    assert {20.0, 390.0} < set(grid)
     for centre in (20.0, 390.0, 400.0):
         distances = np.sort(np.abs(grid / centre - 1))
-        assert distances[0] == 0
-        assert distances[1] == pytest.approx(1e-4, rel=1e-6)
+        assert np.min(distances[distances > 0]) == pytest.approx(1e-4, rel=1e-6)
         assert np.max(np.diff(distances[distances < 0.1])) < 0.035
 
 

@@ -4,13 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydantic import PositiveFloat
 from support.plants import LBT_YAML
 from support.studies import BASE, LBT_TEXT, load_small_study, study_file
 
 import lbt_synth as lbt
-from lbt_synth.config.plant_and_truth import measurement_noise_nm
-from lbt_synth.config.schema import FileSection, SensorSection
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.studies.study import sample as evaluation
@@ -402,54 +399,6 @@ def test_every_number_of_a_configuration(tmp_path, path, value):
         parameters=f"{{'{path}': {{list: [{value!r}, {other!r}]}}, {NOISE}}}",
         count=COUNT,
     )
-
-
-class NewSensor(SensorSection):
-    """A sensor with a key that this package does not know."""
-
-    excess: PositiveFloat = 1.0
-
-
-class NewFile(FileSection):
-    """A configuration with that sensor."""
-
-    sensor: NewSensor
-
-
-@pytest.mark.parametrize(
-    ("excess", "singles"),
-    [
-        (lambda sensor: sensor.excess, 2),  # one value at once: a group for each of two
-        (lambda sensor: sensor.per_sample.excess, 1),  # an array: one group
-        (lambda sensor: 1.0, 2),  # which no builder reads
-    ],
-)
-@pytest.mark.parametrize("controllers", ["{kalman: {design: kalman}}", OWN])
-def test_a_new_key_takes_the_way_that_its_builder_declares(
-    tmp_path, monkeypatch, excess, singles, controllers
-):
-    """No line of a study knows the key: how its builder reads it is all that says."""
-
-    def noise(settings):
-        return measurement_noise_nm(settings) * excess(settings.sensor)
-
-    for module in ("config.load", "studies.study.study"):
-        monkeypatch.setattr(f"lbt_synth.{module}.FileSection", NewFile)
-    for module in ("config.load", "config.ensemble"):
-        monkeypatch.setattr(f"lbt_synth.{module}.measurement_noise_nm", noise)
-    study, columns, _ = agree(
-        tmp_path,
-        base=LBT_TEXT.replace("sensor:\n", "sensor:\n  excess: 1.0\n"),
-        controllers=controllers,
-        parameters=f"{{sensor.excess: {{list: [1.5, 3.0]}}, {GAIN}}}",
-    )
-    name = f"{next(iter(study.controllers))}.noise_nm"
-    groups = [columns[name][study.values(0, COUNT)[:, 0] == value] for value in (1.5, 3.0)]
-    if excess(NewSensor(noise_nm=1.0, excess=2.0)) > 1:  # it is read
-        assert np.mean(groups[0]) < 0.7 * np.mean(groups[1])
-    rows = counted(monkeypatch)
-    evaluate_samples(study, study.values(0, COUNT), 0)
-    assert len(rows) == singles
 
 
 def test_two_answers_stop_a_study(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""H-infinity controllers of generalised plants, and why there is none."""
+"""Controllers of generalised plants: H2, H-infinity and mixed, and why there is none."""
 
 from dataclasses import replace
 
@@ -6,12 +6,14 @@ import control
 import numpy as np
 import pytest
 import scipy.signal
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_discrete_lyapunov
+from support.common_lyapunov import common_lyapunov_rms
 from support.generalized_plants import random_plant, sampled
 
 import lbt_synth as lbt
 from lbt_synth.errors import DetectabilityError, InfeasibleError, ProblemError
 from lbt_synth.linear import GeneralizedPlant, StateSpace, mixed_sensitivity
+from lbt_synth.linear.output_feedback.two_riccati import free_parameter, scaled_plant
 
 
 @pytest.mark.parametrize("route", ["riccati", "lmi"])
@@ -207,3 +209,76 @@ def test_mass_with_a_weight_of_its_control():
     design = lbt.hinf_controller(sampled_problem(system))
     assert design.gamma_infeasible == pytest.approx(design.gamma_least, rel=5e-3)
     assert design.regularised > 0  # the measurement has no noise
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_no_neighbour_leaves_less(seed):
+    """The variance is that of scipy's Lyapunov equation, and least among its neighbours."""
+    plant = random_plant(seed, n=4)
+    design = lbt.h2_controller(plant)
+
+    def variance(controller):
+        loop = plant.closed_loop(controller)
+        P = solve_discrete_lyapunov(loop.A, loop.B @ loop.B.T)
+        return np.trace(loop.C @ P @ loop.C.T + loop.D @ loop.D.T)
+
+    K = design.controller
+    least = variance(K)
+    assert design.rms == pytest.approx(np.sqrt(least), rel=1e-9)
+    rng = np.random.default_rng(seed)
+    for _ in range(20):
+        parts = {name: getattr(K, name) for name in "ABCD"}
+        moved = {k: v + 1e-4 * rng.normal(size=v.shape) for k, v in parts.items()}
+        assert variance(lbt.linear.StateSpace(**moved)) >= least * (1 - 1e-12)
+
+
+def test_scalar_closed_form():
+    """A random walk with unit noises: the fourth power of the rms is 5."""
+    plant = lbt.linear.GeneralizedPlant(
+        A=1.0,
+        B1=[[1.0, 0.0]],
+        B2=1.0,
+        C1=[[1.0], [0.0]],
+        C2=1.0,
+        D12=[[0.0], [1.0]],
+        D21=[[0.0, 1.0]],
+    )
+    assert lbt.h2_controller(plant).rms ** 4 == pytest.approx(5.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 6])
+def test_never_worse_than_one_lyapunov_matrix(seed):
+    plant = random_plant(seed, n=3, D22=False)
+    least, quiet = lbt.hinf_controller(plant), lbt.h2_controller(plant)
+    gamma = 0.5 * (least.gamma + quiet.gamma)
+    design = lbt.mixed_controller(plant, gamma=gamma, taps=12)
+    assert design.gamma <= gamma
+    assert quiet.rms * (1 - 1e-9) <= design.rms
+    assert design.rms <= common_lyapunov_rms(plant, gamma) * (1 + 1e-4)
+
+
+def test_variance_is_least_variance_and_size_of_the_filter():
+    scaled = scaled_plant(random_plant(3, n=4))
+    equations = scaled.equations(0.0)
+    loop = free_parameter(equations)
+    taps = 0.3 * np.random.default_rng(0).normal(size=(5, *loop.through.shape))
+    closed = scaled.plant.closed_loop(loop.controller(taps))
+    assert closed.spectral_radius < 1
+    least = lbt.h2_controller(scaled.plant).rms
+    rms = lbt.design.certificate.certify_error(closed).rms
+    assert rms**2 == pytest.approx(least**2 + np.sum(taps**2), rel=1e-9)
+
+
+def test_loose_bound_gives_the_least_variance():
+    plant = random_plant(3, n=3)
+    quiet = lbt.h2_controller(plant)
+    assert lbt.mixed_controller(plant, gamma=2 * quiet.gamma).rms == pytest.approx(quiet.rms)
+
+
+def test_bounds_that_cannot_be_met():
+    plant = random_plant(3, n=3)
+    least = lbt.hinf_controller(plant).gamma_least
+    with pytest.raises(InfeasibleError, match="because"):
+        lbt.mixed_controller(plant, gamma=0.9 * least)
+    with pytest.raises(InfeasibleError, match="with 1 taps"):
+        lbt.mixed_controller(plant, gamma=1.002 * least, taps=1)

@@ -1,14 +1,26 @@
-"""The plant and the truth that a configuration describes."""
+"""Plant, truth, sensors and end-to-end simulation that a configuration describes."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 from support.configs import AR, OTHER, SMALL, change_key, minimal_config, write_config
 from support.drifting import drift_file
+from support.end_to_end import CONFIG as END_TO_END
 from support.plants import LBT_YAML, ROOT
+from support.several_sensors import CONFIG as SENSORS
+from support.several_sensors import write_config as write_sensors
 from support.vibration_config import write_vibration
 
 import lbt_synth as lbt
+from lbt_synth.errors import ConfigError
 from lbt_synth.studies.robustness import mirror_rows
+
+SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
+LINES = [
+    {"kind": "sinusoid", "frequency_hz": 0.3, "rms_nm": 400, "axis": "both"},
+    {"kind": "sinusoid", "frequency_hz": 40.0, "rms_nm": 50, "axis": "tip"},
+]
 
 
 def test_every_kind_of_turbulence_and_noise(tmp_path):
@@ -115,9 +127,9 @@ def test_a_configuration_may_have_one(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ("kind: drift", "end_hz and duration_s go with kind: drift"),
-        ("kind: drift\n      end_hz: 23", "end_hz and duration_s go with kind: drift"),
-        ("kind: sinusoid\n      end_hz: 23", "end_hz and duration_s go with kind: drift"),
+        ("kind: drift", "end_hz is missing, which goes with kind: drift"),
+        ("kind: drift\n      end_hz: 23", "duration_s is missing, which goes with kind: drift"),
+        ("kind: sinusoid\n      end_hz: 23", "end_hz goes with kind: drift, and only"),
         ("kind: sinusoid\n      damping: 0.1", "damping goes with kind: resonance"),
         ("kind: drift\n      end_hz: 500\n      duration_s: 60", r"\[0\].end_hz: must lie below"),
         ("kind: drift\n      end_hz: -3\n      duration_s: 60", "greater than or equal to 0.001"),
@@ -151,9 +163,6 @@ def test_priors_of_a_configuration(tmp_path):
             lbt.load_config(write_vibration(tmp_path, **keys))
 
 
-SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
-
-
 # Configuration and command line
 def test_the_example_has_a_mirror_for_design_and_loop():
     config = lbt.load_config(SLOW_YAML)
@@ -171,7 +180,11 @@ def test_the_example_has_a_mirror_for_design_and_loop():
     ("old", "new", "message"),
     [
         ("bandwidth_hz: 100.0", "bandwith_hz: 100.0", "did you mean bandwidth_hz"),
-        ("bandwidth_hz: 100.0", "proportional_per_s2: 4.0e5", "expected either bandwidth_hz"),
+        (
+            "bandwidth_hz: 100.0",
+            "proportional_per_s2: 4.0e5",
+            "exactly one of bandwidth_hz, derivative_per_s",
+        ),
         (
             "    bandwidth_hz: 100.0",
             "    proportional_per_s2: 4.0e5\n    derivative_per_s: 800.0",
@@ -201,12 +214,6 @@ def test_gains_of_a_configuration(tmp_path):
     )
     mirror = lbt.load_config(path).hardware.mirror
     assert (mirror.proportional_per_s2, mirror.derivative_per_s) == (4.0e5, 800.0)
-
-
-LINES = [
-    {"kind": "sinusoid", "frequency_hz": 0.3, "rms_nm": 400, "axis": "both"},
-    {"kind": "sinusoid", "frequency_hz": 40.0, "rms_nm": 50, "axis": "tip"},
-]
 
 
 @pytest.mark.parametrize(
@@ -240,3 +247,100 @@ def test_a_line_has_one_frequency_error(tmp_path):
     line = LINES[0] | {"frequency_error_hz": 1, "frequency_error_percent": 5}
     with pytest.raises(lbt.errors.ConfigError, match="one of frequency_error_hz, frequency_error"):
         lbt.load_config(write_config(tmp_path, minimal_config(truth={"vibrations": [line]})))
+
+
+def load_sensors(tmp_path, *edits):
+    """The configuration with parts of its text replaced."""
+    text = SENSORS
+    for old, new in edits:
+        assert old in text
+        text = text.replace(old, new)
+    return lbt.load_config(write_sensors(tmp_path, text))
+
+
+def test_a_file_describes_its_sensors(sensors_config):
+    plant = sensors_config.plant
+    assert plant.hardware.suite.units == ("wavefront", "slow", "m1", "m2")
+    assert plant.period == 2
+    assert plant.read.tolist() == [[True] * 6, [True, True, False, False, True, True]]
+    assert plant.motions[1]["m2"].phase_deg == 150
+    assert sensors_config.truth.motions == plant.motions
+
+
+def test_lines_of_the_truth_name_their_channels(tmp_path):
+    line = "{axis: tip, kind: sinusoid, frequency_hz: 21, rms_nm: 400, accelerometers: {m1: {motion_nm_per_nm: 3}}}"
+    config = load_sensors(
+        tmp_path, ("truth: {vibrations: model}", f"truth: {{vibrations: [{line}]}}")
+    )
+    assert config.truth.motions[0]["m1"].size == 3
+
+
+def test_a_spread_line_moves_its_channels_with_each_of_its_lines(tmp_path):
+    config = load_sensors(
+        tmp_path,
+        (
+            "frequency_hz: 20, damping: 0.01",
+            "frequency_hz: 20, spread_hz: 1, lines: 3, damping: 0.01",
+        ),
+    )
+    motions = config.plant.motions
+    assert [sorted(motion) for motion in motions] == [["m1"], ["m1"], ["m1"], ["m2"]]
+
+
+def test_correlated_noise(tmp_path):
+    config = load_sensors(
+        tmp_path, ("noise_m_s2: 2.0e-4", "covariance: [[4.0e-8, 2.0e-8], [2.0e-8, 4.0e-8]]")
+    )
+    factor = config.plant.hardware.suite.accelerometers[0].noise_factor(2)
+    assert np.allclose(factor @ factor.T, [[4e-8, 2e-8], [2e-8, 4e-8]])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("rate_hz: 500", "rate_hz: 300", "whole multiple"),
+        ("delay_frames: 2.5", "delay_frames: 1", "at least 1.5"),
+        ("channels: [m1, m2]", "channels: [m1, m1]", "different names"),
+        ("channels: [m1, m2]", "channels: [m1, wavefront]", "different names"),
+        ("channels: [m1, m2]", "channels: [m1]", "names the channel 'm2'"),
+        ("noise_m_s2: 2.0e-4", "noise_nm: 2", "goes with kind: wavefront"),
+        (", noise_nm: 20}", "}", "exactly one of noise_nm, noise_m_s2, covariance"),
+        ("channels: [m1, m2], ", "", "channels is missing"),
+        ("{rate_hz: 500, delay", "{rate: 500, delay", "unknown key sensors.slow.rate"),
+        ("  slow: {rate_hz: 500,", "  wavefront: {rate_hz: 500,", "none of them 'wavefront'"),
+    ],
+)
+def test_mistakes_are_named(tmp_path, old, new, said):
+    with pytest.raises(ConfigError, match=said):
+        load_sensors(tmp_path, (old, new))
+
+
+def test_a_horizon_makes_all_sensors_later(sensors_config):
+    hardware = sensors_config.design("kalman", horizon=2).hardware
+    assert hardware.delay_frames == 3
+    assert [sensor.delay_frames for sensor in hardware.suite.sensors] == [3.0, 2.0]
+
+
+def test_methods_for_the_own_sensor_leave_the_others_out(sensors_config):
+    design = sensors_config.design("integrator", gain=0.3)
+    assert design.controller.D.shape == (2, 2)
+    assert design.assumptions == ("the loop's own sensor is read alone, without slow, m1, m2",)
+
+
+def test_a_sensor_matrix_cannot_be_simulated(tmp_path):
+    text = (
+        Path(END_TO_END)
+        .read_text()
+        .replace("sensor:\n", "sensor:\n  matrix: [[1, 0], [0, 2]]\n", 1)
+    )
+    (tmp_path / "c.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=r"sensor\.matrix must be left out"):
+        _ = lbt.load_config(tmp_path / "c.yaml").end_to_end
+
+
+def test_without_a_pyramid(tmp_path):
+    text = Path(END_TO_END).read_text()
+    start, end = text.index("  pyramid:"), text.index("mirror:")
+    (tmp_path / "c.yaml").write_text(text[:start] + "  noise_nm: 15.0\n\n" + text[end:])
+    with pytest.raises(ConfigError, match=r"sensor\.pyramid is missing"):
+        _ = lbt.load_config(tmp_path / "c.yaml").end_to_end

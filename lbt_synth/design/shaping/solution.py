@@ -1,4 +1,4 @@
-"""The sequence of convex programmes that solves a specification in one basis."""
+"""A specification solved in one basis by convex programmes, and again with few functions."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lbt_synth.design.shaping.channel import Channel
+from lbt_synth.design.shaping.channel import Channel, mode_loop
 from lbt_synth.design.shaping.frequencies import ROOM, Grid, fine_frequencies
-from lbt_synth.design.shaping.objectives import noise_level
+from lbt_synth.design.shaping.objectives import frequency_costs, noise_level
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import InfeasibleError, NumericalError
+from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import (
     Constraint,
     Discs,
@@ -28,16 +29,15 @@ _STEPS = 24
 _DECREASE = 1e-6  # of the objective, below which a step is the last
 _LEAST_SHARE = 1e-3  # of a step that is tried
 _PENALTY = 10.0  # relative rise of the objective that a relative excess of a bound is worth
-_FINE = 2048
-_WORST = 2e-3  # by which a worst case may exceed that of the programme's own frequencies
-_CLOSE = 0.98  # of a bound, beyond which the neighbourhood is checked more finely
-_BETWEEN = 33
+_FINE = 2048  # frequencies, at least, at which bounds are looked at between those of a programme
+_MISS = 2e-3  # by which an objective or a worst case may exceed that of the programme's frequencies
+_FLAT = 0.1  # weight of the whole response, beside the spectra: demands hold at all frequencies
 _RELAXED = 1e-6  # relaxations below this are none
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SequenceSolution:
-    """Coefficients in one basis, and how they were found."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModeSolution:
+    """A specification solved in one basis."""
 
     channel: Channel
     grid: Grid  # of the last programme
@@ -45,35 +45,59 @@ class SequenceSolution:
     objectives_nm2: tuple[float, ...]  # at the optimum for unit gain, and after each programme
     programmes: int  # number of them
     status: str  # what the solver said of the last programme
+    objective_nm: float  # root of the objective in the real loop
 
     @property
-    def objective_nm2(self) -> float:
-        """Objective over the grid [nm^2]."""
-        return self.objectives_nm2[-1]
+    def parameter(self) -> Controller:
+        """The Youla parameter."""
+        return self.channel.basis.parameter(self.coefficients)
 
 
-def solve_sequence(
-    spec: Specification, channel: Channel, *, start: FloatArray | None = None, fineness: int = 1
-) -> SequenceSolution:
-    """Minimise the objective of a specification in a basis, from coefficients (n,) if given.
+def solve_mode(
+    spec: Specification, channel: Channel, *, start: FloatArray | None = None
+) -> ModeSolution:
+    """Solve a specification in a basis, from coefficients (n,) if given.
 
     A convex specification takes one programme, and another for each time that a bound is exceeded
     between its frequencies. One with terms at other sensor gains is solved for unit gain first,
     until the loop is stable at all of them, and goes on with steps to the optimum of a model of the
-    objective, as far as they lower it, until the demands hold at all frequencies.
+    objective, as far as they lower it, until the demands hold at all frequencies. The grid becomes
+    finer until its objective is that of the real loop, which keeps all demands.
     """
-    programme = _Programme(spec, channel, fineness)
-    convex, values = is_convex(programme.function), []
+    miss = np.inf
+    for fineness in (1, 2, 4):
+        programme = _Programme(spec, channel, fineness)
+        c, values = _minimise(programme, start)
+        loop = mode_loop(channel.hardware, channel.basis.parameter(c))
+        exact = spec.objective.measured_nm2(loop)
+        miss = abs(values[-1] / exact - 1)
+        if miss < _MISS and all(check.passed for check in spec.checks(loop)):
+            return ModeSolution(
+                channel=channel,
+                grid=programme.grid,
+                coefficients=c,
+                objectives_nm2=tuple(values),
+                programmes=programme.solved,
+                status=programme.status,
+                objective_nm=float(np.sqrt(exact)),
+            )
+    raise NumericalError(
+        f"the objective over the frequencies of the programme misses that of the real loop by "
+        f"{miss:.2g}, expected {_MISS:g}, or a bound is exceeded between them. Try "
+        "fewer functions, a smoother spectrum, or wider bands.",
+        status="quadrature",
+    )
+
+
+def _minimise(programme: _Programme, start: FloatArray | None) -> tuple[FloatArray, list[float]]:
+    """Return coefficients, and the objective over the grid after each programme."""
+    convex = is_convex(programme.function)
     # the steps need coefficients whose loops are stable at all sensor gains
-    if convex or start is None or not programme.is_stable(start):
-        c = _minimize_at_unit_gain(programme, convex=convex)
-        values.append(programme.function.value(c))
-    else:
-        c = start
-    if not convex:
-        c = _lower_objective(programme, c, values)
-    solved, status = programme.solved, programme.status
-    return SequenceSolution(channel, programme.grid, c, tuple(values), solved, status)
+    if not convex and start is not None and programme.is_stable(start):
+        return _lower_objective(programme, start, [])
+    c = _minimize_at_unit_gain(programme, convex=convex)
+    values = [programme.function.value(c)]
+    return (c, values) if convex else _lower_objective(programme, c, values)
 
 
 def _minimize_at_unit_gain(programme: _Programme, *, convex: bool) -> FloatArray:
@@ -84,7 +108,9 @@ def _minimize_at_unit_gain(programme: _Programme, *, convex: bool) -> FloatArray
             return c
 
 
-def _lower_objective(programme: _Programme, c: FloatArray, values: list[float]) -> FloatArray:
+def _lower_objective(
+    programme: _Programme, c: FloatArray, values: list[float]
+) -> tuple[FloatArray, list[float]]:
     """Lower the objective by steps to the optimum of its model at c; append its values."""
     while True:
         step, before = programme.solve(programme.function, start=c) - c, programme.merit(c)
@@ -95,7 +121,7 @@ def _lower_objective(programme: _Programme, c: FloatArray, values: list[float]) 
         values.append(programme.function.value(c))
         settled = before - programme.merit(c) <= _DECREASE * before
         if not programme.refine(c) and settled:
-            return c
+            return c, values
 
 
 class _Programme:
@@ -110,7 +136,9 @@ class _Programme:
         zero = 1e-4 * self.function.value(np.zeros(self.size))
         self.scale = max(4 * noise_level(specification.objective) ** 2, zero)
         self._excess = np.zeros(0)
-        self._fine = self._between(fine_frequencies(channel, _FINE * fineness))
+        fine = replace(self.grid, points_hz=fine_frequencies(channel, _FINE * fineness))
+        function, groups = specification.compile(channel, fine)
+        self._fine = function, _merge_groups(groups)
 
     def solve(self, function: Function, start: FloatArray | None = None) -> FloatArray:
         """Minimise a function under all demands; return the coefficients (n,)."""
@@ -153,33 +181,20 @@ class _Programme:
 
     def _find_excess(self, c: FloatArray) -> FloatArray:
         """Frequencies at which bounds, or the programme's own worst cases, are exceeded [Hz]."""
-        leaves = leaf_fractions(self.function)
-        limits = [leaf.value(c) * (1 + _WORST) if leaf.worst else np.inf for leaf in leaves]
-
-        def peaks(fine: tuple[Function, tuple[Constraint, ...]], level: float) -> FloatArray:
-            """Local peaks above a level of their limits, each between its neighbours, (k, 3)."""
-            bounds = [bound for bound in fine[1] if isinstance(bound, Discs | HalfPlanes)]
-            found = [_local_peaks(bound.frequency_hz, bound.use(c), level) for bound in bounds]
-            found += [
-                _local_peaks(leaf.frequency_hz, leaf.values(c), limit * level)
-                for leaf, limit in zip(leaf_fractions(fine[0]), limits, strict=True)
-                if leaf.worst
-            ]
-            return np.unique(np.concatenate([np.zeros((0, 3)), *found]), axis=0)
-
-        found = peaks(self._fine, 1 + ROOM / 2)
-        close = found if found.size else peaks(self._fine, _CLOSE)
-        if found.size or not close.size:
-            return close[:, 1]
-        # between the neighbours of what comes close
-        finer = self._between(np.unique(np.linspace(close[:, 0], close[:, 2], _BETWEEN)))
-        return peaks(finer, 1 + ROOM / 2)[:, 1]
-
-    def _between(self, points_hz: FloatArray) -> tuple[Function, tuple[Constraint, ...]]:
-        """Return the objective and the constraints at other points."""
-        grid = replace(self.grid, points_hz=points_hz)
-        function, groups = self.specification.compile(self.channel, grid)
-        return function, _merge_groups(groups)
+        function, constraints = self._fine
+        pairs = zip(leaf_fractions(self.function), leaf_fractions(function), strict=True)
+        uses = [
+            (leaf.frequency_hz, leaf.values(c) / (coarse.value(c) * (1 + _MISS)))
+            for coarse, leaf in pairs
+            if leaf.worst
+        ]
+        uses += [
+            (bound.frequency_hz, bound.use(c))
+            for bound in constraints
+            if isinstance(bound, Discs | HalfPlanes)
+        ]
+        peaks = [_local_peaks(f, use, 1 + ROOM / 2) for f, use in uses]
+        return np.unique(np.concatenate([np.zeros(0), *peaks]))
 
 
 def _merge_groups(groups: tuple[tuple[Constraint, ...], ...]) -> tuple[Constraint, ...]:
@@ -188,13 +203,11 @@ def _merge_groups(groups: tuple[tuple[Constraint, ...], ...]) -> tuple[Constrain
 
 
 def _local_peaks(frequency_hz: FloatArray, values: FloatArray, limit: float) -> FloatArray:
-    """Local peaks above a limit, with the frequencies before and after each, (k, 3)."""
+    """Return the frequencies of local peaks above a limit, (k,)."""
     order = np.argsort(frequency_hz, kind="stable")
     f, v = frequency_hz[order], values[order]
     inner = np.r_[True, v[1:] >= v[:-1]] & np.r_[v[:-1] >= v[1:], True]
-    at = np.nonzero(inner & (v > limit))[0]
-    before, after = np.maximum(at - 1, 0), np.minimum(at + 1, f.size - 1)
-    return np.stack([f[before], f[at], f[after]], axis=1)
+    return np.asarray(f[inner & (v > limit)])
 
 
 def _infeasibility_error(programme: _Programme) -> InfeasibleError | NumericalError:
@@ -232,3 +245,47 @@ def _infeasibility_error(programme: _Programme) -> InfeasibleError | NumericalEr
         "frequencies.",
         conflict=tuple(labels[i] for i in core),
     )
+
+
+def reduce_mode(
+    spec: Specification, long: ModeSolution, most: int, tolerance: float
+) -> ModeSolution:
+    """Solve with as few functions as keep the objective of a long parameter within a tolerance."""
+    accepted, losses = None, [np.inf]
+    for size in range(most, 0, -1):
+        shorter = solve_with_few(spec, long, size)
+        losses.append(np.inf if shorter is None else shorter.objective_nm / long.objective_nm - 1)
+        if losses[-1] <= tolerance:
+            accepted = shorter
+        elif size < most and losses[-2] > tolerance:  # two in a row: a size alone may be unlucky
+            break
+    if accepted is not None:
+        return accepted
+    states = most + long.channel.hardware.mirror_system.whole.n_states
+    best, advice = "none was feasible", f"Try states={2 * states}."
+    if np.isfinite(loss := min(losses)):
+        best = f"the best lost {100 * loss:.3g} %"
+        advice = f"Try states={2 * states} or loss={1.1 * loss:.2g}."
+    raise InfeasibleError(
+        f"no controller of {states} states per mode came within {100 * tolerance:.3g} % of the "
+        f"long parameter's {long.objective_nm:.4g} nm (root of the whole objective): {best}. "
+        f"{advice}"
+    )
+
+
+def solve_with_few(spec: Specification, long: ModeSolution, size: int) -> ModeSolution | None:
+    """Solve with the few functions that a long parameter needs most; None where they fail.
+
+    The response counts at each frequency as much as an error of it costs.
+    """
+    channel, f, w = long.channel, long.grid.nodes_hz, long.grid.weights_hz
+    basis, nyquist = channel.basis, channel.nyquist_hz
+    noise = noise_level(spec.objective) ** 2 / nyquist
+    cost = w * (frequency_costs(spec.objective, f, 2 * nyquist) + noise)
+    weight = np.sqrt(cost / np.sum(cost) + _FLAT**2 * w / nyquist)
+    few, start = basis.truncated(long.coefficients, size, f, weight)
+    shorter = Channel(hardware=channel.hardware, basis=few)
+    try:
+        return solve_mode(spec, shorter, start=start)
+    except (InfeasibleError, NumericalError):
+        return None

@@ -1,0 +1,473 @@
+"""Build what a configuration describes: plant, truth, noise, sensors and end-to-end simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+import numpy as np
+
+from lbt_synth import models
+from lbt_synth.config.schema import (
+    AtmosphereSection,
+    FileSection,
+    LocalLoopSection,
+    OtherSensorSection,
+    TelescopeSection,
+    TrueVibrationSection,
+    TurbulenceSection,
+    VibrationSection,
+)
+from lbt_synth.errors import ConfigError, name_key
+from lbt_synth.models.sensor_suite import Motions, Sensor, checked_motions
+from lbt_synth.models.vibration import TrueVibration, spread_lines
+from lbt_synth.validation import FloatArray, agree, frozen_copy
+
+if TYPE_CHECKING:
+    from lbt_synth.interop import EndToEndSetup
+
+T = TypeVar("T")
+_AXES = {"tip": [(1.0, 0.0)], "tilt": [(0.0, 1.0)], "both": [(1.0, 0.0), (0.0, 1.0)]}
+_USUAL_LINES = 5  # of a spread vibration, unless the file says
+_OF_SYSTEM = {"pixels", "actuators_across", "wind_direction_deg", "calibration_nm"}
+
+
+def require_telescope(settings: FileSection, reason: str) -> TelescopeSection:
+    """Return the section ``telescope``; raise ConfigError with the reason if it is missing."""
+    if settings.telescope is None:
+        raise ConfigError(f"the key telescope is missing: {reason}.", path="telescope")
+    return settings.telescope
+
+
+def require_atmosphere(settings: FileSection, reason: str) -> AtmosphereSection:
+    """Return the section ``atmosphere``; raise ConfigError with the reason if it is missing."""
+    if settings.atmosphere is None:
+        raise ConfigError(f"the key atmosphere is missing: {reason}.", path="atmosphere")
+    return settings.atmosphere
+
+
+def count_axes(settings: FileSection) -> int:
+    """Return the number of modes n: ``loop.axes``, else that of the matrices, else 2."""
+    sensor, influence = settings.sensor.matrix, settings.mirror.influence_matrix
+    sizes = [
+        *([("sensor.matrix", "columns", len(sensor[0]))] if sensor else []),
+        *([("mirror.influence_matrix", "rows", len(influence))] if influence else []),
+    ]
+    axes = settings.loop.axes
+    if axes is None:
+        return sizes[0][2] if sizes else 2
+    for key, word, size in sizes:
+        if size != axes:
+            raise ConfigError(
+                f"{key} must have {axes} {word} to match loop.axes; got {size}.", path=key
+            )
+    return axes
+
+
+def count_measurements(settings: FileSection) -> int:
+    """Return the number of measurements q: rows of ``sensor.matrix``, else one per axis."""
+    sensor = settings.sensor.matrix
+    return len(sensor) if sensor else count_axes(settings)
+
+
+def _require_length(values: list[T], count: int, key: str, what: str) -> list[T]:
+    """Return a list that must have one value for each of ``count`` axes or measurements."""
+    if len(values) != count:
+        raise ConfigError(
+            f"{key}: must be one for all, or a list of one per {what} ({count}); got "
+            f"{len(values)}.",
+            path=key,
+        )
+    return values
+
+
+def build_atmosphere(settings: FileSection) -> models.Atmosphere | None:
+    """Build the atmosphere of a configuration, None if it has none."""
+    air = settings.atmosphere
+    if air is None:
+        return None
+    reason = "the turbulence of atmosphere is that over its diameter"
+    return models.Atmosphere(
+        diameter_m=require_telescope(settings, reason).diameter_m, **air.model_dump()
+    )
+
+
+def _convert_mas_to_nm(settings: FileSection, mas: float, key: str) -> float:
+    """Convert an angle of the file [mas] to a wavefront [nm rms]."""
+    reason = f"{key} is in mas, and a wavefront in nm needs telescope.diameter_m"
+    telescope = require_telescope(settings, f"{reason}. Give it, or the value in nm")
+    return mas * models.nm_per_mas(telescope.diameter_m)
+
+
+def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
+    """Return the noise per frame [nm], of all measurements or of each; (b,) of samples."""
+    sensor = settings.sensor
+    if isinstance(sensor.noise_nm, list):
+        count = count_measurements(settings)
+        return frozen_copy(
+            _require_length(sensor.noise_nm, count, "sensor.noise_nm", "measurement")
+        )
+    if sensor.noise_mas is not None:
+        return _convert_mas_to_nm(settings, sensor.noise_mas, "sensor.noise_mas")
+    if (pyramid := sensor.pyramid) is None:
+        return sensor.noise_nm  # type: ignore[return-value]  # the schema wants one of the three
+    telescope = require_telescope(
+        settings, "the noise of sensor.pyramid depends on it. Give it, or sensor.noise_nm"
+    )
+    numbers = dict(pyramid)
+    across = numbers.pop("subapertures_across")
+    return models.pyramid_tilt_noise_nm(
+        subapertures=models.illuminated_subapertures(across, telescope.obstruction),
+        diameter_m=telescope.diameter_m,
+        **numbers,
+    )
+
+
+def _gains_per_measurement(settings: FileSection) -> FloatArray:
+    """Return the sensor gains that the design assumes, one per measurement, (q,)."""
+    assumed, count = settings.model.sensor_gain, count_measurements(settings)
+    if isinstance(assumed, list):
+        return frozen_copy(_require_length(assumed, count, "model.sensor_gain", "measurement"))
+    return frozen_copy(np.full(count, assumed))
+
+
+def reference_gain(settings: FileSection) -> float:
+    """Return the assumed gain with which a single number is compared: the mean of the gains."""
+    assumed = settings.model.sensor_gain
+    return (
+        float(np.mean(_gains_per_measurement(settings))) if isinstance(assumed, list) else assumed
+    )
+
+
+def relative_gain(settings: FileSection, reference: float) -> Any:
+    """Return the real sensor gain divided by that in the plant's sensor matrix; (b,) of samples.
+
+    ``reference`` is the :func:`reference_gain` of that matrix.
+    """
+    real, key = settings.truth.sensor_gain, "truth.sensor_gain"
+    if not isinstance(real, list):
+        return real / reference
+    assumed = _gains_per_measurement(settings)
+    ratios = np.array(_require_length(real, assumed.size, key, "measurement")) / assumed
+    if not agree(ratios, np.full_like(ratios, ratios[0])):
+        text = ", ".join(f"{ratio:.4g}" for ratio in ratios)
+        raise ConfigError(
+            f"{key}: must be model.sensor_gain times one factor, for the loop has one optical gain "
+            f"that may differ from the model's; got the factors {text}. Give one number: their "
+            "mean, in the proportion of model.sensor_gain.",
+            path=key,
+        )
+    return float(ratios[0])
+
+
+def true_vibrations_owner(settings: FileSection) -> Literal["model", "truth"]:
+    """Return which section has the vibrations that the real loop meets."""
+    return "truth" if isinstance(settings.truth.vibrations, list) else "model"
+
+
+def vibration_numbers(
+    settings: FileSection, owner: Literal["model", "truth"]
+) -> Iterator[tuple[Any, str, dict[str, Any]]]:
+    """Yield each vibration of the model or of the truth: its section, its key, its numbers."""
+    rate, axes = settings.loop.frame_rate_hz, count_axes(settings)
+    for i, section in enumerate(getattr(settings, owner).vibrations or ()):
+        key = f"{owner}.vibrations[{i}]"
+        _require_below_nyquist(section.frequency_hz, rate, f"{key}.frequency_hz")
+        for direction in _directions(section, axes, key):
+            place = {"frequency_hz": section.frequency_hz, "direction": direction}
+            rms_nm = vibration_rms_nm(section, settings, key)
+            place |= {"damping": section.damping, "rms_nm": rms_nm}
+            yield section, key, place | ({"sections": section.sections} if section.sections else {})
+
+
+def _directions(
+    section: VibrationSection | TrueVibrationSection, axes: int, key: str
+) -> list[tuple[float, ...]]:
+    """Return the directions of the vibrations that one entry of a list describes."""
+    if axes == 1:
+        if section.axis in ("tilt", "both") or section.direction_deg is not None:
+            raise ConfigError(
+                f"{key}: this loop has one axis: leave axis and direction_deg out.", path=key
+            )
+        return [(1.0,)]
+    if section.direction_deg is not None:
+        angle = np.radians(section.direction_deg)
+        return [(float(np.cos(angle)), float(np.sin(angle)))]
+    if section.axis is None:
+        raise ConfigError(f"{key}: expected exactly one of axis, direction_deg.", path=key)
+    return [tuple(direction) for direction in _AXES[section.axis]]
+
+
+def vibration_rms_nm(section: Any, settings: FileSection, key: str) -> float:
+    """Return the size of a vibration [nm rms wavefront], which the file gives in nm or mas."""
+    if section.rms_nm is not None:
+        return section.rms_nm  # type: ignore[no-any-return]  # of a section with a size
+    return _convert_mas_to_nm(settings, section.rms_mas, f"{key}.rms_mas")
+
+
+def _require_below_nyquist(frequency_hz: Any, frame_rate_hz: float, key: str) -> None:
+    highest_hz = np.max(frequency_hz)
+    if not highest_hz < frame_rate_hz / 2:
+        raise ConfigError(
+            f"{key}: must lie below the Nyquist frequency {frame_rate_hz / 2:.6g} Hz; "
+            f"got {highest_hz:.6g}.",
+            path=key,
+        )
+
+
+def model_lines(settings: FileSection) -> list[tuple[Any, str, list[models.Vibration]]]:
+    """Return each vibration of the model, with its lines: several if it is spread."""
+    rate, lines = settings.loop.frame_rate_hz, []
+    for section, key, numbers in vibration_numbers(settings, "model"):
+        line = models.Vibration(**numbers)
+        spread = [line]
+        if section.spread_hz is not None:
+            with name_key(f"{key}.spread_hz"):
+                count = section.lines or _USUAL_LINES
+                spread = spread_lines(line, section.spread_hz, count, name="the half width")
+                spread[-1].ar_model(rate)  # the highest must lie below the Nyquist frequency
+        lines.append((section, key, spread))
+    return lines
+
+
+def _build_true_vibrations(
+    settings: FileSection, plant: models.TipTiltPlant
+) -> tuple[TrueVibration, ...]:
+    if true_vibrations_owner(settings) == "model":
+        return plant.vibrations
+    rate, lines = settings.loop.frame_rate_hz, list[TrueVibration]()
+    for section, key, numbers in vibration_numbers(settings, "truth"):
+        if section.kind == "drift":
+            start_hz = numbers.pop("frequency_hz")
+            _require_below_nyquist(section.end_hz, rate, f"{key}.end_hz")
+            with name_key(key):
+                ends = {"start_hz": start_hz, "end_hz": section.end_hz}
+                lines.append(
+                    models.DriftingVibration(**numbers, **ends, duration_s=section.duration_s)
+                )
+        elif section.kind == "resonance":
+            lines.append(models.Vibration(**numbers))
+        else:
+            del numbers["damping"]
+            lines.append(models.SinusoidalVibration(**numbers))
+    return tuple(lines)
+
+
+def _frequency_errors(
+    settings: FileSection, vibrations: tuple[TrueVibration, ...]
+) -> tuple[float, ...] | None:
+    """Return the error that is stated of each vibration [Hz], 0 beside others; None if none is."""
+    sections = getattr(settings, true_vibrations_owner(settings)).vibrations or []
+    if all(section.largest_error_hz is None for section in sections):
+        return None
+    places = np.array([section.frequency_hz for section in sections])
+    starts = [
+        line.start_hz if isinstance(line, models.DriftingVibration) else line.frequency_hz
+        for line in vibrations
+    ]
+    nearest = [sections[int(np.argmin(np.abs(places - start)))] for start in starts]
+    return tuple(section.largest_error_hz or 0.0 for section in nearest)
+
+
+def build_plant(
+    settings: FileSection, atmosphere: models.Atmosphere | None, noise_nm: float | FloatArray
+) -> models.TipTiltPlant:
+    """Build the plant of the design, with all its sensors."""
+    lines = model_lines(settings)
+    plant = models.tip_tilt_plant(
+        frame_rate_hz=settings.loop.frame_rate_hz,
+        delay_frames=settings.loop.delay_frames,
+        turbulence=_build_turbulence(settings, atmosphere, noise_nm),
+        vibrations=[line for *_, spread in lines for line in spread] or None,
+        noise_nm=noise_nm,
+        sensor_matrix=settings.sensor.matrix,
+        influence_matrix=settings.mirror.influence_matrix,
+        sensor_gain=_gains_per_measurement(settings),
+        modes=count_axes(settings),
+        mirror=_build_mirror(settings.mirror.local_loop),
+    )
+    if not settings.sensors:
+        return plant
+    with name_key("sensors"):
+        sensors = tuple(_build_sensor(*entry) for entry in settings.sensors.items())
+        suite = models.SensorSuite(sensors=sensors)
+        motions = [(s, key, len(spread)) for s, key, spread in lines]
+        return plant.with_sensors(suite, _build_motions(motions, suite))
+
+
+def turbulence_sections(settings: FileSection) -> list[TurbulenceSection]:
+    """Return the section of the assumed turbulence of each axis."""
+    turbulence, axes = settings.model.turbulence, count_axes(settings)
+    if isinstance(turbulence, list):
+        return _require_length(turbulence, axes, "model.turbulence", "axis")
+    return [turbulence] * axes
+
+
+def _build_turbulence(
+    settings: FileSection, atmosphere: models.Atmosphere | None, noise_nm: float | FloatArray
+) -> models.ARModel | list[models.ARModel]:
+    """Return one model for all axes, or one per axis where sections or noise differ."""
+    axes, key = count_axes(settings), "model.turbulence"
+    sections, listed = turbulence_sections(settings), isinstance(settings.model.turbulence, list)
+    noisy = np.ndim(noise_nm) == 1 and any(section.kind == "ar2" for section in sections)
+    if noisy and count_measurements(settings) != axes:
+        raise ConfigError(
+            f"{key}: kind ar2 is fitted above the noise of its axis, but sensor.noise_nm has one "
+            f"per measurement, {np.size(noise_nm)} for {axes} axes. Give one noise for all, or "
+            "kind ar.",
+            path=key,
+        )
+    noises = np.broadcast_to(noise_nm if noisy else np.ravel(noise_nm)[0], (axes,)).tolist()
+    if not listed and not noisy:
+        return _build_turbulence_model(sections[0], settings, atmosphere, noises[0], key)
+    keys = [f"{key}[{i}]" if listed else key for i in range(axes)]
+    return [
+        _build_turbulence_model(section, settings, atmosphere, noise, place)
+        for section, noise, place in zip(sections, noises, keys, strict=True)
+    ]
+
+
+def _build_turbulence_model(
+    section: TurbulenceSection,
+    settings: FileSection,
+    atmosphere: models.Atmosphere | None,
+    noise_nm: float,
+    key: str,
+) -> models.ARModel:
+    rate = settings.loop.frame_rate_hz
+    if section.kind == "ar":
+        with name_key(f"{key}.coefficients"):
+            numbers = section.model_dump(exclude={"kind"})
+            return models.ARModel(**numbers, frame_rate_hz=rate)
+    if atmosphere is None:
+        reason = f"{key} of kind {section.kind} is computed from it. Give it, or kind ar"
+        raise ConfigError(f"the key atmosphere is missing: {reason}.", path="atmosphere")
+    if section.kind == "ar1":
+        return models.ar1_turbulence(atmosphere, frame_rate_hz=rate)
+    return models.ar2_turbulence(atmosphere, frame_rate_hz=rate, noise_nm=noise_nm)
+
+
+def _build_mirror(section: LocalLoopSection | None) -> models.PositionLoop | None:
+    """Build the mirror's local loop, None for a mirror that settles at once."""
+    if section is None:
+        return None
+    numbers: dict[str, Any] = section.model_dump(exclude_none=True)
+    make = (
+        models.PositionLoop if section.bandwidth_hz is None else models.PositionLoop.from_bandwidth
+    )
+    with name_key("mirror.local_loop"):
+        return make(**numbers)
+
+
+def _build_sensor(name: str, section: OtherSensorSection) -> Sensor:
+    with name_key(f"sensors.{name}"):
+        timing = {"rate_hz": section.rate_hz, "delay_frames": section.delay_frames}
+        sizes = (section.noise_nm, section.noise_m_s2, section.covariance)
+        (size,) = (np.array(size) for size in sizes if size is not None)
+        noise = float(size) if size.ndim == 0 else size
+        if section.kind == "wavefront":
+            matrix = None if section.matrix is None else np.array(section.matrix)
+            return models.WavefrontSensor(name=name, **timing, noise_nm=noise, sensor_matrix=matrix)
+        return models.Accelerometer(
+            name=name,
+            **timing,
+            channels=tuple(section.channels or ()),
+            noise_m_s2=noise,
+            highpass_hz=section.highpass_hz,
+        )
+
+
+def _build_motions(lines: list[tuple[Any, str, int]], suite: models.SensorSuite) -> Motions:
+    """Return the motions of each line, from sections with their keys and numbers of lines."""
+    motions: list[dict[str, models.Motion]] = []
+    for section, key, count in lines:
+        with name_key(f"{key}.accelerometers"):
+            moving = {
+                name: models.Motion(size=motion.motion_nm_per_nm, phase_deg=motion.phase_deg)
+                for name, motion in (section.accelerometers or {}).items()
+            }
+            checked_motions((moving,), suite, 1)
+        motions += [moving] * count
+    return tuple(motions)
+
+
+def build_truth(
+    settings: FileSection,
+    atmosphere: models.Atmosphere | None,
+    noise_nm: float | FloatArray,
+    plant: models.TipTiltPlant,
+) -> models.Truth:
+    """Build the truth: turbulence, vibrations, noise and gain of the real loop."""
+    kind, suite, motions = settings.true_turbulence, plant.hardware.suite, plant.motions
+    if kind == "frozen_flow":
+        require_atmosphere(
+            settings,
+            "truth.turbulence: frozen_flow is its spectrum. Give it, or truth.turbulence: model",
+        )
+    one = plant.turbulence[0]
+    same = all(model is one for model in plant.turbulence)
+    spectra: dict[str, models.Spectrum | tuple[models.ARModel, ...] | None] = {
+        "frozen_flow": atmosphere,
+        "model": one if same else plant.turbulence,
+        "none": None,
+    }
+    vibrations = _build_true_vibrations(settings, plant)
+    if suite.sensors and true_vibrations_owner(settings) == "truth":
+        lines = [(section, key, 1) for section, key, _ in vibration_numbers(settings, "truth")]
+        motions = _build_motions(lines, suite)
+    return models.Truth(
+        turbulence=spectra[kind],
+        vibrations=vibrations,
+        motions=motions if suite.sensors else (),
+        noise_nm=noise_nm,
+        sensor_gain=relative_gain(settings, reference_gain(settings)),
+        frequency_errors_hz=_frequency_errors(settings, vibrations),
+    )
+
+
+def build_end_to_end_setup(
+    settings: FileSection, hardware: models.LoopHardware, truth: models.Truth
+) -> EndToEndSetup:
+    """Build the simulation that a configuration describes; refuse one that describes none."""
+    from lbt_synth.interop import EndToEndSetup, EndToEndSystem  # half of the time of a design
+
+    hint = "an end-to-end simulation needs it"
+    telescope, air = require_telescope(settings, hint), require_atmosphere(settings, hint)
+    pyramid, modes = settings.sensor.pyramid, settings.mirror.modes
+    calibrated = "must be left out for an end-to-end simulation, which calibrates it in nanometres"
+    turbulence, screens = settings.true_turbulence, "must be a length: phase screens have an end"
+    needs = "for an end-to-end simulation"
+    for key, right, why in (
+        ("sensor.pyramid", pyramid is not None, f"is missing; {hint}"),
+        ("atmosphere.outer_scale_m", air.outer_scale_m is not None, f"{screens}. Try 25"),
+        ("truth.turbulence", turbulence == "frozen_flow", f"must be frozen_flow {needs}"),
+        ("loop.axes", hardware.modes == 2, f"must be 2, tip and tilt, {needs}"),
+        ("mirror.modes", modes is not None, f"is missing; {hint}"),
+        ("sensor.matrix", settings.sensor.matrix is None, calibrated),
+        ("mirror.influence_matrix", settings.mirror.influence_matrix is None, calibrated),
+    ):
+        if not right:
+            raise ConfigError(f"{key} {why}.", path=key)
+    sensing: dict[str, Any] = {} if pyramid is None else pyramid.model_dump()
+    section = settings.end_to_end
+    # the optics do not depend on the sensor gain that the design assumes
+    modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=2)
+    with name_key("end_to_end"):
+        system = EndToEndSystem(
+            hardware=modal,
+            sensing_wavelength_um=sensing.pop("wavelength_um"),
+            imaging_wavelength_um=settings.imaging.wavelength_um,
+            modes=modes or 0,
+            **telescope.model_dump(),
+            **air.model_dump(),
+            **sensing,
+            **section.model_dump(include=_OF_SYSTEM),
+        )
+        return EndToEndSetup(
+            system=system,
+            vibrations=truth.vibrations,
+            motions=truth.motions,
+            seed=settings.simulation.seed,
+            **section.model_dump(exclude=_OF_SYSTEM),
+        )

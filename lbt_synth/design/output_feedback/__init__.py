@@ -1,1 +1,0 @@
-"""Controllers from measurements for any generalised plant, each with a certificate."""
