@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from support.gain_file_edits import ORIGINALS, original
-from support.gain_files import edited_file
+from support.gain_files import ORIGINALS, edited_file, original
 
 import lbt_synth as lbt
 from lbt_synth.design.record import DesignRecord, rebuild_design, record_design

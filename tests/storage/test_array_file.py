@@ -95,7 +95,7 @@ def test_files_of_other_programs_are_read_with_and_without_checksums():
 def test_every_flipped_bit_of_an_hdu_with_a_checksum_is_found_or_changes_nothing():
     content, draw, refused = table_file(), random.Random(1), 0
     whole = values(content)
-    for _ in range(300):
+    for _ in range(100):
         at = draw.randrange(len(content))
         damaged = bytearray(content)
         damaged[at] ^= 1 << draw.randrange(8)
@@ -106,19 +106,16 @@ def test_every_flipped_bit_of_an_hdu_with_a_checksum_is_found_or_changes_nothing
             assert values(bytes(damaged)) == whole  # behind END
         except ValueError:
             refused += 1
-    assert refused > 150
+    assert refused > 50
 
 
-@pytest.mark.parametrize("length", [0, 100, 3000, 5000, -2880, -1000])
+@pytest.mark.parametrize("length", [0, 3000, -1000])
 @pytest.mark.parametrize("sums", [True, False])
-def test_fits_content_that_is_cut_is_refused(length, sums):
-    with pytest.raises(ValueError, match="FITS"), open_fits(table_file(sums=sums)[:length]):
-        pass
-
-
-def test_what_follows_the_last_hdu_is_refused():
-    with pytest.raises(ValueError, match="FITS"), open_fits(table_file() + b"x" * 2880):
-        pass
+def test_fits_content_that_is_cut_or_goes_on_is_refused(length, sums):
+    content = table_file(sums=sums)
+    for damaged in (content[:length], content + b"x" * 2880):
+        with pytest.raises(ValueError, match="FITS"), open_fits(damaged):
+            pass
 
 
 @pytest.mark.parametrize("value", ["p" * 200, "several words, " * 12 + "end"])

@@ -38,10 +38,6 @@ class Shown(Plain):
         return Summary(tables=[table] * self.tables, notes=["x < y"])
 
 
-def html(shown):
-    return ElementTree.fromstring(shown._repr_html_())
-
-
 def test_an_array_is_its_shape_in_one_line():
     assert repr(Plain(values=np.eye(40))) == "<Plain: values=array(40, 40), note='x'>"
     line = repr(Plain(values=np.eye(2), note="long\n" * 100))
@@ -61,12 +57,11 @@ def test_printing_shows_the_facts_in_columns():
         "  states             3",
         "  x < y",
     ]
-    assert Shown(values=np.eye(2)).summary() == str(Shown(values=np.eye(2)))
-
-
-def test_several_tables_have_their_captions():
+    shown = Shown(values=np.eye(2))
+    assert shown.summary() == str(shown)
+    assert ElementTree.fromstring(shown._repr_html_()).text == str(shown)  # in a notebook
     lines = str(Shown(values=np.eye(2), tables=2)).splitlines()
-    assert lines.count("  Facts") == 2
+    assert lines.count("  Facts") == 2  # captions of several tables
 
 
 def test_a_table_of_rows_keeps_its_headings():
@@ -76,8 +71,3 @@ def test_a_table_of_rows_keeps_its_headings():
             return Summary(tables=[Table(caption="L", headings=("line", "f"), rows=(("a", "20"),))])
 
     assert str(Listed()).splitlines()[1:] == ["  line   f", "  a     20"]
-
-
-def test_a_notebook_shows_the_same():
-    shown = Shown(values=np.eye(2))
-    assert html(shown).text == str(shown)

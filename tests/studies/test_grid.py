@@ -147,7 +147,6 @@ def test_a_dead_process_ends_the_run_and_the_next_one_goes_on(tmp_path, monkeypa
         run_study(study, folder, executor=pool, evaluate=dies_once)
     kept = sum(stop - start for start, stop in part_rows(folder))
     assert 0 < kept < 80
-    with WorkerPool(2) as pool:
-        again = run_study(study, folder, executor=pool, evaluate=dies_once)
+    again = run_study(study, folder, evaluate=dies_once)
     assert (again.computed, again.failures) == (80 - kept, ())
     assert_whole(folder, study)

@@ -1,7 +1,5 @@
 """Designs against the least residuals, and beside reference designs in the truth."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support.configs import minimal_config, write_config
@@ -34,16 +32,6 @@ def test_study(config):
     assert axis.get_xlabel() == "frequency of the true vibration [Hz]"
     assert axis.get_ylabel() == "residual [nm rms]"
     assert len({str(line.get_linestyle()) for line in axis.get_lines()[:2]}) == 2
-
-
-def test_study_of_an_unstable_design(config):
-    designs = {"low": lbt.hinf(config.plant, gamma_ratio=1.05, route="riccati")}
-    truth = replace(config.truth, sensor_gain=0.3)
-    study = lbt.studies.limits(designs, config.hardware, truth, config.imaging, errors_hz=[-1, 1])
-    (row,) = study.rows
-    assert not row.stable
-    assert np.isnan([row.residual_nm, row.strehl, row.worst_nm, row.above_limit_percent]).all()
-    limits_figure(study)
 
 
 def test_a_filter_of_several_sensors_has_no_distance_from_the_limit_of_one(

@@ -53,19 +53,6 @@ def test_table_ii(entries):
         assert abs(entry.difference) < 1.0, entry
 
 
-def test_sigma_of_the_paper_kalman_peaks_where_hinf_is_flatter():
-    kalman, hinf = given.paper_filters()
-    peaks = [
-        float(
-            lbt.linear.largest_singular_values(
-                d.problem.with_unit_weights().error_system(d.gain_predictor), [20.0]
-            )[0]
-        )
-        for d in (kalman, hinf)
-    ]
-    assert peaks[1] < 0.8 * peaks[0]
-
-
 @pytest.fixture(scope="module")
 def setup():
     return load_setup()
@@ -133,7 +120,7 @@ def test_entries_are_means_over_seeds_beside_the_modal_analysis(table):
     assert slow[3.5] < slow[-3.5]  # an integrator rejects 23.5 Hz less than 16.5 Hz
 
 
-@pytest.mark.parametrize("gain", [-0.1, 0.0, 5.0])
+@pytest.mark.parametrize("gain", [-0.1, 5.0])
 def test_a_loop_that_is_unstable_at_the_measured_gain_predicts_nothing(setup, rows, gain):
     table = make_entries(rows, fake_results(rows, gain=gain), setup)
     assert {e.modal for e in table} == {0.0}

@@ -42,15 +42,6 @@ def test_robustness_rows(config):
         assert row.within_nm == pytest.approx(budget.within_nm)  # no command follows it
 
 
-def test_unstable_rows_say_so(config):
-    truth = replace(config.truth, sensor_gain=0.3)
-    (row,) = robustness(
-        config.plant, truth, config.imaging, errors_hz=[0], methods=["hinf"], gamma_ratio=1.05
-    )
-    assert not row.stable
-    assert np.isnan(row.strehl)
-
-
 def test_the_study_refuses_what_it_cannot_do(config):
     turbulence = config.plant.turbulence[0]
     still = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=turbulence, noise_nm=10)
@@ -69,17 +60,11 @@ def test_what_needs_a_stationary_truth_refuses_it(config):
     design = lbt.kalman(plant)
     loop = lbt.close_loop(plant.hardware, design.controller)
     camera = lbt.Imaging(diameter_m=8.22)
-    hw = plant.hardware
     for refused in (
         lambda: lbt.residual_budget(loop, truth),
-        lambda: lbt.loop.least_residual(hw, truth),
-        lambda: lbt.loop.least_worst_residual(
-            hw, truth, band_hz=(15, 25), rms_nm=100, direction=(1,)
-        ),
         lambda: robustness_map(design, truth, camera, errors_hz=[0], sensor_gains=[1]),
-        lambda: limits({"kalman": design}, hw, truth, camera),
+        lambda: limits({"kalman": design}, plant.hardware, truth, camera),
         lambda: list(robustness(plant, truth, camera, errors_hz=[0])),
-        lambda: lbt.design.optimal_integrator(hw, truth),
     ):
         with pytest.raises(lbt.errors.ProblemError, match="drifts from 17 to 23 Hz. Simulate it"):
             refused()
@@ -135,7 +120,6 @@ def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,), rel=1
 
 TRUTHS = {
     "two sinusoids": ((sinusoid(), sinusoid(33.0, 120, (0.0, 1.0))), "air"),
-    "random": ((random_line(),), "none"),
     "random and sinusoid": ((random_line(25.0, 90, 0.02, DIAGONAL), sinusoid()), "ar"),
     "table": ((sinusoid(),), "table"),
 }
@@ -145,9 +129,9 @@ TRUTHS = {
 def test_each_point_is_that_of_the_single_evaluator(kalman, air, name):
     vibrations, turbulence = TRUTHS[name]
     table = TabulatedSpectrum(frequency_hz=[1, 5, 40, 120], density_nm2_hz=[3e4, 900, 8, 0.1])
-    spectra = {"air": air, "ar": SLOW, "none": None, "table": table}
+    spectra = {"air": air, "ar": SLOW, "table": table}
     truth = lbt.Truth(turbulence=spectra[turbulence], vibrations=vibrations, noise_nm=15.5)
-    assert_as_single(kalman, truth, CAMERA, [-2.5, 0.0, 1.0], [0.07, 0.6, 1.0, 1.9])
+    assert_as_single(kalman, truth, CAMERA, [-2.5, 1.0], [0.07, 0.6, 1.9])
 
 
 def test_axes_of_their_own_disturbances():
@@ -165,11 +149,6 @@ def test_delay_errors_whole_and_fractional(air):
     lazy = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.3)
     found = assert_as_single(lazy, truth, CAMERA, [0.0, 2.0], [0.5, 1.0], [-1.0, 0.0, 0.25, 1.0])
     assert np.all(np.diff(found.strehl[:, 1, 0]) < 0)  # a later loop is a worse one
-
-
-def test_one_axis(axis_plant, air):
-    truth = lbt.Truth(turbulence=air, vibrations=(sinusoid(direction=(1.0,)),), noise_nm=15.5)
-    assert_as_single(lbt.kalman(axis_plant), truth, CAMERA, [0.0, 1.5], [0.4, 1.0])
 
 
 def test_unstable_points_are_nan(robust, settings):
@@ -211,18 +190,6 @@ def test_order_and_neighbours_change_nothing(kalman, settings):
     assert found.strehl[0, 70, 1] == pytest.approx(
         mapped([2], [many[70]]).strehl[0, 0, 0], rel=1e-6
     )
-
-
-def test_the_sign_of_the_error_is_true_less_assumed(kalman, settings):
-    """A design that believes more than is true meets a line that lies below."""
-    moved = replace(
-        settings.truth, vibrations=(sinusoid(18.5, settings.truth.vibrations[0].rms_nm),)
-    )
-    below = robustness_map(kalman, moved, settings.imaging, errors_hz=[0], sensor_gains=[1])
-    error = robustness_map(
-        kalman, settings.truth, settings.imaging, errors_hz=[-1.5], sensor_gains=[1]
-    )
-    assert below.strehl == pytest.approx(error.strehl, rel=1e-12)
 
 
 def test_each_line_moves_by_its_share(kalman, settings):
@@ -374,7 +341,7 @@ def plant():
 
 def test_the_front_of_the_lbt(plant):
     """A norm close to its least costs sensor-gain robustness, whichever filter has it."""
-    points = list(lbt.studies.tradeoff(plant, points=5, taps=8))
+    points = list(lbt.studies.tradeoff(plant, points=3, taps=8))
     for family in ("mixed", "central"):
         own = [point for point in points if point.family == family]
         gamma, rms, low = ([getattr(p, key) for p in own] for key in ("gamma", "rms", "gain_low"))

@@ -1,29 +1,79 @@
-"""A design of every method, to be saved in gain files."""
+"""A design of every method, with what is not the simplest, and their gain files, changed by hand."""
 
+import functools
 import json
 
 import numpy as np
+from support.lqg import shell, slow_plant
 from support.plants import lbt_axis_plant
-from support.sensor_loops import FAST, SLOW, example_plant
+from support.shaping import shaped_design
 
 import lbt_synth as lbt
+from lbt_synth.models.sensor_suite import Accelerometer, Motion, SensorSuite, WavefrontSensor
 from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 
 
-def every_design():
-    plant = lbt_axis_plant(modes=2, delay_frames=2.5)
-    bare = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0, dt_s=0.1)
-    return {
-        "kalman": lbt.kalman(plant),
-        "hinf": lbt.hinf(plant, gamma_ratio=1.3, route="riccati"),
-        "bare": lbt.kalman(bare),
-        "sensors": lbt.kalman(example_plant((FAST, SLOW))),
-        "sensors_hinf": lbt.hinf(example_plant((SLOW,)), gamma_ratio=1.3),
-        "integrator": lbt.integrator(plant.hardware, gain=0.3),
-    }
+@functools.cache
+def odd_plant():
+    """A plant whose sensor, mirror, noise and delay are not the simplest."""
+    plant = lbt_axis_plant(modes=2)
+    return lbt.tip_tilt_plant(
+        frame_rate_hz=800,
+        turbulence=plant.turbulence,
+        vibrations=plant.vibrations,
+        noise_nm=[15.5, 20.0],
+        delay_frames=2.5,
+        sensor_matrix=[[1.1, 0.1], [-0.1, 0.9]],
+        influence_matrix=[[0.9, 0.0], [0.1, 1.2]],
+    )
 
 
-DESIGNS = every_design()
+def bare_problem():
+    return lbt.EstimationProblem(
+        A=[[1.9, -0.99], [1.0, 0.0]],
+        B=[[1.0, 0.0], [0.0, 0.0]],
+        C=[[0.0, 1.0]],
+        D=[[0.0, 3.0]],
+        L=[[1.0, 0.0]],
+        dt_s=0.002,
+    )
+
+
+def sensors_original(*, bounded):
+    """A filter of a slow sensor and an accelerometer beside the loop's own sensor."""
+    slow = WavefrontSensor(name="slow", rate_hz=400, delay_frames=2, noise_nm=9.0)
+    shaken = Accelerometer(
+        name="mirror",
+        rate_hz=800,
+        delay_frames=1.5,
+        channels=("m1",),
+        noise_m_s2=2e-3,
+        highpass_hz=1.0,
+    )
+    own = odd_plant()
+    motions = ({"m1": Motion(size=2.0, phase_deg=20.0)},) * len(own.vibrations)
+    plant = own.with_sensors(SensorSuite(sensors=(slow, shaken)), motions)
+    return lbt.hinf(plant, gamma_ratio=1.2) if bounded else lbt.kalman(plant)
+
+
+ORIGINALS = {
+    "kalman": lambda: lbt.kalman(odd_plant()),
+    "bare": lambda: lbt.kalman(bare_problem()),
+    "hinf": lambda: lbt.hinf(odd_plant(), gamma_ratio=1.2, route="riccati"),
+    "least": lambda: lbt.hinf(lbt_axis_plant(modes=2), gamma_ratio=1, route="riccati"),
+    "mixed": lambda: lbt.mixed(lbt_axis_plant(modes=1), gamma_ratio=1.1, taps=4),
+    "lqg": lambda: lbt.lqg(slow_plant(2.0, shell(), modes=2), command_weight=0.01),
+    "shaped": shaped_design,
+    "sensors": lambda: sensors_original(bounded=False),
+    "sensors_hinf": lambda: sensors_original(bounded=True),
+    "integrator": lambda: lbt.integrator(odd_plant().hardware, gain=0.3),
+    "mirror": lambda: lbt.integrator(slow_plant(2.0, shell(), modes=2).hardware, gain=0.1),
+}
+
+
+@functools.cache
+def original(name):
+    return ORIGINALS[name]()
 
 
 def edited_file(path, design, change, *, digest_again=True):

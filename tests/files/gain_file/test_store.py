@@ -1,38 +1,29 @@
 """Gain files: round trips, damage, tampering, hostile files."""
 
-import os
+import copy
+import functools
+import json
 import re
 import subprocess
 import sys
 from collections import Counter
 from dataclasses import astuple, replace
+from itertools import cycle
 
 import numpy as np
 import pytest
 from astropy.io import fits
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from support.exports import relative
-from support.gain_file_edits import (
-    COMMANDS,
-    ENDINGS,
-    ORIGINALS,
-    Edit,
-    command,
-    judge,
-    random_edits,
-    run_quietly,
-    saved,
-)
-from support.gain_files import DESIGNS, edited_file
-from support.lqg import shell, slow_plant
+from support.gain_files import ORIGINALS, edited_file, original
 from support.plants import LBT_YAML, ROOT
-from support.shaping import shaped_design
 from support.specula_filters import noise_series, simulate_commands
 
 import lbt_synth as lbt
+from lbt_synth.design.record import record_design
 from lbt_synth.files.gain_file.store import load_with_digest, require_certificate, require_same
-from lbt_synth.storage.array_file import npz_bytes
+from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
+
+ENDINGS = ("fits", "npz")
 
 
 def state_space_filter(path):
@@ -58,74 +49,100 @@ def state_space_filter(path):
     return step
 
 
-@pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
-def test_the_fits_file_drives_a_foreign_state_space_filter(tmp_path, name):
-    design = DESIGNS[name]
-    step = state_space_filter(lbt.save_gain(tmp_path / "g.fits", design))
-    run = design.controller.start()
+@pytest.mark.parametrize("name", ["kalman", "hinf", "integrator", "sensors"])
+def test_a_fits_file_speaks_to_people_and_drives_a_foreign_filter(tmp_path, name):
+    design = original(name)
+    path = lbt.save_gain(tmp_path / "g.fits", design)
+    header = fits.getheader(path)
+    assert (header["METHOD"], header["RATE_HZ"], header["DELAY"]) == (design.method, 800, 2.5)
+    assert header["NEWSTATE"] is True
+    assert header["NFILTER"] == design.controller.B.shape[-1]
+    if name != "integrator":
+        assert header["RMS"] == pytest.approx(design.rms)
+    if name == "sensors":  # its matrices change from frame to frame
+        return
+    step, run = state_space_filter(path), design.controller.start()
     for y in np.random.default_rng(0).standard_normal((100, 2)):
         assert np.allclose(step(y), run.step(y), rtol=1e-13, atol=1e-13)
 
 
-def test_fits_headers_speak_to_people(tmp_path):
-    header = fits.getheader(lbt.save_gain(tmp_path / "g.fits", DESIGNS["kalman"]))
-    assert header["METHOD"] == "kalman"
-    assert header["RATE_HZ"] == 800
-    assert header["DELAY"] == 2.5
-    assert header["NEWSTATE"] is True
-    assert header["RMS"] == pytest.approx(DESIGNS["kalman"].rms)
+@pytest.mark.parametrize(("name", "ending"), [*zip(ORIGINALS, cycle(ENDINGS), strict=False)])
+def test_round_trip_keeps_every_bit(tmp_path, name, ending):
+    design = original(name)
+    back = lbt.load_gain(lbt.save_gain(tmp_path / f"gain.{ending}", design))
+    assert type(back) is type(design)
+    for field in "ABCD":
+        assert np.array_equal(getattr(back.controller, field), getattr(design.controller, field))
+    assert back.controller.dt_s == design.controller.dt_s
+    assert (back.solver, back.claims) == (design.solver, design.claims)
+    assert back.certificate.checks == design.certificate.checks
+    assert back.recertify().passed
+    if isinstance(design, lbt.design.FilterDesign):
+        assert type(back.problem) is type(design.problem)
+        for field in ("gain_predictor", "gain_filter"):
+            assert np.array_equal(getattr(back, field), getattr(design, field))
+        for field in "ABCDL":
+            assert np.array_equal(getattr(back.problem, field), getattr(design.problem, field))
+        for one, other in zip(back.fallbacks, design.fallbacks, strict=True):
+            assert one.missing == other.missing
+            assert np.array_equal(one.gains, other.gains)
+    if isinstance(back.problem, lbt.models.TipTiltPlant):
+        assert back.problem.vibrations == design.problem.vibrations
+        assert back.problem.motions == design.problem.motions
+    if isinstance(design, lbt.design.LqgDesign):
+        assert np.array_equal(back.gain_mirror, design.gain_mirror)
+    if isinstance(design, lbt.design.ShapedDesign):
+        assert back.terms_nm() == design.terms_nm()
+    if design.hardware is not None:
+        assert back.hardware.suite.is_same(design.hardware.suite)
+        assert back.hardware.delay_frames == design.hardware.delay_frames
+        assert np.array_equal(back.hardware.sensor, design.hardware.sensor)
+        assert np.array_equal(back.hardware.mirror_taps, design.hardware.mirror_taps)
+        if design.hardware.mirror is not None:
+            assert astuple(back.hardware.mirror) == astuple(design.hardware.mirror)
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
-@pytest.mark.parametrize("mirror", [None, "slow"])
-def test_gain_files(tmp_path, ending, mirror):
-    plant = slow_plant(2.0, shell() if mirror else None, modes=2)
-    design = lbt.lqg(plant, command_weight=0.01)
-    loaded = lbt.load_gain(lbt.save_gain(tmp_path / f"x.{ending}", design))
-    assert isinstance(loaded, lbt.design.LqgDesign)
+def test_the_proof_travels_with_the_gain_file(tmp_path, axis_plant):
+    design = lbt.hinf(axis_plant, gamma_ratio=1.1)
+    loaded = lbt.load_gain(lbt.save_gain(tmp_path / "g.npz", design))
+    assert loaded.gamma_infeasible == design.gamma_infeasible
+    assert np.array_equal(loaded.witness.states, design.witness.states)
     assert loaded.recertify().passed
-    np.testing.assert_array_equal(loaded.controller.A, design.controller.A)
-    np.testing.assert_array_equal(loaded.gain_mirror, design.gain_mirror)
-    assert loaded.command_weight == 0.01
-    assert loaded.objective_nm == design.objective_nm
-    if mirror:
-        assert astuple(loaded.hardware.mirror) == astuple(plant.hardware.mirror)
-    else:
-        assert loaded.hardware.mirror is None
-    other = lbt.load_gain(lbt.save_gain(tmp_path / f"k.{ending}", lbt.kalman(plant)))
-    assert other.recertify().passed
-    np.testing.assert_array_equal(other.hardware.mirror_taps, plant.hardware.mirror_taps)
 
 
-def test_a_gain_file_that_does_not_fit_its_mirror_is_refused(tmp_path):
-    def change(document):
-        document["arrays"]["GAIN_MIRROR"][0].pop()
-
-    path = edited_file(tmp_path / "p.npz", lbt.lqg(slow_plant(2.0, shell())), change)
-    with pytest.raises(lbt.errors.GainFileError, match="gain_mirror must be"):
-        lbt.load_gain(path)
-
-
-@pytest.fixture
-def small():
-    return shaped_design()
-
-
-@pytest.mark.parametrize("ending", [".fits", ".npz"])
-def test_a_shaped_design_returns_from_its_gain_file(small, tmp_path, ending):
-    loaded = lbt.load_gain(lbt.save_gain(tmp_path / f"gain{ending}", small))
-    assert isinstance(loaded, lbt.design.ShapedDesign)
-    assert loaded.recertify().passed
-    assert loaded.objective_nm == small.objective_nm
-    assert [d.label for d in loaded.specifications[0].demands] == [
-        d.label for d in small.specifications[0].demands
-    ]
-    assert loaded.terms_nm() == small.terms_nm()
-    np.testing.assert_array_equal(loaded.controller.A, small.controller.A)
+def scale_gain(document):
+    document["arrays"]["GAIN_PREDICTOR"][0][0] *= 1.01
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("name", "change", "text"),
+    [
+        ("kalman", scale_gain, "A is not what plant, loop and gains make"),
+        ("kalman", lambda d: d["arrays"].pop("A"), "A is missing"),
+        ("kalman", lambda d: d["arrays"].update(B=[[1.0]]), "B must be"),
+        ("kalman", lambda d: d["arrays"].update(GAIN_FILTER=[[1.0]]), "gain_filter must"),
+        ("kalman", lambda d: d["arrays"].update(A=[[float("nan")]]), "A must be finite"),
+        ("kalman", lambda d: d["meta"].pop("certificate"), "certificate is missing"),
+        ("kalman", lambda d: d["meta"].update(problem="riddle"), "riddle"),
+        ("kalman", lambda d: d["meta"].update(delay_frames=-1), "delay_frames must be"),
+        ("lqg", lambda d: d["arrays"]["GAIN_MIRROR"].pop(), "gain_mirror must be"),
+        (
+            "kalman",
+            lambda d: d["meta"].update(schema_version=99, library_version="0.2.0"),
+            "layout version 99, of lbt_synth 0.2.0; this version reads 5. Design it again "
+            "with lbt-synth design CONFIG --method METHOD -o FILE.",
+        ),
+        ("kalman", lambda d: d["meta"].update(schema_version=1), "layout version 1, of"),
+    ],
+)
+def test_files_that_were_edited_and_signed_anew_are_refused(tmp_path, name, change, text):
+    error = lbt.errors.SchemaVersionError if "layout" in text else lbt.errors.GainFileError
+    with pytest.raises(error, match=text):
+        lbt.load_gain(edited_file(tmp_path / "g.npz", original(name), change))
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
     [
         (lambda m: m["claims"].update(objective_nm=[-1.0]), "must be at least 0"),
         (lambda m: m["claims"].update(beauty=1.0), "does not claim beauty"),
@@ -143,290 +160,37 @@ def test_a_shaped_design_returns_from_its_gain_file(small, tmp_path, ending):
         (lambda m: m["specifications"][0].update(kind="Anything"), "Anything"),
     ],
 )
-def test_impossible_claims_of_a_gain_file_are_refused(small, tmp_path, change, message):
-    path = edited_file(tmp_path / "gain.npz", small, lambda document: change(document["meta"]))
-    with pytest.raises(lbt.errors.GainFileError, match=message):
-        lbt.load_gain(path)
-
-
-def test_the_proof_travels_with_the_gain_file(tmp_path, axis_plant):
-    design = lbt.hinf(axis_plant, gamma_ratio=1.1)
-    for ending in (".fits", ".npz"):
-        loaded = lbt.load_gain(lbt.save_gain(tmp_path / f"g{ending}", design))
-        assert loaded.gamma_infeasible == design.gamma_infeasible
-        assert np.array_equal(loaded.witness.states, design.witness.states)
-        assert loaded.recertify().passed
-
-
-@pytest.mark.parametrize("ending", ENDINGS)
-@pytest.mark.parametrize("name", DESIGNS)
-def test_round_trip_keeps_every_bit(tmp_path, name, ending):
-    design = DESIGNS[name]
-    back = lbt.load_gain(lbt.save_gain(tmp_path / f"gain.{ending}", design))
-    assert type(back) is type(design)
-    for field in "ABCD":
-        assert np.array_equal(getattr(back.controller, field), getattr(design.controller, field))
-    assert back.controller.dt_s == design.controller.dt_s
-    assert back.solver == design.solver
-    assert back.certificate.checks == design.certificate.checks
-    assert back.recertify().passed
-    if isinstance(design, lbt.design.FilterDesign):
-        assert type(back.problem) is type(design.problem)
-        for field in ("gain_predictor", "gain_filter"):
-            assert np.array_equal(getattr(back, field), getattr(design, field))
-        for field in "ABCDL":
-            assert np.array_equal(getattr(back.problem, field), getattr(design.problem, field))
-        for one, other in zip(back.fallbacks, design.fallbacks, strict=True):
-            assert one.missing == other.missing
-            assert np.array_equal(one.gains, other.gains)
-    assert back.claims == design.claims
-    if design.hardware is not None:
-        assert back.hardware.suite.is_same(design.hardware.suite)
-        assert back.hardware.delay_frames == design.hardware.delay_frames
-        assert np.array_equal(back.hardware.sensor, design.hardware.sensor)
-
-
-@pytest.mark.parametrize("name", ["kalman", "sensors"])
-def test_vibrations_survive(tmp_path, name):
-    plant = DESIGNS[name].problem
-    back = lbt.load_gain(lbt.save_gain(tmp_path / "g.fits", DESIGNS[name])).problem
-    assert back.vibrations == plant.vibrations
-    assert back.motions == plant.motions
-
-
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_truncated_files_are_refused(tmp_path, ending):
-    path = lbt.save_gain(tmp_path / f"g.{ending}", DESIGNS["hinf"])
-    content = path.read_bytes()
-    for length in (
-        0,
-        10,
-        len(content) // 3,
-        len(content) // 2,
-        len(content) - 3000,
-        len(content) - 40,
-    ):
-        path.write_bytes(content[:length])
-        with pytest.raises(lbt.errors.GainFileError) as caught:
-            lbt.load_gain(path)
-        assert "\n" not in str(caught.value)
-
-
-@pytest.fixture(scope="module")
-def contents(tmp_path_factory):
-    """The gain file of the Kalman filter, by its format."""
-    target = tmp_path_factory.mktemp("kalman") / "g"
-    return {
-        ending: lbt.save_gain(target.with_suffix(f".{ending}"), DESIGNS["kalman"]).read_bytes()
-        for ending in ENDINGS
-    }
-
-
-@settings(max_examples=120, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    ending=st.sampled_from(ENDINGS), place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7)
-)
-def test_a_flipped_bit_is_found_or_harmless(tmp_path, contents, ending, place, bit):
-    path = tmp_path / f"g.{ending}"
-    content = bytearray(contents[ending])
-    content[int(place * len(content))] ^= 1 << bit
-    path.write_bytes(bytes(content))
-    try:
-        back = lbt.load_gain(path)
-    except lbt.errors.GainFileError:
-        return
-    assert np.array_equal(back.controller.A, DESIGNS["kalman"].controller.A)
-    assert np.array_equal(back.gain_predictor, DESIGNS["kalman"].gain_predictor)
-
-
-def test_foreign_files_are_refused(tmp_path):
-    picture = tmp_path / "image.fits"
-    fits.PrimaryHDU(np.ones((4, 4))).writeto(picture)
-    other = tmp_path / "other.npz"
-    np.savez(other, a=np.ones(3))
-    notes = tmp_path / "notes.npz"
-    notes.write_bytes(npz_bytes({}, '{"schema": "recipes"}'))
-    prose = tmp_path / "prose.npz"
-    prose.write_bytes(npz_bytes({}, "[1, 2]"))
-    pickled = tmp_path / "pickled.npz"
-    np.savez(pickled, META=np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    for path in (picture, other, notes, prose, pickled):
-        with pytest.raises(lbt.errors.GainFileError, match=f"{path.name} is "):
-            lbt.load_gain(path)
-
-
-def edited(tmp_path, change, **more):
-    return edited_file(tmp_path / "g.npz", DESIGNS["kalman"], change, **more)
-
-
-def test_an_edited_gain_does_not_match_its_digest(tmp_path):
-    def change(document):
-        document["arrays"]["GAIN_PREDICTOR"][0][0] *= 1.0001
-
-    with pytest.raises(lbt.errors.GainFileError, match="does not match its digest"):
-        lbt.load_gain(edited(tmp_path, change, digest_again=False))
-
-
-@pytest.mark.parametrize("version", [1, 99])
-def test_another_layout_is_refused_with_the_way_to_make_the_file_again(tmp_path, version):
-    def change(document):
-        document["meta"].update(schema_version=version, library_version="0.2.0")
-
-    said = (
-        f"layout version {version}, of lbt_synth 0.2.0; this version reads 5. Design it again "
-        "with lbt-synth design CONFIG --method METHOD -o FILE."
-    )
-    with pytest.raises(lbt.errors.SchemaVersionError, match=said):
-        lbt.load_gain(edited(tmp_path, change))
-
-
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        (lambda d: d["arrays"].pop("A"), "A is missing"),
-        (lambda d: d["arrays"].update(B=[[1.0]]), "B must be"),
-        (lambda d: d["arrays"].update(GAIN_FILTER=[[1.0]]), "gain_filter must"),
-        (lambda d: d["arrays"].update(A=[[float("nan")]]), "A must be finite"),
-        (lambda d: d["meta"].pop("certificate"), "certificate is missing"),
-        (lambda d: d["meta"].update(problem="riddle"), "riddle"),
-        (lambda d: d["meta"].update(delay_frames=-1), "delay_frames must be"),
-    ],
-)
-def test_signed_nonsense_is_inconsistent(tmp_path, change, text):
+def test_impossible_claims_of_a_gain_file_are_refused(tmp_path, change, text):
+    path = edited_file(tmp_path / "g.npz", original("shaped"), lambda d: change(d["meta"]))
     with pytest.raises(lbt.errors.GainFileError, match=text):
-        lbt.load_gain(edited(tmp_path, change))
-
-
-def test_a_file_that_was_tampered_with_is_not_verified(tmp_path):
-    """Even when it is signed anew: verification computes everything from the matrices."""
-
-    def change(document):
-        gain = document["arrays"]["GAIN_PREDICTOR"]
-        gain[0][0] *= 1.01
-
-    with pytest.raises(lbt.errors.GainFileError, match="A is not what plant, loop and gains make"):
-        lbt.load_gain(edited(tmp_path, change))
-
-
-def test_endings_and_missing_files(tmp_path):
-    with pytest.raises(lbt.errors.OutputError, match="must end in .fits, .npz; got 'g.txt'"):
-        lbt.save_gain(tmp_path / "g.txt", DESIGNS["kalman"])
-    for ending in ("txt", "json"):
-        with pytest.raises(
-            lbt.errors.GainFileError, match=f"must end in .fits, .npz; got 'g.{ending}'"
-        ):
-            lbt.load_gain(tmp_path / f"g.{ending}")
-    with pytest.raises(lbt.errors.GainFileError, match="cannot read .*No such file"):
-        lbt.load_gain(tmp_path / "none.fits")
-    (tmp_path / "folder.fits").mkdir()
-    with pytest.raises(lbt.errors.GainFileError, match="cannot read"):
-        lbt.load_gain(tmp_path / "folder.fits")
-
-
-def test_nothing_half_written_stays(tmp_path, monkeypatch):
-    path = lbt.save_gain(tmp_path / "g.fits", DESIGNS["kalman"])
-    before = path.read_bytes()
-
-    def full_disk(_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(lbt.errors.OutputError, match="cannot write .*No space left on device"):
-        lbt.save_gain(path, DESIGNS["hinf"])
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["g.fits"]
-
-
-def test_directories_that_cannot_be_written(tmp_path):
-    with pytest.raises(lbt.errors.OutputError, match="cannot write .*No such file or directory"):
-        lbt.save_gain(tmp_path / "nowhere" / "g.fits", DESIGNS["kalman"])
-    (tmp_path / "taken.fits").mkdir()
-    with pytest.raises(lbt.errors.OutputError, match="is a directory"):
-        lbt.save_gain(tmp_path / "taken.fits", DESIGNS["kalman"])
-    file = tmp_path / "file"
-    file.write_text("")
-    with pytest.raises(lbt.errors.OutputError, match="Not a directory"):
-        lbt.save_gain(file / "g.fits", DESIGNS["kalman"])
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "null",
-        "[" * 100_000,
-        '{"schema": "lbt_synth gain file", "x": NaN}',
-        '{"schema": "lbt_synth gain file", "schema": "lbt_synth gain file"}',
-        "\x00",
-    ],
-)
-def test_hostile_metadata(tmp_path, text):
-    path = tmp_path / "h.npz"
-    path.write_bytes(npz_bytes({}, text))
-    with pytest.raises(lbt.errors.GainFileError):
         lbt.load_gain(path)
 
 
-def test_hostile_archives(tmp_path):
-    content = lbt.save_gain(tmp_path / "g.npz", DESIGNS["bare"]).read_bytes()
-    path = tmp_path / "h.npz"
-    for place in range(0, len(content), 7):  # every kind of byte of the format, one at a time
-        damaged = bytearray(content)
-        damaged[place] ^= 0xFF
-        path.write_bytes(bytes(damaged))
-        try:
-            assert np.array_equal(lbt.load_gain(path).controller.A, DESIGNS["bare"].controller.A)
-        except lbt.errors.GainFileError:
-            continue
-
-
-def test_impossible_names():
-    with pytest.raises(lbt.errors.GainFileError, match="null"):
-        lbt.load_gain("x\0y.npz")
-    with pytest.raises(lbt.errors.OutputError, match="null"):
-        lbt.save_gain("x\0y.npz", DESIGNS["bare"])
-
-
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_the_same_design_is_the_same_file(tmp_path, ending):
-    one = lbt.save_gain(tmp_path / f"a.{ending}", DESIGNS["kalman"]).read_bytes()
-    assert lbt.save_gain(tmp_path / f"b.{ending}", DESIGNS["kalman"]).read_bytes() == one
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        (b"RATE_HZ =                800.0", b"RATE_HZ =                900.0"),
-        (b"VERSION =                    1", b"VERSION =                    2"),
-        (b"NEWSTATE=                    T", b"NEWSTATE=                    F"),
-    ],
-)
-def test_an_edited_header_card_is_found(tmp_path, old, new):
-    path = lbt.save_gain(tmp_path / "g.fits", DESIGNS["kalman"])
+def test_a_file_that_was_edited_and_not_signed_does_not_match_its_digest(tmp_path):
+    path = edited_file(tmp_path / "g.npz", original("kalman"), scale_gain, digest_again=False)
+    with pytest.raises(lbt.errors.GainFileError, match="does not match its digest"):
+        lbt.load_gain(path)
+    path = lbt.save_gain(tmp_path / "g.fits", original("kalman"))
+    card = b"RATE_HZ =                800.0"
     content = path.read_bytes()
-    assert old in content
-    path.write_bytes(content.replace(old, new))
+    assert card in content
+    path.write_bytes(content.replace(card, card.replace(b"8", b"9")))
     with pytest.raises(lbt.errors.GainFileError, match="the checksum of its HDU 0 is wrong"):
         lbt.load_gain(path)
 
 
 def test_a_header_that_says_something_else_is_found_behind_a_right_checksum(tmp_path):
-    with fits.open(lbt.save_gain(tmp_path / "g.fits", DESIGNS["kalman"])) as hdus:
+    with fits.open(lbt.save_gain(tmp_path / "g.fits", original("kalman"))) as hdus:
         hdus[0].header["RATE_HZ"] = 900.0
         hdus.writeto(tmp_path / "other.fits", checksum=True)
     with pytest.raises(lbt.errors.GainFileError, match="header.RATE_HZ must be 800.0"):
         lbt.load_gain(tmp_path / "other.fits")
 
 
-def test_the_header_counts_the_measurements_of_all_sensors(tmp_path):
-    design = DESIGNS["sensors"]
-    header = fits.getheader(lbt.save_gain(tmp_path / "g.fits", design))
-    assert header["NFILTER"] == design.problem.n_measurements
-
-
 def test_only_designs_are_saved(tmp_path):
     with pytest.raises(lbt.errors.ProblemError, match="design must be a Design; got int"):
         lbt.save_gain(tmp_path / "g.fits", 3)
-    twisted = replace(DESIGNS["kalman"])
+    twisted = replace(original("kalman"))
     k = twisted.controller
     object.__setattr__(twisted, "controller", replace(k, B=1.001 * k.B))
     with pytest.raises(lbt.errors.OutputError, match="contradicts itself: B is not what plant"):
@@ -488,66 +252,151 @@ def test_the_same_measurements_give_the_same_commands(simulated_designs, specula
     assert relative(series[name][1], expected) < LIMITS[precision]
 
 
-HARMLESS = ("refused", "no other design", "another claim that holds", "cannot be written")
-QUICK = ("kalman", "bare", "integrator")
+# What a design does not depend on: words, what its solver said, values of checks (rounding).
+NOTES = {"solver", "assumptions", "library_version", "bound_programme", "long_objective_nm"}
+NOTES |= {"long_functions", "value", "computed_by", "configuration"}
+MISSING = object()
 
 
-def refused_commands(name, ending, folder, commands):
-    """Commands that do not take a file as it was written."""
-    path = saved(name, ending).write(folder / f"{name}.{ending}")
-    return [each for each in commands if run_quietly(command(each, path))[0] != 0]
+def fields(value, place=()):
+    """Yield places and values of all fields of a tree of dictionaries and lists, branches too."""
+    if place:
+        yield place, value
+    if isinstance(value, dict | list):
+        for key in value if isinstance(value, dict) else range(len(value)):
+            yield from fields(value[key], (*place, key))
 
 
-def test_a_sample_of_edits(tmp_path):
-    for name, ending in zip(QUICK, (*ENDINGS, "npz"), strict=True):
-        assert not refused_commands(name, ending, tmp_path, ("verify",))
-    verdicts = [judge(edit, tmp_path, ("verify",)) for edit in random_edits(40, 1, QUICK)]
-    assert set(verdicts) <= set(HARMLESS), verdicts
-    assert verdicts.count("refused") > 30
+def replacements(value):
+    """Return what a hostile hand may write in place of a field."""
+    if isinstance(value, np.ndarray):
+        one = value.copy()
+        one.flat[np.argmax(np.abs(value))] *= 1.01
+        other = [one, 0.8 * value, value[:-1], value[None], np.full_like(value, np.nan)]
+    elif isinstance(value, bool):
+        other = [not value, "yes"]
+    elif isinstance(value, int | float):
+        other = [1.01 * value, 7 * value, -value, 0.0, 1e300, float("nan"), str(value), [value]]
+    elif isinstance(value, str):
+        other = ["kalman", "hinf", "integrator", "lqg", "plant", value + " x", "", "\ud800", 3]
+    elif isinstance(value, list):
+        other = [value[:-1], [*value, 1.0], [*value, *value], "list"]
+    elif isinstance(value, dict):
+        other = [list(value), value | {"more": 1}, "dict"]
+    else:
+        other = [100.0, "none", []]
+    if isinstance(value, np.ndarray):
+        return [*(new for new in other if not np.array_equal(new, value)), None, MISSING]
+    return [new for new in [*other, None, MISSING] if type(new) is not type(value) or new != value]
+
+
+def without_notes(value):
+    if isinstance(value, dict):
+        return {key: without_notes(each) for key, each in value.items() if key not in NOTES}
+    return [without_notes(each) for each in value] if isinstance(value, list | tuple) else value
+
+
+def difference(one, other):
+    """Say whether two designs are the same but for notes, or another word beside equal claims."""
+    one, other = record_design(one), record_design(other)
+    equal = one.arrays.keys() == other.arrays.keys() and all(
+        np.shape(array) == np.shape(other.arrays[name])
+        and np.allclose(array, other.arrays[name], rtol=1e-12, atol=0)
+        for name, array in one.arrays.items()
+    )
+    if not equal or one.meta["claims"] != other.meta["claims"]:
+        return "another design"
+    same = without_notes(one.meta) == without_notes(other.meta)
+    return "the same design" if same else "another word"
+
+
+def outcome(name, parts, place, new, path):
+    """Say what comes of a file of which one field was changed and the digest written again."""
+    document = copy.deepcopy(parts)
+    *before, last = place
+    branch = functools.reduce(lambda at, key: at[key], before, document)
+    if new is MISSING:
+        del branch[last]
+    else:
+        branch[last] = new
+    try:
+        document["meta"]["digest"] = digest(document["arrays"], document["meta"])
+        path.write_bytes(npz_bytes(document["arrays"], json.dumps(document["meta"])))
+    except (TypeError, ValueError, AttributeError):
+        return "cannot be written"
+    try:
+        back = lbt.load_gain(path)
+    except lbt.errors.GainFileError as error:
+        return "refused" if "\n" not in str(error) else "refused in many lines"
+    if not back.recertify().passed:
+        return "refused"
+    kind = difference(back, original(name))
+    return f"{kind}: {place[-1]}" if kind == "another word" else kind
+
+
+def outcomes(name, count, folder):
+    """Count what comes of some of all changes of one field of the file of a design."""
+    arrays, text = read_npz(lbt.save_gain(folder / "g.npz", original(name)).read_bytes())
+    parts = {"arrays": dict(arrays), "meta": json.loads(text)}
+    edits = [
+        (place, new)
+        for place, value in fields(parts)
+        if len(place) > 1 and place[-1] != "digest"
+        for new in replacements(value)
+    ]
+    chosen = np.random.default_rng(1).permutation(len(edits))[:count]
+    return Counter(outcome(name, parts, *edits[i], folder / "g.npz") for i in chosen)
+
+
+# Nothing proves the period of a problem without a loop, names, and a calibrated feed-forward; and
+# an objective that was computed again holds.
+WORDS = ("dt_s", "name", "method", "feed_forward", "low_hz", "high_hz", "rms_nm")
+WORDS = {f"another word: {key}" for key in WORDS}
+HARMLESS = {"refused", "the same design", "cannot be written"}
+
+
+@pytest.mark.parametrize("name", ["kalman", "bare", "integrator"])
+def test_no_edit_of_some_is_taken_for_another_design(tmp_path, name):
+    counts = outcomes(name, 30, tmp_path)
+    assert counts.keys() <= HARMLESS | WORDS
+    assert counts["refused"] > 15
 
 
 @pytest.mark.study
-def test_no_edit_is_taken_for_a_certified_design(tmp_path, capsys):
-    """2,000 edits over methods and formats print the table of docs/gain_file.md."""
-    for name in ORIGINALS:
-        for ending in ENDINGS:
-            assert not refused_commands(name, ending, tmp_path, ("verify", "show", "export"))
-    assert not refused_commands("kalman", "npz", tmp_path, ("simulate",))
-    counts = {name: Counter() for name in ORIGINALS}
-    told = []
-    for number, edit in enumerate(random_edits(2000)):
-        verdict = judge(edit, tmp_path, COMMANDS if number % 10 == 0 else ("verify",))
-        kind = verdict if verdict in HARMLESS else verdict.split()[0]
-        counts[edit.design][kind] += 1
-        if kind not in HARMLESS or (kind == "no other design" and not edit.is_note):
-            told.append((verdict, edit.design, edit.ending, edit.place, edit.change))
-    kinds = (*HARMLESS, "certified", "traceback", "more")
+@pytest.mark.parametrize("name", ORIGINALS)
+def test_no_edit_is_taken_for_another_design(tmp_path, name, capsys):
+    """The rows of the table of docs/gain_file.md."""
+    counts = outcomes(name, 180, tmp_path)
     with capsys.disabled():
-        print(f"\n| design | {' | '.join(kinds)} |")
-        for name, each in counts.items():
-            print(f"| {name} | {' | '.join(str(each[kind]) for kind in kinds)} |")
-        print(f"| all | {' | '.join(str(sum(c[k] for c in counts.values())) for k in kinds)} |")
-        print(*told, sep="\n")
-    assert not [entry for entry in told if entry[0] not in HARMLESS]
+        row = [counts[kind] for kind in ("refused", "the same design", "cannot be written")]
+        print("|", " | ".join(map(str, [name, *row, sum(counts[kind] for kind in WORDS)])), "|")
+    assert counts.keys() <= HARMLESS | WORDS
 
 
 def test_another_claim_that_holds_has_another_digest(tmp_path):
     """The band's worst frequency is at its other end: from 9.09 Hz on it promises no less."""
-    place = ("meta", "specifications", 0, "objective", "terms", 1, "low_hz")
-    edit = Edit("shaped", "npz", place, "times 1.01", 9.09)
-    assert judge(edit, tmp_path, ("verify",)) == "another claim that holds"
-    contents = (saved("shaped", "npz"), saved("shaped", "npz").changed(edit))
-    digests = [load_with_digest(each.write(tmp_path / "g.npz"))[1] for each in contents]
-    assert digests[0] != digests[1]
-    wider = replace(edit, place=(*place[:-1], "high_hz"), value=12.0)  # it leaves more there
-    assert judge(wider, tmp_path, ("verify",)) == "refused"
 
+    def promise(**band):
+        def change(document):
+            document["meta"]["specifications"][0]["objective"]["terms"][1].update(band)
 
-def test_a_demand_that_is_there_twice_is_refused(tmp_path):
-    place = ("meta", "specifications", 0, "demands")
-    demands = saved("shaped", "npz").parts["meta"]["specifications"][0]["demands"]
-    edit = Edit("shaped", "npz", place, "longer", [*demands, *demands])
-    assert judge(edit, tmp_path, ("verify",)) == "refused"
+        return edited_file(tmp_path / "g.npz", original("shaped"), change)
+
+    unchanged, narrow = (load_with_digest(promise(**band)) for band in ({}, {"low_hz": 9.09}))
+    assert narrow[0].recertify().passed
+    assert narrow[1] != unchanged[1]
+    with pytest.raises(lbt.errors.GainFileError):  # it leaves more there
+        lbt.load_gain(promise(high_hz=12.0))
+    with pytest.raises(lbt.errors.GainFileError):  # demands that are there twice
+        lbt.load_gain(
+            edited_file(
+                tmp_path / "g.npz",
+                original("shaped"),
+                lambda d: d["meta"]["specifications"][0].update(
+                    demands=2 * d["meta"]["specifications"][0]["demands"]
+                ),
+            )
+        )
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,12 @@
 """Telemetry files, and telemetry of simulations."""
 
 import json
-import os
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.plants import lbt_axis_plant
 from support.telemetry import ENDINGS, SHELL, full, same, telemetries
 
 import lbt_synth as lbt
@@ -16,24 +14,18 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.files import Telemetry, load_telemetry, save_telemetry, telemetry_from_simulation
 from lbt_synth.files.telemetry import store
 from lbt_synth.files.telemetry.aot import lost_fields
-from lbt_synth.files.telemetry.telemetry import CONVENTION, LAYERS
+from lbt_synth.files.telemetry.telemetry import LAYERS
 from lbt_synth.storage import array_file as archive
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-@pytest.mark.parametrize("slopes", [True, False])
-def test_round_trip_keeps_every_bit(tmp_path, ending, slopes):
-    seen = full(with_slopes=slopes)
-    assert same(seen, load_telemetry(save_telemetry(tmp_path / f"t.{ending}", seen)))
+def test_round_trip_keeps_every_bit(tmp_path, ending):
+    least = Telemetry(frame_rate_hz=1.0, commands=[[1.0]], measurements=[[2.0]])
+    for seen in (full(), full(with_slopes=False), least):
+        assert same(seen, load_telemetry(save_telemetry(tmp_path / f"t.{ending}", seen)))
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_the_least_telemetry(tmp_path, ending):
-    seen = Telemetry(frame_rate_hz=1.0, commands=[[1.0]], measurements=[[2.0]])
-    assert same(seen, load_telemetry(save_telemetry(tmp_path / f"t.{ending}", seen)))
-
-
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=10, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seen=telemetries(), ending=st.sampled_from(ENDINGS))
 def test_any_telemetry_comes_back(tmp_path, seen, ending):
     assert same(seen, load_telemetry(save_telemetry(tmp_path / f"t.{ending}", seen)))
@@ -41,7 +33,7 @@ def test_any_telemetry_comes_back(tmp_path, seen, ending):
 
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_float32_rounds_series_and_nothing_else(tmp_path, ending):
-    seen = full(frames=5000)
+    seen = full(frames=2000)
     path = save_telemetry(tmp_path / f"t.{ending}", seen, precision="float32")
     back = load_telemetry(path)
     series = [
@@ -65,14 +57,7 @@ def test_float32_refuses_what_it_cannot_hold(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_same_telemetry_is_the_same_file(tmp_path):
-    for ending in ENDINGS:
-        one = save_telemetry(tmp_path / f"a.{ending}", full()).read_bytes()
-        assert save_telemetry(tmp_path / f"b.{ending}", full()).read_bytes() == one
-
-
-@pytest.mark.parametrize("delay", [1.0, 2.0, 2.25, 3.5])
-@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize(("delay", "ending"), [(1.0, "npz"), (2.25, "fits"), (3.5, "npz")])
 def test_the_loop_equations_hold_in_the_file_alone(tmp_path, delay, ending):
     """What the file says of timing, checked on a simulation without noise."""
     rng = np.random.default_rng(3)
@@ -115,12 +100,11 @@ def test_the_loop_equations_hold_in_the_file_alone(tmp_path, delay, ending):
 
 
 @pytest.mark.parametrize("kind", ["fits", "npz", pytest.param("aot", marks=pytest.mark.e2e)])
-@pytest.mark.parametrize("delay", [2.0, 2.25])
-def test_the_equation_of_a_moving_mirror_holds_in_the_file_alone(tmp_path, kind, delay):
+def test_the_equation_of_a_moving_mirror_holds_in_the_file_alone(tmp_path, kind):
     """phi_cor(k) = N (c0 u(k) + c1 u(k-1) + ...), as the file says, with what it holds."""
     path = lbt.LoopHardware(
         frame_rate_hz=800.0,
-        delay_frames=delay,
+        delay_frames=2.25,
         influence_matrix=[[1.0, 0.2], [-0.1, 0.8]],
         mirror=SHELL,
     )
@@ -147,50 +131,6 @@ def test_the_equation_of_a_moving_mirror_holds_in_the_file_alone(tmp_path, kind,
     )
     assert np.allclose(replayed.residual_nm, run.residual_nm, rtol=0, atol=1e-9)
     assert "mirror" not in lost_fields(seen)
-
-
-@pytest.mark.parametrize("ending", ENDINGS)
-def test_truncated_files_are_refused(tmp_path, ending):
-    path = save_telemetry(tmp_path / f"t.{ending}", full())
-    content = path.read_bytes()
-    for length in np.linspace(0, len(content) - 40, 30).astype(int):
-        path.write_bytes(content[:length])
-        with pytest.raises(lbt.errors.TelemetryError) as caught:
-            load_telemetry(path)
-        assert "\n" not in str(caught.value)
-        assert caught.value.path == path
-
-
-@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    ending=st.sampled_from(ENDINGS), place=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7)
-)
-def test_a_flipped_bit_is_found_or_harmless(tmp_path, ending, place, bit):
-    seen = full()
-    path = save_telemetry(tmp_path / f"t.{ending}", seen)
-    content = bytearray(path.read_bytes())
-    content[int(place * len(content))] ^= 1 << bit
-    path.write_bytes(bytes(content))
-    try:
-        back = load_telemetry(path)
-    except lbt.errors.TelemetryError:
-        return
-    assert same(seen, back)
-
-
-def test_foreign_files_are_refused(tmp_path):
-    picture = tmp_path / "image.fits"
-    fits.PrimaryHDU(np.ones((4, 4))).writeto(picture)
-    other = tmp_path / "other.npz"
-    np.savez(other, a=np.ones(3))
-    gain = lbt.save_gain(tmp_path / "gain.fits", lbt.kalman(lbt_axis_plant()))
-    pickled = tmp_path / "pickled.npz"
-    np.savez(pickled, META=np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    for path in (picture, other, gain, pickled):
-        with pytest.raises(lbt.errors.TelemetryError, match=f"{path.name} is "):
-            load_telemetry(path)
-    with pytest.raises(lbt.errors.GainFileError, match="is not a gain file"):
-        lbt.load_gain(save_telemetry(tmp_path / "t.fits", full()))
 
 
 def edited(tmp_path, change, *, resign=True):
@@ -236,7 +176,6 @@ def test_edited_files_are_refused(tmp_path, change, resign, text):
 def test_names_and_formats(tmp_path):
     seen = full()
     for name, kind, text in (
-        ("t.txt", None, "telemetry must end in .fits, .npz or .aot.fits; got 't.txt'"),
         ("t.fits", "npz", "does not fit the format 'npz'"),
         ("t.npz", "fits", "does not fit the format 'fits'"),
         ("t.aot.fits", "fits", "does not fit the format 'fits'"),
@@ -246,29 +185,6 @@ def test_names_and_formats(tmp_path):
             save_telemetry(tmp_path / name, seen, format=kind)
     with pytest.raises(lbt.errors.OutputError, match="holds a Telemetry; got int"):
         save_telemetry(tmp_path / "t.fits", 3)
-    with pytest.raises(lbt.errors.OutputError, match="No such file or directory"):
-        save_telemetry(tmp_path / "nowhere" / "t.fits", seen)
-    with pytest.raises(lbt.errors.TelemetryError, match="must end in"):
-        load_telemetry(tmp_path / "t.txt")
-    (tmp_path / "folder.fits").mkdir()
-    with pytest.raises(lbt.errors.TelemetryError, match="cannot read"):
-        load_telemetry(tmp_path / "folder.fits")
-    with pytest.raises(lbt.errors.TelemetryError, match="null"):
-        load_telemetry("x\0y.npz")
-
-
-def test_nothing_half_written_stays(tmp_path, monkeypatch):
-    path = save_telemetry(tmp_path / "t.fits", full())
-    before = path.read_bytes()
-
-    def full_disk(_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(lbt.errors.OutputError, match="No space left on device"):
-        save_telemetry(path, full(random=1))
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["t.fits"]
 
 
 def test_the_fits_file_explains_itself(tmp_path):
@@ -295,16 +211,6 @@ def test_the_fits_file_explains_itself(tmp_path):
         assert names[-1] == "META"
     with np.load(lbt.files.save_telemetry(tmp_path / "t.npz", seen)) as arrays:
         assert np.array_equal(arrays["MIRROR_TAPS"], seen.hardware.mirror_taps)
-
-
-def test_a_settled_mirror_leaves_the_file_as_it_was(tmp_path):
-    seen = full(mirror=None)
-    assert seen.convention == CONVENTION
-    assert seen.mirror_taps is None
-    arrays, meta = store.pack(seen, "float64")
-    assert "MIRROR_TAPS" not in arrays
-    assert "mirror" not in meta  # what 0.1 wrote, and reads
-    assert store.unpack(arrays, meta).mirror is None
 
 
 def test_the_camera_gives_telescope_and_strehl_ratio():

@@ -25,7 +25,7 @@ def shaking(rate_hz, count):
     )
 
 
-@pytest.mark.parametrize("rate_hz", [1000.2, 1024.0, 1280.0, 2500.0])
+@pytest.mark.parametrize("rate_hz", [1000.2, 2500.0])
 def test_readings_of_any_rate_lie_on_the_frames(rate_hz):
     own = shaking(rate_hz, int(FRAMES * rate_hz / RATE) + 1)
     laid = resample(own, rate_hz, RATE)
@@ -43,14 +43,10 @@ def test_faster_readings_are_averaged():
     np.testing.assert_allclose(resample(own, 1024, RATE)[:, 0], 9.81, rtol=1e-12)
 
 
-def test_slower_readings_are_refused():
-    with pytest.raises(lbt.errors.ProblemError, match="at least once a frame"):
-        resample(np.zeros((100, 1)), 999, RATE)
-
-
 def test_rates_that_leave_no_frame_are_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((100, 2)))
-    for rate_hz, words in ((1e9, "Is the rate right"), (0, "above 0")):
+    refused = ((1e9, "Is the rate right"), (0, "above 0"), (999, "at least once a frame"))
+    for rate_hz, words in refused:
         with pytest.raises(lbt.errors.ProblemError, match=words):
             load_readings(tmp_path / "a.npy", RATE, rate_hz=rate_hz)
 

@@ -45,10 +45,9 @@ def test_whiteness_of_white_noise_in_segments() -> None:
         assert np.all(np.sum(np.array(p_values) < 0.05, axis=0) <= 16)
 
 
-@pytest.mark.parametrize("wind", [8.0, 20.0])
-def test_frozen_flow_does_not_shift_the_gain(wind: float) -> None:
+def test_frozen_flow_does_not_shift_the_gain() -> None:
     """Without chance in the data only the model can."""
-    air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=wind, diameter_m=8.22)
+    air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=20, diameter_m=8.22)
     search = Search(data=expected_periodogram(air, 5.0, 0.6))
     model = add_evidence(search, find_components(search))
     error = float(np.sqrt(model.covariance[0, 0]))
@@ -124,7 +123,7 @@ def disturbance(wind: float, pole: float, rms_nm: float) -> lbt.models.SumSpectr
     return lbt.models.SumSpectrum(parts=[air, drift])
 
 
-@pytest.mark.parametrize(("wind", "noise_nm"), [(8.0, NOISE_NM), (20.0, NOISE_NM), (20.0, 1.0)])
+@pytest.mark.parametrize(("wind", "noise_nm"), [(8.0, NOISE_NM), (20.0, 1.0)])
 def test_a_drift_over_frozen_flow_does_not_shift_the_gain(wind: float, noise_nm: float) -> None:
     """Without a roll-off beside the drift it was a quarter too low: 13 standard errors.
 
@@ -138,10 +137,9 @@ def test_a_drift_over_frozen_flow_does_not_shift_the_gain(wind: float, noise_nm:
     assert np.exp(spectrum.background.log_noise / 2) == pytest.approx(noise_nm, rel=0.02)
 
 
-@pytest.mark.parametrize(("wind", "pole", "rms_nm"), [(20.0, 0.999, 30.0), (8.0, 0.9995, 100.0)])
-def test_the_filter_of_a_drift_beside_turbulence(wind: float, pole: float, rms_nm: float) -> None:
+def test_the_filter_of_a_drift_beside_turbulence() -> None:
     """The plant has the drift as an overdamped resonance."""
-    total = disturbance(wind, pole, rms_nm)
+    total = disturbance(8.0, 0.9995, 100.0)
     search = Search(data=expected_periodogram(total, NOISE_NM, GAIN), gain=GAIN)
     axis = describe_axis(search, add_evidence(search, find_components(search)), None, "")
     (drift,) = axis.parts

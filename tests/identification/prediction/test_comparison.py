@@ -4,6 +4,7 @@ The least-squares predictor, against textbook regression and closed forms.
 """
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -22,7 +23,6 @@ from support.predictions import (
     TILTED,
     a_plant,
     a_series,
-    a_truth,
     pseudo_open_loop,
 )
 
@@ -32,24 +32,7 @@ from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 
-def test_on_held_out_data_no_predictor_beats_the_limit():
-    plant = a_plant(gain=0.5)
-    limit = lbt.kalman(plant).rms
-    for seed in range(4):
-        night = lbt.simulate(
-            lbt.integrator(plant.hardware, gain=0.2).controller,
-            a_truth(),
-            hardware=plant.hardware,
-            frames=12_000,
-            seed=seed,
-            settle_frames=0,
-        )
-        z = pseudo_open_loop(night.measurements[0], night.commands[0], plant.hardware)
-        table = lbt.identification.prediction_against_data(plant, z, {}, taps=24)
-        row = table["least-squares predictor"].replayed
-        assert row.total_nm2 > limit**2 - 4 * row.total_error_nm2
-
-
+@cache
 def two_different_axes():
     turbulence = [
         lbt.models.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE),
@@ -84,15 +67,8 @@ def test_the_table():
     table = lbt.identification.prediction_against_data(
         plant, z, given_, measurements=y, running=ran, imaging=CAMERA
     )
-    names = [entry.name for entry in table.entries]
-    assert names == [
-        "what ran",
-        "best integrator",
-        "Kalman",
-        "H-infinity",
-        "least-squares predictor",
-        "limit of performance",
-    ]
+    names = "what ran, best integrator, Kalman, H-infinity, least-squares predictor"
+    assert [entry.name for entry in table.entries] == [*names.split(", "), "limit of performance"]
     assert table.notes == ()
     for entry in table.entries[:-1]:
         assert abs(entry.deviations) < 4, entry.name
@@ -106,6 +82,8 @@ def test_the_table():
     np.testing.assert_allclose(limit.model_axis_nm, kalman.certificate.rms_per_output, rtol=1e-9)
     assert (limit.replayed, limit.replayed_nm is np.nan) == (None, True)
     assert np.isnan([limit.ratio, limit.deviations, limit.strehl]).all()
+    row = table["least-squares predictor"].replayed  # which nothing that is causal can beat
+    assert row.total_nm2 > limit.model_nm**2 - 4 * row.total_error_nm2
     # what ran: its own measurements on the same frames
     begin, end = table.test[0]
     assert (begin, end) == (15_000, 30_000)  # the first half is enough to warm up
@@ -174,23 +152,13 @@ def test_a_wrong_model_is_found_out():
 
 def test_replays_run_on_whole_series():
     plant, _, _, z = two_different_axes()
-    controllers = [
-        lbt.kalman(plant).controller,
-        lbt.integrator(plant.hardware, gain=0.3).controller,
-    ]
-    for controller in controllers:
-        calls = [
-            count_calls(
-                lbt.identification.replayed_residual,
-                series,
-                controller,
-                plant.hardware,
-                noise_nm=[15.0, 10.0],
-            )
-            for series in (z[: len(z) // 2], z)
-        ]
-        assert calls[1] < 1.2 * calls[0]
-        assert calls[1] < len(z)  # no step of Python per frame
+    replay, controller = lbt.identification.replayed_residual, lbt.kalman(plant).controller
+    half, whole = (
+        count_calls(replay, series, controller, plant.hardware, noise_nm=[15.0, 10.0])
+        for series in (z[: len(z) // 2], z)
+    )
+    assert whole < 1.2 * half
+    assert whole < len(z)  # no step of Python per frame
 
 
 def test_a_limit_that_is_not_known_is_a_note():
@@ -208,9 +176,8 @@ def test_a_limit_that_is_not_known_is_a_note():
     assert "no limit of performance: a limit needs modes that decouple" in table.notes[-1]
 
 
-@pytest.mark.parametrize("correlation", [0.6, -0.9])
-def test_the_noise_of_the_table_has_its_correlations(correlation):
-    S, R = np.array([[1.0, 0.8], [0.3, 1.0]]), 100 * np.array([[1, correlation], [correlation, 1]])
+def test_the_noise_of_the_table_has_its_correlations():
+    S, R = np.array([[1.0, 0.8], [0.3, 1.0]]), 100 * np.array([[1, -0.9], [-0.9, 1]])
     slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=5.0, frame_rate_hz=RATE)
     plant = lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=slow, noise_nm=R, sensor_matrix=S)
     rng = np.random.default_rng(0)
@@ -247,39 +214,6 @@ def test_more_noise_than_the_data_has_is_a_note():
         assert np.isnan(entry.replayed.upper_nm)
 
 
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        ({"controllers": {"best integrator": lbt.integrator(PATH, gain=0.3)}}, "may be called"),
-        ({"measurements": GOOD[:1999]}, "within 1999 frames"),
-        ({"measurements": GOOD[:, :1]}, r"measurements must be \(frames, 2\)"),
-        ({"measurements": np.vstack([GOOD, GOOD])}, "must have the 2000 frames of open_loop"),
-        ({"measurements": SPOILT[::-1]}, "measurements, frames 1000 to 2000, must be finite"),
-        ({"running": lbt.integrator(PATH, gain=0.3)}, "needs its measurements"),
-        ({"imaging": 2.2}, "expected an Imaging"),
-    ],
-)
-def test_tables_that_are_refused(more, message):
-    arguments = {"controllers": {}} | more
-    with pytest.raises(lbt.errors.ProblemError, match=message):
-        lbt.identification.prediction_against_data(a_plant(), GOOD, **arguments)
-
-
-def test_tables_of_what_does_not_hold():
-    wild = lbt.Controller(
-        A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / RATE
-    )
-    table = lbt.identification.prediction_against_data(a_plant(), GOOD, {"mine": wild})
-    assert "mine is unstable at the sensor gain of the model" in table.notes
-    assert "mine" not in [row.name for row in table.entries]
-    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
-        lbt.identification.prediction_against_data(PATH, GOOD, {})
-    with pytest.raises(
-        lbt.errors.ProblemError, match="the table has the rows best integrator, .*'mine'"
-    ):
-        table["mine"]
-
-
 def textbook_regression(z, mirror_taps, taps, axes):
     m, rows, wanted = len(mirror_taps), [], []
     for k in range(m - 1 + taps, len(z)):
@@ -294,7 +228,7 @@ def textbook_regression(z, mirror_taps, taps, axes):
     return np.array(rows), np.array(wanted)
 
 
-@pytest.mark.parametrize("delay", [1.0, 2.0, 2.3])
+@pytest.mark.parametrize("delay", [1.0, 2.3])
 def test_the_predictor_is_the_least_squares_of_a_textbook(delay):
     rng = np.random.default_rng(1)
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay)
@@ -310,7 +244,7 @@ def test_the_predictor_is_the_least_squares_of_a_textbook(delay):
         np.testing.assert_allclose(coefficients[i], found, rtol=1e-9, atol=1e-10)
 
 
-@pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), CASES)
+@pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), CASES[1:])
 def test_the_controller_of_the_predictor_gives_its_residual(delay, gain, mirror, sensor):
     """The loop around it leaves z less the FIR prediction: in a replay, to rounding."""
     rng = np.random.default_rng(4)
@@ -343,8 +277,7 @@ def test_ar_processes_are_predicted_as_in_closed_form():
     np.testing.assert_allclose(coefficients.ravel(), [a1, a2], rtol=0, atol=0.02)
 
 
-@pytest.mark.parametrize("delay", [2.0, 2.4])
-def test_more_taps_come_to_the_limit_and_none_passes_it(delay):
+def test_more_taps_come_to_the_limit_and_none_passes_it():
     """By the model, exactly: a predictor that was fitted to a long series, over its length."""
     line = lbt.Vibration(frequency_hz=40, damping=0.05, rms_nm=100, direction=(1,))
     fast = lbt.models.ARModel(coefficients=[0.95], driving_rms_nm=20.0, frame_rate_hz=RATE)
@@ -354,7 +287,7 @@ def test_more_taps_come_to_the_limit_and_none_passes_it(delay):
         vibrations=[line],
         noise_nm=20.0,
         modes=1,
-        delay_frames=delay,
+        delay_frames=2.4,
     )
     path, rng = plant.hardware, np.random.default_rng(5)
     z = a_series(fast, 50_000, rng) + a_series(line.ar_model(RATE), 50_000, rng)
@@ -383,18 +316,53 @@ def test_regressors_that_depend_on_each_other():
     assert np.max(np.abs(left.measured_nm)) < 1e-9
 
 
+def make_table(**changes):
+    """Compare what is predicted with data, with changed arguments."""
+    arguments = {"plant": a_plant(), "open_loop": GOOD, "controllers": {}} | changes
+    plant, series, controllers = (arguments.pop(k) for k in ("plant", "open_loop", "controllers"))
+    return lbt.identification.prediction_against_data(plant, series, controllers, **arguments)
+
+
+def fit_predictor(path=PATH, **options):
+    return lbt.identification.least_squares_predictor(GOOD, path, **options)
+
+
+INTEGRATOR = lbt.integrator(PATH, gain=0.3)
+
+
 @pytest.mark.parametrize(
-    ("path", "more", "message"),
+    ("call", "message"),
     [
-        (PATH, {"taps": 0}, "taps must be at least 1"),
-        (PATH, {"taps": 2.0}, "taps must be an integer"),
-        (PATH, {"taps": 1200}, "for each of 1200 coefficients.*; got 799"),
-        (PATH, {"stretches": [(0, 20), (30, 50)]}, "each of 32 coefficients.* got 0"),
-        (FLAT, {}, "sensor matrix that can be inverted"),
-        (STUCK, {}, "influence matrix that can be inverted; got \\(2, 2\\) of rank 1"),
-        (a_plant(), {}, "expected a LoopHardware"),
+        (lambda: make_table(controllers={"best integrator": INTEGRATOR}), "may be called"),
+        (lambda: make_table(measurements=GOOD[:1999]), "within 1999 frames"),
+        (lambda: make_table(measurements=GOOD[:, :1]), r"measurements must be \(frames, 2\)"),
+        (
+            lambda: make_table(measurements=np.vstack([GOOD, GOOD])),
+            "have the 2000 frames of open_l",
+        ),
+        (lambda: make_table(measurements=SPOILT[::-1]), "measurements, frames 1000 to 2000, must"),
+        (lambda: make_table(running=INTEGRATOR), "needs its measurements"),
+        (lambda: make_table(imaging=2.2), "expected an Imaging"),
+        (lambda: make_table(plant=PATH), "expected a TipTiltPlant"),
+        (lambda: make_table()["mine"], "the table has the rows best integrator, .*'mine'"),
+        (lambda: fit_predictor(taps=0), "taps must be at least 1"),
+        (lambda: fit_predictor(taps=2.0), "taps must be an integer"),
+        (lambda: fit_predictor(taps=1200), "for each of 1200 coefficients.*; got 799"),
+        (lambda: fit_predictor(stretches=[(0, 20), (30, 50)]), "each of 32 coefficients.* got 0"),
+        (lambda: fit_predictor(FLAT), "sensor matrix that can be inverted"),
+        (lambda: fit_predictor(STUCK), r"influence matrix that can be .* got \(2, 2\) of rank 1"),
+        (lambda: fit_predictor(a_plant()), "expected a LoopHardware"),
     ],
 )
-def test_predictors_that_are_refused(path, more, message):
+def test_what_cannot_be_compared_or_predicted_is_refused(call, message):
     with pytest.raises(lbt.errors.ProblemError, match=message):
-        lbt.identification.least_squares_predictor(GOOD, path, **more)
+        call()
+
+
+def test_a_controller_that_is_unstable_is_a_note():
+    wild = lbt.Controller(
+        A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / RATE
+    )
+    table = make_table(controllers={"mine": wild})
+    assert "mine is unstable at the sensor gain of the model" in table.notes
+    assert "mine" not in [row.name for row in table.entries]

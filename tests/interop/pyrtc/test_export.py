@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 from support.exports import bare_design, lbt_designs, relative, with_controller
-from support.gain_file_edits import odd_plant
+from support.gain_files import odd_plant
 from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt

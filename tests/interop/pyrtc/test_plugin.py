@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from support.exports import lbt_config, lbt_designs, relative
-from support.gain_file_edits import odd_plant
+from support.gain_files import odd_plant
 from support.pyrtc_systems import (
     SENSOR_HZ,
     drawn,

@@ -8,7 +8,6 @@ from support.plants import LBT_YAML
 from support.studies import BASE, LBT_TEXT, load_small_study, study_file
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.studies.study import sample as evaluation
 from lbt_synth.studies.study.sample import evaluate_samples
@@ -124,40 +123,6 @@ def test_unstable_loops_and_samples_that_fail(tmp_path):
     np.testing.assert_array_equal(np.isnan(columns["tight.strehl"]), lost)
 
 
-def test_simulated_samples(tmp_path):
-    study = load_small_study(
-        tmp_path,
-        evaluation="simulation",
-        controllers="{a: {design: kalman}, b: "
-        "{design: integrator, gain: 0.3}, c: {design: integrator, gain: 0.9}}",
-        parameters="{truth.sensor_gain: {uniform: [1.2, 1.3]}}",
-    )
-    assert study.result_columns[:3] == ("a.strehl", "a.residual_nm", "a.stable")
-    columns, _ = evaluate_samples(study, study.values(3, 5), 3)
-    assert columns["c.stable"].tolist() == [0, 0]
-    for i, row in enumerate((3, 4)):
-        _, hardware, truth = make_sample(study, study.values(row, row + 1)[0])
-        loops = [
-            lbt.close_loop(
-                hardware, study.controllers[name].controller, sensor_gain=truth.sensor_gain
-            )
-            for name in "ab"
-        ]
-        settle = max(100, *(settling_frames(x.spectral_radius) for x in loops))
-        for loop, name in zip(loops, "ab", strict=True):
-            run = lbt.simulate(
-                loop.controller,
-                truth,
-                hardware=hardware,
-                frames=400,
-                cases=1,
-                seed=study.simulation_seed(row),
-                settle_frames=settle,
-            )
-            assert columns[f"{name}.strehl"][i] == run.strehl(study.config.imaging).mean()
-    assert study.simulation_seed(3) != study.simulation_seed(4)
-
-
 COUNT = 8
 NOISE = "error.noise_factor: {uniform: [0.9, 1.1]}"
 GAIN = "truth.sensor_gain: {uniform: [0.5, 1]}"
@@ -209,11 +174,11 @@ WEATHER = """{
 
 
 def test_filters_for_their_own_samples(tmp_path, monkeypatch):
-    own = {"base": LBT_TEXT, "controllers": OWN, "parameters": WEATHER}
+    own = {"base": LBT_TEXT, "controllers": BOTH, "parameters": WEATHER}
     study, columns, _ = agree(tmp_path, count=6, **own)
     rows = counted(monkeypatch)
     evaluate_samples(study, study.values(0, 6), 0)
-    assert rows == [3]  # all of them at once, and one by itself
+    assert rows == [3, 3]  # all of them at once, and one of each controller by itself
     strehl = columns["own.strehl"]
     assert len(np.unique(strehl[~np.isnan(strehl)])) >= 3
 
@@ -239,8 +204,7 @@ MIRROR = "mirror:\n  local_loop: {natural_frequency_hz: 50, damping: 0.5, bandwi
 SPREAD = BASE.replace("rms_nm: 500.0}]", "rms_nm: 500.0, spread_hz: 1.0, lines: 3}]", 1)
 SINUSOID = "[{kind: sinusoid, frequency_hz: 20.0, rms_nm: 500.0}]"
 CHANGED = {  # a configuration, what is put in place of what, parameters, samples
-    "the telescope of the paper": (LBT_TEXT, {}, WEATHER, COUNT),
-    "the same with turbulence of kind ar2": (LBT_TEXT, {"kind: ar1": "kind: ar2"}, WEATHER, COUNT),
+    "turbulence of kind ar2": (LBT_TEXT, {"kind: ar1": "kind: ar2"}, WEATHER, 5),
     "one axis and the turbulence of the model": (
         BASE,
         {},
@@ -291,12 +255,11 @@ def test_changed_configurations(tmp_path, name):
     ("old", "new", "path", "values"),
     [
         ("axis: both,", "direction_deg: 0,", "model.vibrations[0].direction_deg", "[30, 0]"),
-        *(
-            ("mirror:\n", "mirror:\n  influence_matrix: [[1.0, 0.0], [0.0, 1.0]]\n", path, values)
-            for path, values in (
-                ("mirror.influence_matrix[0][1]", "[0.3, 0]"),
-                ("mirror.influence_matrix[1][1]", "[1, 1.3]"),
-            )
+        (
+            "mirror:\n",
+            "mirror:\n  influence_matrix: [[1.0, 0.0], [0.0, 1.0]]\n",
+            "mirror.influence_matrix[0][1]",
+            "[0.3, 0]",
         ),
     ],
 )
@@ -313,10 +276,12 @@ def test_an_image_that_is_gone(tmp_path):
       'truth.vibrations[0].rms_mas': {list: [40, 1.0e+5]},
       truth.sensor_gain: {uniform: [0.5, 1]}
     }"""
-    _, columns, failures = agree(tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters)
+    _, columns, failures = agree(
+        tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters, count=4
+    )
     assert not failures
     strehl = columns["slow.strehl"]
-    assert (strehl == 0).sum() == COUNT / 2 == (strehl > 0).sum()
+    assert (strehl == 0).sum() == 2 == (strehl > 0).sum()
     assert (columns["slow.stable"] == 1).all()
 
 
@@ -328,9 +293,9 @@ def test_groups_of_what_makes_another_configuration(tmp_path, monkeypatch):
       imaging.wavelength_um: {list: [1.65]},
       truth.sensor_gain: {uniform: [0.4, 1]}
     }"""
-    agree(tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters, samples="16", count=16)
+    agree(tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters)
     # one of each group and controller, then those of the evaluation that it is held against
-    assert len(rows) == 4 + 16
+    assert len(rows) == 4 + COUNT
 
 
 def test_samples_that_the_configuration_refuses(tmp_path):
@@ -395,9 +360,9 @@ def test_every_number_of_a_configuration(tmp_path, path, value):
     agree(
         tmp_path,
         base=LBT_TEXT,
-        controllers=BOTH,
+        controllers=OWN,
         parameters=f"{{'{path}': {{list: [{value!r}, {other!r}]}}, {NOISE}}}",
-        count=COUNT,
+        count=4,
     )
 
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
-from support.study_results import cell_text, draw_points, make_columns
+from scipy.stats import qmc
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.storage.display_unit import own_display_unit, show_in
@@ -20,6 +20,27 @@ from lbt_synth.studies.study.statistics import (
 )
 
 NAN = float("nan")
+RESULTS = ("stable", "strehl", "residual_nm")
+
+
+def draw_points(kind, n, dimensions, seed):
+    if kind == "independent":
+        return np.random.default_rng(seed).random((n, dimensions))
+    engine = qmc.Sobol if kind == "sobol" else qmc.LatinHypercube
+    return engine(dimensions, seed=seed).random(n)
+
+
+def make_columns(parameters, strehls, **changes):
+    """Columns of results in which every loop is stable, unless changed."""
+    columns = dict(parameters)
+    for name, strehl in strehls.items():
+        columns |= {f"{name}.strehl": strehl, f"{name}.stable": np.ones(len(strehl))}
+        columns[f"{name}.residual_nm"] = np.full(len(strehl), 100.0)
+    return columns | changes
+
+
+def cell_text(cell):
+    return cell if isinstance(cell, str) else cell.text
 
 
 def test_unstable_counts_as_zero_and_failed_is_left_out(small):
@@ -48,6 +69,7 @@ def test_a_stable_loop_without_light_comes_after_unstable_ones_and_ties_by_row()
     assert [columns["row"][place] for place in worst] == [8, 4, 1, 2, 9]
 
 
+@settings(max_examples=5)
 @given(seed=st.integers(0, 10_000))
 def test_the_order_of_samples_is_of_no_matter(seed):
     rng = np.random.default_rng(seed)
@@ -147,22 +169,16 @@ def ishigami_indices(a=7.0, b=0.1):
     return np.array([first, second, 0.0, 0.0]) / (first + second + first_and_third)
 
 
-def test_the_oracle_has_the_published_indices():
-    np.testing.assert_allclose(ishigami_indices()[:3], [0.3139, 0.4424, 0], atol=5e-5)
-
-
 @pytest.mark.parametrize(
     ("kind", "n", "limit"),
     [
-        ("independent", 1000, 0.06),
         ("independent", 20_000, 0.015),
         ("latin", 4000, 0.03),
-        ("sobol", 1024, 0.02),
         ("sobol", 4096, 0.006),
-        ("sobol", 2**16, 0.001),
     ],
 )
 def test_ishigami(kind, n, limit):
+    np.testing.assert_allclose(ishigami_indices()[:3], [0.3139, 0.4424, 0], atol=5e-5)
     u = draw_points(kind, n, 4, seed=5)
     found = [index(column, ishigami(u)) for column in u.T]
     values, errors = np.transpose(found)
@@ -170,6 +186,7 @@ def test_ishigami(kind, n, limit):
     assert np.all(np.abs(values - ishigami_indices()) < 4 * errors)
 
 
+@pytest.mark.study
 def test_standard_errors_are_those_of_repeated_samples():
     """Mean error, spread over 200 samples, and the mean of the standard errors."""
     n = 1000
@@ -188,31 +205,6 @@ def test_standard_errors_are_those_of_repeated_samples():
     assert np.all(np.abs(bias) < 0.8 * errors.mean(axis=0))
 
 
-def test_even_samples_are_not_corrected_as_if_they_were_independent():
-    """The correction of independent samples is 31 / 4064 of the unexplained part."""
-    u = draw_points("sobol", 4096, 3, seed=3)
-    assert abs(index(u[:, 2], ishigami(u))[0]) < 1e-3
-
-
-def test_a_parameter_without_effect_has_no_index():
-    u = draw_points("independent", 3000, 2, seed=2)
-    value, error = index(u[:, 1], np.sin(7 * u[:, 0]))
-    assert abs(value) < 2.5 * error
-    assert error < 0.01
-
-
-def test_a_list_has_its_values_as_groups():
-    rng = np.random.default_rng(0)
-    values = rng.choice([10.0, 20.0, 30.0], size=6000, p=[0.5, 0.3, 0.2])
-    means = {10.0: 0.2, 20.0: 0.8, 30.0: 0.5}
-    exact = np.array([means[v] for v in values])
-    result = exact + rng.normal(scale=0.1, size=values.size)
-    value, error = index(values, result)
-    mean = 0.5 * 0.2 + 0.3 * 0.8 + 0.2 * 0.5
-    between = 0.5 * (0.2 - mean) ** 2 + 0.3 * (0.8 - mean) ** 2 + 0.2 * (0.5 - mean) ** 2
-    assert value == pytest.approx(between / (between + 0.01), abs=4 * error)
-
-
 def test_the_index_of_a_list_is_epsilon_squared():
     """Kelley's estimator, from scipy's analysis of variance."""
     rng = np.random.default_rng(1)
@@ -224,6 +216,7 @@ def test_the_index_of_a_list_is_epsilon_squared():
     assert index(values, result)[0] == pytest.approx(epsilon, rel=1e-9)
 
 
+@settings(max_examples=10)
 @given(shift=st.floats(-5, 5), scale=st.sampled_from([-3.0, 0.01, 7.0]), seed=st.integers(0, 1000))
 def test_the_index_knows_no_units(shift, scale, seed):
     u = draw_points("independent", 150, 2, seed)
@@ -231,16 +224,6 @@ def test_the_index_knows_no_units(shift, scale, seed):
     here = index(u[:, 0], result)
     there = index(np.exp(3 * u[:, 0]), shift + scale * result)
     assert there == pytest.approx(here, abs=1e-9)
-
-
-@pytest.mark.parametrize("weights", [(1.0, 2.0, 3.0), (5.0, 0.1, 1.0)])
-def test_an_additive_model_has_the_shares_of_its_terms(weights):
-    u = draw_points("sobol", 4096, 3, seed=1)
-    columns = make_columns({f"p{i}": u[:, i] for i in range(3)}, {"a": u @ np.array(weights) / 10})
-    found = study_statistics(columns, ["p0", "p1", "p2"], ["a"]).controllers[0]
-    expected = np.square(weights) / np.sum(np.square(weights))
-    rows = found.sensitivity.values()
-    np.testing.assert_allclose([row["index"] for row in rows], expected, atol=2e-3)
 
 
 def test_what_only_two_together_do_is_in_no_index():
@@ -253,6 +236,19 @@ def test_what_only_two_together_do_is_in_no_index():
         assert row["index"] < 0.02
     interactions = summary_tables(found)[-1].rows[-1]
     assert float(interactions[1].split()[0]) > 97
+
+
+def test_failed_samples_are_left_out_of_indices():
+    u = draw_points("independent", 300, 2, seed=3)
+    columns = make_columns({"q": u[:, 0], "p": u[:, 1]}, {"a": 0.2 * u[:, 0] + 0.5 * u[:, 1]})
+    failed = np.arange(300) % 7 == 0
+    nans = {f"a.{name}": np.where(failed, NAN, columns[f"a.{name}"]) for name in RESULTS}
+    kept = {name: column[~failed] for name, column in columns.items()}
+    spoilt, whole = (study_statistics(each, ["q", "p"], ["a"]) for each in (columns | nans, kept))
+    assert spoilt.ranked == whole.ranked == ("p", "q")
+    for name in ("p", "q"):
+        expected = whole.controllers[0].sensitivity[name]
+        assert spoilt.controllers[0].sensitivity[name] == pytest.approx(expected, rel=1e-12)
 
 
 def test_constants_have_no_index():
@@ -271,8 +267,7 @@ def test_constants_have_no_index():
     assert [row[2] for row in table.rows if len(row) > 1] == ["-", "-"]
 
 
-@pytest.mark.parametrize("kind", ["independent", "latin", "sobol"])
-@pytest.mark.parametrize("n", [512, 4096])
+@pytest.mark.parametrize(("kind", "n"), [("independent", 4096), ("latin", 512), ("sobol", 512)])
 def test_an_edge_is_blurred_within_its_group_alone(kind, n):
     """A loop that is unstable beyond 0.9 has a Strehl ratio of 0 there."""
     u = draw_points(kind, n, 2, seed=2)
@@ -296,15 +291,6 @@ def test_one_odd_sample_makes_no_index():
         result[place] = 0.0
         found.append(first_order_index(np.arange(1000.0), result)[0])
     assert np.max(np.abs(found)) < 0.05
-
-
-def test_a_list_of_independent_samples_keeps_its_correction():
-    rng = np.random.default_rng(1)
-    found = [
-        first_order_index(np.sort(rng.integers(0, 10, 1024) * 1.0), rng.normal(size=1024))[0]
-        for _ in range(100)
-    ]
-    assert abs(np.mean(found)) < 0.003
 
 
 @pytest.mark.parametrize("shuffled", [False, True])

@@ -74,7 +74,7 @@ def test_more_samples_begin_with_the_same(tmp_path):
     np.testing.assert_array_equal(few, many)
 
 
-@pytest.mark.parametrize("first", [0, 16_380, 40_000])
+@pytest.mark.parametrize("first", [16_380, 40_000])
 def test_points_are_those_of_one_long_sequence(tmp_path, first):
     settings = load_small_study(tmp_path, samples=str(1 << 17)).settings
     engine = qmc.Sobol(3, scramble=True, seed=np.random.default_rng(settings.seed))

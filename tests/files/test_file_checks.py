@@ -1,0 +1,148 @@
+"""Files of gains and of telemetry: names, foreign content, damage, and what is half written."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from support.gain_files import original
+from support.telemetry import full, same
+
+import lbt_synth as lbt
+from lbt_synth.storage.array_file import npz_bytes
+
+ENDINGS = ("fits", "npz")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file, and what its tests write."""
+
+    make: Callable[[], Any]
+    save: Callable[..., Any]
+    load: Callable[[Any], Any]
+    error: type[lbt.errors.FileError]
+    is_same: Callable[[Any, Any], bool]
+
+
+def is_same_design(one, other):
+    return np.array_equal(one.controller.A, other.controller.A) and np.array_equal(
+        one.gain_predictor, other.gain_predictor
+    )
+
+
+KINDS = {
+    "gains": Kind(
+        make=lambda: original("bare"),
+        save=lbt.save_gain,
+        load=lbt.load_gain,
+        error=lbt.errors.GainFileError,
+        is_same=is_same_design,
+    ),
+    "telemetry": Kind(
+        make=full,
+        save=lbt.files.save_telemetry,
+        load=lbt.files.load_telemetry,
+        error=lbt.errors.TelemetryError,
+        is_same=same,
+    ),
+}
+
+
+@pytest.fixture(params=KINDS)
+def kind(request):
+    return KINDS[request.param]
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_truncated_files_are_refused_and_flipped_bits_found_or_harmless(tmp_path, kind, ending):
+    content = kind.save(tmp_path / f"a.{ending}", kind.make()).read_bytes()
+    assert kind.save(tmp_path / f"b.{ending}", kind.make()).read_bytes() == content
+    path, size = tmp_path / f"g.{ending}", len(content)
+    for length in (0, 10, size // 2, size - 3000, size - 40):
+        path.write_bytes(content[: max(length, 0)])
+        with pytest.raises(kind.error) as caught:
+            kind.load(path)
+        assert "\n" not in str(caught.value)
+        assert caught.value.path == path
+    refused, places = 0, np.linspace(0, size - 1, 61).astype(int)
+    for place in places:
+        damaged = bytearray(content)
+        damaged[place] ^= 0xFF if place % 2 else 1 << int(place) % 8
+        path.write_bytes(bytes(damaged))
+        try:
+            assert kind.is_same(kind.make(), kind.load(path))
+        except kind.error:
+            refused += 1
+    assert refused > len(places) / 3
+
+
+def test_foreign_files_are_refused(tmp_path, kind):
+    picture, other, pickled = (tmp_path / name for name in ("a.fits", "b.npz", "c.npz"))
+    fits.PrimaryHDU(np.ones((4, 4))).writeto(picture)
+    np.savez(other, a=np.ones(3))
+    np.savez(pickled, META=np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    (tmp_path / "notes.npz").write_bytes(npz_bytes({}, '{"schema": "recipes"}'))
+    (tmp_path / "prose.npz").write_bytes(npz_bytes({}, "[1, 2]"))
+    for stranger in KINDS.values():
+        if stranger is not kind:
+            stranger.save(tmp_path / "stranger.npz", stranger.make())
+    for path in tmp_path.iterdir():
+        with pytest.raises(kind.error, match=f"{path.name} is "):
+            kind.load(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "null",
+        "[" * 100_000,
+        '{"schema": "lbt_synth SCHEMA file", "x": NaN}',
+        '{"schema": "lbt_synth SCHEMA file", "schema": "lbt_synth SCHEMA file"}',
+        "\x00",
+    ],
+)
+def test_hostile_metadata(tmp_path, kind, text):
+    path = tmp_path / "h.npz"
+    schema = "gain" if kind.load is lbt.load_gain else "telemetry"
+    path.write_bytes(npz_bytes({}, text.replace("SCHEMA", schema)))
+    with pytest.raises(kind.error):
+        kind.load(path)
+
+
+def test_names_that_cannot_be_read_or_written(tmp_path, kind):
+    (tmp_path / "folder.fits").mkdir()
+    for name, words in (
+        ("g.txt", "must end in .fits, .npz.*; got 'g.txt'"),
+        ("g.json", "must end in .fits, .npz.*; got 'g.json'"),
+        ("none.fits", "cannot read .*No such file"),
+        ("folder.fits", "cannot read"),
+        ("x\0y.npz", "null"),
+    ):
+        with pytest.raises(kind.error, match=words):
+            kind.load(tmp_path / name)
+    for name, words in (
+        ("g.txt", "must end in .fits, .npz.*; got 'g.txt'"),
+        ("nowhere/g.fits", "cannot write .*No such file or directory"),
+        ("folder.fits", "is a directory"),
+        ("x\0y.npz", "null"),
+    ):
+        with pytest.raises(lbt.errors.OutputError, match=words):
+            kind.save(tmp_path / name, kind.make())
+
+
+def test_nothing_half_written_stays(tmp_path, monkeypatch, kind):
+    path = kind.save(tmp_path / "g.fits", kind.make())
+    before = path.read_bytes()
+
+    def full_disk(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(lbt.errors.OutputError, match="cannot write .*No space left on device"):
+        kind.save(path, kind.make())
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["g.fits"]
