@@ -40,7 +40,7 @@ from lbt_synth.identification.prediction.residual import (
 )
 from lbt_synth.identification.stretches import Stretches, StretchesLike, cut_stretches
 from lbt_synth.linear import Controller
-from lbt_synth.linear.held_controller import as_controller
+from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import ComplexArray, FloatArray, integer, number, require_instance

@@ -23,7 +23,7 @@ FORBIDDEN = {
     "report/page/new_sheet.py": ("weasyprint", "Only report.page.html imports weasyprint"),
     "report/new_page.py": ("jinja2", "Only report.page.html imports jinja2"),
     "loop/new_figure.py": ("matplotlib", "Only report imports matplotlib"),
-    "linear/new_system.py": ("control", "Only linear.other_systems imports control"),
+    "linear/new_system.py": ("control", "Only linear.state_space imports control"),
     "cli/new_shell.py": ("shtab", "Only cli.parser imports shtab"),
     "interop/new_rtc.py": ("pyrtc", "Only interop.pyrtc imports pyrtc"),
     "linear/new_oracle.py": ("slycot", "Nothing else imports a GPL package"),

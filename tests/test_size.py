@@ -20,7 +20,7 @@ LINES = {
     "files": 1608,
     "identification": 10620,
     "interop": 4360,
-    "linear": 6078,
+    "linear": 5874,
     "loop": 4905,
     "methods": 920,
     "models": 4400,

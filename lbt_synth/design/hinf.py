@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -20,11 +20,6 @@ from lbt_synth.linear.riccati.filtering import (
     least_gamma,
 )
 from lbt_synth.validation import choice, number
-
-if TYPE_CHECKING:
-    from lbt_synth.linear.lmi.filters import LmiSolution
-
-SolvedGains: TypeAlias = "FilterRiccati | LmiSolution"
 
 AT_LEAST = 1e-9  # a level this close to the least one counts as the least one itself
 LARGEST_LMI = 20  # states; the inequality takes minutes beyond
@@ -133,7 +128,7 @@ def _design(
     gamma_ratio: float | None,
 ) -> FilterDesign:
     """Find the least gamma by one route, and the filter of the level asked for."""
-    gains: SolvedGains
+    gains: FilterRiccati
     lower, upper = _kalman_bracket(problem, start)
     if route == "lmi":
         from lbt_synth.linear.lmi.filters import hinf_lmi, least_gamma_lmi
@@ -141,13 +136,13 @@ def _design(
         scales: dict[str, Any] = {"coordinates": start.P, "scale": upper}
         gains, witness = least_gamma_lmi(problem, **scales)
 
-        def central(gamma: float) -> SolvedGains:
+        def central(gamma: float) -> FilterRiccati:
             return hinf_lmi(problem, gamma, **scales)
     else:
         _, level, best = least_gamma(problem, lower=lower, upper=upper, start=start)
         gains, witness = best, worst_invisible_disturbance(problem, best.P, level, start.P)
 
-        def central(gamma: float) -> SolvedGains:
+        def central(gamma: float) -> FilterRiccati:
             return _central(problem, start, gamma)
 
     least, infeasible = _verified_bracket(problem, start, gains, witness)
@@ -195,7 +190,7 @@ def require_reachable(gamma: float, least: float) -> None:
 
 
 def _verified_bracket(
-    problem: EstimationProblem, start: FilterRiccati, gains: SolvedGains, witness: Witness
+    problem: EstimationProblem, start: FilterRiccati, gains: FilterRiccati, witness: Witness
 ) -> tuple[float, float]:
     """Bounds of the least gamma: the norm of a filter, and a level that a witness refutes."""
     error = problem.error_system(gains.gain_predictor)

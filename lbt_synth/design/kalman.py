@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from lbt_synth.design.filter_design import FilterDesign, filter_design
 from lbt_synth.design.result import SolverReport
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.estimation_problem import require_problem
-from lbt_synth.linear.riccati.filtering import FilterRiccati, kalman_riccati
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.validation import FloatArray, choice
-
-if TYPE_CHECKING:
-    from lbt_synth.linear.lmi.filters import LmiSolution
 
 
 def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccati") -> FilterDesign:
@@ -57,7 +52,7 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccat
     choice(route, "route", ("riccati", "sdp"))
     problem = problem.ahead(horizon)
     solution = kalman_riccati(problem)
-    gains: FilterRiccati | LmiSolution = solution
+    gains = solution
     if route == "sdp":
         problem.require_one_phase("the semidefinite programme", "route='riccati'")
         from lbt_synth.linear.lmi.filters import kalman_sdp

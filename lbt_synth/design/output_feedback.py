@@ -37,8 +37,12 @@ from lbt_synth.linear.output_feedback.lower_bound import (
     ControlWitness,
     infeasible_control_level,
 )
-from lbt_synth.linear.output_feedback.scaled_plant import ScaledPlant, scaled_plant
-from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati, free_parameter
+from lbt_synth.linear.output_feedback.two_riccati import (
+    ScaledPlant,
+    TwoRiccati,
+    free_parameter,
+    scaled_plant,
+)
 from lbt_synth.storage.rows import fact_table, row_table
 from lbt_synth.storage.summaries import Summary
 from lbt_synth.validation import choice, integer, number

@@ -26,7 +26,7 @@ from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
 from lbt_synth.interop.proof import FRAMES, LOSS, Written, prove_written, rehearsal_error
-from lbt_synth.linear.held_controller import as_controller
+from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.simulation.disturbances import Disturbance
 from lbt_synth.loop.simulation.run import (

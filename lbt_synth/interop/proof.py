@@ -26,8 +26,8 @@ from lbt_synth.design.shaping.objectives import leaves
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
+from lbt_synth.linear.controller import RunningController
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
-from lbt_synth.linear.state_space import RunningController
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import residual_budget
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN

@@ -1,5 +1,6 @@
+from .controller import Controller as Controller
+from .controller import estimator_form as estimator_form
 from .estimation_problem import EstimationProblem as EstimationProblem
-from .estimator_form import estimator_form as estimator_form
 from .generalized_plant import GeneralizedPlant as GeneralizedPlant
 from .generalized_plant import mixed_sensitivity as mixed_sensitivity
 from .infeasibility_proof import Witness as Witness
@@ -9,5 +10,4 @@ from .norms import largest_singular_values as largest_singular_values
 from .riccati.dare import solve_dare as solve_dare
 from .riccati.filtering import gamma_riccati as gamma_riccati
 from .riccati.filtering import kalman_riccati as kalman_riccati
-from .state_space import Controller as Controller
 from .state_space import StateSpace as StateSpace

@@ -2,8 +2,8 @@
 
 Within a block of b frames the outputs are a matrix times (state at the block's
 beginning, inputs of the block); the states at the beginnings obey a recursion
-with ``A^b``, which is solved by blocks again. The result is that of the frame-by-frame
-recursion up to rounding.
+with ``A^b``. Two steps of a recursion are one step with the square of its matrix, so that it is
+halved until one step is left. The result is that of the frame-by-frame recursion up to rounding.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from lbt_synth.errors import DimensionError
 from lbt_synth.linear import StateSpace
 from lbt_synth.validation import FloatArray, real_array
 
-_BLOCK = 8
-_STEPS = 16  # blocks per block of the recursion
-_CACHED = 500_000  # input and output values worked on at once
+_BLOCK = 8  # frames, fastest for 5 to 50 states (benchmarks/speed.py)
+_CACHED = 500_000  # input and output values worked on at once, which fit a processor's cache
 
 
 def filter_series(system: StateSpace, inputs: ArrayLike) -> FloatArray:
@@ -58,7 +57,7 @@ def _filter_batch(operators: _BlockOperators, u: FloatArray) -> FloatArray:
         padded[:, :frames] = u
         u = padded
     chunks = u.reshape(cases, blocks, _BLOCK * m)
-    starts = _recursion(operators.step, chunks @ operators.reach)
+    starts = _recursion(operators.step, chunks[:, :-1] @ operators.reach)
     out = chunks @ operators.toeplitz
     out += starts @ operators.observe
     return np.asarray(out.reshape(cases, blocks * _BLOCK, -1)[:, :frames])
@@ -107,25 +106,11 @@ def _block_operators(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray)
 
 
 def _recursion(A: FloatArray, drive: FloatArray) -> FloatArray:
-    """States ``x(j+1) = A x(j) + drive(j)`` from zero, for (cases, steps, n) drives."""
+    """States ``x(j+1) = A x(j) + drive(j)`` from zero, one more than drives (cases, steps, n)."""
     cases, steps, n = drive.shape
-    if steps <= 2 * _STEPS:
-        out = np.zeros((cases, steps, n))
-        for j in range(steps - 1):
-            out[:, j + 1] = out[:, j] @ A.T + drive[:, j]
-        return out
-    blocks = -(-steps // _STEPS)
-    padded = np.zeros((cases, blocks * _STEPS, n))
-    padded[:, :steps] = drive
-    chunks = padded.reshape(cases, blocks, _STEPS, n)
-    powers = [np.eye(len(A))]
-    for _ in range(_STEPS):
-        powers.append(powers[-1] @ A)
-    inside = np.zeros_like(chunks)  # states of each block when it begins at zero
-    for j in range(_STEPS - 1):
-        inside[:, :, j + 1] = inside[:, :, j] @ A.T + chunks[:, :, j]
-    ends = inside[:, :, -1] @ A.T + chunks[:, :, -1]
-    starts = _recursion(powers[_STEPS], ends)
-    transport = np.hstack([power.T for power in powers[:_STEPS]])  # (n, block n)
-    inside += (starts @ transport).reshape(cases, blocks, _STEPS, n)
-    return inside.reshape(cases, blocks * _STEPS, n)[:, :steps]
+    out = np.zeros((cases, steps + 1, n))
+    if steps:
+        first, second = drive[:, ::2], drive[:, 1::2]
+        out[:, ::2] = _recursion(A @ A, first[:, : steps // 2] @ A.T + second)
+        out[:, 1::2] = out[:, :steps:2] @ A.T + first
+    return out

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
+from lbt_synth.linear.controller import Controller
 from lbt_synth.linear.matrix_functions import nearest_powers_of_two, transpose
-from lbt_synth.linear.state_space import Controller, LinearSystem, StateSpace
+from lbt_synth.linear.state_space import LinearSystem, StateSpace
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
@@ -169,13 +171,16 @@ class EstimationProblem(LinearSystem):
         if len(C) == 0:
             B, C = np.pad(B, ((0, 0), (0, 1))), np.zeros((1, self.n_states))
             D = np.eye(1, B.shape[1], B.shape[1] - 1)
-        return EstimationProblem(A=A, B=B, C=C, D=D, L=self.L, dt_s=self.dt_s)
+        return self.bare(A=A, B=B, C=C, D=D, read=None)
+
+    def bare(self, **changes: Any) -> EstimationProblem:
+        """Return the problem of these matrices alone, with some of them changed."""
+        names = ("A", "B", "C", "D", "L", "read", "dt_s")
+        return EstimationProblem(**{name: getattr(self, name) for name in names} | changes)
 
     def restricted(self, measurements: BoolArray) -> EstimationProblem:
         """Return the problem without the measurements that are not marked, (q,)."""
-        A, B, C, D = self.A, self.B, self.C, self.D
-        read = self.read & measurements
-        return EstimationProblem(A=A, B=B, C=C, D=D, L=self.L, read=read, dt_s=self.dt_s)
+        return self.bare(read=self.read & measurements)
 
     def error_system(self, gain_predictor: FloatArray) -> StateSpace:
         """System ``(A - gain C, B - gain D, L, 0)`` from w to a predictor's error ``z - z_hat``.
@@ -213,9 +218,7 @@ class EstimationProblem(LinearSystem):
         self.require_one_phase("a scaling of disturbances", "phase(t).with_unit_weights()")
         size = np.linalg.norm(np.vstack([self.B, self.D]), axis=0)
         size = np.where(size > 0, size, 1.0)
-        A, C, L, read = self.A, self.C, self.L, self.read
-        B, D = self.B / size, self.D / size
-        return EstimationProblem(A=A, B=B, C=C, D=D, L=L, read=read, dt_s=self.dt_s)
+        return self.bare(B=self.B / size, D=self.D / size)
 
     def ahead(self, frames: int) -> EstimationProblem:
         """Problem whose one-step prediction is the estimate of ``z(k + frames)`` from y up to k.
@@ -269,15 +272,9 @@ class EstimationProblem(LinearSystem):
         A[: n + width, :n] = np.vstack([self.A, entry])
         last = np.eye(width, n + late, k=n + late - width)
         C, L = (np.hstack([part, np.zeros((len(part), late))]) for part in (self.C, self.L))
-        return EstimationProblem(
-            A=A,
-            B=np.vstack([self.B, np.zeros((late, self.B.shape[1]))]),
-            C=last if steps > 1 else C,
-            D=self.D,
-            L=L if steps > 1 else last,
-            read=self.read,
-            dt_s=self.dt_s,
-        )
+        B = np.vstack([self.B, np.zeros((late, self.B.shape[1]))])
+        C, L = (last, L) if steps > 1 else (C, last)
+        return self.bare(A=A, B=B, C=C, L=L)
 
     def with_memory(self, taps: FloatArray) -> EstimationProblem:
         """Add the past innovations of a filter as states, for filters that weight them.
@@ -389,12 +386,5 @@ def error_units(covariance: FloatArray) -> FloatArray:
 
 def scale_states(problem: EstimationProblem, units: FloatArray) -> EstimationProblem:
     """Return the problem with its states divided by units (n, 1)."""
-    return EstimationProblem(
-        A=problem.A * units.T / units,
-        B=problem.B / units,
-        C=problem.C * units.T,
-        D=problem.D,
-        L=problem.L * units.T,
-        read=problem.read,
-        dt_s=problem.dt_s,
-    )
+    A, B = problem.A * units.T / units, problem.B / units
+    return problem.bare(A=A, B=B, C=problem.C * units.T, L=problem.L * units.T)

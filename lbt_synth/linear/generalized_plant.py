@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from scipy.linalg import block_diag, matrix_balance
 
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.linear.other_systems import SAMPLE_FIRST
-from lbt_synth.linear.state_space import StateSpace
+from lbt_synth.linear.state_space import SAMPLE_FIRST, StateSpace
 from lbt_synth.storage.summaries import Summarised
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
@@ -280,9 +279,8 @@ def mixed_sensitivity(
     names = [name for name, value in given.items() if value is not None]
     if not names:
         raise ProblemError("give at least one of performance, control and robustness.")
-    weight = stack_weights(
-        _weight(given[name], name, len(reads[name][0]), G.dt_s) for name in names
-    )
+    weights = (_weight(given[name], name, len(reads[name][0]), G.dt_s) for name in names)
+    weight = _stack_weights(weights, G.dt_s)
     C1, D11, D12 = (np.vstack([reads[name][i] for name in names]) for i in range(3))
     loop = GeneralizedPlant(
         A=G.A,
@@ -296,19 +294,20 @@ def mixed_sensitivity(
         D22=-G.D,
         dt_s=G.dt_s,
     )
-    return weigh_plant(loop, weight)
+    return _weigh_plant(loop, weight)
 
 
-def _weight(value: Any, name: str, size: int, dt_s: float) -> Weight:
+def _weight(value: Any, name: str, size: int, dt_s: float) -> StateSpace:
     """Return a weight of signals of some size, with a sampling period."""
     if isinstance(value, int | float | np.ndarray):
-        weight = constant_weight(matrix(value, name))
+        D = matrix(value, name)
+        none = np.zeros((0, D.shape[1])), np.zeros((len(D), 0))
+        weight = StateSpace(A=np.zeros((0, 0)), B=none[0], C=none[1], D=D, dt_s=dt_s)
     else:
-        W = StateSpace.of(value)
-        require_same_period(dt_s, W)
-        weight = Weight(W.A, W.B, W.C, W.D)
+        weight = StateSpace.of(value)
+        require_same_period(dt_s, weight)
     if weight.D.shape == (1, 1):
-        weight = stack_weights([weight] * size)
+        weight = _stack_weights([weight] * size, dt_s)
     if weight.D.shape[1] != size:
         raise DimensionError(
             f"the weight {name} must take {size} signals; got one of {weight.D.shape[1]}."
@@ -316,26 +315,14 @@ def _weight(value: Any, name: str, size: int, dt_s: float) -> Weight:
     return weight
 
 
-class Weight(NamedTuple):
-    """Matrices of a weight in textbook form; a constant one has no states."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-
-
-def constant_weight(D: FloatArray) -> Weight:
-    """Return a weight without states."""
-    return Weight(np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((len(D), 0)), D)
-
-
-def stack_weights(weights: Iterable[Weight]) -> Weight:
+def _stack_weights(weights: Iterable[StateSpace], dt_s: float) -> StateSpace:
     """Return weights of signals that lie one after the other, as one weight of all of them."""
-    return Weight(*(block_diag(*parts) for parts in zip(*weights, strict=True)))
+    stacks = [w.stacks() for w in weights]
+    A, B, C, D = (block_diag(*(part[0] for part in parts)) for parts in zip(*stacks, strict=True))
+    return StateSpace(A=A, B=B, C=C, D=D, dt_s=dt_s)
 
 
-def weigh_plant(plant: GeneralizedPlant, weight: Weight) -> GeneralizedPlant:
+def _weigh_plant(plant: GeneralizedPlant, weight: StateSpace) -> GeneralizedPlant:
     """Return the plant with a weight after its errors; states are those of the plant, then its."""
     P, W = plant, weight
     n, s, none = len(P.A), len(W.A), np.zeros

@@ -35,9 +35,9 @@ from lbt_synth.linear.matrix_functions import as_stack, component_labels
 from lbt_synth.validation import FloatArray, matrix, set_fields
 
 _RANK_TOLERANCE = 1e-13
-_SLOW = 0.999  # a pole of the backward recursion beyond this may belong to a sinusoid
+_SLOW = 0.99  # a pole of a worst case beyond this may belong to a steady oscillation
 _SMALLEST_SCALE = 1e-7  # of a state, as a part of the largest standard deviation
-_STRAYED = 1e-9  # share of the successors that may lie where no filter has an error
+_STRAYED = 1e-10  # share of the successors that may lie outside of the range of every storage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,7 +107,7 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
             f"{witness.period}."
         )
     covariances, disturbances = as_stack(covariance), as_stack(witness.disturbances)
-    spaces = [whitening_coordinates(own) for own in covariances]
+    spaces = [whitening_coordinates(P) for P in covariances]
     states = [  # in the space of a filter's error
         basis @ (inverse @ x)
         for x, (basis, inverse) in zip(as_stack(witness.states), spaces, strict=True)
@@ -117,37 +117,33 @@ def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: F
         A, B, C, D = problem.read_parts(t)
         w = w - D.T @ np.linalg.solve(D @ D.T, C @ x + D @ w)
         after, onward = A @ x + B @ w, (t + 1) % problem.period
-        pair = _gain_of_step(problem.L, after, states[onward], spaces[onward], covariances[onward])
-        if pair is None:
+        growth = priced_growth(after, states[onward], *spaces[onward])
+        if growth is None:
             return 0.0
-        gained, spent = gained + pair[0], spent + float(np.sum(w**2)) + pair[1]
+        root, price = growth
+        gained += float(np.sum((problem.L @ states[onward]) ** 2) + np.sum((problem.L @ root) ** 2))
+        spent += float(np.sum(w**2)) + price
     return float(np.sqrt(gained / spent)) if spent > 0 else 0.0
 
 
-def _gain_of_step(
-    L: FloatArray,
-    after: FloatArray,
-    then: FloatArray,
-    space: tuple[FloatArray, FloatArray],
-    covariance: FloatArray,
-) -> tuple[float, float] | None:
-    """Return power of z after a step, and price of the shortfall; None where successors stray.
+def priced_growth(
+    after: FloatArray, states: FloatArray, basis: FloatArray, inverse: FloatArray
+) -> tuple[FloatArray, float] | None:
+    """Return a root (n, r) of the moments that successors have more than states, and its price.
 
-    The states of the next phase are ``then``, and there is the space of a filter's error.
+    The price is that of a shortfall by rounding. The moments are formed in the coordinates of a
+    storage, its basis (n, r) and inverse; None where successors stray from its range.
     """
-    basis, inverse = space
-    deviation = np.sqrt(np.diag(covariance))
-    scale = np.maximum(deviation, _SMALLEST_SCALE * deviation.max(initial=0.0))[:, None]
+    inner, before = inverse @ after, inverse @ states  # squares would double their rounding
+    deviation = np.linalg.norm(basis, axis=1, keepdims=True)
+    scale = np.maximum(deviation, _SMALLEST_SCALE * deviation.max(initial=0.0))
     scale = np.where(scale > 0, scale, 1.0)
-    own, own_then = inverse @ after, inverse @ then  # squares would double their rounding
-    strayed = np.linalg.norm((after - basis @ own) / scale)
+    strayed = np.linalg.norm((after - basis @ inner) / scale)
     if strayed > _STRAYED * np.linalg.norm(after / scale):
         return None
-    # after after' = x x' + growth; only rounding makes an eigenvalue of the growth negative
-    values, vectors = np.linalg.eigh(own @ own.T - own_then @ own_then.T)
-    growth_root = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
-    gained = float(np.sum((L @ then) ** 2) + np.sum((L @ growth_root) ** 2))
-    return gained, -float(values[values < 0].sum())
+    values, vectors = np.linalg.eigh(inner @ inner.T - before @ before.T)
+    root = basis @ (vectors * np.sqrt(np.maximum(values, 0)))
+    return root, -float(values[values < 0].sum())
 
 
 def whitening_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -161,12 +157,12 @@ def whitening_coordinates(covariance: FloatArray) -> tuple[FloatArray, FloatArra
     sizes: list[FloatArray] = []
     directions: list[FloatArray] = []
     for part in range(np.max(label) + 1):
-        own = np.flatnonzero(label == part)
-        units = spread[own]
-        values, vectors = np.linalg.eigh(covariance[np.ix_(own, own)] / np.outer(units, units))
+        rows = np.flatnonzero(label == part)
+        units = spread[rows]
+        values, vectors = np.linalg.eigh(covariance[np.ix_(rows, rows)] / np.outer(units, units))
         kept = values > _RANK_TOLERANCE * values[-1]
         sizes.append(np.sqrt(values[kept]))
-        directions.append(np.eye(len(label))[:, own] @ vectors[:, kept])
+        directions.append(np.eye(len(label))[:, rows] @ vectors[:, kept])
     return scaled_basis(spread, np.hstack(directions), np.concatenate(sizes))
 
 
@@ -192,9 +188,9 @@ def worst_invisible_disturbance(
     P, covariance = P / units / units.T, covariance / units / units.T
     candidates = [_worst_burst(problem, P, gamma)]
     if problem.period == 1:
-        poles = np.linalg.eigvals(_backward(problem, 0, P, gamma)[0])
-        slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]
-        candidates += [_sinusoid(problem, float(np.angle(pole))) for pole in slow]
+        system, gain = problem.read_parts(0), (problem.L, np.zeros_like(problem.L @ problem.B))
+        angles = slow_angles(_backward(problem, 0, P, gamma)[0])
+        candidates += [steady_oscillation(system, gain, angle) for angle in angles]
     best = max(candidates, key=lambda witness: infeasible_level(problem, witness, covariance))
     return replace(best, states=units * best.states)
 
@@ -206,28 +202,26 @@ def _worst_burst(problem: EstimationProblem, P: FloatArray, gamma: float) -> Wit
     is the worst past that leads there.
     """
     N, L, phases = problem.period, problem.L, as_stack(P)
-    top = [np.linalg.eigh(L @ own @ L.T) for own in phases]
+    top = [np.linalg.eigh(L @ X @ L.T) for X in phases]
     last = int(np.argmax([values[-1] for values, _ in top]))
     end = L.T @ top[last][1][:, -1]
-    steps = [_backward(problem, t, own, gamma) for t, own in enumerate(phases)]
+    steps = [_backward(problem, t, X, gamma) for t, X in enumerate(phases)]
     order = [(last + k) % N for k in range(N)]
     around = reduce(np.matmul, (steps[t][0] for t in order))
     costates = stationary_root(around, end[:, None])  # of the phase where the burst ends
     if not np.all(np.isfinite(costates)):  # a recursion that rounding makes unstable
         costates = end[:, None]
-    states: dict[int, FloatArray] = {}
-    disturbances: dict[int, FloatArray] = {}
+    pairs: dict[int, tuple[FloatArray, FloatArray]] = {}
     for t in reversed(order):
         (backward, B), (_, _, C, D) = steps[t], problem.read_parts(t)
         before = backward @ costates
-        states[t] = phases[t] @ before
-        hiding = -D.T @ np.linalg.solve(D @ D.T, C @ states[t])
-        disturbances[t] = B.T @ costates + hiding
+        x = phases[t] @ before
+        pairs[t] = x, B.T @ costates - D.T @ np.linalg.solve(D @ D.T, C @ x)
         costates = before
-    return Witness(
-        states=np.stack([states[t] for t in range(N)]),
-        disturbances=np.stack([disturbances[t] for t in range(N)]),
+    states, disturbances = (
+        np.stack(kind) for kind in zip(*(pairs[t] for t in range(N)), strict=True)
     )
+    return Witness(states=states, disturbances=disturbances)
 
 
 def _backward(
@@ -241,16 +235,31 @@ def _backward(
     return np.asarray(backward, dtype=np.float64), B
 
 
-def _sinusoid(problem: EstimationProblem, angle: float) -> Witness:
-    """Return the invisible sinusoid of one frequency that has the most z for its w."""
-    (A, B, C, D), L = problem.read_parts(0), problem.L
+def steady_oscillation(
+    system: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
+    gain: tuple[FloatArray, FloatArray],
+    angle: float,
+) -> Witness:
+    """Return the oscillation of one frequency that a system does not show, and that gains most.
+
+    Of ``e^(j angle) x = A x + B w`` with ``C x + D w = 0``, the pair of the largest ``L x + M w``
+    for its w; nothing where there is none.
+    """
+    (A, B, C, D), (L, M) = system, gain
     n = len(A)
-    # e^(j angle) x = A x + B w and C x + D w = 0
-    steady = np.block([[np.exp(1j * angle) * np.eye(n) - A, -B], [C, D]])
-    pairs = null_space(steady)
-    x, w = pairs[:n], pairs[n:]
-    gained, spent = (L @ x).conj().T @ (L @ x), w.conj().T @ w
-    floor = 1e-13 * np.trace(spent).real * np.eye(len(spent))
-    best = pairs @ eigh(gained, spent + floor)[1][:, -1]
-    parts = np.stack([best.real, best.imag], axis=1)
-    return Witness(states=parts[:n], disturbances=parts[n:])
+    pairs = null_space(np.block([[np.exp(1j * angle) * np.eye(n) - A, -B], [C, D]]))
+    if pairs.shape[1] == 0:
+        return Witness(states=np.zeros((n, 1)), disturbances=np.zeros((B.shape[1], 1)))
+    gained, disturbances = L @ pairs[:n] + M @ pairs[n:], pairs[n:]
+    spent = disturbances.conj().T @ disturbances
+    floor = 1e-13 * max(np.trace(spent).real, 1e-300) * np.eye(len(spent))
+    best = pairs @ eigh(gained.conj().T @ gained, spent + floor)[1][:, -1]
+    phases = np.stack([best.real, best.imag], axis=1)
+    return Witness(states=phases[:n], disturbances=phases[n:])
+
+
+def slow_angles(A: FloatArray) -> list[float]:
+    """Return the angles of the slow poles of a recursion, the slowest first."""
+    poles = np.linalg.eigvals(A)
+    slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]
+    return [float(np.angle(pole)) for pole in slow[np.argsort(-np.abs(slow))]]

@@ -18,43 +18,28 @@ from lbt_synth.linear.matrix_functions import (
 )
 from lbt_synth.validation import ComplexArray, FloatArray
 
-_SOLVED = 1e-14  # relative residual of an equation solved to rounding
 # A step of refinement that moves X by more than this part of it is repeated with the residual in
 # extended precision: next to the unit circle, rounding of the residual moves X by a million times
 # itself and more.
 _SETTLED = 1e-11
-_REFINEMENTS = 6
 
 _Matrix = TypeVar("_Matrix", FloatArray, ComplexArray)
 
 
 def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
-    """Solve ``X = A X A' + Q`` for a stable A, with iterative refinement.
+    """Solve ``X = A X A' + Q`` for an A (n, n) and a semidefinite Q, as a stack of one.
 
-    By squaring, or by squaring the triangular form of A if that leaves a smaller residual: its
-    powers keep the eigenvalues of a matrix that is far from normal. A is (n, n), Q symmetric; an A
-    whose spectral radius is not below 1 raises an UnstableLoopError.
+    An A whose spectral radius is not below 1 raises an UnstableLoopError.
     """
-    squared, residuals = stationary_covariances(A[None], Q[None])
-    if residuals[0] < _SOLVED:
-        return np.asarray(squared[0])
-    triangle, into, back = _triangular_form(A)
-    X = np.zeros_like(Q)
-    with np.errstate(all="ignore"):  # the residual is measured below
-        for _ in range(2):
-            rest = into @ (A @ X @ A.T - X + Q) @ into.conj().T
-            X = symmetrise(
-                X + (back @ smith_sum(triangle[None], rest[None])[0] @ back.conj().T).real
-            )
-    left = lyapunov_residual(A, Q, X)
-    if not (np.isfinite(X).all() or np.isfinite(squared).all()):
+    X = stationary_covariances(A[None], Q[None])[0][0]
+    if not np.isfinite(X).all():
         radius = float(np.max(np.abs(np.linalg.eigvals(A))))
         raise UnstableLoopError(
             "a stationary covariance needs a stable system; got a pole of modulus "
             f"{radius:.9g}, whose covariance grows without end.",
             spectral_radius=radius,
         )
-    return X if left < residuals[0] or np.isnan(residuals[0]) else np.asarray(squared[0])
+    return np.asarray(X)
 
 
 def _triangular_form(A: FloatArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
@@ -74,35 +59,36 @@ def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
         X = smith_sum(A, Q)
         X, step = _refine(A, Q, X, np.float64)
         poor = np.flatnonzero(step > _SETTLED)
-        step[poor] = np.inf
-        for _ in range(_REFINEMENTS if poor.size else 0):
-            last = step[poor]
+        last = np.full(len(A), np.inf)
+        while poor.size:
             X[poor], step[poor] = _refine(A[poor], Q[poor], X[poor], np.longdouble)
-            poor = poor[(step[poor] > _SETTLED) & (step[poor] < last / 2)]
-        for i in np.flatnonzero(~(step <= _SETTLED) & np.isfinite(X).all(axis=(1, 2))):
-            root = stationary_root(A[i], semidefinite_root(Q[i]))
-            X[i] = root @ root.T
-        AXA = A @ X @ transpose(A)
-        size = frobenius_norms(X) + frobenius_norms(AXA) + frobenius_norms(Q)
-        residuals = frobenius_norms(AXA - X + Q) / np.where(size > 0, size, 1.0)
+            improved = (step[poor] > _SETTLED) & (step[poor] < last[poor] / 2)
+            last[poor] = step[poor]
+            poor = poor[improved]
+        residuals = _relative_residuals(A, Q, X)
+        for i in np.flatnonzero(~(step <= _SETTLED)):
+            if np.max(np.abs(np.linalg.eigvals(A[i]))) < 1:
+                root = stationary_root(A[i], semidefinite_root(Q[i]))
+                X[i] = root @ root.T
+                residuals[i] = _relative_residuals(A[i], Q[i], X[i])
     return X, residuals
+
+
+def _relative_residuals(A: FloatArray, Q: FloatArray, X: FloatArray) -> FloatArray:
+    """Return the residuals of ``X = A X A' + Q`` over the sizes of its terms."""
+    AXA = A @ X @ transpose(A)
+    size = frobenius_norms(X) + frobenius_norms(AXA) + frobenius_norms(Q)
+    return np.asarray(frobenius_norms(AXA - X + Q) / np.where(size > 0, size, 1.0))
 
 
 def _refine(
     A: FloatArray, Q: FloatArray, X: FloatArray, precision: type[np.floating[Any]]
 ) -> tuple[FloatArray, FloatArray]:
     """Correct X by its residual, summed in some precision; return the relative steps as well."""
-    left, middle = A.astype(precision), X.astype(precision)
-    residual = (left @ middle @ transpose(left) - middle + Q).astype(np.float64)
+    Ap, Xp = A.astype(precision), X.astype(precision)
+    residual = (Ap @ Xp @ transpose(Ap) - Xp + Q).astype(np.float64)
     step = smith_sum(A, symmetrise(residual))
     return symmetrise(X + step), frobenius_norms(step) / np.maximum(frobenius_norms(X), 1e-300)
-
-
-def lyapunov_residual(A: FloatArray, Q: FloatArray, X: FloatArray) -> float:
-    """Relative residual of ``X = A X A' + Q`` in the 1-norm."""
-    AXA = A @ X @ A.T
-    scale = np.linalg.norm(X, 1) + np.linalg.norm(AXA, 1) + np.linalg.norm(Q, 1)
-    return float(np.linalg.norm(AXA - X + Q, 1) / scale) if scale != 0 else 0.0
 
 
 def smith_sum(A: _Matrix, Q: _Matrix) -> _Matrix:

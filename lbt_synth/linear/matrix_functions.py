@@ -49,9 +49,9 @@ def is_stable(A: FloatArray) -> bool:
     return bool(np.max(np.abs(np.linalg.eigvals(A))) < 1)
 
 
-def relative_distance(own: FloatArray, other: FloatArray) -> float:
+def relative_distance(array: FloatArray, other: FloatArray) -> float:
     """Return the norm of the difference of two arrays over that of the other."""
-    return float(np.linalg.norm(own - other)) / max(float(np.linalg.norm(other)), 1e-300)
+    return float(np.linalg.norm(array - other)) / max(float(np.linalg.norm(other)), 1e-300)
 
 
 def nearest_powers_of_two(sizes: FloatArray) -> FloatArray:

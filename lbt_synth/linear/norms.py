@@ -31,8 +31,8 @@ from lbt_synth.linear.state_space import (
 )
 from lbt_synth.validation import ComplexArray, FloatArray
 
-_TOLERANCE = 2e-11
-_CAREFUL = 8
+_TOLERANCE = 2e-11  # relative, of a level above the peak: some times the rounding of a response
+_CAREFUL = 8  # highest points that are solved one by one, which is more accurate next to a pole
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,8 +91,7 @@ def hinf_norm(system: Any) -> HinfNorm:
         )
     _require_stable(G)
     G = G if G.period == 1 else G.lifted_compactly()
-    found = [_peak(part.balanced(), 0.0, np.pi) for part in independent_parts(G)]
-    return max(found, key=float)
+    return max((_peak(part.balanced(), 0.0, np.pi) for part in independent_parts(G)), key=float)
 
 
 def _require_stable(G: StateSpace) -> None:
@@ -124,14 +123,14 @@ def square_parts(G: StateSpace) -> list[StateSpace]:
 def band_norm(system: StateSpace, low_hz: float, high_hz: float) -> HinfNorm:
     """Largest singular value over a band of frequencies; poles outside the band do no harm."""
     low, high = (2 * np.pi * f * system.dt_s for f in (low_hz, high_hz))
-    found = _peak(system.balanced(), low, high)
+    norm = _peak(system.balanced(), low, high)
     # rounding must not move an end of the band outside the band
-    return replace(found, peak_frequency_hz=min(max(found.peak_frequency_hz, low_hz), high_hz))
+    return replace(norm, peak_frequency_hz=min(max(norm.peak_frequency_hz, low_hz), high_hz))
 
 
 def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:
     """Largest singular value of a balanced system between two angles, by level sets."""
-    largest = partial(_largest, G, schur_form(G))
+    largest = partial(_largest, G, schur_form(G), spectral_norms)
     seeds = _seeds(G, low, high)
     peak, angle = _climb(G, seeds, largest, lambda level: level_angles(G, level))
     return HinfNorm(
@@ -169,17 +168,11 @@ def _largest_real_part(G: StateSpace, least: float) -> float:
         values = np.linalg.eigvalsh(response + response.conj().transpose(0, 2, 1))[:, -1] / 2
         return np.asarray(values, dtype=np.float64)
 
-    def largest(angles: FloatArray) -> tuple[float, float]:
-        z = np.exp(1j * angles)
-        high = np.argsort(hermitian(schur_response(form, z)))[-_CAREFUL:]
-        careful = hermitian(pointwise_response(G, z[high]))
-        best = int(np.argmax(careful))
-        return float(careful[best]), float(angles[high[best]])
-
     def pencil(level: float) -> FloatArray:
         R = G.D + G.D.T - 2 * level * np.eye(len(G.D))
         return popov_angles(G.A, G.B, np.zeros_like(G.A), G.C, R)
 
+    largest = partial(_largest, G, form, hermitian)
     peak, _ = _climb(G, seeds, largest, pencil, size=size, least=least)
     return peak + 2 * _TOLERANCE * max(size, abs(peak))
 
@@ -290,11 +283,16 @@ def fold_angles(angles: FloatArray, low: float, high: float) -> FloatArray:
     return np.unique(np.concatenate([np.clip(inside, low, high), [low, high]]))
 
 
-def _largest(G: StateSpace, form: SchurForm, angles: FloatArray) -> tuple[float, float]:
-    """Largest singular value and its angle; the highest few are computed again with care."""
+def _largest(
+    G: StateSpace,
+    form: SchurForm,
+    measure: Callable[[ComplexArray], FloatArray],
+    angles: FloatArray,
+) -> tuple[float, float]:
+    """Largest measure of the response and its angle; the highest few are computed with care."""
     z = np.exp(1j * angles)
-    high = np.argsort(spectral_norms(schur_response(form, z)))[-_CAREFUL:]
-    careful = spectral_norms(pointwise_response(G, z[high]))
+    high = np.argsort(measure(schur_response(form, z)))[-_CAREFUL:]
+    careful = measure(pointwise_response(G, z[high]))
     best = int(np.argmax(careful))
     return float(careful[best]), float(angles[high[best]])
 

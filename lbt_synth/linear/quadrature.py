@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy
+from lbt_synth.validation import ComplexArray, FloatArray
 
 _NARROWEST = 1e-10  # pole width that panels are still refined to, as a fraction of Nyquist
-_PANEL = 2.0  # length of a panel over its distance from a pole, or over the pole's width
+_HALVINGS = 45  # of panels, after which an integral does not settle: 1e-14 of their length
 
 
 def gauss_panels(edges: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
@@ -31,6 +31,16 @@ def panel_rule(low: FloatArray, high: FloatArray, order: int) -> tuple[FloatArra
     return middle + half * x, half * w
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RefinedPanels:
+    """Panels on which an integral has converged, in increasing order."""
+
+    low: FloatArray  # (panels,)
+    high: FloatArray  # (panels,)
+    integrals: FloatArray  # (panels, ...): integral over each panel
+    change: float  # by the last halvings: summed over the panels, the largest of the entries
+
+
 def _panel_integrals(
     integrand: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray, order: int
 ) -> FloatArray:
@@ -41,59 +51,60 @@ def _panel_integrals(
     return np.asarray(np.einsum("po,po...->p...", weights, values))
 
 
-def _halves(
+def _halve_panels(
     integrand: Callable[[FloatArray], FloatArray],
-    low: FloatArray,
-    middle: FloatArray,
-    high: FloatArray,
+    edges: FloatArray,
     order: int,
-) -> tuple[FloatArray, FloatArray]:
-    """Integrals over the lower and upper halves of panels, (panels, ...) each, in one call."""
-    both = _panel_integrals(
-        integrand, np.concatenate([low, middle]), np.concatenate([middle, high]), order
+    measure: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]],
+) -> RefinedPanels:
+    """Halve panels until the measures (panels, k) of their last changes are below limits.
+
+    Measures and limits are functions of the changes (panels, ...), of the integral over all panels,
+    and of the lengths (panels,).
+    """
+    low, high = edges[:-1], edges[1:]
+    coarse = _panel_integrals(integrand, low, high, order)
+    settled: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+    total, moved = np.zeros(coarse.shape[1:]), 0.0
+    for _ in range(_HALVINGS):
+        middle, count = (low + high) / 2, low.size
+        low, high = np.concatenate([low, middle]), np.concatenate([middle, high])
+        halves = _panel_integrals(integrand, low, high, order)
+        fine = halves[:count] + halves[count:]
+        lengths = high[count:] - low[:count]
+        change, limits = measure(fine - coarse, total + fine.sum(axis=0), lengths)
+        done = np.all(change <= limits, axis=1)
+        settled.append((low[:count][done], high[count:][done], fine[done]))
+        total = total + fine[done].sum(axis=0)
+        moved += float(change[done].max(axis=1, initial=0.0).sum())
+        if done.all():
+            begin, end, integrals = (np.concatenate(rows) for rows in zip(*settled, strict=True))
+            rank = np.argsort(begin)
+            return RefinedPanels(
+                low=begin[rank], high=end[rank], integrals=integrals[rank], change=moved
+            )
+        halved = np.tile(~done, 2)
+        low, high, coarse = low[halved], high[halved], halves[halved]
+    raise NumericalError(
+        f"the integral of a spectrum did not settle: it still changes after {_HALVINGS} halvings. "
+        "Check that the spectrum is finite, without jumps and not a set of delta functions; give a "
+        "table its own frequencies.",
+        status="quadrature",
     )
-    return both[: low.size], both[low.size :]
-
-
-def _stack(left: FloatArray, right: FloatArray, rows: BoolArray) -> FloatArray:
-    """Chosen rows of two arrays, one below the other."""
-    return np.concatenate([left[rows], right[rows]])
 
 
 def adaptive_integral(
     integrand: Callable[[FloatArray], FloatArray], edges: FloatArray
 ) -> FloatArray:
     """Integrate a matrix-valued function, halving panels until its trace converges to 1e-7."""
-    low, high = edges[:-1], edges[1:]
-    coarse = _panel_integrals(integrand, low, high, 6)
-    done = np.zeros(coarse.shape[1:])
-    for _ in range(40):
-        middle = (low + high) / 2
-        left, right = _halves(integrand, low, middle, high, 6)
-        fine = left + right
-        total = np.trace(done + fine.sum(axis=0), axis1=-2, axis2=-1)
-        change = np.abs(np.trace(fine - coarse, axis1=-2, axis2=-1))
-        open_ = np.any((change > 1e-7 * total).reshape(low.size, -1), axis=1)
-        done = done + fine[~open_].sum(axis=0)
-        if not open_.any():
-            return np.asarray(done)
-        low, high = _stack(low, middle, open_), _stack(middle, high, open_)
-        coarse = _stack(left, right, open_)
-    raise NumericalError(
-        "the integral of a spectrum did not settle: it still changes after 40 halvings. "
-        "Check that the spectrum is finite and not a set of delta functions.",
-        status="quadrature",
-    )
 
+    def measure(
+        change: FloatArray, total: FloatArray, lengths: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        traces = np.abs(np.trace(change, axis1=-2, axis2=-1)).reshape(lengths.size, -1)
+        return traces, 1e-7 * np.trace(total, axis1=-2, axis2=-1).ravel()
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RefinedPanels:
-    """Panels on which a vector-valued integral has converged, in increasing order."""
-
-    low: FloatArray  # (panels,)
-    high: FloatArray  # (panels,)
-    integrals: FloatArray  # (panels, k): integral over each panel
-    change: float  # by the last halvings: summed over the panels, the largest of the k entries
+    return np.asarray(_halve_panels(integrand, edges, 6, measure).integrals.sum(axis=0))
 
 
 def refine_panels(
@@ -105,40 +116,14 @@ def refine_panels(
         values = integrand(x)
         return np.concatenate([values, np.abs(values[:, :1])], axis=1)
 
-    low, high = edges[:-1], edges[1:]
-    coarse = _panel_integrals(with_size, low, high, 10)
-    done: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-    done_size = moved = 0.0
-    for _ in range(45):
-        middle = (low + high) / 2
-        left, right = _halves(with_size, low, middle, high, 10)
-        fine = left + right
-        scale = min(1.0, done_size + float(fine[:, -1].sum()))
-        change = np.max(np.abs(fine - coarse)[:, :-1], axis=1)
-        open_ = change > np.maximum(1e-10 * scale, floor * (high - low))
-        done.append((low[~open_], high[~open_], fine[~open_, :-1]))
-        done_size += float(fine[~open_, -1].sum())
-        moved += float(change[~open_].sum())
-        if not open_.any():
-            begin, end, integrals = (np.concatenate(parts) for parts in zip(*done, strict=True))
-            rank = np.argsort(begin)
-            return RefinedPanels(
-                low=begin[rank], high=end[rank], integrals=integrals[rank], change=moved
-            )
-        low, high = _stack(low, middle, open_), _stack(middle, high, open_)
-        coarse = _stack(left, right, open_)
-    raise NumericalError(
-        "the integral of a spectrum's logarithm did not settle: it still changes after 45 "
-        "halvings. Check that the spectrum is finite and without jumps; give a table its own "
-        "frequencies.",
-        status="quadrature",
-    )
+    def measure(
+        change: FloatArray, total: FloatArray, lengths: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        limits = np.maximum(1e-10 * min(1.0, float(total[-1])), floor * lengths)
+        return np.abs(change[:, :-1]), limits[:, None]
 
-
-def panel_edges(poles: ComplexArray, frame_rate_hz: float) -> FloatArray:
-    """Panels of (0, Nyquist) [Hz]: geometric, and more of them around each pole."""
-    edges = [np.geomspace(1e-6, 1, 40), np.array([0.0]), pole_edges(poles)]
-    return frozen_copy(distinct_edges(np.concatenate(edges)) * (frame_rate_hz / 2))
+    panels = _halve_panels(with_size, edges, 10, measure)
+    return replace(panels, integrals=panels.integrals[:, :-1])
 
 
 def graded_edges(poles: ComplexArray) -> FloatArray:
@@ -150,7 +135,7 @@ def graded_edges(poles: ComplexArray) -> FloatArray:
     """
     upper = poles[poles.imag >= 0]
     centre = np.abs(np.angle(upper)) / np.pi
-    width = np.maximum(1 - np.abs(upper), np.pi * _NARROWEST) / np.pi
+    width = np.maximum(np.abs(1 - np.abs(upper)), np.pi * _NARROWEST) / np.pi
     size = np.exp2(np.floor(np.log2(width)))
     distinct = np.unique(size + 1j * np.floor(4 * centre / size), return_index=True)[1]
     centre, width = centre[distinct], width[distinct]
@@ -160,30 +145,8 @@ def graded_edges(poles: ComplexArray) -> FloatArray:
     while low.size:
         outside = np.maximum(low[:, None] - centre, centre - high[:, None])
         nearest = np.min(np.maximum(outside, width), axis=1, initial=1.0)
-        long = high - low > _PANEL * nearest
+        long = high - low > 2 * nearest
         done.append(low[~long])
         middle = (low[long] + high[long]) / 2
         low, high = np.concatenate([low[long], middle]), np.concatenate([middle, high[long]])
     return np.sort(np.concatenate(done))
-
-
-def pole_edges(poles: ComplexArray) -> FloatArray:
-    """Edges of panels around sharp poles, in units of the Nyquist frequency, unsorted.
-
-    The panels widen with the distance from the pole until other panels are as fine. A flank of a
-    narrow peak must not lie in one long panel: the nodes of its halves would miss it, too.
-    """
-    edges = [np.zeros(0)]
-    for pole in np.ravel(poles):
-        centre, width = abs(np.angle(pole)) / np.pi, max(1 - abs(pole), 1e-9) / np.pi
-        if width < 0.1:
-            steps = max(3, 1 + int(np.log(0.3 / width) / np.log(4)))
-            offsets = np.concatenate([[0.0], width * 4.0 ** np.arange(steps)])
-            edges += [centre + offsets, centre - offsets]
-    return np.concatenate(edges)
-
-
-def distinct_edges(edges: FloatArray) -> FloatArray:
-    """Sort edges into (0, 1), and drop those that coincide."""
-    grid = np.unique(np.clip(edges, 0, 1))
-    return np.asarray(grid[np.concatenate([[True], np.diff(grid) > 1e-12])])

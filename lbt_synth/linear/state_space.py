@@ -1,8 +1,4 @@
-"""Discrete-time linear systems in textbook form, and controllers in the form in which they run.
-
-:class:`StateSpace` is the textbook form ``y(k) = C x(k) + D u(k)``.
-:class:`Controller` is the form of real-time computers: the state is updated first, and the
-output is read from the *new* state, ``u(k) = C x(k+1) + D y(k)``.
+"""Discrete-time linear systems in textbook form, and their responses.
 
 The matrices may repeat with a period of N samples, as those of sensors that are read at several
 rates do: each is then a stack (N, ...), one matrix for each phase t = k mod N.
@@ -12,7 +8,6 @@ doi:10.1007/978-1-84800-911-0.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
@@ -20,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import matrix_balance
 
-from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.lyapunov import join_roots, stationary_covariance, stationary_root
 from lbt_synth.linear.matrix_functions import (
     as_stack,
@@ -29,7 +24,6 @@ from lbt_synth.linear.matrix_functions import (
     solve_stack,
     transpose,
 )
-from lbt_synth.linear.other_systems import control_system, system_parts
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.storage.warning_filters import ignore_warnings
@@ -48,10 +42,13 @@ from lbt_synth.validation import (
 # T, C U, U* B and D, and whether they are those of the dual system; see schur_form
 SchurForm: TypeAlias = tuple[ComplexArray, ComplexArray, ComplexArray, FloatArray, bool]
 
-_PROBES = 5  # points at which partial fractions are checked by solving linear systems
-_AGREEMENT = 1e-9
+SAMPLE_FIRST = (
+    'Sample it first: control.sample_system(system, dt, method="bilinear") keeps the H-infinity '
+    "norm, which the default, a zero-order hold, does not."
+)
+
+_AGREEMENT = 1e-9  # relative, of partial fractions with solved linear systems at five points
 _CHUNK = 60_000  # complex numbers that a frequency response computes at once; they fit a cache
-_PHASE_CHUNK = 2_000_000  # and that of all phases
 
 
 @table_row
@@ -197,7 +194,7 @@ class StateSpace(LinearSystem):
         """
         if isinstance(system, StateSpace):
             return system
-        A, B, C, D, dt_s = system_parts(system)
+        A, B, C, D, dt_s = _system_parts(system)
         return cls(A=A, B=B, C=C, D=D, dt_s=dt_s)
 
     def to_control(self) -> Any:
@@ -211,7 +208,10 @@ class StateSpace(LinearSystem):
         0.01
         """
         self.require_one_phase("a system of python-control", "lifted().to_control()")
-        return control_system(self.A, self.B, self.C, self.D, self.dt_s)
+        import control
+
+        parts = (self.A, self.B, self.C, self.D)
+        return control.StateSpace(*parts, self.dt_s, remove_useless_states=False)
 
     def balanced(self) -> StateSpace:
         """Scale the states by powers of two, which leaves the input-output map as it is.
@@ -332,7 +332,7 @@ class StateSpace(LinearSystem):
         z = np.exp(2j * np.pi * frequency * self.dt_s)
         (p, m), N, whole = self.D.shape[-2:], self.period, self.lifted()
         schur = complex_schur(whole.A)
-        step = max(1, _PHASE_CHUNK // (N * max(p, self.n_states)))
+        step = max(1, _CHUNK // max(p, self.n_states, 1))
         out = np.empty((z.size, N, p, m), dtype=np.complex128)
         for j in range(m):  # the input of a period is one of its columns times z^0, z^1, ...
             column = replace(whole, B=whole.B[:, j::m], D=whole.D[:, j::m])
@@ -485,7 +485,7 @@ def stacked_response(matrices: tuple[FloatArray, ...], z: ComplexArray) -> Compl
         residues = np.einsum("kms,ksq->smqk", C @ vectors, entries)
         for pole, residue in zip(poles.T, residues, strict=True):
             planes += residue[:, :, None] * (1 / (z[:, None] - pole))
-    probes = np.linspace(0, z.size - 1, _PROBES).astype(np.int64)
+    probes = np.linspace(0, z.size - 1, 5).astype(np.int64)
     pencils = z[probes, None, None, None] * np.eye(A.shape[1]) - A
     direct = C @ np.linalg.solve(pencils, B.astype(np.complex128)) + D
     apart = np.max(np.abs(out[probes] - direct), axis=(0, 2, 3))
@@ -508,136 +508,38 @@ def _repeating_response(
     return np.asarray(out.reshape(len(z), N, -1) / turns[:, :, None])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Controller(LinearSystem):
-    """Controller in new-state form: ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``.
+def _system_parts(system: Any) -> tuple[Any, Any, Any, Any, float]:
+    """Return A, B, C, D and the sampling period [s] of a discrete system; refuse anything else.
 
-    As in :class:`StateSpace`, each matrix may be a stack of one matrix per phase.
-
-    Parameters
-    ----------
-    A : (n, n) or (N, n, n) array_like
-        State matrix.
-    B : (n, q) or (N, n, q) array_like
-        Input matrix; y(k) has q measurements.
-    C : (m, n) or (N, m, n) array_like
-        Output matrix, applied to the state *after* its update.
-    D : (m, q) or (N, m, q) array_like
-        Feedthrough matrix.
-    dt_s : float, optional
-        Sampling period [s].
-    applied : (n, m) or (N, n, m) array_like, optional
-        How the last command enters the new state, where A has it as ``applied C``: what
-        :func:`estimator_form` takes out of A again.
-
-    Raises
-    ------
-    ProblemError
-        If a matrix is not finite or the sizes clash.
-
-    Examples
-    --------
-    An integrator ``u(k) = u(k-1) + 0.5 y(k)``:
-
-    >>> import lbt_synth as lbt
-    >>> integrator = lbt.Controller(A=[[1.0]], B=[[0.5]], C=[[1.0]], D=[[0.0]])
-    >>> run = integrator.start()
-    >>> [float(run.step([1.0])[0]) for _ in range(3)]
-    [0.5, 1.0, 1.5]
+    It takes a tuple (A, B, C, D), systems of python-control and of ``scipy.signal`` in any form,
+    and whatever else has these matrices and ``dt_s``. A period that is not given is 1.
     """
+    if isinstance(system, tuple | list) and len(system) == 4:
+        A, B, C, D = system
+        return A, B, C, D, 1.0
+    library = type(system).__module__.partition(".")[0]
+    if library == "scipy" and hasattr(system, "to_ss"):
+        states = system.to_ss()
+        dt = 0 if states.dt is None else states.dt  # scipy writes None in continuous time
+        return states.A, states.B, states.C, states.D, _period(dt)
+    if library == "control" and not hasattr(system, "A"):
+        import control
 
-    applied: FloatArray | None = None
+        system = control.ss(system)
+    if all(hasattr(system, name) for name in ("A", "B", "C", "D")):
+        dt = system.dt if hasattr(system, "dt") else getattr(system, "dt_s", 0)
+        return system.A, system.B, system.C, system.D, _period(dt)
+    raise ProblemError(
+        "a system must be a StateSpace, a control.StateSpace, a scipy.signal.StateSpace or a "
+        f"tuple (A, B, C, D); got {type(system).__name__}."
+    )
 
-    def __post_init__(self) -> None:
-        LinearSystem.__post_init__(self)
-        if self.applied is not None:
-            rows, cols = (self.n_states, "to match A"), (self.C.shape[-2], "to match C")
-            applied = matrix(self.applied, "applied", rows=rows, cols=cols, stacked=True)
-            parts = {name: getattr(self, name) for name in "ABCD"}
-            self._set_phases(1, **parts, applied=applied)
 
-    def phase(self, t: int) -> Controller:
-        """Return the controller of a phase, t mod N, as if it were that of all."""
-        A, B, C, D = (stack[t % self.period] for stack in self.stacks())
-        applied = self.applied
-        if applied is not None and self.period > 1:
-            applied = applied[t % self.period]
-        return Controller(A=A, B=B, C=C, D=D, dt_s=self.dt_s, applied=applied)
-
-    def to_statespace(self) -> StateSpace:
-        """Return the same input-output map in the textbook (current-state) form."""
-        return StateSpace(
-            A=self.A, B=self.B, C=self.C @ self.A, D=self.C @ self.B + self.D, dt_s=self.dt_s
+def _period(dt: Any) -> float:
+    if dt is None or dt is True:
+        return 1.0
+    if dt == 0:
+        raise ProblemError(
+            f"the system must be in discrete time; got a continuous one (dt = 0). {SAMPLE_FIRST}"
         )
-
-    def start(
-        self, fallbacks: Mapping[frozenset[str], Controller] | None = None
-    ) -> RunningController:
-        """Return a running copy with a zero state, to be stepped sample by sample.
-
-        The fall-backs are the controllers for sets of sensors that are not read.
-        """
-        return RunningController(self, fallbacks=fallbacks or {})
-
-
-@dataclass(slots=True, eq=False)
-class RunningController:
-    """A controller with its state: call ``step(y) -> u`` once per sample, or ``reset()``.
-
-    The plain form assumes that its commands are applied; an estimator form is given those that
-    were. Fall-backs share the states, so that a switch is without a jump.
-    """
-
-    controller: Any  # a Controller, or an estimator form
-    form: str = "plain"  # or "estimator"
-    fallbacks: Mapping[frozenset[str], Controller] = field(default_factory=dict)
-    state: FloatArray = field(init=False)
-    phase: int = field(init=False)  # of the next sample
-    _phases: list[tuple[FloatArray, ...]] = field(init=False, repr=False)  # A, B, C, D of each
-
-    def __post_init__(self) -> None:
-        self.reset()
-
-    def reset(self) -> None:
-        """Set the state to zero; the next sample is the first of a period, all sensors are read."""
-        self._phases = list(zip(*self.controller.stacks(), strict=True))
-        self.state, self.phase = np.zeros(len(self._phases[0][0])), 0
-
-    def miss(self, missing: Iterable[str]) -> None:
-        """Go on with the fall-back for sensors that are not read; with all for none."""
-        names = frozenset(missing)
-        if names and names not in self.fallbacks:
-            raise ProblemError(f"there is no filter without {', '.join(sorted(names))}.")
-        controller = self.fallbacks[names] if names else self.controller
-        self._phases = list(zip(*controller.stacks(), strict=True))
-
-    def step(self, y: ArrayLike, applied: ArrayLike | None = None) -> FloatArray:
-        """Take the measurements y(k), (q,), and return the command u(k), (m,).
-
-        Cases side by side have (q, c) and (m, c). An estimator form takes the command that was
-        applied in the last sample, too; without it the last one of its own counts. A value that is
-        not finite raises a NonFiniteError and leaves the state as it is: hold the last command.
-        """
-        A, B, C, D = self._phases[self.phase]
-        measured = _signal(y, "y", B)
-        state = self.state[:, None] if measured.ndim > self.state.ndim else self.state
-        drive = B @ measured
-        if self.form == "estimator":
-            last = C @ state if applied is None else _signal(applied, "applied", C.T)
-            drive = drive + self.controller.applied @ last
-        self.state = A @ state + drive
-        self.phase = (self.phase + 1) % len(self._phases)
-        return np.asarray(C @ self.state + D @ measured)
-
-
-def _signal(values: ArrayLike, name: str, matrix: FloatArray) -> FloatArray:
-    """Return a signal that a matrix takes, (q,) or (q, c)."""
-    signal = np.asarray(values, dtype=np.float64)
-    if signal.ndim not in (1, 2) or len(signal) != matrix.shape[1]:
-        raise DimensionError(
-            f"{name} must have shape ({matrix.shape[1]},) to match a matrix {matrix.shape}; got "
-            f"{signal.shape}."
-        )
-    if not np.isfinite(signal).all():
-        raise NonFiniteError(f"{name} must be finite; got {signal}. Hold the last command.")
-    return signal
+    return float(dt)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from lbt_synth.linear import StateSpace
-from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_edges
+from lbt_synth.linear.quadrature import adaptive_integral, graded_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
 from lbt_synth.loop.evaluator import STILL, Evaluator, ResidualBudget
 from lbt_synth.loop.stable_range import append_taps
@@ -317,7 +317,7 @@ def _roots(poles: ComplexArray, period: int) -> ComplexArray:
 def resonance_edges(loop: ClosedLoop) -> FloatArray:
     """Panels of (0, Nyquist) [Hz] for a loop."""
     roots = _roots(loop.system.poles, loop.system.period)
-    return panel_edges(roots, loop.hardware.frame_rate_hz)
+    return graded_edges(roots) * loop.hardware.frame_rate_hz / 2
 
 
 def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:

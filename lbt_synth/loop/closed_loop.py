@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller, StateSpace
-from lbt_synth.linear.held_controller import HasController, as_controller
+from lbt_synth.linear.controller import HasController, as_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response
 from lbt_synth.models.plant.assembly import memory, other_exposures, own_exposure

@@ -10,7 +10,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import Controller
-from lbt_synth.linear.held_controller import as_controller
+from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop.closed_loop import require_loop_rate, require_matching_controller
 from lbt_synth.loop.evaluator import ResidualBudget
 from lbt_synth.loop.stacks import LoopStack, close_loops, stack_evaluator

@@ -9,7 +9,7 @@ import numpy as np
 
 from lbt_synth.linear import StateSpace, hinf_norm
 from lbt_synth.linear.norms import independent_parts
-from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
+from lbt_synth.linear.quadrature import gauss_panels, graded_edges
 from lbt_synth.linear.state_space import split_into_parts
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.closed_loop import ClosedLoop
@@ -123,9 +123,9 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
     """
     loop.require_stable()
     system, nyquist = loop.output_sensitivity(), loop.hardware.frame_rate_hz / 2
-    poles = pole_edges(loop.controller.to_statespace().poles)  # resonances of the open loop
-    edges = distinct_edges(np.concatenate([resonance_edges(loop) / nyquist, poles[poles > 1e-6]]))
-    nodes, _ = gauss_panels(edges * nyquist, 12)
+    panels = graded_edges(loop.controller.to_statespace().poles)  # resonances of the open loop
+    edges = np.union1d(resonance_edges(loop), panels[panels > 1e-6] * nyquist)
+    nodes, _ = gauss_panels(edges, 12)
     uniform = np.linspace(0, nyquist, _UNIFORM + 1)[1:]
 
     def broken(frequency_hz: FloatArray) -> ComplexArray:

@@ -33,7 +33,7 @@ from numpy.polynomial.polynomial import polysub
 from scipy.optimize.elementwise import find_root
 
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
-from lbt_synth.linear.held_controller import HasController, as_controller
+from lbt_synth.linear.controller import HasController, as_controller
 from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.linear.norms import fold_angles, largest_real_part, popov_angles, square_parts
 from lbt_synth.linear.state_space import schur_form, schur_response

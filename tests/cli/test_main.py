@@ -167,8 +167,14 @@ def test_a_design_of_one_sensor_loads_what_it_uses(tmp_path, method):
     ours = (
         *("design.loop_shaping", "design.modal", "design.shaping.solution"),
         *("design.mixed", "design.lqg"),
-        *("linear.riccati.periodic", "linear.output_feedback"),
-        *("loop.simulation", "interop", "config.end_to_end", "studies.study", "studies.robustness"),
+        *(
+            "linear.output_feedback",
+            "loop.simulation",
+            "interop",
+            "config.end_to_end",
+            "studies.study",
+            "studies.robustness",
+        ),
         *("report.figures", "report.page", "identification.fit", "identification.records"),
     )
     scipys = ("stats", "signal")

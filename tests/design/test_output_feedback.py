@@ -13,8 +13,7 @@ from support.generalized_plants import random_plant, sampled
 import lbt_synth as lbt
 from lbt_synth.errors import DetectabilityError, InfeasibleError, ProblemError
 from lbt_synth.linear import GeneralizedPlant, StateSpace, mixed_sensitivity
-from lbt_synth.linear.output_feedback.scaled_plant import scaled_plant
-from lbt_synth.linear.output_feedback.two_riccati import free_parameter
+from lbt_synth.linear.output_feedback.two_riccati import free_parameter, scaled_plant
 
 
 @pytest.mark.parametrize("route", ["riccati", "lmi"])

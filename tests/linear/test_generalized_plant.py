@@ -8,7 +8,6 @@ from support.generalized_plants import random_plant, sampled
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.linear import GeneralizedPlant, StateSpace, mixed_sensitivity
-from lbt_synth.linear.generalized_plant import Weight, constant_weight, stack_weights, weigh_plant
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -71,26 +70,6 @@ def test_a_plant_in_continuous_time_is_refused(dt_s):
     two = control.ss([[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]], np.zeros((2, 2)))
     with pytest.raises(ProblemError, match='Sample it first.*method="bilinear"'):
         GeneralizedPlant.of(two, measurements=1, controls=1)
-
-
-def test_weighted_plant_is_the_product_of_responses():
-    plant = random_plant(2, n=4)
-    p1 = plant.sizes[2]
-    one = Weight(*(np.array([[value]]) for value in (0.6, 1.0, 0.5, 0.3)))
-    lag = stack_weights([one] * p1)
-    frequency_hz = np.linspace(0.02, 0.48, 7)
-    G = plant.whole.frequency_response(frequency_hz)
-    G[:, :p1] = StateSpace(**lag._asdict()).frequency_response(frequency_hz) @ G[:, :p1]
-    weighted = weigh_plant(plant, lag).whole.frequency_response(frequency_hz)
-    assert weighted == pytest.approx(G, rel=1e-9)
-
-
-def test_constant_weights_add_no_states():
-    plant = random_plant(3, n=4)
-    p1 = plant.sizes[2]
-    weighted = weigh_plant(plant, constant_weight(2 * np.eye(p1)))
-    assert np.array_equal(weighted.A, plant.A)
-    assert np.array_equal(weighted.C1, 2 * plant.C1)
 
 
 # -- mixed sensitivity ----------------------------------------------------------

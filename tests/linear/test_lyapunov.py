@@ -85,6 +85,22 @@ def test_a_stack_holds_loops_whose_squaring_loses_the_digits():
         assert found[2, 2] == pytest.approx(left, rel=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("gaps", "limit"), [((1e-4, 1e-3, 1e-2, 1e-1), 1e-5), ((1e-5, 1e-4, 1e-3), 1e-3)]
+)
+def test_several_slow_poles_against_90_digits(gaps, limit):
+    """Squaring the triangular form leaves a residual of 1e-14 and is off by factors."""
+    n = len(gaps)
+    A, Q = np.eye(n, k=-1), np.diag(np.eye(n)[0])
+    A[0] = -np.poly(1 - np.array(gaps))[1:]
+    with mpmath.workdps(90):
+        power, exact = mpmath.matrix(A.tolist()), mpmath.matrix(Q.tolist())
+        for _ in range(45):
+            exact, power = exact + power * exact * power.T, power * power
+        exact = np.array(exact.tolist(), dtype=float)
+    assert stationary_covariance(A, Q) == pytest.approx(exact, rel=limit)
+
+
 @pytest.mark.parametrize("pole", [1.0, 1.2, -1.5])
 def test_an_unstable_system_has_no_stationary_covariance(pole):
     with pytest.raises(lbt.errors.UnstableLoopError, match=f"a pole of modulus {abs(pole):g}"):

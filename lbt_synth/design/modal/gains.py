@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.polynomial.polynomial import polyadd
@@ -28,7 +27,7 @@ from scipy.special import comb
 from lbt_synth.design.integrator import PURE, TRIED_GAINS, hardware_gain_limit
 from lbt_synth.design.modal.stack import Vibrations, lines_per_mode, number_per_mode
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.linear.quadrature import distinct_edges, gauss_panels, pole_edges
+from lbt_synth.linear.quadrature import gauss_panels, graded_edges
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.ensemble import textbook_matrices
 from lbt_synth.loop.stacks import close_loops, stack_evaluator
@@ -37,7 +36,6 @@ from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.validation import (
     BoolArray,
-    ComplexArray,
     FloatArray,
     integer,
     number,
@@ -287,8 +285,8 @@ def _spectra_per_mode(
     """
     if isinstance(spectra, ModalTurbulence):
         require_loop_rate(spectra.frame_rate_hz, path)
-        poles = _distinct_poles(np.linalg.eigvals(spectra.companions).ravel())
-        return spectra.psd, spectra.n_modes, [pole_edges(poles)]
+        poles = np.linalg.eigvals(spectra.companions).ravel().astype(np.complex128)
+        return spectra.psd, spectra.n_modes, [graded_edges(poles)]
     each = tuple(spectra) if isinstance(spectra, Sequence) else ()
     if not each or not all(isinstance(spectrum, Spectrum) for spectrum in each):
         raise ProblemError(
@@ -313,19 +311,7 @@ def _spectra_per_mode(
 
 
 def _model_edges(model: ARModel) -> FloatArray:
-    return pole_edges(np.linalg.eigvals(model.companion).astype(np.complex128))
-
-
-def _distinct_poles(poles: Any) -> ComplexArray:
-    """Leave out poles so close to another one that the same panels fit both peaks.
-
-    Their angles and distances from the circle agree to a quarter of the width of the peak.
-    """
-    inside = poles[np.abs(poles) < 1]
-    steps = np.round(np.log(1 - np.abs(inside)) * 4)
-    places = np.round(np.abs(np.angle(inside)) / np.exp(steps / 4) * 4)
-    _, kept = np.unique(np.stack([steps, places]), axis=1, return_index=True)
-    return np.asarray(inside[kept], dtype=np.complex128)
+    return graded_edges(np.linalg.eigvals(model.companion).astype(np.complex128))
 
 
 def _checked_spectra(
@@ -377,8 +363,8 @@ def _find_gains(
     # the poles of a loop are the roots of 1 - z^-1 + h z^-1 M, in powers of z^-1
     path_taps = np.append(0.0, path.mirror_taps)
     poles = [np.roots(polyadd([1.0, -1.0], part * limit * path_taps)) for part in _RESONANT]
-    grid = [np.zeros(1), np.geomspace(1e-6, 1, 60), pole_edges(np.array(poles)), edges]
-    edges = distinct_edges(np.concatenate(grid))
+    resonances = np.concatenate([root.ravel() for root in poles]).astype(np.complex128)
+    edges = np.union1d(graded_edges(resonances), edges)
     last = np.full((2, gain.size), np.inf)  # gains and variances
     for _ in range(_HALVINGS):
         nodes, weights = gauss_panels(edges * rate / 2, _NODES)

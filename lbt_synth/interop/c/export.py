@@ -26,7 +26,7 @@ from lbt_synth.interop.c.terms import (
 )
 from lbt_synth.interop.pipeline import Arithmetic, Target, comment_text
 from lbt_synth.linear import Controller
-from lbt_synth.linear.held_controller import as_controller
+from lbt_synth.linear.controller import as_controller
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, choice

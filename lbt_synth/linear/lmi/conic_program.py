@@ -1,4 +1,7 @@
-"""Conic programmes that minimise functions of the coefficients of a Youla parameter.
+"""Conic programmes given to the solver as arrays, and functions of a Youla parameter as such.
+
+Loop shaping solves many programmes a design, and cvxpy takes longer to build each than Clarabel to
+solve it. All other programmes are stated in cvxpy.
 
 A function with denominators (at another gain of the loop than the nominal one) is not convex.
 At the current coefficients it is replaced by a convex model: to second order where squares are
@@ -16,11 +19,17 @@ doi:10.1007/978-3-642-12598-0_9).
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from typing import TypeAlias
 
+import clarabel
 import numpy as np
+from scipy import sparse
 from scipy.linalg import eigh
 
+from lbt_synth.errors import NumericalError
 from lbt_synth.linear.convex_functions import (
     CombinedFunction,
     Constraint,
@@ -30,13 +39,118 @@ from lbt_synth.linear.convex_functions import (
     FunctionBound,
     HalfPlanes,
 )
-from lbt_synth.linear.lmi.conic_data import USABLE, ConicProgramme, require_optimum
+from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray
 
 _LEAST_CURVATURE = 0.03  # of that of the slopes alone
-_CLOSE, _EVERY = 0.8, 8  # share of a bound, and which others: what a programme starts with
-_EXCEEDED = 1e-7  # relative
 _FLAT = 1e-12  # part of the largest curvature below which a direction is flat
+_CLOSE = 0.8  # share of a bound: a programme starts with those that are used more, for speed
+# Tighter tolerances end as "optimal_inaccurate" on plants with two equal axes, and gain nothing.
+SETTINGS = {"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8, "max_iter": 200}
+# Near the edge of feasibility the solver loses its accuracy, sometimes with its own scaling of
+# the programme and sometimes without. These settings are tried in turn.
+ATTEMPTS: tuple[dict[str, bool | float], ...] = (
+    {},
+    {"equilibrate_enable": False},
+    {"static_regularization_constant": 1e-9},
+)
+Rows: TypeAlias = FloatArray | sparse.csr_matrix
+USABLE = ("optimal", "optimal_inaccurate")
+_STATUS = {
+    "Solved": "optimal",
+    "AlmostSolved": "optimal_inaccurate",
+    "PrimalInfeasible": "infeasible",
+    "AlmostPrimalInfeasible": "infeasible_inaccurate",
+    "DualInfeasible": "unbounded",
+    "AlmostDualInfeasible": "unbounded_inaccurate",
+    "MaxIterations": "user_limit",
+}
+
+
+def solver_error(reason: str) -> NumericalError:
+    """Error of a programme that the solver gave up on."""
+    return NumericalError(
+        f"the conic programme was not solved: {reason} Try slightly different bounds, or another "
+        "number of taps or functions; for kalman and hinf, the Riccati route.",
+        status="solver error",
+    )
+
+
+@contextmanager
+def refused_panic() -> Iterator[None]:
+    """Refuse a programme whose numbers are out of range: there the compiled solver panics."""
+    try:
+        yield
+    except BaseException as error:  # a panic is no Exception
+        if type(error).__name__ != "PanicException":
+            raise
+        raise solver_error("the solver gave up on numbers out of its range.") from error
+
+
+def require_optimum(run: tuple[str, int], programme: str, advice: str) -> None:
+    """Refuse a programme whose status is not that of an optimum."""
+    if run[0] not in USABLE:
+        raise NumericalError(
+            f"{programme} ended as {run[0]!r}; expected an optimum. {advice}", status=run[0]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConicSolution:
+    """What the solver found."""
+
+    x: FloatArray  # (n,)
+    status: str
+    iterations: int
+
+
+class ConicProgramme:
+    """Minimise ``x'P x / 2 + q'x``, with ``offsets + rows x`` in cones."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._cones: list[object] = []
+        self._rows: list[sparse.csr_matrix] = []
+        self._offsets: list[FloatArray] = []
+
+    def add_nonnegative(self, rows: Rows, offsets: FloatArray) -> None:
+        """Require ``offsets + rows x >= 0``, (m, n) and (m,)."""
+        self._add(rows, offsets, [clarabel.NonnegativeConeT(len(offsets))])
+
+    def add_second_order(self, rows: Rows, offsets: FloatArray) -> None:
+        """Require of each of k vectors, (k d, n) and (k, d), that its first entry is a bound.
+
+        The bound is on the Euclidean norm of the others.
+        """
+        count, length = offsets.shape
+        self._add(rows, offsets.ravel(), [clarabel.SecondOrderConeT(length)] * count)
+
+    def _add(self, rows: Rows, offsets: FloatArray, cones: list[object]) -> None:
+        self._rows.append(sparse.csr_matrix(rows))
+        self._offsets.append(offsets)
+        self._cones += cones
+
+    def minimize(self, linear: FloatArray, quadratic: FloatArray | None = None) -> ConicSolution:
+        """Solve for q, (n,), and P, (n, n)."""
+        blocks = [sparse.csr_matrix((0, self.size)), *self._rows]
+        A = -sparse.vstack(blocks, format="csc")
+        b = np.concatenate([np.zeros(0), *self._offsets])
+        P = np.zeros((self.size, self.size)) if quadratic is None else np.triu(quadratic)
+        if not all(np.all(np.isfinite(part)) for part in (A.data, b, P, linear)):
+            raise solver_error("its numbers are not finite.")
+        for attempt in ATTEMPTS:
+            settings = clarabel.DefaultSettings()
+            settings.verbose = False
+            for name, value in {**SETTINGS, **attempt}.items():
+                setattr(settings, name, value)
+            with refused_panic():
+                answer = clarabel.DefaultSolver(
+                    sparse.csc_matrix(P), linear, A, b, self._cones, settings
+                ).solve()
+            status = _STATUS.get(str(answer.status))
+            if status is not None:
+                return ConicSolution(np.array(answer.x), status, int(answer.iterations))
+        raise solver_error("the solver lost its accuracy on the way.")
 
 
 def minimize(
@@ -52,33 +166,27 @@ def minimize(
     Return the coefficients, None if the constraints cannot hold together, and the solver's status.
     """
     origin = np.zeros(size) if start is None else start
-    chosen = [_is_close(constraint, origin) for constraint in constraints]
+    chosen = [_use(constraint, origin) > _CLOSE for constraint in constraints]
     while True:
         programme = ConicProgramme(size + _count_levels(function))
         for constraint, places in zip(constraints, chosen, strict=True):
             _constrain(programme, _part(constraint, places), origin)
         linear, roots = _Model(programme, origin, scale).expression(function)
-        found = programme.minimize(linear, 2 * roots.T @ roots)
-        if found.status not in USABLE:
-            return None, found.status
-        c = origin + found.x[:size]
-        exceeded = [_use(constraint, c) > 1 + _EXCEEDED for constraint in constraints]
+        solution = programme.minimize(linear, 2 * roots.T @ roots)
+        if solution.status not in USABLE:
+            return None, solution.status
+        c = origin + solution.x[:size]
+        exceeded = [
+            _use(constraint, c) > 1 + 10 * SETTINGS["tol_feas"] for constraint in constraints
+        ]
         if not any(np.any(new & ~old) for new, old in zip(exceeded, chosen, strict=True)):
-            return c, found.status
+            return c, solution.status
         chosen = [new | old for new, old in zip(exceeded, chosen, strict=True)]
 
 
 def _use(constraint: Constraint, c: FloatArray) -> FloatArray:
     """Share of each bound that is used; that of a function is always imposed."""
     return np.ones(1) if isinstance(constraint, FunctionBound) else constraint.use(c)
-
-
-def _is_close(constraint: Constraint, c: FloatArray) -> BoolArray:
-    """Which of the bounds a programme starts with: those that are nearly used, and some others."""
-    use = _use(constraint, c)
-    close = use > _CLOSE
-    close[::_EVERY] = True
-    return close
 
 
 def _part(constraint: Constraint, chosen: BoolArray) -> Constraint:
@@ -103,16 +211,16 @@ def minimize_relaxation(
     for i, group in enumerate(groups):
         for constraint in group:
             _constrain(programme, constraint, origin, None if rigid[i] else size + i)
-    found = programme.minimize(slack)
-    if "infeasible" in found.status:
+    relaxed = programme.minimize(slack)
+    if "infeasible" in relaxed.status:
         return np.full(count, np.inf)
     require_optimum(
-        (found.status, found.iterations),
+        (relaxed.status, relaxed.iterations),
         "the search for constraints that clash",
         "They may be close to what can be met, or very far from it; relax them, or try another "
         "number of functions.",
     )
-    return np.where(rigid, 0.0, found.x[size:])
+    return np.where(rigid, 0.0, relaxed.x[size:])
 
 
 def _count_levels(function: Function) -> int:
@@ -137,14 +245,14 @@ class _Model:
             weighted = list(zip(function.weights, function.parts, strict=True))
             if function.worst:
                 return self._largest(weighted)
-            found = [(w, self.expression(part)) for w, part in weighted]
-            linear = np.sum([w * line for w, (line, _) in found], axis=0)
-            return linear, np.concatenate([np.sqrt(w) * roots for w, (_, roots) in found])
+            models = [(w, self.expression(part)) for w, part in weighted]
+            linear = np.sum([w * line for w, (line, _) in models], axis=0)
+            return linear, np.concatenate([np.sqrt(w) * roots for w, (_, roots) in models])
         if function.worst:
             return self._worst(function)
         gradient, hessian = _second_order(function, self.origin)
         pad = self.programme.size - self.origin.size
-        root = _root(hessian / self.scale)
+        root = semidefinite_root(hessian / self.scale).T
         return np.pad(gradient / self.scale, (0, pad)), np.pad(root, ((0, 0), (0, pad)))
 
     def _worst(self, function: Fractions) -> tuple[FloatArray, FloatArray]:
@@ -194,8 +302,8 @@ def _second_order(function: Fractions, c: FloatArray) -> tuple[FloatArray, Float
     n = c.size
     J, r = slopes.reshape(-1, n), values.ravel()
     gradient = 2 * np.real(r.conj() @ J)
-    whole = np.concatenate([J.real, J.imag])
-    hessian = whole.T @ whole
+    real_slopes = np.concatenate([J.real, J.imag])
+    hessian = real_slopes.T @ real_slopes
     if turn is None:
         return gradient, hessian
     steered = np.einsum("fr,frn->fn", values.conj(), slopes)
@@ -206,12 +314,6 @@ def _second_order(function: Fractions, c: FloatArray) -> tuple[FloatArray, Float
     parts, basis = eigh(bend, hessian + floor * np.eye(n))
     back = (hessian + floor * np.eye(n)) @ basis
     return gradient, np.asarray((back * np.maximum(1 + parts, _LEAST_CURVATURE)) @ back.T)
-
-
-def _root(hessian: FloatArray) -> FloatArray:
-    """Root R with ``R'R`` the given matrix, (n, n)."""
-    parts, basis = np.linalg.eigh((hessian + hessian.T) / 2)
-    return np.asarray(np.sqrt(np.maximum(parts, 0.0))[:, None] * basis.T)
 
 
 def _constrain(
@@ -230,7 +332,6 @@ def _constrain(
         centres = constraint.centres / constraint.radii + turns @ origin
         _bound_norms(programme, centres[:, None], turns[:, None], more, 1.0)
     else:
-        assert isinstance(constraint, FunctionBound)
         root, target = _least_squares_form(constraint.function)
         unit = 1 / np.sqrt(constraint.limit)
         _bound_norms(programme, unit * (root @ origin - target)[None], unit * root[None], more, 1.0)
@@ -257,6 +358,6 @@ def _least_squares_form(function: Fractions) -> tuple[FloatArray, FloatArray]:
     """Root and target with ``sum |centres + rows c|^2 = ||root c - target||^2``."""
     size = function.rows.shape[-1]
     rows = function.rows.reshape(-1, size)
-    whole = np.hstack([rows, -function.centres.reshape(-1, 1)])
-    triangle = np.asarray(np.linalg.qr(np.vstack([whole.real, whole.imag]), mode="r"))
+    system = np.hstack([rows, -function.centres.reshape(-1, 1)])
+    triangle = np.asarray(np.linalg.qr(np.vstack([system.real, system.imag]), mode="r"))
     return triangle[:, :size], triangle[:, size]

@@ -24,22 +24,11 @@ from scipy.linalg import null_space
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import EstimationProblem, decorrelate, filter_gains
 from lbt_synth.linear.infeasibility_proof import Witness, whitening_coordinates
-from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.conic_program import require_optimum
 from lbt_synth.linear.lmi.programmes import solve, symmetric_variable, symmetrise
 from lbt_synth.linear.matrix_functions import part_labels, semidefinite_root
+from lbt_synth.linear.riccati.filtering import FilterRiccati
 from lbt_synth.validation import FloatArray, IntArray, frozen_copy
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LmiSolution:
-    """A solved semidefinite programme, back in the problem's own coordinates."""
-
-    gamma: float  # level of the programme (infinite for the Kalman filter)
-    P: FloatArray  # (n, n): covariance, or ``gamma^2`` times the inverse of the storage matrix
-    gain_predictor: FloatArray  # (n, q), in closed form from P
-    gain_filter: FloatArray  # (n, q), in closed form from P
-    status: str  # as reported by the solver; the design is certified without it
-    iterations: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,17 +38,11 @@ class BalancedProblem:
     problem: EstimationProblem  # decorrelated (``B D' = 0``), with unit measurement noise
     basis: FloatArray  # (n, r): ``x = basis xbar``; directions without error are dropped
     measurement_scale: FloatArray  # (q, q): ``ybar = measurement_scale y``
-    output_scale: float  # ``zbar = z / output_scale``
     injection: FloatArray  # (n, q): part of the gain that the decorrelation adds
 
     def solution(
-        self,
-        P: FloatArray,
-        information: FloatArray,
-        run: tuple[str, int],
-        *,
-        gamma: float = np.inf,
-    ) -> LmiSolution:
+        self, P: FloatArray, information: FloatArray, run: tuple[str, int]
+    ) -> FilterRiccati:
         """Bring a covariance, and the gains of an information matrix, to the original states."""
         try:
             predictor, filtering = filter_gains(self.problem, information)
@@ -68,11 +51,11 @@ class BalancedProblem:
                 f"the inequality's storage matrix has no gain: {error}. {_ADVICE}", status=run[0]
             ) from error
         back = self.basis @ predictor @ self.measurement_scale
-        return LmiSolution(
-            gamma=gamma,
+        return FilterRiccati(
             P=frozen_copy(self.basis @ P @ self.basis.T),
             gain_predictor=frozen_copy(back + self.injection),
             gain_filter=frozen_copy(self.basis @ filtering @ self.measurement_scale),
+            residual=np.nan,
             status=run[0],
             iterations=run[1],
         )
@@ -104,7 +87,6 @@ def balance(
         ),
         basis=frozen_copy(basis),
         measurement_scale=frozen_copy(measurement_scale),
-        output_scale=output_scale,
         injection=injection,
     )
 
@@ -112,7 +94,9 @@ def balance(
 _ADVICE = 'Try route="riccati".'
 
 
-def kalman_sdp(problem: EstimationProblem, *, coordinates: FloatArray, scale: float) -> LmiSolution:
+def kalman_sdp(
+    problem: EstimationProblem, *, coordinates: FloatArray, scale: float
+) -> FilterRiccati:
     """Maximise tr P subject to ``[[APA' + BB' - P, APC'], [CPA', DD' + CPC']] >= 0``, ``P >= 0``.
 
     The stabilising solution of the filter Riccati equation is the greatest P that satisfies the
@@ -131,7 +115,7 @@ def kalman_sdp(problem: EstimationProblem, *, coordinates: FloatArray, scale: fl
 
 def least_gamma_lmi(
     problem: EstimationProblem, *, coordinates: FloatArray, scale: float
-) -> tuple[LmiSolution, Witness]:
+) -> tuple[FilterRiccati, Witness]:
     """Find the least gamma, and a filter that reaches it; the dual solution is its witness."""
     scaled = balance(problem, coordinates, scale)
     basis, parts = _invisible_basis(scaled.problem)
@@ -146,7 +130,7 @@ def least_gamma_lmi(
 
 def hinf_lmi(
     problem: EstimationProblem, gamma: float, *, coordinates: FloatArray, scale: float
-) -> LmiSolution:
+) -> FilterRiccati:
     """Find the central filter of a given gamma, which has the greatest storage matrix.
 
     All is divided by ``gamma^2``, which suits large levels.
@@ -196,8 +180,8 @@ def _invisible_basis(problem: EstimationProblem) -> tuple[FloatArray, IntArray]:
     basis = np.zeros((len(label), 0))
     parts: IntArray = np.zeros(0, dtype=np.int64)
     for part in np.unique(label):
-        own = label == part
-        vectors = np.eye(len(label))[:, own] @ null_space(seen[:, own])
+        rows = label == part
+        vectors = np.eye(len(label))[:, rows] @ null_space(seen[:, rows])
         basis = np.hstack([basis, vectors])
         parts = np.append(parts, np.full(vectors.shape[1], part))
     return basis, parts
@@ -205,10 +189,9 @@ def _invisible_basis(problem: EstimationProblem) -> tuple[FloatArray, IntArray]:
 
 def _unpack(
     scaled: BalancedProblem, P: FloatArray, level: float, run: tuple[str, int]
-) -> LmiSolution:
+) -> FilterRiccati:
     """Turn ``P / gamma^2`` into a filter in the problem's coordinates; the level is gamma^2."""
     storage = (P + P.T) / 2
     information = storage - scaled.problem.L.T @ scaled.problem.L / level
-    gamma = float(np.sqrt(level) * scaled.output_scale)
     P = np.asarray(np.linalg.inv(storage), dtype=np.float64)
-    return scaled.solution(P, information, run, gamma=gamma)
+    return scaled.solution(P, information, run)

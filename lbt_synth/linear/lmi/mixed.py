@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from lbt_synth.linear.estimation_problem import EstimationProblem
-from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.conic_program import require_optimum
 from lbt_synth.linear.lmi.programmes import norm_below, solve
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.matrix_functions import component_labels

@@ -16,19 +16,20 @@ from scipy.linalg import null_space
 
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
 from lbt_synth.linear.infeasibility_proof import Witness
-from lbt_synth.linear.lmi.conic_data import require_optimum
+from lbt_synth.linear.lmi.conic_program import require_optimum
 from lbt_synth.linear.lmi.programmes import norm_below, solve, symmetrise
 from lbt_synth.linear.matrix_functions import semidefinite_root
-from lbt_synth.linear.output_feedback.full_information import Side, control_side, estimation_side
 from lbt_synth.linear.output_feedback.lower_bound import (
     ControlWitness,
+    Side,
+    control_side,
+    estimation_side,
     storage_coordinates,
     storage_root,
 )
 from lbt_synth.linear.output_feedback.two_riccati import FreeParameter
 from lbt_synth.validation import FloatArray
 
-_RANK = 1e-7  # share of the largest root of a cost that counts as none for the solver
 _REASON = "the dual of the matrix inequalities has a point there"
 
 
@@ -59,7 +60,7 @@ class _Storage:
 
     def __init__(self, side: Side) -> None:
         self.side = side
-        self.basis, self.inverse = storage_coordinates(storage_root(side), _RANK)
+        self.basis, self.inverse = storage_coordinates(storage_root(side))
         if not self.basis.size:  # old versions of cvxpy have no empty variables
             self.basis, self.inverse = np.zeros((len(side.A), 1)), np.zeros((1, len(side.A)))
         self.size = self.basis.shape[1]
@@ -79,8 +80,8 @@ class _Storage:
     def pairs(self, dual: FloatArray) -> Witness:
         """Return the pairs of a dual solution."""
         count = self.hidden.shape[1]
-        found = self.hidden @ semidefinite_root(dual[:count, :count])
-        return Witness(states=self.basis @ found[: self.size], disturbances=found[self.size :])
+        moments = self.hidden @ semidefinite_root(dual[:count, :count])
+        return Witness(states=self.basis @ moments[: self.size], disturbances=moments[self.size :])
 
 
 def least_variance_below(

@@ -7,7 +7,12 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from lbt_synth.linear.lmi.conic_data import ATTEMPTS, SETTINGS, solver_error
+from lbt_synth.linear.lmi.conic_program import (
+    ATTEMPTS,
+    SETTINGS,
+    refused_panic,
+    solver_error,
+)
 from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import IntArray
 
@@ -30,8 +35,8 @@ def norm_below(real: Any, imaginary: Any, level: Any) -> Any:
     """Return the constraint that a complex matrix has a spectral norm of at most a level."""
     block = cp.bmat([[real, -imaginary], [imaginary, real]])
     rows, columns = block.shape
-    whole = cp.bmat([[level * np.eye(rows), block], [block.T, level * np.eye(columns)]])
-    return symmetrise(whole) >> 0
+    inequality = cp.bmat([[level * np.eye(rows), block], [block.T, level * np.eye(columns)]])
+    return symmetrise(inequality) >> 0
 
 
 def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
@@ -40,7 +45,7 @@ def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
     for attempt, settings in enumerate(ATTEMPTS):
         try:
             # the certificate judges an inaccurate solution, not a warning
-            with ignore_warnings(message="Solution may be inaccurate"):
+            with refused_panic(), ignore_warnings(message="Solution may be inaccurate"):
                 programme.solve(solver=cp.CLARABEL, **SETTINGS, **settings)
             break
         except cp.error.SolverError as error:
@@ -48,10 +53,5 @@ def solve(objective: Any, constraints: list[Any]) -> tuple[str, int]:
                 raise solver_error("the solver lost its accuracy on the way.") from error
         except ValueError as error:  # raised by cvxpy on data that are not finite
             raise solver_error("its numbers are not finite.") from error
-        except BaseException as error:
-            # on numbers out of range the compiled solver raises something other than an Exception
-            if type(error).__name__ != "PanicException":
-                raise
-            raise solver_error("the solver gave up on numbers out of its range.") from error
     iterations = programme.solver_stats.num_iters if programme.solver_stats else 0
     return str(programme.status), int(iterations or 0)

@@ -20,32 +20,60 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from scipy.linalg import eigh, null_space
-from scipy.optimize import minimize_scalar
 
 from lbt_synth.errors import ProblemError, SynthesisError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant
-from lbt_synth.linear.infeasibility_proof import Witness, scaled_basis
+from lbt_synth.linear.infeasibility_proof import (
+    Witness,
+    priced_growth,
+    scaled_basis,
+    steady_oscillation,
+)
 from lbt_synth.linear.lyapunov import stationary_root
 from lbt_synth.linear.matrix_functions import semidefinite_root
-from lbt_synth.linear.output_feedback.full_information import (
-    Side,
-    WorstCase,
-    control_side,
-    estimation_side,
-)
 from lbt_synth.linear.riccati.dare import solve_dare
 from lbt_synth.validation import FloatArray
 
 _STEPS = 64  # of the recursion that bounds the storage matrix
 _STEADY = 1e-12  # part of the states' moments by which those of an oscillation may change
-_STRAYED = 1e-10  # share of the successors that may lie outside of the storage's range
 _RANK = 1e-8  # share of the largest root of a cost that counts as none
 _SINGULAR = 1e-15  # of what the largest control moves, that counts as none
-_WIDEST = 12.0  # logarithm of the relative weight of the two sides
+
+
+class Side(NamedTuple):
+    """The matrices of one side: of control, or transposed, of estimation."""
+
+    A: FloatArray
+    B1: FloatArray
+    B2: FloatArray
+    C1: FloatArray
+    D11: FloatArray
+    D12: FloatArray
+
+
+def control_side(plant: GeneralizedPlant) -> Side:
+    """Return the side of a controller that knows state and disturbance."""
+    P = plant
+    return Side(A=P.A, B1=P.B1, B2=P.B2, C1=P.C1, D11=P.D11, D12=P.D12)
+
+
+def estimation_side(plant: GeneralizedPlant) -> Side:
+    """Return the side of an estimator whose corrections reach state and error, transposed."""
+    P = plant
+    return Side(A=P.A.T, B1=P.C1.T, B2=P.C2.T, C1=P.B1.T, D11=P.D11.T, D12=P.D21.T)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class WorstCase:
+    """The loop of best control and worst disturbance at a level, as functions of the state."""
+
+    A: FloatArray  # (n, n), stable
+    C: FloatArray  # (p1, n), to the error
+    entry: FloatArray  # (n, 1), state that the last, worst disturbance leaves
+    error: FloatArray  # (p1, 1), and the error at that instant
 
 
 _SideOf: TypeAlias = Callable[[GeneralizedPlant], Side]
@@ -55,13 +83,14 @@ _SideOf: TypeAlias = Callable[[GeneralizedPlant], Side]
 class ControlWitness:
     """Why no controller reaches a level."""
 
-    unseen: Witness | None  # states (n, r) and disturbances (m1, r) that no measurement shows
-    # costates (n, s) and weights of the error (p1, s) that no control moves
-    unmoved: Witness | None
     reason: str  # the reason in words
+    # states (n, r) and disturbances (m1, r) that no measurement shows
+    unseen: Witness | None = None
+    # costates (n, s) and weights of the error (p1, s) that no control moves
+    unmoved: Witness | None = None
 
 
-NO_PROOF = ControlWitness(unseen=None, unmoved=None, reason="no proof was found")
+NO_PROOF = ControlWitness(reason="no proof was found")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +108,7 @@ def infeasible_control_level(plant: GeneralizedPlant, witness: ControlWitness) -
     What measurements would show or controls move is removed from the pairs first.
     """
     pairs = (witness.unseen, estimation_side), (witness.unmoved, control_side)
-    sides = [_moments(plant, side_of, each) for each, side_of in pairs if each is not None]
+    sides = [_moments(plant, side_of, pair) for pair, side_of in pairs if pair is not None]
     levels = [np.sqrt(side.gained / side.spent) for side in sides if side.spent > 0]
     if len(sides) == 2:
         levels.append(_coupled_level(*sides))
@@ -87,78 +116,57 @@ def infeasible_control_level(plant: GeneralizedPlant, witness: ControlWitness) -
 
 
 def _coupled_level(one: _Moments, two: _Moments) -> float:
-    """Level that both sides prove together, at the best relative weight of the two."""
+    """Level that both sides prove together, at the best relative weight of the two.
+
+    With the weights t and 1/t they prove all levels for which ``t a1 + a2 / t < 2 gamma s``, with
+    ``a = gamma^2 spent - gained`` of each side and s the nuclear norm: at the best t, those of
+    ``a1 a2 < gamma^2 s^2``, a quadratic inequality of gamma^2.
+    """
     shared = float(np.linalg.norm(one.root.T @ two.root, "nuc"))
-
-    def levels(weights: FloatArray | float) -> FloatArray:
-        t = np.exp(weights)
-        spent = t * one.spent + two.spent / t
-        gained = t * one.gained + two.gained / t
-        levels = (shared + np.sqrt(shared**2 + gained * spent)) / np.maximum(spent, 1e-300)
-        return np.asarray(levels)
-
-    grid = np.linspace(-_WIDEST, _WIDEST, 97)
-    best, step = float(grid[np.argmax(levels(grid))]), float(grid[1] - grid[0])
-    refined = minimize_scalar(
-        lambda w: -float(levels(w)), bounds=(best - step, best + step), options={"xatol": 1e-9}
-    )
-    return float(np.max(levels(np.array([best, refined.x]))))
+    if not one.spent * two.spent > 0:
+        return 0.0
+    first, second = one.gained / one.spent, two.gained / two.spent
+    both = shared**2 / one.spent / two.spent
+    root = np.hypot(first - second + both, 2 * np.sqrt(second * both))
+    return float(np.sqrt((first + second + both + root) / 2))
 
 
 def _moments(plant: GeneralizedPlant, side_of: _SideOf, pairs: Witness) -> _Moments:
     """Evaluate pairs against the side in whose equation they are the costates."""
-    side = side_of(plant)
-    steady = _hidden(side, pairs.states, pairs.disturbances)
-    growth = steady.after @ steady.after.T - pairs.states @ pairs.states.T
-    size = float(np.sum(pairs.states**2))
-    turning = pairs.states.shape[1] <= 2 and np.linalg.norm(growth) <= _STEADY * size
-    if steady.hidden and turning:
-        none = np.zeros((len(pairs.states), 1))
-        return _Moments(steady.gained, steady.spent, none)
-    basis, inverse = storage_coordinates(_storage_root_of(plant, side_of), _RANK)
-    return _moments_within(side, pairs, basis, inverse)
+    side, states = side_of(plant), pairs.states
+    after, steady = _hide(side, states, pairs.disturbances)
+    growth, size = after @ after.T - states @ states.T, float(np.sum(states**2))
+    turning = states.shape[1] <= 2 and np.linalg.norm(growth) <= _STEADY * size
+    if steady is not None and turning:
+        return steady
+    basis, inverse = storage_coordinates(_storage_root_of(plant, side_of))
+    states = basis @ (inverse @ states)
+    after, within = _hide(side, states, pairs.disturbances)
+    priced = priced_growth(after, states, basis, inverse)
+    if within is None or priced is None:
+        return _Moments(0.0, 1.0, np.zeros_like(states))
+    root, price = priced
+    return _Moments(within.gained, within.spent + price, root)
 
 
-def _moments_within(side: Side, pairs: Witness, basis: FloatArray, inverse: FloatArray) -> _Moments:
-    """Evaluate pairs in the range of a storage matrix."""
-    before = inverse @ pairs.states
-    states = basis @ before
-    found = _hidden(side, states, pairs.disturbances)
-    after = inverse @ found.after  # before any square, which would double its rounding
-    strayed = np.linalg.norm(found.after - basis @ after)
-    if strayed > _STRAYED * np.linalg.norm(found.after) or not found.hidden:
-        return _Moments(0.0, 1.0, np.zeros((len(states), 1)))
-    values, vectors = np.linalg.eigh(after @ after.T - before @ before.T)
-    spent = found.spent - float(values[values < 0].sum())
-    return _Moments(found.gained, spent, basis @ (vectors * np.sqrt(np.maximum(values, 0))))
+def _hide(
+    side: Side, states: FloatArray, signals: FloatArray
+) -> tuple[FloatArray, _Moments | None]:
+    """Change signals as little as hides them from what the constraint reads.
 
-
-@dataclass(frozen=True, slots=True)
-class _Hidden:
-    """Pairs after the least change that hides them."""
-
-    after: FloatArray  # (n, r)
-    gained: float
-    spent: float
-    hidden: bool
-
-
-def _hidden(side: Side, states: FloatArray, signals: FloatArray) -> _Hidden:
-    """Change signals as little as hides them from what the constraint reads."""
+    Return the successors (n, r), and the moments without growth; None where they are not hidden.
+    """
     shown = side.B2.T @ states + side.D12.T @ signals
     signals = signals - np.linalg.pinv(side.D12.T, rcond=1e-10) @ shown
-    left = side.B2.T @ states + side.D12.T @ signals
-    size = np.linalg.norm(side.B2.T @ states) + np.linalg.norm(side.D12.T @ signals)
+    seen, cancelled = side.B2.T @ states, side.D12.T @ signals
+    size = np.linalg.norm(seen) + np.linalg.norm(cancelled)
     gain = side.B1.T @ states + side.D11.T @ signals
-    return _Hidden(
-        after=side.A.T @ states + side.C1.T @ signals,
-        gained=float(np.sum(gain**2)),
-        spent=float(np.sum(signals**2)),
-        hidden=bool(np.linalg.norm(left) <= _STEADY * size),
-    )
+    moments = _Moments(float(np.sum(gain**2)), float(np.sum(signals**2)), np.zeros_like(states))
+    is_hidden = np.linalg.norm(seen + cancelled) <= _STEADY * size
+    return side.A.T @ states + side.C1.T @ signals, moments if is_hidden else None
 
 
-def storage_coordinates(root: FloatArray, rank: float) -> tuple[FloatArray, FloatArray]:
+def storage_coordinates(root: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return T (n, r) with ``T T'`` the storage of a root, and its left inverse.
 
     Directions below a share of the largest are left out.
@@ -166,7 +174,7 @@ def storage_coordinates(root: FloatArray, rank: float) -> tuple[FloatArray, Floa
     spread = np.linalg.norm(root, axis=1)
     spread = np.where(spread > 0, spread, 1.0)
     directions, sizes, _ = np.linalg.svd(root / spread[:, None], full_matrices=False)
-    kept = sizes > rank * sizes[0]
+    kept = sizes > _RANK * sizes[0]
     return scaled_basis(spread, directions[:, kept], sizes[kept])
 
 
@@ -229,16 +237,7 @@ def coupled_bursts(
     return _burst(estimation, Y, meeting), _burst(control, X, Y @ meeting)
 
 
-def steady_oscillation(side: Side, angle: float) -> Witness:
+def steady_pairs(side: Side, angle: float) -> Witness:
     """Return the pairs of one frequency that gain most: no law changes them."""
-    n = len(side.A)
-    turn = np.exp(1j * angle) * np.eye(n)
-    pairs = null_space(np.block([[turn - side.A.T, -side.C1.T], [side.B2.T, side.D12.T]]))
-    if pairs.shape[1] == 0:
-        return Witness(states=np.zeros((n, 1)), disturbances=np.zeros((len(side.C1), 1)))
-    gain = side.B1.T @ pairs[:n] + side.D11.T @ pairs[n:]
-    spent = pairs[n:].conj().T @ pairs[n:]
-    floor = 1e-13 * max(np.trace(spent).real, 1e-300) * np.eye(len(spent))
-    best = pairs @ eigh(gain.conj().T @ gain, spent + floor)[1][:, -1]
-    parts = np.stack([best.real, best.imag], axis=1)
-    return Witness(states=parts[:n], disturbances=parts[n:])
+    S = side
+    return steady_oscillation((S.A.T, S.C1.T, S.B2.T, S.D12.T), (S.B1.T, S.D11.T), angle)

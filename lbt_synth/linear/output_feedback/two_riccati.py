@@ -3,7 +3,10 @@
 The central controller: the disturbance is replaced by its distance from the worst one, and the
 control by its distance from the best one; what is left is to estimate the best control from the
 measurements. M. Green, D. J. N. Limebeer, "Linear Robust Control", Prentice-Hall (1995),
-appendix B. With an infinite level it is the controller of least variance.
+appendix B; A. A. Stoorvogel, "The H-infinity Control Problem", Prentice-Hall (1992), chapter 9.
+The equation of one side is that of control with known state and disturbance; the other side, the
+estimation of the state, is the same problem with all matrices transposed. With an infinite level
+it is the controller of least variance.
 
 All stabilising controllers: with ``u = u_least + R^(-1/2) q`` and
 ``q = Q S^(-1/2) innovation``, R and S the weights of control and innovation, every stable Q gives
@@ -15,33 +18,133 @@ Autom. Control 21, 319 (1976), doi:10.1109/TAC.1976.1101223).
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
-from lbt_synth.errors import NonFiniteError, NumericalError
+from lbt_synth.errors import DetectabilityError, NonFiniteError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant, invert_well_posed
-from lbt_synth.linear.matrix_functions import semidefinite_root
+from lbt_synth.linear.infeasibility_proof import slow_angles
+from lbt_synth.linear.matrix_functions import nearest_powers_of_two, semidefinite_root
 from lbt_synth.linear.norms import hinf_norm
-from lbt_synth.linear.output_feedback.full_information import (
-    FullInformation,
-    WorstCase,
-    control_side,
-    estimation_side,
-)
 from lbt_synth.linear.output_feedback.lower_bound import (
     ControlWitness,
+    Side,
+    WorstCase,
+    control_side,
     coupled_bursts,
+    estimation_side,
     last_step,
-    steady_oscillation,
+    steady_pairs,
 )
+from lbt_synth.linear.riccati.dare import solve_dare, unstable_hidden_mode
+from lbt_synth.linear.riccati.equations import Equations, solve_by_doubling, solve_by_schur
 from lbt_synth.linear.state_space import StateSpace
-from lbt_synth.validation import FloatArray
+from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _TOLERANCE = 1e-11
-_NOTHING = 1e-6  # part of the level of the least variance that counts as none
-_SLOW = 0.99  # a pole of the worst case beyond this may belong to a steady oscillation
+_NOTHING = 1e-6  # part of the largest, of levels or of states of a mode, that counts as none
+_PART = 1e-10  # of the largest singular value, below which a channel cancels nothing
+_ROUNDING = 1e-9  # share of a solution that its residual, or a negative part, may be
+
+
+class FullInformation:
+    """Solves ``X`` of one side for any gamma, as the excess over the least-variance solution.
+
+    With the law of least variance ``u = -feedback x - feedforward w``, what is left is a problem
+    without state weight, so that doubling starts inside the reach of the stabilising solution and
+    D12 may be singular. Of the side of estimation, transposed, ``weight`` is the covariance of
+    the innovation and ``feedback`` its gain into the state.
+    """
+
+    def __init__(self, side: Side) -> None:
+        A, B1, B2, C1, D11, D12 = side
+        dare = solve_dare(A, B2, C1.T @ C1, D12.T @ D12, C1.T @ D12)
+        self.side, self.least = side, dare.X
+        self.weight = D12.T @ D12 + B2.T @ dare.X @ B2
+        self.feedback = dare.gain_feedback
+        self.feedforward = np.linalg.solve(self.weight, B2.T @ dare.X @ B1 + D12.T @ D11)
+        self.A, self.B = A - B2 @ self.feedback, B1 - B2 @ self.feedforward
+        C, D = C1 - D12 @ self.feedback, D11 - D12 @ self.feedforward
+        self.pushed = D.T @ D + self.B.T @ dare.X @ self.B
+        self.cross = self.A.T @ dare.X @ self.B + C.T @ D
+        self.reach = np.linalg.solve(np.linalg.cholesky(self.weight), B2.T).T
+
+    def floor(self) -> float:
+        """Level that no X can have: that of one step after rest."""
+        return float(np.sqrt(max(np.linalg.eigvalsh(self.pushed)[-1], 0.0)))
+
+    def solve(self, gamma: float) -> tuple[float, FloatArray | None]:
+        """Return the slack of the last step's condition, and X where the slack is above 0.
+
+        Next to the least level X may grow without bound, where doubling loses its digits: the
+        ordered Schur form keeps them, and its slack goes on below that level. Where its eigenvalues
+        lie on the circle its X solves nothing, and where the equation is ill scaled it has none.
+        """
+        equation, m = self._equation(gamma), self.B.shape[1]
+        if np.linalg.eigvalsh(equation.R[0, :m, :m])[-1] >= 0:
+            return -1.0, None
+        slack = -1.0
+        for route in (solve_by_schur, solve_by_doubling):
+            slack, X = self._judge(equation, route(equation)[0], gamma)
+            if X is not None:
+                return slack, self.least + X
+        return slack, None
+
+    def _judge(
+        self, equation: Equations, X: FloatArray, gamma: float
+    ) -> tuple[float, FloatArray | None]:
+        """Return the slack of a solution, and its X if it is one that a controller can have."""
+        m, unit = self.B.shape[1], gamma**2 / max(float(np.sum(self.B**2)), 1e-300)
+        gains, residual, relative = equation.evaluate(X)
+        nothing = float(np.linalg.norm(residual)) < _ROUNDING * unit
+        if not (nothing or relative[0] < _ROUNDING):
+            return -1.0, None
+        if np.max(np.abs(equation.poles(gains))) >= 1:
+            return -1.0, None
+        weights = equation.weights(X)[0]
+        answer = np.linalg.solve(weights[m:, m:], weights[m:, :m])
+        slack = -float(np.linalg.eigvalsh(weights[:m, :m] - weights[:m, m:] @ answer)[-1])
+        if slack <= 0:
+            return slack, None
+        sizes = np.linalg.eigvalsh(X[0])
+        negative = sizes[0] < -_ROUNDING * max(sizes[-1], unit)
+        return (-1.0, None) if negative else (slack, X[0])
+
+    def _equation(self, gamma: float) -> Equations:
+        """Return the equation of the excess; disturbances are in units of the level."""
+        (n, m), p = self.B.shape, self.reach.shape[1]
+        return Equations(
+            A=self.A[None],
+            B=np.hstack([self.B / gamma, self.reach])[None],
+            Q=np.zeros((1, n, n)),
+            R=block_diag(self.pushed / gamma**2 - np.eye(m), np.eye(p))[None],
+            S=np.hstack([self.cross / gamma, np.zeros((n, p))])[None],
+        )
+
+    def refine(self, X: FloatArray, gamma: float) -> FloatArray:
+        """Return X after Newton steps on a residual in extended precision."""
+        A, B1, B2, C1, D11, D12 = self.side
+        D = np.hstack([D11, D12])
+        R = D.T @ D - block_diag(gamma**2 * np.eye(B1.shape[1]), np.zeros((B2.shape[1],) * 2))
+        parts = {"A": A, "B": np.hstack([B1, B2]), "Q": C1.T @ C1, "R": R, "S": C1.T @ D}
+        equation = Equations(**{name: part[None] for name, part in parts.items()})
+        refined = equation.refine(X[None], np.zeros(1, dtype=np.int64))
+        return np.asarray(refined.X[0])
+
+    def worst_case(self, X: FloatArray, gamma: float) -> WorstCase:
+        """Return the worst case at a level, for its X."""
+        A, B1, B2, C1, D11, D12 = self.side
+        B, D, m = np.hstack([B1, B2]), np.hstack([D11, D12]), B1.shape[1]
+        R = D.T @ D + B.T @ X @ B
+        R[:m, :m] -= gamma**2 * np.eye(m)
+        law = -np.linalg.solve(R, D.T @ C1 + B.T @ X @ A)
+        answer = np.linalg.solve(R[m:, m:], R[m:, :m])
+        last = np.linalg.eigh(R[:m, :m] - R[:m, m:] @ answer)[1][:, -1:]
+        signals = np.vstack([last, -answer @ last])
+        return WorstCase(A=A + B @ law, C=C1 + D @ law, entry=B @ signals, error=D @ signals)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,13 +193,13 @@ class TwoRiccati:
 
         Raises a NumericalError if not even the level of the least variance has one.
         """
-        found: dict[float, LevelSolution] = {}
+        solutions: dict[float, LevelSolution] = {}
 
         def slack(gamma: float) -> float:
             value, solution = self.solve(gamma)
             if solution is None:
                 return min(value, -_TOLERANCE)  # at a slack of 0 there is no controller
-            found[gamma] = solution
+            solutions[gamma] = solution
             return value
 
         loop = self.plant.closed_loop(self.least_variance())
@@ -106,20 +209,16 @@ class TwoRiccati:
         for growth in np.geomspace(1e-9, 1e9, 19):  # next to nothing rounding is larger
             if not np.isfinite(upper) or slack(upper * (1 + growth)) > 0:
                 break
-        if not found:
+        if not solutions:
             raise NumericalError(
                 "the Riccati equations have no solution at the level of the least variance. "
                 "Scale states and signals to similar sizes.",
                 status="search",
             )
-        upper = min(found)
+        upper = min(solutions)
         if lower < upper and slack(lower) <= 0:
             brentq(slack, lower, upper, xtol=2 * _TOLERANCE * upper)  # its steps are half of it
-        return found[min(found)]
-
-    def _frequency_text(self, angle: float) -> str:
-        """Return the frequency of an angle on the unit circle."""
-        return f"{angle / (2 * np.pi * self.plant.dt_s):.6g} Hz"
+        return solutions[min(solutions)]
 
     def proofs(self, solution: LevelSolution, plant: GeneralizedPlant) -> list[ControlWitness]:
         """Return what may prove of a plant, this or the one next to it, that no level is lower.
@@ -131,39 +230,35 @@ class TwoRiccati:
         with suppress(np.linalg.LinAlgError):
             control = self.control.worst_case(solution.X, solution.gamma)
             estimation = self.estimation.worst_case(solution.Y, solution.gamma)
+            cases = (
+                ("unmoved", control_side(plant), control, solution.X, _CONTROL),
+                ("unseen", estimation_side(plant), estimation, solution.Y, _ESTIMATION),
+            )
+            for pairs, side, worst, cost, (reason, reason_at) in cases:
+                if plant is self.plant:
+                    with suppress(NonFiniteError):  # of a worst case that rounding makes unstable
+                        burst = {pairs: last_step(worst, cost)}
+                        out.append(ControlWitness(**burst, reason=reason))
+                for angle in (*slow_angles(worst.A)[:4], 0.0, np.pi):
+                    steady = {pairs: steady_pairs(side, angle)}
+                    text = f"{reason_at} {angle / (2 * np.pi * plant.dt_s):.6g} Hz"
+                    out.append(ControlWitness(**steady, reason=text))
             if plant is self.plant:
-                with suppress(NonFiniteError):  # of a worst case that rounding makes unstable
-                    unmoved = last_step(control, solution.X)
-                    out.append(ControlWitness(unseen=None, unmoved=unmoved, reason=_CONTROL))
-                with suppress(NonFiniteError):
-                    unseen = last_step(estimation, solution.Y)
-                    out.append(ControlWitness(unseen=unseen, unmoved=None, reason=_ESTIMATION))
                 with suppress(NonFiniteError):
                     unseen, unmoved = coupled_bursts(control, solution.X, estimation, solution.Y)
                     out.append(ControlWitness(unseen=unseen, unmoved=unmoved, reason=_COUPLED))
-            for angle in _slow_angles(control):
-                pairs = steady_oscillation(control_side(plant), angle)
-                words = f"{_CONTROL_AT} {self._frequency_text(angle)}"
-                out.append(ControlWitness(unseen=None, unmoved=pairs, reason=words))
-            for angle in _slow_angles(estimation):
-                pairs = steady_oscillation(estimation_side(plant), angle)
-                words = f"{_ESTIMATION_AT} {self._frequency_text(angle)}"
-                out.append(ControlWitness(unseen=pairs, unmoved=None, reason=words))
         return out
 
 
-def _slow_angles(worst: WorstCase) -> list[float]:
-    """Angles of the slow poles of a worst case, the slowest few, and both ends."""
-    poles = np.linalg.eigvals(worst.A)
-    slow = poles[(np.abs(poles) > _SLOW) & (poles.imag >= 0)]
-    return [*(float(np.angle(pole)) for pole in slow[np.argsort(-np.abs(slow))][:4]), 0.0, np.pi]
-
-
 _COUPLED = "what is not seen in time cannot be made good in time"
-_CONTROL = "even a controller that knows the state and the disturbance leaves as much"
-_ESTIMATION = "even a control that reaches every state leaves as much, as the disturbance is unseen"
-_CONTROL_AT = "even a controller that knows the disturbance leaves as much at"
-_ESTIMATION_AT = "even a control that reaches every state leaves as much, unseen, at"
+_CONTROL = (
+    "even a controller that knows the state and the disturbance leaves as much",
+    "even a controller that knows the disturbance leaves as much at",
+)
+_ESTIMATION = (
+    "even a control that reaches every state leaves as much, as the disturbance is unseen",
+    "even a control that reaches every state leaves as much, unseen, at",
+)
 
 
 def central_controller(
@@ -315,3 +410,140 @@ def free_parameter(equations: TwoRiccati) -> FreeParameter:
         T12=StateSpace(A=P.A - P.B2 @ F, B=B2, C=P.C1 - P.D12 @ F, D=D12, dt_s=dt_s),
         T21=StateSpace(A=P.A - state @ P.C2, B=P.B1 - state @ P.D21, C=C2, D=D21, dt_s=dt_s),
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScaledPlant:
+    """A plant as it was given, and as it is solved."""
+
+    given: GeneralizedPlant
+    plant: GeneralizedPlant  # states and signals scaled by powers of two
+    unit: float  # a level of the scaled plant over that of the given one
+    controls: FloatArray  # (m2,) u of a unit of the scaled u
+    measurements: FloatArray  # (p2,) scaled y of a unit of y
+
+    def closed_loop(self, controller: StateSpace) -> tuple[StateSpace, StateSpace]:
+        """Return a controller of the scaled plant in the given units, and its loop."""
+        K, u = controller, self.controls[:, None]
+        K = replace(K, B=K.B * self.measurements, C=u * K.C, D=u * K.D * self.measurements)
+        return K, self.given.closed_loop(K)
+
+    def equations(self, share: float) -> TwoRiccati:
+        """Return the equations of the plant, with a share of errors and disturbances added."""
+        return TwoRiccati(regularise(self.plant, share) if share else self.plant)
+
+
+def scaled_plant(plant: GeneralizedPlant) -> ScaledPlant:
+    """Return the form in which a plant is solved; DetectabilityError if nothing stabilises it.
+
+    States are balanced, and errors, disturbances, controls and measurements have size one, so that
+    no unit is singular. What a control may cancel, D11, has no part in the sizes.
+    """
+    require_instance(plant, GeneralizedPlant, "plant")
+    require_stabilisable(plant)
+    sizes = _size(plant.C1, plant.D12), _size(plant.B1, plant.D21)
+    z, w = (1 / float(nearest_powers_of_two(np.array([size]))[0]) for size in sizes)
+    P = replace(
+        plant,
+        B1=w * plant.B1,
+        C1=z * plant.C1,
+        D11=z * w * plant.D11,
+        D12=z * plant.D12,
+        D21=w * plant.D21,
+    )
+    P = P.with_whole(P.whole.balanced())
+    controls, measurements = _units(P.B2, P.D12), _units(P.C2.T, P.D21.T)
+    y = measurements[:, None]
+    scaled = replace(
+        P,
+        B2=P.B2 * controls,
+        D12=P.D12 * controls,
+        C2=y * P.C2,
+        D21=y * P.D21,
+        D22=y * P.D22 * controls,
+    )
+    return ScaledPlant(
+        given=plant, plant=scaled, unit=z * w, controls=controls, measurements=measurements
+    )
+
+
+def _units(into: FloatArray, through: FloatArray) -> FloatArray:
+    """Return powers of two that make columns of two matrices together of size about one."""
+    size = np.hypot(np.linalg.norm(into, axis=0), np.linalg.norm(through, axis=0))
+    return 1 / nearest_powers_of_two(size)
+
+
+def regularise(plant: GeneralizedPlant, share: float) -> GeneralizedPlant:
+    """Return the plant with small errors of each control and state, and small disturbances of both.
+
+    ``share`` is their part of the plant's own errors and disturbances. A controller leaves no
+    less in the regularised plant than in the plant itself, and in the limit as much. Where a
+    constant control ``u = K y`` cancels much of D11, the errors are those of the distance from it,
+    and it makes nothing of the disturbances of the measurements: they are relative to what is left.
+    """
+    P, n = plant, len(plant.A)
+    m1, m2, p1, p2 = P.sizes
+    K = _cancelling(P)
+    error = share * _size(P.C1 + P.D12 @ K @ P.C2, P.D12, P.D11 + P.D12 @ K @ P.D21)
+    push = share * _size(P.B1 + P.B2 @ K @ P.D21, P.D21, P.D11 + P.D12 @ K @ P.D21)
+    C1 = np.vstack([P.C1, -error * K @ P.C2, error * np.eye(n)])
+    D12 = np.vstack([P.D12, error * np.eye(m2), np.zeros((n, m2))])
+    B1 = np.hstack([P.B1, -push * P.B2 @ K, push * np.eye(n)])
+    D21 = np.hstack([P.D21, push * np.eye(p2), np.zeros((p2, n))])
+    D11 = np.zeros((len(C1), B1.shape[1]))
+    D11[:p1] = np.hstack([P.D11, -push * P.D12 @ K, np.zeros((p1, n))])
+    D11[p1 : p1 + m2, : m1 + p2] = np.hstack([-error * K @ P.D21, -error * push * K])
+    return replace(P, B1=B1, C1=C1, D11=D11, D12=D12, D21=D21)
+
+
+def _cancelling(plant: GeneralizedPlant) -> FloatArray:
+    """Return the constant control (m2, p2) that leaves least of D11, if it makes nothing larger."""
+    P = plant
+    K = -np.linalg.pinv(P.D12, rcond=_PART) @ P.D11 @ np.linalg.pinv(P.D21, rcond=_PART)
+    through = P.D11 + P.D12 @ K @ P.D21
+    cancelled = _size(P.C1 + P.D12 @ K @ P.C2, P.D12, through)
+    cancelled *= _size(P.B1 + P.B2 @ K @ P.D21, P.D21, through)
+    uncancelled = _size(P.C1, P.D12, P.D11) * _size(P.B1, P.D21, P.D11)
+    return K if cancelled < uncancelled else 0 * K
+
+
+def _size(*parts: FloatArray) -> float:
+    return max(float(np.linalg.norm(part, 2)) for part in parts) or 1.0
+
+
+def require_stabilisable(plant: GeneralizedPlant) -> None:
+    """Raise if a mode that does not decay is not reached by u, or not seen by y."""
+    reached = unstable_hidden_mode(plant.A.T, plant.B2.T, drive=plant.C1.T)
+    seen = unstable_hidden_mode(plant.A, plant.C2, drive=plant.B1)
+    for value, A, C, words in (
+        (reached, plant.A.T, plant.B2.T, "no control reaches it. Give it a control"),
+        (seen, plant.A, plant.C2, "no measurement sees it. Measure it"),
+    ):
+        if value is None:
+            continue
+        vector = _null_vector(A, C, value)
+        raise DetectabilityError(
+            f"no controller stabilises the plant: its mode at {_number(value)} does not decay, and "
+            f"{words}, or take it out of the plant (a weight with such a pole: let it decay a "
+            f"little). The mode is made of the states {_states(vector)}.",
+            eigenvalue=value,
+            eigenvector=frozen_copy(np.abs(vector)),
+        )
+
+
+def _null_vector(A: FloatArray, C: FloatArray, value: complex) -> FloatArray:
+    """Return the unit vector that C does not see and A multiplies by a value, (n,) complex."""
+    pencil = np.vstack([A - value * np.eye(len(A)), C])
+    return np.asarray(np.linalg.svd(pencil)[2][-1].conj())
+
+
+def _states(vector: FloatArray) -> str:
+    """Name the few states that have the largest part in a mode."""
+    size = np.abs(vector) / np.max(np.abs(vector))
+    order = [int(i) for i in np.argsort(-size) if size[i] > _NOTHING]
+    named = ", ".join(f"{i} ({size[i]:.3g})" for i in order[:4])
+    return named + (", ..." if len(order) > 4 else "")
+
+
+def _number(value: complex) -> str:
+    return f"{value.real + 0.0:.6g}" if abs(value.imag) <= 1e-9 * abs(value) else f"{value:.6g}"

@@ -7,11 +7,18 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag, eigvals
 
-from lbt_synth.errors import DimensionError, InfeasibleError, NumericalError, ProblemError
-from lbt_synth.linear.riccati.equations import Equations, Solutions
-from lbt_synth.linear.riccati.routes import ROUTES
-from lbt_synth.linear.riccati.solvability import require_stabilising
+from lbt_synth.errors import (
+    DefinitenessError,
+    DetectabilityError,
+    DimensionError,
+    InfeasibleError,
+    NumericalError,
+    ProblemError,
+)
+from lbt_synth.linear.riccati.equations import ROUTES, Equations, Solutions
+from lbt_synth.linear.state_space import balancing_scales
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -30,16 +37,12 @@ _SATISFIED = 1e-8  # if the estimated error of X is larger, the next route is tr
 # exists if Newton's method, started at X, converges in spite of rounding (Kantorovich: below 1/4).
 _NEAR = 1e-2
 _CONTRACTION = 0.1
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Attempt:
-    """What one route did."""
-
-    route: str  # "doubling", "shifted doubling" or "schur"
-    # numbers of equations that it was given, and that it solved
-    tried: int
-    solved: int
+_RANK = 1e-10  # share of a matrix below which an input or an output does nothing
+# A multiple eigenvalue on the circle is computed up to this far from it. It is tested on the circle
+# as well, where a mode that decays passes.
+_CIRCLE = 1e-3
+_ROUNDING = 1e-14  # share of a pencil that rounding of the data may be: its singular value is zero
+_ELSEWHERE = 0.37 + 0.61j  # an arbitrary point, at which only a singular pencil is singular
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,7 +64,9 @@ class DareSolution:
     # of the control problem; elsewhere X is a saddle point
     negative: IntArray
     iterations: int  # most doublings made for an equation
-    attempts: tuple[Attempt, ...]  # routes in the order they were tried
+    # routes that solved something, in the order they were tried: "doubling", "shifted doubling" and
+    # "schur"
+    route: str
 
     @property
     def residual(self) -> float:
@@ -72,12 +77,6 @@ class DareSolution:
     def error(self) -> float:
         """Largest estimate of the relative error of X."""
         return float(np.max(self.errors, initial=0.0))
-
-    @property
-    def route(self) -> str:
-        """Routes that solved something, in the order they were tried."""
-        solvers = [attempt.route for attempt in self.attempts if attempt.solved]
-        return ", ".join(solvers or [attempt.route for attempt in self.attempts])
 
 
 def solve_dare(
@@ -167,14 +166,14 @@ def _join_parts(equations: Equations, parts: list[tuple[IntArray, IntArray]]) ->
         errors=read_only(np.max([part.errors for part in joined], axis=0)),
         negative=read_only(np.sum([part.negative for part in joined], axis=0)),
         iterations=max(part.iterations for part in joined),
-        attempts=max((part.attempts for part in joined), key=len),
+        route=max((part.route for part in joined), key=len),
     )
 
 
 def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
     """Solve a stack, verify each answer, and put the leading dimensions back."""
     balanced, factors, units = equations.scaled()
-    best, attempts = _try_routes(balanced)
+    best, route = _try_routes(balanced)
     radius = np.abs(best.poles).max(axis=-1)
 
     solved = (radius < 1) & (best.residuals <= RESIDUAL_LIMIT) & (best.errors <= ERROR_LIMIT)
@@ -189,7 +188,7 @@ def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
         except ValueError:  # numbers out of range (LinAlgError): refused without a reason
             continue
     if not solved.all():
-        _refuse(int(np.flatnonzero(~solved)[0]), lead, best, attempts)
+        _refuse(int(np.flatnonzero(~solved)[0]), lead, best)
     X = best.X
     weights = balanced.weights(X)
     negative = np.sum(np.linalg.eigvalsh(weights) < 0, axis=-1)
@@ -205,7 +204,7 @@ def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
         errors=frozen_copy(best.errors.reshape(lead)),
         negative=read_only(negative.reshape(lead)),
         iterations=int(np.max(best.steps, initial=0)),
-        attempts=attempts,
+        route=route,
     )
 
 
@@ -237,26 +236,34 @@ def _stack_arguments(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations,
     return Equations(**stacks), lead
 
 
-def _try_routes(equations: Equations) -> tuple[Solutions, tuple[Attempt, ...]]:
-    """Try the routes in order, each on the equations that are still unsolved; keep the best."""
-    best: Solutions | None = None
-    attempts = []
-    pending = np.arange(len(equations.A))
+def _try_routes(equations: Equations) -> tuple[Solutions, str]:
+    """Try the routes in order, each on the equations that are still unsolved; keep the best.
+
+    Return the names of the routes that solved something as well, or of all.
+    """
+    count, (n, m) = len(equations.A), equations.B.shape[-2:]
+    best = Solutions(
+        X=np.full((count, n, n), np.nan),
+        gains=np.full((count, m, n), np.nan),
+        poles=np.full((count, n), np.nan, dtype=np.complex128),
+        residuals=np.full(count, np.inf),
+        errors=np.full(count, np.inf),
+        steps=np.zeros(count, dtype=np.int64),
+    )
+    names, pending = [], np.arange(count)
     for route, solve in ROUTES:
-        if best is not None and pending.size == 0:
-            break
-        part = equations.take(pending)
-        found = part.refine(*solve(part))
-        stable = np.abs(found.poles).max(axis=-1) < 1
-        found = replace(found, residuals=np.where(stable, found.residuals, np.inf))
-        best = best or found
-        better = found.residuals < best.residuals[pending]
-        best.replace_rows(pending[better], found, better)
-        satisfied = (found.residuals <= RESIDUAL_LIMIT) & (found.errors <= _SATISFIED)
-        attempts.append(Attempt(route=route, tried=pending.size, solved=int(satisfied.sum())))
+        unsolved = equations.take(pending)
+        trial = unsolved.refine(*solve(unsolved))
+        stable = np.abs(trial.poles).max(axis=-1) < 1
+        trial = replace(trial, residuals=np.where(stable, trial.residuals, np.inf))
+        better = trial.residuals < best.residuals[pending]
+        best.replace_rows(pending[better], trial, better)
+        satisfied = (trial.residuals <= RESIDUAL_LIMIT) & (trial.errors <= _SATISFIED)
+        names += [route] if satisfied.any() else []
         pending = pending[~satisfied]
-    assert best is not None  # there are routes
-    return best, tuple(attempts)
+        if not pending.size:
+            break
+    return best, ", ".join(names or [route for route, _ in ROUTES])
 
 
 def _prefix(index: int, lead: tuple[int, ...]) -> str:
@@ -267,21 +274,20 @@ def _prefix(index: int, lead: tuple[int, ...]) -> str:
     return f"equation {where[0] if len(where) == 1 else where}: "
 
 
-def _refuse(
-    index: int, lead: tuple[int, ...], best: Solutions, attempts: tuple[Attempt, ...]
-) -> None:
+def _refuse(index: int, lead: tuple[int, ...], best: Solutions) -> None:
+    """Refuse an equation that no route solved."""
     residual, error = float(best.residuals[index]), float(best.errors[index])
     stable = bool(np.isfinite(residual))
-    found = "no stable closed loop"
+    outcome = "no stable closed loop"
     if stable:
         gap = 1 - float(np.abs(best.poles[index]).max())
-        found = (
+        outcome = (
             f"a relative residual of {residual:.3g}, an estimated error of {error:.3g} and a pole "
             f"{gap:.3g} inside the unit circle"
         )
     raise NumericalError(
         f"{_prefix(index, lead)}the Riccati equation was not solved: "
-        f"{', '.join(attempt.route for attempt in attempts)} gave {found}; expected a stable "
+        f"{', '.join(route for route, _ in ROUTES)} gave {outcome}; expected a stable "
         f"closed loop, a residual below {RESIDUAL_LIMIT:g} and an estimated error below "
         f"{ERROR_LIMIT:g}, and a pole further from the unit circle than rounding can move it. "
         "There may be no stabilising solution; look for modes near the unit circle that are barely "
@@ -315,3 +321,105 @@ def _require_saddle(
             f"{_prefix(int(i), lead)}{wrong} The level that R holds cannot be met: try a larger "
             "one."
         )
+
+
+def unstable_hidden_mode(
+    A: FloatArray, C: FloatArray, *, drive: FloatArray, only_unit_circle: bool = False
+) -> complex | None:
+    """Eigenvalue of A that does not decay and that C does not see, or None.
+
+    The Popov-Belevitch-Hautus test on the eigenvalues with modulus 1 or more
+    (or about 1, with ``only_unit_circle``). ``drive`` (n, p), which enters the states,
+    serves to scale them, because the answer must not depend on their units.
+    """
+    n = A.shape[0]
+    entry, leaving = np.linalg.norm(drive, axis=1), np.linalg.norm(C, axis=0)
+    units = balancing_scales(A, entry, leaving)[:n]
+    A, C = A * units / units[:, None], C * units
+    scale_A = max(float(np.linalg.norm(A, 2)), 1e-300)
+    scale_C = max(float(np.linalg.norm(C, 2)), 1e-300)
+    points: list[tuple[complex, float]] = []
+    for value in np.linalg.eigvals(A):
+        size = abs(value)
+        if size >= 1 - _RANK and not (only_unit_circle and size > 1 + _RANK):
+            points.append((complex(value), _RANK))
+        if abs(size - 1) < _CIRCLE:
+            points.append((complex(value / size), _ROUNDING))
+    for point, tolerance in points:
+        pencil = np.vstack([(A - point * np.eye(n)) / scale_A, C / scale_C])
+        if np.linalg.svd(pencil, compute_uv=False)[-1] < tolerance:
+            return point
+    return None
+
+
+def require_stabilising(equations: Equations, index: int, name: str = "") -> None:
+    """Raise if an equation has no stabilising solution for a reason that can be named."""
+    A, B, Q, R, S = (getattr(equations, key)[index] for key in "ABQRS")
+    hidden = unstable_hidden_mode(A.T, B.T, drive=weight_root(Q))
+    if hidden is not None:
+        raise DetectabilityError(
+            f"{name}(A, B) must be stabilisable; the mode of A at {hidden:.6g} does not decay and "
+            "B does not reach it. Give it an input, or take it out of the model.",
+            eigenvalue=hidden,
+        )
+    inputs = np.vstack([part / max(np.abs(part).max(), 1e-300) for part in (B, R, S)])
+    if np.linalg.svd(inputs, compute_uv=False)[-1] < _RANK:
+        raise DefinitenessError(
+            f"{name}R must be positive definite, or B and S must act where it is not; got a "
+            "combination of inputs that has no weight and no effect. Leave it out."
+        )
+    if np.linalg.eigvalsh(R)[0] > 0:
+        feedback = np.linalg.solve(R, S.T)
+        weight = Q - S @ feedback
+        hidden = unstable_hidden_mode(
+            A - B @ feedback, weight_root((weight + weight.T) / 2).T, drive=B, only_unit_circle=True
+        )
+        if hidden is not None:
+            raise DetectabilityError(
+                f"{name}Q must see every mode on the unit circle; the mode of A at {hidden:.6g} "
+                "has no weight, so there is no stabilising solution. Add a small weight on it.",
+                eigenvalue=hidden,
+            )
+    zero = _unit_circle_zero(A, B, Q, R, S, name)
+    if zero is not None:
+        raise DetectabilityError(
+            f"{name}to rounding, the equation has a zero on the unit circle, at {zero:.6g}: there "
+            "its weights leave an oscillation free of cost, so there is no stabilising solution. "
+            "Add a small weight.",
+            eigenvalue=zero,
+        )
+
+
+def weight_root(weight: FloatArray) -> FloatArray:
+    """Columns whose squares add up to the absolute value of a symmetric matrix."""
+    values, vectors = np.linalg.eigh(weight)
+    size = np.abs(values)
+    size = np.where(size > 1e-14 * size.max(initial=0.0), size, 0.0)  # a root doubles its digits
+    return np.asarray(vectors * np.sqrt(size), dtype=np.float64)
+
+
+def _unit_circle_zero(
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray, name: str
+) -> complex | None:
+    """Eigenvalue on the unit circle of the extended symplectic pencil, or None."""
+    (n, m), zero = B.shape, np.zeros
+    weight = max(np.abs(Q).max(), np.abs(R).max(), np.abs(S).max(), 1e-300)
+    Q, R, S = Q / weight, R / weight, S / weight
+    M = np.block([[A, zero((n, n)), B], [-Q, np.eye(n), -S], [S.T, zero((m, n)), R]])
+    N = block_diag(np.eye(n), np.vstack([A.T, -B.T]), zero((0, m)))
+    size = float(np.linalg.norm(M, 2))
+    elsewhere = M - _ELSEWHERE * N
+    elsewhere = elsewhere / np.maximum(np.abs(elsewhere).max(axis=1, keepdims=True), 1e-300)
+    if np.linalg.svd(elsewhere, compute_uv=False)[-1] < _ROUNDING:
+        raise DefinitenessError(
+            f"{name}R + B'XB must not be singular; it is, whatever X: some input has neither a "
+            "weight nor an effect that Q sees. Give R or Q a small weight there."
+        )
+    values = eigvals(M, N)
+    for value in values[np.isfinite(values)]:
+        if abs(abs(value) - 1) > _CIRCLE:
+            continue
+        on_circle = value / abs(value)
+        if np.linalg.svd(M - on_circle * N, compute_uv=False)[-1] < _ROUNDING * size:
+            return complex(on_circle)
+    return None

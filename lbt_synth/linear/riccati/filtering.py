@@ -1,7 +1,9 @@
-"""Solve the Riccati equations of the Kalman and the H-infinity predictor; find the least gamma.
+"""The Riccati equations of the Kalman and the H-infinity predictor, and the least gamma.
 
-Measurements that are not read are left out, and have no gain. Problems with a longer period are
-solved in :mod:`lbt_synth.linear.riccati.periodic`.
+One sample of a recursion ``P+ = A P (I + G P)^-1 A' + H`` is the triple (A, G, H). The triples of
+a period are joined into one, whose fixed point is found; a sweep through the period then gives the
+solution of each phase. A problem that is constant is one of a single phase. Measurements that are
+not read are left out, and have no gain; all are in units of their noise.
 
 B. Hassibi, A. H. Sayed, T. Kailath, "Indefinite-Quadratic Estimation and
 Control", SIAM (1999), doi:10.1137/1.9781611970760, chapter 4 (a-priori filter).
@@ -9,7 +11,8 @@ Control", SIAM (1999), doi:10.1137/1.9781611970760, chapter 4 (a-priori filter).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cache, reduce
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -22,12 +25,27 @@ from lbt_synth.linear.estimation_problem import (
     error_units,
     scale_states,
 )
-from lbt_synth.linear.matrix_functions import is_stable, nearest_powers_of_two
-from lbt_synth.linear.riccati.dare import solve_dare
-from lbt_synth.linear.riccati.equations import Equations
-from lbt_synth.linear.riccati.routes import doubling
-from lbt_synth.linear.riccati.solvability import unstable_hidden_mode
+from lbt_synth.linear.matrix_functions import (
+    as_stack,
+    is_stable,
+    nearest_powers_of_two,
+    relative_distance,
+    symmetrise,
+)
+from lbt_synth.linear.riccati.dare import (
+    ERROR_LIMIT,
+    solve_dare,
+    unstable_hidden_mode,
+    weight_root,
+)
+from lbt_synth.linear.riccati.equations import Equations, doubling
 from lbt_synth.validation import FloatArray, frozen_copy
+
+_RESIDUAL_LIMIT = 1e-9  # relative, of a gamma-Riccati equation; checked by its refusal
+_GAMMA_TOLERANCE = 4e-12  # relative, of the search: a few times the rounding of a slack
+_INDEFINITE = 1e-6  # share of X that poles near the unit circle may leave below zero in a doubling
+
+_Triple = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,10 +60,10 @@ class FilterRiccati:
     gain_predictor: FloatArray
     gain_filter: FloatArray
     # relative residual of the equation; with a longer period, relative change of P in the last
-    # step, or over a period
+    # Newton step, or over a period; nan of an inequality
     residual: float
-    iterations: int  # number of doublings; with a longer period, of Newton steps after them
-    status: str  # the route that gave P
+    iterations: int  # number of doublings, or of steps of the solver
+    status: str  # the route that gave P, or what the solver reports; no certificate uses it
 
 
 def require_detectable(problem: EstimationProblem) -> None:
@@ -96,25 +114,97 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
     >>> round(float(lbt.linear.kalman_riccati(p).P[0, 0]), 12)
     1.61803398875
     """
+    scaled, units = _in_noise_units(problem)
+    constant = _over_a_period(scaled)
+    require_detectable(constant)
+    dare = solve_dare(constant.A.T, constant.C.T, constant.Q, constant.R, constant.S)
+    covariances, residual = dare.X[None], dare.residual
     if problem.period > 1:
-        from lbt_synth.linear.riccati.periodic import periodic_kalman
+        covariances, residual = _settle_phases(scaled, dare.X)
+    gains = np.stack([kalman_gains(scaled, t, P) for t, P in enumerate(covariances)], axis=1)
+    if problem.period == 1:
+        gains[0, 0][:, problem.read[0]] = dare.gain_feedback.T  # refined in extended precision
+    return _filter_of(covariances, gains / units, residual, dare.iterations, dare.route)
 
-        return periodic_kalman(problem)
-    part = ReadPart(problem)
-    if not part.is_whole:
-        return part.scatter(kalman_riccati(part.problem))
-    require_detectable(problem)
-    dare = solve_dare(problem.A.T, problem.C.T, problem.Q, problem.R, problem.S)
-    innovation = problem.R + problem.C @ dare.X @ problem.C.T
-    gain_filter = np.linalg.solve(innovation, problem.C @ dare.X).T
+
+def _in_noise_units(problem: EstimationProblem) -> tuple[EstimationProblem, FloatArray]:
+    """Return the problem in units (q,) of the noise of its measurements, powers of two."""
+    D = as_stack(problem.D) * problem.read[:, :, None]
+    units = nearest_powers_of_two(np.linalg.norm(D, axis=-1).max(axis=0))
+    return problem.bare(C=problem.C / units[:, None], D=problem.D / units[:, None]), units
+
+
+def _over_a_period(problem: EstimationProblem) -> EstimationProblem:
+    """Return the constant problem whose Kalman recursion over a sample is that over a period."""
+    if problem.period == 1:
+        return problem.phase(0)
+    triples = (_kalman_triple(problem, t) for t in range(problem.period))
+    A, G, H = reduce(_join_triples, triples)
+    zero, identity = np.zeros_like(A), np.eye(len(A))
+    B, D = np.hstack([weight_root(H), zero]), np.hstack([zero, identity])
+    return EstimationProblem(A=A, B=B, C=weight_root(G).T, D=D, L=identity)
+
+
+def _filter_of(
+    P: FloatArray, gains: FloatArray, residual: float, iterations: int, status: str
+) -> FilterRiccati:
+    """Return the solution of P (N, n, n) and gains (2, N, n, q), whose only phase is squeezed."""
+    phases = 0 if len(P) == 1 else slice(None)
     return FilterRiccati(
-        P=dare.X,
-        gain_predictor=frozen_copy(dare.gain_feedback.T),
-        gain_filter=frozen_copy(gain_filter),
-        residual=dare.residual,
-        iterations=dare.iterations,
-        status=dare.route,
+        P=frozen_copy(P[phases]),
+        gain_predictor=frozen_copy(gains[0][phases]),
+        gain_filter=frozen_copy(gains[1][phases]),
+        residual=residual,
+        iterations=iterations,
+        status=status,
     )
+
+
+def _settle_phases(problem: EstimationProblem, P: FloatArray) -> tuple[FloatArray, float]:
+    """Return the covariances of all phases, (N, n, n), and their last relative change.
+
+    After a sweep in Joseph's form, each Newton step takes the covariances that the gains leave.
+    """
+    covariances = np.empty_like(problem.A)
+    for t in range(problem.period):
+        covariances[t] = P
+        gain = kalman_gains(problem, t, P)[0]
+        error, drive = problem.A[t] - gain @ problem.C[t], problem.B[t] - gain @ problem.D[t]
+        P = symmetrise(error @ P @ error.T + drive @ drive.T)
+    change, last = 1.0, np.inf
+    while 0 < change < last / 2:
+        gains = np.stack([kalman_gains(problem, t, P)[0] for t, P in enumerate(covariances)])
+        error_system = problem.error_system(gains)
+        if not error_system.spectral_radius < 1:
+            change = np.inf
+            break
+        refined = error_system.covariances()
+        last, change = change, relative_distance(covariances, refined)
+        covariances = refined
+    if change > ERROR_LIMIT:
+        raise NumericalError(
+            f"the periodic Riccati equation was solved only to a relative {change:.3g}; expected "
+            f"{ERROR_LIMIT:g}. Scale the states to similar sizes.",
+            status="residual",
+            residual=change,
+        )
+    return covariances, change
+
+
+def _join_triples(first: _Triple, then: _Triple) -> _Triple:
+    """Return the triple of two samples of the recursion, one after the other."""
+    (A1, G1, H1), (A2, G2, H2) = first, then
+    identity = np.eye(len(A1))
+    onward = A2 @ np.linalg.solve(identity + H1 @ G2, identity)
+    information = np.linalg.solve(identity + G2 @ H1, G2) @ A1
+    return onward @ A1, symmetrise(G1 + A1.T @ information), symmetrise(H2 + onward @ H1 @ A2.T)
+
+
+def _kalman_triple(problem: EstimationProblem, t: int) -> _Triple:
+    """Return one sample of the Kalman recursion, with process and measurement noise separated."""
+    _, _, C, D = problem.read_parts(t)
+    A, B, _ = decorrelate(problem, t)
+    return A, symmetrise(C.T @ np.linalg.solve(D @ D.T, C)), B @ B.T
 
 
 def kalman_gains(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArray:
@@ -128,54 +218,13 @@ def kalman_gains(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArra
     return out
 
 
-_ALIKE = 1e4  # ratio of the noise of measurements up to which they keep their units
-
-
-class ReadPart:
-    """The measurements of a problem that are read, in units of their noise if these differ much."""
-
-    def __init__(self, problem: EstimationProblem) -> None:
-        A, B, C, D = problem.read_parts(0)
-        self.rows = problem.read[0]
-        sizes = np.linalg.norm(D, axis=1)
-        alike = sizes.max() <= _ALIKE * sizes.min()
-        self.units = np.ones(len(D)) if alike else nearest_powers_of_two(sizes)
-        self.is_whole = bool(alike and self.rows.all())
-        self.problem = problem
-        if not self.is_whole:
-            C, D = (part / self.units[:, None] for part in (C, D))
-            self.problem = EstimationProblem(A=A, B=B, C=C, D=D, L=problem.L, dt_s=problem.dt_s)
-
-    def gather(self, solution: FilterRiccati) -> FilterRiccati:
-        """Return a solution of the whole problem as one of the part."""
-        if self.is_whole:
-            return solution
-        predictor, filtering = solution.gain_predictor, solution.gain_filter
-        predictor, filtering = (gain[:, self.rows] * self.units for gain in (predictor, filtering))
-        return replace(solution, gain_predictor=predictor, gain_filter=filtering)
-
-    def scatter(self, solution: FilterRiccati) -> FilterRiccati:
-        """Return a solution of the part with gains of all measurements, zero for the others."""
-        if self.is_whole:
-            return solution
-        gains = np.zeros((2, len(solution.P), len(self.rows)))
-        gains[:, :, self.rows] = solution.gain_predictor, solution.gain_filter
-        gains[:, :, self.rows] /= self.units
-        predictor, filtering = (frozen_copy(gain) for gain in gains)
-        return replace(solution, gain_predictor=predictor, gain_filter=filtering)
-
-
-_RESIDUAL_LIMIT = 1e-9
-_GAMMA_TOLERANCE = 4e-12
-_INDEFINITE = 1e-6  # what poles near the unit circle may leave below zero in a doubling
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LevelTrial:
     """Whether one level can be met, and the solution of its equation if so."""
 
     slack: float  # least eigenvalue of ``I - L P L' / gamma^2``; negative if it cannot be met
-    P: FloatArray | None = None  # (n, n), in the units of the equation
+    P: FloatArray | None = None  # (N, n, n), in the units of the equation
+    residual: float = 0.0  # relative change of P over a period
     iterations: int = 0  # doublings
 
 
@@ -196,63 +245,65 @@ class GammaEquation:
 
     H1 is positive semidefinite and holds no difference of large numbers, so the
     doubling starts inside the stabilising solution's reach. The states are in units in which
-    the Kalman errors have size one.
+    the Kalman errors have size one, the measurements in those of their noise.
     """
 
     def __init__(self, problem: EstimationProblem, start: FilterRiccati) -> None:
-        self.units = error_units(start.P)
-        self.problem = scale_states(problem, self.units)
-        self.start = _scale_solution(start, 1 / self.units)
-        self.A, self.B, self.injection = decorrelate(self.problem)
-        self.identity = np.eye(len(self.A))
-        self.keep = self.identity - self.start.gain_filter @ self.problem.C
-        filtered = self.keep @ self.start.P
-        self.filtered = (filtered + filtered.T) / 2
-        self.information = self.problem.C.T @ np.linalg.solve(self.problem.R, self.problem.C)
+        covariances = as_stack(start.P)
+        self.units = error_units(covariances)
+        scaled, self.noise_units = _in_noise_units(problem)
+        self.problem = scale_states(scaled, self.units)
+        self.least = covariances / self.units / self.units.T
+        self.samples = []  # A, filtered covariance, F and C'R^-1 C of each phase
+        for t, P in enumerate(self.least):
+            A, information, _ = _kalman_triple(self.problem, t)
+            rows, C = self.problem.read[t], self.problem.read_parts(t)[2]
+            keep = np.eye(len(A)) - kalman_gains(self.problem, t, P)[1][:, rows] @ C
+            self.samples.append((A, symmetrise(keep @ P), keep, information))
 
     def trial(self, gamma: float) -> LevelTrial:
         """Solve at one level, to the accuracy of the doubling."""
-        L, P0 = self.problem.L, self.start.P
-        seen = L @ self.filtered
-        room = np.eye(L.shape[0]) - seen @ L.T / gamma**2
-        if np.linalg.eigvalsh(room)[0] <= 0:
+        L, identity = self.problem.L, np.eye(self.problem.n_states)
+        triples = []
+        for A, filtered, keep, information in self.samples:
+            seen = L @ filtered
+            room = np.eye(len(L)) - seen @ L.T / gamma**2
+            if np.linalg.eigvalsh(room)[0] <= 0:
+                return LevelTrial(slack=-1.0)
+            spread = np.linalg.solve(room, L) / gamma**2
+            widened = (identity + seen.T @ spread) @ keep
+            G1 = (information - L.T @ L / gamma**2) @ widened
+            H1 = A @ (seen.T @ spread @ filtered) @ A.T
+            triples.append((A @ widened, symmetrise(G1), symmetrise(H1)))
+        A, G, H = reduce(_join_triples, triples)
+        excess, steps = doubling(A.T[None], G[None], H[None])
+        X, transition, slack = excess[0], identity, np.inf
+        P = np.empty_like(self.least)
+        for t, (A1, G1, H1) in enumerate(triples):
+            if not np.isfinite(X).all():
+                return LevelTrial(slack=-1.0)
+            spectrum = np.linalg.eigvalsh(X)
+            if spectrum[0] < -_INDEFINITE * abs(spectrum[-1]):
+                return LevelTrial(slack=-1.0)
+            P[t] = self.least[t] + X
+            slack = min(slack, 1 - float(np.linalg.eigvalsh(L @ P[t] @ L.T)[-1]) / gamma**2)
+            onward = np.linalg.solve((identity + X @ G1).T, A1.T).T  # A (I + P W)^-1
+            transition = onward @ transition
+            X = symmetrise(onward @ X @ A1.T + H1)
+        if not is_stable(transition):
             return LevelTrial(slack=-1.0)
-        W = self.information - L.T @ L / gamma**2
-        spread = np.linalg.solve(room, L) / gamma**2
-        widened = (self.identity + seen.T @ spread) @ self.keep
-        A1, G1 = self.A @ widened, W @ widened
-        H1 = self.A @ (seen.T @ spread @ self.filtered) @ self.A.T
-        found, steps = doubling(A1.T[None], (G1 + G1.T)[None] / 2, (H1 + H1.T)[None] / 2)
-        X = found[0]
-        if not np.all(np.isfinite(X)):
-            return LevelTrial(slack=-1.0)
-        P = P0 + X
-        spectrum = np.linalg.eigvalsh(X)
-        slack = 1 - float(np.linalg.eigvalsh(L @ P @ L.T)[-1]) / gamma**2
-        transition = np.linalg.solve((self.identity + X @ G1).T, A1.T).T  # A (I + P W)^-1
-        if spectrum[0] < -_INDEFINITE * abs(spectrum[-1]) or not is_stable(transition):
-            return LevelTrial(slack=-1.0)
-        return LevelTrial(slack=slack, P=P if slack > 0 else None, iterations=int(steps[0]))
+        residual = relative_distance(self.least[0] + X, P[0])
+        if slack <= 0:
+            return LevelTrial(slack=slack)
+        return LevelTrial(slack=slack, P=P, residual=residual, iterations=int(steps[0]))
 
     def solution(self, gamma: float, trial: LevelTrial) -> FilterRiccati | None:
-        """Refine a trial by Newton steps and form its gains; None if it is no filter."""
+        """Refine a trial and form its gains; None if it is no filter."""
         if trial.P is None:
             return None
-        problem, n, q = self.problem, len(self.A), len(self.problem.C)
-        outputs = np.vstack([problem.C, problem.L / gamma])
-        weight = block_diag(problem.R, -np.eye(len(problem.L)))
-        equation = Equations(
-            A=self.A.T[None],
-            B=outputs.T[None],
-            Q=(self.B @ self.B.T)[None],
-            R=weight[None],
-            S=np.zeros((1, n, len(outputs))),
-        )
-        P, residual = np.zeros((n, n)), 0.0
-        for x, u in equation.independent_parts():
-            own = np.ix_(x, x)
-            refined = equation.part(x, u).refine(trial.P[own][None], np.array([trial.iterations]))
-            P[own], residual = refined.X[0], max(residual, float(refined.residuals[0]))
+        problem, P, residual = self.problem, trial.P, trial.residual
+        if problem.period == 1:
+            P, residual = self._refined(gamma, P)
         if residual > _RESIDUAL_LIMIT:
             raise NumericalError(
                 f"the gamma-Riccati equation at gamma = {gamma:.9g} was solved only to a relative "
@@ -261,32 +312,48 @@ class GammaEquation:
                 status="residual",
                 residual=residual,
             )
-        # the first block column of P outputs' Re^-1, with Re the indefinite covariance of the
-        # innovations of y and of z / gamma: Pt itself may be unbounded
-        innovations = outputs @ P @ outputs.T + weight
-        gain_filter = np.asarray(np.linalg.solve(innovations, outputs @ P)[:q].T)
-        gain = self.A @ gain_filter + self.injection
-        if not is_stable(problem.A - gain @ problem.C):
+        gains = np.stack([_central_gains(problem, t, gamma, p) for t, p in enumerate(P)], axis=1)
+        if not problem.error_system(gains[0]).spectral_radius < 1:
             return None
-        solution = FilterRiccati(
-            P=P,
-            gain_predictor=gain,
-            gain_filter=gain_filter,
-            residual=residual,
-            iterations=trial.iterations,
-            status="doubling",
+        gains = self.units * gains / self.noise_units
+        covariances = self.units * P * self.units.T
+        return _filter_of(covariances, gains, residual, trial.iterations, "doubling")
+
+    def _refined(self, gamma: float, P: FloatArray) -> tuple[FloatArray, float]:
+        """Return the solution of one phase after Newton steps, (1, n, n), and its residual."""
+        _, _, C, D = self.problem.read_parts(0)
+        A, B, _ = decorrelate(self.problem)
+        outputs = np.vstack([C, self.problem.L / gamma])
+        equation = Equations(
+            A=A.T[None],
+            B=outputs.T[None],
+            Q=(B @ B.T)[None],
+            R=block_diag(D @ D.T, -np.eye(len(self.problem.L)))[None],
+            S=np.zeros((1, len(A), len(outputs))),
         )
-        return _scale_solution(solution, self.units)
+        out, residual = np.zeros_like(P), 0.0
+        for x, u in equation.independent_parts():
+            block = np.ix_(np.zeros(1, dtype=np.int64), x, x)
+            refined = equation.part(x, u).refine(P[block], np.zeros(1, dtype=np.int64))
+            out[block], residual = refined.X, max(residual, float(refined.residuals[0]))
+        return out, residual
 
 
-def _scale_solution(solution: FilterRiccati, units: FloatArray) -> FilterRiccati:
-    """Return the solution with its states multiplied by units (n, 1)."""
-    return replace(
-        solution,
-        P=frozen_copy(units * solution.P * units.T),
-        gain_predictor=frozen_copy(units * solution.gain_predictor),
-        gain_filter=frozen_copy(units * solution.gain_filter),
-    )
+def _central_gains(problem: EstimationProblem, t: int, gamma: float, P: FloatArray) -> FloatArray:
+    """Return the gains of predictor and filter (2, n, q) of the central filter at a phase.
+
+    They are the first block column of ``P outputs' Re^-1``, with Re the indefinite covariance of
+    the innovations of y and of z / gamma: Pt itself may be unbounded.
+    """
+    _, _, C, D = problem.read_parts(t)
+    A, _, injection = decorrelate(problem, t)
+    outputs = np.vstack([C, problem.L / gamma])
+    innovations = outputs @ P @ outputs.T + block_diag(D @ D.T, -np.eye(len(problem.L)))
+    gain_filter = np.linalg.solve(innovations, outputs @ P)[: len(C)].T
+    out = np.zeros((2, problem.n_states, problem.n_measurements))
+    rows = problem.read[t % problem.period]
+    out[0][:, rows], out[1][:, rows] = A @ gain_filter + injection, gain_filter
+    return out
 
 
 def gamma_riccati(
@@ -325,23 +392,13 @@ def gamma_riccati(
     (True, False)
     """
     start = kalman_riccati(problem) if start is None else start
-    if problem.period > 1:
-        from lbt_synth.linear.riccati.periodic import periodic_hinf
-
-        return periodic_hinf(problem, gamma, start)
-    part = ReadPart(problem)
-    equation = GammaEquation(part.problem, part.gather(start))
-    solution = equation.solution(gamma, equation.trial(gamma))
-    return None if solution is None else part.scatter(solution)
+    equation = GammaEquation(problem, start)
+    return equation.solution(gamma, equation.trial(gamma))
 
 
 def meets_level(problem: EstimationProblem, gamma: float, start: FilterRiccati) -> bool:
     """Return whether a filter meets a level of gamma; ``start`` is the Kalman filter's solution."""
-    if problem.period > 1:
-        return gamma_riccati(problem, gamma, start=start) is not None
-    part = ReadPart(problem)
-    equation = GammaEquation(part.problem, part.gather(start))
-    return equation.trial(gamma).P is not None
+    return GammaEquation(problem, start).trial(gamma).P is not None
 
 
 def least_gamma(
@@ -350,37 +407,25 @@ def least_gamma(
     """Bracket the least gamma, at which ``gamma^2 I - L P L'`` stops being positive.
 
     Returns the ends of the bracket, and the filter at the upper one. The bracket is 1e-11 wide,
-    relative; with a longer period 1e-9.
+    relative.
     """
-    start = kalman_riccati(problem) if start is None else start
-    if problem.period > 1:
-        from lbt_synth.linear.riccati.periodic import least_periodic_gamma
-
-        return least_periodic_gamma(problem, lower, upper, start)
-    part = ReadPart(problem)
-    equation = GammaEquation(part.problem, part.gather(start))
-    lower, upper, solution = _search_level(equation, lower, upper)
-    return lower, upper, part.scatter(solution)
-
-
-def _search_level(
-    equation: GammaEquation, lower: float, upper: float
-) -> tuple[float, float, FilterRiccati]:
-    """Bracket the least level that an equation meets; return also the filter at the upper end."""
+    equation = GammaEquation(problem, kalman_riccati(problem) if start is None else start)
+    errors = (equation.problem.L @ P @ equation.problem.L.T for P in equation.least)
+    # no filter has less than the Kalman filter's variance, the mean square over all frequencies
+    lower = max(lower, *(float(np.sqrt(np.linalg.eigvalsh(error)[-1])) for error in errors))
     met: dict[float, LevelTrial] = {}
 
     def slack(gamma: float) -> float:
         nonlocal lower
         trial = equation.trial(gamma)
-        if trial.P is not None:
-            met[gamma] = trial
-        else:
+        if trial.P is None:
             lower = max(lower, gamma)
+            return min(trial.slack, -_GAMMA_TOLERANCE)  # at a slack of 0 there is no filter
+        met[gamma] = trial
         return trial.slack
 
     for _ in range(60):  # the upper level is feasible in exact arithmetic
-        above = slack(upper)
-        if above > 0:
+        if slack(upper) > 0:
             break
         upper *= 1.0001 if upper < 1.01 * lower else 1.01
     if not met:
@@ -389,33 +434,21 @@ def _search_level(
             "the Kalman filter. Scale the states to similar sizes.",
             gamma=upper,
         )
-    root = lower
-    below = slack(lower) if lower < upper else 1.0
-    if below <= 0:
-        start_level = upper  # the slack is almost linear in s = (start_level / gamma)^2
-        slack_at = {(upper / lower) ** 2: below, 1.0: above}
-        s_root = brentq(
-            lambda s: slack_at[s] if s in slack_at else slack(start_level * s**-0.5),
-            (upper / lower) ** 2,
-            1.0,
-            xtol=2 * _GAMMA_TOLERANCE,
-        )
-        root = start_level * s_root**-0.5
-    upper, width = min(met), _GAMMA_TOLERANCE
-    for _ in range(100):  # the search leaves one end of its bracket far away: bring it in
-        if upper - lower <= 2.5 * _GAMMA_TOLERANCE * upper:
-            break
-        above, below = root * (1 + width), root * (1 - width)
-        if above < upper:
-            slack(above)
-        else:
-            slack(below if below > lower and width < 1e-3 else (lower + upper) / 2)
-        upper, width = min(met), 4 * width
+    highest = upper
+
+    @cache
+    def slack_at(s: float) -> float:
+        """Return the slack, which is almost linear in ``s = (highest / gamma)^2``."""
+        return slack(highest * s**-0.5)
+
+    lowest = (upper / lower) ** 2
+    if lowest > 1 and slack_at(lowest) <= 0:
+        brentq(slack_at, lowest, 1.0, xtol=2 * _GAMMA_TOLERANCE)  # its steps are half of it
     for gamma in sorted(met):  # a level too close to the edge may give no filter
         solution = equation.solution(gamma, met[gamma])
         if solution is not None:
             return lower, gamma, solution
     raise NumericalError(
-        f"the least gamma was not bracketed: it lies between {lower:.9g} and {upper:.9g}.",
+        f"the least gamma was not bracketed: it lies between {lower:.9g} and {min(met):.9g}.",
         status="search",
     )

@@ -11,9 +11,12 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.block_filtering import filter_series
-from lbt_synth.linear.estimator_form import EstimatorForm
-from lbt_synth.linear.held_controller import HasController, as_controller
-from lbt_synth.linear.state_space import RunningController
+from lbt_synth.linear.controller import (
+    EstimatorForm,
+    HasController,
+    RunningController,
+    as_controller,
+)
 from lbt_synth.loop.closed_loop import ClosedLoop, close_loop, reads_others
 from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
 from lbt_synth.loop.strehl import Imaging, series_strehl

@@ -11,7 +11,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedAxis, IdentifiedLine, IdentifiedModel
 from lbt_synth.linear import Controller
-from lbt_synth.linear.held_controller import as_controller
+from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import ClosedLoop, Simulation, close_loop
 from lbt_synth.loop.simulation.run import Segment
 from lbt_synth.models import ARModel, Truth, Vibration

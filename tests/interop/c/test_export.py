@@ -22,7 +22,7 @@ from lbt_synth.interop.c import export as c_export
 from lbt_synth.interop.c.terms import RunningSource, source_terms
 from lbt_synth.interop.pipeline import target_named, target_names
 from lbt_synth.interop.proof import rehearsal_error
-from lbt_synth.linear.state_space import RunningController
+from lbt_synth.linear.controller import RunningController
 from lbt_synth.loop.simulation.run import Drop
 
 FRAMES = 3000

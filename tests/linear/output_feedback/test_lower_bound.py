@@ -42,7 +42,7 @@ def test_perturbed_witness_proves_less():
 
 def test_nothing_is_proved_by_nothing():
     plant = random_plant(4)
-    nothing = ControlWitness(unseen=None, unmoved=None, reason="")
+    nothing = ControlWitness(reason="")
     assert infeasible_control_level(plant, nothing) == 0
 
 
@@ -59,5 +59,5 @@ def test_measurements_in_other_units_prove_no_more(size):
         D21=np.diag([size, 1 / size]),
     )
     pair = Witness(states=np.ones((1, 1)), disturbances=-np.ones((2, 1)))
-    witness = ControlWitness(unseen=pair, unmoved=None, reason="none")
+    witness = ControlWitness(unseen=pair, reason="none")
     assert infeasible_control_level(plant, witness) < 1e-9
