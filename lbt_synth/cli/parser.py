@@ -96,7 +96,7 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
     for name, add_arguments in COMMANDS.items():
         text = " ".join((add_arguments.__doc__ or "").split())
         # a script for a shell has the commands with a help; the groups list them for the others
-        listed = {"help": text} if len(named) > 1 else {}
+        listed: dict[str, Any] = {"help": text} if len(named) > 1 else {}
         command = commands.add_parser(name, description=text, **listed)
         arguments.add_switch(command, "--json", "print one JSON object instead")
         if name in named:
