@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.storage.worker_processes import WorkerPool
+from lbt_synth.storage.thread_limits import WorkerPool
 
 STUDY = """
 version: 1

@@ -7,7 +7,7 @@ from argparse import Namespace
 from lbt_synth.cli import loop_records
 from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import count_progress
+from lbt_synth.cli.streams import count_progress
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import LoopRecord, design_from_record
 from lbt_synth.identification.auto import LEAST_SECONDS, RecordedDesign

@@ -20,7 +20,7 @@ from lbt_synth.cli.loop_inputs import (
 )
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.parser import command_options
-from lbt_synth.cli.progress import track_progress
+from lbt_synth.cli.streams import track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware

@@ -10,7 +10,7 @@ from lbt_synth.cli import loop_records
 from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import count_progress
+from lbt_synth.cli.streams import count_progress
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import Diagnosis, LoopRecord, diagnose
 from lbt_synth.identification.commands.control_law import ControlLaw

@@ -12,7 +12,7 @@ from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.engine import run_in_parts
 from lbt_synth.cli.loop_inputs import choose_wavefront_unit, load_design, load_designs
 from lbt_synth.cli.output import Report, json_value
-from lbt_synth.cli.progress import count_progress
+from lbt_synth.cli.streams import count_progress
 from lbt_synth.config import load_config
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, UnstableLoopError

@@ -11,12 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import lbt_synth
-from lbt_synth.cli.progress import count_progress
-from lbt_synth.cli.streams import print_error
+from lbt_synth.cli.streams import count_progress, print_error
 from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.storage.atomic_files import make_directory
-from lbt_synth.storage.thread_limits import limit_threads
-from lbt_synth.storage.worker_processes import WorkerPool
+from lbt_synth.storage.thread_limits import WorkerPool, limit_threads
 from lbt_synth.validation import integer
 
 _TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer

@@ -23,8 +23,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from lbt_synth.cli.parser import build_parser, command_module, command_options
-from lbt_synth.cli.progress import show_progress
-from lbt_synth.cli.streams import discard, print_error
+from lbt_synth.cli.streams import discard, print_error, show_progress
 from lbt_synth.errors import ConfigError, LbtSynthError, SynthesisError
 from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.thread_limits import limit_threads

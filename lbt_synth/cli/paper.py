@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report
-from lbt_synth.cli.progress import track_progress
+from lbt_synth.cli.streams import track_progress
 from lbt_synth.design import FilterDesign
 from lbt_synth.files import save_gain
 from lbt_synth.methods.registry import design_label, design_title

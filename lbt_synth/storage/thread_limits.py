@@ -1,11 +1,18 @@
-"""One thread of linear algebra: with more, small matrices are slower, on busy cores by far."""
+"""One thread of linear algebra, here and in workers: with more, small matrices are slower."""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
+import threading
+import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
 
+_ORPHAN_SECONDS = 1.0
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -22,3 +29,38 @@ def limit_threads() -> Iterator[None]:
     finally:
         for name in free:
             del os.environ[name]
+
+
+class WorkerPool(ProcessPoolExecutor):
+    """Fresh processes that end with their parent, however it ends.
+
+    Start it within :func:`limit_threads`, whose limit the
+    processes inherit. An error in its ``with`` block ends them at once, without waiting for what is
+    running.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self._others: set[BaseProcess] = set(multiprocessing.active_children())
+        super().__init__(
+            workers,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=_watch_parent,
+            initargs=(os.getpid(),),
+        )
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:
+            for worker in set(multiprocessing.active_children()) - self._others:
+                worker.terminate()
+        self.shutdown(wait=True, cancel_futures=True)
+
+
+def _watch_parent(parent: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it, and ends the workers
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_ORPHAN_SECONDS)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -11,6 +11,7 @@ from support.commands import run
 from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
+from lbt_synth.cli import streams
 from lbt_synth.cli.main import entry_point
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import discard, printable
@@ -143,3 +144,25 @@ def test_characters_that_an_encoding_lacks_are_escaped(monkeypatch, gains):
     assert "\n  quantity" in out
     assert "\n -----" in out
     assert "\\u" not in out
+
+
+def show_all(quiet):
+    with streams.show_progress("thinking", quiet=quiet):
+        with streams.count_progress(total=8, what="runs") as count:
+            count(3)
+        seen = streams.track_progress(range(2), total=2, what="rows")
+        assert list(seen) == [0, 1]
+
+
+@pytest.mark.parametrize(("terminal", "quiet"), [(False, False), (False, True), (True, True)])
+def test_nothing_is_said_to_programs(capsys, monkeypatch, terminal, quiet):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
+    show_all(quiet)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_terminal_shows_what_is_done(capsys, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    show_all(quiet=False)
+    assert "thinking" in capsys.readouterr().err

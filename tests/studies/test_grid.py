@@ -21,7 +21,7 @@ from support.studies import (
 
 from lbt_synth.errors import NumericalError, OutputError
 from lbt_synth.storage import array_file
-from lbt_synth.storage.worker_processes import WorkerPool
+from lbt_synth.storage.thread_limits import WorkerPool
 from lbt_synth.studies import run_study
 from lbt_synth.studies.grid import Sweep
 

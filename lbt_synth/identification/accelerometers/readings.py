@@ -68,13 +68,6 @@ def load_readings(
     return tuple(names), values, tuple(notes)
 
 
-def lay_beside(values: FloatArray, frames: int) -> FloatArray:
-    """Return readings (n, channels) beside a record of so many frames, NaN beyond their end."""
-    out = np.full((frames, values.shape[1]), np.nan)
-    out[: len(values)] = values[:frames]
-    return out
-
-
 def _is_offset(series: FloatArray) -> bool:
     """Whether the mean of readings is more than what they move by."""
     good = series[np.isfinite(series)]

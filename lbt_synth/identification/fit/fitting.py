@@ -220,13 +220,6 @@ def _with_noise(data: LoopPeriodogram, spectrum: SpectrumModel) -> SpectrumModel
     return spectrum.with_background(log_noise=max(spectrum.background.log_noise, least))
 
 
-def refit(search: Search, start: SpectrumModel) -> FittedModel | None:
-    """Fit a model of other data to these; None if no fit settles."""
-    if not search.finds_gain:
-        start = start.with_background(log_gain=float(np.log(search.gain or 1.0)))
-    return fit(search, start)
-
-
 def likeliest(search: Search, fits: Iterable[FittedModel | None]) -> FittedModel | None:
     """Return the fit of the least cost; None if none of them settled."""
     settled = (model for model in fits if model is not None)

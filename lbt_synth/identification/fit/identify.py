@@ -50,7 +50,7 @@ from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.records.faults import RARE
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
-from lbt_synth.validation import FloatArray, number, one_or_each, real_array, require_instance
+from lbt_synth.validation import FloatArray, one_or_each, real_array, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
@@ -155,7 +155,9 @@ def identify(
         "most_lines": most_lines,
     }
     if isinstance(record, SpectrumRecord):
-        _refuse_of_series(sensor_gain=sensor_gain, stretches=stretches, start=start)
+        of_series = {"sensor_gain": sensor_gain, "stretches": stretches, "start": start}
+        if names := [name for name, value in of_series.items() if value is not None]:
+            raise ProblemError(f"{names[0]} is for series of a loop; a spectrum is of the phase.")
         return _identify_spectra(record, frame_rate_hz, delay_frames, noise_nm, options)
     require_instance(record, LoopRecord)
     if noise_nm is not None:
@@ -199,13 +201,6 @@ def identify(
         mirror=record.mirror,
         notes=tuple(notes),
     )
-
-
-def _refuse_of_series(**options: object) -> None:
-    """Refuse options with a spectrum that only series have."""
-    for name, value in options.items():
-        if value is not None:
-            raise ProblemError(f"{name} is for series of a loop; a spectrum is of the phase.")
 
 
 def _fit_axes(
@@ -301,55 +296,37 @@ def _pool_gains(
     return pooled, "one sensor gain for all axes"
 
 
-def _doubt_scale(axes: Sequence[IdentifiedAxis]) -> Iterator[str]:
-    """Yield that gains above 1 may be those of commands recorded at a fraction of their size."""
-    above = {
-        f"{axis.sensor_gain:.3f} +- {axis.sensor_gain_error:.3f}"
-        for axis in axes
-        if axis.sensor_gain_error is not None
-        and _CALIBRATED + DIFFERENT * axis.sensor_gain_error < axis.sensor_gain < POSSIBLE_GAINS[1]
-    }
-    if above:
-        yield (
-            f"warning: a calibrated sensor has a gain of at most 1; here it is "
-            f"{' and '.join(sorted(above))}. Commands recorded at a fraction of what was applied "
-            "look like that (--command-scale 2 if at half)"
-        )
-
-
 def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[str]:
     """Yield notes on odd gains, hidden noise, too many lines, and what no model has."""
-    fitted = [axis.sensor_gain_error is not None for axis in axes]
+    above = set()
     for i, axis in enumerate(axes):
-        if fitted[i] and not POSSIBLE_GAINS[0] < axis.sensor_gain < POSSIBLE_GAINS[1]:
+        error, (low, high) = axis.sensor_gain_error, POSSIBLE_GAINS
+        if error is not None and not low < axis.sensor_gain < high:
             yield (
                 f"warning: axis {i} has a sensor gain of {axis.sensor_gain:.3g}: are the units, "
                 "signs and axes of the commands right?"
             )
-    yield from _doubt_scale(axes)
-    for i, axis in enumerate(axes):
+        elif error is not None and _CALIBRATED + DIFFERENT * error < axis.sensor_gain:
+            above.add(f"{axis.sensor_gain:.3f} +- {error:.3f}")
         if axis.noise_error_nm > _UNSEEN * axis.noise_nm:
             yield f"warning: the noise of axis {i} is not seen under the rest of its spectrum"
-    for i, axis in enumerate(axes):
         if sum(part.kind != "turbulence" for part in axis.parts) >= most_lines > 0:
             yield (
                 f"the limit of {most_lines} lines was reached on axis {i}: there may be more, and "
                 "the rest of the model suffers"
             )
-    for i, axis in enumerate(axes):
         if axis.noise_correlation:
             yield (
                 f"the noise of axis {i} is not white: neighbouring frames have a correlation of "
                 f"{axis.noise_correlation:.3f} +- {axis.noise_correlation_error:.3f}, which the "
                 "model and its errors hold. Designs take white noise of the same rms"
             )
-        elif fitted[i] and axis.noise_correlation_error > _UNSEEN_COLOUR:
+        elif error is not None and axis.noise_correlation_error > _UNSEEN_COLOUR:
             yield (
                 f"warning: the record does not show whether the noise of axis {i} is white (its "
                 f"correlation is 0 +- {axis.noise_correlation_error:.2g}): noise, sensor gain and "
                 "their errors hold if it is"
             )
-    for i, axis in enumerate(axes):
         test = axis.whiteness
         if min(test.p_value, test.correlation_p_value) < RARE:
             yield (
@@ -358,6 +335,12 @@ def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[st
                 "that is not white. The standard errors do not cover that, and the sensor gain may "
                 "be wrong by many of them"
             )
+    if above:  # gains of both axes in one sentence
+        yield (
+            f"warning: a calibrated sensor has a gain of at most 1; here it is "
+            f"{' and '.join(sorted(above))}. Commands recorded at a fraction of what was applied "
+            "look like that (--command-scale 2 if at half)"
+        )
 
 
 def _identify_spectra(
@@ -381,8 +364,13 @@ def _identify_spectra(
         )
     inside = (record.frequency_hz > 0) & (record.frequency_hz < rate / 2)
     f, densities = record.frequency_hz[inside], record.density_nm2_hz[inside].T
-    options |= {"frame_rate_hz": rate, "averages": record.averages}
-    axes = [identify_spectrum(f, density, **options) for density in densities]
+    averages: list[float | None] = [record.averages] * record.axes
+    if record.averages is None:
+        averages = [estimate_averages(density) for density in densities]
+    axes = [
+        _identify_spectrum(f, density, rate, count or 1.0, **options)
+        for density, count in zip(densities, averages, strict=True)
+    ]
     axes = [
         replace(axis, noise_nm=noise, noise_error_nm=0.0) if noise else axis
         for axis, noise in zip(axes, stated.tolist(), strict=True)
@@ -392,8 +380,8 @@ def _identify_spectra(
     notes += [
         f"the density of axis {i} does not scatter as periodograms do (smoothed, interpolated "
         "or computed?) and was taken for one of them. Give averages to find weaker lines"
-        for i, density in enumerate(densities)
-        if record.averages is None and estimate_averages(density) is None
+        for i, count in enumerate(averages)
+        if count is None
     ]
     return IdentifiedModel(
         axes=tuple(axes),
@@ -471,21 +459,9 @@ def refit_axis(axis: IdentifiedAxis, search: Search, error: float, note: str) ->
 
 
 def axis_periodogram(
-    measurement: ArrayLike,
-    correction: ArrayLike | None,
-    frame_rate_hz: float,
-    stretches: StretchesLike | None,
+    y: FloatArray, c: FloatArray | None, frame_rate_hz: float, stretches: StretchesLike | None
 ) -> LoopPeriodogram:
-    """Return the periodogram of series that can be identified."""
-    y = real_array(measurement, "measurement")
-    if y.ndim != 1:
-        raise DimensionError(f"measurement must be a series (frames,); got shape {y.shape}.")
-    c = None if correction is None else real_array(correction, "correction")
-    if c is not None and c.shape != y.shape:
-        raise DimensionError(
-            f"correction must have shape {y.shape} like measurement; got {c.shape}."
-        )
-    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    """Return the periodogram of measurements and corrections (frames,) of one axis."""
     pieces = checked_stretches(None if stretches is None else sorted(stretches), y.size)
     longest = max(stop - begin for begin, stop in pieces)
     if longest < 2 * SHORTEST_SEGMENT:
@@ -496,7 +472,7 @@ def axis_periodogram(
     if all(np.ptp(y[begin:stop]) == 0 for begin, stop in pieces):
         raise ProblemError("the measurement is constant: there is nothing to identify.")
     with np.errstate(over="ignore", invalid="ignore"):
-        data = loop_periodogram(y, c, frame_rate_hz=rate, stretches=pieces)
+        data = loop_periodogram(y, c, frame_rate_hz=frame_rate_hz, stretches=pieces)
         finite = np.all(np.isfinite(data.power(1.0)))
     if not finite or np.min(data.measured) <= 0:
         raise ProblemError(
@@ -506,53 +482,35 @@ def axis_periodogram(
     return data
 
 
-def identify_spectrum(
-    frequency_hz: ArrayLike,
-    density_nm2_hz: ArrayLike,
-    *,
-    frame_rate_hz: float,
-    averages: float | None = None,
+def _identify_spectrum(
+    frequency_hz: FloatArray,
+    density_nm2_hz: FloatArray,
+    rate_hz: float,
+    averages: float,
     **options: Any,
 ) -> IdentifiedAxis:
-    """Identify one axis from its one-sided density (f,) [nm^2/Hz] at even frequencies (f,) [Hz].
-
-    The frequencies lie above 0 and below half the frame rate of the loop to come; the sensor gain
-    of the result is 1. The density is the mean of ``averages`` independent periodograms, by default
-    found from its scatter: one that scatters less than the mean of 1000 was smoothed, interpolated
-    or computed, and counts as one. Options are ``announced``, ``lowest_line_hz`` and ``most_lines``
-    of :class:`Search`.
-    """
-    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
-    f = real_array(frequency_hz, "frequency_hz")
-    density = real_array(density_nm2_hz, "density_nm2_hz")
-    if f.ndim != 1 or f.shape != density.shape or f.size < 32:
+    """Identify one axis from its density (f,) [nm^2/Hz], a mean of independent periodograms."""
+    if frequency_hz.size < 32:
         raise DimensionError(
-            "frequency_hz and density_nm2_hz must be lists of the same length, at least 32; got "
-            f"{f.shape} and {density.shape}."
+            "a spectrum must have at least 32 frequencies above 0 and below half the frame rate, "
+            f"{rate_hz / 2:.6g} Hz; got {frequency_hz.size}."
         )
-    steps = np.diff(f)
-    if np.any(steps <= 0) or f[0] <= 0 or f[-1] >= rate / 2:
-        raise ProblemError(
-            f"frequency_hz must increase from above 0 to below {rate / 2:.6g}; got {f[0]:.6g} to "
-            f"{f[-1]:.6g}. Leave the mean out, and what lies above the Nyquist frequency."
-        )
+    steps = np.diff(frequency_hz)
     if np.max(steps) > 1.01 * np.min(steps):
         raise ProblemError(
             f"frequency_hz must be evenly spaced; got steps of {np.min(steps):.6g} to "
             f"{np.max(steps):.6g}. Interpolate, or leave the odd part out."
         )
-    if np.any(density <= 0):
-        raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(density):.6g}.")
-    if averages is None:
-        averages = estimate_averages(density) or 1.0
-    zero = np.zeros_like(f)
+    if np.any(density_nm2_hz <= 0):
+        raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(density_nm2_hz):.6g}.")
+    zero = np.zeros_like(frequency_hz)
     data = LoopPeriodogram(
-        frequency_hz=f,
-        measured=density,
+        frequency_hz=frequency_hz,
+        measured=density_nm2_hz,
         crossed=zero,
         corrected=zero,
-        count=np.full(f.size, number(averages, "averages", above=0)),
-        frame_rate_hz=rate,
+        count=zero + averages,
+        frame_rate_hz=rate_hz,
         resolution_hz=float(np.median(steps)),
     )
     search = Search(data=data, gain=1.0, **options)

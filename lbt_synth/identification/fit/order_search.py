@@ -119,7 +119,9 @@ def find_components(
 
     A start from earlier data is polished only.
     """
-    model = fitting.refit(search, start) if start is not None else _begin(search)
+    if start is not None and not search.finds_gain:
+        start = start.with_background(log_gain=float(np.log(search.gain or 1.0)))
+    model = _begin(search) if start is None else fitting.fit(search, start)
     if model is None and start is not None:
         return find_components(search, rounds=rounds)
     if model is None:
