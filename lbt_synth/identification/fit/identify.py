@@ -364,6 +364,8 @@ def _identify_spectra(
         )
     inside = (record.frequency_hz > 0) & (record.frequency_hz < rate / 2)
     f, densities = record.frequency_hz[inside], record.density_nm2_hz[inside].T
+    if np.any(densities <= 0):
+        raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(densities):.6g}.")
     averages: list[float | None] = [record.averages] * record.axes
     if record.averages is None:
         averages = [estimate_averages(density) for density in densities]
@@ -501,8 +503,6 @@ def _identify_spectrum(
             f"frequency_hz must be evenly spaced; got steps of {np.min(steps):.6g} to "
             f"{np.max(steps):.6g}. Interpolate, or leave the odd part out."
         )
-    if np.any(density_nm2_hz <= 0):
-        raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(density_nm2_hz):.6g}.")
     zero = np.zeros_like(frequency_hz)
     data = LoopPeriodogram(
         frequency_hz=frequency_hz,
