@@ -30,6 +30,7 @@ _DECREASE = 1e-6  # of the objective, below which a step is the last
 _LEAST_SHARE = 1e-3  # of a step that is tried
 _PENALTY = 10.0  # relative rise of the objective that a relative excess of a bound is worth
 _FINE = 2048  # frequencies, at least, at which bounds are looked at between those of a programme
+_NOTHING_NM2 = 1e-6  # a residual of a picometre, with which none is compared
 _MISS = 2e-3  # by which an objective or a worst case may exceed that of the programme's frequencies
 _FLAT = 0.1  # weight of the whole response, beside the spectra: demands hold at all frequencies
 _RELAXED = 1e-6  # relaxations below this are none
@@ -70,7 +71,7 @@ def solve_mode(
         c, values = _minimise(programme, start)
         loop = mode_loop(channel.hardware, channel.basis.parameter(c))
         exact = spec.objective.measured_nm2(loop)
-        miss = abs(values[-1] / exact - 1)
+        miss = abs(values[-1] - exact) / max(exact, _NOTHING_NM2)
         if miss < _MISS and all(check.passed for check in spec.checks(loop)):
             return ModeSolution(
                 channel=channel,
