@@ -176,12 +176,16 @@ def _check_objective(evidence: Evidence, claimed: tuple[float, ...]) -> Iterator
             objective = float(np.sqrt(design.specifications[mode].objective.measured_nm2(loop)))
         except UnstableLoopError:
             objective = np.inf
-        above = objective / claimed[mode] - 1 if claimed[mode] > 0 else np.inf
-        below = claimed[mode] / objective - 1 if objective > 0 else np.inf
+        above, below = _excess(objective, claimed[mode]), _excess(claimed[mode], objective)
         how, name = "closed loops in state space", f"{prefix}objective"
         yield Check(f"{name} found over the one claimed, less 1", above, TOLERANCE, how)
         yield Check(f"{name} claimed over the one found, less 1", below, ORIGIN_TOLERANCE, how)
     yield _decoupling_check(design)
+
+
+def _excess(value: float, other: float) -> float:
+    """Return by how much a value is above another, in parts of it; 0 where both are nothing."""
+    return value / other - 1 if other > 0 else (np.inf if value > 0 else 0.0)
 
 
 def _decoupling_check(design: ShapedDesign) -> Check:

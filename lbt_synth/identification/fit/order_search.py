@@ -315,8 +315,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
         else:
             clusters.append([i])
     for cluster in clusters:
-        first, counts = components[cluster[0]], {2, MOST_SECTIONS}
-        groups = [cluster]
+        first, counts, groups = components[cluster[0]], {2, MOST_SECTIONS}, [cluster]
         if len(cluster) == 1:
             if search.place(first)[1] < fitting.RESOLVED * search.data.step_hz:
                 continue

@@ -21,9 +21,7 @@ import numpy as np
 from lbt_synth.models.resonance_spectrum import PARAMETERS, WIDE_DAMPING
 from lbt_synth.validation import FloatArray
 
-GAIN, NOISE, COLOUR, CORNER, BACKGROUND = range(
-    5
-)  # places of an axis' own parameters, their number
+GAIN, NOISE, COLOUR, CORNER, BACKGROUND = range(5)  # places of what an axis has, their number
 TILT_ORDER = 5 / 6  # of the roll-off: tilt falls with f^(-17/3), a second-order process with f^-4
 _NO_CORNER = 50.0  # angle per frame; a corner above it is none
 _LEAST = 0.05  # damping ratio of slow components; narrower ones are lines
