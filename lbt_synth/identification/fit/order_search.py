@@ -46,8 +46,9 @@ _BANDS = 80  # of the background
 _WIDEST = 0.3  # of its frequency: a band that is tried, and the damping ratio of a new component
 _NARROWEST = 1e-4  # damping ratio of a new component
 _BESIDE = 0.08  # of its frequency: lines that are nearer may be one bump
+_ROUGH = 30.0  # prices: a bump of several lines that begins with less is not fitted
 _TO_HALF = 2 * float(np.log(2))  # square of a Gaussian's half width over its variance
-_OTHER_GAINS = (0.4, 0.9, 1.1)  # of a sensor, from which models that are as likely are sought
+_OTHER_GAINS = (0.45, 1.05)  # of a sensor, from which models that are as likely are sought
 _AS_LIKELY = 5.0  # log-likelihood by which one of two gains is excluded
 
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
@@ -327,7 +328,8 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
             others = (c for i, c in enumerate(components) if i not in group)
             bump = _bump([components[i] for i in group], sections)
             trial = replace(spectrum, components=(*others, bump))
-            if len(group) > 1 or contrast(data, trial) < whole + search.price:
+            rough = 1.0 if len(group) == 1 else _ROUGH
+            if contrast(data, trial) < whole + rough * search.price:
                 yield trial
 
 
