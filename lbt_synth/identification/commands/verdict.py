@@ -45,6 +45,7 @@ from lbt_synth.identification.fit.fitting import (
 )
 from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components
 from lbt_synth.identification.fit.periodogram import loop_periodogram
+from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
@@ -452,12 +453,16 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
 
 
 def _fit(
-    coarse: CoarseRecord, repair: CommandRepair, held: FloatArray | None = None
-) -> tuple[float, FloatArray]:
-    """Return the criterion of the fit over all axes, and the gains (axes,), nan where one failed.
+    coarse: CoarseRecord,
+    repair: CommandRepair,
+    held: FloatArray | None = None,
+    starts: Sequence[FittedModel] = (),
+) -> tuple[float, FloatArray, list[FittedModel]]:
+    """Return the criterion of the fit over all axes, the gains (axes,), and the models.
 
-    Gains (axes,) may be held. The model has the lines and the wide resonances that it needs, of
-    which the coarse spectrum has few.
+    A fit that fails has a gain of nan, and ends it. Gains (axes,) may be held, and models of other
+    gains are starts beside a search: a search alone may miss what they have. The model has the
+    lines and the wide resonances that it needs, of which the coarse spectrum has few.
     """
     record = coarse.record
     length = int(SEGMENT_S * record.frame_rate_hz)
@@ -466,19 +471,21 @@ def _fit(
         for a, b in coarse.stretches
         for start in range(a, max(b - length, a) + 1, length)
     ]
-    total, gains = 0.0, np.full(record.axes, np.nan)
+    total, gains, models = 0.0, np.full(record.axes, np.nan), list[FittedModel]()
     series = zip(record.measurements.T, coarse.corrections(repair).T, strict=True)
     for i, (y, c) in enumerate(series):
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
         gain = None if held is None else float(np.clip(held[i], GAINS["above"], GAINS["below"]))
         search = Search(data=data, gain=gain, most_lines=_LINES, gain_error=float("inf"))
         try:
-            model = find_components(search, rounds=FEW_ROUNDS)
+            trials = [find_components(search, rounds=FEW_ROUNDS)]
+            trials += [find_components(search, start.spectrum) for start in starts[i : i + 1]]
         except NumericalError:
-            total = np.inf
-        else:
-            total, gains[i] = total + cost(search, model), model.spectrum.background.gain
-    return total, gains
+            return np.inf, gains, []
+        model = min(trials, key=partial(cost, search))
+        models.append(model)
+        total, gains[i] = total + cost(search, model), model.spectrum.background.gain
+    return total, gains, models
 
 
 def _scale(
@@ -494,7 +501,7 @@ def _scale(
     if np.all((choice.gain >= low) & (choice.gain <= high)):
         return one
     scaled = replace(choice.repair, scale=tuple(choice.gain))
-    free, ratios = _fit(coarse, scaled)
+    free, ratios, models = _fit(coarse, scaled)
     gains = np.where(np.isfinite(ratios), ratios, 1.0) * choice.gain
     if np.all((gains >= low) & (gains <= high)):
         return one
@@ -504,9 +511,11 @@ def _scale(
             return likely_factors(gains, plausible)
         if np.mean(np.log(gains)) < np.log(low):
             return one  # commands that are too large come from a law that is too strong
-    nearest = np.clip(gains, low, high)
-    if _fit(coarse, scaled, nearest / choice.gain)[0] - free < CLEAR:
-        return one  # plausible gains are nearly as likely
+    # the nearest plausible gains, one for all axes, and the usual one: there may be two optima
+    common, usual = np.exp(np.mean(np.log(gains))) * one, TYPICAL_GAIN * one
+    for tried in np.clip([gains, common, usual], low, high):
+        if _fit(coarse, scaled, tried / choice.gain, models)[0] - free < CLEAR:
+            return one  # they are nearly as likely
     return likely_factors(gains, plausible)
 
 
