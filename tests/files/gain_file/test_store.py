@@ -20,7 +20,12 @@ from support.specula_filters import noise_series, simulate_commands
 
 import lbt_synth as lbt
 from lbt_synth.design.record import record_design
-from lbt_synth.files.gain_file.store import load_with_digest, require_certificate, require_same
+from lbt_synth.files.gain_file.store import (
+    load_with_digest,
+    require_agreement,
+    require_certificate,
+    require_same,
+)
 from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 
 ENDINGS = ("fits", "npz")
@@ -47,6 +52,24 @@ def state_space_filter(path):
         return C @ x + D @ u
 
     return step
+
+
+def test_records_agree_to_the_last_digits():
+    """To 1e-9 of an entry; what is further apart is named, with its part of the largest entry."""
+    record = record_design(original("kalman"))
+    B = record.arrays["B"]
+    place = np.unravel_index(np.argmax(np.abs(B)), B.shape)
+
+    def changed(part):
+        moved = B.copy()
+        moved[place] *= 1 + part
+        return replace(record, arrays=record.arrays | {"B": moved})
+
+    require_agreement(changed(0.9e-9), record)
+    with pytest.raises(ValueError, match="B is not what .*differs by 1.1e-09 of its largest"):
+        require_agreement(changed(1.1e-9), record)
+    with pytest.raises(ValueError, match="differs by 0.25 of its largest"):
+        require_agreement(changed(0.25), record)
 
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator", "sensors"])

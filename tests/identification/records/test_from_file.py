@@ -442,9 +442,13 @@ def test_two_files_are_laid_beside_each_other_by_their_counters(tmp_path, series
     longer = csv(tmp_path / "l.csv", frame=np.arange(70), u_nm=np.append(u, u[:10]))
     seen = lbt.load_record(mine, commands=longer, frame_rate_hz=RATE, delay_frames=2)
     assert np.array_equal(seen.commands[:, 0], np.append(u, u[:10])[10:])
+    first = csv(tmp_path / "p.csv", frame=np.arange(10, 50), u_nm=u[:40])
+    seen = lbt.load_record(mine, commands=first, frame_rate_hz=RATE, delay_frames=2)
+    assert any("by frame: 40 of 60 rows have one" in note for note in seen.health.notes)
     far = csv(tmp_path / "f.csv", frame=np.arange(500, 560), u_nm=u)
-    with pytest.raises(TelemetryError, match="only 0 of 60 measurements have a command"):
+    with pytest.raises(TelemetryError, match="only 0 of 60 measurements have a command") as caught:
         lbt.load_record(mine, commands=far, frame_rate_hz=RATE)
+    assert "they go from 10 to 69 and from 500 to 559" in str(caught.value)
     twice = csv(tmp_path / "t.csv", frame=np.arange(60) // 2 * 2, u_nm=u)
     with pytest.raises(TelemetryError, match="of both files must rise from row to row"):
         lbt.load_record(mine, commands=twice, frame_rate_hz=RATE)
