@@ -460,9 +460,8 @@ def _fit(
 ) -> tuple[float, FloatArray, list[FittedModel]]:
     """Return the criterion of the fit over all axes, the gains (axes,), and the models.
 
-    A fit that fails has a gain of nan, and ends it. Gains (axes,) may be held, and models of other
-    gains are starts beside a search: a search alone may miss what they have. The model has the
-    lines and the wide resonances that it needs, of which the coarse spectrum has few.
+    A fit that fails has a gain of nan. Gains (axes,) may be held, and models of other gains are
+    starts beside a search, which may miss what they have, such as wide resonances.
     """
     record = coarse.record
     length = int(SEGMENT_S * record.frame_rate_hz)

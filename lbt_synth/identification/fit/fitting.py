@@ -198,8 +198,10 @@ def fit(
     minus a margin.
     """
     data, bound = search.merge(start), float("inf")
-    if len(start.axes) == 1:
-        start = _with_noise(data, start)
+    if len(start.axes) == 1:  # a noise of nothing has no slope
+        least = _SEED * float(np.min(density(data, start))) * data.frame_rate_hz / 2
+        noise = max(start.background.log_noise, float(np.log(least)))
+        start = start.with_background(log_noise=noise)
     if better_than is not None:
         bound = contrast(data, better_than.spectrum) + margin
     model = minimise(data, start, search.priors(start), bound=bound, accuracy=accuracy)
@@ -211,13 +213,6 @@ def fit(
     if len(inside.components) < len(start.components):
         return fit(search, inside, better_than=better_than, margin=margin, accuracy=accuracy)
     return replace(model, contrast=contrast(search.data, model.spectrum))
-
-
-def _with_noise(data: LoopPeriodogram, spectrum: SpectrumModel) -> SpectrumModel:
-    """Return a model with at least some noise: where it is nothing, it has no slope."""
-    lowest = float(np.min(density(data, spectrum))) * data.frame_rate_hz / 2
-    least = float(np.log(_SEED * lowest))
-    return spectrum.with_background(log_noise=max(spectrum.background.log_noise, least))
 
 
 def likeliest(search: Search, fits: Iterable[FittedModel | None]) -> FittedModel | None:

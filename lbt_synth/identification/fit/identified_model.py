@@ -309,7 +309,9 @@ def model_tables(model: IdentifiedModel) -> list[Table]:
             axis=_direction_text(line, names),
             damping=f"{line.damping:.3g}" if line.resolved else f"< {line.damping:.2g}",
             damping_error=line.damping_error if line.resolved else None,
-            origin=line.kind + _sections_text(line) + ", announced" * line.announced,
+            origin=line.kind
+            + f", {line.sections} sections" * (line.sections > 1)
+            + ", announced" * line.announced,
         )
         for line in model.parts
     ]
@@ -321,11 +323,6 @@ def _shown_cells(value: float, digits: str, error: float | None, unit: str) -> t
     name, factor = shown_unit(unit)
     size = None if error is None else factor * error
     return cell_text(factor * value, shown_format(digits, factor)), cell_text(size, ".2g"), name
-
-
-def _sections_text(line: IdentifiedLine) -> str:
-    """Say how many sections a bump has."""
-    return f", {line.sections} sections" if line.sections > 1 else ""
 
 
 def _direction_text(line: IdentifiedLine, names: Sequence[str]) -> str:

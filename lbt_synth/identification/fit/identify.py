@@ -399,11 +399,9 @@ def find_axis(search: Search, *, start: IdentifiedAxis | None = None) -> Identif
     models = find_models(search, None if start is None else start.fitted_model.spectrum)
     model = models[0]
     if not search.finds_gain:
-        note = (
-            "1: of an open loop it has no meaning"
-            if search.gain is None
-            else ("given" if closed else "given: the series is divided by it")
-        )
+        note = "given" if closed else "given: the series is divided by it"
+        if search.gain is None:
+            note = "1: of an open loop it has no meaning"
         return describe_axis(search, add_evidence(search, model), None, note)
     model, near = find_rivals(search, models, other_gains=not _is_clear(model, start))
     model = add_evidence(search, model)

@@ -1,9 +1,8 @@
 """The search for the components of a spectrum, and for their number.
 
-The model grows from a background, turbulence over white noise, fitted to medians over bands, which
-narrow lines hardly touch. Bands with too much power become components, all parameters are fitted
-together, and what adds less than its price is dropped again. A model of earlier data is only
-polished: fitted to these, given what it lacks, and pruned.
+The model grows from turbulence over white noise, fitted to medians over bands, which lines hardly
+touch. Bands with too much power become components, all parameters are fitted together, and what
+adds less than its price is dropped. A model of earlier data is only polished.
 """
 
 from __future__ import annotations

@@ -50,13 +50,6 @@ class PlantParts:
         lines = len(self.vibrations)
         motions = self.motions if any(self.motions) else ({},) * lines
         set_fields(self, motions=checked_motions(motions, self.hardware.suite, lines))
-        for line, motion in zip(self.vibrations, self.motions, strict=True):
-            if line.sections > 1 and motion:
-                raise ProblemError(
-                    f"a bump of {line.sections} sections moves no channel of an accelerometer; got "
-                    f"the motion of {', '.join(motion)} with that at {line.frequency_hz:.6g} Hz. "
-                    "Try sections=1, or leave the motion out."
-                )
 
     @property
     def order(self) -> int:

@@ -19,6 +19,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.linalg import expm
 
+from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.matrix_functions import symmetrise
 from lbt_synth.models.loop_hardware import LoopHardware
@@ -84,6 +85,11 @@ def seen_vibration(
     the common one of the accelerometers that see the line.
     """
     require_below_nyquist(line.frequency_hz, hardware.frame_rate_hz)
+    if line.sections > 1:
+        raise ProblemError(
+            f"a bump of {line.sections} sections moves no channel of an accelerometer; got motions "
+            f"of that at {line.frequency_hz:.6g} Hz. Try sections=1, or leave them out."
+        )
     exposures = [
         _exposure(line, motion, sensor, hardware, ahead)
         for sensor in accelerometers
