@@ -225,6 +225,13 @@ def one_or_each(value: Any, name: str, size: int | None = None, **bounds: Any) -
     return out
 
 
+def each_of(value: Any, name: str, size: int, **bounds: Any) -> FloatArray:
+    """Return numbers (size,): one for all, alone or in a list, or one each, within bounds."""
+    out = np.atleast_1d(real_array(value, name))
+    out = one_or_each(out[0] if out.size == 1 else out, name, size, **bounds)
+    return np.broadcast_to(out, (size,))
+
+
 def integer(value: Any, name: str, **bounds: float) -> int:
     """Return an integer that is ``at_least`` or ``at_most`` its bounds."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):

@@ -512,7 +512,8 @@ def _scale(
             return one  # commands that are too large come from a law that is too strong
     # the nearest plausible gains, one for all axes, and the usual one: there may be two optima
     common, usual = np.exp(np.mean(np.log(gains))) * one, TYPICAL_GAIN * one
-    for tried in np.clip([gains, common, usual], low, high):
+    tries = np.clip([gains, common, usual], low, high).tolist()
+    for tried in dict.fromkeys(map(tuple, tries)):  # each once
         if _fit(coarse, scaled, tried / choice.gain, models)[0] - free < CLEAR:
             return one  # they are nearly as likely
     return likely_factors(gains, plausible)

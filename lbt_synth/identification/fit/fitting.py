@@ -232,12 +232,13 @@ def required_evidence(search: Search, spectrum: SpectrumModel, i: int) -> float:
     component = spectrum.components[i]
     if component.announced is not None:
         return _ANNOUNCED
-    more = (component.sections > 1) - (component.kind == "drift")
-    price = search.price + more * search.parameter_price
+    parameters = PARAMETERS + (component.sections > 1) - (component.kind == "drift")
+    price = parameters * search.parameter_price
     bumps = [c for k, c in enumerate(spectrum.components) if c.sections > 1 and k != i]
     away = (abs(component.log_frequency - c.log_frequency) / c.damping_ratio for c in bumps)
-    upon = component.kind == "line" and min(away, default=_FAR) < _FAR
-    return max(price, upon * _WORTH * float(np.sum(search.data.count)))
+    if component.kind != "line" or min(away, default=_FAR) >= _FAR:
+        return price
+    return max(price, _WORTH * float(np.sum(search.data.count)))
 
 
 def total_price(search: Search, spectrum: SpectrumModel) -> float:

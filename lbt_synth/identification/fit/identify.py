@@ -50,7 +50,7 @@ from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.records.faults import RARE
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
-from lbt_synth.validation import FloatArray, one_or_each, real_array, require_instance
+from lbt_synth.validation import FloatArray, each_of, real_array, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
@@ -353,9 +353,7 @@ def _identify_spectra(
     """Identify each spectrum, between 0 and the Nyquist frequency of the loop."""
     stated = np.zeros(record.axes)  # 0 where it is that of the spectrum
     if noise_nm is not None:
-        noise = np.atleast_1d(real_array(noise_nm, "noise_nm"))
-        one = noise[0] if noise.size == 1 else noise
-        stated += one_or_each(one, "noise_nm", record.axes, above=0)
+        stated = each_of(noise_nm, "noise_nm", record.axes, above=0)
     rate = frame_rate_hz if frame_rate_hz is not None else record.frame_rate_hz
     if rate is None:
         raise ProblemError(

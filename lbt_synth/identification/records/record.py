@@ -20,11 +20,11 @@ from lbt_synth.validation import (
     Obstruction,
     Positive,
     check_fields,
+    each_of,
     frozen_copy,
     integer,
     matrix,
     number,
-    one_or_each,
     read_only,
     real_array,
     set_fields,
@@ -232,11 +232,7 @@ class LoopRecord:
 
     def known_gains(self, sensor_gain: ArrayLike) -> FloatArray:
         """Return the gain of each axis, (axes,), from one for all, alone or in a list, or each."""
-        gains = np.atleast_1d(real_array(sensor_gain, "sensor_gain"))
-        gains = one_or_each(
-            gains[0] if gains.size == 1 else gains, "sensor_gain", self.axes, above=0
-        )
-        return np.broadcast_to(gains, (self.axes,))
+        return each_of(sensor_gain, "sensor_gain", self.axes, above=0)
 
     def stretches(self) -> tuple[tuple[int, int], ...]:
         """Return (start, stop) of each stretch of contiguous usable frames."""
