@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
@@ -27,7 +28,7 @@ from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
-from lbt_synth.studies.grid import loop_columns
+from lbt_synth.studies.grid import evaluate, loop_columns
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ def limits(
     imaging: Imaging,
     *,
     errors_hz: Sequence[float] = (0.0,),
+    executor: Executor | None = None,
 ) -> LimitStudy:
     """Evaluate designs exactly and compare them with the limits.
 
@@ -121,6 +123,8 @@ def limits(
         True frequency less that of the model [Hz], of the vibration that moves most; the others
         move in proportion (``truth.frequency_errors_hz``), over the whole range between the
         extremes.
+    executor : concurrent.futures.Executor, optional
+        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Returns
     -------
@@ -165,32 +169,14 @@ def limits(
         rest = replace(truth, vibrations=(), motions=(), frequency_errors_hz=None)
         least_worst = partial(least_worst_residual, alone, rest, band_hz=band_hz)
         band = limit_or_none(partial(least_worst, rms_nm=line.rms_nm, direction=line.direction))
-    rows, curves = [], []
-    for name, design in designs.items():
-        loop = design.close(hardware, sensor_gain=truth.sensor_gain)
-        numbers = loop_columns(loop, truth, imaging)
-        residual_nm = numbers["residual_nm"]
-        curve = _residual_curve(loop, truth, shifts, residual_nm)
-        worst_nm = float(np.max(curve)) if shifts.size else residual_nm
-        margin_deg = np.nan
-        if loop.is_stable and not loop.reads_others:
-            margin_deg = phase_margin_deg(loop)
-        limit_nm, band_nm = (  # of the loop's own sensor
-            np.nan if bound is None or loop.reads_others else bound.rms_nm
-            for bound in (limit, band)
-        )
-        row = {
-            "design": name,
-            "above_limit_percent": above_percent(residual_nm, limit_nm),
-            "worst_nm": worst_nm,
-            "above_band_limit_percent": above_percent(worst_nm, band_nm),
-            "phase_margin_deg": margin_deg,
-            "stable": loop.is_stable,
-        }
-        rows.append(fill_row(LimitRow, SimpleNamespace(**numbers), design, **row))
-        curves.append(curve)
+    bounds_nm = tuple(np.nan if bound is None else bound.rms_nm for bound in (limit, band))
+    samples = (
+        (name, design, hardware, truth, imaging, shifts, bounds_nm)
+        for name, design in designs.items()
+    )
+    rows, curves = zip(*evaluate(_limit_row, samples, executor), strict=True)
     return LimitStudy(
-        rows=tuple(rows),
+        rows=rows,
         limit=limit,
         band=band,
         band_hz=band_hz,
@@ -198,6 +184,37 @@ def limits(
         residual_nm=frozen_copy(curves),
         frequency_hz=truth.lines_hz[0] if len(truth.lines_hz) == 1 else None,
     )
+
+
+def _limit_row(
+    name: str,
+    design: Design,
+    hardware: LoopHardware,
+    truth: Truth,
+    imaging: Imaging,
+    shifts: FloatArray,
+    bounds_nm: tuple[float, float],
+) -> tuple[LimitRow, FloatArray]:
+    """Return the row of a design beside the two limits, and its residual at each shift, (s,)."""
+    loop = design.close(hardware, sensor_gain=truth.sensor_gain)
+    numbers = loop_columns(loop, truth, imaging)
+    residual_nm = numbers["residual_nm"]
+    curve = _residual_curve(loop, truth, shifts, residual_nm)
+    worst_nm = float(np.max(curve)) if shifts.size else residual_nm
+    margin_deg, (limit_nm, band_nm) = np.nan, bounds_nm
+    if loop.reads_others:  # the limits are those of the loop's own sensor
+        limit_nm = band_nm = np.nan
+    elif loop.is_stable:
+        margin_deg = phase_margin_deg(loop)
+    row = {
+        "design": name,
+        "above_limit_percent": above_percent(residual_nm, limit_nm),
+        "worst_nm": worst_nm,
+        "above_band_limit_percent": above_percent(worst_nm, band_nm),
+        "phase_margin_deg": margin_deg,
+        "stable": loop.is_stable,
+    }
+    return fill_row(LimitRow, SimpleNamespace(**numbers), design, **row), curve
 
 
 def _frequency_shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
