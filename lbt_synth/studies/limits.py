@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
@@ -96,6 +96,10 @@ class LimitStudy:
     # (designs, s): residual of each design at each shift [nm rms]; nan if unstable
     residual_nm: FloatArray
     frequency_hz: float | None  # frequency of the truth's vibrations, if it is one
+    # beside reference designs: what is wrong with a design in this truth, by its name, and why
+    # references are missing
+    warnings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def limits(
@@ -239,26 +243,19 @@ def _residual_curve(
     return np.asarray(np.sqrt(residual_nm**2 - first + np.array(others)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TruthComparison:
-    """Designs in the truth of a configuration."""
-
-    rows: tuple[LimitRow, ...]  # the designs, then the reference designs that are none of them
-    # the least residual of any linear controller; None where the modes do not decouple
-    limit: ResidualLimit | None
-    # what is wrong with a design in this truth: an unstable loop, a residual far above what the
-    # design expects, and demands that cost residual
-    warnings: Mapping[str, tuple[str, ...]]
-    notes: tuple[str, ...]  # why reference designs are missing
-
-
 def compare_in_truth(
-    designs: Mapping[str, Design], config: Config, *, without: Collection[str] = ()
-) -> TruthComparison:
+    designs: Mapping[str, Design],
+    config: Config,
+    *,
+    without: Collection[str] = (),
+    errors_hz: Sequence[float] = (0.0,),
+) -> LimitStudy:
     """Compare designs in the stationary truth of a configuration with its reference designs.
 
     These are the integrator of least residual, the Kalman filter and the H-infinity filter; some
-    methods are left out if the designs are those already.
+    methods are left out, and so is one that leaves the same as a design. Warnings say what is wrong
+    with a design in this truth: an unstable loop, a residual far above what the design expects, and
+    demands that cost residual.
     """
     references: dict[str, Design] = {}
     notes = []
@@ -270,14 +267,17 @@ def compare_in_truth(
             references[name] = config.design(method.name, **method.reference_options)
         except LbtSynthError as error:
             notes.append(f"{method.name} is left out: {error}")
-    study = limits({**designs, **references}, config.hardware, config.truth, config.imaging)
+    loop = config.hardware, config.truth, config.imaging
+    study = limits({**designs, **references}, *loop, errors_hz=errors_hz)
     ours, theirs = study.rows[: len(designs)], study.rows[len(designs) :]
     there = np.array([row.residual_nm for row in ours])
     others = [row for row in theirs if not np.isclose(row.residual_nm, there, rtol=1e-6).any()]
     better = {row.design: (references[row.design], row.residual_nm) for row in others}
-    return TruthComparison(
-        rows=(*ours, *others),
-        limit=study.limit,
+    rows = (*ours, *others)
+    return replace(
+        study,
+        rows=rows,
+        residual_nm=frozen_copy(study.residual_nm[[study.rows.index(row) for row in rows]]),
         warnings={
             row.design: tuple(_warnings(designs[row.design], row, config, better)) for row in ours
         },

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import label
 
-from lbt_synth import studies
 from lbt_synth.config import Config
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import LbtSynthError, ProblemError
@@ -22,7 +21,6 @@ from lbt_synth.loop import (
     LoopMargins,
     ResidualBudget,
     Simulation,
-    close_loop,
     loop_margins,
     moving_gain,
     residual_budget,
@@ -40,7 +38,7 @@ from lbt_synth.storage.rows import Facts, columns, fact, facts
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import LimitRow, RobustnessMap, robustness_map
-from lbt_synth.studies.limits import LimitStudy, TruthComparison, compare_in_truth
+from lbt_synth.studies.limits import LimitStudy, compare_in_truth
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _MOST_FRAMES = 8192  # of a run: its series and spectra need no more
@@ -54,25 +52,33 @@ class DesignAssessment:
     design: Design
     loop: ClosedLoop  # with the real sensor gain
     notes: tuple[str, ...]  # how the loop that it was made for differs from this one
-    # None where the loop is unstable: the exact residual, the margins at the real sensor gain, the
-    # intervals around it of a gain that moves, and a run in time
+    # None where the loop is unstable: the exact residual, and a run in time; and, None for several
+    # sensors, too, the margins at the real sensor gain, and the intervals around it of a gain that
+    # moves
     budget: ResidualBudget | None
+    run: Simulation | None
     margins: LoopMargins | None
     moving: MovingGain | None
-    run: Simulation | None
     # interval of real sensor gains with a stable loop, relative to the sensor matrix of the
     # configuration, around the real one, the assumed one, or one of the map; nan for none
     sensor_gains: tuple[float, float]
     checks: tuple[Check, ...]  # the certificate, recomputed
     certificate_error: str  # why it could not be; empty if it could
-    map: RobustnessMap  # Strehl ratio over the frequency error and the real sensor gain
-    strehls: FloatArray  # (e,): Strehl ratio over the frequency error at the real sensor gain
+    # Strehl ratio over the frequency error and the real sensor gain; None for several sensors
+    map: RobustnessMap | None
+    # (e,): Strehl ratio over the frequency error at the real sensor gain; nan where it is unknown
+    strehls: FloatArray
     limits: LimitRow  # residual, Strehl ratio, and how far they are from the limits
 
     @property
     def stable(self) -> bool:
         """Whether the loop is stable at the real sensor gain."""
         return self.loop.is_stable
+
+    @property
+    def alone(self) -> bool:
+        """Whether it reads the loop's own sensor alone, and has transfer functions."""
+        return not self.loop.reads_others
 
     @property
     def certified(self) -> bool:
@@ -92,22 +98,24 @@ def assess_design(
     hardware, truth, settings = config.hardware, config.truth, config.settings.simulation
     real_gain = config.sensor_gain * truth.sensor_gain
     gains = np.unique([*config.settings.robustness.sensor_gains, real_gain])
-    over: dict[str, Any] = {"errors_hz": errors_hz, "sensor_gains": gains / config.sensor_gain}
-    image = robustness_map(design, truth, config.imaging, hardware=hardware, **over)
     checks: tuple[Check, ...] = ()
-    complaint, budget, margins, moving, run = "", None, None, None, None
+    complaint, budget, margins, moving, run, image = "", None, None, None, None, None
     try:
         checks = design.recertify().checks
     except (LbtSynthError, ArithmeticError) as error:
         complaint = str(error)
-    starts = [loop.sensor_gain, 1.0, *image.sensor_gains[image.stable[0]]]
+    starts, strehls = [loop.sensor_gain, 1.0], np.full(errors_hz.size, np.nan)
+    if not loop.reads_others:
+        over: dict[str, Any] = {"errors_hz": errors_hz, "sensor_gains": gains / config.sensor_gain}
+        image = robustness_map(design, truth, config.imaging, hardware=hardware, **over)
+        starts += image.sensor_gains[image.stable[0]].tolist()
+        image = replace(image, sensor_gains=frozen_copy(gains))  # the real ones again
+        strehls = image.strehl[0, int(np.searchsorted(gains, real_gain))]
     low, high = stable_interval(hardware, design.controller, starts)
     if loop.is_stable:
-        budget, margins, moving = (
-            residual_budget(loop, truth),
-            loop_margins(loop),
-            moving_gain(loop),
-        )
+        budget = residual_budget(loop, truth)
+        if not loop.reads_others:
+            margins, moving = loop_margins(loop), moving_gain(loop)
         run = simulate(
             design.controller,
             truth,
@@ -129,8 +137,8 @@ def assess_design(
         sensor_gains=(low * config.sensor_gain, high * config.sensor_gain),
         checks=checks,
         certificate_error=complaint,
-        map=replace(image, sensor_gains=frozen_copy(gains)),  # the real ones again
-        strehls=image.strehl[0, int(np.searchsorted(gains, real_gain))],
+        map=image,
+        strehls=strehls,
         limits=limits,
     )
 
@@ -175,9 +183,9 @@ class DesignReport:
     config: Config  # the configuration
     gain_files: Mapping[str, str | os.PathLike[str]]  # that designs came from, by their names
     assessments: tuple[DesignAssessment, ...]  # one per design, exact
-    # residuals over the frequency error, and what no linear controller goes below
+    # the designs beside reference designs and limits, over the frequency error, and what they were
+    # not made for
     limits: LimitStudy
-    truth: TruthComparison  # the designs beside reference designs, and what they were not made for
     # (e,): frequency errors, truth less design [Hz]; only 0 where the truth has no vibration
     errors_hz: FloatArray
 
@@ -244,11 +252,8 @@ def design_report(
         require_instance(design, Design)
         require_compatible(name, design, config.hardware)
     truth, hardware, errors = config.truth, config.hardware, frequency_errors(config)
-    study = studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors))
-    loops = [
-        close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-        for design in designs.values()
-    ]
+    study = compare_in_truth(designs, config, errors_hz=list(errors))
+    loops = [design.close(hardware, sensor_gain=truth.sensor_gain) for design in designs.values()]
     # all settle as the slowest, so that one seed is the same weather for all
     radii = [loop.spectral_radius for loop in loops if loop.is_stable]
     settle_frames = max(map(settling_frames, radii), default=0)
@@ -257,10 +262,9 @@ def design_report(
         gain_files=dict(gain_files or {}),
         assessments=tuple(
             assess_design(design, loop, row, config, errors, settle_frames)
-            for design, loop, row in zip(designs.values(), loops, study.rows, strict=True)
+            for design, loop, row in zip(designs.values(), loops, study.rows, strict=False)
         ),
         limits=study,
-        truth=compare_in_truth(designs, config),
         errors_hz=errors,
     )
 
@@ -348,7 +352,10 @@ def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
         route=fact(design.solver.route),
         origin=fact(f"{design.method}, {design.solver.route}", help="method, computed by"),
         n_states=fact(design.controller.n_states, help="states of the controller"),
-        multiplications=fact(frame_cost(design).multiplications, help="multiplications per frame"),
+        multiplications=fact(
+            frame_cost(design).multiplications if one.alone else None,
+            help="multiplications per frame",
+        ),
         gamma=fact(design.gamma, help="achieved gamma, norm of the error in its own model", **norm),
         estimation_rms=fact(design.rms, help="error in its own model", **_RMS),
         certificate=fact(_certificate_word(one), help="certificate, recomputed"),
@@ -405,9 +412,9 @@ _KEPT = 0.9  # of its best Strehl ratio, within which a design counts as good
 def good_range(report: DesignReport, one: DesignAssessment) -> tuple[float, float] | None:
     """Return between which frequency errors [Hz] a design keeps 90 % of its best Strehl ratio.
 
-    None where it is unstable, or where there is no range of errors.
+    None where it is unstable, reads several sensors, or where there is no range of errors.
     """
-    if not one.stable or report.errors_hz.size == 1:
+    if np.isnan(one.strehls).any() or report.errors_hz.size == 1:
         return None
     runs, _ = label(one.strehls >= _KEPT * np.max(one.strehls))
     good = report.errors_hz[runs == runs[np.argmax(one.strehls)]]
@@ -431,12 +438,10 @@ def verdict(report: DesignReport) -> str:
             f"Least residual: {least} (Strehl ratio {100 * strehl:.1f} %)"
             f"{where if report.config.truth.vibrations else ''}."
         )
-    if report.stable and report.errors_hz.size > 1:
+    worst = {o.name: -100 * float(np.min(o.strehls)) for o in report.stable if o.alone}
+    if worst and report.errors_hz.size > 1:
         first, last = (f"{report.errors_hz[i]:+.4g}" for i in (0, -1))
-        most = _leaders(
-            {one.name: -100 * float(np.min(one.strehls)) for one in report.stable},
-            lambda percent: f"{-percent:.1f} %",
-        )
+        most = _leaders(worst, lambda percent: f"{-percent:.1f} %")
         sentences.append(
             f"Highest Strehl ratio at worst, if their frequencies are wrong by {first} to {last} "
             f"Hz: {most}."

@@ -32,7 +32,6 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure as new_figure
 from bokeh.server.server import Server
-from bokeh.server.util import bind_sockets
 
 from lbt_synth.config.write import config_text
 from lbt_synth.errors import LbtSynthError, ProblemError
@@ -374,16 +373,17 @@ def serve(
     def open_page(document: Any) -> None:
         Session(document, exploration, first, folder, saved)
 
+    place = port
     try:
-        sockets, place = bind_sockets(host, port)
+        for family, *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+            with socket.create_server((address[0], place), family=family) as probe:
+                place = probe.getsockname()[1]
     except (OSError, UnicodeError) as error:  # a name of another alphabet, or too long
         reason = getattr(error, "strerror", None) or str(error)
         raise ProblemError(
             f"cannot serve at --host {host} --port {port}: {reason}. Try another one; --port 0 is "
             "any that is free."
         ) from error
-    for probe in sockets:
-        probe.close()
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     own = (f"{one}:{place}" for one in ("localhost", "127.0.0.1", name))
     server = Server(

@@ -11,7 +11,7 @@ from support.pages import Reader
 from support.several_sensors import write_config
 
 import lbt_synth as lbt
-from lbt_synth.report.designs.page import design_page, sensors_page
+from lbt_synth.report.designs.page import design_page
 from lbt_synth.report.designs.report import verdict
 from lbt_synth.report.page.html import page_html
 from lbt_synth.storage.tables import Table
@@ -183,32 +183,32 @@ def test_refused_in_the_library(report, config, designs, tmp_path):
             call()
 
 
-def test_a_page_has_the_table_of_failures_and_a_run(sensors_design, sensors_file, sensors_config):
+def test_one_page_has_designs_of_several_sensors_and_of_one(
+    sensors_design, sensors_file, sensors_config
+):
+    designs = {"both": sensors_design, "own": lbt.integrator(sensors_config.hardware, gain=0.3)}
     files = {"both": sensors_file}
-    page, found = sensors_page(sensors_config, {"both": sensors_design}, gain_files=files)
+    report = lbt.report.design_report(sensors_config, designs, gain_files=files)
+    page = design_page(report)
     text = page_html(page).decode()
-    assert "When sensors fail" in text
+    assert "both: When sensors fail" in text
     for source in (sensors_file, sensors_config.source):
         assert hashlib.sha256(source.read_bytes()).hexdigest() in text
     assert "each sensor missing in turn" in text
-    assert found.rows[0].design == "both"
-    limit = found.limit.rms_nm
-    assert found.rows[0].residual_nm < limit  # of the own sensor alone
+    both, own = report.assessments
+    limit = report.limits.limit.rms_nm
+    assert both.limits.residual_nm < limit < own.limits.residual_nm
     assert f"alone leaves less than {limit:.1f}" in text
+    assert f"Least residual: both, {both.limits.residual_nm:.1f}" in verdict(report)
+    assert "Hz: own, " in verdict(report)
+    charts = {chart.key: chart.figure for chart in page.charts}
+    assert len(charts["series"].axes) == 2
+    assert len(charts["poles"].axes) == len(charts["spectra"].axes) == 1
 
 
-def test_the_command_takes_them_alone(sensors_file, gains, tmp_path, capsys):
+def test_the_command_takes_them(sensors_file, tmp_path, capsys):
     config, page = write_config(tmp_path), tmp_path / "page.html"
     status, text, _ = run(capsys, "report", config, sensors_file, "-o", page)
     assert (status, page.exists()) == (0, True)
-    assert "above the limit" in text
-    page.unlink()
-    status, _, error = run(capsys, "report", config, sensors_file, gains["kalman"], "-o", page)
-    assert (status, page.exists()) == (2, False)
-    assert "lbt-synth limits takes both" in error
-
-
-@pytest.fixture
-def gains(tmp_path_factory, config):
-    design = lbt.integrator(config.hardware, gain=0.5)
-    return {"kalman": lbt.save_gain(tmp_path_factory.mktemp("own") / "own.fits", design)}
+    assert "Least residual" in text
+    assert 'id="bode"' not in page.read_text()
