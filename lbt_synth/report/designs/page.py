@@ -15,20 +15,13 @@ from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.report.designs.report import DesignAssessment, DesignReport, summary_table, verdict
 from lbt_synth.report.draw import Figure, count_columns, drawing, square_in
 from lbt_synth.report.figures.loops import (
-    FREQUENCY,
     draw_bode,
     draw_design,
     draw_sigma,
     draw_steps,
     sigma_curves,
 )
-from lbt_synth.report.figures.records import (
-    SERIES_S,
-    SPECTRUM,
-    TIME,
-    run_spectra,
-    sensor_failure_figure,
-)
+from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
 from lbt_synth.report.figures.studies import (
     FREQUENCY_ERROR,
     SENSOR_GAIN,
@@ -267,36 +260,18 @@ def _draw_poles(designs: Sequence[DesignAssessment]) -> Figure:
 
 def _simulation_blocks(report: DesignReport) -> list[Block]:
     """Return series and spectra of the simulated loops."""
-    settings = report.config.settings.simulation
-    runs = [(one, one.run) for one in report.assessments if one.run is not None]
-    if not runs:
-        return ["No loop is stable, so none was simulated."]
-    rate_hz, frames = runs[0][1].frame_rate_hz, runs[0][1].residual_nm.shape[1]
-    shown = min(frames, int(SERIES_S * rate_hz))
-    time_s = np.arange(shown) / rate_hz
-    reach = 1.05 * max(float(np.max(np.abs(run.residual_nm[0, :shown, 0]))) for _, run in runs)
-    residual = {"label": "residual", "unit": "nm", "low": -reach, "high": reach}
-    with drawing([0.95] * len(runs)) as series:
-        for panel, (one, run) in zip(series, runs, strict=True):
-            panel.set_axes(TIME, residual, title=one.name)
-            style: dict[str, Any] = {"look": report.names.index(one.name), "dash": 0}
-            y = run.residual_nm[0, :shown, 0]
-            panel.curve("residual", time_s, y, quiet=True, width=0.9, **style)
-    blocks: list[Block] = [
-        f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}.",
-        chart("series", series[0].figure, duration=f"{time_s[-1]:.2f}"),
-    ]
-    runs = [(one, run) for one, run in runs if one.alone]
-    if not runs:
-        return blocks
-    with drawing([2.2] * len(runs), columns=count_columns(len(runs))) as spectra:
-        for panel, (one, run) in zip(spectra, runs, strict=True):
-            panel.set_axes(FREQUENCY, SPECTRUM, title=one.name)
-            f, opened, simulated, exact = run_spectra(run, one.loop, report.config.truth)
-            panel.curve("before the correction", f, opened, look=None, width=0.8)
-            panel.curve("residual, simulated", f, simulated, look=5, dash=0)
-            panel.curve("residual, exact", f, exact, look=1, width=1.4)
-    return [*blocks, chart("spectra", spectra[0].figure)]
+    settings, truth = report.config.settings.simulation, report.config.truth
+    blocks: list[Block] = []
+    for number, one in enumerate(report.assessments, start=1):
+        if one.run is not None:
+            frames = one.run.residual_nm.shape[1]
+            text = f"{count_text(settings.cases, 'run')} of {frames} frames each, seed "
+            blocks = blocks or [f"{text}{settings.seed}."]
+            exact: dict[str, Any] = {"loop": one.loop, "truth": truth} if one.alone else {}
+            figure = simulation_figure(one.run, title=one.name, **exact)
+            key = f"simulation-{number}"
+            blocks.append(chart(key, figure, group="simulation", name=one.name))
+    return blocks or ["No loop is stable, so none was simulated."]
 
 
 _AWAY_S = 1.0  # that each sensor is missing, and that all are there again

@@ -104,8 +104,9 @@ def test_many_designs_are_a_panel_each(few):
     report = lbt.report.design_report(few, many)
     page = design_page(report)
     charts = {chart.key: chart.figure for chart in page.charts}
-    for key, bars in {"map": 1, "poles": 0, "spectra": 0, "series": 0}.items():
+    for key, bars in {"map": 1, "poles": 0}.items():
         assert len(charts[key].axes) == len(many) + bars
+    assert sum(key.startswith("simulation-") for key in charts) == len(many)
     blocks = page.sections["Summary"]
     table, truth, *_ = [block for block in blocks if isinstance(block, Table)]
     assert len(truth.rows) == len(many) + 3
@@ -202,8 +203,8 @@ def test_one_page_has_designs_of_several_sensors_and_of_one(
     assert f"Least residual: both, {both.limits.residual_nm:.1f}" in verdict(report)
     assert "Hz: own, " in verdict(report)
     charts = {chart.key: chart.figure for chart in page.charts}
-    assert len(charts["series"].axes) == 2
-    assert len(charts["poles"].axes) == len(charts["spectra"].axes) == 1
+    assert [len(charts[f"simulation-{i}"].axes[1].lines) for i in (1, 2)] == [2, 3]
+    assert len(charts["poles"].axes) == 1
 
 
 def test_the_command_takes_them(sensors_file, tmp_path, capsys):
