@@ -33,6 +33,7 @@ from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.loop.stable_range import MovingGain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.report.page.html import words
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, columns, fact, facts
 from lbt_synth.storage.tables import Cell, Table
@@ -292,25 +293,7 @@ def refine_values(values: Sequence[float]) -> FloatArray:
     return np.asarray(np.interp(places, np.arange(ordered.size), ordered))
 
 
-_RMS: dict[str, Any] = {"unit": "nm rms", "format": ".1f"}
-_RATIO: dict[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}
-_PARTS = {"turbulence": "turbulence", "vibration": "vibration", "noise": "noise"}  # of a residual
-_PARTS |= {"within": "within frames"}
-_MARGINS = (
-    ("modulus", "modulus margin", ""),
-    ("phase_deg", "phase margin", "deg"),
-    ("delay_frames", "delay margin", "frames"),
-    ("crossover_hz", "highest crossover", "Hz"),
-)
-# of the table of all designs: its groups, by the first of their facts
-_GROUPS = {
-    "origin": "Design",
-    "loop": "In the loop of the configuration",
-    "above_limit_percent": "Distance to the limit of any linear controller",
-    "worst_nm": "Over frequency errors of {}",
-    "modulus": "Margins at the real sensor gain",
-}
-WORDS = (
+WORDS = (  # facts that are texts, made of several numbers
     "origin",
     "certificate",
     "loop",
@@ -325,72 +308,60 @@ _TONES = {"passed": "good", "stable": "good", "FAILED": "bad", "NOT": "bad", "UN
 def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
     """Return the numbers of a design, and those of ``WORDS``, which are texts.
 
-    The page prints what has a help, in this order.
+    How each is called and printed is in the words of pages; the page prints what has a help.
     """
     design, row, margins, moving = one.design, one.limits, one.margins, one.moving
-    limits, gain, ranged = report.limits, report.config.sensor_gain, report.errors_hz.size > 1
+    limits, gain = report.limits, report.config.sensor_gain
+    strehls = np.zeros(0) if one.run is None else one.run.strehl(report.config.imaging)
     factors = None if margins is None else (margins.gain_low, margins.gain_high)
     moves = None if moving is None else (gain * moving.moving_low, gain * moving.moving_high)
-    strehls = np.zeros(0) if one.run is None else one.run.strehl(report.config.imaging)
-    mean = float(np.mean(strehls)) if strehls.size else None
-    scatter = 100 * float(np.std(strehls, ddof=1)) if strehls.size > 1 else None
-    parts = {
-        f"{part}_nm": fact(getattr(one.budget, f"{part}_nm", None), help=f"of that {word}", **_RMS)
-        for part, word in _PARTS.items()
+    budget = one.budget
+    values = {
+        "design": one.name,
+        "method": design.method,
+        "stable": one.stable,
+        "certified": one.certified,
+        "route": design.solver.route,
+        "origin": f"{design.method}, {design.solver.route}",
+        "n_states": design.controller.n_states,
+        "multiplications": frame_cost(design).multiplications if one.alone else None,
+        "gamma": design.gamma,
+        "estimation_rms": design.rms,
+        "certificate": _certificate_word(one),
+        "loop": "stable" if one.stable else "UNSTABLE",
+        "spectral_radius": one.loop.spectral_radius,
+        "residual_nm": row.residual_nm,
+        "turbulence_nm": budget and budget.turbulence_nm,
+        "vibration_nm": budget and budget.vibration_nm,
+        "noise_nm": budget and budget.noise_nm,
+        "within_nm": budget and budget.within_nm,
+        "strehl": row.strehl,
+        "strehl_simulated": float(np.mean(strehls)) if strehls.size else None,
+        "scatter": 100 * float(np.std(strehls, ddof=1)) if strehls.size > 1 else None,
+        "above_limit_percent": _known(limits.limit) and row.above_limit_percent,
+        "worst_nm": row.worst_nm if report.errors_hz.size > 1 else None,
+        "worst_strehl": float(one.strehls.min()),
+        "good_errors": _interval(good_range(report, one), "+.4g"),
+        "above_band_limit_percent": _known(limits.band) and row.above_band_limit_percent,
+        "modulus": margins and margins.modulus,
+        "phase_deg": margins and margins.phase_deg,
+        "delay_frames": margins and margins.delay_frames,
+        "crossover_hz": margins and margins.crossover_hz,
+        "gain_margin": _interval(factors, ".3g"),
+        "stable_gains": _interval(one.sensor_gains),
+        "moving_gains": _interval(moves),
     }
-    numbers = {
-        name: fact(getattr(margins, name, None), help=text, format=".3g", unit=unit)
-        for name, text, unit in _MARGINS
-    }
-    norm: dict[str, Any] = {"unit": "nm", "format": ".5g"}
-    at_known, anywhere = "frequency known", "frequency anywhere in this range"
-    return facts(
-        design=fact(one.name, "design"),
-        method=fact(design.method, "method"),
-        stable=fact(one.stable, "stable"),
-        certified=fact(one.certified, "certified"),
-        route=fact(design.solver.route),
-        origin=fact(f"{design.method}, {design.solver.route}", help="method, computed by"),
-        n_states=fact(design.controller.n_states, help="states of the controller"),
-        multiplications=fact(
-            frame_cost(design).multiplications if one.alone else None,
-            help="multiplications per frame",
-        ),
-        gamma=fact(design.gamma, help="achieved gamma, norm of the error in its own model", **norm),
-        estimation_rms=fact(design.rms, help="error in its own model", **_RMS),
-        certificate=fact(_certificate_word(one), help="certificate, recomputed"),
-        loop=fact("stable" if one.stable else "UNSTABLE", help="closed loop"),
-        spectral_radius=fact(
-            one.loop.spectral_radius, format=".6g", help="largest modulus of its poles"
-        ),
-        residual_nm=fact(row.residual_nm, "residual", help="residual, exact", **_RMS),
-        **parts,
-        strehl=fact(row.strehl, "Strehl", help="Strehl ratio, exact", **_RATIO),
-        strehl_simulated=fact(mean, help="Strehl ratio, simulated", **_RATIO),
-        scatter=fact(scatter, help="its scatter between runs", unit="points", format=".2f"),
-        above_limit_percent=_above(row.above_limit_percent, limits.limit, at_known),
-        worst_nm=fact(row.worst_nm if ranged else None, help="worst residual", **_RMS),
-        worst_strehl=fact(
-            float(one.strehls.min()), "worst Strehl", help="worst Strehl ratio", **_RATIO
-        ),
-        good_errors=fact(
-            _interval(good_range(report, one), "+.4g"),
-            help="within 10 % of its best Strehl ratio [Hz]",
-        ),
-        above_band_limit_percent=_above(row.above_band_limit_percent, limits.band, anywhere),
-        **numbers,
-        gain_margin=fact(_interval(factors, ".3g"), help="gain margin, factors"),
-        stable_gains=fact(_interval(one.sensor_gains), help="stable real sensor gains"),
-        moving_gains=fact(_interval(moves), help="proved while the gain moves at any speed"),
-    )
+    bounds = {"limit": _known(limits.limit), "band": _known(limits.band)}
+    entries = {}
+    for name, printing in words("facts").items():
+        text = printing.get("help", "").format(**bounds)
+        entries[name] = fact(values[name], **printing | {"help": text})
+    return facts(**entries)
 
 
-def _above(percent: float, limit: ResidualLimit | BandLimit | None, where: str) -> Any:
-    """Return the fact of percents above a limit, which may say nothing."""
-    if limit is None or not limit.rms_nm > 0:
-        return fact(None)
-    text = f"above the limit of {nm_text(limit.rms_nm, '.1f')}, {where}"
-    return fact(percent, unit="%", format=".0f", help=text)
+def _known(limit: ResidualLimit | BandLimit | None) -> str | None:
+    """Return a limit as a text; None where there is none, or one of 0, above which all is."""
+    return None if limit is None or not limit.rms_nm > 0 else nm_text(limit.rms_nm, ".1f")
 
 
 def _interval(ends: tuple[float, float] | None, spec: str = ".4g") -> str:
@@ -481,7 +452,7 @@ def summary_table(report: DesignReport) -> Table:
     lines: list[tuple[str | Cell, ...]] = []
     group = ""
     for how in columns(rows[0]):
-        group = _GROUPS.get(how.name, group).format(ends)
+        group = words("groups").get(how.name, group).format(ends=ends)
         texts = [how.text(row) for row in rows]
         if not how.help or set(texts) == {"-"}:
             continue

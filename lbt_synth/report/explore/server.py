@@ -95,7 +95,7 @@ class LivePanel:
         scale = "log" if self._is_log else "linear"
         self.figure = figure = new_figure(
             name=key,
-            title=words()[key]["title"],
+            title=words(key)["title"],
             **({"width": 330} if square else {"sizing_mode": "stretch_width"}),
             height=330 if square else 300,
             x_axis_type=scale,
@@ -128,7 +128,7 @@ class LivePanel:
         tips = [("", "@name"), ("x", "$snap_x{%.4g}"), ("y", "$snap_y{%.4g}")]
         formats = dict.fromkeys(("$snap_x", "$snap_y"), "printf")
         figure.add_tools(HoverTool(renderers=[marks], tooltips=tips, formatters=formats))
-        caption = Div(text=escape(words()[key]["caption"]), sizing_mode="stretch_width")
+        caption = Div(text=escape(words(key)["caption"]), sizing_mode="stretch_width")
         self.root = column(figure, caption, sizing_mode="stretch_width")
 
     def show(self, designs: Mapping[str, Shown], rules: Sequence[float]) -> None:

@@ -50,10 +50,10 @@ def simulation_figure(
         spectra.set_axes(FREQUENCY, SPECTRUM)
         f, opened, residual = run_spectra(run)
         spectra.curve("before the correction", f, opened, look=None, width=0.8)
-        spectra.curve("after it", f, residual, look=5, dash=0)
+        spectra.curve("after it", f, residual, look=5, width=1.0, dash=0)
         if loop is not None and truth is not None:
             exact = exact_spectrum(loop, truth, f, _segment(run))
-            spectra.curve("after it, exact", f, exact, look=2, width=1.4)
+            spectra.curve("after it, exact", f, exact, look=1, width=1.4)
     return series.figure
 
 

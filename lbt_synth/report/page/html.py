@@ -91,13 +91,13 @@ class Page:
 
 
 @cache
-def words() -> dict[str, dict[str, str]]:
-    """Return the texts of ``words.toml`` by group and name, each on one line."""
+def words(group: str) -> dict[str, Any]:
+    """Return the texts of a group of ``words.toml`` by their names, each on one line."""
     path = files("lbt_synth.report.page") / "words.toml"
-    texts: dict[str, dict[str, str]] = tomllib.loads(path.read_text(encoding="utf-8"))
+    texts: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))[group]
     return {
-        group: {name: " ".join(text.split()) for name, text in own.items()}
-        for group, own in texts.items()
+        name: " ".join(text.split()) if isinstance(text, str) else text
+        for name, text in texts.items()
     }
 
 
@@ -106,7 +106,7 @@ def chart(key: str, figure: Figure, *, group: str = "", **facts: object) -> Char
 
     Its words for those who do not see it say from where to where its curves reach.
     """
-    texts = {name: text.format(**facts) for name, text in words()[group or key].items()}
+    texts = {name: text.format(**facts) for name, text in words(group or key).items()}
     texts["alt"] += "".join(f" {text}." for text in _ranges(figure))
     return Chart(key=key, figure=figure, **texts)
 
@@ -137,7 +137,7 @@ def survival_blocks(margins: Mapping[str, LoopMargins]) -> list[Block]:
 
 def paragraph(name: str, /, **facts: object) -> str:
     """Return the text of a paragraph with facts filled in."""
-    return words()["paragraphs"][name].format(**facts)
+    return str(words("paragraphs")[name]).format(**facts)
 
 
 def new_page(
