@@ -37,13 +37,6 @@ def test_an_unstable_loop_is_named_loudly(report, text):
     assert text.count("wild: unstable") > 5
 
 
-def test_the_loop_gain_has_the_margins_of_the_table(report):
-    (found,) = [each for each in design_page(report).charts if each.key == "bode"]
-    for one in report.stable:
-        assert f"{one.name}: {one.margins.phase_deg:.1f}° at" in found.alt
-    assert "phase margin" in {line.get_label() for line in found.figure.axes[1].get_lines()}
-
-
 def test_a_limit_of_nothing_is_no_limit(config, designs):
     still = lbt.Truth(turbulence=None, noise_nm=config.truth.noise_nm)
     report = lbt.report.design_report(replace(config, truth=still), {"slow": designs["slow"]})
@@ -140,17 +133,6 @@ def test_a_certificate_that_cannot_be_computed(few, monkeypatch):
     assert "The certificate of slow fails: the norm did not settle." in text
     assert "slow: not computed: the norm did not settle." in text
     assert "NOT COMPUTED" in text
-
-
-def test_both_files_or_none(report, tmp_path, monkeypatch):
-    (tmp_path / "a.html").write_text("old")
-    monkeypatch.setattr("lbt_synth.report.page.html.page_html", lambda page: b"new")
-    monkeypatch.setattr("lbt_synth.report.page.html.print_html", lambda html: 1 / 0)
-    monkeypatch.setattr("lbt_synth.report.page.html.require_weasyprint", lambda: None)
-    with pytest.raises(ZeroDivisionError):
-        lbt.report.write_page(design_page(report), tmp_path / "a.html", pdf=tmp_path / "a.pdf")
-    assert (tmp_path / "a.html").read_text() == "old"
-    assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
 
 
 def test_refused_in_the_library(report, config, designs, tmp_path):

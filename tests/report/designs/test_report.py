@@ -110,17 +110,6 @@ def test_the_verdict_is_made_of_the_numbers(report):
     assert "ertificates that do NOT hold: wild." in words
 
 
-def test_equal_designs_share_the_lead(few, designs):
-    kalman = designs["kalman"]
-    pair = {"one": kalman, "two": kalman}
-    words = verdict(lbt.report.design_report(few, pair)).replace("\u00a0", " ")
-    assert "Least residual: one and two, " in words
-    assert "Hz: one and two, " in words
-    three = verdict(lbt.report.design_report(few, {"slow": designs["slow"], **pair}))
-    assert "Least residual: one and two, " in three
-    assert "Hz: one and two, " in three or "Hz: slow, " in three
-
-
 def test_simulations_agree_with_the_exact_answer(report):
     for one in report.stable:
         exact = lbt.residual_budget(one.loop, report.config.truth)

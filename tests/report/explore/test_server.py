@@ -7,14 +7,12 @@ from queue import Queue
 import numpy as np
 import pytest
 from bokeh.document import Document
-from support.browser import DESK, PHONE, chromium
+from support.browser import DESK, chromium
 from support.commands import run
 from support.configs import write_config
 from support.explore import (
-    MODEL,
     await_true,
     await_verdict,
-    choose,
     five_lines,
     move,
     press,
@@ -235,44 +233,6 @@ def test_every_slider_moves_curves(page):
 
 
 @pytest.mark.browser
-def test_files_are_saved(page, folder):
-    move(page, "delay", 0.3)
-    press(page, "save")
-    await_true(lambda: text_of(page, "saved"))
-    assert "lbt-synth design explored-1.yaml --method kalman" in text_of(page, "saved")
-    saved = lbt.load_config(folder / "explored-1.yaml")
-    assert saved.hardware.delay_frames == 2.5
-    assert lbt.load_gain(folder / "explored-1.fits").certificate.passed
-
-
-@pytest.mark.browser
-def test_a_method_is_chosen_and_a_curve_kept(page):
-    press(page, "keep")
-    await_true(lambda: "Kalman, kept" in text_of(page, "facts"))
-    assert choose(page, "hinf").startswith("H∞ leaves")
-
-
-@pytest.mark.browser
-def test_it_fits_a_phone(page, address):
-    show(page, address, {**PHONE, "width": 390})
-    assert page.execute_script("return document.documentElement.scrollWidth") <= 390
-    shown = page.execute_script(f"return {MODEL}('delay').visible")
-    assert shown
-
-
-@pytest.mark.browser
-def test_nothing_is_asked_from_elsewhere(page, address):
-    asked_for = {
-        found
-        for entry in page.get_log("performance")
-        if '"Network.requestWillBeSent"' in entry["message"]
-        for found in re.findall(r'"url":"([^"]*)"', entry["message"])
-    }
-    assert asked_for
-    assert all(url.startswith((address, "data:", "blob:")) for url in asked_for)
-
-
-@pytest.mark.browser
 def test_another_origin_is_refused(driver, address):
     driver.get("data:text/html,<title>elsewhere</title>")
     script = (
@@ -311,14 +271,6 @@ def test_nothing_is_overwritten(exploration, tmp_path):
     assert [path.name for path in third[0]] == [f"explored-3.{e}" for e in ("yaml", "fits", "sh")]
     assert (tmp_path / "explored-2.sh").read_text() == "mine"
     assert len(list(tmp_path.iterdir())) == 7
-
-
-def test_the_head_says_what_was_moved(exploration, tmp_path):
-    view = new_view(exploration, "kalman", {"gain": 0.5})
-    config = save_view(exploration, view, tmp_path)[0][0]
-    head = config.read_text().splitlines()[:2]
-    assert head[0].startswith("# 'lbt.yaml' with real sensor gain 0.5; lbt_synth ")
-    assert head[1] == "# lbt-synth design explored-1.yaml --method kalman -o explored-1.fits"
 
 
 @pytest.fixture(scope="module")

@@ -5,14 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.end_to_end import make_table
 from support.figures import legend
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.report.figures.studies import (
-    end_to_end_figure,
-    end_to_end_table_figure,
     limits_figure,
     tradeoff_figure,
 )
@@ -30,15 +27,6 @@ def test_robustness_figure_draws_the_paper_beside(config):
         [replace(row, strehl=0.99 + row.strehl / 1000) for row in rows]
     ).axes
     assert 97.9 < better.get_ylim()[0] < 99
-
-
-def test_robustness_figure_of_an_unstable_method(config):
-    truth = replace(config.truth, sensor_gain=0.3)
-    rows = list(
-        robustness(config.plant, truth, config.imaging, errors_hz=[-1, 0], gamma_ratio=1.05)
-    )
-    (axis,) = lbt.report.figures.robustness_figure(rows).axes
-    assert legend(axis) == ["Kalman", "H∞: unstable"]
 
 
 @pytest.fixture(scope="module")
@@ -102,23 +90,6 @@ def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, 
     nowhere.savefig(tmp_path / "b.pdf")
 
 
-def test_map_figures_that_are_refused(maps, kalman, settings):
-    with pytest.raises(lbt.errors.ProblemError, match="at least one map"):
-        lbt.report.figures.robustness_map_figure({})
-    late = robustness_map(
-        kalman,
-        settings.truth,
-        settings.imaging,
-        errors_hz=[0],
-        sensor_gains=[1],
-        delay_errors_frames=[0.1],
-    )
-    with pytest.raises(
-        lbt.errors.ProblemError, match=r"same delay errors \[0.0\]; got \[0.1\] for late"
-    ):
-        lbt.report.figures.robustness_map_figure({**maps, "late": late})
-
-
 def test_modal_figure_has_labels_units_and_all_modes():
     residuals = {"integrators": [9.0, 5.0, 2.0], "Kalman filters": [8.0, 4.0, 1.0]}
     above, below = lbt.report.figures.modal_figure(
@@ -145,30 +116,6 @@ def test_bad_modal_figures_are_refused():
     ):
         with pytest.raises(error, match=words):
             lbt.report.figures.modal_figure(*arguments)
-
-
-def test_the_table_of_the_paper_has_a_panel_a_controller():
-    figure = end_to_end_table_figure(make_table())
-    assert [axis.get_title(loc="left") for axis in figure.axes] == ["Kalman", "H∞", "slow"]
-    assert figure.axes[0].lines[0].get_label() == "Agapito et al. 2008"
-
-
-def test_a_run_has_three_panels_and_a_colour_bar():
-    rng = np.random.default_rng(0)
-    run = lbt.interop.EndToEndRun(
-        system=lbt.load_config(LBT_YAML).end_to_end.system,
-        strehl_series=np.full(40, 0.8),
-        other_modes_series=np.full(40, 0.9),
-        **{
-            name: rng.normal(size=(40, 672)) for name in ("measurements", "commands", "residual_nm")
-        },
-        psf=np.eye(60),
-        psf_pixel_mas=18.4,
-        seed=0,
-        settle_frames=400,
-        seconds=1.0,
-    )
-    assert len(end_to_end_figure(run).axes) == 4
 
 
 def test_a_sensor_gain_of_zero_has_no_line():

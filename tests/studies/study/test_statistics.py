@@ -13,7 +13,6 @@ from lbt_synth.studies import study_statistics
 from lbt_synth.studies.study.statistics import (
     first_order_index,
     percentiles,
-    sensitivity_table,
     share,
     summary_tables,
     worst_table,
@@ -58,36 +57,6 @@ def test_unstable_counts_as_zero_and_failed_is_left_out(small):
 def test_worst_rows_are_the_unstable_then_those_of_least_strehl(small):
     a, b = study_statistics(small, ["gain"], ["a", "b"]).controllers
     assert (a.worst, b.worst) == ((1, 2, 4, 0), (1, 2, 3, 4, 0))
-
-
-def test_a_stable_loop_without_light_comes_after_unstable_ones_and_ties_by_row():
-    strehl = np.array([0.0, 0.3, 0.3, NAN, 0.3])
-    columns = make_columns(
-        {}, {"a": strehl}, row=np.array([4, 9, 2, 8, 1]), **{"a.stable": [1, 1, 1, 0, 1]}
-    )
-    worst = study_statistics(columns, [], ["a"]).controllers[0].worst
-    assert [columns["row"][place] for place in worst] == [8, 4, 1, 2, 9]
-
-
-@settings(max_examples=5)
-@given(seed=st.integers(0, 10_000))
-def test_the_order_of_samples_is_of_no_matter(seed):
-    rng = np.random.default_rng(seed)
-    columns = make_columns(
-        {"p": rng.random(60), "q": rng.integers(0, 3, 60) * 10.0},
-        {"a": rng.random(60), "b": rng.random(60)},
-        row=np.arange(60),
-    )
-    columns["a.stable"][rng.random(60) < 0.2] = 0
-    columns["b.stable"][rng.random(60) < 0.2] = NAN
-    order = rng.permutation(60)
-    here = study_statistics(columns, ["p", "q"], ["a", "b"])
-    there = study_statistics(
-        {name: values[order] for name, values in columns.items()}, ["p", "q"], ["a", "b"]
-    )
-    assert [t.rows for t in summary_tables(here)] == [t.rows for t in summary_tables(there)]
-    for one, other in zip(here.controllers, there.controllers, strict=True):
-        assert list(one.worst) == order[list(other.worst)].tolist()
 
 
 @pytest.mark.parametrize(
@@ -186,6 +155,16 @@ def test_ishigami(kind, n, limit):
     assert np.all(np.abs(values - ishigami_indices()) < 4 * errors)
 
 
+# rbd_fast.analyze of SALib 1.6.0, of the same 4000 samples
+SALIB = (0.318278, 0.448807, -0.000789, -0.001446)
+
+
+def test_indices_are_those_of_salib():
+    u = np.random.default_rng(5).random((4000, 4))
+    values = [index(column, ishigami(u))[0] for column in u.T]
+    np.testing.assert_allclose(values, SALIB, atol=0.0025)
+
+
 @pytest.mark.study
 def test_standard_errors_are_those_of_repeated_samples():
     """Mean error, spread over 200 samples, and the mean of the standard errors."""
@@ -236,19 +215,6 @@ def test_what_only_two_together_do_is_in_no_index():
         assert row["index"] < 0.02
     interactions = summary_tables(found)[-1].rows[-1]
     assert float(interactions[1].split()[0]) > 97
-
-
-def test_failed_samples_are_left_out_of_indices():
-    u = draw_points("independent", 300, 2, seed=3)
-    columns = make_columns({"q": u[:, 0], "p": u[:, 1]}, {"a": 0.2 * u[:, 0] + 0.5 * u[:, 1]})
-    failed = np.arange(300) % 7 == 0
-    nans = {f"a.{name}": np.where(failed, NAN, columns[f"a.{name}"]) for name in RESULTS}
-    kept = {name: column[~failed] for name, column in columns.items()}
-    spoilt, whole = (study_statistics(each, ["q", "p"], ["a"]) for each in (columns | nans, kept))
-    assert spoilt.ranked == whole.ranked == ("p", "q")
-    for name in ("p", "q"):
-        expected = whole.controllers[0].sensitivity[name]
-        assert spoilt.controllers[0].sensitivity[name] == pytest.approx(expected, rel=1e-12)
 
 
 def test_constants_have_no_index():
@@ -340,14 +306,3 @@ def test_tables(small):
     worst = worst_table(found.controllers[0], small, ["gain"])
     assert [cell_text(cell) for cell in worst.rows[0]] == ["11", "unstable", "0.6"]
     assert [cell_text(cell) for cell in worst.rows[1]] == ["12", "40.0", "0.7"]
-
-
-def test_the_table_of_indices_ends_with_what_they_lack():
-    columns = make_columns({"p": np.linspace(0, 1, 50)}, {"a": np.linspace(0, 1, 50)})
-    found = study_statistics(columns, ["p"], ["a"])
-    index = next(t for t in summary_tables(found) if t.caption.startswith("Variance"))
-    assert index.rows == (
-        ("p", "100.0 ± 0.0"),
-        ("only together (interactions)", "0.0 ± 0.0"),
-    )
-    assert sensitivity_table(found, names={"p": "short"}).rows[0][0] == "short"
