@@ -174,10 +174,8 @@ def limits(
         least_worst = partial(least_worst_residual, alone, rest, band_hz=band_hz)
         band = limit_or_none(partial(least_worst, rms_nm=line.rms_nm, direction=line.direction))
     bounds_nm = tuple(np.nan if bound is None else bound.rms_nm for bound in (limit, band))
-    samples = (
-        (name, design, hardware, truth, imaging, shifts, bounds_nm)
-        for name, design in designs.items()
-    )
+    met = hardware, truth, imaging
+    samples = ((name, design, met, shifts, bounds_nm) for name, design in designs.items())
     rows, curves = zip(*evaluate(_limit_row, samples, executor), strict=True)
     return LimitStudy(
         rows=rows,
@@ -193,13 +191,12 @@ def limits(
 def _limit_row(
     name: str,
     design: Design,
-    hardware: LoopHardware,
-    truth: Truth,
-    imaging: Imaging,
+    met: tuple[LoopHardware, Truth, Imaging],
     shifts: FloatArray,
-    bounds_nm: tuple[float, float],
+    bounds_nm: tuple[float, ...],
 ) -> tuple[LimitRow, FloatArray]:
     """Return the row of a design beside the two limits, and its residual at each shift, (s,)."""
+    hardware, truth, imaging = met
     loop = design.close(hardware, sensor_gain=truth.sensor_gain)
     numbers = loop_columns(loop, truth, imaging)
     residual_nm = numbers["residual_nm"]

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,7 @@ from lbt_synth.design import (
 from lbt_synth.design.mixed import require_taps
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.linear import Controller, EstimationProblem
+from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.loop import (
     Imaging,
@@ -68,6 +68,9 @@ from lbt_synth.validation import (
     require_instance,
 )
 
+_Loop: TypeAlias = tuple[Design, LoopHardware, Truth, Imaging]
+# true vibrations, each with its frequencies [Hz] under e errors, (e,)
+_MovedLines: TypeAlias = Sequence[tuple[Vibration | SinusoidalVibration, FloatArray]]
 FAMILIES = (MIXED.name, "central")
 _CROWDING = 1.5  # above 1, points are denser near the least norm
 _GAINS_AT_ONCE = 64  # of a map
@@ -154,26 +157,22 @@ def robustness(
     for name in names:
         choice(name, "method", record_methods())
     errors = [number(error, "errors_hz") for error in errors_hz]
-    loop = plant, truth, imaging, gamma_ratio, hold
-    samples = ((*loop, error, name) for error in errors for name in names)
+    model = {"gamma_ratio": gamma_ratio, "hold": hold}
+    loop = plant, truth, imaging
+    samples = ((loop, model, error, name) for error in errors for name in names)
     yield from evaluate(_robustness_row, samples, executor)
 
 
 def _robustness_row(
-    plant: TipTiltPlant,
-    truth: Truth,
-    imaging: Imaging,
-    gamma_ratio: float,
-    hold: str,
-    error_hz: float,
-    method: str,
+    loop: tuple[TipTiltPlant, Truth, Imaging], model: dict[str, Any], error_hz: float, method: str
 ) -> RobustnessRow:
     """Design for lines that are moved by an error, and close the real loop."""
+    plant, truth, imaging = loop
     shifts = [-truth.frequency_shift_hz(line.frequency_hz, error_hz) for line in plant.vibrations]
-    moved = retuned_plant(plant, shifts, hold=hold)
-    design = reference_design(method, moved, {"gamma_ratio": gamma_ratio})
-    loop = design.close(plant.hardware, sensor_gain=truth.sensor_gain)
-    numbers = loop_columns(loop, truth, imaging) | {"stable": loop.is_stable}
+    moved = retuned_plant(plant, shifts, hold=model["hold"])
+    design = reference_design(method, moved, {"gamma_ratio": model["gamma_ratio"]})
+    closed = design.close(plant.hardware, sensor_gain=truth.sensor_gain)
+    numbers = loop_columns(closed, truth, imaging) | {"stable": closed.is_stable}
     return fill_row(RobustnessRow, design, error_hz=error_hz, **numbers)
 
 
@@ -281,10 +280,10 @@ def robustness_map(
         raise ProblemError(
             "a frequency error needs a vibration in the truth; got a truth without any."
         )
-    lines = list(_moved_lines(truth, errors, hardware))
+    lines = _moved_lines(truth, errors, hardware)
     pieces = np.array_split(gains, -(-gains.size // _GAINS_AT_ONCE))
-    loop = design.controller, hardware, truth, imaging, lines
-    samples = ((*loop, float(delay), piece) for delay in delays for piece in pieces)
+    loop = design, hardware, truth, imaging
+    samples = ((loop, lines, float(delay), piece) for delay in delays for piece in pieces)
     stacks = list(evaluate(_map_columns, samples, executor))
     size = delays.size, gains.size, errors.size
     strehl, residual_nm, stable = (
@@ -303,15 +302,10 @@ def robustness_map(
 
 
 def _map_columns(
-    controller: Controller,
-    hardware: LoopHardware,
-    truth: Truth,
-    imaging: Imaging,
-    lines: Sequence[tuple[Vibration | SinusoidalVibration, FloatArray]],
-    delay_error_frames: float,
-    gains: FloatArray,
+    loop: _Loop, lines: _MovedLines, delay_error_frames: float, gains: FloatArray
 ) -> dict[str, FloatArray]:
     """Return what the loops of all gains leave with lines at all frequencies, by column."""
+    design, hardware, truth, imaging = loop
     errors = lines[0][1].size if lines else 1
     ensemble = LoopEnsemble(
         sensor_gain=np.repeat(gains, errors),
@@ -323,13 +317,12 @@ def _map_columns(
             for line, frequencies in lines
         ),
     )
-    return residual_columns(ensemble_residuals(controller, hardware, ensemble), imaging)
+    return residual_columns(ensemble_residuals(design.controller, hardware, ensemble), imaging)
 
 
-def _moved_lines(
-    truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
-) -> Iterator[tuple[Vibration | SinusoidalVibration, FloatArray]]:
-    """Yield the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
+def _moved_lines(truth: Truth, errors_hz: FloatArray, hardware: LoopHardware) -> _MovedLines:
+    """Return the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
+    moved: list[tuple[Vibration | SinusoidalVibration, FloatArray]] = []
     nyquist_hz, shares = hardware.frame_rate_hz / 2, truth.frequency_shifts_hz(1.0)
     for line, share in zip(stationary_vibrations(truth.vibrations), shares, strict=True):
         checked_direction(line, hardware)
@@ -341,7 +334,8 @@ def _moved_lines(
                 f"error of {errors_hz[wrong][0]:.6g} Hz, which moves the one at "
                 f"{line.frequency_hz:.6g} Hz to {frequencies[wrong][0]:.6g} Hz."
             )
-        yield line, frequencies
+        moved.append((line, frequencies))
+    return moved
 
 
 def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
@@ -392,34 +386,27 @@ def run_failures(
         drops=drops,
     )
     segments = run_segments(drops, frames / rate)
-    samples = (
-        (design, hardware, truth, config.imaging, simulation, segment) for segment in segments
-    )
+    loop = design, hardware, truth, config.imaging
+    samples = ((loop, simulation, segment) for segment in segments)
     return simulation, list(zip(segments, evaluate(_segment_row, samples), strict=True))
 
 
-def _segment_row(
-    design: Design,
-    hardware: LoopHardware,
-    truth: Truth,
-    imaging: Imaging,
-    simulation: Simulation,
-    segment: Segment,
-) -> Facts:
+def _segment_row(loop: _Loop, simulation: Simulation, segment: Segment) -> Facts:
     """Return what a loop leaves while some sensors fail, in a run and exactly."""
-    loop = close_loop(
+    design, hardware, truth, imaging = loop
+    closed = close_loop(
         hardware,
         design.controllers[frozenset(segment.missing)],
         sensor_gain=truth.sensor_gain,
         blind=(*segment.missing, *segment.wrong),
     )
     # a frozen reading adds an offset of its own
-    exact = loop.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
+    exact = closed.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
     rate = hardware.frame_rate_hz
     first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
     run = simulation.part(first, last)
-    exact_nm = residual_budget(loop, truth).rms_nm if exact else np.nan
-    ratio = float(np.mean(run.strehl(imaging))) if loop.is_stable else np.nan
+    exact_nm = residual_budget(closed, truth).rms_nm if exact else np.nan
+    ratio = float(np.mean(run.strehl(imaging))) if closed.is_stable else np.nan
     rms, second = {"unit": "nm rms", "format": ".2f"}, {"unit": "s", "format": "g"}
     return facts(
         start_s=fact(segment.start_s, "from", **second),
@@ -428,7 +415,7 @@ def _segment_row(
         residual_nm=fact(float(np.sqrt(np.mean(run.rms_nm**2))), "simulated", **rms),
         exact_nm=fact(exact_nm, "exact, once settled", **rms),
         strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
-        stable=fact(loop.is_stable, "stable"),
+        stable=fact(closed.is_stable, "stable"),
     )
 
 
@@ -455,21 +442,20 @@ def mirror_rows(
         "kalman, real positions": kalman(plant),
         regulated.method: regulated,
     }
-    samples = ((name, design, hardware, truth, imaging) for name, design in designs.items())
+    samples = ((name, (design, hardware, truth, imaging)) for name, design in designs.items())
     return tuple(evaluate(_mirror_row, samples))
 
 
-def _mirror_row(
-    name: str, design: Design, hardware: LoopHardware, truth: Truth, imaging: Imaging
-) -> Facts:
+def _mirror_row(name: str, loop: _Loop) -> Facts:
     """Return what a design leaves on a moving mirror."""
-    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    numbers = loop_columns(loop, truth, imaging)
-    unsettled_nm = settling_error(loop, truth).rms_nm if loop.is_stable else np.nan
+    design, hardware, truth, imaging = loop
+    closed = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+    numbers = loop_columns(closed, truth, imaging)
+    unsettled_nm = settling_error(closed, truth).rms_nm if closed.is_stable else np.nan
     rms: dict[str, Any] = {"unit": "nm", "format": ".2f"}
     return facts(
         design=fact(name, "design"),
-        stable=fact(loop.is_stable),
+        stable=fact(closed.is_stable),
         residual_nm=fact(numbers["residual_nm"], "residual", missing="unstable", **rms),
         strehl=fact(numbers["strehl"], "Strehl", unit="%", scale=100, format=".2f"),
         unsettled_nm=fact(unsettled_nm, "settled less real position", **rms),
