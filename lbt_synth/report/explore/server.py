@@ -50,7 +50,7 @@ from lbt_synth.report.explore.exploration import (
 )
 from lbt_synth.report.figures.studies import strehl_axis
 from lbt_synth.report.page.html import creator_name, words
-from lbt_synth.storage.atomic_files import write_together
+from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.storage.display_unit import shown_unit
 
 Ends = tuple[tuple[float, float], tuple[float, float]]  # of the scales of x and y
@@ -161,9 +161,6 @@ def _strokes(look: int) -> str:
     return " ".join(f"{2.4 * stroke:.0f}" for stroke in dashes(look)) or "solid"
 
 
-_ENDINGS = (".yaml", ".fits", ".sh")
-
-
 def save_view(
     exploration: Exploration, view: View, folder: Path
 ) -> tuple[list[Path], tuple[str, ...]]:
@@ -171,9 +168,9 @@ def save_view(
     stem = next(
         stem
         for stem in (f"explored-{number}" for number in count(1))
-        if not any((folder / (stem + ending)).exists() for ending in _ENDINGS)
+        if not any((folder / (stem + ending)).exists() for ending in (".yaml", ".fits"))
     )
-    config, gain, script = (folder / (stem + ending) for ending in _ENDINGS)
+    config, gain = folder / f"{stem}.yaml", folder / f"{stem}.fits"
     request = view.request
     options = [f"--{name.replace('_', '-')} {value}" for name, value in request.given.items()]
     design = ["lbt-synth design", config.name, "--method", request.method.name, *options]
@@ -183,11 +180,10 @@ def save_view(
     )
     moves = view.moves or "nothing moved"
     head = f"{exploration.config.source.name!a} with {moves}; {creator_name()}"
-    lines = ["#!/bin/sh", f"# {head}", "set -e", 'cd "$(dirname "$0")"', *commands, ""]
     text = config_text(view.config.settings, {"": "\n".join((head, *commands))})
-    write_together({config: text.encode(), script: "\n".join(lines).encode()})
+    write_atomically(config, text.encode())
     save_gain(gain, view.design)
-    return [config, gain, script], commands
+    return [config, gain], commands
 
 
 def knob_slider(knob: Knob) -> Slider:

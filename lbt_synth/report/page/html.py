@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from html import escape
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
@@ -199,13 +199,8 @@ def creator_name() -> str:
 
 def program_versions() -> tuple[tuple[str, str], ...]:
     """Return name and version of the programs that make a page."""
-    installed = [("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())]
-    for name in _PROGRAMS:
-        try:
-            installed.append((name, version(name)))
-        except PackageNotFoundError:
-            installed.append((name, "not installed"))
-    return tuple(installed)
+    ours = ("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())
+    return (*ours, *((name, version(name)) for name in _PROGRAMS))
 
 
 _COLUMNS = 6  # that fit a sheet of paper beside the first one of a table

@@ -153,7 +153,7 @@ def test_kept_curves_are_named_by_their_moves(own):
 def test_a_save_that_fails_is_said(own, tmp_path):
     own.session._save()
     assert "explored-1.yaml" in own["saved"].text
-    assert len(own.session._saved) == 3
+    assert len(own.session._saved) == 2
     own.session._folder = tmp_path / "nowhere"
     own.session._save()
     assert "cannot write" in own["saved"].text
@@ -247,30 +247,31 @@ def test_another_origin_is_refused(driver, address):
 def test_the_commands_make_the_files(exploration, tmp_path, monkeypatch, capsys, method):
     wish = method, {"delay": 2.5, "shift": 0.7, "gamma_ratio": 1.4}
     view = new_view(exploration, *wish)
-    (config, gain, script), commands = save_view(exploration, view, tmp_path)
+    (config, gain), commands = save_view(exploration, view, tmp_path)
     assert lbt.load_config(config).text == view.config.text
+    head = config.read_text().splitlines()[:2]
+    assert head[0].startswith("# 'lbt.yaml' with total delay 2.5 frames, frequency error")
+    assert head[1] == f"# {commands[0]}"
     kept = lbt.load_gain(gain)
     np.testing.assert_array_equal(kept.gain_predictor, view.design.gain_predictor)
     gain.unlink()
     monkeypatch.chdir(tmp_path)
     words = commands[0].split()
     assert words[0] == "lbt-synth"
-    assert commands[0] in script.read_text().splitlines()
     status, _, error = run(capsys, *words[1:])
     assert (status, error) == (0, "")
     made = lbt.load_gain(gain)
     np.testing.assert_allclose(made.gain_predictor, kept.gain_predictor, rtol=1e-9, atol=1e-12)
 
 
-def test_nothing_is_overwritten(exploration, tmp_path):
-    view = new_view(exploration, "kalman")
-    first = save_view(exploration, view, tmp_path)
-    (tmp_path / "explored-2.sh").write_text("mine")
-    third = save_view(exploration, view, tmp_path)
-    assert [path.name for path in first[0]] == [f"explored-1.{e}" for e in ("yaml", "fits", "sh")]
-    assert [path.name for path in third[0]] == [f"explored-3.{e}" for e in ("yaml", "fits", "sh")]
-    assert (tmp_path / "explored-2.sh").read_text() == "mine"
-    assert len(list(tmp_path.iterdir())) == 7
+def test_nothing_is_overwritten(exploration, first, tmp_path):
+    one, _ = save_view(exploration, first, tmp_path)
+    (tmp_path / "explored-2.fits").write_text("mine")
+    third, _ = save_view(exploration, first, tmp_path)
+    assert [path.name for path in one] == ["explored-1.yaml", "explored-1.fits"]
+    assert [path.name for path in third] == ["explored-3.yaml", "explored-3.fits"]
+    assert (tmp_path / "explored-2.fits").read_text() == "mine"
+    assert len(list(tmp_path.iterdir())) == 5
 
 
 @pytest.fixture(scope="module")
