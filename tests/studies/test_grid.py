@@ -78,9 +78,15 @@ def test_a_part_is_believed_by_its_digest_alone(tmp_path):
     arrays, text = array_file.read_npz(path.read_bytes())
     with pytest.raises(OutputError, match="is of another study"):
         replace(sweep, digest="e" * 64).read(path)
-    path.write_bytes(array_file.npz_bytes({"RESULTS": 1.001 * arrays["RESULTS"]}, text))
-    with pytest.raises(OutputError, match="is damaged. Delete it"):
-        sweep.read(path)
+    content = path.read_bytes()
+    changed = array_file.npz_bytes({"RESULTS": 1.001 * arrays["RESULTS"]}, text)
+    for damage in (changed, content[:-30], content[:200] + b"x" + content[201:], b""):
+        path.write_bytes(damage)
+        with pytest.raises(OutputError, match="is damaged. Delete it"):
+            sweep.read(path)
+    path.with_name("0000000001-0000000002.npz").write_bytes(content)
+    with pytest.raises(OutputError, match="has rows that are in"):
+        sweep.paths()
 
 
 def wrong(study, values, start):

@@ -1,8 +1,5 @@
 """Runs of studies: what they write, resume and refuse."""
 
-import errno
-import os
-
 import numpy as np
 import pytest
 from support.studies import (
@@ -17,7 +14,7 @@ from support.studies import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.studies.study.run import replay_row
 from lbt_synth.studies.study.sample import evaluate_samples
 
@@ -76,71 +73,6 @@ def test_failures_are_listed_and_their_rows_are_there(tmp_path):
     assert [failure[:2] for failure in run.failures] == [(row, "tight") for row in noisy]
     assert np.all(np.isnan(found["tight.strehl"][noisy]))
     assert not np.any(np.isnan(found["a.strehl"]))
-
-
-@pytest.mark.usefixtures("small_parts")
-def test_other_studies_and_damage_are_refused(tmp_path):
-    study, folder = load_small_study(tmp_path, samples="60", controllers=TWO), make_folder(tmp_path)
-
-    def stops(study, values, start):
-        if start >= 40:
-            raise KeyboardInterrupt
-        return evaluate_quickly(study, values, start)
-
-    def refused(words, call=lambda: lbt.studies.run_study(study, folder)):
-        with pytest.raises(OutputError, match=words):
-            call()
-
-    with pytest.raises(KeyboardInterrupt):
-        lbt.studies.run_study(study, folder, evaluate=stops)
-    other = load_small_study(tmp_path, samples="60", controllers=TWO, seed="8")
-    refused("is of another study", lambda: lbt.studies.run_study(other, folder))
-    refused("is of another study", lambda: replay_row(other, folder, 0))
-    part = part_path(folder, 0)
-    content = part.read_bytes()
-    for damage in (content[:-30], content[:200] + b"x" + content[201:], b""):
-        part.write_bytes(damage)
-        refused("is damaged. Delete it")
-    part.write_bytes(content)
-    twin = part.with_name("0000000003-0000000005.npz")
-    twin.write_bytes(content)
-    refused("has rows that are in")
-    twin.unlink()
-    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    assert_whole(folder, study)
-
-
-def test_no_directory_and_inputs_in_the_way(tmp_path):
-    study = load_small_study(tmp_path)
-    with pytest.raises(OutputError, match="cannot make the directory"):
-        lbt.studies.run_study(study, tmp_path / "nowhere")
-    made = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.4)
-    lbt.save_gain(tmp_path / "b.fits", made)
-    study = load_small_study(tmp_path, controllers="{a: {file: b.fits}, b: {design: kalman}}")
-    with pytest.raises(OutputError, match="must not replace the input"):
-        lbt.studies.run_study(study, tmp_path)
-
-
-@pytest.mark.usefixtures("small_parts")
-@pytest.mark.parametrize("calls", [1, 5, 9])
-def test_a_full_disk(tmp_path, monkeypatch, calls):
-    """The manifest and the design, parts, the results: whatever cannot be written."""
-    study, folder = load_small_study(tmp_path, samples="60"), make_folder(tmp_path)
-    left, sync = [calls], os.fsync
-
-    def full(handle):
-        left[0] -= 1
-        if left[0] < 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        sync(handle)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(OutputError, match="No space left on device.*its free space"):
-            lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    assert not list(folder.rglob(".*.*"))  # nothing half-written
-    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    assert_whole(folder, study)
 
 
 def test_tables_are_written_from_the_parts(tmp_path):

@@ -213,40 +213,6 @@ def test_changed_configurations(tmp_path, name):
     agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=count)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "path", "values"),
-    [
-        ("axis: both,", "direction_deg: 0,", "model.vibrations[0].direction_deg", "[30, 0]"),
-        (
-            "mirror:\n",
-            "mirror:\n  influence_matrix: [[1.0, 0.0], [0.0, 1.0]]\n",
-            "mirror.influence_matrix[0][1]",
-            "[0.3, 0]",
-        ),
-    ],
-)
-def test_samples_whose_axes_are_no_longer_independent(tmp_path, old, new, path, values):
-    """The configuration has a filter per axis, and some of its samples do not."""
-    assert old in LBT_TEXT
-    parameters = f"{{'{path}': {{list: {values}}}, truth.sensor_gain: {{uniform: [0.5, 1]}}}}"
-    agree(tmp_path, base=LBT_TEXT.replace(old, new), controllers=OWN, parameters=parameters)
-
-
-def test_an_image_that_is_gone(tmp_path):
-    """A jitter of more than the Strehl ratio is integrated for leaves none, either way."""
-    parameters = """{
-      'truth.vibrations[0].rms_mas': {list: [40, 1.0e+5]},
-      truth.sensor_gain: {uniform: [0.5, 1]}
-    }"""
-    _, columns, failures = agree(
-        tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters, count=4
-    )
-    assert not failures
-    strehl = columns["slow.strehl"]
-    assert (strehl == 0).sum() == 2 == (strehl > 0).sum()
-    assert (columns["slow.stable"] == 1).all()
-
-
 def test_samples_that_the_configuration_refuses(tmp_path):
     """A tail of the normal distribution below 0: those fail as they do on their own."""
     parameters = """{

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import stats
 from scipy.stats import qmc
 
@@ -198,28 +196,6 @@ def test_the_index_of_a_list_is_epsilon_squared():
     assert index(values, result)[0] == pytest.approx(epsilon, rel=1e-9)
 
 
-@settings(max_examples=10)
-@given(shift=st.floats(-5, 5), scale=st.sampled_from([-3.0, 0.01, 7.0]), seed=st.integers(0, 1000))
-def test_the_index_knows_no_units(shift, scale, seed):
-    u = draw_points("independent", 150, 2, seed)
-    result = u[:, 0] ** 2 + 0.3 * u[:, 1]
-    here = index(u[:, 0], result)
-    there = index(np.exp(3 * u[:, 0]), shift + scale * result)
-    assert there == pytest.approx(here, abs=1e-9)
-
-
-def test_what_only_two_together_do_is_in_no_index():
-    u = draw_points("independent", 5000, 2, seed=4)
-    result = (u[:, 0] - 0.5) * (u[:, 1] - 0.5) + 0.5
-    columns = make_columns({"p": u[:, 0], "q": u[:, 1]}, {"a": result})
-    found = study_statistics(columns, ["p", "q"], ["a"])
-    for row in found.controllers[0].sensitivity.values():
-        assert abs(row["index"]) < 4 * row["index_error"]
-        assert row["index"] < 0.02
-    interactions = summary_tables(found)[-1].rows[-1]
-    assert float(interactions[1].split()[0]) > 97
-
-
 def test_constants_have_no_index():
     u = draw_points("independent", 200, 1, seed=0)
     columns = make_columns(
@@ -234,20 +210,6 @@ def test_constants_have_no_index():
     assert found.ranked == ("p",)
     table = next(t for t in summary_tables(found) if t.caption.startswith("Variance"))
     assert [row[2] for row in table.rows if len(row) > 1] == ["-", "-"]
-
-
-@pytest.mark.parametrize(("kind", "n"), [("independent", 4096), ("latin", 512), ("sobol", 512)])
-def test_an_edge_is_blurred_within_its_group_alone(kind, n):
-    """A loop that is unstable beyond 0.9 has a Strehl ratio of 0 there."""
-    u = draw_points(kind, n, 2, seed=2)
-    x, y = u.T
-    value, error = index(x, np.where(x > 0.9, 0.0, 0.8 - 0.2 * y))
-    between, within = 0.09 * 0.7**2, 0.9 * 0.2**2 / 12
-    blurred = (
-        0.7**2 / 4 / (16 if n == 4096 else 8)
-    )  # a step in the middle of a group, without a line
-    missing = between / (between + within) - value
-    assert -3 * error < missing < blurred / (between + within) + 3 * error
 
 
 def test_one_odd_sample_makes_no_index():

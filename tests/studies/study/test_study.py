@@ -213,18 +213,6 @@ def test_refusals(tmp_path, line):
     assert path in ([], [caught.value.path])
 
 
-def test_three_axes_are_refused(tmp_path):
-    base = BASE.replace("axes: 1, ", "").replace(
-        "noise_nm: 15.0", "noise_nm: 15.0, matrix: [[1, 0, 0], [0, 1, 0], [0, 0, 1]]"
-    )
-    base = base.replace("vibrations: [{frequency_hz: 20.0, damping: 0.01, rms_nm: 500.0}]", "")
-    base = base.replace(
-        "vibrations: [{kind: sinusoid, frequency_hz: 20.0, rms_nm: 500.0}]", "sensor_gain: 1.0"
-    )
-    with pytest.raises(ConfigError, match="one or two axes; got a loop of 3"):
-        load_small_study(tmp_path, base=base, parameters="{truth.sensor_gain: {uniform: [0.5, 1]}}")
-
-
 def test_a_drift_needs_simulation(tmp_path):
     base = BASE.replace("kind: sinusoid,", "kind: drift, end_hz: 21.0, duration_s: 1.0,")
     with pytest.raises(ConfigError, match="no exact answer; set evaluation: simulation"):
