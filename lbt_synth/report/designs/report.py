@@ -415,7 +415,7 @@ def verdict(report: DesignReport) -> str:
         most = _leaders(worst, lambda percent: f"{-percent:.1f} %")
         sentences.append(
             f"Highest Strehl ratio at worst, if their frequencies are wrong by {first} to {last} "
-            f"Hz: {most}."
+            f"Hz{'' if all(o.alone for o in report.stable) else ', of one sensor'}: {most}."
         )
     sentences.append(_certificate_sentence(report))
     # a number stays in one line with its unit

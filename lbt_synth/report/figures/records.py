@@ -77,7 +77,7 @@ def sensor_failure_figure(
     """
     frames, window = run.residual_nm.shape[1], max(int(_WINDOW_S * run.frame_rate_hz), 1)
     end = frames // window * window
-    power = np.mean(np.sum(run.residual_nm[:, :end] ** 2, axis=2), axis=0)
+    power = np.mean(np.sum(run.image_nm2[:, :end], axis=2), axis=0)  # as the camera sees it
     rms_nm = np.sqrt(power.reshape(-1, window).mean(axis=1))
     centres = (np.arange(rms_nm.size) + 0.5) * window / run.frame_rate_hz
     failures = [segment for segment in segments if segment.text]

@@ -183,7 +183,7 @@ def test_one_page_has_designs_of_several_sensors_and_of_one(
     assert both.limits.residual_nm < limit < own.limits.residual_nm
     assert f"alone leaves less than {limit:.1f}" in text
     assert f"Least residual: both, {both.limits.residual_nm:.1f}" in verdict(report)
-    assert "Hz: own, " in verdict(report)
+    assert "Hz, of one sensor: own, " in verdict(report).replace("\u00a0", " ")
     charts = {chart.key: chart.figure for chart in page.charts}
     assert [len(charts[f"simulation-{i}"].axes[1].lines) for i in (1, 2)] == [2, 3]
     assert len(charts["poles"].axes) == 1

@@ -74,6 +74,8 @@ def test_spans_and_levels(sensors_design, sensors_config):
     assert len(series.patches) == len(size.patches) == 2
     drawn = [line for line in size.lines if len(line.get_xdata()) == 2]
     assert [float(line.get_ydata()[0]) for line in drawn] == [20.0, 60.0, 20.0]
+    (mean,) = [line.get_ydata() for line in size.lines if len(line.get_xdata()) == 20]
+    assert np.mean(np.square(mean)) == pytest.approx(float(run.rms_nm[0]) ** 2)  # as exact ones
 
 
 def test_the_exact_spectrum_has_the_exact_power():
