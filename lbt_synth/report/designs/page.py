@@ -21,7 +21,11 @@ from lbt_synth.report.figures.loops import (
     draw_steps,
     sigma_curves,
 )
-from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
+from lbt_synth.report.figures.records import (
+    SERIES_S,
+    sensor_failure_figure,
+    simulation_figure,
+)
 from lbt_synth.report.figures.studies import (
     FREQUENCY_ERROR,
     SENSOR_GAIN,
@@ -274,9 +278,6 @@ def _simulation_blocks(report: DesignReport) -> list[Block]:
     return blocks or ["No loop is stable, so none was simulated."]
 
 
-_AWAY_S = 1.0  # that each sensor is missing, and that all are there again
-
-
 def _failure_blocks(report: DesignReport) -> list[Block]:
     """Return what designs of several sensors leave while some fail."""
     blocks: list[Block] = []
@@ -294,10 +295,10 @@ def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart
     """Draw a run in which each sensor and channel is missing in turn."""
     units = (OWN_SENSOR, *design.other_sensors)
     drops = [
-        Drop(unit=unit, start_s=(2 * i + 1) * _AWAY_S, end_s=(2 * i + 2) * _AWAY_S)
+        Drop(unit=unit, start_s=(2 * i + 1) * SERIES_S, end_s=(2 * i + 2) * SERIES_S)
         for i, unit in enumerate(units)
     ]
-    seconds = (2 * len(units) + 1) * _AWAY_S
+    seconds = (2 * len(units) + 1) * SERIES_S
     frames, seed = int(seconds * config.hardware.frame_rate_hz), config.settings.simulation.seed
     simulation, rows = run_failures(
         design, config, config.truth, drops, frames=frames, cases=1, seed=seed
@@ -308,5 +309,5 @@ def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart
         sensor_failure_figure(simulation, [segment for segment, _ in rows], exact_nm),
         group="sensor-failures",
         name=name,
-        away=f"{_AWAY_S:g}",
+        away=f"{SERIES_S:g}",
     )

@@ -256,7 +256,7 @@ def design_report(
     study = compare_in_truth(designs, config, errors_hz=list(errors))
     loops = [design.close(hardware, sensor_gain=truth.sensor_gain) for design in designs.values()]
     # all settle as the slowest, so that one seed is the same weather for all
-    radii = [loop.spectral_radius for loop in loops if loop.is_stable]
+    radii = [loop.radius_per_frame for loop in loops if loop.is_stable]
     settle_frames = max(map(settling_frames, radii), default=0)
     return DesignReport(
         config=config,
@@ -329,7 +329,7 @@ def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
         "estimation_rms": design.rms,
         "certificate": _certificate_word(one),
         "loop": "stable" if one.stable else "UNSTABLE",
-        "spectral_radius": one.loop.spectral_radius,
+        "spectral_radius": one.loop.radius_per_frame,
         "residual_nm": row.residual_nm,
         "turbulence_nm": budget and budget.turbulence_nm,
         "vibration_nm": budget and budget.vibration_nm,

@@ -26,7 +26,7 @@ from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Vibration
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.report.designs.report import frequency_errors, require_compatible
-from lbt_synth.report.figures.loops import frequency_grid
+from lbt_synth.report.figures.loops import FAR, frequency_grid
 from lbt_synth.report.figures.records import SEGMENT, exact_spectrum
 from lbt_synth.storage.display_unit import nm_text, shown_unit
 from lbt_synth.storage.rows import fact, facts, row_table
@@ -376,16 +376,14 @@ def show_design(design: Design, config: Config, start: Config, shift_hz: float) 
     )
 
 
-_FAR = 9.0  # loop gain outside the plane that is drawn; a canvas takes no larger numbers
-
-
 def _loop_gains(returned: ComplexArray) -> ComplexArray:
     """Return the loop gains of all measurements, each broken in turn, with gaps between them.
 
-    With the others closed, a response (f, m, m) from noise to measurement is 1 / (1 + gain).
+    With the others closed, a response (f, m, m) from noise to measurement is 1 / (1 + gain). What
+    is far outside the plane is cut, as a canvas takes no large numbers.
     """
     broken = 1 / returned.diagonal(axis1=1, axis2=2).T - 1
-    near = np.clip(broken.real, -_FAR, _FAR) + 1j * np.clip(broken.imag, -_FAR, _FAR)
+    near = np.clip(broken.real, -FAR, FAR) + 1j * np.clip(broken.imag, -FAR, FAR)
     return np.asarray(np.pad(near, ((0, 0), (0, 1)), constant_values=np.nan).ravel())
 
 

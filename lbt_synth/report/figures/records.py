@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from scipy.signal import freqz, get_window, welch
+from scipy.stats import kstwobign
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
@@ -27,7 +28,6 @@ SPECTRUM = {"label": "power spectrum", "unit": "nm²/Hz", "log": True}
 SERIES_S = 1.0  # of a series, in which single oscillations are seen
 _WINDOW_S = 0.1  # over which the size of the residual is averaged
 _BANDS = 240  # of equal ratio over which the periodogram is averaged
-_KOLMOGOROV = 1.6276  # Kolmogorov's statistic at 1 %
 _NAMES = ("tip", "tilt")
 
 
@@ -276,7 +276,7 @@ def _cumulative_curves(
 def _draw_innovations(panel: Panel, axis: IdentifiedAxis, frequency: dict[str, object]) -> None:
     test = axis.whiteness
     even = np.arange(1, test.cumulative.size + 1) / test.cumulative.size
-    bound = 100 * _KOLMOGOROV / np.sqrt(test.effective)
+    bound = 100 * kstwobign.isf(0.01) / np.sqrt(test.effective)  # of Kolmogorov's statistic
     excess = 100 * (test.cumulative - even)
     reach = max(2 * bound, 1.2 * float(np.max(np.abs(excess))))
     y_axis = {"label": "power up to f", "unit": "%", "low": -reach, "high": reach}

@@ -1,7 +1,6 @@
 """The report of designs as a page: it has all that it should, and says loudly what is wrong."""
 
 import hashlib
-import shutil
 from dataclasses import replace
 
 import pytest
@@ -92,20 +91,6 @@ def test_a_truth_without_vibrations(config, designs):
     assert "Least residual: slow, " in verdict(report)
 
 
-def test_many_designs_are_a_panel_each(few):
-    many = {f"design {i}": lbt.integrator(few.hardware, gain=0.2 + 0.02 * i) for i in range(8)}
-    report = lbt.report.design_report(few, many)
-    page = design_page(report)
-    charts = {chart.key: chart.figure for chart in page.charts}
-    for key, bars in {"map": 1, "poles": 0}.items():
-        assert len(charts[key].axes) == len(many) + bars
-    assert sum(key.startswith("simulation-") for key in charts) == len(many)
-    blocks = page.sections["Summary"]
-    table, truth, *_ = [block for block in blocks if isinstance(block, Table)]
-    assert len(truth.rows) == len(many) + 3
-    assert len(table.headings) == 9
-
-
 def test_nothing_stable_is_needed(config, designs):
     report = lbt.report.design_report(config, {"wild": designs["wild"]})
     text = words_of(report)
@@ -133,37 +118,6 @@ def test_a_certificate_that_cannot_be_computed(few, monkeypatch):
     assert "The certificate of slow fails: the norm did not settle." in text
     assert "slow: not computed: the norm did not settle." in text
     assert "NOT COMPUTED" in text
-
-
-def test_refused_in_the_library(report, config, designs, tmp_path):
-    gone = tmp_path / "gone.yaml"
-    shutil.copy(config.source, gone)
-    loaded = lbt.load_config(gone)
-    gone.unlink()
-    make, errors = lbt.report.design_report, lbt.errors
-    none = {"kalman": tmp_path / "none.fits"}
-    for call, error, words in (
-        (lambda: make(config, {}), errors.ProblemError, "at least one design; got none"),
-        (lambda: make("lbt.yaml", designs), errors.ProblemError, "expected a Config"),
-        (
-            lambda: design_page(replace(report, gain_files=none)),
-            errors.FileError,
-            "cannot read",
-        ),
-        (
-            lambda: design_page(replace(report, config=loaded)),
-            errors.FileError,
-            "cannot read",
-        ),
-        (lambda: design_page(report, title=" "), errors.ProblemError, "title must hold"),
-        (
-            lambda: lbt.report.write_page(design_page(report), tmp_path / "a.txt"),
-            errors.OutputError,
-            "must end in .html",
-        ),
-    ):
-        with pytest.raises(error, match=words):
-            call()
 
 
 def test_one_page_has_designs_of_several_sensors_and_of_one(

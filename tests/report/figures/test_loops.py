@@ -114,19 +114,6 @@ def test_designs_without_a_loop_are_refused():
             draw(kind)({})
 
 
-def test_sigma_figure_has_labels_units_and_marked_vibrations(designs):
-    error, rejection, noise = draw("sigma")(designs).axes
-    assert legend(error) == ["Kalman", "H-infinity", "vibration"]
-    assert legend(rejection) == ["Kalman", "H-infinity", "integrator", "vibration"]
-    assert "[nm]" in error.get_ylabel()
-    assert noise.get_xlabel() == "frequency [Hz]"
-    marks = [line for line in error.get_lines() if line.get_label() == "vibration"]
-    assert marks[0].get_xdata()[0] == 20
-    # the curve is the achieved norm at its highest point
-    curve = error.get_lines()[0].get_ydata()
-    assert curve.max() == pytest.approx(designs["Kalman"].gamma, rel=1e-3)
-
-
 def test_a_sigma_plot_names_an_unstable_loop(designs):
     _, rejection, noise = draw("sigma")(designs, sensor_gain=0.4).axes
     assert "0.4 times the sensor gain" in rejection.get_title(loc="left")

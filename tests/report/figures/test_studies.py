@@ -68,28 +68,6 @@ def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
     figure.savefig(tmp_path / "map.png")
 
 
-def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, tmp_path):
-    def mapped(design, gains, delays):
-        return robustness_map(
-            design,
-            settings.truth,
-            settings.imaging,
-            errors_hz=[0],
-            sensor_gains=gains,
-            delay_errors_frames=delays,
-        )
-
-    figure = lbt.report.figures.robustness_map_figure(
-        {"a": mapped(kalman, [1], [0, 0.1]), "b": mapped(robust, [0.9], [0, 0.1])}
-    )
-    assert len(figure.axes) == 5
-    assert figure.axes[2].get_title(loc="left") == "a, delay error +0.1 frames"
-    assert figure.axes[2].get_ylabel() == "sensor gain [-]"
-    figure.savefig(tmp_path / "a.png")
-    nowhere = lbt.report.figures.robustness_map_figure({"a": mapped(robust, [0.1, 0.2], [0])})
-    nowhere.savefig(tmp_path / "b.pdf")
-
-
 def test_modal_figure_has_labels_units_and_all_modes():
     residuals = {"integrators": [9.0, 5.0, 2.0], "Kalman filters": [8.0, 4.0, 1.0]}
     above, below = lbt.report.figures.modal_figure(
@@ -105,17 +83,6 @@ def test_modal_figure_has_labels_units_and_all_modes():
     (gains,) = above.get_lines()
     assert gains.get_color() not in [line.get_color() for line in below.get_lines()]
     assert len(lbt.report.figures.modal_figure({"one": [1.0]}).axes) == 1
-
-
-def test_bad_modal_figures_are_refused():
-    for arguments, error, words in (
-        (({},), lbt.errors.ProblemError, "got none"),
-        (({"a": [1.0, 0.0]},), lbt.errors.ProblemError, "a must be above 0"),
-        (({"a": 1.0},), lbt.errors.DimensionError, "one number per mode"),
-        (({"a": [1.0], "b": [1.0, 2.0]},), lbt.errors.DimensionError, "b must have 1 modes"),
-    ):
-        with pytest.raises(error, match=words):
-            lbt.report.figures.modal_figure(*arguments)
 
 
 def test_a_sensor_gain_of_zero_has_no_line():

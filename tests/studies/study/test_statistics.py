@@ -62,15 +62,10 @@ def test_worst_rows_are_the_unstable_then_those_of_least_strehl(small):
     [
         ({"a.stable": [1, 2, 1, 1, 1]}, ProblemError, "must be 1, 0 or nan; got 2 at index 1"),
         ({"a.strehl": [NAN] * 5}, NonFiniteError, "within .0, 1.*got nan at index 0"),
-        ({"a.strehl": [1.2, 0, 0, 0, 0]}, ProblemError, "within .0, 1.*got 1.2 at index 0"),
         ({"a.residual_nm": [-1, 0, 0, 0, 0]}, ProblemError, "at least 0 .*got -1"),
-        ({"a.residual_nm": [np.inf, 0, 0, 0, 0]}, NonFiniteError, "got inf at index 0"),
         ({"b.stable": [1, 1]}, DimensionError, "'b.stable' must have 5 rows"),
-        ({"a.strehl": [1, 1]}, DimensionError, "'a.strehl' must have 5 rows"),
         ({"gain": [1, 2, NAN, 4, 5]}, NonFiniteError, "'gain' must be finite; got nan"),
-        ({"gain": [[1, 2]]}, DimensionError, "'gain' must have 5 rows"),
         ({"gain": list("abcde")}, ProblemError, "'gain' must be an array of numbers"),
-        ({"row": [0, 1, NAN, 3, 4]}, NonFiniteError, "'row' must be finite"),
     ],
 )
 def test_columns_that_cannot_be_are_refused(small, change, error, says):
