@@ -152,11 +152,11 @@ def _summary_blocks(
         if one.unstable
     )
     failed = ", ".join(f"{c.controller} {c.failed}" for c in statistics.controllers if c.failed)
-    done, whole = statistics.samples, study.samples
+    done, total = statistics.samples, study.samples
     blocks: list[Block] = [
         Notice(text=text, tone=tone)
         for text, tone, is_so in (
-            (paragraph("incomplete", done=done, samples=whole), "bad", done < whole),
+            (paragraph("incomplete", done=done, samples=total), "bad", done < total),
             (f"Unstable loops: {unstable}.", "bad", unstable),
             (f"Evaluations that failed, and are in none of the figures: {failed}.", "bad", failed),
             (

@@ -113,18 +113,18 @@ class Sweep:
         try:
             arrays, text = array_file.read_npz(read_bytes(path, OutputError))
             meta = json.loads(text)
-            whole = meta["digest"] == array_file.digest(arrays, meta)
+            intact = meta["digest"] == array_file.digest(arrays, meta)
             results, sweep = arrays["RESULTS"], meta["sweep"]
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             refuse(path, f"is damaged. {_DELETE}", error)
         start, stop = map(int, path.stem.split("-"))
-        if whole and sweep != self.digest:
+        if intact and sweep != self.digest:
             refuse(
                 path,
                 "is of another study: other settings, inputs, or another version of lbt_synth. "
                 "Name another directory, or delete it.",
             )
-        if not whole or results.shape != (stop - start, len(self.columns)):
+        if not intact or results.shape != (stop - start, len(self.columns)):
             refuse(path, f"is damaged. {_DELETE}")
         return Part(results, [tuple(failure) for failure in meta["failures"]], meta["seconds"])
 

@@ -410,17 +410,17 @@ def judge(view: View) -> str:
     checks = count_text(len(view.design.certificate.checks), "check")
     certified = f"certified ({checks}), and stable for sensor gains of {low:.3g} to {high:.3g}"
     compared = compare_in_truth({view.name: view.design}, config)
-    own, *others = compared.rows
-    if not own.stable:
+    row, *others = compared.rows
+    if not row.stable:
         return f"{view.name} is {certified}; at {now:.3g} this loop is UNSTABLE."
     margins = loop_margins(close_loop(config.hardware, controller, sensor_gain=gain))
-    residual, strehl = nm_text(own.residual_nm, ".1f", unit="nm rms"), 100 * own.strehl
+    residual, strehl = nm_text(row.residual_nm, ".1f", unit="nm rms"), 100 * row.strehl
     sentences = [f"{view.name} leaves {residual}, Strehl ratio {strehl:.1f} %"]
     if compared.limit is not None:
-        above = f"{own.above_limit_percent:.1f}"
+        above = f"{row.above_limit_percent:.1f}"
         sentences[0] += f", {above} % above the least of any linear controller"
-    best = min(others, key=lambda row: row.residual_nm, default=own)
-    if best.residual_nm < own.residual_nm:
+    best = min(others, key=lambda other: other.residual_nm, default=row)
+    if best.residual_nm < row.residual_nm:
         least = nm_text(best.residual_nm, ".1f")
         sentences.append(f"the {design_title(best.method)} leaves {least} here")
     sentences.append(

@@ -381,12 +381,12 @@ def serve(
             "any that is free."
         ) from error
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
-    own = (f"{one}:{place}" for one in ("localhost", "127.0.0.1", name))
+    hosts = (f"{one}:{place}" for one in ("localhost", "127.0.0.1", name))
     server = Server(
         {"/": open_page},
         address=host,
         port=place,
-        allow_websocket_origin=[*own, *origins],
+        allow_websocket_origin=[*hosts, *origins],
         unused_session_lifetime_milliseconds=_UNUSED_MS,
     )
     # a thread that computes must not keep curves from being sent

@@ -177,7 +177,7 @@ def sigma_curves(
             error = largest_singular_values(system, grid)
         if name in loops and loops[name].is_stable:
             S, N = loops[name].sensitivity(grid), loops[name].noise_transfer(grid)
-            diagonals = [np.abs(part.diagonal(axis1=1, axis2=2)).T for part in (S, N)]
+            diagonals = [np.abs(response.diagonal(axis1=1, axis2=2)).T for response in (S, N)]
             if _are_apart(S) and _are_apart(N) and not np.allclose(diagonals[0], diagonals[0][0]):
                 for axis, pair in enumerate(zip(*diagonals, strict=True)):
                     curves[axes_name(name, [axis], alone=False)] = grid, None, *pair

@@ -288,8 +288,8 @@ def modal_figure(
     if not residuals_nm:
         raise ProblemError("a modal figure needs the residuals of a controller; got none.")
     others = {"turbulence_nm": turbulence_nm, "gains": gains}
-    given = (*residuals_nm.items(), *others.items())
-    curves = {name: positive(values, name) for name, values in given if values is not None}
+    numbers = {**residuals_nm, **others}
+    curves = {n: positive(values, n) for n, values in numbers.items() if values is not None}
     count = curves[next(iter(residuals_nm))].size
     for name, curve in curves.items():
         if curve.shape != (count,) or not count:
