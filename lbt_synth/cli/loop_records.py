@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lbt_synth.cli.arguments import given_options
+from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config
 from lbt_synth.config.write import RAISED, config_text, require_writable_facts
@@ -215,6 +215,15 @@ def _expected_lines(arguments: Namespace) -> FloatArray:
             )
         lines += [(row[0], np.nansum(row[1:])) for row in table]
     return np.reshape(lines, (-1, 2))
+
+
+def require_comparable(arguments: Namespace, record: LoopRecord | SpectrumRecord) -> None:
+    """Refuse accelerometers beside a spectrum, and what is said of none."""
+    if arguments.accelerometers is None:
+        for option in given_options(arguments, "accelerometer_rate_hz", "acceleration_unit"):
+            raise ProblemError(f"{option_name(option)} goes with --accelerometers.")
+    elif isinstance(record, SpectrumRecord):
+        raise ProblemError("accelerometers are compared with the recorded series; got a spectrum.")
 
 
 def read_accelerations(arguments: Namespace, record: LoopRecord) -> Readings:

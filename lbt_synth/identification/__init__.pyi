@@ -9,7 +9,6 @@ from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identify import identify as identify
 from .prediction.comparison import PredictionTable as PredictionTable
-from .prediction.comparison import least_squares_predictor as least_squares_predictor
 from .prediction.comparison import prediction_against_data as prediction_against_data
 from .prediction.residual import ResidualEstimate as ResidualEstimate
 from .prediction.residual import replayed_residual as replayed_residual

@@ -168,6 +168,8 @@ def _predicted_residuals(
             raise ProblemError(
                 f"designs must be Controllers or Designs; got {type(design).__name__} for {name!r}."
             )
+        if isinstance(design, Design) and design.other_sensors:
+            continue  # the model says nothing of what they read
         loop = close_loop(model.hardware, controller)
         loop.require_stable()
         residuals[name] = [_residual_density(model, loop, i) for i in range(len(model.axes))]
