@@ -219,7 +219,7 @@ def mode_variances(design: Design, loop: ClosedLoop, rows: slice) -> FloatArray:
     """Variance of some outputs of the loop, one each, under what the design is for."""
     s, rate = loop.system, loop.hardware.frame_rate_hz
     seen = replace(loop, system=replace(s, C=s.C[rows], D=s.D[rows]))
-    n, q = loop.hardware.modes, loop.hardware.n_measurements
+    n, q = loop.hardware.modes, loop.controller.D.shape[-1]
     if design.mode_specifications:
         return _shaped_variances(design, seen)
     drive = np.sqrt(1 - POLE**2)
@@ -348,7 +348,7 @@ def rehearsal_error(design: Design, other: Any) -> float:
 
 def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
     """Return the commands of the controller itself, and the readings of several sensors."""
-    if not design.other_sensors:
+    if not design.other_sensors or design.plant is None:
         return _rehearse(design, design.controller.start()), None
     plant, (starts, length) = design.problem, _absences(design)
     rate = plant.hardware.frame_rate_hz
