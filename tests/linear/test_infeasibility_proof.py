@@ -48,16 +48,13 @@ def test_a_forged_claim_is_found_out(axis_plant):
     design = lbt.hinf(axis_plant, gamma_ratio=1.2, route="riccati")
     assert design.recertify().passed
     forged = dataclasses.replace(
-        design,
-        claims={**design.claims, "gamma_infeasible": 1.001 * design.gamma_infeasible},
+        design, claims={**design.claims, "gamma_infeasible": 1.001 * design.gamma_infeasible}
     )
     failed = [check.name for check in forged.recertify().checks if not check.passed]
     assert failed == ["infeasible level over the level proved, less 1"]
     with pytest.raises(lbt.errors.DimensionError, match="a witness must have 4 rows of states"):
         lbt.design.certify_infeasible(
-            axis_plant,
-            1.0,
-            Witness(states=np.ones((3, 1)), disturbances=np.ones((3, 1))),
+            axis_plant, 1.0, Witness(states=np.ones((3, 1)), disturbances=np.ones((3, 1)))
         )
 
 
@@ -73,9 +70,7 @@ def test_states_without_error_prove_nothing():
     extended = lbt.mixed(p, gamma_ratio=1.01, taps=3).problem
     memory = np.eye(extended.n_states)[:, -2:]
     assert not lbt.design.certify_infeasible(
-        extended,
-        1.1 * least,
-        Witness(states=memory, disturbances=1e-6 * np.ones((2, 2))),
+        extended, 1.1 * least, Witness(states=memory, disturbances=1e-6 * np.ones((2, 2)))
     ).passed
 
 

@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
-from lbt_synth.linear.quadrature import (
-    adaptive_integral,
-    graded_edges,
-    refine_panels,
-)
+from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, refine_panels
 
 
 def test_integrals_that_do_not_settle():

@@ -593,10 +593,7 @@ def test_processes_and_spectra_are_sums_of_waves_in_the_image(mirror, delay):
     for truth, density in (
         (Truth(turbulence=model), model.psd(hertz) / share),
         (Truth(turbulence=Anonymous(model)), model.psd(hertz)),
-        (
-            Truth(turbulence=None, vibrations=(line,)),
-            shaken * np.sinc(60 / 800) ** 2 / share,
-        ),
+        (Truth(turbulence=None, vibrations=(line,)), shaken * np.sinc(60 / 800) ** 2 / share),
     ):
         expected = 200 * weight @ (density * powers)
         assert lbt.residual_budget(loop, truth).rms_nm ** 2 == pytest.approx(expected, rel=1e-4)

@@ -7,12 +7,7 @@ from functools import cache
 import control
 import numpy as np
 import pytest
-from support.generalized_plants import (
-    lightly_damped_plant,
-    random_plant,
-    sampled_plant,
-    stacked,
-)
+from support.generalized_plants import lightly_damped_plant, random_plant, sampled_plant, stacked
 from support.plants import ROOT
 
 import lbt_synth as lbt

@@ -141,11 +141,7 @@ def test_kolmogorov_flows():
 def test_what_is_no_flow():
     for values, kind, words in (
         ({"seeing_arcsec": [0.5, 0.0]}, ProblemError, "seeing_arcsec must be above 0"),
-        (
-            {"seeing_arcsec": [0.5, 0.6], "wind_speed_m_s": [1, 2, 3]},
-            DimensionError,
-            "same length",
-        ),
+        ({"seeing_arcsec": [0.5, 0.6], "wind_speed_m_s": [1, 2, 3]}, DimensionError, "same length"),
         ({"wind_speed_m_s": [[1.0]]}, DimensionError, "lists, one number per loop"),
     ):
         with pytest.raises(kind, match=words):
