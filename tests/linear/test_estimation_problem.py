@@ -143,3 +143,14 @@ def test_something_is_measured_and_something_estimated(rows, said):
             D=[[0, 1]] * q or np.zeros((0, 2)),
             L=np.ones((p, 1)),
         )
+
+
+def test_sizes_that_clash_are_named():
+    sizes = {"A": (3, 3), "B": (3, 4), "C": (1, 3), "D": (1, 4), "L": (1, 3)}
+    wrong = {"A": (3, 2), "B": (2, 4), "C": (1, 2), "D": (1, 3), "L": (1, 5)}
+    good = {name: np.ones(size) for name, size in sizes.items()} | {"A": np.eye(3) / 2}
+    for name, size in wrong.items():
+        with pytest.raises(DimensionError, match=f"{name} must"):
+            EstimationProblem(**(good | {name: np.ones(size)}))
+    with pytest.raises(DefinitenessError, match="Every measurement needs noise"):
+        EstimationProblem(A=0.5, B=[[1.0]], C=1.0, D=[[0.0]], L=1.0)

@@ -4,8 +4,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 from support import predictions
 from support.continuous_loops import noise_covariance, power_of_two_sensors, sinusoid_powers
@@ -28,7 +26,6 @@ import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import kalman_riccati
 from lbt_synth.loop.budget import residual_budget
-from lbt_synth.loop.stable_range import radii_by_gain
 from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
 
 AGELESS = Accelerometer(
@@ -84,15 +81,16 @@ def test_noise_of_an_integrator_has_a_closed_form():
         assert budget.noise_nm**2 == pytest.approx(4 * g / (2 - g), rel=1e-9)
 
 
-@pytest.mark.parametrize("gain", [0.4, 1.0])
 @pytest.mark.parametrize(
-    "model",
+    ("gain", "model"),
     [
-        lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89, frame_rate_hz=800),
-        lbt.models.ARModel(
-            coefficients=[1.997477, -0.997555], driving_rms_nm=0.37, frame_rate_hz=800
+        (
+            0.4,
+            lbt.models.ARModel(
+                coefficients=[1.997477, -0.997555], driving_rms_nm=0.37, frame_rate_hz=800
+            ),
         ),
-        lbt.Vibration(frequency_hz=17, damping=0.005, rms_nm=300).ar_model(800),
+        (1.0, lbt.Vibration(frequency_hz=17, damping=0.005, rms_nm=300).ar_model(800)),
     ],
 )
 def test_quadrature_agrees_with_the_lyapunov_equation(gain, model):
@@ -110,21 +108,6 @@ def test_quadrature_agrees_with_the_lyapunov_equation(gain, model):
             assert np.allclose(other, one, rtol=2e-4, atol=1e-9 * one.max())
 
 
-@pytest.mark.parametrize("half_width", [0.3, 0.03, 0.003])
-def test_narrow_lines_of_a_table_are_not_missed(half_width):
-    """A triangle of unit area: its residual is the rejection at its place."""
-    table = lbt.models.TabulatedSpectrum(
-        frequency_hz=[37.3 - half_width, 37.3, 37.3 + half_width],
-        density_nm2_hz=[0, 100 / half_width, 0],
-    )
-    plant = lbt_axis_plant()
-    loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=0.4).controller)
-    budget = lbt.residual_budget(loop, Truth(turbulence=table))
-    gain, share = abs(loop.sensitivity([37.3])[0, 0, 0]), np.sinc(37.3 / 800)
-    assert budget.turbulence_nm == pytest.approx(10 * gain * share, rel=1e-3)
-    assert budget.within_nm == pytest.approx(10 * np.sqrt(1 - share**2), rel=1e-3)
-
-
 def test_a_measured_spectrum_against_brute_force():
     rng = np.random.default_rng(0)
     f = np.linspace(5, 100, 3393)
@@ -134,6 +117,13 @@ def test_a_measured_spectrum_against_brute_force():
     )
     plant = lbt_axis_plant()
     loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=0.4).controller)
+    # a triangle of unit area leaves the rejection at its place
+    narrow = lbt.models.TabulatedSpectrum(
+        frequency_hz=[37.297, 37.3, 37.303], density_nm2_hz=[0, 100 / 0.003, 0]
+    )
+    left = abs(loop.sensitivity([37.3])[0, 0, 0]) * np.sinc(37.3 / 800)
+    line = lbt.residual_budget(loop, Truth(turbulence=narrow))
+    assert line.turbulence_nm == pytest.approx(10 * left, rel=1e-3)
     fine = np.linspace(5, 100, 3392 * 20 + 1)
     power = np.abs(loop.sensitivity(fine)[:, 0, 0]) ** 2
     share = np.sinc(fine / 800) ** 2
@@ -142,16 +132,6 @@ def test_a_measured_spectrum_against_brute_force():
     assert budget.turbulence_nm**2 == pytest.approx(expected, rel=1e-5)
     expected = trapezoid(table.psd(fine) * (1 - share), fine)
     assert budget.within_nm**2 == pytest.approx(expected, rel=1e-5)
-
-
-def test_a_narrow_resonance_tends_to_the_sinusoid():
-    plant = lbt_axis_plant(modes=2)
-    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
-    along = {"frequency_hz": 18.0, "rms_nm": 100.0, "direction": (0.6, 0.8)}
-    line = Truth(turbulence=None, vibrations=(lbt.models.SinusoidalVibration(**along),))
-    narrow = Truth(turbulence=None, vibrations=(lbt.Vibration(**along, damping=1e-6),))
-    exact, limit = (lbt.residual_budget(loop, t).vibration_nm2 for t in (line, narrow))
-    assert np.allclose(limit, exact, rtol=1e-3)
 
 
 def test_parts_of_the_budget_add_up():
@@ -171,19 +151,6 @@ def test_parts_of_the_budget_add_up():
     assert np.allclose(b.total_nm2, sum(getattr(b, f"{name}_nm2") for name in names))
     lines = sum(np.real(np.outer(a, a.conj())) / 2 for a in b.line_amplitudes_nm)
     assert np.allclose(b.gaussian_nm2, b.total_nm2 - lines)
-
-
-@given(angle=st.floats(0, np.pi))
-def test_a_decoupled_loop_treats_all_directions_alike(angle):
-    plant = lbt_axis_plant(modes=2)
-    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
-    line = lbt.models.SinusoidalVibration(
-        frequency_hz=18, rms_nm=100, direction=(np.cos(angle), np.sin(angle))
-    )
-    budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
-    other = lbt.models.SinusoidalVibration(frequency_hz=18, rms_nm=100)
-    same = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(other,)))
-    assert budget.rms_nm == pytest.approx(same.rms_nm, rel=1e-6)
 
 
 def test_loops_refuse_what_does_not_fit():
@@ -212,7 +179,7 @@ def test_loops_refuse_what_does_not_fit():
 uneven = partial(Truth, noise_nm=(15.5, 6.0), sensor_gain=0.8)
 
 
-@pytest.mark.parametrize("spectra", [(SLOW, QUICK), (SLOW, TABLE), (None, QUICK), (TABLE, None)])
+@pytest.mark.parametrize("spectra", [(SLOW, TABLE), (None, QUICK)])
 def test_axes_without_coupling_are_loops_of_their_own(spectra):
     both, single = LOOPS
     truth = uneven(turbulence=spectra, vibrations=LINES)
@@ -232,16 +199,6 @@ def test_axes_without_coupling_are_loops_of_their_own(spectra):
             lbt.loop.least_residual(single, alone).variance_nm2[0], rel=1e-9
         )
     assert abs(budget.turbulence_nm2[0, 1]) < 1e-9
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.floats(0.1, 50), st.sampled_from([SLOW, QUICK, TABLE, None]))
-def test_equal_axes_are_one_truth_for_all(noise, spectrum):
-    path = lbt.LoopHardware(frame_rate_hz=RATE)
-    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3).controller)
-    one = lbt.residual_budget(loop, Truth(turbulence=spectrum, noise_nm=noise))
-    each = lbt.residual_budget(loop, Truth(turbulence=[spectrum] * 2, noise_nm=[noise] * 2))
-    np.testing.assert_allclose(each.total_nm2, one.total_nm2, rtol=1e-12, atol=1e-12)
 
 
 def test_coupled_axes_against_the_frequency_response():
@@ -288,17 +245,6 @@ def test_the_budget_of_a_model_is_that_of_its_truth(delay, gain, mirror, sensor)
         np.testing.assert_allclose(again.total_nm2, own.total_nm2, rtol=1e-9, atol=1e-9)
 
 
-def test_noise_that_is_correlated_between_axes():
-    noise = np.array([[200.0, 60.0], [60.0, 100.0]])
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=predictions.RATE, turbulence=predictions.SLOW, noise_nm=noise
-    )
-    design = lbt.kalman(plant)
-    loop = lbt.close_loop(plant.hardware, design.controller)
-    budget = lbt.residual_budget(loop, plant, frame_means=True)
-    assert budget.rms_nm == pytest.approx(design.rms, rel=1e-9)
-
-
 def test_a_budget_of_no_loop_or_no_plant_is_refused():
     plant = predictions.a_plant()
     unstable = lbt.close_loop(
@@ -337,7 +283,7 @@ def test_what_is_left_of_strong_slow_lines_keeps_its_digits():
     assert lbt.lqg(plant).certificate.passed
 
 
-@pytest.mark.parametrize("density", [-1.0, 1j, np.nan])
+@pytest.mark.parametrize("density", [-1.0, 1j])
 def test_a_spectrum_that_is_none_is_refused(density):
     class Odd:
         def psd(self, frequency_hz):
@@ -360,8 +306,7 @@ def closed(plant, **facts):
     return controller, lbt.close_loop(plant.hardware, controller, **facts)
 
 
-@pytest.mark.parametrize("delay", [1, 2, 3])
-@pytest.mark.parametrize("sensors", [(FAST,), (OTHER,), (FAST, OTHER), (SELDOM,)])
+@pytest.mark.parametrize(("delay", "sensors"), [(1, (FAST, OTHER)), (2, (FAST,)), (3, (SELDOM,))])
 def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
     plant = example_plant(sensors, delay_frames=delay)
     P = kalman_riccati(plant).P.reshape(-1, plant.n_states, plant.n_states)
@@ -376,8 +321,7 @@ def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
     [
         ({}, {}),
         ({}, {"sensor_gain": 0.6}),
-        ({}, {"blind": ("truth",)}),
-        ({}, {"blind": ("m1",)}),
+        ({}, {"blind": ("truth", "m1")}),
         ({"delay_frames": 1.5, "turbulence": AR3}, {}),
         ({"delay_frames": 3, "sensors": (HALF, OTHER)}, {}),
         ({"sensors": (AGELESS,)}, {}),
@@ -404,7 +348,7 @@ def test_rates_that_do_not_divide_each_other():
     assert np.abs(budget.noise_nm2 - noise).max() < 1e-8 * np.trace(noise)
 
 
-@pytest.mark.parametrize(("age", "period"), [(0, 1), (1, 1), (1.4, 1), (2.4, 2)])
+@pytest.mark.parametrize(("age", "period"), [(0, 1), (2.4, 2)])
 def test_a_sinusoid_leaves_what_a_run_leaves(age, period):
     fast = Accelerometer(
         name="mirror",
@@ -462,44 +406,13 @@ def test_a_spectrum_leaves_the_spectrum_of_what_impulses_leave():
     np.testing.assert_allclose(budget.turbulence_nm2, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_spectra_and_their_ar_models_agree():
+def test_refusals():
     plant = example_plant()
-    _, loop = closed(plant)
-    for frame_means in (True, False):
-        one, other = (
-            lbt.residual_budget(loop, Truth(turbulence=source), frame_means=frame_means)
-            for source in (Anonymous(AIR, of_means=frame_means), AIR)
-        )
-        for name in ("turbulence_nm2", "within_nm2"):
-            quadrature, exact = getattr(one, name), getattr(other, name)
-            np.testing.assert_allclose(quadrature, exact, rtol=1e-7, atol=1e-6)
-
-
-def test_the_truth_may_have_another_noise_and_gain():
-    plant = example_plant()
-    controller, loop = closed(plant, sensor_gain=0.8)
-    noisy, calm = (
-        lbt.residual_budget(loop, Truth(turbulence=None, noise_nm=noise, sensor_gain=0.8)).noise_nm2
-        for noise in (75.0, 0.0)
-    )
-    *_, whole = simulated_covariances(plant, controller, sensor_gain=0.8)
-    np.testing.assert_allclose(noisy, whole, rtol=1e-7)
-    assert 0 < np.trace(calm) < np.trace(noisy)
-    assert lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=0.8)).rms_nm > 0
-
-
-def test_an_unstable_loop_has_no_budget():
-    _, loop = closed(example_plant(), sensor_gain=8.0)
+    _, loop = closed(plant, sensor_gain=8.0)
     assert not loop.is_stable
     with pytest.raises(UnstableLoopError, match=r"an unstable one .* at sensor gain 8\)"):
         lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=8.0))
-
-
-def test_refusals():
-    plant = example_plant()
     _, loop = closed(plant)
-    with pytest.raises(ProblemError, match="truth's sensor gain 0.9; got 1"):
-        lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=0.9))
     with pytest.raises(ProblemError, match="no sensor or channel is called 'm9'"):
         closed(plant, blind=("m9",))
     other, _ = closed(example_plant((FAST,)))
@@ -514,15 +427,6 @@ def test_refusals():
         lbt.residual_budget(loop, Truth(turbulence=AIR, vibrations=(drifting,)))
 
 
-def test_radii_of_many_gains_are_those_of_their_loops():
-    plant = example_plant(influence_matrix=[[2.0, 0.1], [0.3, 1.0]])
-    controller, _ = closed(plant)
-    gains = np.array([0.2, 0.7, 1.0, 1.7])
-    found = radii_by_gain(plant.hardware, controller)(gains)
-    loops = [closed(plant, sensor_gain=gain)[1].spectral_radius for gain in gains]
-    np.testing.assert_allclose(found, loops, rtol=1e-9)
-
-
 def a_shell(**changes):
     facts = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 150}
     return PositionLoop.from_bandwidth(**(facts | {"sampling_hz": 8000.0} | changes))
@@ -531,8 +435,9 @@ def a_shell(**changes):
 MIRRORS = {"settled": None, "shell": a_shell(), "ramp": a_shell(ramp_samples=4, delay_samples=0)}
 
 
-@pytest.mark.parametrize("delay", [1, 2, 2.25, 2.49, 2.9, 3])
-@pytest.mark.parametrize("mirror", MIRRORS)
+@pytest.mark.parametrize(
+    ("mirror", "delay"), [("settled", 1), ("settled", 2.9), ("shell", 2.49), ("ramp", 3)]
+)
 def test_the_image_has_what_a_run_in_small_steps_leaves(mirror, delay):
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, modes=1, mirror=MIRRORS[mirror])
     controller, hertz = lbt.integrator(path, gain=0.2).controller, np.array([3, 20, 62, 150, 390])
@@ -555,8 +460,7 @@ def test_the_image_has_what_a_run_in_small_steps_leaves(mirror, delay):
         )
 
 
-@pytest.mark.parametrize("delay", [2, 2.49])
-@pytest.mark.parametrize("mirror", ["settled", "shell"])
+@pytest.mark.parametrize(("mirror", "delay"), [("settled", 2.49), ("shell", 2)])
 def test_coupled_modes_have_what_a_run_in_small_steps_leaves(mirror, delay):
     path = lbt.LoopHardware(
         frame_rate_hz=800,
@@ -578,7 +482,7 @@ def test_coupled_modes_have_what_a_run_in_small_steps_leaves(mirror, delay):
         assert np.abs(budget.total_nm2 - expected).max() < 1e-4 * np.trace(expected)
 
 
-@pytest.mark.parametrize(("mirror", "delay"), [("settled", 2), ("settled", 2.49), ("shell", 2.25)])
+@pytest.mark.parametrize(("mirror", "delay"), [("settled", 2), ("shell", 2.25)])
 def test_processes_and_spectra_are_sums_of_waves_in_the_image(mirror, delay):
     """Of a process each frame has the mean: in the phase there is ``1 / sinc^2`` as much."""
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, modes=1, mirror=MIRRORS[mirror])
@@ -599,40 +503,7 @@ def test_processes_and_spectra_are_sums_of_waves_in_the_image(mirror, delay):
         assert lbt.residual_budget(loop, truth).rms_nm ** 2 == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("delay", [1, 1.5, 2, 2.25, 2.49, 2.9, 3])
-def test_no_command_follows_a_line_within_a_frame(delay):
-    plant = lbt_axis_plant(delay_frames=delay)
-    line = sinusoid(20, 797, (1,))
-    for gain in (0.05, 0.3):
-        loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=gain).controller)
-        budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
-        floor = 797**2 * (1 - np.sinc(20 / 800) ** 2)
-        assert budget.within_nm**2 == pytest.approx(floor, rel=1e-9)
-        assert budget.rms_nm**2 > floor
-        means = lbt.residual_budget(
-            loop, Truth(turbulence=None, vibrations=(line,)), frame_means=True
-        )
-        assert means.within_nm == 0.0
-
-
-@pytest.mark.parametrize("sensors", [(FAST, OTHER), (OTHER,)])
-def test_a_loop_of_several_sensors_in_the_image(sensors):
-    """At a whole delay: a run in frames leaves the means, and the rest moves within them."""
-    plant = example_plant(sensors)
-    controller, loop = closed(plant)
-    line = sinusoid(62.5, 200, (3, 4))
-    share, frames = np.sinc(62.5 / RATE_HZ), 400
-    wave = share * np.sqrt(2) * 200 * np.exp(2j * np.pi * 62.5 / RATE_HZ * np.arange(frames))
-    total = np.stack([wave.real, wave.imag], axis=1)[:, :, None] * np.array([0.6, 0.8])
-    left = run_loop(plant, controller, total, np.zeros((frames, 2, plant.hardware.n_readings)))
-    means = np.einsum("fri,frj->ij", left[-16:], left[-16:]) / 32
-    budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
-    floor = 200**2 * (1 - share**2) * np.outer([0.6, 0.8], [0.6, 0.8])
-    np.testing.assert_allclose(budget.vibration_nm2, means, rtol=1e-8)
-    np.testing.assert_allclose(budget.within_nm2, floor, rtol=1e-9)
-
-
-@pytest.mark.parametrize("delay", [2, 2.25, 2.49])
+@pytest.mark.parametrize("delay", [2, 2.49])
 def test_a_loop_of_two_sensors_has_what_a_run_in_small_steps_leaves(delay):
     plant = example_plant((OTHER,), delay_frames=delay)
     controller, loop = closed(plant)
@@ -642,9 +513,10 @@ def test_a_loop_of_two_sensors_has_what_a_run_in_small_steps_leaves(delay):
     np.testing.assert_allclose(budget.vibration_nm2 + budget.within_nm2, expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("delay", [1, 2, 2.25, 2.49, 2.9])
-@pytest.mark.parametrize("mirror", MIRRORS)
-@pytest.mark.parametrize("frame_means", [False, True])
+@pytest.mark.parametrize(
+    ("mirror", "delay", "frame_means"),
+    [("settled", 2.49, False), ("shell", 1, True), ("ramp", 2.25, False)],
+)
 def test_an_ensemble_leaves_what_its_loops_leave(mirror, delay, frame_means):
     sensor = [[1.0, 0.2], [-0.1, 0.7]]
     path = lbt.LoopHardware(
@@ -674,31 +546,3 @@ def test_an_ensemble_leaves_what_its_loops_leave(mirror, delay, frame_means):
             for name in ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "within_nm2"):
                 one, other = getattr(found, name)[i], getattr(budget, name)
                 assert np.abs(one - other).max() < 2e-6 * max(np.trace(other), 1e-3), name
-
-
-@pytest.mark.parametrize("mirror", ["settled", "shell"])
-@pytest.mark.parametrize("whole", [2, 3])
-def test_a_fraction_of_a_frame_tends_to_the_whole_delay(whole, mirror):
-    line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1,))
-    slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-    truths = [
-        Truth(turbulence=slow),
-        Truth(turbulence=Anonymous(slow)),
-        Truth(turbulence=None, vibrations=(line,)),
-        Truth(turbulence=None, vibrations=(sinusoid(20, 300, (1,)),)),
-        Truth(turbulence=None, noise_nm=15.5),
-    ]
-    controller = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.3).controller
-
-    def budgets(delay):
-        path = lbt.LoopHardware(
-            frame_rate_hz=800, delay_frames=delay, modes=1, mirror=MIRRORS[mirror]
-        )
-        loop = lbt.close_loop(path, controller)
-        return [lbt.residual_budget(loop, truth) for truth in truths]
-
-    here = budgets(whole)
-    for delay in (whole - 1e-7, whole + 1e-7):
-        for one, exact in zip(budgets(delay), here, strict=True):
-            assert one.rms_nm == pytest.approx(exact.rms_nm, rel=2e-6)
-            assert one.within_nm == pytest.approx(exact.within_nm, rel=1e-5, abs=1e-4)

@@ -20,8 +20,7 @@ def broken(gain, *, delay=2, modes=1, **path):
     )
 
 
-@pytest.mark.parametrize("delay", [1, 2, 3])
-@pytest.mark.parametrize("gain", [0.1, 0.4])
+@pytest.mark.parametrize(("delay", "gain"), [(1, 0.4), (3, 0.1)])
 def test_an_integrator_has_the_crossings_of_its_closed_form(gain, delay):
     """``L = g z^-d / (1 - z^-1)``: a gain of g / (2 sin(w/2)), a phase of -90 + (1/2 - d) w."""
     (found,) = broken(gain, delay=delay)
@@ -107,13 +106,6 @@ def test_a_loop_without_a_crossing_has_no_phase_margin():
     assert lbt.loop_margins(loop).phase_deg == np.inf
 
 
-def test_an_unstable_loop_has_no_margins():
-    hardware = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-    fast = lbt.Controller(A=1.0, B=1.2, C=1.0, D=0.0, dt_s=1 / RATE)
-    with pytest.raises(lbt.errors.UnstableLoopError):
-        lbt.loop.broken_loops(lbt.close_loop(hardware, fast))
-
-
 def test_a_response_that_vanishes_has_no_phase_there():
     """Half a frame of delay: ``(1 + z^-1) / 2`` is 0 at half the frame rate."""
     (found,) = broken(0.3, delay=2.5)
@@ -133,15 +125,16 @@ def test_marginal_and_unstable_loops_have_no_residual():
         for ask in (
             lambda loop=loop: lbt.residual_budget(loop, truth),
             lambda loop=loop: lbt.loop_margins(loop),
+            lambda loop=loop: lbt.loop.broken_loops(loop),
         ):
             with pytest.raises(lbt.errors.UnstableLoopError, match=word) as caught:
                 ask()
             assert caught.value.spectral_radius >= 1 - 1e-6
         with pytest.raises(lbt.errors.UnstableLoopError):
             lbt.simulate(controller, truth, hardware=path, frames=10)
+        assert np.all(np.isnan(lbt.loop.stable_sensor_gains(path, controller)))
 
 
-# -- margins -------------------------------------------------------------------
 def test_margins_of_an_integrator_against_hand_computation():
     """g z^-2/(1 - z^-1) = exp(-3j w/2) g / (2j sin(w/2)): |L| = 1 at w = 2 asin(g/2)."""
     g = 0.5
@@ -161,10 +154,9 @@ def test_margins_of_an_integrator_against_hand_computation():
     assert margins.modulus == pytest.approx(distance, rel=1e-6)
 
 
-@pytest.mark.parametrize("design", [lbt.kalman, lambda p: lbt.hinf(p, gamma_ratio=1.2)])
-def test_the_ends_of_the_gain_interval_are_where_it_turns_unstable(design):
+def test_the_ends_of_the_gain_interval_are_where_it_turns_unstable():
     plant = lbt_axis_plant(modes=2)
-    controller = design(plant).controller
+    controller = lbt.kalman(plant).controller
     low, high = lbt.loop.stable_sensor_gains(plant.hardware, controller)
 
     def stable(gain):
@@ -173,19 +165,6 @@ def test_the_ends_of_the_gain_interval_are_where_it_turns_unstable(design):
     assert all(stable(g) for g in np.geomspace(low * 1.0001, high * 0.9999, 25))
     assert not stable(low * 0.999)
     assert not stable(high * 1.001)
-
-
-def test_the_delay_margin_is_that_of_the_simulated_loop():
-    plant = lbt_axis_plant()
-    controller = lbt.kalman(plant).controller
-    margins = lbt.loop_margins(lbt.close_loop(plant.hardware, controller))
-    assert margins.delay_s == margins.delay_frames / 800
-
-    def radius(further: float) -> float:
-        longer = replace(plant.hardware, delay_frames=2 + further)
-        return lbt.close_loop(longer, controller).spectral_radius
-
-    assert radius(margins.delay_frames) < 1 < radius(1.001 * margins.delay_frames)
 
 
 def test_the_delay_margin_does_not_step_over_a_whole_delay():
@@ -267,14 +246,7 @@ def test_phases_of_each_axis_within_the_disk_do_not_change_the_encirclements(cou
     assert encirclements((-2.5 * half, -2.5 * half)) != nominal
 
 
-def test_an_unstable_nominal_has_no_interval():
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    wild = lbt.Controller(A=1.0, B=3.0, C=1.0, D=0.0, dt_s=1 / 800)
-    assert np.all(np.isnan(lbt.loop.stable_sensor_gains(path, wild)))
-
-
-@pytest.mark.parametrize("delay", [1.0, 2.0, 2.4])
-@pytest.mark.parametrize("gain", [0.1, 0.5, 0.9])
+@pytest.mark.parametrize(("delay", "gain"), [(1.0, 0.9), (2.0, 0.5), (2.4, 0.1)])
 def test_a_loop_is_stable_at_its_delay_margin_and_not_beyond(delay, gain):
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, modes=1)
     limit = lbt.design.integrator_gain_limit(delay)

@@ -33,10 +33,10 @@ AIR = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, dia
         lambda v: lbt.models.TabulatedSpectrum(frequency_hz=[0, v], density_nm2_hz=[1, 1]),
     ],
 )
-@pytest.mark.parametrize("value", [np.nan, np.inf, -2.0])
-def test_impossible_values_are_refused(make, value):
-    with pytest.raises(ProblemError):
-        make(value)
+def test_impossible_values_are_refused(make):
+    for value in (np.nan, np.inf, -2.0):
+        with pytest.raises(ProblemError):
+            make(value)
 
 
 @pytest.mark.parametrize(

@@ -63,8 +63,9 @@ def test_the_density_found_is_the_hardest(config):
     assert hardest == pytest.approx(limit.rms_nm, rel=1e-3)
 
 
-@pytest.mark.parametrize("frame_means", [False, True])
-@pytest.mark.parametrize("delay", [1, 2, 2.7, 3])
+@pytest.mark.parametrize(
+    ("delay", "frame_means"), [(1, False), (2.7, False), (2.7, True), (3, False), (3, True)]
+)
 def test_designs_stay_above_the_band_limit(delay, frame_means):
     plant = lbt_axis_plant(delay_frames=delay, damping=0.05)
     still = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
@@ -108,7 +109,7 @@ def test_narrow_bands_tend_to_the_known_frequency(frame_means):
             direction=(1,),
             frame_means=frame_means,
         ).rms_nm
-        for width in (10, 1, 1e-2, 1e-5)
+        for width in (10, 1, 1e-2, 1e-9)
     ]
     assert found[0] > found[1] > found[2] > found[3] > known
     assert found[3] == pytest.approx(known, rel=1e-4)
@@ -161,14 +162,3 @@ def test_a_search_that_does_not_settle(monkeypatch):
             direction=(1,),
         )
     assert caught.value.residual > 0
-
-
-def test_a_band_may_be_very_narrow():
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
-    truth = lbt.Truth(turbulence=slow, noise_nm=10.0)
-    known = lbt.loop.least_residual(path, truth, frame_means=True).rms_nm
-    narrow = lbt.loop.least_worst_residual(
-        path, truth, band_hz=(20, 20 + 1e-9), rms_nm=100, direction=(1,), frame_means=True
-    )
-    assert known <= narrow.rms_nm < known * 1.01

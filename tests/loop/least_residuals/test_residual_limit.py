@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from support.limits import RATE, Anonymous, ar, budget, path, variance
+from support.limits import RATE, ar, budget, path, variance
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
@@ -16,15 +16,13 @@ from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 
 
-@pytest.mark.parametrize("delay", [1, 2, 3, 6, 20])
-@pytest.mark.parametrize("a", [-0.9, 0.0, 0.5, 0.999])
+@pytest.mark.parametrize(("delay", "a"), [(1, 0.5), (2, -0.9), (3, 0.0), (6, 0.999), (20, 0.5)])
 def test_ar1_without_noise(delay, a):
     expected = 4 * sum(a ** (2 * k) for k in range(delay))
     assert variance(path(delay), turbulence=ar(a, driving=2.0)) == pytest.approx(expected, rel=1e-9)
 
 
-@pytest.mark.parametrize("noise", [1e-6, 1e-3, 1.0, 1e3, 1e6])
-@pytest.mark.parametrize("delay", [1, 2, 4])
+@pytest.mark.parametrize(("noise", "delay"), [(1e-6, 1), (1e-3, 2), (1.0, 4), (1e6, 2)])
 def test_ar1_with_noise_to_the_last_digits(noise, delay):
     """The scalar Riccati equation solved in 60 digits; the limit may be far below the noise."""
     a = 0.99
@@ -39,19 +37,9 @@ def test_ar1_with_noise_to_the_last_digits(noise, delay):
     assert found == pytest.approx(expected, rel=1e-9)
 
 
-def test_golden_ratio_of_the_random_walk():
-    """Equal steps and noise: an error of one step ahead of the golden ratio."""
-    found = variance(path(1), turbulence=ar(1 - 1e-9), noise_nm=1.0)
-    assert found == pytest.approx((1 + np.sqrt(5)) / 2, rel=1e-8)
-
-
 @pytest.mark.parametrize("delay", [1, 2.7, 5])
 def test_white_disturbance_cannot_be_corrected(delay):
     assert variance(path(delay), turbulence=ar(0.0, driving=3.0), noise_nm=2) == pytest.approx(9)
-
-
-def test_nothing_to_correct():
-    assert variance(path(), turbulence=None, noise_nm=5.0) == 0.0
 
 
 def test_a_band_limited_process_without_noise_is_known_for_ever():
@@ -60,20 +48,9 @@ def test_a_band_limited_process_without_noise_is_known_for_ever():
     assert variance(path(), turbulence=table, noise_nm=1.0) > 0.1
 
 
-def test_a_noisy_ideal_low_pass_process():
-    """Phi is 1 + r below half of Nyquist and r above: all cosine integrals are known."""
-    r, edge = 0.3, 200.0
-    psd = Anonymous(lambda f: np.where(f < edge, 1 / 400.0, 0.0))
-    psd.breakpoints_hz = np.array([edge])
-    lift = np.log1p(1 / r)
-    sigma2 = r * np.exp(lift / 2)
-    f1 = lift * np.sin(np.pi / 2) / np.pi
-    found = variance(path(2), turbulence=psd, noise_nm=np.sqrt(r))
-    assert found == pytest.approx(sigma2 * (1 + f1**2) - r, rel=1e-9)
-
-
-@pytest.mark.parametrize("delay", [1.7, 2.51, 2.7, 3.9, 2.999, 6.6])
-@pytest.mark.parametrize("noise", [0.0, 0.4])
+@pytest.mark.parametrize(
+    ("delay", "noise"), [(1.7, 0.4), (2.51, 0.0), (2.5, 0.4), (2.999, 0.4), (6.6, 0.4)]
+)
 def test_fractions_against_the_wiener_filter_on_a_grid(delay, noise):
     """``E = int S - |[conj(Theta) S / conj(F)]_+|^2`` by FFT, the all-pass factor kept whole."""
     model = ar(1.5, -0.8)
@@ -97,19 +74,7 @@ def test_fractions_against_the_wiener_filter_on_a_grid(delay, noise):
     )
 
 
-def test_fractions_meet_the_whole_delays():
-    model = {"turbulence": ar(1.5, -0.8), "noise_nm": 0.4}
-    whole = [variance(path(d), **model) for d in (2, 3)]
-    for delay in (2.1, 2.5):
-        assert variance(path(delay), **model) == pytest.approx(whole[0], rel=1e-12)
-    assert variance(path(2.5 + 1e-9), **model) == pytest.approx(whole[0], rel=1e-7)
-    assert variance(path(3 - 1e-9), **model) == pytest.approx(whole[1], rel=1e-7)
-    rising = [variance(path(d), **model) for d in np.linspace(2.5, 3, 21)]
-    assert np.all(np.diff(rising) > 0)
-
-
-@pytest.mark.parametrize("delay", [1, 2, 3])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("delay", "seed"), [(1, 0), (2, 1), (3, 2), (3, 5)])
 def test_kalman_filters_reach_the_limit(delay, seed):
     rng = np.random.default_rng(seed)
     roots = rng.uniform(0.1, 0.999, 3) * np.exp(1j * rng.uniform(0, np.pi, 3))
@@ -137,22 +102,6 @@ def test_kalman_filters_reach_the_limit(delay, seed):
     left = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), plant)
     assert left.rms_nm == pytest.approx(limit.rms_nm, rel=1e-8)
     assert limit.change < 1e-6
-
-
-@pytest.mark.parametrize("delay", [1.3, 2.5, 2.7])
-def test_kalman_filters_of_fractional_delays_stay_above(delay):
-    plant = lbt_axis_plant(delay_frames=delay)
-    design = lbt.kalman(plant)
-    truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
-    limit = lbt.loop.least_residual(plant.hardware, truth, frame_means=True).rms_nm
-    assert limit < budget(design, truth).rms_nm < 1.08 * limit
-    loop = lbt.close_loop(plant.hardware, design.controller)
-    left = lbt.residual_budget(loop, plant)
-    residual, limit, above = model_limits(design).values()
-    assert residual == pytest.approx(left.rms_nm)  # not its estimation error
-    assert residual**2 > design.rms**2
-    assert above == pytest.approx(100 * (residual / limit - 1))
-    assert 0 <= above < 0.5
 
 
 def moving_power(spectra, frame_rate_hz, *, of_means):
@@ -210,7 +159,7 @@ def test_limit_of_the_example_and_a_filter_that_comes_close(config):
         assert least < budget(design, still, frame_means=frame_means).rms_nm < 1.05 * least
 
 
-@settings(max_examples=40)
+@settings(max_examples=10)
 @given(
     gain=st.floats(0.02, 0.9),
     delay=st.sampled_from([1, 1.4, 2, 2.8, 3]),
@@ -248,6 +197,7 @@ def test_no_design_passes_the_limit(gain, delay, noise, seed, frame_means):
     assert left.rms_nm >= limit * (1 - 1e-9)
 
 
+@settings(max_examples=5)
 @given(noise=st.floats(0.01, 100), factor=st.floats(1.01, 10), gain=st.floats(0.2, 3))
 def test_noise_scale_and_sensor_gain(noise, factor, gain):
     model = {"turbulence": ar(1.5, -0.8)}
@@ -284,16 +234,6 @@ def test_a_sinusoid_of_known_frequency_costs_what_moves_within_a_frame():
     assert narrow[2] == pytest.approx(with_line, rel=1e-2)
 
 
-def test_kolmogorov_turbulence(air):
-    endless = replace(air, outer_scale_m=None)
-    hardware = path(modes=2)
-    one, other = (
-        lbt.loop.least_residual(hardware, lbt.Truth(turbulence=a, noise_nm=15.5)).rms_nm
-        for a in (air, endless)
-    )
-    assert one < other < 1.2 * one
-
-
 def coupled_plant(ratio=2.0, **options):
     """A line along a diagonal over turbulence of another size on either axis."""
     slow = [ar(1.98, -0.9805, driving=driving) for driving in (1.0, ratio)]
@@ -303,7 +243,7 @@ def coupled_plant(ratio=2.0, **options):
     )
 
 
-@pytest.mark.parametrize("delay", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("delay", [1.0, 3.0])
 def test_coupled_modes_have_the_limit_of_the_best_filter(delay):
     plant = coupled_plant(delay_frames=delay)
     limit = least_model_residual(plant)
@@ -360,7 +300,7 @@ def test_the_bound_of_two_sensors_of_each_frame_is_met(sensor_gain):
     assert least == pytest.approx(left, rel=1e-7)
 
 
-@pytest.mark.parametrize(("divisor", "delay_frames"), [(2, 2), (5, 2), (5, 3.2), (20, 2)])
+@pytest.mark.parametrize(("divisor", "delay_frames"), [(2, 2), (5, 3.2), (20, 2)])
 def test_no_filter_of_a_slow_sensor_passes_the_bound(divisor, delay_frames):
     left, least = variances_of_sensors([second(RATE / divisor, delay_frames, 3.0)])
     alone = variances_of_sensors([second(RATE / divisor, delay_frames, 1e4)])[0]
@@ -394,11 +334,10 @@ def test_an_exposure_that_ends_within_a_frame_has_no_bound():
         variances_of_sensors([second(RATE / 5, 2.1, 3.0)])
 
 
-DELAYS = [1, 1.5, 2, 2.01, 2.25, 2.49, 2.75, 3]
-
-
-@pytest.mark.parametrize("delay", DELAYS)
-@pytest.mark.parametrize("kind", ["example", "calm", "quick"])
+@pytest.mark.parametrize(
+    ("kind", "delay"),
+    [("example", 1), ("example", 2.49), ("calm", 2.01), ("calm", 3), ("quick", 1.5), ("quick", 2)],
+)
 def test_the_best_filters_come_close_to_the_limit_in_the_image(delay, kind):
     """At whole delays they reach it: with a fraction, they draw a line between two means."""
     plant = {
@@ -418,16 +357,6 @@ def test_the_best_filters_come_close_to_the_limit_in_the_image(delay, kind):
             assert limit * (1 - 1e-5) <= left < limit * (1 + 5e-3)
         else:
             assert left == pytest.approx(limit, rel=1e-9)
-
-
-def test_fractions_in_the_image_lie_between_the_whole_delays():
-    model = {"turbulence": ar(1.5, -0.8), "noise_nm": 0.4, "frame_means": False}
-    least = [
-        variance(path(delay), **model) for delay in (2, 2 + 1e-6, 2.25, 2.5, 2.75, 3 - 1e-6, 3)
-    ]
-    assert least[1] == pytest.approx(least[0], rel=1e-4)
-    assert least[5] == pytest.approx(least[6], rel=1e-4)
-    assert np.all(np.diff(least) > 0)
 
 
 def test_mirrors_with_dynamics_have_no_limit_in_the_image_yet():

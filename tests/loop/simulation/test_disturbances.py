@@ -14,7 +14,7 @@ from lbt_synth.models.plant.seen_vibration import seen_vibration
 def test_drawn_series_have_their_spectrum(air):
     path = lbt.LoopHardware(frame_rate_hz=400, modes=1)
     truth = lbt.Truth(turbulence=air)
-    series = draw_disturbance(truth, path, frames=8192, cases=200, frame_means=True).phase_nm[
+    series = draw_disturbance(truth, path, frames=4096, cases=100, frame_means=True).phase_nm[
         ..., 0
     ]
     variance = np.mean(series**2, axis=1)
@@ -27,8 +27,7 @@ def test_drawn_series_have_their_spectrum(air):
     assert abs(step.mean() - expected) < 5 * step.std(ddof=1) / np.sqrt(len(step))
 
 
-@pytest.mark.parametrize("frames", [100, 1000])
-def test_power_is_drawn_whole_however_short_the_series(frames):
+def test_power_is_drawn_whole_however_short_the_series():
     """A line between two bins, and a spectrum that rises towards zero, keep their variance."""
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     steep = lbt.Atmosphere(
@@ -39,23 +38,9 @@ def test_power_is_drawn_whole_however_short_the_series(frames):
     )
     for spectrum, rms in ((steep, steep.tilt_rms_nm), (line, 10.0)):
         series = draw_disturbance(
-            lbt.Truth(turbulence=spectrum),
-            path,
-            frames=frames,
-            cases=3000,
-            seed=2,
-            frame_means=True,
+            lbt.Truth(turbulence=spectrum), path, frames=100, cases=3000, seed=2, frame_means=True
         ).phase_nm
         assert np.sqrt(np.mean(series**2)) == pytest.approx(rms, rel=0.05)
-
-
-def test_white_noise_is_drawn_white():
-    flat = lbt.models.TabulatedSpectrum(frequency_hz=[0, 400], density_nm2_hz=[1.0, 1.0])
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    series = draw_disturbance(
-        lbt.Truth(turbulence=flat), path, frames=8, cases=60_000, seed=3, frame_means=True
-    ).phase_nm
-    assert np.mean(series**2) == pytest.approx(400, rel=0.01)
 
 
 def test_drawn_ar_series_are_stationary_from_the_first_frame():
@@ -108,9 +93,9 @@ def drawn(line, *, frames, cases=1, zero_frame=0, seed=0):
 
 def test_the_drawn_resonance_has_its_rms_and_its_decay():
     line = drifting(duration_s=2, damping=0.02)
-    series = drawn(line, frames=2800, cases=2000, zero_frame=400)
+    series = drawn(line, frames=2800, cases=1000, zero_frame=400)
     for frame in (0, 1, 399, 1200, 2000, 2799):
-        assert series[:, frame].std() == pytest.approx(100, rel=0.07)
+        assert series[:, frame].std() == pytest.approx(100, rel=0.08)
     early, late = series[:, :2], series[:, 2400:2402]  # before the drift, and after it
     for pair, hz in ((early, 17), (late, 23)):
         model = (
@@ -118,7 +103,7 @@ def test_the_drawn_resonance_has_its_rms_and_its_decay():
         )
         a1, a2 = model.coefficients
         correlation = np.mean(pair[:, 0] * pair[:, 1]) / np.mean(pair**2)
-        assert correlation == pytest.approx(a1 / (1 - a2), abs=1.5e-3)
+        assert correlation == pytest.approx(a1 / (1 - a2), abs=2e-3)
 
 
 def path_with(channel):

@@ -8,7 +8,6 @@ from scipy.signal import hilbert
 from support.drifting import drifting
 from support.lqg import shell
 from support.plants import lbt_axis_plant
-from support.uneven_axes import LINES, LOOPS, SLOW, TABLE
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
@@ -16,8 +15,10 @@ from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.loop.simulation.run import Drop, run_segments
 
 
-@pytest.mark.parametrize("delay", [1, 1.4, 2, 2.7, 3])
-def test_fast_loop_is_the_loop_as_written(delay):
+@pytest.mark.parametrize(
+    ("delay", "mirror"), [(1, None), (2.7, None), (2, shell(70, delay_samples=2))]
+)
+def test_fast_loop_is_the_loop_as_written(delay, mirror):
     rng = np.random.default_rng(2)
     turbulence = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=30, frame_rate_hz=800)
     plant = lbt.tip_tilt_plant(
@@ -29,7 +30,10 @@ def test_fast_loop_is_the_loop_as_written(delay):
         sensor_matrix=rng.standard_normal((3, 2)),
         influence_matrix=rng.standard_normal((2, 4)),
     )
-    controller = lbt.kalman(plant).controller
+    path = replace(plant.hardware, mirror=mirror)
+    leaky = lbt.design.IntegratorLaw(leak=0.98)
+    design = lbt.integrator(path, gain=0.1, law=leaky) if mirror else lbt.kalman(plant)
+    controller = design.controller
     truth = lbt.Truth(
         turbulence=turbulence,
         noise_nm=5,
@@ -37,9 +41,7 @@ def test_fast_loop_is_the_loop_as_written(delay):
         vibrations=(lbt.models.SinusoidalVibration(frequency_hz=24, rms_nm=90, direction=(1, 2)),),
     )
     fast, stepped = (
-        lbt.simulate(
-            k, truth, hardware=plant.hardware, frames=300, cases=2, seed=4, settle_frames=50
-        )
+        lbt.simulate(k, truth, hardware=path, frames=300, cases=2, seed=4, settle_frames=50)
         for k in (controller, controller.start())
     )
     for name in ("residual_nm", "commands", "measurements", "total_nm"):
@@ -47,8 +49,9 @@ def test_fast_loop_is_the_loop_as_written(delay):
         assert np.allclose(one, other, atol=1e-9 * np.abs(other).max()), name
 
 
-@pytest.mark.parametrize("frame_means", [False, True])
-@pytest.mark.parametrize(("delay", "mirror"), [(2, None), (2.4, None), (2, 70), (2.4, 70)])
+@pytest.mark.parametrize(
+    ("delay", "mirror", "frame_means"), [(2, None, True), (2.4, None, False), (2.4, 70, False)]
+)
 def test_simulation_agrees_with_the_exact_answer(config, delay, mirror, frame_means):
     """Within the statistical error, which the scatter of independent runs gives."""
     moved = None if mirror is None else shell(mirror, delay_samples=2)
@@ -56,14 +59,14 @@ def test_simulation_agrees_with_the_exact_answer(config, delay, mirror, frame_me
     controller = lbt.lqg(replace(config.plant, hardware=path), command_weight=1e-3).controller
     options = {"frame_means": frame_means}
     run = lbt.simulate(
-        controller, config.truth, hardware=path, frames=8000, cases=24, seed=3, **options
+        controller, config.truth, hardware=path, frames=4000, cases=24, seed=3, **options
     )
     loop = lbt.close_loop(path, controller)
     exact = lbt.residual_budget(loop, config.truth, **options)
     variances = run.rms_nm**2
     error = variances.std(ddof=1) / np.sqrt(len(variances))
     assert abs(variances.mean() - exact.rms_nm**2) < 4 * error
-    assert error < 0.03 * exact.rms_nm**2  # the test has teeth
+    assert error < 0.04 * exact.rms_nm**2  # the test has teeth
     strehls = run.strehl(config.imaging)
     scatter = strehls.std(ddof=1) / np.sqrt(len(strehls))
     # the series' own mean is taken out of its image, which only helps
@@ -131,40 +134,6 @@ def test_wrong_controllers_and_counts_are_refused(axis_plant):
         lbt.simulate(controller, shaken, hardware=hw, frames=10)
 
 
-def test_axis_of_the_lbt_in_the_time_domain():
-    """Truth is the model: the simulated means over frames are the Kalman filter's 135.958 nm."""
-    plant = lbt_axis_plant()
-    truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
-    run = lbt.simulate(
-        lbt.kalman(plant), truth, hardware=plant.hardware, frames=4000, cases=50, frame_means=True
-    )
-    variances = run.rms_nm**2
-    error = variances.std(ddof=1) / np.sqrt(len(variances))
-    assert abs(variances.mean() - 135.958**2) < 4 * error
-
-
-def test_a_line_above_nyquist_is_refused_as_in_the_exact_answer(axis_plant):
-    line = lbt.models.SinusoidalVibration(frequency_hz=600, rms_nm=1, direction=(1,))
-    truth = lbt.Truth(turbulence=None, vibrations=(line,))
-    with pytest.raises(
-        lbt.errors.ProblemError, match="below the Nyquist frequency 400 Hz; got 600 Hz"
-    ):
-        lbt.simulate(
-            lbt.kalman(axis_plant).controller, truth, hardware=axis_plant.hardware, frames=10
-        )
-
-
-def test_a_simulation_agrees_with_the_exact_answer():
-    both, _ = LOOPS
-    truth = lbt.Truth(turbulence=[SLOW, TABLE], noise_nm=[20.0, 5.0], vibrations=LINES)
-    design = lbt.integrator(both, gain=0.4)
-    run = lbt.simulate(design.controller, truth, hardware=both, frames=20_000, cases=4, seed=3)
-    loop = lbt.close_loop(both, design.controller)
-    exact = lbt.residual_budget(loop, truth)
-    power = np.mean(run.image_nm2, axis=(0, 1))
-    np.testing.assert_allclose(power, np.diag(exact.total_nm2), rtol=0.05)
-
-
 def test_time_0_is_the_first_kept_frame():
     plant = lbt_axis_plant()
     truth = lbt.Truth(turbulence=None, vibrations=(drifting(),), noise_nm=1)
@@ -179,17 +148,6 @@ def test_time_0_is_the_first_kept_frame():
     phases = [np.unwrap(np.angle(hilbert(s))) for s in series.values()]
     apart = np.diff(phases, axis=0)[0][300:-300]
     assert np.ptp(apart) < 0.05
-
-
-def test_simulation_by_taps_is_that_of_the_states():
-    plant = lbt_axis_plant(modes=1)
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell(70, delay_samples=2))
-    slow = lbt.integrator(path, gain=0.1)
-    truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
-    same = {"hardware": path, "frames": 400, "seed": 3, "settle_frames": 100}
-    by_states = lbt.simulate(slow.controller, truth, **same)
-    by_taps = lbt.simulate(slow.controller.start(), truth, **same)
-    np.testing.assert_allclose(by_states.residual_nm, by_taps.residual_nm, atol=1e-9)
 
 
 PATH = lbt.LoopHardware(frame_rate_hz=500, modes=1)
@@ -242,10 +200,7 @@ def exact_nm(design, truth, missing, filtered):
     return lbt.residual_budget(loop, truth).rms_nm
 
 
-@pytest.mark.parametrize(
-    ("missing", "reading"),
-    [((), "missing"), (("m1",), "missing"), (("m2",), "zero"), (("slow", "m2"), "missing")],
-)
+@pytest.mark.parametrize(("missing", "reading"), [(("m2",), "zero"), (("slow", "m2"), "missing")])
 def test_a_run_has_the_exact_residual(sensors_design, sensors_config, missing, reading):
     drops = [Drop(unit=unit, start_s=0, reading=reading) for unit in missing]
     found = np.sqrt(np.mean(failing_run(sensors_design, sensors_config.truth, drops).rms_nm ** 2))
@@ -274,18 +229,6 @@ def test_a_frozen_wavefront_runs_away_where_the_table_says_so(sensors_design, se
     found = failing_run(sensors_design, sensors_config.truth, [away], frames=6000, cases=2)
     grows = np.max(np.abs(found.residual_nm[:, -100:])) > 1e4
     assert grows == (not loop.is_stable)
-
-
-def test_a_sinusoid_that_channels_see(sensors_design, sensors_config):
-    lines = tuple(
-        lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=100, direction=d)
-        for f, d in ((20, (1, 0)), (33, (0, 1)))
-    )
-    truth = replace(sensors_config.truth, vibrations=lines)
-    loop = sensors_design.close(sensors_config.hardware)
-    exact = lbt.residual_budget(loop, truth)
-    found = failing_run(sensors_design, truth, frames=20_000, cases=4)
-    assert np.sqrt(np.mean(found.rms_nm**2)) == pytest.approx(exact.rms_nm, rel=0.03)
 
 
 def test_segments_of_drops_that_overlap():

@@ -29,20 +29,6 @@ def test_the_step_is_that_of_a_second_order_system_when_sampled_fast():
     assert mirror.bandwidth_hz == pytest.approx(500 * np.sqrt(quarter), rel=2e-3)
 
 
-def test_the_lag_converges_with_the_sampling():
-    """Sampled feedback differs from the continuous one by a term of first order in the sample."""
-    t = np.linspace(0, 2e-3, 50)
-    w, z = 2 * np.pi * 500, 0.7
-    wd = w * np.sqrt(1 - z**2)
-    exact = 1 - np.exp(-z * w * t) * (np.cos(wd * t) + z / np.sqrt(1 - z**2) * np.sin(wd * t))
-    errors = []
-    for rate in (2e5, 4e5, 8e5):
-        step = shell(sampling_hz=rate, delay_samples=0).step_response()
-        errors.append(np.max(np.abs(np.interp(t, step.time_s, step.position) - exact)))
-    assert errors[0] / errors[1] == pytest.approx(2, rel=0.05)
-    assert errors[1] / errors[2] == pytest.approx(2, rel=0.05)
-
-
 @pytest.mark.parametrize("changes", [{}, {"ramp_samples": 37, "delay_samples": 0}, SLOW])
 def test_a_step_response_in_blocks_is_that_sample_by_sample(changes):
     mirror = shell(**changes)

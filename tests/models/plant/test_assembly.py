@@ -20,19 +20,7 @@ SEEING = Accelerometer(
 
 @pytest.mark.parametrize(
     ("age", "period", "common"),
-    [
-        (1, 1, 1),
-        (3, 1, 1),
-        (2.3, 1, 1),
-        (2, 2, 2),
-        (2, 2, 4),
-        (2.5, 2, 2),
-        (7.6, 3, 6),
-        (20, 20, 20),
-        (39, 20, 20),
-        (40, 20, 60),
-        (59.5, 20, 20),
-    ],
+    [(1, 1, 1), (2.3, 1, 1), (2, 2, 4), (2.5, 2, 2), (7.6, 3, 6), (20, 20, 20), (59.5, 20, 20)],
 )
 def test_a_reading_is_the_mean_of_its_exposure(age, period, common):
     signal = np.random.default_rng(0).standard_normal((200, 2))
@@ -67,7 +55,7 @@ def test_sensors_side_by_side():
     assert not both.C[:, :2, n:].any()
 
 
-@pytest.mark.parametrize("delay", [1, 2, 2.4, 3])
+@pytest.mark.parametrize("delay", [1, 2.4])
 def test_channels_that_see_nothing_leave_the_filter_of_the_wavefront(delay):
     fast = Accelerometer(
         name="mirror", rate_hz=500, delay_frames=2, channels=("m1",), noise_m_s2=1.0
@@ -119,7 +107,7 @@ def test_lines_that_move_keep_their_channels():
     np.testing.assert_allclose(one.C, plant.C, rtol=1e-12)
 
 
-@pytest.mark.parametrize("sections", [2, 3, 4])
+@pytest.mark.parametrize("sections", [2, 4])
 def test_a_bump_is_a_chain_of_resonances(sections):
     """The filter leaves what the same bump as one process of order 2 a section leaves."""
     slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=2, frame_rate_hz=1000)
@@ -140,7 +128,7 @@ def test_a_bump_is_a_chain_of_resonances(sections):
         plant.with_sensors(SensorSuite(sensors=(SEEING,)), ({"m1": Motion(size=1)}, {}))
 
 
-@pytest.mark.parametrize("steps", [0, 2, 3])
+@pytest.mark.parametrize("steps", [0, 3])
 def test_a_prediction_further_ahead_has_the_same_readings(steps):
     plant = example_plant((FAST,))
     parts = {name: getattr(plant, name) for name in "ABCDL"}
@@ -162,10 +150,6 @@ def test_lines_that_no_channel_sees_stay_in_place():
     position = plant.A[len(kept) - 2 : len(kept), len(kept)]
     np.testing.assert_allclose(position, LINES[1].direction, rtol=1e-12)
     assert not plant.C[2:, : len(kept)].any()
-
-
-def test_noise_of_a_reading_is_that_of_nothing_else():
-    assert not example_plant().S.any()
 
 
 @pytest.mark.parametrize(

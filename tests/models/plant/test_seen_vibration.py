@@ -34,9 +34,8 @@ def lag_covariances(A, B, C):
     return np.array([C @ np.linalg.matrix_power(A, lag) @ P @ C.T for lag in range(LAGS)])
 
 
-@pytest.mark.parametrize("part", [1.0, 0.25])
 @pytest.mark.parametrize(
-    ("frequency_hz", "damping"), [(5, 1e-3), (5, 0.1), (60, 0.05), (150, 0.03), (390, 0.9)]
+    ("frequency_hz", "damping", "part"), [(5, 1e-3, 0.25), (60, 0.05, 1.0), (390, 0.9, 0.25)]
 )
 def test_exact_sampling_has_the_covariances_of_256_kicks_a_frame(frequency_hz, damping, part):
     line = lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=563.6)
@@ -52,21 +51,16 @@ def test_exact_sampling_has_the_covariances_of_256_kicks_a_frame(frequency_hz, d
     C[1, [5, 7]] = np.array([-1, 1]) * RATE_HZ / w  # less the mean acceleration over w^2
     C[2, [4, 6]] = np.array([1, -1]) * RATE_HZ / w  # the mean velocity over w
     expected = lag_covariances(A, B, C)
+    P = seen_vibration(line, {}, (), PATH).covariances()[0]
+    np.testing.assert_allclose(P[1:, 1:], 563.6**2 * np.eye(2), rtol=1e-12, atol=1e-6)
     sizes = np.sqrt(np.diag(expected[0]))
     assert np.abs((found - expected) / np.outer(sizes, sizes)).max() < 1e-9
     assert sizes[0] < 563.6
 
 
-def test_the_oscillator_has_the_rms_of_the_line():
-    line = lbt.Vibration(frequency_hz=150, damping=0.03, rms_nm=563.6)
-    P = seen_vibration(line, {}, (), PATH).covariances()[0]
-    np.testing.assert_allclose(P[1:, 1:], 563.6**2 * np.eye(2), rtol=1e-12, atol=1e-6)
-
-
 @pytest.mark.parametrize(
-    ("period", "age"), [(1, 0.0), (1, 0.3), (1, 2.0), (1, 1.6), (2, 1.0), (4, 3.7), (4, 9.25)]
+    ("period", "age", "ahead"), [(1, 0.0, 0), (1, 0.3, 1), (1, 2.0, 3), (2, 1.0, 1), (4, 9.25, 3)]
 )
-@pytest.mark.parametrize("ahead", [0, 1, 3])
 def test_a_line_that_hardly_decays_is_read_as_a_sinusoid(period, age, ahead):
     """In size and phase: its readings over its mean positions, as it turns freely."""
     sensor = mirror(rate_hz=RATE_HZ / period, delay_frames=(age + 1) / period, highpass_hz=20.0)
@@ -187,7 +181,7 @@ def random_case(seed):
     return frequency_hz, damping, noise, [0.0, 0.0, 0.375, 1.25][seed % 4]
 
 
-@pytest.mark.parametrize("seed", range(100))
+@pytest.mark.parametrize("seed", range(12))
 def test_no_certified_residual_is_below_that_of_physics(seed):
     case = random_case(seed)
     design, model = designed(*case), physics(*case)
@@ -196,13 +190,3 @@ def test_no_certified_residual_is_below_that_of_physics(seed):
     assert design.rms > least * (1 - 1e-6)
     assert left > least * (1 - 1e-6)
     assert design.rms == pytest.approx(left, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("case", "expected_nm"), [((60.0, 0.05, 0.01, 0.0), 55.64), ((150.0, 0.03, 0.001, 0.0), 96.42)]
-)
-def test_two_lines_that_used_to_be_known_in_advance(case, expected_nm):
-    """The second difference of the frame to come left 39 and 33 nm of them."""
-    design = designed(*case)
-    assert design.rms == pytest.approx(least_nm(*physics(*case)), rel=1e-6)
-    assert round(design.rms, 2) == expected_nm
