@@ -182,6 +182,20 @@ def test_unstable_loops_have_no_residual(kalman):
     assert agree(found, kalman, w, lambda i: AIR) > 3
 
 
+def test_three_coupled_modes():
+    rng = np.random.default_rng(3)
+    sensor = np.eye(3) + 0.2 * rng.standard_normal((3, 3))
+    gain = 0.3 * np.linalg.inv(sensor) + 0.02 * rng.standard_normal((3, 3))
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=3, sensor_matrix=sensor)
+    lazy = lbt.Controller(A=np.eye(3), B=gain, C=np.eye(3), D=np.zeros((3, 3)), dt_s=1 / RATE)
+    found = ensemble_residuals(lazy, path, LoopEnsemble(turbulence=AIR, noise_nm=[[4, 9, 15]]))
+    truth = lbt.Truth(turbulence=AIR, noise_nm=(4, 9, 15))
+    budget = lbt.residual_budget(lbt.close_loop(path, lazy), truth)
+    for name in ("turbulence_nm2", "noise_nm2"):
+        off = np.max(np.abs(getattr(found, name)[0] - getattr(budget, name)))
+        assert off < 5e-7 * np.trace(getattr(budget, name))
+
+
 def test_a_mirror_with_dynamics(kalman):
     shell = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
     design = lbt.kalman(plant(mirror=shell))

@@ -112,7 +112,7 @@ def test_scalar_closed_forms(horizon):
             assert design.gamma_infeasible == pytest.approx(exact, rel=rel), (a, q, r)
 
 
-@settings(max_examples=8)
+@settings(max_examples=12)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 5), q=st.integers(1, 2), l=st.integers(1, 2))
 def test_the_bracket_is_closed(seed, n, q, l):
     problem = random_problem(np.random.default_rng(seed), n, q, l=l)

@@ -231,6 +231,18 @@ def test_a_frozen_wavefront_runs_away_where_the_table_says_so(sensors_design, se
     assert grows == (not loop.is_stable)
 
 
+def test_a_sinusoid_that_channels_see(sensors_design, sensors_config):
+    lines = tuple(
+        lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=100, direction=d)
+        for f, d in ((20, (1, 0)), (33, (0, 1)))
+    )
+    truth = replace(sensors_config.truth, vibrations=lines)
+    loop = sensors_design.close(sensors_config.hardware)
+    exact = lbt.residual_budget(loop, truth)
+    found = failing_run(sensors_design, truth, frames=10_000, cases=4)
+    assert np.sqrt(np.mean(found.rms_nm**2)) == pytest.approx(exact.rms_nm, rel=0.03)
+
+
 def test_segments_of_drops_that_overlap():
     drops = [Drop(unit="a", start_s=1, end_s=3), Drop(unit="b", start_s=2, reading="zero")]
     found = run_segments(drops, 4.0)
