@@ -1,6 +1,6 @@
 """The exact residual of a loop against closed forms, brute force and runs of the loop."""
 
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +9,6 @@ from support import predictions
 from support.continuous_loops import noise_covariance, power_of_two_sensors, sinusoid_powers
 from support.plants import lbt_axis_plant
 from support.sensor_loops import (
-    AIR,
     FAST,
     MOTIONS,
     RATE_HZ,
@@ -20,7 +19,7 @@ from support.sensor_loops import (
 )
 from support.sensor_loops import LINES as SHAKES
 from support.sensor_loops import SLOW as OTHER
-from support.uneven_axes import LINES, LOOPS, QUICK, RATE, SLOW, TABLE, one_axis
+from support.uneven_axes import RATE, SLOW, TABLE
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
@@ -28,9 +27,6 @@ from lbt_synth.linear import kalman_riccati
 from lbt_synth.loop.budget import residual_budget
 from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
 
-AGELESS = Accelerometer(
-    name="mirror", rate_hz=RATE_HZ, delay_frames=1, channels=("m1", "m2"), noise_m_s2=2e-3
-)
 SELDOM = WavefrontSensor(name="seldom", rate_hz=50, delay_frames=1.3, noise_nm=4)
 THIRD = Accelerometer(
     name="third", rate_hz=RATE_HZ / 3, delay_frames=1, channels=("m1", "m2"), noise_m_s2=2e-3
@@ -153,54 +149,6 @@ def test_parts_of_the_budget_add_up():
     assert np.allclose(b.gaussian_nm2, b.total_nm2 - lines)
 
 
-def test_loops_refuse_what_does_not_fit():
-    path = lbt.LoopHardware(frame_rate_hz=800)
-    lazy = lbt.integrator(path, gain=0.3).controller
-    with pytest.raises(DimensionError, match="map 1 measurements to 1 commands; got 2 to 2"):
-        lbt.close_loop(lbt.LoopHardware(frame_rate_hz=800, modes=1), lazy)
-    with pytest.raises(
-        ProblemError, match="must run at the loop's 500 Hz; got one designed for 800"
-    ):
-        lbt.close_loop(lbt.LoopHardware(frame_rate_hz=500), lazy)
-    loop = lbt.close_loop(path, lazy)
-    with pytest.raises(ProblemError, match="truth's sensor gain 0.5; got 1"):
-        lbt.residual_budget(loop, Truth(turbulence=None, sensor_gain=0.5))
-    line = lbt.models.SinusoidalVibration(frequency_hz=10, rms_nm=1, direction=(1, 0, 0))
-    with pytest.raises(DimensionError, match="must have 2 components"):
-        lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
-    fast = lbt.models.SinusoidalVibration(frequency_hz=600, rms_nm=1)
-    with pytest.raises(ProblemError, match="below the Nyquist"):
-        lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(fast,)))
-    other_rate = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=1, frame_rate_hz=100)
-    with pytest.raises(ProblemError, match="must be sampled at the loop's 800 Hz"):
-        lbt.residual_budget(loop, Truth(turbulence=other_rate))
-
-
-uneven = partial(Truth, noise_nm=(15.5, 6.0), sensor_gain=0.8)
-
-
-@pytest.mark.parametrize("spectra", [(SLOW, TABLE), (None, QUICK)])
-def test_axes_without_coupling_are_loops_of_their_own(spectra):
-    both, single = LOOPS
-    truth = uneven(turbulence=spectra, vibrations=LINES)
-    budget = lbt.residual_budget(
-        lbt.close_loop(both, lbt.integrator(both, gain=0.4).controller, sensor_gain=0.8), truth
-    )
-    limit = lbt.loop.least_residual(both, truth)
-    for axis in (0, 1):
-        loop = lbt.close_loop(single, lbt.integrator(single, gain=0.4).controller, sensor_gain=0.8)
-        alone = one_axis(truth, axis)
-        own = lbt.residual_budget(loop, alone)
-        for name in ("turbulence_nm2", "noise_nm2", "vibration_nm2"):
-            assert getattr(budget, name)[axis, axis] == pytest.approx(
-                getattr(own, name)[0, 0], rel=1e-9
-            ), name
-        assert limit.variance_nm2[axis] == pytest.approx(
-            lbt.loop.least_residual(single, alone).variance_nm2[0], rel=1e-9
-        )
-    assert abs(budget.turbulence_nm2[0, 1]) < 1e-9
-
-
 def test_coupled_axes_against_the_frequency_response():
     """A loop that mixes the axes: the sum of |S e_i|^2 S_i by brute force."""
     path = lbt.LoopHardware(
@@ -245,25 +193,6 @@ def test_the_budget_of_a_model_is_that_of_its_truth(delay, gain, mirror, sensor)
         np.testing.assert_allclose(again.total_nm2, own.total_nm2, rtol=1e-9, atol=1e-9)
 
 
-def test_a_budget_of_no_loop_or_no_plant_is_refused():
-    plant = predictions.a_plant()
-    unstable = lbt.close_loop(
-        plant.hardware, lbt.integrator(plant.hardware, gain=0.9).controller, sensor_gain=1.0
-    )
-    wild = lbt.Controller(
-        A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / predictions.RATE
-    )
-    assert unstable.is_stable
-    with pytest.raises(UnstableLoopError):
-        lbt.residual_budget(lbt.close_loop(plant.hardware, wild), plant)
-    with pytest.raises(ProblemError, match="expected a Truth"):
-        lbt.residual_budget(unstable, plant.hardware)
-    with pytest.raises(ProblemError, match="must be a ClosedLoop"):
-        lbt.residual_budget(unstable.system, plant)
-    with pytest.raises(ProblemError, match="expected a TipTiltPlant"):
-        lbt.design.model_integrator(predictions.a_truth())
-
-
 def test_what_is_left_of_strong_slow_lines_keeps_its_digits():
     """It is 1e-5 of the lines; the loop is the optimal one, which leaves the limit."""
     air = lbt.models.ARModel(coefficients=[0.9998], driving_rms_nm=0.01, frame_rate_hz=4000)
@@ -283,37 +212,10 @@ def test_what_is_left_of_strong_slow_lines_keeps_its_digits():
     assert lbt.lqg(plant).certificate.passed
 
 
-@pytest.mark.parametrize("density", [-1.0, 1j])
-def test_a_spectrum_that_is_none_is_refused(density):
-    class Odd:
-        def psd(self, frequency_hz):
-            return np.full(frequency_hz.shape, density)
-
-    path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
-    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3))
-    truth = Truth(turbulence=Odd(), noise_nm=1.0)
-    for compute in (
-        lambda: lbt.residual_budget(loop, truth),
-        lambda: lbt.loop.least_residual(path, truth),
-    ):
-        with pytest.raises(ProblemError, match="one finite number of at least 0"):
-            compute()
-
-
 def closed(plant, **facts):
     """Return the controller of the Kalman filter, and its loop."""
     controller = plant.controller(kalman_riccati(plant).gain_predictor)
     return controller, lbt.close_loop(plant.hardware, controller, **facts)
-
-
-@pytest.mark.parametrize(("delay", "sensors"), [(1, (FAST, OTHER)), (2, (FAST,)), (3, (SELDOM,))])
-def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
-    plant = example_plant(sensors, delay_frames=delay)
-    P = kalman_riccati(plant).P.reshape(-1, plant.n_states, plant.n_states)
-    _, loop = closed(plant)
-    rms = np.sqrt(np.mean([np.trace(plant.L @ one @ plant.L.T) for one in P]))
-    budget = residual_budget(loop, plant, frame_means=True)
-    assert budget.rms_nm == pytest.approx(rms, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -324,8 +226,8 @@ def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
         ({}, {"blind": ("truth", "m1")}),
         ({"delay_frames": 1.5, "turbulence": AR3}, {}),
         ({"delay_frames": 3, "sensors": (HALF, OTHER)}, {}),
-        ({"sensors": (AGELESS,)}, {}),
         ({"sensors": (SLEEPY,)}, {}),
+        ({"sensors": (THIRD, SELDOM), "lines": SHAKES[:1], "motions": MOTIONS[:1]}, {}),
         ({"mirror": SHELL, "influence_matrix": [[2.0, 0.1], [0.3, 1.0]]}, {}),
         ({"sensor_matrix": [[1, 0], [0, 1], [0.5, 0.5]], "noise_nm": [30, 30, 40]}, {}),
     ],
@@ -334,18 +236,15 @@ def test_budgets_are_what_impulses_leave(changes, loop):
     plant = example_plant(**changes)
     controller, own = closed(plant, **loop)
     budget = residual_budget(own, plant, frame_means=True)
+    if not loop and changes.keys().isdisjoint(
+        ("mirror", "turbulence")
+    ):  # the residual of the model is the error of the filter
+        P = kalman_riccati(plant).P.reshape(-1, plant.n_states, plant.n_states)
+        rms = np.sqrt(np.mean([np.trace(plant.L @ one @ plant.L.T) for one in P]))
+        assert budget.rms_nm == pytest.approx(rms, rel=1e-9)
     exact = budget.turbulence_nm2, budget.random_vibration_nm2, budget.noise_nm2
     for one, simulated in zip(exact, simulated_covariances(plant, controller, **loop), strict=True):
         assert np.abs(one - simulated).max() < 1e-8 * np.trace(one)
-
-
-def test_rates_that_do_not_divide_each_other():
-    plant = example_plant((THIRD, SELDOM), lines=SHAKES[:1], motions=MOTIONS[:1])
-    assert plant.period == 60
-    controller, loop = closed(plant)
-    budget = residual_budget(loop, plant)
-    *_, noise = simulated_covariances(plant, controller, frames=200)
-    assert np.abs(budget.noise_nm2 - noise).max() < 1e-8 * np.trace(noise)
 
 
 @pytest.mark.parametrize(("age", "period"), [(0, 1), (2.4, 2)])
@@ -406,27 +305,6 @@ def test_a_spectrum_leaves_the_spectrum_of_what_impulses_leave():
     np.testing.assert_allclose(budget.turbulence_nm2, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_refusals():
-    plant = example_plant()
-    _, loop = closed(plant, sensor_gain=8.0)
-    assert not loop.is_stable
-    with pytest.raises(UnstableLoopError, match=r"an unstable one .* at sensor gain 8\)"):
-        lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=8.0))
-    _, loop = closed(plant)
-    with pytest.raises(ProblemError, match="no sensor or channel is called 'm9'"):
-        closed(plant, blind=("m9",))
-    other, _ = closed(example_plant((FAST,)))
-    with pytest.raises(ProblemError, match="6 measurements to 2 commands in a period of 4"):
-        lbt.close_loop(plant.hardware, other)
-    with pytest.raises(ProblemError, match="sensor_gain"):
-        closed(plant, sensor_gain=0.0)
-    drifting = lbt.models.DriftingVibration(
-        start_hz=20, end_hz=30, duration_s=1, damping=0.01, rms_nm=100
-    )
-    with pytest.raises(ProblemError, match="stationary"):
-        lbt.residual_budget(loop, Truth(turbulence=AIR, vibrations=(drifting,)))
-
-
 def a_shell(**changes):
     facts = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 150}
     return PositionLoop.from_bandwidth(**(facts | {"sampling_hz": 8000.0} | changes))
@@ -436,32 +314,9 @@ MIRRORS = {"settled": None, "shell": a_shell(), "ramp": a_shell(ramp_samples=4, 
 
 
 @pytest.mark.parametrize(
-    ("mirror", "delay"), [("settled", 1), ("settled", 2.9), ("shell", 2.49), ("ramp", 3)]
+    ("mirror", "delay"), [("settled", 1), ("settled", 2.49), ("shell", 2.9), ("ramp", 3)]
 )
 def test_the_image_has_what_a_run_in_small_steps_leaves(mirror, delay):
-    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, modes=1, mirror=MIRRORS[mirror])
-    controller, hertz = lbt.integrator(path, gain=0.2).controller, np.array([3, 20, 62, 150, 390])
-    powers = sinusoid_powers(path, controller, hertz, (1.0,), frames=150)[:, 0, 0]
-    loop, rms_nm = lbt.close_loop(path, controller), np.array([500.0, 100.0, 50.0, 20.0, 10.0])
-    lines = [sinusoid(f, rms, (1,)) for f, rms in zip(hertz, rms_nm, strict=True)]
-    for line, power in zip(lines, powers, strict=True):
-        budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
-        assert budget.rms_nm**2 == pytest.approx(line.rms_nm**2 * power, rel=1e-4)
-    noise = noise_covariance(path, controller, [15.5], frames=150)[0, 0]
-    whole = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=lines, noise_nm=15.5))
-    assert whole.rms_nm**2 == pytest.approx(rms_nm**2 @ powers + noise, rel=1e-4)
-    assert whole.noise_nm**2 <= noise * (1 + 1e-4)
-    calm = lbt.residual_budget(loop, Truth(turbulence=None, noise_nm=15.5))
-    assert calm.rms_nm**2 == pytest.approx(noise, rel=1e-4)
-    if mirror == "settled":
-        assert calm.within_nm == pytest.approx(0, abs=1e-6)
-        assert whole.within_nm**2 == pytest.approx(
-            rms_nm**2 @ (1 - np.sinc(hertz / 800) ** 2), rel=1e-9
-        )
-
-
-@pytest.mark.parametrize(("mirror", "delay"), [("settled", 2.49), ("shell", 2)])
-def test_coupled_modes_have_what_a_run_in_small_steps_leaves(mirror, delay):
     path = lbt.LoopHardware(
         frame_rate_hz=800,
         delay_frames=delay,
@@ -469,17 +324,27 @@ def test_coupled_modes_have_what_a_run_in_small_steps_leaves(mirror, delay):
         influence_matrix=[[1.0, 0.1], [0.3, 0.8]],
         mirror=MIRRORS[mirror],
     )
-    B = 0.3 * np.linalg.pinv(path.sensor @ path.influence) + [[0, 0.05, 0], [0.02, 0, 0]]
+    B = 0.2 * np.linalg.pinv(path.sensor @ path.influence) + [[0, 0.05, 0], [0.02, 0, 0]]
     controller = lbt.Controller(A=np.eye(2), B=B, C=np.eye(2), D=np.zeros((2, 3)), dt_s=1 / 800)
-    along, noise_nm = np.array([0.6, 0.8]), [5.0, 9.0, 15.0]
-    left = 100**2 * sinusoid_powers(path, controller, [62.0], along, frames=150, sensor_gain=0.8)
-    white = noise_covariance(path, controller, noise_nm, frames=150, sensor_gain=0.8)
     loop = lbt.close_loop(path, controller, sensor_gain=0.8)
-    line = sinusoid(62.0, 100.0, tuple(along))
-    for lines, noise, expected in (((line,), 0.0, left[0]), ((), noise_nm, white)):
-        truth = Truth(turbulence=None, vibrations=lines, noise_nm=noise, sensor_gain=0.8)
+    along, hertz, noise_nm = np.array([0.6, 0.8]), [3.0, 62.0, 390.0], [5.0, 9.0, 15.0]
+    facts = {"frames": 150, "sensor_gain": 0.8}
+    waves = 100**2 * sinusoid_powers(path, controller, hertz, along, **facts)
+    white = noise_covariance(path, controller, noise_nm, **facts)
+    lines = tuple(sinusoid(f, 100.0, tuple(along)) for f in hertz)
+    for shaken, noise, expected in (
+        *(((line,), 0.0, wave) for line, wave in zip(lines, waves, strict=True)),
+        ((), noise_nm, white),
+        (lines, noise_nm, waves.sum(axis=0) + white),
+    ):
+        truth = Truth(turbulence=None, vibrations=shaken, noise_nm=noise, sensor_gain=0.8)
         budget = lbt.residual_budget(loop, truth)
         assert np.abs(budget.total_nm2 - expected).max() < 1e-4 * np.trace(expected)
+        if mirror == "settled":
+            within = sum(
+                line.rms_nm**2 * (1 - np.sinc(line.frequency_hz / 800) ** 2) for line in shaken
+            )
+            assert np.trace(budget.within_nm2) == pytest.approx(within, rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize(("mirror", "delay"), [("settled", 2), ("shell", 2.25)])
@@ -513,36 +378,66 @@ def test_a_loop_of_two_sensors_has_what_a_run_in_small_steps_leaves(delay):
     np.testing.assert_allclose(budget.vibration_nm2 + budget.within_nm2, expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("mirror", "delay", "frame_means"),
-    [("settled", 2.49, False), ("shell", 1, True), ("ramp", 2.25, False)],
+PATH = lbt.LoopHardware(frame_rate_hz=800)
+LAZY = lbt.integrator(PATH, gain=0.3).controller
+LOOP = lbt.close_loop(PATH, LAZY)
+WILD = lbt.Controller(A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / 800)
+OTHER_RATE = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=1, frame_rate_hz=100)
+DRIFTING = lbt.models.DriftingVibration(
+    start_hz=20, end_hz=30, duration_s=1, damping=0.01, rms_nm=100
 )
-def test_an_ensemble_leaves_what_its_loops_leave(mirror, delay, frame_means):
-    sensor = [[1.0, 0.2], [-0.1, 0.7]]
-    path = lbt.LoopHardware(
-        frame_rate_hz=800, delay_frames=delay, mirror=MIRRORS[mirror], sensor_matrix=sensor
-    )
-    B = 0.3 * np.linalg.inv(path.sensor @ path.influence) + [[0, 0.05], [0.02, 0]]
-    controller = lbt.Controller(A=np.eye(2), B=B, C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / 800)
-    spectra = [(Broad(), None), (None, SLOW), (QUICK, QUICK), (TABLE, SLOW), None]
-    drawn = [{"damping": 0.01}, {"damping": None}]
-    for spectrum, damped in zip([*spectra, None], [None, None, None, *drawn, None], strict=True):
-        facts = {"frequency_hz": 31.0, "rms_nm": 200.0, "direction": (1, 0.5)}
-        lines, own = [], ()
-        if damped is not None:
-            lines = [lbt.loop.EnsembleVibration(**facts, **damped)]
-            kind = lbt.Vibration if damped["damping"] else lbt.models.SinusoidalVibration
-            own = (kind(**facts, **({k: v for k, v in damped.items() if v})),)
-        gains = [0.7, 1.0]
-        ensemble = lbt.loop.LoopEnsemble(
-            sensor_gain=gains, turbulence=spectrum, noise_nm=9.0, vibrations=lines
-        )
-        found = lbt.loop.ensemble_residuals(controller, path, ensemble, frame_means=frame_means)
-        for i, gain in enumerate(gains):
-            truth = Truth(turbulence=spectrum, noise_nm=9.0, vibrations=own, sensor_gain=gain)
-            loop = lbt.close_loop(path, controller, sensor_gain=gain)
-            budget = lbt.residual_budget(loop, truth, frame_means=frame_means)
-            assert found.rms_nm[i] == pytest.approx(budget.rms_nm, rel=1e-6)
-            for name in ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "within_nm2"):
-                one, other = getattr(found, name)[i], getattr(budget, name)
-                assert np.abs(one - other).max() < 2e-6 * max(np.trace(other), 1e-3), name
+
+
+class Odd:
+    """A density that is none."""
+
+    def psd(self, frequency_hz):
+        return np.full(np.shape(frequency_hz), -1.0)
+
+
+def met(*lines, turbulence=None, loop=LOOP, **facts):
+    """Ask for the residual of a loop."""
+    return lbt.residual_budget(loop, Truth(turbulence=turbulence, vibrations=lines, **facts))
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "words"),
+    [
+        (
+            lambda: lbt.close_loop(lbt.LoopHardware(frame_rate_hz=800, modes=1), LAZY),
+            DimensionError,
+            "got 2 to 2",
+        ),
+        (lambda: lbt.close_loop(replace(PATH, frame_rate_hz=500), LAZY), ProblemError, "for 800"),
+        (lambda: met(sensor_gain=0.5), ProblemError, "truth's sensor gain 0.5; got 1"),
+        (lambda: met(sinusoid(10, 1, (1, 0, 0))), DimensionError, "must have 2 components"),
+        (lambda: met(sinusoid(600, 1)), ProblemError, "below the Nyquist"),
+        (lambda: met(turbulence=OTHER_RATE), ProblemError, "sampled at the loop's 800 Hz"),
+        (lambda: met(DRIFTING), ProblemError, "stationary"),
+        (lambda: met(turbulence=Odd()), ProblemError, "one finite number of at least 0"),
+        (
+            lambda: lbt.loop.least_residual(PATH, Truth(turbulence=Odd(), noise_nm=1.0)),
+            ProblemError,
+            "one finite number of at least 0",
+        ),
+        (lambda: met(loop=lbt.close_loop(PATH, WILD)), UnstableLoopError, "an unstable one"),
+        (
+            lambda: met(loop=closed(example_plant(), sensor_gain=8.0)[1], sensor_gain=8.0),
+            UnstableLoopError,
+            r"an unstable one .* at sensor gain 8\)",
+        ),
+        (lambda: lbt.residual_budget(LOOP, PATH), ProblemError, "expected a Truth"),
+        (lambda: lbt.design.model_integrator(PATH), ProblemError, "expected a TipTiltPlant"),
+        (lambda: met(loop=LOOP.system), ProblemError, "must be a ClosedLoop"),
+        (lambda: closed(example_plant(), blind=("m9",)), ProblemError, "is called 'm9'"),
+        (
+            lambda: lbt.close_loop(example_plant().hardware, closed(example_plant((FAST,)))[0]),
+            ProblemError,
+            "6 measurements to 2 commands in a period of 4",
+        ),
+        (lambda: closed(example_plant(), sensor_gain=0.0), ProblemError, "sensor_gain"),
+    ],
+)
+def test_refusals(call, error, words):
+    with pytest.raises(error, match=words):
+        call()

@@ -165,14 +165,13 @@ def test_the_moving_gain_lies_in_the_constant_one_and_axes_count_one_by_one():
 def test_intervals_are_of_the_sensor_gain_whatever_the_loop_has():
     plant = lbt_axis_plant()
     controller = lbt.kalman(plant).controller
-    loop = lbt.close_loop(plant.hardware, controller, sensor_gain=0.5)
-    moving = lbt.loop.moving_gain(loop)
+    low, high = lbt.loop.stable_sensor_gains(plant.hardware, controller)
+    moving = lbt.loop.moving_gain(lbt.close_loop(plant.hardware, controller, sensor_gain=0.5))
     assert moving.moving_low < 0.5 < moving.moving_high < moving.constant_high
-    expected = lbt.loop.stable_sensor_gains(plant.hardware, controller)
-    assert (moving.constant_low, moving.constant_high) == pytest.approx(expected)
-
-
-def test_an_unstable_loop_is_refused():
+    assert (moving.constant_low, moving.constant_high) == pytest.approx((low, high))
+    inside = [*np.geomspace(low * 1.0001, high * 0.9999, 9), low * 0.999, high * 1.001]
+    loops = [lbt.close_loop(plant.hardware, controller, sensor_gain=gain) for gain in inside]
+    assert [loop.is_stable for loop in loops] == [True] * 9 + [False] * 2
     with pytest.raises(lbt.errors.UnstableLoopError):
         lbt.loop.moving_gain(integrator_loop(2, gain=1.5))
 

@@ -61,16 +61,6 @@ def test_known_value_and_marechal():
     assert small == pytest.approx(np.exp(-2 * (2 * np.pi * 20 / 2200) ** 2), abs=2e-4)
 
 
-@settings(max_examples=10)
-@given(angle=st.floats(0, np.pi), sx=st.floats(0, 800), sy=st.floats(0, 800))
-def test_turning_the_jitter_changes_nothing(angle, sx, sy):
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    covariance = np.diag([sx**2, sy**2])
-    one = lbt.loop.jitter_strehl(covariance, imaging=CAMERA)
-    other = lbt.loop.jitter_strehl(turn @ covariance @ turn.T, imaging=CAMERA)
-    assert one == pytest.approx(other, abs=1e-6)
-
-
 def test_large_jitter_stays_between_zero_and_one():
     """Asymptotes: a Gaussian blob, and a circle that the image runs round."""
     camera = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
@@ -87,15 +77,6 @@ def test_large_jitter_stays_between_zero_and_one():
     )
     assert abs(circle) < 1e-4
     assert lbt.loop.jitter_strehl(np.eye(2) * 1e12, imaging=camera) == 0  # the image is gone
-
-
-def test_series_of_an_exact_sinusoid():
-    time = np.arange(6000) / 6000
-    series = np.stack([700 * np.cos(2 * np.pi * 7 * time), 300 * np.sin(2 * np.pi * 7 * time)], 1)
-    exact = lbt.loop.jitter_strehl(
-        np.zeros((2, 2)), imaging=CAMERA, line_amplitudes_nm=[[700, -300j]]
-    )
-    assert series_strehl(series, CAMERA) == pytest.approx(exact, abs=1e-5)
 
 
 @settings(max_examples=20)
@@ -193,17 +174,3 @@ def test_many_jitters_are_integrated_as_each_of_them():
             covariances[i], imaging=DIMMER_CAMERA, line_amplitudes_nm=lines[i]
         )
         assert alone == pytest.approx(found[i], abs=1e-14)
-
-
-def test_many_jitters_of_wrong_sizes():
-    with pytest.raises(
-        lbt.errors.DimensionError, match=r"must be \(3, sinusoids, 2\); got \(2, 1, 2\)"
-    ):
-        lbt.loop.jitter_strehl(
-            np.zeros((3, 2, 2)), imaging=DIMMER_CAMERA, line_amplitudes_nm=np.zeros((2, 1, 2))
-        )
-    indefinite = np.stack([np.eye(2), np.diag([1, -1])])
-    with pytest.raises(lbt.errors.DefinitenessError, match="least eigenvalue of -1"):
-        lbt.loop.jitter_strehl(
-            indefinite, imaging=DIMMER_CAMERA, line_amplitudes_nm=np.zeros((2, 0, 2))
-        )
