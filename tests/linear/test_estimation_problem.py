@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.periodic_problems import lifted_problem, random_periodic_problem, relative_distance
+from support.periodic_problems import lifted_problem, relative_distance
 
 import lbt_synth as lbt
 from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
@@ -19,14 +19,6 @@ WALK = {
     "L": [[1.0]],
     "read": [[True, False], [True, True]],
 }
-
-
-def test_the_schedule_alone_may_have_a_period():
-    problem = EstimationProblem(**WALK)
-    assert problem.period == 2
-    assert problem.A.shape == (2, 1, 1)
-    assert problem.n_measurements == 2
-    assert [len(problem.read_parts(t)[2]) for t in range(2)] == [1, 2]
 
 
 def test_a_measurement_that_is_left_out_is_not_read():
@@ -104,13 +96,6 @@ def test_nor_does_it_with_a_period_of_one(factor):
     upper = lbt.hinf_norm(one.error_system(start.gain_predictor)).upper
     brackets = [least_gamma(p, lower=0.1, upper=upper) for p in (one, other)]
     assert brackets[1][1] == pytest.approx(brackets[0][1], rel=1e-10)
-
-
-def test_the_problem_over_a_period_has_the_readings_of_a_period():
-    problem = random_periodic_problem(3)
-    lifted = lifted_problem(problem)
-    assert len(lifted.C) == problem.read.sum()
-    np.testing.assert_allclose(lifted.A, problem.monodromy)
 
 
 @pytest.mark.parametrize(

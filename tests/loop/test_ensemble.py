@@ -22,9 +22,6 @@ from lbt_synth.models import (
 
 WRONG = [
     ({"sensor_gain": 0.0}, ProblemError, "sensor_gain must be above 0"),
-    ({"sensor_gain": [np.nan, 1]}, ProblemError, "finite"),
-    ({"noise_nm": -1.0}, ProblemError, "noise_nm must be at least 0"),
-    ({"delay_frames": [0.5, 2]}, ProblemError, "delay_frames must be at least 1"),
     ({"delay_frames": [2, 20.5]}, ProblemError, "at least 1 and at most 20"),
     ({"sensor_gain": [1, 1], "noise_nm": [1, 1, 1]}, DimensionError, "one entry per loop"),
     ({"sensor_gain": []}, DimensionError, "at least one loop"),
@@ -60,8 +57,6 @@ def test_what_loops_cannot_meet(kalman, given, kind, message):
     ("given", "message"),
     [
         ({"frequency_hz": 0.0}, "frequency_hz must be above 0"),
-        ({"rms_nm": [1.0, -1.0]}, "rms_nm must be above 0"),
-        ({"damping": 0.0}, "damping must be above 0"),
         ({"direction": [0.0, 0.0]}, "direction must be a vector"),
         ({"direction": 1.0}, "direction must be a vector"),
     ],

@@ -87,15 +87,12 @@ def test_the_noise_of_all_sensors():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Motion(size=0.0), "size"),
         (lambda: wavefront(delay_frames=0.5), "delay_frames.* at least 1"),
-        (lambda: wavefront(rate_hz=-1), "rate_hz"),
         (lambda: wavefront(noise_nm=0.0).noise_factor(2), "noise_nm.* positive|above 0"),
         (lambda: accelerometer(channels=()), r"channels of mirror .* at least one; got \(\)"),
         (lambda: accelerometer(channels=("m1", "m1")), "channels of mirror must be different"),
         (lambda: wavefront(sensor_matrix=np.eye(3)).response(2), "must have 2 columns"),
         (lambda: wavefront(delay_frames=1).age_frames(PATH), "at least 1.25 of its frames.*got 1"),
-        (lambda: accelerometer(delay_frames=0.5), "delay_frames.* at least 1"),
         (
             lambda: accelerometer(rate_hz=500, delay_frames=1.25).age_frames(
                 replace(PATH, delay_frames=3)
@@ -103,7 +100,6 @@ def test_the_noise_of_all_sensors():
             "delay of sensor mirror must be at least 1.5 of its frames, .* ended .* got 1.25",
         ),
         (lambda: period_frames(wavefront(rate_hz=300), PATH), "whole multiple .*got 300 Hz"),
-        (lambda: period_frames(wavefront(rate_hz=2000), PATH), "whole multiple"),
         (lambda: period_frames(wavefront(rate_hz=0.5), PATH), "up to 1000"),
         (lambda: SensorSuite(sensors=(wavefront(name="wavefront"),)), "none of them 'wavefront'"),
         (lambda: SensorSuite(sensors=(accelerometer(), wavefront(name="m1"))), "different names"),

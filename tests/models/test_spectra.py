@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import mpmath
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 from scipy.linalg import solve_discrete_lyapunov
-from support.eris import eris_example, eris_record
 
 import lbt_synth as lbt
 
@@ -47,26 +44,6 @@ def test_what_is_no_spectrum_is_refused():
     ):
         with pytest.raises(lbt.errors.ProblemError, match=words):
             call()
-
-
-@pytest.fixture(scope="module")
-def example() -> ModuleType:
-    return eris_example()
-
-
-@pytest.fixture(scope="module")
-def seen() -> lbt.identification.SpectrumRecord:
-    return eris_record()
-
-
-def test_parts_of_the_disturbance_are_the_file(seen, example):
-    met = example.disturbance(seen)
-    f = np.concatenate([seen.frequency_hz, seen.frequency_hz[:-1] + 0.009])
-    for i, column in enumerate(seen.spectra):
-        whole = lbt.models.SumSpectrum(parts=[met.background[i], met.lines[i]])
-        assert whole.psd(f) == pytest.approx(column.psd(f), rel=1e-12)
-        moved = example.disturbance(seen, shift_hz=0.5).lines[i]
-        assert moved.psd(f + 0.5) == pytest.approx(met.lines[i].psd(f), rel=1e-9, abs=1e-9)
 
 
 @settings(max_examples=10)

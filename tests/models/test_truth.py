@@ -19,15 +19,10 @@ AIR = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, dia
     "make",
     [
         lambda v: lbt.Vibration(frequency_hz=v, damping=0.1, rms_nm=1),
-        lambda v: lbt.Vibration(frequency_hz=1, damping=v, rms_nm=1),
-        lambda v: lbt.Vibration(frequency_hz=1, damping=0.1, rms_nm=v),
         lambda v: lbt.models.SinusoidalVibration(frequency_hz=1, rms_nm=v),
-        lambda v: lbt.models.ARModel(coefficients=[v], driving_rms_nm=1, frame_rate_hz=1),
         lambda v: lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=v, frame_rate_hz=1),
         lambda v: lbt.Truth(turbulence=None, noise_nm=v),
-        lambda v: lbt.Truth(turbulence=None, sensor_gain=v),
         lambda v: lbt.Imaging(diameter_m=v),
-        lambda v: lbt.LoopHardware(frame_rate_hz=v),
         lambda v: lbt.LoopHardware(frame_rate_hz=1, delay_frames=v),
         lambda v: lbt.models.nm_per_mas(v),
         lambda v: lbt.models.TabulatedSpectrum(frequency_hz=[0, v], density_nm2_hz=[1, 1]),
@@ -57,7 +52,6 @@ def test_impossible_values_are_refused(make):
         ({"turbulence": None, "noise_nm": [[1.0]]}, DimensionError, r"got shape \(1, 1\)"),
         ({"turbulence": None, "noise_nm": []}, DimensionError, r"got shape \(0,\)"),
         ({"turbulence": None, "noise_nm": [1.0, -1.0]}, ProblemError, "noise_nm"),
-        ({"turbulence": None, "noise_nm": [1.0, np.nan]}, ProblemError, "noise_nm"),
         (
             {"turbulence": None, "frequency_errors_hz": [1.0]},
             DimensionError,

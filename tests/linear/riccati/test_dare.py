@@ -6,16 +6,7 @@ import scipy.linalg
 import slycot
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.darex import (
-    EXAMPLES,
-    error_in_digits,
-    exact_solution,
-    example_2_1,
-    example_2_4,
-    example_2_5,
-    peers,
-    relative,
-)
+from support.darex import EXAMPLES, example_2_5, peers, relative
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
@@ -163,16 +154,6 @@ def test_indefinite_weights_against_slycot(seed, n):
     assert np.linalg.eigvalsh(solution.X)[0] > 0
 
 
-def test_an_indefinite_level_that_cannot_be_met_is_refused():
-    """x+ = 0.9 x + w + u, z = x: below the least level of state feedback there is no X."""
-    met = lbt.solve_dare(0.9, [[1.0, 1.0]], 1, np.diag([-4.0, 1.0]))
-    assert met.X[0, 0] > 0
-    with pytest.raises(
-        (lbt.errors.InfeasibleError, lbt.errors.NumericalError, lbt.errors.DetectabilityError)
-    ):
-        lbt.solve_dare(0.9, [[1.0, 1.0]], 1, np.diag([-0.5, 1.0]))
-
-
 def test_a_saddle_with_the_wrong_signs_is_refused(monkeypatch):
     """A stabilising X that changes the signs of the weight is no H-infinity solution."""
     with pytest.raises(lbt.errors.InfeasibleError, match="as many negative eigenvalues as R"):
@@ -273,15 +254,6 @@ def test_known_solutions(example):
     assert error <= 10 * max(best, ROUNDING)
     assert error < 1e-12
     assert np.max(np.abs(solution.poles)) < 1
-
-
-@pytest.mark.parametrize("example", [example_2_1(1e6), example_2_4(1e6)], ids=lambda e: e.name)
-def test_ten_times_better_than_the_peers(example):
-    """Against the exact solution of the rounded data: the printed one is only as good as those."""
-    exact = exact_solution(example)
-    ours = error_in_digits(lbt.solve_dare(example.A, example.B, example.Q, example.R).X, exact)
-    best = min(error_in_digits(X, exact) for X in peers(example).values())
-    assert ours <= max(0.1 * best, ROUNDING / 2)  # which processors round differently
 
 
 def test_parts_that_share_nothing_are_solved_apart():

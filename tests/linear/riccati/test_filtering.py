@@ -6,7 +6,6 @@ import cvxpy as cp
 import mpmath
 import numpy as np
 import pytest
-import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.periodic_problems import lifted_problem, random_periodic_problem, relative_distance
@@ -19,26 +18,6 @@ from lbt_synth.linear import EstimationProblem, infeasible_level
 from lbt_synth.linear.infeasibility_proof import worst_invisible_disturbance
 from lbt_synth.linear.riccati import filtering
 from lbt_synth.linear.riccati.filtering import gamma_riccati, kalman_riccati, least_gamma
-
-
-def test_an_ordinary_plant_that_scipy_refuses():
-    """AR2 turbulence and a lightly damped vibration."""
-    turbulence = lbt.models.ARModel(
-        coefficients=[1.997477, -0.997555], driving_rms_nm=0.37, frame_rate_hz=800
-    )
-    line = lbt.Vibration(frequency_hz=20, damping=1e-4, rms_nm=800, direction=(1,))
-    refused = 0
-    for noise in np.geomspace(1e-2, 1e3, 12):
-        plant = lbt.tip_tilt_plant(
-            frame_rate_hz=800, turbulence=turbulence, vibrations=[line], noise_nm=noise, modes=1
-        )
-        solution = kalman_riccati(plant)
-        assert solution.residual < 1e-12
-        try:
-            scipy.linalg.solve_discrete_are(plant.A.T, plant.C.T, plant.Q, plant.R)
-        except (np.linalg.LinAlgError, ValueError):
-            refused += 1
-    assert refused > 0
 
 
 def test_a_measurement_that_is_not_read_is_left_out():
@@ -227,12 +206,6 @@ def test_an_oscillation_without_damping_or_drive_is_still_refused():
         lbt.solve_dare(A.T, undriven.C.T, undriven.Q, undriven.R)
 
 
-def repeated(problem, period):
-    """Return a problem with a period of 1 as one with a longer period."""
-    parts = {name: np.tile(getattr(problem, name), (period, 1, 1)) for name in "ABCD"}
-    return EstimationProblem(**parts, L=problem.L)
-
-
 def proved(problem, start, solution, level):
     """Return the level that the worst disturbance against a solution proves infeasible."""
     witness = worst_invisible_disturbance(problem, solution.P, level, start.P)
@@ -263,23 +236,6 @@ def test_the_gain_of_the_measurement_update_without_correlation(seed):
     high = lbt.hinf_norm(alone.error_system(start.gain_predictor)).upper
     for solution in (start, gamma_riccati(alone, 1.2 * high, start=start)):
         assert relative_distance(alone.A @ solution.gain_filter, solution.gain_predictor) < 1e-9
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_hinf_of_matrices_that_repeat(seed):
-    one = random_problem(np.random.default_rng(seed), 4, 2, l=2)
-    expected = lbt.hinf(one, route="riccati")
-    problem = repeated(one, 3)
-    start = kalman_riccati(problem)
-    upper = lbt.hinf_norm(one.error_system(start.gain_predictor[0])).upper
-    low, high, solution = least_gamma(problem, lower=0.0, upper=upper, start=start)
-    assert high * (1 - 1e-9) <= low <= high
-    assert high * (1 - 1e-6) < proved(problem, start, solution, high) <= high
-    assert high == pytest.approx(expected.gamma_least, rel=1e-8)
-    central, single = gamma_riccati(problem, 1.1 * high), gamma_riccati(one, 1.1 * high)
-    for t in range(3):
-        assert relative_distance(central.gain_predictor[t], single.gain_predictor) < 1e-7
-        assert relative_distance(central.gain_filter[t], single.gain_filter) < 1e-7
 
 
 @pytest.mark.parametrize("seed", range(0, 12, 4))

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.limits import RATE, Anonymous, ar, budget, path
-from support.plants import lbt_axis_plant
+from support.limits import RATE, Anonymous, ar, path
 
 import lbt_synth as lbt
 from lbt_synth.loop.least_residuals import band_limit as band_module
@@ -63,36 +62,6 @@ def test_the_density_found_is_the_hardest(config):
     assert hardest == pytest.approx(limit.rms_nm, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("delay", "frame_means"), [(1, False), (2.7, False), (2.7, True), (3, False), (3, True)]
-)
-def test_designs_stay_above_the_band_limit(delay, frame_means):
-    plant = lbt_axis_plant(delay_frames=delay, damping=0.05)
-    still = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
-    known = {"band_hz": (17, 23), "rms_nm": 500, "direction": (1,), "frame_means": frame_means}
-    if delay % 1 and not frame_means:
-        with pytest.raises(lbt.errors.ProblemError, match="known for whole frames of delay"):
-            lbt.loop.least_worst_residual(plant.hardware, still, **known)
-        return
-    limit = lbt.loop.least_worst_residual(plant.hardware, still, **known)
-    assert limit.rms_nm <= limit.achieved_nm < limit.rms_nm * (1 + (1e-7 if frame_means else 0.02))
-    for design in (lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.1, route="riccati")):
-        worst = max(
-            budget(
-                design,
-                replace(
-                    still,
-                    vibrations=(
-                        lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=500, direction=(1,)),
-                    ),
-                ),
-                frame_means=frame_means,
-            ).rms_nm
-            for f in (17, 18.5, 20, 21.5, 23)
-        )
-        assert worst > limit.rms_nm
-
-
 @pytest.mark.parametrize("frame_means", [False, True])
 def test_narrow_bands_tend_to_the_known_frequency(frame_means):
     line = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,))
@@ -115,6 +84,20 @@ def test_narrow_bands_tend_to_the_known_frequency(frame_means):
     assert found[3] == pytest.approx(known, rel=1e-4)
 
 
+@pytest.mark.parametrize("delay", [1, 2.7, 3])
+def test_a_controller_reaches_the_band_limit(delay):
+    still = lbt.Truth(turbulence=ar(0.9886, driving=89.0), noise_nm=15.5)
+    band = {"band_hz": (17, 23), "rms_nm": 500, "direction": (1,)}
+    means = lbt.loop.least_worst_residual(path(delay), still, **band, frame_means=True)
+    assert means.rms_nm <= means.achieved_nm < means.rms_nm * (1 + 1e-7)
+    if delay % 1:
+        with pytest.raises(lbt.errors.ProblemError, match="known for whole frames of delay"):
+            lbt.loop.least_worst_residual(path(delay), still, **band)
+    else:
+        image = lbt.loop.least_worst_residual(path(delay), still, **band)
+        assert image.rms_nm <= image.achieved_nm < image.rms_nm * 1.02
+
+
 def test_band_without_noise():
     still = lbt.Truth(turbulence=ar(0.99))
     known = {"band_hz": (15, 25), "rms_nm": 100, "direction": (1,)}
@@ -132,13 +115,10 @@ def test_band_without_noise():
     ("arguments", "text"),
     [
         ({"band_hz": (20,)}, "must be two frequencies"),
-        ({"band_hz": 20}, "must be two frequencies"),
         ({"band_hz": (25, 20)}, "must increase"),
         ({"band_hz": (20, 20)}, "For a known frequency"),
         ({"band_hz": (20, 400)}, "below the Nyquist frequency 400"),
         ({"band_hz": (0, 20)}, "above 0"),
-        ({"band_hz": (10, float("nan"))}, "finite"),
-        ({"rms_nm": -1}, "rms_nm must be above 0"),
         ({"direction": (1, 0)}, "must have 1 components"),
         ({"direction": (0,)}, "not zero"),
     ],

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.periodic_problems import relative_distance
-from support.sensor_loops import AIR, FAST, LINES, MOTIONS, SLOW, example_plant, held_mean
+from support.sensor_loops import AIR, FAST, MOTIONS, SLOW, example_plant, held_mean
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
-from lbt_synth.models.plant.assembly import Exposure, memory, other_exposures, own_exposure
+from lbt_synth.models import Accelerometer, Motion, SensorSuite
+from lbt_synth.models.plant.assembly import Exposure, memory
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 SEEING = Accelerometer(
@@ -37,22 +37,6 @@ def test_a_reading_is_the_mean_of_its_exposure(age, period, common):
         x = held.A[t] @ x + held.B[t] @ s
     assert compared > 5
     assert held.n_states <= 2 * (2 + age // period)
-
-
-def test_sensors_side_by_side():
-    slow = WavefrontSensor(name="truth", rate_hz=250, delay_frames=2, noise_nm=4)
-    suite = SensorSuite(sensors=(slow,))
-    path = lbt.LoopHardware(frame_rate_hz=1000, delay_frames=2.5, modes=2, suite=suite)
-    exposures = [own_exposure(path), *other_exposures(path)]
-    assert [(e.age_frames, e.period) for e in exposures] == [(1.0, 1), (6.5, 4)]
-    both = memory(exposures, 2, 4)
-    alone = [memory([each], 2, 4) for each in exposures]
-    assert both.n_states == sum(each.n_states for each in alone)
-    n = alone[0].n_states
-    np.testing.assert_array_equal(both.A[:, n:, n:], alone[1].A)
-    np.testing.assert_array_equal(both.C[:, 2:, n:], alone[1].C)
-    assert not both.A[:, :n, n:].any()
-    assert not both.C[:, :2, n:].any()
 
 
 @pytest.mark.parametrize("delay", [1, 2.4])
@@ -139,17 +123,6 @@ def test_a_prediction_further_ahead_has_the_same_readings(steps):
     near, far = several.hardware, several.ahead(steps).hardware
     for one, other in zip(near.suite.sensors, far.suite.sensors, strict=True):
         assert other.age_frames(far) == pytest.approx(one.age_frames(near))
-
-
-def test_lines_that_no_channel_sees_stay_in_place():
-    plant = example_plant((FAST,), motions=({}, MOTIONS[1]))
-    own = plant.own_sensor_alone()
-    kept = [0, 2, *range(4, own.n_states)]  # without the samples of the second line
-    np.testing.assert_array_equal(plant.A[: len(kept), : len(kept)], own.A[np.ix_(kept, kept)])
-    # its mean position has its place in the total phase, and no channel sees the first line
-    position = plant.A[len(kept) - 2 : len(kept), len(kept)]
-    np.testing.assert_allclose(position, LINES[1].direction, rtol=1e-12)
-    assert not plant.C[2:, : len(kept)].any()
 
 
 @pytest.mark.parametrize(

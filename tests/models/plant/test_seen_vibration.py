@@ -94,15 +94,6 @@ def test_a_reading_knows_nothing_of_the_frame_to_come():
     np.testing.assert_allclose((seen.C @ seen.B)[1], 1e-9 * w * RATE_HZ * seen.B[2], rtol=1e-12)
 
 
-def test_positions_do_not_depend_on_who_reads():
-    line = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=500)
-    alone = seen_vibration(line, {}, (), PATH)
-    late = mirror(delay_frames=1.4), mirror(name="b", channels=("b",), delay_frames=2.7)
-    seen = seen_vibration(line, {"v": Motion(size=1), "b": Motion(size=2)}, late, PATH)
-    np.testing.assert_allclose(seen.B[:3, :3], alone.B, rtol=1e-9, atol=1e-9)
-    assert np.abs(seen.B[:3, 3:]).max() < 1e-9 * np.abs(alone.B).max()
-
-
 def test_channels_that_move_alike_share_their_memory():
     line = lbt.Vibration(frequency_hz=60, damping=0.05, rms_nm=500)
     alike = {"a": Motion(size=1), "v": Motion(size=0.3, phase_deg=180)}

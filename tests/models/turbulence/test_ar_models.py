@@ -58,19 +58,6 @@ def test_ar2_fit_is_not_a_line_between_two_nodes():
     assert contrast(model) < min(map(contrast, others))
 
 
-def test_ar2_fit_of_an_atmosphere_that_takes_many_steps():
-    air = lbt.Atmosphere(
-        seeing_arcsec=0.552013095527444,
-        outer_scale_m=11.007068525910793,
-        wind_speed_m_s=2.7861543721165756,
-        diameter_m=1.392828858735345,
-    )
-    found = lbt.models.ar2_turbulence(
-        air, frame_rate_hz=1771.8517360710612, noise_nm=71.35054707271983
-    )
-    assert found.rms_nm == pytest.approx(air.tilt_rms_nm, rel=1e-6)
-
-
 def test_noise_that_hides_the_turbulence_is_named():
     """A line without damping would explain it as well: nothing is left to fit."""
     air = lbt.Atmosphere(**SITE, outer_scale_m=22)
