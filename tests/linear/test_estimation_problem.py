@@ -104,11 +104,7 @@ def test_nor_does_it_with_a_period_of_one(factor):
         ({"read": [[True]]}, DimensionError, r"read must be \(1, 2\) truth values"),
         ({"read": [[False, False]]}, DimensionError, "some of them true"),
         ({"L": [[1.0, 1.0]]}, DimensionError, r"L must have 1 column to match A"),
-        (
-            {"D": [[[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]]},
-            DefinitenessError,
-            "read at phase 1 is singular.*needs noise of its own",
-        ),
+        ({"D": [[[0.0, 1.0, 0.0], [0.0, 1.0, 0.0]]]}, DefinitenessError, "read at phase 1 is"),
         ({"D": np.zeros((1, 2, 3))}, DefinitenessError, "read at phase 0 is singular"),
     ],
 )

@@ -80,11 +80,7 @@ SAMPLE_IT = 'Sample it first.*method="bilinear"'
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [
-        (
-            lambda: GeneralizedPlant(**ONE, D12=np.ones((2, 1))),
-            DimensionError,
-            "D12 must have 1 row",
-        ),
+        (lambda: GeneralizedPlant(**ONE, D12=np.ones((2, 1))), DimensionError, "D12 must have 1"),
         (
             lambda: GeneralizedPlant(**(ONE | {"B2": np.zeros((1, 0))})),
             DimensionError,

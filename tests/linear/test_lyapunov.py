@@ -6,7 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_lyapunov
-from support.exact_covariance import exact_covariance
+from support.rational import exact_covariance
 
 import lbt_synth as lbt
 from lbt_synth.linear.lyapunov import stationary_covariance, stationary_covariances, stationary_root

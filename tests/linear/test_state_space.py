@@ -178,10 +178,7 @@ def test_a_period_of_one_sample_is_none():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (
-            lambda s: s.frequency_response(1.0),
-            r"period of 1; got one of 5.*phase_response\(\.\.\.\)",
-        ),
+        (lambda s: s.frequency_response(1.0), r"of 1; got one of 5.*phase_response\(\.\.\.\)"),
         (lambda s: s.to_control(), r"got one of 5 samples\. Try lifted\(\)\.to_control\(\)"),
         (lambda s: s.balanced(), r"got one of 5 samples\. Try lifted\(\)\.balanced\(\)"),
         (

@@ -109,10 +109,7 @@ def test_the_noise_of_all_sensors():
             ).period(PATH),
             "at most 1000 frames; got 1477",
         ),
-        (
-            lambda: SensorSuite(sensors=(wavefront(),)).marked(("m9",), PATH),
-            "no sensor or channel is called 'm9'; there are wavefront, truth",
-        ),
+        (lambda: SensorSuite(sensors=(wavefront(),)).marked(("m9",), PATH), "no sensor or channel"),
         (
             lambda: checked_motions(({"m9": Motion(size=1)},), SensorSuite(sensors=(FAST,)), 1),
             "names the channel 'm9'; the channels are m1, m2",

@@ -42,21 +42,13 @@ def test_impossible_values_are_refused(make):
         ({"turbulence": 3.0}, ProblemError, "psd"),
         ({"turbulence": "slow"}, ProblemError, "one per mode; got str"),
         *(
-            (
-                {"turbulence": None, "vibrations": (v,)},
-                ProblemError,
-                "vibrations must be Vibration, Sinusoidal",
-            )
+            ({"turbulence": None, "vibrations": (v,)}, ProblemError, "vibrations must be"),
             for v in ("abc", 20.0, None)
         ),
         ({"turbulence": None, "noise_nm": [[1.0]]}, DimensionError, r"got shape \(1, 1\)"),
         ({"turbulence": None, "noise_nm": []}, DimensionError, r"got shape \(0,\)"),
         ({"turbulence": None, "noise_nm": [1.0, -1.0]}, ProblemError, "noise_nm"),
-        (
-            {"turbulence": None, "frequency_errors_hz": [1.0]},
-            DimensionError,
-            r"one per vibration \(0\); got 1",
-        ),
+        ({"turbulence": None, "frequency_errors_hz": [1.0]}, DimensionError, r"one per vibration"),
         (
             {"turbulence": None, "vibrations": (LINE,), "frequency_errors_hz": [-1.0]},
             ProblemError,

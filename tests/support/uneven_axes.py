@@ -11,22 +11,3 @@ LINES = (
     lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1, 0)),
     lbt.models.SinusoidalVibration(frequency_hz=33, rms_nm=90, direction=(0, 1)),
 )
-
-
-def one_axis(truth, axis):
-    """The same truth on one axis."""
-    lines = []
-    for line in truth.vibrations:
-        if line.direction[axis]:
-            extra = {"damping": line.damping} if isinstance(line, lbt.Vibration) else {}
-            lines.append(
-                type(line)(
-                    frequency_hz=line.frequency_hz, rms_nm=line.rms_nm, direction=(1,), **extra
-                )
-            )
-    return lbt.Truth(
-        turbulence=truth.turbulence[axis],
-        vibrations=lines,
-        noise_nm=truth.noise_nm[axis],
-        sensor_gain=truth.sensor_gain,
-    )

@@ -144,16 +144,8 @@ def test_a_prediction_further_ahead_has_the_same_readings(steps):
             DimensionError,
             "gain_predictor must have",
         ),
-        (
-            lambda: example_plant(delay_frames=4, sensors=(FAST,)),
-            ProblemError,
-            "sensor mirror must be at least 3 of its frames",
-        ),
-        (
-            lambda: example_plant().require_own_sensor("this"),
-            ProblemError,
-            "this reads the loop's own sensor alone; got a plant that truth, m1, m2 see, too",
-        ),
+        (lambda: example_plant(delay_frames=4, sensors=(FAST,)), ProblemError, "3 of its frames"),
+        (lambda: example_plant().require_own_sensor("this"), ProblemError, "m1, m2 see, too"),
     ],
 )
 def test_refusals(make, error, words):
