@@ -72,66 +72,42 @@ def test_design_of_a_textbook_plant():
 
 ONE = {"A": 0.5, "B1": 1.0, "B2": 1.0, "C1": 1.0, "C2": 1.0}
 LOOP = GeneralizedPlant(**ONE, D22=1.0)
-STATIC = {"A": 0.0, "B": 0.0, "C": 0.0}
+NO_INPUT = {"B2": np.zeros((1, 0))}
+HELD = lbt.Controller(A=0.0, B=0.0, C=0.0, D=0.0)
+SLOW = control.ss([[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]], np.zeros((2, 2)))
 LAG = control.tf([1.0], [1.0, 1.0])
 SAMPLE_IT = 'Sample it first.*method="bilinear"'
+
+
+def static(D, **more):
+    return StateSpace(A=0.0, B=np.zeros((1, len(np.atleast_2d(D)[0]))), C=0.0, D=D, **more)
+
+
+def sensed(**more):
+    return mixed_sensitivity(G, **more)
 
 
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [
         (lambda: GeneralizedPlant(**ONE, D12=np.ones((2, 1))), DimensionError, "D12 must have 1"),
-        (
-            lambda: GeneralizedPlant(**(ONE | {"B2": np.zeros((1, 0))})),
-            DimensionError,
-            "B2 must have at least one signal",
-        ),
-        (
-            lambda: GeneralizedPlant.of(TWO, measurements=2, controls=1),
-            ProblemError,
-            "measurements must be at most 1",
-        ),
+        (lambda: GeneralizedPlant(**(ONE | NO_INPUT)), DimensionError, "B2 must have at least one"),
+        (lambda: GeneralizedPlant.of(TWO, measurements=2, controls=1), ProblemError, "at most 1"),
         (lambda: GeneralizedPlant(**ONE, dt_s=None), ProblemError, SAMPLE_IT),
         (lambda: GeneralizedPlant(**ONE, dt_s=0), ProblemError, SAMPLE_IT),
+        (lambda: GeneralizedPlant.of(SLOW, measurements=1, controls=1), ProblemError, SAMPLE_IT),
         (
-            lambda: GeneralizedPlant.of(
-                control.ss([[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]], np.zeros((2, 2))),
-                measurements=1,
-                controls=1,
-            ),
-            ProblemError,
-            SAMPLE_IT,
-        ),
-        (
-            lambda: LOOP.closed_loop(
-                StateSpace(A=0.0, B=np.zeros((1, 2)), C=0.0, D=np.zeros((1, 2)))
-            ),
+            lambda: LOOP.closed_loop(static([[0.0, 0.0]])),
             DimensionError,
-            "1 measurements to 1 controls",
+            "1 measurements to 1 cont",
         ),
-        (lambda: LOOP.closed_loop(StateSpace(**STATIC, D=1.0)), NumericalError, "not well posed"),
-        (
-            lambda: LOOP.closed_loop(StateSpace(**STATIC, D=0.0, dt_s=0.1)),
-            ProblemError,
-            "one sampling period; got 1 s and 0.1 s",
-        ),
-        (
-            lambda: LOOP.closed_loop(lbt.Controller(**STATIC, D=0.0)),
-            ProblemError,
-            "must be a StateSpace",
-        ),
-        (lambda: mixed_sensitivity(G), ProblemError, "at least one of performance"),
-        (
-            lambda: mixed_sensitivity(G, performance=sampled(LAG, 0.2)),
-            ProblemError,
-            "one sampling period",
-        ),
-        (lambda: mixed_sensitivity(G, performance=LAG), ProblemError, "must be in discrete time"),
-        (
-            lambda: mixed_sensitivity(G, robustness=np.ones((1, 3))),
-            DimensionError,
-            "robustness must take 1 signals",
-        ),
+        (lambda: LOOP.closed_loop(static(1.0)), NumericalError, "not well posed"),
+        (lambda: LOOP.closed_loop(static(0.0, dt_s=0.1)), ProblemError, "got 1 s and 0.1 s"),
+        (lambda: LOOP.closed_loop(HELD), ProblemError, "must be a StateSpace"),
+        (lambda: sensed(), ProblemError, "at least one of performance"),
+        (lambda: sensed(performance=sampled(LAG, 0.2)), ProblemError, "one sampling period"),
+        (lambda: sensed(performance=LAG), ProblemError, "must be in discrete time"),
+        (lambda: sensed(robustness=np.ones((1, 3))), DimensionError, "must take 1 signals"),
     ],
 )
 def test_refusals(call, error, words):

@@ -75,34 +75,23 @@ def witness(states, disturbances):
 
 
 ONE_PHASE = witness(np.ones((1, 4, 1)), np.ones((1, 3, 1)))
+THREE_STATES = witness(np.ones((3, 1)), np.ones((3, 1)))
 TWO_PHASES = witness(np.ones((2, 4, 1)), np.ones((2, 3, 1)))
+
+
+def certified(plant, level, proof):
+    return lbt.design.certify_infeasible(plant, level, proof)
 
 
 @pytest.mark.parametrize(
     ("call", "error", "words"),
     [
         (lambda p: witness(np.zeros(2), np.zeros(2)), DimensionError, "states must be a matrix"),
-        (
-            lambda p: witness(np.zeros((2, 3)), np.zeros((2, 2))),
-            DimensionError,
-            "disturbances must have 3 columns",
-        ),
+        (lambda p: witness(np.eye(3), np.eye(2)), DimensionError, "must have 3 columns"),
         (lambda p: witness([[np.nan]], [[1.0]]), NonFiniteError, "finite"),
-        (
-            lambda p: witness(np.ones((2, 4, 1)), np.ones((4, 1))),
-            DimensionError,
-            "must have the same phases",
-        ),
-        (
-            lambda p: lbt.design.certify_infeasible(p, 1.0, witness(np.ones((3, 1)), [[1.0]] * 3)),
-            DimensionError,
-            "a witness must have 4 rows of states",
-        ),
-        (
-            lambda p: lbt.design.certify_infeasible(p, -5.0, ONE_PHASE),
-            ProblemError,
-            "level must be at least 0",
-        ),
+        (lambda p: witness(np.ones((2, 4, 1)), np.ones((4, 1))), DimensionError, "the same phases"),
+        (lambda p: certified(p, 1.0, THREE_STATES), DimensionError, "must have 4 rows of states"),
+        (lambda p: certified(p, -5.0, ONE_PHASE), ProblemError, "level must be at least 0"),
         (
             lambda p: lbt.linear.infeasible_level(p, TWO_PHASES, np.eye(4)),
             DimensionError,
@@ -113,5 +102,4 @@ TWO_PHASES = witness(np.ones((2, 4, 1)), np.ones((2, 3, 1)))
 def test_refusals(axis_plant, call, error, words):
     with pytest.raises(error, match=words):
         call(axis_plant)
-
     assert ONE_PHASE.states.shape == (4, 1)

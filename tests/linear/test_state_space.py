@@ -93,6 +93,9 @@ def test_states_of_very_different_sizes_are_balanced_without_a_warning():
     assert 0.1e60 < state / outside < 10e60
 
 
+PATH = lbt.LoopHardware(frame_rate_hz=100, delay_frames=2, modes=2)
+
+
 def random_stack(seed=0, *, period=5, n=3, m=2, p=2, kind=lbt.linear.StateSpace):
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((period, n, n))
@@ -181,13 +184,7 @@ def test_a_period_of_one_sample_is_none():
         (lambda s: s.frequency_response(1.0), r"of 1; got one of 5.*phase_response\(\.\.\.\)"),
         (lambda s: s.to_control(), r"got one of 5 samples\. Try lifted\(\)\.to_control\(\)"),
         (lambda s: s.balanced(), r"got one of 5 samples\. Try lifted\(\)\.balanced\(\)"),
-        (
-            lambda s: lbt.close_loop(
-                lbt.LoopHardware(frame_rate_hz=100, delay_frames=2, modes=2),
-                lbt.Controller(A=s.A, B=s.B, C=s.C, D=s.D, dt_s=s.dt_s),
-            ),
-            "got one of several sensors",
-        ),
+        (lambda s: lbt.close_loop(PATH, random_stack(kind=lbt.Controller)), "of several sensors"),
     ],
 )
 def test_what_a_longer_period_does_not_have(call, words):

@@ -6,10 +6,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from support.limits import RATE, ar, budget, path, variance
+from support.lqg import shell
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.design.result import model_limits
+from lbt_synth.errors import CoupledModesError, ProblemError
 from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 
@@ -315,9 +317,7 @@ def test_the_best_filters_come_close_to_the_limit_in_the_image(delay, kind):
 
 
 CALM = {"turbulence": ar(0.9), "noise_nm": 1.0}
-SHELL = lbt.models.PositionLoop.from_bandwidth(
-    natural_frequency_hz=20, damping=0.5, bandwidth_hz=100
-)
+LATE, MOVING = second(RATE / 5, 2.1, 3.0), path(mirror=shell(100))
 
 
 @pytest.mark.parametrize(
@@ -325,19 +325,11 @@ SHELL = lbt.models.PositionLoop.from_bandwidth(
     [
         (
             lambda: least_model_residual(coupled_plant(delay_frames=2.4)),
-            lbt.errors.CoupledModesError,
+            CoupledModesError,
             "modes that decouple",
         ),
-        (
-            lambda: variances_of_sensors([second(RATE / 5, 2.1, 3.0)]),
-            lbt.errors.ProblemError,
-            "ends within a frame of the loop",
-        ),
-        (
-            lambda: variance(path(mirror=SHELL), **CALM, frame_means=False),
-            lbt.errors.ProblemError,
-            "one with dynamics",
-        ),
+        (lambda: variances_of_sensors([LATE]), ProblemError, "ends within a frame of the loop"),
+        (lambda: variance(MOVING, **CALM, frame_means=False), ProblemError, "one with dynamics"),
     ],
 )
 def test_refusals(call, error, words):

@@ -125,29 +125,24 @@ def test_a_prediction_further_ahead_has_the_same_readings(steps):
         assert other.age_frames(far) == pytest.approx(one.age_frames(near))
 
 
+SUITE = SensorSuite(sensors=(FAST,))
+
+
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [
-        (lambda: example_plant().with_sensors((SLOW,)), ProblemError, "suite must be a"),
+        (lambda p: p.with_sensors((SLOW,)), ProblemError, "suite must be a"),
+        (lambda p: p.with_sensors(SUITE, MOTIONS[:1]), DimensionError, "one mapping per vibration"),
+        (lambda p: replace(p.parts(), motions=MOTIONS[:1]), DimensionError, "one mapping"),
+        (lambda p: p.controller(np.zeros((1, 2, 3))), DimensionError, "gain_predictor must have"),
         (
-            lambda: example_plant().with_sensors(SensorSuite(sensors=(FAST,)), MOTIONS[:1]),
-            DimensionError,
-            "one mapping per vibration",
+            lambda p: example_plant((FAST,), delay_frames=4),
+            ProblemError,
+            "at least 3 of its frames",
         ),
-        (
-            lambda: replace(example_plant().parts(), motions=MOTIONS[:1]),
-            DimensionError,
-            "one mapping",
-        ),
-        (
-            lambda: example_plant().controller(np.zeros((1, 2, 3))),
-            DimensionError,
-            "gain_predictor must have",
-        ),
-        (lambda: example_plant(delay_frames=4, sensors=(FAST,)), ProblemError, "3 of its frames"),
-        (lambda: example_plant().require_own_sensor("this"), ProblemError, "m1, m2 see, too"),
+        (lambda p: p.require_own_sensor("this"), ProblemError, "truth, m1, m2 see, too"),
     ],
 )
 def test_refusals(make, error, words):
     with pytest.raises(error, match=words):
-        make()
+        make(example_plant())
