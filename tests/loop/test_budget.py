@@ -68,15 +68,6 @@ def sinusoid(frequency_hz, rms_nm, direction=(1, 0)):
     )
 
 
-def test_noise_of_an_integrator_has_a_closed_form():
-    """Delay 1: variance g / (2 - g); delay 2: g (from the Jury table) (2 + g) / ((2 - g ...)."""
-    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
-    for g in (0.1, 0.7, 1.6):
-        loop = lbt.close_loop(path, lbt.integrator(path, gain=g).controller)
-        budget = lbt.residual_budget(loop, Truth(turbulence=None, noise_nm=2.0))
-        assert budget.noise_nm**2 == pytest.approx(4 * g / (2 - g), rel=1e-9)
-
-
 @pytest.mark.parametrize(
     ("gain", "model"),
     [
@@ -345,27 +336,6 @@ def test_the_image_has_what_a_run_in_small_steps_leaves(mirror, delay):
                 line.rms_nm**2 * (1 - np.sinc(line.frequency_hz / 800) ** 2) for line in shaken
             )
             assert np.trace(budget.within_nm2) == pytest.approx(within, rel=1e-9, abs=1e-9)
-
-
-@pytest.mark.parametrize(("mirror", "delay"), [("settled", 2), ("shell", 2.25)])
-def test_processes_and_spectra_are_sums_of_waves_in_the_image(mirror, delay):
-    """Of a process each frame has the mean: in the phase there is ``1 / sinc^2`` as much."""
-    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, modes=1, mirror=MIRRORS[mirror])
-    controller = lbt.integrator(path, gain=0.2).controller
-    x, weight = np.polynomial.legendre.leggauss(60)
-    hertz = 200 * (1 + x)
-    powers = sinusoid_powers(path, controller, hertz, (1.0,), frames=150)[:, 0, 0]
-    share = np.sinc(hertz / 800) ** 2
-    model = lbt.models.ARModel(coefficients=[0.7], driving_rms_nm=30, frame_rate_hz=800)
-    line = lbt.Vibration(frequency_hz=60, damping=0.3, rms_nm=100, direction=(1,))
-    loop, shaken = lbt.close_loop(path, controller), line.ar_model(800).psd(hertz)
-    for truth, density in (
-        (Truth(turbulence=model), model.psd(hertz) / share),
-        (Truth(turbulence=Anonymous(model)), model.psd(hertz)),
-        (Truth(turbulence=None, vibrations=(line,)), shaken * np.sinc(60 / 800) ** 2 / share),
-    ):
-        expected = 200 * weight @ (density * powers)
-        assert lbt.residual_budget(loop, truth).rms_nm ** 2 == pytest.approx(expected, rel=1e-4)
 
 
 @pytest.mark.parametrize("delay", [2, 2.49])

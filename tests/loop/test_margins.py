@@ -202,24 +202,6 @@ def test_gains_of_each_axis_within_the_disk_keep_a_coupled_loop_stable(coupled):
     assert not lbt.close_loop(wide, law).is_stable
 
 
-def test_phases_of_each_axis_within_the_disk_do_not_change_the_encirclements(coupled):
-    path, law = coupled
-    loop = lbt.close_loop(path, law)
-    half = np.deg2rad(lbt.loop_margins(loop).disk_phase_deg)
-    frequency_hz = np.linspace(1e-3, 250, 40_000)
-    up = np.linalg.inv(loop.output_sensitivity().frequency_response(frequency_hz)) - np.eye(2)
-    around = np.concatenate([up[::-1].conj(), up])
-
-    def encirclements(phases):
-        turned = np.exp(1j * np.array(phases))[:, None] * around
-        angle = np.unwrap(np.angle(np.linalg.det(np.eye(2) + turned)))
-        return round((angle[-1] - angle[0]) / (2 * np.pi))
-
-    nominal = encirclements((0, 0))
-    assert {encirclements((a, b)) for a in (half, -half) for b in (half, -half)} == {nominal}
-    assert encirclements((-2.5 * half, -2.5 * half)) != nominal
-
-
 @pytest.mark.parametrize(("delay", "gain"), [(1.0, 0.9), (2.0, 0.5), (2.4, 0.1)])
 def test_a_loop_is_stable_at_its_delay_margin_and_not_beyond(delay, gain):
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, modes=1)

@@ -48,15 +48,6 @@ def test_ends_of_a_change_of_rank_one_are_where_poles_cross(seed, n):
             assert affine_radii(parts, np.array([end]))[0] == pytest.approx(1, abs=1e-8)
 
 
-@pytest.mark.parametrize("width", [1e-2, 1e-8])
-def test_poles_beside_the_circle(width):
-    """The poles of ``z^2 - g z + (1 - width)^2`` pass 1 where g is 1 plus the last term."""
-    A = (1 - width) * np.array([[0.0, 1.0], [-1.0, 0.0]])
-    slope = np.array([[0.0, 0.0], [0.0, 1.0]])
-    _, high = stable_range(affine_parts(A[None], slope[None]), 1e-3)
-    assert high == pytest.approx(1 + (1 - width) ** 2, rel=1e-9)
-
-
 @pytest.mark.parametrize(
     ("low", "high", "nominal"),
     [(0.35, 1.9, 1.0), (0.0, 1.2, 1.0), (0.97, np.inf, 1.0), (0.4, 5.0, 2.0)],
@@ -66,20 +57,24 @@ def test_ends_of_a_stepped_range(low, high, nominal):
     assert found == pytest.approx((low, high), rel=1e-11)
 
 
+def test_narrow_holes_and_poles_beside_the_circle_end_a_range():
+    def radii(gains):
+        return np.where((gains > 1.3) & (gains < 1.32), 1.5, 0.5)
+
+    assert stepped_range(radii) == pytest.approx((0.0, 1.3), rel=1e-11)
+    assert np.all(np.isnan(stepped_range(radii, 1.31)))
+    for width in (1e-2, 1e-8):  # poles of z^2 - g z + (1 - width)^2 pass 1
+        A = (1 - width) * np.array([[0.0, 1.0], [-1.0, 0.0]])
+        parts = affine_parts(A[None], np.diag([0.0, 1.0])[None])
+        assert stable_range(parts, 1e-3)[1] == pytest.approx(1 + (1 - width) ** 2, rel=1e-9)
+
+
 def test_radii_of_many_gains_are_those_of_their_loops():
     plant = example_plant(influence_matrix=[[2.0, 0.1], [0.3, 1.0]])
     controller, gains = lbt.kalman(plant).controller, np.array([0.2, 1.0, 1.7])
     loops = [lbt.close_loop(plant.hardware, controller, sensor_gain=gain) for gain in gains]
     radii = radii_by_gain(plant.hardware, controller)(gains)
     np.testing.assert_allclose(radii, [loop.spectral_radius for loop in loops], rtol=1e-9)
-
-
-def test_a_stable_interval_ends_at_a_narrow_hole():
-    def radii(gains):
-        return np.where((gains > 1.3) & (gains < 1.32), 1.5, 0.5)
-
-    assert stepped_range(radii) == pytest.approx((0.0, 1.3), rel=1e-11)
-    assert np.all(np.isnan(stepped_range(radii, 1.31)))
 
 
 @pytest.mark.parametrize("method", ["kalman", "integrator"])
@@ -248,15 +243,15 @@ def test_a_gain_alone_has_the_exact_interval():
 
 
 def test_loops_that_stand_for_all_are_the_corners_and_whole_delays():
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=2.9)
-    changes = loop_changes(path, low=0.5, high=1.5, delay_frames=0.3)
-    assert {(gain, round(delay, 9)) for gain, delay, _ in changes} == {
-        (g, d) for g in (0.5, 1.5) for d in (2.6, 3.0, 3.2)
-    }
-    assert not loop_changes(path, low=1.0, high=1.0, delay_frames=0.0)
-    short = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=1.0)
+    late, short = (lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=d) for d in (2.9, 1))
+    changes = loop_changes(late, low=0.5, high=1.5, delay_frames=0.3)
+    corners = {(gain, delay) for gain in (0.5, 1.5) for delay in (2.6, 3.0, 3.2)}
+    assert {(gain, round(delay, 9)) for gain, delay, _ in changes} == corners
+    assert not loop_changes(late, low=1.0, high=1.0, delay_frames=0.0)
     delays = {delay for _, delay, _ in loop_changes(short, low=1, high=1, delay_frames=0.5)}
     assert delays == {1.5}  # none is below one frame
+    moving = replace(late, mirror=shell(100, delay_samples=2))
+    assert np.isnan(errors_together(lbt.close_loop(moving, lbt.integrator(moving, gain=0.05))))
 
 
 def test_taps_behind_several_outputs():
@@ -272,8 +267,3 @@ def test_taps_behind_several_outputs():
     turn = np.exp(-2j * np.pi * f / 800)
     expected = (turn[:, None] ** np.arange(3) @ taps)[:, None, None] * system.frequency_response(f)
     np.testing.assert_allclose(append_taps(system, taps).frequency_response(f), expected)
-
-
-def test_a_mirror_with_dynamics_has_no_answer():
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell(100, delay_samples=2))
-    assert np.isnan(errors_together(lbt.close_loop(path, lbt.integrator(path, gain=0.1))))

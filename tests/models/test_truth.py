@@ -41,10 +41,8 @@ def test_impossible_values_are_refused(make):
         ({"turbulence": [SLOW, 3.0]}, ProblemError, "one per mode; got float"),
         ({"turbulence": 3.0}, ProblemError, "psd"),
         ({"turbulence": "slow"}, ProblemError, "one per mode; got str"),
-        *(
-            ({"turbulence": None, "vibrations": (v,)}, ProblemError, "vibrations must be"),
-            for v in ("abc", 20.0, None)
-        ),
+        ({"turbulence": None, "vibrations": ("abc",)}, ProblemError, "vibrations must be"),
+        ({"turbulence": None, "vibrations": (None,)}, ProblemError, "vibrations must be"),
         ({"turbulence": None, "noise_nm": [[1.0]]}, DimensionError, r"got shape \(1, 1\)"),
         ({"turbulence": None, "noise_nm": []}, DimensionError, r"got shape \(0,\)"),
         ({"turbulence": None, "noise_nm": [1.0, -1.0]}, ProblemError, "noise_nm"),

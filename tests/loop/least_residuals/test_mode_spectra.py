@@ -11,25 +11,6 @@ from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.least_residuals.mode_spectra import InnerFactor
 
 
-@pytest.mark.parametrize("angle", [0.3, 2.0])
-def test_directions_can_be_turned(angle):
-    def turned(alpha):
-        lines = [
-            lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=50, direction=d)
-            for f, d in (
-                (20, (np.cos(alpha), np.sin(alpha))),
-                (31, (-np.cos(alpha), -np.sin(alpha))),
-                (47, (-np.sin(alpha), np.cos(alpha))),
-            )
-        ]
-        truth = lbt.Truth(turbulence=ar(0.99), vibrations=lines, noise_nm=2.0)
-        return lbt.loop.least_residual(path(modes=2), truth)
-
-    limit = turned(angle)
-    assert np.sort(limit.variance_nm2) == pytest.approx(np.sort(turned(0.0).variance_nm2))
-    assert np.allclose(limit.directions @ limit.directions.T, np.eye(2))
-
-
 def test_more_measurements_than_modes():
     """Two equal sensors of one mode halve the noise; a mixed sensor can be undone."""
     model = {"turbulence": ar(0.99)}

@@ -127,9 +127,6 @@ def test_limit_of_the_example(config):
     air = moving_power([config.truth.turbulence] * hardware.modes, RATE, of_means=False)
     assert limit.within_nm2.sum() == pytest.approx(floor + air, rel=1e-4)
     assert limit.rms_nm**2 == pytest.approx(means**2 + floor + air, rel=3e-2)
-
-
-def test_kalman_of_the_example(config):
     design = lbt.kalman(config.plant)
     residual_nm, limit_nm, above = model_limits(design).values()
     models = [line.ar_model(RATE) for line in config.plant.vibrations]
@@ -138,13 +135,6 @@ def test_kalman_of_the_example(config):
     assert residual_nm**2 == pytest.approx(design.rms**2 + power, rel=1e-6)
     assert limit_nm == pytest.approx(residual_nm, rel=1e-9)
     assert abs(above) < 1e-6
-    as_truth = lbt.Truth(
-        turbulence=config.plant.turbulence[0],
-        vibrations=config.plant.vibrations,
-        noise_nm=config.noise_nm,
-    )
-    means = lbt.loop.least_residual(config.hardware, as_truth, frame_means=True)
-    assert means.rms_nm == pytest.approx(design.rms)
 
 
 @settings(max_examples=10)
@@ -262,18 +252,13 @@ def second(rate_hz, delay_frames, noise_nm):
     )
 
 
-@pytest.mark.parametrize("sensor_gain", [1.0, 0.6])
-def test_the_bound_of_two_sensors_of_each_frame_is_met(sensor_gain):
-    left, least = variances_of_sensors([second(RATE, 2, 9.0)], sensor_gain=sensor_gain)
+def test_the_bound_of_two_sensors_is_met_by_quick_ones_and_passed_by_none():
+    left, least = variances_of_sensors([second(RATE, 2, 9.0)], sensor_gain=0.6)
     assert least == pytest.approx(left, rel=1e-7)
-
-
-@pytest.mark.parametrize(("divisor", "delay_frames"), [(2, 2), (5, 3.2), (20, 2)])
-def test_no_filter_of_a_slow_sensor_passes_the_bound(divisor, delay_frames):
-    left, least = variances_of_sensors([second(RATE / divisor, delay_frames, 3.0)])
-    alone = variances_of_sensors([second(RATE / divisor, delay_frames, 1e4)])[0]
-    assert least < left < alone
-    assert least > 0.3 * left  # it is no empty bound
+    for divisor, delay_frames in ((2, 2), (5, 3.2)):
+        left, least = variances_of_sensors([second(RATE / divisor, delay_frames, 3.0)])
+        alone = variances_of_sensors([second(RATE / divisor, delay_frames, 1e4)])[0]
+        assert 0.3 * left < least < left < alone
 
 
 def test_accelerometers_cannot_do_more_than_know_the_vibrations():

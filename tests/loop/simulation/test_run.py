@@ -215,9 +215,11 @@ def test_a_sinusoid_that_channels_see(sensors_design, sensors_config):
     ],
 )
 def test_wrong_drops(sensors_design, sensors_config, fields, words):
+    def drop():
+        return [Drop(**({"unit": "m1"} | fields))]
+
     with pytest.raises(ProblemError, match=words):
-        drop = Drop(**({"unit": "m1"} | fields))
-        failing_run(sensors_design, sensors_config.truth, [drop], frames=10)
+        failing_run(sensors_design, sensors_config.truth, drop(), frames=10)
 
 
 def test_segments_of_drops_that_overlap():
