@@ -41,20 +41,6 @@ SHELL = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwi
 AR3 = lbt.models.ARModel(coefficients=[1.2, -0.3, -0.05], driving_rms_nm=20, frame_rate_hz=RATE_HZ)
 
 
-class Anonymous:
-    """A spectrum that hides that it is an AR model, so that it goes through quadrature.
-
-    It is that of the means over frames, or of the phase that has them.
-    """
-
-    def __init__(self, model, *, of_means=True):
-        self.model, self.of_means = model, of_means
-
-    def psd(self, frequency_hz):
-        share = 1.0 if self.of_means else np.sinc(frequency_hz / self.model.frame_rate_hz) ** 2
-        return self.model.psd(frequency_hz) / share
-
-
 class Broad:
     """A smooth spectrum of no model."""
 
@@ -66,33 +52,6 @@ def sinusoid(frequency_hz, rms_nm, direction=(1, 0)):
     return lbt.models.SinusoidalVibration(
         frequency_hz=frequency_hz, rms_nm=rms_nm, direction=direction
     )
-
-
-@pytest.mark.parametrize(
-    ("gain", "model"),
-    [
-        (
-            0.4,
-            lbt.models.ARModel(
-                coefficients=[1.997477, -0.997555], driving_rms_nm=0.37, frame_rate_hz=800
-            ),
-        ),
-        (1.0, lbt.Vibration(frequency_hz=17, damping=0.005, rms_nm=300).ar_model(800)),
-    ],
-)
-def test_quadrature_agrees_with_the_lyapunov_equation(gain, model):
-    plant = lbt_axis_plant(modes=2)
-    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller, sensor_gain=gain)
-    for frame_means in (True, False):
-        exact, quadrature = (
-            lbt.residual_budget(
-                loop, Truth(turbulence=source, sensor_gain=gain), frame_means=frame_means
-            )
-            for source in (model, Anonymous(model, of_means=frame_means))
-        )
-        for name in ("turbulence_nm2", "within_nm2"):
-            one, other = getattr(exact, name), getattr(quadrature, name)
-            assert np.allclose(other, one, rtol=2e-4, atol=1e-9 * one.max())
 
 
 def test_a_measured_spectrum_against_brute_force():

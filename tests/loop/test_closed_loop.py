@@ -4,8 +4,6 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support.lqg import shell
 from support.plants import ROOT, lbt_axis_plant
 
@@ -34,17 +32,6 @@ def test_error_transfer_of_the_lbt(gain):
     assert np.allclose(loop.sensitivity(f)[:, 0, 0], (1 - h) / (1 - (1 - gain) * h), rtol=1e-8)
     noise = -(H / z) / (1 - (1 - gain) * h)
     assert np.allclose(loop.noise_transfer(f)[:, 0, 0], noise, rtol=1e-8)
-
-
-@settings(max_examples=10)
-@given(gain=st.floats(0.01, 0.99), delay=st.integers(1, 4))
-def test_integrator_loop_is_its_textbook_transfer_function(gain, delay):
-    g = gain * lbt.design.integrator_gain_limit(delay)
-    path = lbt.LoopHardware(frame_rate_hz=500, delay_frames=delay, modes=1)
-    loop = lbt.close_loop(path, lbt.integrator(path, gain=g).controller)
-    z = np.exp(2j * np.pi * np.array([1.0, 40, 200]) / 500)
-    open_loop = g * z**-delay / (1 - 1 / z)
-    assert np.allclose(loop.sensitivity([1.0, 40, 200])[:, 0, 0], 1 / (1 + open_loop), rtol=1e-9)
 
 
 def test_the_page_says_where_the_settled_design_becomes_unstable(config):

@@ -46,9 +46,7 @@ def test_fast_loop_is_the_loop_as_written(delay, mirror):
         assert np.allclose(one, other, atol=1e-9 * np.abs(other).max()), name
 
 
-@pytest.mark.parametrize(
-    ("delay", "mirror", "frame_means"), [(2, None, True), (2.4, None, False), (2.4, 70, False)]
-)
+@pytest.mark.parametrize(("delay", "mirror", "frame_means"), [(2, None, True), (2.4, 70, False)])
 def test_simulation_agrees_with_the_exact_answer(config, delay, mirror, frame_means):
     """Within the statistical error, which the scatter of independent runs gives."""
     moved = None if mirror is None else shell(mirror, delay_samples=2)
