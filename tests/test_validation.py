@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from support.refusals import require_refusals
 
 from lbt_synth import errors, validation
 from lbt_synth.errors import DefinitenessError, DimensionError, NonFiniteError, ProblemError
@@ -18,9 +19,8 @@ MASKED = np.ma.array([[0.5, 1.0], [2.0, 3.0]], mask=[[0, 1], [0, 0]])
 matrix, number, definite = validation.matrix, validation.number, validation.definite
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "words"),
-    [
+def test_refusals():
+    rows = [
         *(
             (partial(matrix, [[1.0, 2.0], [bad, 4.0]], "A"), NonFiniteError, r"index \(1, 0\)")
             for bad in (np.nan, np.inf)
@@ -73,11 +73,8 @@ matrix, number, definite = validation.matrix, validation.number, validation.defi
         (lambda: Outer(gain="1"), ProblemError, "gain must be a number"),
         (lambda: Outer(frames=0), ProblemError, "frames must be at least 1; got 0"),
         (lambda: Outer(frames=None), ProblemError, "frames must be an integer"),
-    ],
-)
-def test_refusals(call, error, words):
-    with pytest.raises(error, match=words):
-        call()
+    ]
+    require_refusals(rows)
 
 
 def test_definiteness_does_not_depend_on_units_nor_symmetry_on_rounding():

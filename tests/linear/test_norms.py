@@ -6,6 +6,7 @@ import pytest
 import slycot
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.refusals import require_refusals
 from support.systems import random_system
 
 import lbt_synth as lbt
@@ -68,17 +69,13 @@ BLIND = lbt.linear.StateSpace(A=[[0.5]], B=[[1.0]], C=np.zeros((0, 1)), D=np.zer
 WALK = lbt.linear.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "words"),
-    [
+def test_refusals():
+    rows = [
         (lambda: lbt.hinf_norm("system"), lbt.errors.ProblemError, "got str"),
         (lambda: lbt.hinf_norm(BLIND), lbt.errors.DimensionError, "1 inputs and 0 outputs"),
         (lambda: band_norm(WALK, 0, 0.5), lbt.errors.NumericalError, "at 0 Hz is not finite"),
-    ],
-)
-def test_refusals(call, error, words):
-    with pytest.raises(error, match=words):
-        call()
+    ]
+    require_refusals(rows)
 
 
 def test_a_narrow_peak_is_found_and_placed():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.ensembles import AIR, LINE, RATE, SLOW, plant, weather
+from support.refusals import require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
@@ -44,25 +45,6 @@ WRONG = [
         "must have 2 components",
     ),
 ]
-
-
-@pytest.mark.parametrize(("given", "kind", "message"), WRONG)
-def test_what_loops_cannot_meet(kalman, given, kind, message):
-    with pytest.raises(kind, match=message):
-        ensemble_residuals(kalman.controller, kalman.hardware, LoopEnsemble(**given))
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"frequency_hz": 0.0}, "frequency_hz must be above 0"),
-        ({"direction": [0.0, 0.0]}, "direction must be a vector"),
-        ({"direction": 1.0}, "direction must be a vector"),
-    ],
-)
-def test_what_is_no_vibration(given, message):
-    with pytest.raises(ProblemError, match=message):
-        EnsembleVibration(**({"frequency_hz": 20.0, "rms_nm": 1.0} | given))
 
 
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
@@ -301,13 +283,21 @@ def test_a_sinusoid_at_a_pole_of_the_controller_is_gone():
     assert seen.rms_nm[1] == pytest.approx(moving.rms_nm, rel=1e-9)
 
 
-def test_controllers_that_do_not_fit(kalman):
-    ensemble = LoopEnsemble(loops=3)
-    with pytest.raises(lbt.errors.DimensionError, match=r"one per loop \(3\)"):
-        ensemble_residuals([kalman.controller] * 2, kalman.hardware, ensemble)
+def test_refusals(kalman):
+    law, path, three = kalman.controller, kalman.hardware, LoopEnsemble(loops=3)
     small = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-    with pytest.raises(lbt.errors.DimensionError, match="map 1 measurements"):
-        ensemble_residuals(kalman.controller, small, ensemble)
     slow = lbt.LoopHardware(frame_rate_hz=500)
-    with pytest.raises(lbt.errors.ProblemError, match="must run at the loop's 500 Hz"):
-        ensemble_residuals(kalman.controller, slow, ensemble)
+    require_refusals(
+        (lambda row=row: ensemble_residuals(law, path, LoopEnsemble(**row)), error, words)
+        for row, error, words in WRONG
+    )
+    facts = {"frequency_hz": 20.0, "rms_nm": 1.0}
+    rows = [
+        (lambda: EnsembleVibration(**(facts | {"frequency_hz": 0.0})), ProblemError, "above 0"),
+        (lambda: EnsembleVibration(**facts, direction=[0.0, 0.0]), ProblemError, "be a vector"),
+        (lambda: EnsembleVibration(**facts, direction=1.0), ProblemError, "be a vector"),
+        (lambda: ensemble_residuals([law] * 2, path, three), DimensionError, r"one per loop \(3\)"),
+        (lambda: ensemble_residuals(law, small, three), DimensionError, "map 1 measurements"),
+        (lambda: ensemble_residuals(law, slow, three), ProblemError, "run at the loop's 500 Hz"),
+    ]
+    require_refusals(rows)

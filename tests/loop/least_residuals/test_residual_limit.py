@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from support.limits import RATE, ar, path, variance
 from support.lqg import shell
+from support.refusals import require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.design.result import model_limits
@@ -238,9 +239,8 @@ CALM = {"turbulence": ar(0.9), "noise_nm": 1.0}
 LATE, MOVING = second(RATE / 5, 2.1, 3.0), path(mirror=shell(100))
 
 
-@pytest.mark.parametrize(
-    ("call", "error", "words"),
-    [
+def test_refusals():
+    rows = [
         (
             lambda: least_model_residual(coupled_plant(delay_frames=2.4)),
             CoupledModesError,
@@ -248,8 +248,5 @@ LATE, MOVING = second(RATE / 5, 2.1, 3.0), path(mirror=shell(100))
         ),
         (lambda: variances_of_sensors([LATE]), ProblemError, "ends within a frame of the loop"),
         (lambda: variance(MOVING, **CALM, frame_means=False), ProblemError, "one with dynamics"),
-    ],
-)
-def test_refusals(call, error, words):
-    with pytest.raises(error, match=words):
-        call()
+    ]
+    require_refusals(rows)

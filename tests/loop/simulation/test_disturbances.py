@@ -43,24 +43,23 @@ def test_power_is_drawn_whole_however_short_the_series():
         assert np.sqrt(np.mean(series**2)) == pytest.approx(rms, rel=0.05)
 
 
-def test_a_mode_keeps_its_weather_when_the_other_changes():
+def test_every_controller_and_mode_meets_the_weather_of_its_seed():
     both, _ = LOOPS
-    design = lbt.integrator(both, gain=0.4)
-    runs = [
-        lbt.simulate(
-            design.controller,
-            lbt.Truth(turbulence=[SLOW, other]),
-            hardware=both,
-            frames=50,
-            cases=2,
-            seed=1,
-        )
-        for other in (QUICK, TABLE, None)
-    ]
-    for run in runs[1:]:
-        np.testing.assert_array_equal(run.residual_nm[..., 0], runs[0].residual_nm[..., 0])
-        assert not np.array_equal(run.residual_nm[..., 1], runs[0].residual_nm[..., 1])
-    assert not np.any(runs[2].residual_nm[..., 1])
+
+    def run(other, gain=0.4, seed=1):
+        law, truth = lbt.integrator(both, gain=gain), lbt.Truth(turbulence=[SLOW, other])
+        size = {"frames": 50, "cases": 2, "seed": seed, "settle_frames": 100}
+        return lbt.simulate(law, truth, hardware=both, **size)
+
+    first, table, calm = (run(other) for other in (QUICK, TABLE, None))
+    for changed in (table, calm):
+        np.testing.assert_array_equal(changed.residual_nm[..., 0], first.residual_nm[..., 0])
+        assert not np.array_equal(changed.residual_nm[..., 1], first.residual_nm[..., 1])
+    assert not np.any(calm.residual_nm[..., 1])
+    lively, later = run(QUICK, gain=0.6), run(QUICK, seed=2)
+    np.testing.assert_array_equal(lively.total_nm, first.total_nm)
+    assert not np.array_equal(lively.residual_nm, first.residual_nm)
+    assert not np.array_equal(later.total_nm, first.total_nm)
 
 
 PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
