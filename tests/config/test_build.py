@@ -4,13 +4,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.configs import AR, OTHER, SMALL, change_key, minimal_config, write_config
+from support.configs import (
+    AR,
+    OTHER,
+    SMALL,
+    change_key,
+    minimal_config,
+    write_config,
+    write_vibration,
+)
 from support.drifting import drift_file
 from support.end_to_end import CONFIG as END_TO_END
 from support.plants import LBT_YAML, ROOT
 from support.several_sensors import CONFIG as SENSORS
 from support.several_sensors import write_config as write_sensors
-from support.vibration_config import write_vibration
 
 import lbt_synth as lbt
 from lbt_synth.errors import ConfigError

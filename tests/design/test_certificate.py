@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.exact_covariance import exact_covariance
+from support.rational import exact_covariance
 
 import lbt_synth as lbt
 from lbt_synth.design.certificate import certify_error, certify_filter
