@@ -23,6 +23,7 @@ from lbt_synth.identification.fit.spectrum_model import (
     damping_parameter,
 )
 from lbt_synth.identification.fit.whittle import (
+    SKIRT,
     FittedModel,
     component_density,
     contrast,
@@ -68,7 +69,7 @@ _DAMPING: dict[Kind, tuple[float, float]] = {
 
 _FINE = 0.02  # of a frequency: a smooth spectrum does not change in such a band
 _WIDEST_HZ, _SHARE = 3.0, 0.1  # of a group, and of what it holds of a line
-_BINS, _SIDELOBES = 10, 64  # on either side of a line that stay single; of a line as narrow as bins
+_BINS = 10  # on either side of a line that stay single; SKIRT of a line as narrow as bins
 RESOLVED = 3  # bins: a narrower line has the sidelobes of the taper, a wider one flanks of its own
 
 
@@ -173,7 +174,7 @@ class Search:
         size = np.maximum(step, np.minimum(_FINE * f, _WIDEST_HZ))
         for line in spectrum.lines:
             centre, half_width = self.place(line)
-            fine = _SIDELOBES if half_width < RESOLVED * step else _BINS
+            fine = SKIRT if half_width < RESOLVED * step else _BINS
             reach = fine * step + _WIDEST_HZ / _SHARE / 2  # beyond, this limit is wider
             near = slice(*np.searchsorted(f, [centre - reach, centre + reach]))
             away = np.maximum(np.abs(f[near] - centre) - fine * step, 0)
@@ -345,7 +346,7 @@ def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumMode
     centre, half = search.place(line)
     if half > 2 * step or centre <= 3 * step:
         return spectrum
-    data = search.data.window(centre - _SIDELOBES * step, centre + _SIDELOBES * step)
+    data = search.data.window(centre - SKIRT * step, centre + SKIRT * step)
     rest = density(data, spectrum.exchange(i))
     for shifts in (_SHIFTS, _SHIFTS / 8):  # the place of a sinusoid is known to a part of a bin
         moves = product(np.log1p(shifts * step / centre), _POWERS)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import count
+from itertools import chain, count
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,6 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedLine,
     IdentifiedModel,
 )
-from lbt_synth.identification.fit.jumps import cut_at_jumps, find_correction_jumps, find_jumps
 from lbt_synth.identification.fit.order_search import (
     OVERDAMPED,
     find_components,
@@ -47,9 +45,10 @@ from lbt_synth.identification.fit.physical_parameters import (
 )
 from lbt_synth.identification.fit.shared_lines import couple_axes
 from lbt_synth.identification.fit.whittle import FittedModel
-from lbt_synth.identification.records.faults import RARE
+from lbt_synth.identification.records.faults import MAD, RARE
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, each_of, real_array, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
@@ -59,6 +58,10 @@ _UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be colour
 OPEN_GAIN = 0.3  # relative error of a gain that a record leaves open
 _POOR_GAIN = 0.1  # relative error from which a note says so
 _AMBIGUOUS = 2.0  # times the error of a fit to more data: it had rivals
+_JUMP = 8.0  # standard deviations of the change of a correction: no loop makes it
+_BESIDE_JUMP = 50  # frames: what is nearer is the same jump, of either axis
+_AROUND_JUMP = 3  # frames left out on either side
+_MOST_JUMPS = 20  # at which a record is cut
 _LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0  # of the periodograms in a density
 
 
@@ -167,29 +170,21 @@ def identify(
     if sensor_gain is not None:
         gains = record.known_gains(sensor_gain).tolist()
     pieces = record.stretches() if stretches is None else _usable_stretches(stretches, record)
-    fits, total = count(1), 3 * record.axes  # at first, after a jump, with the mean gain
+    fits, total = count(1), 2 * record.axes  # at first, and with the mean gain
 
     def step() -> None:
         if progress is not None:
             progress(next(fits), total)
 
-    fit = partial(_fit_axes, record, step, options)
-    early = find_correction_jumps(record.corrections(), pieces)
-    pieces, notes = cut_at_jumps(pieces, early, "commands")
+    pieces, notes = _cut_at_jumps(record.corrections(), pieces)
     starts: Sequence[IdentifiedAxis | None] = start.axes if start else [None] * record.axes
-    axes = fit(pieces, gains, starts)
-    series = record.pseudo_open_loop([axis.sensor_gain for axis in axes])
-    late = find_jumps(series, axes, pieces)
-    cut, late_notes = cut_at_jumps(pieces, late, "pseudo-open loop")
-    if cut != pieces:
-        axes = fit(cut, gains, starts)
-    notes += late_notes
+    axes = _fit_axes(record, step, options, pieces, gains, starts)
     if len(axes) > 1 and all(axis.sensor_gain_error is not None for axis in axes):
         axes, note = _pool_gains(axes, step, options)
         notes.append(note)
     shared: tuple[IdentifiedLine, ...] = ()
     if len(axes) == 2:
-        axes, shared = couple_axes(record, axes, cut, lowest_line_hz)
+        axes, shared = couple_axes(record, axes, pieces, lowest_line_hz)
     notes += _find_doubts(axes, most_lines)
     if progress is not None and next(fits) <= total:
         progress(total, total)
@@ -223,6 +218,34 @@ def _fit_axes(
         axes.append(find_axis(search, start=start))
         step()
     return axes
+
+
+def _cut_at_jumps(corrections: FloatArray, stretches: Stretches) -> tuple[Stretches, list[str]]:
+    """Return stretches without the places where corrections go on elsewhere, and a note.
+
+    No spectrum has jumps, and a fit would choose a sensor gain at which they do not show.
+    """
+    change = np.abs(np.diff(corrections, axis=0))
+    inside = np.zeros(len(change), dtype=np.bool_)
+    for start, stop in stretches:
+        inside[start : stop - 1] = True
+    scale = MAD * np.median(change[inside], axis=0)
+    size = np.max(change[:, scale > 0] / scale[scale > 0], axis=1, initial=0.0) * inside
+    places = np.flatnonzero(size > _JUMP)
+    if not places.size:
+        return stretches, []
+    jumps = np.split(places, 1 + np.flatnonzero(np.diff(places) > _BESIDE_JUMP))
+    note = (
+        f"warning: {count_text(len(jumps), 'jump')} of the commands, the largest at frame "
+        f"{1 + int(np.argmax(size))} with {np.max(size):.0f} standard deviations"
+    )
+    if len(jumps) > _MOST_JUMPS:
+        return stretches, [f"{note}; too many to cut the record there, and the model suffers"]
+    for jump in jumps:
+        low, high = int(jump[0]) + 1 - _AROUND_JUMP, int(jump[-1]) + 1 + _AROUND_JUMP
+        pieces = chain(*(((a, min(b, low)), (max(a, high), b)) for a, b in stretches))
+        stretches = tuple((a, b) for a, b in pieces if b > a)
+    return stretches, [f"{note}; the record was cut there"]
 
 
 def _check_record(

@@ -550,3 +550,33 @@ def test_a_printed_model_lists_its_vibrations_with_their_errors(model):
         assert any(f"{part.rms_nm:.2f}" in row for row in rows)
     assert len(repr(model)) <= 100
     assert len(repr(model.axes[0])) <= 100
+
+
+def test_a_jump_is_found_noted_and_cut() -> None:
+    clean = lbt.identify(spliced_record(lines=LINE, frames=20_000))
+    spliced = spliced_record((0, 1), lines=LINE, frames=20_000)
+    found = lbt.identify(spliced)
+    assert not clean.notes
+    (note,) = found.notes
+    assert note.startswith("warning: 1 jump of the commands, the largest at frame 19998 ")
+    assert note.endswith("the record was cut there")
+    axis = found.axes[0]
+    assert axis.sensor_gain_error is not None
+    assert axis.sensor_gain == pytest.approx(0.6, abs=4 * axis.sensor_gain_error)
+    assert axis.noise_nm == pytest.approx(6, abs=4 * axis.noise_error_nm)
+
+
+@pytest.mark.parametrize("lost", [(5008, 6154), (2000, 9000)])
+def test_frames_that_were_lost_do_not_move_the_gain(lost: tuple[int, int]) -> None:
+    whole = spliced_record((3,), lines=LINE, frames=20_000)
+    y, u = (
+        np.vstack([series[: lost[0]], series[lost[1] :]])
+        for series in (whole.measurements, whole.commands)
+    )
+    spliced = lbt.identification.loop_record(y, u, frame_rate_hz=1000, delay_frames=2, unit="nm")
+    found = lbt.identify(spliced)
+    axis = found.axes[0]
+    assert axis.sensor_gain_error is not None
+    assert axis.sensor_gain == pytest.approx(0.6, abs=4 * axis.sensor_gain_error)
+    assert axis.sensor_gain_error < 0.05
+    assert any("jump" in note for note in found.notes)
