@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram, Whiteness
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.models import (
     ARModel,
@@ -105,6 +105,27 @@ class IdentifiedLine:
             direction=direction or self.direction or (1.0, 0.0),
             sections=self.sections,
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Whiteness:
+    """Tests of the innovations, whose spectrum is the ratio of periodogram to model.
+
+    The cumulative periodogram is tested by Kolmogorov's distribution (M. S. Bartlett, An
+    Introduction to Stochastic Processes, 1955), the autocorrelation by Box and Pierce's sum of
+    squares (doi:10.1080/01621459.1970.10481180).
+    """
+
+    cumulative: FloatArray  # (f,), from 0 to 1
+    deviation: float  # largest distance of the cumulative periodogram from the diagonal
+    effective: float  # number of independent values
+    p_value: float  # probability of a larger distance if the innovations were white
+    correlation_p_value: float  # of a larger sum of squares; nan of a part of the band
+
+    @property
+    def white(self) -> bool:
+        """Whether neither test refuses whiteness at 1 %."""
+        return self.p_value > 0.01 and self.correlation_p_value > 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

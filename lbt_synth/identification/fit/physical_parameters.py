@@ -12,10 +12,12 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
     IdentifiedLine,
     Kind,
+    Whiteness,
 )
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram, Whiteness
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.spectrum_model import BACKGROUND, CORNER, GAIN, SpectrumModel
 from lbt_synth.identification.fit.whittle import (
+    DIFFERENCE,
     FittedModel,
     density,
     derivatives,
@@ -47,16 +49,17 @@ def gain_covariance(
 
     The errors are relative ones, each common to the gains of some axes.
     """
-    rows = derivatives(search.merge(model.spectrum), model.spectrum)[2]
+    data, theta = search.merge(model.spectrum), model.spectrum.pack()
     gains = BACKGROUND * np.arange(len(model.spectrum.axes)) + GAIN
     information = model.information.copy()
     information[gains] = information[:, gains] = 0  # as if it were fitted at these gains
-    held = invert_information(information)
-    covariance = held
+    held = covariance = invert_information(information)
+    gradient = derivatives(data, model.spectrum)[1]
     for axes, error in errors:
-        places = gains[list(axes)]
-        moves = -held @ np.sum(rows[places], axis=0)
-        moves[places] = 1
+        step = np.zeros_like(theta)
+        step[gains[list(axes)]] = DIFFERENCE
+        moved = derivatives(data, model.spectrum.unpack(theta + step))[1]
+        moves = (step - held @ (moved - gradient)) / DIFFERENCE
         covariance = covariance + error**2 * np.outer(moves, moves)
     return covariance
 
@@ -247,7 +250,7 @@ def whiteness(data: LoopPeriodogram, power: FloatArray, model: FloatArray) -> Wh
     # a periodogram of n frames has n / 2 values; bins count as they are independent
     size = 2 * (ratio.size + 1)
     whole = data.frequency_hz.size / data.frequency_hz[-1] * data.frame_rate_hz / 2
-    correlation, p_value = np.zeros(0), float("nan")
+    p_value = float("nan")
     if ratio.size > 0.95 * whole:  # up to the Nyquist frequency
         lags = min(_LAGS, ratio.size // 16)
         filled = np.zeros(size // 2 + 1)  # from 0 to the Nyquist frequency
@@ -256,11 +259,9 @@ def whiteness(data: LoopPeriodogram, power: FloatArray, model: FloatArray) -> Wh
         correlation = np.fft.irfft(filled, size)[1 : lags + 1] * size / (2 * np.sum(ratio))
         p_value = float(chdtrc(lags, 2 * effective * float(np.sum(correlation**2))))
     return Whiteness(
-        deviation=deviation,
-        p_value=float(kolmogorov(deviation * np.sqrt(effective))),
-        autocorrelation=frozen_copy(correlation),
-        correlation_p_value=p_value,
-        frequency_hz=data.frequency_hz,
         cumulative=frozen_copy(cumulative),
+        deviation=deviation,
         effective=effective,
+        p_value=float(kolmogorov(deviation * np.sqrt(effective))),
+        correlation_p_value=p_value,
     )

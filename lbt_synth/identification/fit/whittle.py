@@ -53,7 +53,7 @@ from lbt_synth.models.resonance_spectrum import (
     resonance_densities,
     unit_density,
 )
-from lbt_synth.validation import FloatArray, IntArray
+from lbt_synth.validation import FloatArray
 
 DIFFERENCE = 1e-4  # of a logarithm: the step of a numerical derivative
 WIDE = 30.0  # half width [periods] above which smearing changes a line by less than 0.2 %
@@ -139,7 +139,7 @@ def _smear(
     if not narrow:
         return
     centres, half_widths = np.array(narrow).T[1:]
-    at = data.periods
+    at = data.frequency_hz * data.duration_s
     starts, stops = np.searchsorted(at, [centres - SKIRT, centres + SKIRT])
     inside = np.concatenate([at[a:b] for a, b in zip(starts, stops, strict=True)])
     centre, half_width = np.repeat([centres, half_widths], stops - starts, axis=1)
@@ -220,19 +220,16 @@ def contrasts(data: LoopPeriodogram, gain: float, model: FloatArray) -> FloatArr
 
 
 def _whiten(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return W with ``W S W^T = 1``, (n, n, f), and log det S, (f,), by Cholesky's method."""
-    n = len(matrix)
-    root, inverse = np.zeros_like(matrix), np.zeros_like(matrix)
-    for i in range(n):
-        for j in range(i):
-            rest = matrix[i, j] - np.sum(root[i, :j] * root[j, :j], axis=0)
-            root[i, j] = rest / root[j, j]
-        root[i, i] = np.sqrt(matrix[i, i] - np.sum(root[i, :i] ** 2, axis=0))
-        inverse[i, i] = 1 / root[i, i]
-        for j in range(i):
-            inverse[i, j] = -np.sum(root[i, j:i] * inverse[j:i, j], axis=0) * inverse[i, i]
-    diagonal = np.arange(n)
-    return inverse, 2 * np.sum(np.log(root[diagonal, diagonal]), axis=0)
+    """Return W with ``W S W^T = 1`` of one axis or two, (n, n, f), and log det S, (f,)."""
+    inverse, log_determinant = np.zeros_like(matrix), np.log(matrix[0, 0])
+    inverse[0, 0] = 1 / np.sqrt(matrix[0, 0])
+    if len(matrix) > 1:
+        below = matrix[1, 0] * inverse[0, 0]
+        rest = matrix[1, 1] - below**2
+        inverse[1, 1] = 1 / np.sqrt(rest)
+        inverse[1, 0] = -below * inverse[0, 0] * inverse[1, 1]
+        log_determinant += np.log(rest)
+    return inverse, log_determinant
 
 
 def _vector(matrices: FloatArray) -> FloatArray:
@@ -242,16 +239,8 @@ def _vector(matrices: FloatArray) -> FloatArray:
     """
     if matrices.shape[-2] == 1:
         return np.asarray(matrices[..., 0, :, :])
-    rows, columns, scale = _upper_triangle(matrices.shape[-2])
-    both = matrices[..., rows, columns, :] + matrices[..., columns, rows, :]
-    return np.asarray(scale * both)
-
-
-@lru_cache(maxsize=4)
-def _upper_triangle(n: int) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return rows and columns of the entries of a vector (m,), and half their weights (m, 1)."""
-    rows, columns = np.triu_indices(n)
-    return rows, columns, np.where(rows == columns, 0.5, np.sqrt(0.5))[:, None]
+    between = np.sqrt(0.5) * (matrices[..., 0, 1, :] + matrices[..., 1, 0, :])
+    return np.stack([matrices[..., 0, 0, :], between, matrices[..., 1, 1, :]], axis=-2)
 
 
 def _outer(one: FloatArray, other: FloatArray) -> FloatArray:
@@ -289,8 +278,8 @@ def derivatives(
 ) -> tuple[float, FloatArray, FloatArray]:
     """Return L without the priors, its gradient (p,) and its information matrix (p, p).
 
-    ``held`` (f,) is a density beside that of one axis. The rows of sensor gains are exact second
-    derivatives; there are none by the gains of two axes.
+    ``held`` (f,) is a density beside that of one axis. The row of its sensor gain is of exact
+    second derivatives; there are none by the gains of two axes.
     """
     n, start, root = len(spectrum.axes), spectrum.place(0), np.sqrt(data.count)
     s = data.half_angle_square
@@ -326,12 +315,12 @@ def derivatives(
     flat = rows.reshape(len(rows), -1)
     gradient, information = flat @ (root * (unit - measured)).ravel(), flat @ flat.T
     value = data.count @ (log_determinant + unit.T @ measured)[0]
-    for i in range(n):  # the gains change the data, not the model
-        slope, bend = data.gain_slopes(spectrum.gains, i)
-        by_gain, at = whiten(slope), BACKGROUND * i + GAIN
-        gradient[at] = data.count @ (unit.T @ by_gain)[0]
-        information[at] = information[:, at] = -(flat @ (root * by_gain).ravel())
-        information[at, at] = data.count @ (bend / matrix[0, 0]) if n == 1 else 0.0
+    if n == 1:  # the gain changes the data, not the model
+        gain = spectrum.background.gain
+        by_gain = 2 * gain * (data.crossed + gain * data.corrected) / matrix[0, 0]
+        bend = by_gain + 2 * gain**2 * data.corrected / matrix[0, 0]
+        gradient[GAIN], information[GAIN, GAIN] = data.count @ by_gain, data.count @ bend
+        information[GAIN, 1:] = information[1:, GAIN] = -(flat[1:] @ (root * by_gain))
     return float(value), gradient, information
 
 

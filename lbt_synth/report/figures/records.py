@@ -276,7 +276,7 @@ def _draw_innovations(panel: Panel, axis: IdentifiedAxis, frequency: dict[str, o
     y_axis = {"label": "power up to f", "unit": "%", "low": -reach, "high": reach}
     panel.set_axes(frequency, y_axis, title="innovations, less white noise")
     panel.span("99 % of white noise", -bound, bound, "y")
-    panel.curve("excess", test.frequency_hz, excess, width=1.0, quiet=True)
+    panel.curve("excess", axis.frequency_hz, excess, width=1.0, quiet=True)
 
 
 SEGMENT = 2048  # frames of a segment of the spectra, at most

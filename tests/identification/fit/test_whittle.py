@@ -238,6 +238,7 @@ def test_slopes_of_two_axes_are_those_of_differences(both, coupled) -> None:
         ]
     )
     numeric /= 2e-5
+    numeric[[GAIN, BACKGROUND + GAIN]] = 0  # the gains of two axes are held
     assert slope == pytest.approx(numeric, rel=1e-4, abs=1e-5 * np.max(np.abs(numeric)))
 
 
@@ -258,16 +259,9 @@ def test_information_is_the_second_derivative_where_the_data_are_the_model(both,
         for h in 1e-5 * np.eye(theta.size)
     ]
     exact = np.array(rows) / 2e-5
-    assert information == pytest.approx(exact, abs=1e-5 * np.max(exact))
-    # gains change the data, and what they move is exact
-    _, _, information = derivatives(both, coupled)
     gains = [GAIN, BACKGROUND + GAIN]
-    others = [i for i in range(theta.size) if i not in gains]
-    for gain in gains:
-        h = 1e-5 * np.eye(theta.size)[gain]
-        row = derivatives(both, coupled.unpack(theta + h))[1]
-        row = (row - derivatives(both, coupled.unpack(theta - h))[1])[others] / 2e-5
-        assert information[gain][others] == pytest.approx(row, rel=1e-3, abs=1e-5 * max(abs(row)))
+    exact[gains] = exact[:, gains] = 0  # they are held
+    assert information == pytest.approx(exact, abs=1e-5 * np.max(exact))
 
 
 def test_a_component_that_would_leave_the_band_stays_at_its_end(both, coupled) -> None:
