@@ -147,8 +147,8 @@ class IdentifiedAxis(Summarised):
         its standard error [nm].
     noise_correlation, noise_correlation_error : float
         Correlation of the noise of neighbouring frames, of a first-order process, and its standard
-        error. The first is 0 where the data do not ask for it; the second then says what they would
-        have shown. A plant takes white noise of the same rms.
+        error, or by how much it differs in models that are as likely. The first is 0 where the data
+        do not ask for it. A plant takes white noise of the same rms.
     sensor_gain : float
         Sensor gain: found or given.
     sensor_gain_error : float or None

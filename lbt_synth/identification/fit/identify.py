@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import chain, count
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -41,9 +41,9 @@ from lbt_synth.identification.fit.periodogram import (
 from lbt_synth.identification.fit.physical_parameters import (
     describe_axis,
     hold_gain,
-    standard_errors,
 )
 from lbt_synth.identification.fit.shared_lines import couple_axes
+from lbt_synth.identification.fit.spectrum_model import GAIN
 from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.records.faults import MAD, RARE
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
@@ -54,15 +54,13 @@ from lbt_synth.validation import FloatArray, each_of, real_array, require_instan
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
-_UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be coloured
 OPEN_GAIN = 0.3  # relative error of a gain that a record leaves open
 _POOR_GAIN = 0.1  # relative error from which a note says so
 _AMBIGUOUS = 2.0  # times the error of a fit to more data: it had rivals
 _JUMP = 8.0  # standard deviations of the change of a correction: no loop makes it
-_BESIDE_JUMP = 50  # frames: what is nearer is the same jump, of either axis
-_AROUND_JUMP = 3  # frames left out on either side
+_AROUND_JUMP = 25  # frames left out on either side: what is nearer is the same jump
 _MOST_JUMPS = 20  # at which a record is cut
-_LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0  # of the periodograms in a density
+_MOST_AVERAGES = 1000.0  # of the periodograms in a density: nobody takes more
 
 
 def identify(
@@ -170,54 +168,30 @@ def identify(
     if sensor_gain is not None:
         gains = record.known_gains(sensor_gain).tolist()
     pieces = record.stretches() if stretches is None else _usable_stretches(stretches, record)
-    fits, total = count(1), 2 * record.axes  # at first, and with the mean gain
-
-    def step() -> None:
-        if progress is not None:
-            progress(next(fits), total)
-
     pieces, notes = _cut_at_jumps(record.corrections(), pieces)
     starts: Sequence[IdentifiedAxis | None] = start.axes if start else [None] * record.axes
-    axes = _fit_axes(record, step, options, pieces, gains, starts)
+    report = progress or (lambda done, total: None)
+    series = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
+    axes = list[IdentifiedAxis]()
+    for y, c, gain, axis_start in series:
+        data = axis_periodogram(y, c, record.frame_rate_hz, pieces)
+        axes.append(find_axis(Search(data=data, gain=gain, **options), start=axis_start))
+        report(len(axes), record.axes + 1)
     if len(axes) > 1 and all(axis.sensor_gain_error is not None for axis in axes):
-        axes, note = _pool_gains(axes, step, options)
+        axes, note = _pool_gains(axes, options)
         notes.append(note)
     shared: tuple[IdentifiedLine, ...] = ()
     if len(axes) == 2:
         axes, shared = couple_axes(record, axes, pieces, lowest_line_hz)
-    notes += _find_doubts(axes, most_lines)
-    if progress is not None and next(fits) <= total:
-        progress(total, total)
+    report(record.axes + 1, record.axes + 1)
     return IdentifiedModel(
         axes=tuple(axes),
         shared=shared,
         frame_rate_hz=record.frame_rate_hz,
         delay_frames=next(d for d in (record.delay_frames, delay_frames, _DELAY) if d is not None),
         mirror=record.mirror,
-        notes=tuple(notes),
+        notes=tuple(dict.fromkeys([*notes, *_find_doubts(axes, most_lines)])),
     )
-
-
-def _fit_axes(
-    record: LoopRecord,
-    step: Callable[[], None],
-    options: dict[str, Any],
-    stretches: Stretches,
-    gains: Sequence[float | None],
-    starts: Sequence[IdentifiedAxis | None],
-) -> list[IdentifiedAxis]:
-    """Identify each axis, at its gain or at a free one, and from its start.
-
-    ``options`` are those of a search.
-    """
-    axes = []
-    series = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
-    for y, c, gain, start in series:
-        data = axis_periodogram(y, c, record.frame_rate_hz, stretches)
-        search = Search(data=data, gain=gain, **options)
-        axes.append(find_axis(search, start=start))
-        step()
-    return axes
 
 
 def _cut_at_jumps(corrections: FloatArray, stretches: Stretches) -> tuple[Stretches, list[str]]:
@@ -234,7 +208,7 @@ def _cut_at_jumps(corrections: FloatArray, stretches: Stretches) -> tuple[Stretc
     places = np.flatnonzero(size > _JUMP)
     if not places.size:
         return stretches, []
-    jumps = np.split(places, 1 + np.flatnonzero(np.diff(places) > _BESIDE_JUMP))
+    jumps = np.split(places, 1 + np.flatnonzero(np.diff(places) > _AROUND_JUMP))
     note = (
         f"warning: {count_text(len(jumps), 'jump')} of the commands, the largest at frame "
         f"{1 + int(np.argmax(size))} with {np.max(size):.0f} standard deviations"
@@ -269,12 +243,6 @@ def _check_record(
     record.corrections()  # refuses a closed loop without a delay
     if start is not None and len(start.axes) != record.axes:
         raise ProblemError(f"start must have {record.axes} axes; got {len(start.axes)}.")
-    for i, series in enumerate(record.measurements[record.usable].T):
-        if series.size and np.ptp(series) == 0:
-            raise ProblemError(
-                f"axis {i} of the record is constant: there is nothing to identify. Choose the "
-                "other axis."
-            )
 
 
 def _usable_stretches(stretches: StretchesLike, record: LoopRecord) -> Stretches:
@@ -287,14 +255,13 @@ def _usable_stretches(stretches: StretchesLike, record: LoopRecord) -> Stretches
 
 
 def _pool_gains(
-    axes: list[IdentifiedAxis], step: Callable[[], None], options: dict[str, Any]
+    axes: list[IdentifiedAxis], options: dict[str, Any]
 ) -> tuple[list[IdentifiedAxis], str]:
     """Fit the axes again with the mean of their gains, if they agree; options are of a search.
 
     An axis that leaves its gain open takes that of the other. What is known of a gain beforehand
-    counts once. Where the gains scatter by more than their
-    errors, the error of the mean is scaled by ``sqrt(chi^2 / (n - 1))`` (Particle Data Group,
-    doi:10.1093/ptep/ptac097, section 5.2.2).
+    counts once. Where the gains scatter by more than their errors, the error of the mean is scaled
+    by ``sqrt(chi^2 / (n - 1))`` (Particle Data Group, doi:10.1093/ptep/ptac097, section 5.2.2).
     """
     gains = np.array([axis.sensor_gain for axis in axes])
     errors = np.array([axis.sensor_gain_error for axis in axes], dtype=float)
@@ -311,26 +278,24 @@ def _pool_gains(
     precision = float(np.sum(weight)) - (len(axes) - 1) / GAIN_ERROR**2
     gain = float(np.exp(mean))
     error = float(np.sqrt(max(scatter, 1.0) / max(precision, 1 / GAIN_ERROR**2)))
-    pooled = []
-    for axis in axes:
-        search = Search(data=axis.data, gain=gain, **options)
-        pooled.append(refit_axis(axis, search, error, _gain_note(error, "mean of the axes")))
-        step()
+    note = _gain_note(error, "mean of the axes")
+    pooled = [
+        refit_axis(axis, Search(data=axis.data, gain=gain, **options), error, note) for axis in axes
+    ]
     return pooled, "one sensor gain for all axes"
 
 
 def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[str]:
     """Yield notes on odd gains, hidden noise, too many lines, and what no model has."""
-    above = set()
+    lowest, _ = POSSIBLE_GAINS
     for i, axis in enumerate(axes):
-        error, (low, high) = axis.sensor_gain_error, POSSIBLE_GAINS
-        if error is not None and not low < axis.sensor_gain < high:
+        gain, error, test = axis.sensor_gain, axis.sensor_gain_error, axis.whiteness
+        if error is not None and not lowest < gain < _CALIBRATED + DIFFERENT * error:
             yield (
-                f"warning: axis {i} has a sensor gain of {axis.sensor_gain:.3g}: are the units, "
-                "signs and axes of the commands right?"
+                f"warning: a sensor has a gain of {lowest:g} to 1; here it is {gain:.3g} +- "
+                f"{error:.2g}. Are the units, signs and axes of the commands right? Those recorded "
+                "at a fraction of what was applied look like that (--command-scale 2 if at half)"
             )
-        elif error is not None and _CALIBRATED + DIFFERENT * error < axis.sensor_gain:
-            above.add(f"{axis.sensor_gain:.3f} +- {error:.3f}")
         if axis.noise_error_nm > _UNSEEN * axis.noise_nm:
             yield f"warning: the noise of axis {i} is not seen under the rest of its spectrum"
         if sum(part.kind != "turbulence" for part in axis.parts) >= most_lines > 0:
@@ -344,13 +309,6 @@ def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[st
                 f"{axis.noise_correlation:.3f} +- {axis.noise_correlation_error:.3f}, which the "
                 "model and its errors hold. Designs take white noise of the same rms"
             )
-        elif error is not None and axis.noise_correlation_error > _UNSEEN_COLOUR:
-            yield (
-                f"warning: the record does not show whether the noise of axis {i} is white (its "
-                f"correlation is 0 +- {axis.noise_correlation_error:.2g}): noise, sensor gain and "
-                "their errors hold if it is"
-            )
-        test = axis.whiteness
         if min(test.p_value, test.correlation_p_value) < RARE:
             yield (
                 f"warning: the innovations of axis {i} are not white (p = {test.p_value:.2g}, "
@@ -358,12 +316,6 @@ def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[st
                 "that is not white. The standard errors do not cover that, and the sensor gain may "
                 "be wrong by many of them"
             )
-    if above:  # gains of both axes in one sentence
-        yield (
-            f"warning: a calibrated sensor has a gain of at most 1; here it is "
-            f"{' and '.join(sorted(above))}. Commands recorded at a fraction of what was applied "
-            "look like that (--command-scale 2 if at half)"
-        )
 
 
 def _identify_spectra(
@@ -374,9 +326,6 @@ def _identify_spectra(
     options: dict[str, Any],
 ) -> IdentifiedModel:
     """Identify each spectrum, between 0 and the Nyquist frequency of the loop."""
-    stated = np.zeros(record.axes)  # 0 where it is that of the spectrum
-    if noise_nm is not None:
-        stated = each_of(noise_nm, "noise_nm", record.axes, above=0)
     rate = frame_rate_hz if frame_rate_hz is not None else record.frame_rate_hz
     if rate is None:
         raise ProblemError(
@@ -385,33 +334,69 @@ def _identify_spectra(
         )
     inside = (record.frequency_hz > 0) & (record.frequency_hz < rate / 2)
     f, densities = record.frequency_hz[inside], record.density_nm2_hz[inside].T
+    if f.size < 32:
+        raise DimensionError(
+            "a spectrum must have at least 32 frequencies above 0 and below half the frame rate, "
+            f"{rate / 2:.6g} Hz; got {f.size}."
+        )
+    steps = np.diff(f)
+    if np.max(steps) > 1.01 * np.min(steps):
+        raise ProblemError(
+            f"frequency_hz must be evenly spaced; got steps of {np.min(steps):.6g} to "
+            f"{np.max(steps):.6g}. Interpolate, or leave the odd part out."
+        )
     if np.any(densities <= 0):
         raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(densities):.6g}.")
-    averages: list[float | None] = [record.averages] * record.axes
-    if record.averages is None:
-        averages = [estimate_averages(density) for density in densities]
-    axes = [
-        _identify_spectrum(f, density, rate, count or 1.0, **options)
-        for density, count in zip(densities, averages, strict=True)
-    ]
-    axes = [
-        replace(axis, noise_nm=noise, noise_error_nm=0.0) if noise else axis
-        for axis, noise in zip(axes, stated.tolist(), strict=True)
-    ]
-    left = int(np.sum(record.frequency_hz >= rate / 2))
-    notes = [f"{left} frequencies beyond {rate / 2:g} Hz were left out"] if left else []
-    notes += [
-        f"the density of axis {i} does not scatter as periodograms do (smoothed, interpolated "
-        "or computed?) and was taken for one of them. Give averages to find weaker lines"
-        for i, count in enumerate(averages)
-        if count is None
-    ]
+    beyond = int(np.sum(record.frequency_hz >= rate / 2))
+    notes = [f"{beyond} frequencies beyond {rate / 2:g} Hz were left out"] if beyond else []
+    axes, zero = [], np.zeros_like(f)
+    for i, density in enumerate(densities):
+        averages = record.averages or _estimate_averages(density)
+        if averages is None:
+            notes.append(
+                f"the density of axis {i} does not scatter as periodograms do (smoothed, "
+                "interpolated or computed?) and was taken for one of them. Give averages to find "
+                "weaker lines"
+            )
+        data = LoopPeriodogram(
+            frequency_hz=f,
+            measured=density,
+            crossed=zero,
+            corrected=zero,
+            count=zero + (averages or 1.0),
+            frame_rate_hz=rate,
+            resolution_hz=float(np.median(steps)),
+        )
+        search = Search(data=data, gain=1.0, **options)
+        model = add_evidence(search, find_components(search))
+        axes.append(describe_axis(search, model, None, "1: of a spectrum it has no meaning"))
+    if noise_nm is not None:
+        stated = each_of(noise_nm, "noise_nm", record.axes, above=0).tolist()
+        axes = [
+            replace(axis, noise_nm=noise, noise_error_nm=0.0)
+            for axis, noise in zip(axes, stated, strict=True)
+        ]
     return IdentifiedModel(
         axes=tuple(axes),
         frame_rate_hz=rate,
         delay_frames=_DELAY if delay_frames is None else delay_frames,
         notes=tuple(notes),
     )
+
+
+def _estimate_averages(density: FloatArray) -> float | None:
+    """Return how many periodograms were averaged in a density, by its scatter about a curve.
+
+    The logarithm of a mean of n has the variance ``1 / n + 1 / (2 n^2)``, nearly. None above what
+    anybody averages: otherwise each misfit would count as evidence for a line.
+    """
+    log = np.log(density)
+    # a second difference at a distance hardly sees a curve, and not what neighbours share
+    bend = log[6:] - 2 * log[3:-3] + log[:-6]
+    variance = (MAD * float(np.median(np.abs(bend - np.median(bend))))) ** 2 / 6
+    if variance < 1 / _MOST_AVERAGES:
+        return None
+    return float((1 + np.sqrt(1 + 2 * variance)) / (2 * variance))
 
 
 def find_axis(search: Search, *, start: IdentifiedAxis | None = None) -> IdentifiedAxis:
@@ -451,7 +436,7 @@ def _gain_note(error: float, origin: str) -> str:
 
 def _gain_error(model: FittedModel) -> float:
     """Return the standard error of the logarithm of the gain."""
-    return standard_errors(model.spectrum, model.covariance).background.log_gain
+    return float(np.sqrt(model.covariance[GAIN, GAIN]))
 
 
 def _is_clear(model: FittedModel, start: IdentifiedAxis | None) -> bool:
@@ -483,7 +468,7 @@ def axis_periodogram(
     y: FloatArray, c: FloatArray | None, frame_rate_hz: float, stretches: StretchesLike | None
 ) -> LoopPeriodogram:
     """Return the periodogram of measurements and corrections (frames,) of one axis."""
-    pieces = checked_stretches(None if stretches is None else sorted(stretches), y.size)
+    pieces = checked_stretches(stretches, y.size)
     longest = max(stop - begin for begin, stop in pieces)
     if longest < 2 * SHORTEST_SEGMENT:
         raise ProblemError(
@@ -491,7 +476,9 @@ def axis_periodogram(
             f"longest has {longest}. Record more, or bridge short gaps."
         )
     if all(np.ptp(y[begin:stop]) == 0 for begin, stop in pieces):
-        raise ProblemError("the measurement is constant: there is nothing to identify.")
+        raise ProblemError(
+            "a measurement is constant: there is nothing to identify. Choose the other axis."
+        )
     with np.errstate(over="ignore", invalid="ignore"):
         data = loop_periodogram(y, c, frame_rate_hz=frame_rate_hz, stretches=pieces)
         finite = np.all(np.isfinite(data.power(1.0)))
@@ -501,58 +488,3 @@ def axis_periodogram(
             f"{np.max(np.abs(y)):.6g} nm. Check the units."
         )
     return data
-
-
-def _identify_spectrum(
-    frequency_hz: FloatArray,
-    density_nm2_hz: FloatArray,
-    rate_hz: float,
-    averages: float,
-    **options: Any,
-) -> IdentifiedAxis:
-    """Identify one axis from its density (f,) [nm^2/Hz], a mean of independent periodograms."""
-    if frequency_hz.size < 32:
-        raise DimensionError(
-            "a spectrum must have at least 32 frequencies above 0 and below half the frame rate, "
-            f"{rate_hz / 2:.6g} Hz; got {frequency_hz.size}."
-        )
-    steps = np.diff(frequency_hz)
-    if np.max(steps) > 1.01 * np.min(steps):
-        raise ProblemError(
-            f"frequency_hz must be evenly spaced; got steps of {np.min(steps):.6g} to "
-            f"{np.max(steps):.6g}. Interpolate, or leave the odd part out."
-        )
-    zero = np.zeros_like(frequency_hz)
-    data = LoopPeriodogram(
-        frequency_hz=frequency_hz,
-        measured=density_nm2_hz,
-        crossed=zero,
-        corrected=zero,
-        count=zero + averages,
-        frame_rate_hz=rate_hz,
-        resolution_hz=float(np.median(steps)),
-    )
-    search = Search(data=data, gain=1.0, **options)
-    note = "1: of a spectrum it has no meaning"
-    return describe_axis(search, add_evidence(search, find_components(search)), None, note)
-
-
-def estimate_averages(density: FloatArray) -> float | None:
-    """Return how many periodograms were averaged in a density, by its scatter about a curve.
-
-    It is the shape of a gamma distribution. None above what anybody averages: otherwise each
-    misfit would count as evidence for a line, and standard errors would vanish.
-    """
-    from scipy.optimize import brentq
-    from scipy.special import polygamma
-    from scipy.stats import median_abs_deviation
-
-    log = np.log(density)
-    # a second difference at a distance hardly sees a curve, and not what neighbours share
-    bend = log[6:] - 2 * log[3:-3] + log[:-6]
-    scatter = median_abs_deviation(bend, scale=0.6745) ** 2 / 6
-    if scatter < polygamma(1, _MOST_AVERAGES):
-        return None
-    scatter = min(scatter, polygamma(1, _LEAST_AVERAGES))
-    low, high = np.log(_LEAST_AVERAGES) - 1e-6, np.log(_MOST_AVERAGES) + 1e-6
-    return float(np.exp(brentq(lambda x: polygamma(1, np.exp(x)) - scatter, low, high)))

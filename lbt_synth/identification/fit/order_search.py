@@ -13,6 +13,7 @@ from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
@@ -462,9 +463,9 @@ def _highest_excess(
     """Return a line of the place, width and variance of the highest excess in a band of bins."""
     data, excess = search.data, power[band] - model[band]
     count = max(1, excess.size // 2).bit_length()
-    each = [(2**k, _moving_mean(excess, 2**k)) for k in range(count)]
+    means = [(2**k, uniform_filter1d(excess, 2**k, mode="constant")) for k in range(count)]
     # the smoothing at which the peak is highest over its scatter, which falls with its root
-    _, smooth = max(each, key=lambda one: float(np.max(one[1])) * np.sqrt(one[0]))
+    _, smooth = max(means, key=lambda mean: float(np.max(mean[1])) * np.sqrt(mean[0]))
     peak = int(np.argmax(smooth))
     low_enough = np.flatnonzero(smooth <= 0.5 * smooth[peak])
     low = low_enough[low_enough <= peak].max(initial=0)
@@ -474,11 +475,3 @@ def _highest_excess(
     frequency = float(data.frequency_hz[band.start + peak])
     ratio = min(max(half / frequency, _NARROWEST), widest)
     return search.component("line", frequency, ratio, np.pi * half * height)
-
-
-def _moving_mean(series: FloatArray, width: int) -> FloatArray:
-    """Return the mean over a width around each value, (n,), with zeros beyond the ends."""
-    total = np.cumsum(np.append(0.0, series))
-    last = np.arange(series.size) + (width - 1) // 2 + 1
-    first = np.maximum(last - width, 0)
-    return np.asarray((total[np.minimum(last, series.size)] - total[first]) / width)

@@ -412,7 +412,7 @@ REFUSALS = [
     (lambda: find_record(frame_rate_hz=900.0), ProblemError, "for spectra only"),
     (lambda: find_record(delay_frames=3.0), ProblemError, "with_delay"),
     (lambda: find_axes(WHITE, WHITE), ProblemError, "give delay_frames"),
-    (lambda: find_axes(WHITE * [1, 0]), ProblemError, "axis 1 of the record is constant"),
+    (lambda: find_axes(WHITE * [1, 0]), ProblemError, "measurement is constant"),
     (lambda: find_eris(sensor_gain=0.5), ProblemError, "is for series of a loop"),
     (lambda: find_eris(noise_nm=0.0), ProblemError, "noise_nm must be above 0"),
     (lambda: find_eris(stretches=[(0, 600)]), ProblemError, "is for series of a loop"),
