@@ -77,11 +77,13 @@ def describe_axis(
     note: str,
     *,
     colour_error: float = 0.0,
+    directions: Sequence[tuple[tuple[float, float], float | None]] = (),
 ) -> IdentifiedAxis:
     """Return a fitted model in the units of the phase.
 
     ``gain_error`` is the standard error of the logarithm of the gain, None where it is given;
-    ``colour_error`` by how much the noise's correlation differs in models that are as likely.
+    ``colour_error`` by how much the noise's correlation differs in models that are as likely;
+    ``directions`` those of the last components, which another axis has, too, and their errors.
     """
     data, spectrum = search.data, model.spectrum
     background, rate = spectrum.background, data.frame_rate_hz
@@ -93,6 +95,9 @@ def describe_axis(
         _describe_line(search, model, i, errors, covariance, densities[i], fitted)
         for i in range(len(spectrum.components))
     ]
+    own = len(resonances) - len(directions)
+    for i, (direction, error) in enumerate(directions, start=own):
+        resonances[i] = replace(resonances[i], direction=direction, direction_error_deg=error)
     smooth = fitted.copy()
     for resonance, line in zip(resonances, densities[1:], strict=True):
         if resonance.kind == "line":
