@@ -13,10 +13,8 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.fitting import (
     GAIN_ERROR,
-    GAIN_STEP,
     LOWEST_LINE_HZ,
     MOST_LINES,
-    PLAUSIBLE_GAINS,
     POSSIBLE_GAINS,
     Search,
     add_evidence,
@@ -27,12 +25,7 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedLine,
     IdentifiedModel,
 )
-from lbt_synth.identification.fit.order_search import (
-    OVERDAMPED,
-    find_components,
-    find_models,
-    find_rivals,
-)
+from lbt_synth.identification.fit.order_search import find_components, find_models
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
@@ -43,8 +36,6 @@ from lbt_synth.identification.fit.physical_parameters import (
     hold_gain,
 )
 from lbt_synth.identification.fit.shared_lines import couple_axes
-from lbt_synth.identification.fit.spectrum_model import GAIN
-from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.records.faults import MAD, RARE
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
@@ -55,8 +46,7 @@ _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
 OPEN_GAIN = 0.3  # relative error of a gain that a record leaves open
-_POOR_GAIN = 0.1  # relative error from which a note says so
-_AMBIGUOUS = 2.0  # times the error of a fit to more data: it had rivals
+_POOR_GAIN = 0.1  # relative error from which a note says so, and no later fit begins there
 _JUMP = 8.0  # standard deviations of the change of a correction: no loop makes it
 _AROUND_JUMP = 25  # frames left out on either side: what is nearer is the same jump
 _MOST_JUMPS = 20  # at which a record is cut
@@ -400,20 +390,23 @@ def _estimate_averages(density: FloatArray) -> float | None:
 
 
 def find_axis(search: Search, *, start: IdentifiedAxis | None = None) -> IdentifiedAxis:
-    """Identify one axis from its periodogram, and from a model of earlier data."""
-    closed = search.data.closed
-    models = find_models(search, None if start is None else start.fitted_model.spectrum)
-    model = models[0]
+    """Identify one axis from its periodogram, and from a model of earlier data.
+
+    A model whose gain is poorly known is none to start from: another gain may explain as much.
+    """
+    spectrum = None
+    if start is not None and (start.sensor_gain_error or 0.0) < _POOR_GAIN * start.sensor_gain:
+        spectrum = start.fitted_model.spectrum
+    model, near = find_models(search, spectrum)
+    model = add_evidence(search, model)
     if not search.finds_gain:
-        note = "given" if closed else "given: the series is divided by it"
+        note = "given" if search.data.closed else "given: the series is divided by it"
         if search.gain is None:
             note = "1: of an open loop it has no meaning"
-        return describe_axis(search, add_evidence(search, model), None, note)
-    model, near = find_rivals(search, models, other_gains=not _is_clear(model, start))
-    model = add_evidence(search, model)
+        return describe_axis(search, model, None, note)
     background = model.spectrum.background
     rivals = [rival.spectrum.background for rival in near]
-    fit_error = _gain_error(model)
+    fit_error = model.gain_error
     error = max(fit_error, *(abs(rival.log_gain - background.log_gain) for rival in rivals))
     if error > fit_error:  # what the gain moves is as ambiguous
         model = hold_gain(search, model, error)
@@ -432,30 +425,6 @@ def _gain_note(error: float, origin: str) -> str:
         f"{origin}, which leave it open by {100 * error:.0f} % (the loop hardly acts where the "
         "noise shows). Give it, or record with a higher loop gain"
     )
-
-
-def _gain_error(model: FittedModel) -> float:
-    """Return the standard error of the logarithm of the gain."""
-    return float(np.sqrt(model.covariance[GAIN, GAIN]))
-
-
-def _is_clear(model: FittedModel, start: IdentifiedAxis | None) -> bool:
-    """Whether nothing could explain another gain than that of a model.
-
-    A plausible gain is clear that is well known beside narrow lines, white noise and turbulence
-    that is not overdamped, or was found in earlier data with an error like that of its fit.
-    """
-    background, error = model.spectrum.background, _gain_error(model)
-    earlier = None if start is None else start.sensor_gain_error
-    compared = (
-        start is not None
-        and earlier is not None
-        and earlier < _AMBIGUOUS * error * start.sensor_gain
-    )
-    turbulence, narrow = model.spectrum.components[0], [c.is_narrow for c in model.spectrum.lines]
-    plain = all(narrow) and not background.colour and turbulence.damping_ratio < OVERDAMPED
-    low, high = PLAUSIBLE_GAINS
-    return low <= background.gain <= high and (compared or (plain and error < GAIN_STEP))
 
 
 def refit_axis(axis: IdentifiedAxis, search: Search, error: float, note: str) -> IdentifiedAxis:

@@ -17,7 +17,13 @@ from scipy.ndimage import uniform_filter1d
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
-from lbt_synth.identification.fit.fitting import GAIN_STEP, GAINS, TYPICAL_GAIN, Search
+from lbt_synth.identification.fit.fitting import (
+    GAIN_STEP,
+    GAINS,
+    PLAUSIBLE_GAINS,
+    TYPICAL_GAIN,
+    Search,
+)
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.scoring import SEARCHED
 from lbt_synth.identification.fit.spectrum_model import (
@@ -54,10 +60,13 @@ _AS_LIKELY = 5.0  # log-likelihood by which one of two gains is excluded
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
 
 
-def find_models(search: Search, start: SpectrumModel | None = None) -> list[FittedModel]:
-    """Return the model of one axis, and what explains it as well with another noise.
+def find_models(
+    search: Search, start: SpectrumModel | None = None
+) -> tuple[FittedModel, list[FittedModel]]:
+    """Return the likeliest model of one axis, and all that are as likely.
 
-    Wide resonances and a drift fit most spectra that fall, and so does a colour of the noise.
+    Wide resonances and a drift fit most spectra that fall, and so does a colour of the noise; each
+    of them can explain what a wrong gain leaves. The places of lines cannot.
     """
     model = find_components(search, start)
     spectrum = model.spectrum
@@ -67,32 +76,37 @@ def find_models(search: Search, start: SpectrumModel | None = None) -> list[Fitt
         rival = fitting.fit(search, spectrum.with_background(colour=other.background.colour))
     else:
         rival = find_components(search, other)
-    return sorted([model, *_settled([rival])], key=lambda one: _cost_of_noise(search, one))
-
-
-def find_rivals(
-    search: Search, models: Sequence[FittedModel], *, other_gains: bool
-) -> tuple[FittedModel, list[FittedModel]]:
-    """Return the likeliest of models, also from other gains, and all that are as likely.
-
-    Wide resonances, or a colour of the noise, can explain what a wrong gain leaves; the places of
-    lines cannot.
-    """
-    model, rivals = models[0], list(models)
-    for gain in _OTHER_GAINS if other_gains else ():
-        if abs(np.log(gain) - model.spectrum.background.log_gain) >= GAIN_STEP:
-            with suppress(NumericalError):
-                held = find_components(replace(search, gain=gain), rounds=FEW_ROUNDS)
-                rivals += _settled([fitting.fit(search, held.spectrum)])
-    best, near = min(rivals, key=lambda rival: _cost_of_noise(search, rival)), list[FittedModel]()
-    for rival in rivals:
-        above = (
-            cost(search, rival) - cost(search, best) for cost in (fitting.cost, _cost_of_noise)
+    rivals = [model, *_settled([rival])]
+    best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
+    if search.finds_gain and start is None and not _is_clear(best):
+        for gain in _OTHER_GAINS:
+            if abs(np.log(gain) - best.spectrum.background.log_gain) >= GAIN_STEP:
+                with suppress(NumericalError):
+                    held = find_components(replace(search, gain=gain), rounds=FEW_ROUNDS)
+                    rivals += _settled([fitting.fit(search, held.spectrum)])
+        best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
+    near = [
+        rival
+        for rival in rivals
+        if any(
+            cost(search, rival) - cost(search, best) < _AS_LIKELY
+            for cost in (fitting.cost, _cost_of_noise)
         )
-        near += [rival] * (min(above) < _AS_LIKELY)
-    if best is not model:
-        best = fitting.prune(search, best, thorough=True)
-    return best, near
+    ]
+    return (best if best is model else fitting.prune(search, best, thorough=True)), near
+
+
+def _is_clear(model: FittedModel) -> bool:
+    """Whether nothing could explain another gain than that of a model.
+
+    A plausible gain is clear that is well known beside narrow lines, white noise and turbulence
+    that is not overdamped.
+    """
+    background, turbulence = model.spectrum.background, model.spectrum.components[0]
+    narrow = all(c.is_narrow for c in model.spectrum.lines) and not background.colour
+    low, high = PLAUSIBLE_GAINS
+    plausible = low <= background.gain <= high and model.gain_error < GAIN_STEP
+    return narrow and plausible and turbulence.damping_ratio < OVERDAMPED
 
 
 def _settled(models: Sequence[FittedModel | None]) -> list[FittedModel]:

@@ -75,6 +75,11 @@ class FittedModel:
         """Covariance of the packed parameters, the inverse of the information, (p, p)."""
         return invert_information(self.information)
 
+    @property
+    def gain_error(self) -> float:
+        """Standard error of the logarithm of the sensor gain of the first axis."""
+        return float(np.sqrt(self.covariance[GAIN, GAIN]))
+
 
 def log_smearing(
     half_width: FloatArray | float, distance: FloatArray
