@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.scoring import EXACT, SEARCHED, Priors
 from lbt_synth.identification.fit.spectrum_model import (
     Component,
     Kind,
@@ -23,8 +22,11 @@ from lbt_synth.identification.fit.spectrum_model import (
     damping_parameter,
 )
 from lbt_synth.identification.fit.whittle import (
+    EXACT,
+    SEARCHED,
     SKIRT,
     FittedModel,
+    Priors,
     component_density,
     contrast,
     contrasts,
@@ -123,7 +125,7 @@ class Search:
         return self.component("drift", 2 * DRIFT_RATIO * corner_hz, DRIFT_RATIO, power)
 
     def priors(self, spectrum: SpectrumModel) -> Priors:
-        """Return the priors of a fit; lines of two axes stay in the band."""
+        """Return the priors of a fit, in which lines stay in the band."""
         prior = (float(np.log(TYPICAL_GAIN)), self.gain_error)
         gain = prior if self.finds_gain and len(spectrum.axes) == 1 else _FIXED
         corner = (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH)
@@ -140,7 +142,7 @@ class Search:
         priors = Priors(centre=centre, width=width)
         low, high = (np.full(centre.size, end) for end in priors.bounds)
         for i, c in enumerate(spectrum.components):
-            if c.kind == "line" and len(spectrum.axes) > 1:
+            if c.kind == "line":
                 low[spectrum.place(i)] = self.log_angle(_LOWEST * self.data.step_hz)
                 high[spectrum.place(i)] = _HIGHEST
         return replace(priors, bounds=(low, high))
@@ -162,11 +164,6 @@ class Search:
         """Return the frequency and the half width of a component [Hz], at least a bin wide."""
         centre = component.frequency / self.data.angle_s
         return centre, max(centre * component.damping_ratio, self.data.step_hz)
-
-    def covers(self, component: Component) -> bool:
-        """Whether a component lies between the first bin and the Nyquist frequency."""
-        lowest = self.log_angle(_LOWEST * self.data.step_hz)
-        return component.kind == "drift" or lowest < component.log_frequency < _HIGHEST
 
     def merge(self, spectrum: SpectrumModel) -> LoopPeriodogram:
         """Return means over groups of bins within which a model is nearly constant."""
@@ -194,9 +191,8 @@ def fit(
 ) -> FittedModel | None:
     """Fit all parameters; None if no fit settles.
 
-    Components of one axis that leave the band, from the first bin to the Nyquist frequency, are
-    dropped. A fit is given up where its log-likelihood does not reach that of ``better_than``
-    minus a margin.
+    A fit is given up where its log-likelihood does not reach that of ``better_than`` minus a
+    margin.
     """
     data, bound = search.merge(start), float("inf")
     if len(start.axes) == 1:  # a noise of nothing has no slope
@@ -208,11 +204,6 @@ def fit(
     model = minimise(data, start, search.priors(start), bound=bound, accuracy=accuracy)
     if model is None or model.contrast > bound:
         return None
-    if len(start.axes) > 1:
-        return model
-    inside = model.spectrum.keep(search.covers)
-    if len(inside.components) < len(start.components):
-        return fit(search, inside, better_than=better_than, margin=margin, accuracy=accuracy)
     return replace(model, contrast=contrast(search.data, model.spectrum))
 
 

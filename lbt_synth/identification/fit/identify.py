@@ -24,16 +24,14 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
     IdentifiedLine,
     IdentifiedModel,
+    describe_axis,
+    hold_gain,
 )
 from lbt_synth.identification.fit.order_search import find_components, find_models
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
     loop_periodogram,
-)
-from lbt_synth.identification.fit.physical_parameters import (
-    describe_axis,
-    hold_gain,
 )
 from lbt_synth.identification.fit.shared_lines import couple_axes
 from lbt_synth.identification.records.faults import MAD, RARE
@@ -299,12 +297,11 @@ def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[st
                 f"{axis.noise_correlation:.3f} +- {axis.noise_correlation_error:.3f}, which the "
                 "model and its errors hold. Designs take white noise of the same rms"
             )
-        if min(test.p_value, test.correlation_p_value) < RARE:
+        if test.p_value < RARE:
             yield (
-                f"warning: the innovations of axis {i} are not white (p = {test.p_value:.2g}, "
-                f"{test.correlation_p_value:.2g}): the model leaves something out, such as noise "
-                "that is not white. The standard errors do not cover that, and the sensor gain may "
-                "be wrong by many of them"
+                f"warning: the innovations of axis {i} are not white (p = {test.p_value:.2g}): "
+                "the model leaves something out, such as noise that is not white. The standard "
+                "errors do not cover that, and the sensor gain may be wrong by many of them"
             )
 
 
@@ -355,7 +352,6 @@ def _identify_spectra(
             corrected=zero,
             count=zero + (averages or 1.0),
             frame_rate_hz=rate,
-            resolution_hz=float(np.median(steps)),
         )
         search = Search(data=data, gain=1.0, **options)
         model = add_evidence(search, find_components(search))

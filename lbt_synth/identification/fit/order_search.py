@@ -25,14 +25,13 @@ from lbt_synth.identification.fit.fitting import (
     Search,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.scoring import SEARCHED
 from lbt_synth.identification.fit.spectrum_model import (
     Background,
     Component,
     SpectrumModel,
     damping_parameter,
 )
-from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
+from lbt_synth.identification.fit.whittle import SEARCHED, FittedModel, contrast, density, minimise
 from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
 from lbt_synth.models.vibration import MOST_SECTIONS
 from lbt_synth.validation import FloatArray

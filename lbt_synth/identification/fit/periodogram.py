@@ -46,7 +46,6 @@ class LoopPeriodogram:
     corrected: FloatArray  # (..., f): |C|^2 [nm^2/Hz]; zeros without corrections
     count: FloatArray  # (f,): independent periodograms that each value is the mean of
     frame_rate_hz: float
-    resolution_hz: float  # width of a frequency bin of the transform
     duration_s: float | None = None  # of the tapered segments; None for a density from elsewhere
     # (2, 2, f): the real part of (Y1, C1) times (Y2, C2)* of two axes [nm^2/Hz]
     between: FloatArray | None = None
@@ -183,7 +182,6 @@ def loop_periodogram(
         corrected=np.mean(np.abs(c) ** 2, axis=-2),
         count=np.full(frequency.size, independent),
         frame_rate_hz=frame_rate_hz,
-        resolution_hz=frame_rate_hz / length,
         duration_s=(length - 1) / frame_rate_hz,
         between=between,
     )

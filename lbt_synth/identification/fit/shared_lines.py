@@ -18,20 +18,21 @@ import numpy as np
 
 from lbt_synth.identification.fit import fitting
 from lbt_synth.identification.fit.fitting import Search
-from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
-from lbt_synth.identification.fit.physical_parameters import (
+from lbt_synth.identification.fit.identified_model import (
+    IdentifiedAxis,
+    IdentifiedLine,
     describe_axis,
     gain_covariance,
     standard_errors,
 )
-from lbt_synth.identification.fit.scoring import EXACT
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import (
     GAIN,
     Component,
     SpectrumModel,
 )
 from lbt_synth.identification.fit.whittle import (
+    EXACT,
     FittedModel,
     contrast,
     invert_information,

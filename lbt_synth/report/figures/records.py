@@ -189,7 +189,7 @@ def _residual_density(model: IdentifiedModel, loop: ClosedLoop, i: int) -> Float
 
 def _noise_density(axis: IdentifiedAxis) -> float:
     """Density of the noise, in units of the phase [nm^2/Hz]."""
-    return 2 / axis.frame_rate_hz * (axis.noise_nm / axis.sensor_gain) ** 2
+    return 2 / axis.data.frame_rate_hz * (axis.noise_nm / axis.sensor_gain) ** 2
 
 
 def _noise_text(axis: IdentifiedAxis) -> str:
