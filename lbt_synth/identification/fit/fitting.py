@@ -53,6 +53,7 @@ _WORTH = 1e-3  # of the innovations' variance, by which a line upon a bump must 
 _FAR = 2.0  # half widths of a section from the middle of a bump: what lies beyond is not upon it
 _SEED = 0.01  # of the lowest density: noise from which a fit begins at least
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
+_FASTEST_HZ = 10.0  # natural frequency of turbulence: above, it would be a resonance
 _LOWEST = 0.1  # bins: a component below is a slope without a frequency
 _SHIFTS = np.arange(-2, 2.01, 0.25)  # bins by which a narrow line is moved
 _POWERS = np.log([1.0, 4.0, 0.25])  # by which its power changes there
@@ -145,6 +146,8 @@ class Search:
             if c.kind == "line":
                 low[spectrum.place(i)] = self.log_angle(_LOWEST * self.data.step_hz)
                 high[spectrum.place(i)] = _HIGHEST
+            elif c.kind != "drift":
+                high[spectrum.place(i)] = self.log_angle(_FASTEST_HZ)
         return replace(priors, bounds=(low, high))
 
     def _frequency_prior(self, component: Component) -> tuple[float, float]:

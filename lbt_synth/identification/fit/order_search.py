@@ -148,25 +148,7 @@ def find_components(
         if better is None:
             break
         model = better
-    model = fitting.prune(search, fitting.simplify(search, model), thorough=start is None)
-    return _restore_turbulence(search, model)
-
-
-def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
-    """Make the strongest slow component the turbulence, where a resonance took its place."""
-    spectrum, lowest = model.spectrum, search.log_angle(search.lowest_line_hz)
-    first = spectrum.components[0]
-    slow = [i for i, c in enumerate(spectrum.components) if c.kind in ("slow", "drift")]
-    if first.log_frequency < lowest or not slow or first.damping_ratio > _WIDEST_LINE:
-        return model
-    i = max(slow, key=lambda k: spectrum.components[k].log_power)
-    damping = damping_parameter("line", first.damping_ratio)
-    exchanged = spectrum.exchange(i, replace(first, kind="line", damping=damping))
-    turbulence = replace(spectrum.components[i], kind="turbulence")
-    restored = fitting.fit(search, exchanged.exchange(0, turbulence))
-    if restored and fitting.cost(search, restored) < fitting.cost(search, model) + search.price:
-        return restored
-    return model
+    return fitting.prune(search, fitting.simplify(search, model), thorough=start is None)
 
 
 def _improve(search: Search, model: FittedModel, *, moves: bool) -> FittedModel | None:

@@ -46,7 +46,6 @@ from lbt_synth.identification.stretches import Stretches
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import FloatArray
 
-_HIGHEST_HZ = 10.0  # natural frequency of turbulence
 _MOST_SHARED = 0.9  # of the turbulence, where a fit begins
 
 Pair = tuple[Component | None, Component | None]  # what is one resonance, on either axis
@@ -188,8 +187,7 @@ def _share_turbulence(search: Search, apart: SpectrumModel) -> FittedModel | Non
         return None
     data = search.merge(model.spectrum)
     saved = contrast(data, apart) - contrast(data, model.spectrum)
-    is_slow = search.place(model.spectrum.components[1])[0] < _HIGHEST_HZ
-    return model if is_slow and saved > search.price else None
+    return model if saved > search.price else None
 
 
 def _find_pairs(
