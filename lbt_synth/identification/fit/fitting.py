@@ -16,6 +16,8 @@ import numpy as np
 
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.spectrum_model import (
+    BACKGROUND,
+    COLOUR,
     Component,
     Kind,
     SpectrumModel,
@@ -49,6 +51,7 @@ GAIN_STEP = 0.05  # of the logarithm of a gain: nearer ones are as good as the s
 TYPICAL_GAIN = 0.7  # of a sensor, before the data say more
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
 _COLOURED = 9.0  # the same of a colour of the noise, which a wrong gain can explain, too
+_MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _WORTH = 1e-3  # of the innovations' variance, by which a line upon a bump must lower it
 _FAR = 2.0  # half widths of a section from the middle of a bump: what lies beyond is not upon it
 _SEED = 0.01  # of the lowest density: noise from which a fit begins at least
@@ -126,7 +129,10 @@ class Search:
         return self.component("drift", 2 * DRIFT_RATIO * corner_hz, DRIFT_RATIO, power)
 
     def priors(self, spectrum: SpectrumModel) -> Priors:
-        """Return the priors of a fit, in which lines stay in the band."""
+        """Return the priors of a fit, in which lines stay in the band.
+
+        Sensors and filters make the noise of neighbouring frames alike, hardly ever opposite.
+        """
         prior = (float(np.log(TYPICAL_GAIN)), self.gain_error)
         gain = prior if self.finds_gain and len(spectrum.axes) == 1 else _FIXED
         corner = (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH)
@@ -142,6 +148,8 @@ class Search:
         centre, width = np.array(rows).T
         priors = Priors(centre=centre, width=width)
         low, high = (np.full(centre.size, end) for end in priors.bounds)
+        colours = BACKGROUND * np.arange(len(spectrum.axes)) + COLOUR
+        low[colours], high[colours] = 0.0, _MOST_COLOUR
         for i, c in enumerate(spectrum.components):
             if c.kind == "line":
                 low[spectrum.place(i)] = self.log_angle(_LOWEST * self.data.step_hz)

@@ -41,7 +41,6 @@ FEW_ROUNDS, _MOST_ROUNDS = 3, 12  # of a quick search, and of a whole one
 _HALF = float(np.log(0.5))
 _MOST_SLOW = 2  # parts of the turbulence beside the first
 _COLOUR = 0.3  # of the noise, where a fit begins
-_MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz] and damping: starts of a fit
 _CROSSINGS_HZ = np.geomspace(1.0, 100.0, 5)  # where a drift beside turbulence may meet the noise
 OVERDAMPED = 3.0  # damping ratio of turbulence that may stand for a drift
@@ -75,14 +74,15 @@ def find_models(
         rival = fitting.fit(search, spectrum.with_background(colour=other.background.colour))
     else:
         rival = find_components(search, other)
-    rivals = [model, *_settled([rival])]
+    rivals = [model] if rival is None else [model, rival]
     best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
     if search.finds_gain and start is None and not _is_clear(best):
         for gain in _OTHER_GAINS:
             if abs(np.log(gain) - best.spectrum.background.log_gain) >= GAIN_STEP:
                 with suppress(NumericalError):
                     held = find_components(replace(search, gain=gain), rounds=FEW_ROUNDS)
-                    rivals += _settled([fitting.fit(search, held.spectrum)])
+                    rival = fitting.fit(search, held.spectrum)
+                    rivals += [] if rival is None else [rival]
         best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
     near = [
         rival
@@ -106,18 +106,6 @@ def _is_clear(model: FittedModel) -> bool:
     low, high = PLAUSIBLE_GAINS
     plausible = low <= background.gain <= high and model.gain_error < GAIN_STEP
     return narrow and plausible and turbulence.damping_ratio < OVERDAMPED
-
-
-def _settled(models: Sequence[FittedModel | None]) -> list[FittedModel]:
-    """Return the fits that settled, of noise that is no drift and has no opposite neighbours.
-
-    Sensors and filters make neighbouring frames alike, hardly ever opposite.
-    """
-    return [
-        model
-        for model in models
-        if model is not None and 0 <= model.spectrum.background.colour < _MOST_COLOUR
-    ]
 
 
 def _cost_of_noise(search: Search, model: FittedModel) -> float:
@@ -157,10 +145,8 @@ def _improve(search: Search, model: FittedModel, *, moves: bool) -> FittedModel 
     for trial, saved in _trials(search, model.spectrum, moves):
         margin = max(0.0, price - fitting.total_price(search, trial))
         better = fitting.fit(search, trial, better_than=model, margin=margin)
-        if better is None or abs(better.spectrum.background.colour) > _MOST_COLOUR:
-            continue
-        better = fitting.prune(search, better)
-        if fitting.cost(search, better) < least - saved:
+        better = None if better is None else fitting.prune(search, better)
+        if better is not None and fitting.cost(search, better) < least - saved:
             return better
     return None
 

@@ -92,7 +92,7 @@ class FittedModel:
     @property
     def gain_error(self) -> float:
         """Standard error of the logarithm of the sensor gain of the first axis."""
-        return float(np.sqrt(self.covariance[GAIN, GAIN]))
+        return float(np.sqrt(max(self.covariance[GAIN, GAIN], 0.0)))
 
 
 def log_smearing(
