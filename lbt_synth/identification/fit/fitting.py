@@ -25,6 +25,7 @@ from lbt_synth.identification.fit.spectrum_model import (
 )
 from lbt_synth.identification.fit.whittle import (
     EXACT,
+    HOPE,
     SEARCHED,
     SKIRT,
     FittedModel,
@@ -62,10 +63,10 @@ _SHIFTS = np.arange(-2, 2.01, 0.25)  # bins by which a narrow line is moved
 _POWERS = np.log([1.0, 4.0, 0.25])  # by which its power changes there
 
 # Priors: mean and standard deviation of logarithms and odds. What the data leave open stays where
-# it makes sense: corners within a factor of e^2, parts of the turbulence within e^1.5 of 1 Hz.
+# it makes sense: corners and frequencies of the turbulence within a factor of e^2.
 _FIXED, _NONE = (0.0, 0.0), (0.0, np.inf)
 STARTING_CORNER_HZ = 50.0
-_CORNER_WIDTH, _DRIFT_WIDTH, _SLOW_WIDTH, _COLOUR_WIDTH = 2.0, 2.0, 1.5, 1.0
+_WIDTH = 2.0
 _DAMPING: dict[Kind, tuple[float, float]] = {
     "turbulence": (float(np.log(0.45)), 4.0),
     "slow": (float(np.log(0.45)), 1.0),
@@ -135,10 +136,10 @@ class Search:
         """
         prior = (float(np.log(TYPICAL_GAIN)), self.gain_error)
         gain = prior if self.finds_gain and len(spectrum.axes) == 1 else _FIXED
-        corner = (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH)
+        corner = (self.log_angle(STARTING_CORNER_HZ), _WIDTH)
         rows = list[tuple[float, float]]()
         for axis in spectrum.axes:
-            colour = (0.0, _COLOUR_WIDTH) if axis.colour else _FIXED
+            colour = (0.0, _WIDTH) if axis.colour else _FIXED
             rows += [gain, _NONE, colour, corner if axis.rolls_off else _FIXED]
         for c in spectrum.components:
             ratio = _NONE if c.axis is None and c.kind == "line" else _FIXED
@@ -160,10 +161,10 @@ class Search:
 
     def _frequency_prior(self, component: Component) -> tuple[float, float]:
         if component.kind == "drift":
-            return self.log_angle(2 * DRIFT_RATIO * DRIFT_HZ), _DRIFT_WIDTH
+            return self.log_angle(2 * DRIFT_RATIO * DRIFT_HZ), _WIDTH
         if component.kind == "line":
             return component.announced or _NONE
-        return self.log_angle(1.0), _SLOW_WIDTH
+        return self.log_angle(1.0), _WIDTH
 
     def _damping_prior(self, component: Component) -> tuple[float, float]:
         """Return the prior, narrower where the taper of a density is not known."""
@@ -284,7 +285,7 @@ def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> Fitt
         less = _drop(data, spectrum, i, neighbour)
         if less is not None:
             required = required_evidence(search, spectrum, i)
-            spare = contrast(data, less) - whole - 4 * required
+            spare = contrast(data, less) - whole - HOPE * required
             patient = thorough and (neighbour is not None or not component.is_narrow)
             if patient or spare <= 0:
                 trials.append((spare, required, less, None if patient else model))

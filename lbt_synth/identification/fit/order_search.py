@@ -36,14 +36,14 @@ from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
 from lbt_synth.models.vibration import MOST_SECTIONS
 from lbt_synth.validation import FloatArray
 
-_LITTLE, _CLEARLY = 0.1, 1.0  # log-likelihood that a component or a move must save at least
+_CLEARLY = 1.0  # log-likelihood that a trial must save at least
 FEW_ROUNDS, _MOST_ROUNDS = 3, 12  # of a quick search, and of a whole one
 _HALF = float(np.log(0.5))
 _MOST_SLOW = 2  # parts of the turbulence beside the first
 _COLOUR = 0.3  # of the noise, where a fit begins
 _TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz] and damping: starts of a fit
 _CROSSINGS_HZ = np.geomspace(1.0, 100.0, 5)  # where a drift beside turbulence may meet the noise
-OVERDAMPED = 3.0  # damping ratio of turbulence that may stand for a drift
+_OVERDAMPED = 3.0  # damping ratio of turbulence that may stand for a drift
 _SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
 _WIDEST_LINE = 0.98  # damping ratio
 _BANDS = 80  # of the background
@@ -105,7 +105,7 @@ def _is_clear(model: FittedModel) -> bool:
     narrow = all(c.is_narrow for c in model.spectrum.lines) and not background.colour
     low, high = PLAUSIBLE_GAINS
     plausible = low <= background.gain <= high and model.gain_error < GAIN_STEP
-    return narrow and plausible and turbulence.damping_ratio < OVERDAMPED
+    return narrow and plausible and turbulence.damping_ratio < _OVERDAMPED
 
 
 def _cost_of_noise(search: Search, model: FittedModel) -> float:
@@ -142,35 +142,33 @@ def find_components(
 def _improve(search: Search, model: FittedModel, *, moves: bool) -> FittedModel | None:
     """Return the first trial that is clearly better; None if none is."""
     least, price = fitting.cost(search, model), fitting.total_price(search, model.spectrum)
-    for trial, saved in _trials(search, model.spectrum, moves):
+    for trial in _trials(search, model.spectrum, moves):
         margin = max(0.0, price - fitting.total_price(search, trial))
         better = fitting.fit(search, trial, better_than=model, margin=margin)
         better = None if better is None else fitting.prune(search, better)
-        if better is not None and fitting.cost(search, better) < least - saved:
+        if better is not None and fitting.cost(search, better) < least - _CLEARLY:
             return better
     return None
 
 
-def _trials(
-    search: Search, spectrum: SpectrumModel, moves: bool
-) -> Iterator[tuple[SpectrumModel, float]]:
-    """Yield models with other turbulence, new lines or other places, and what they must save."""
+def _trials(search: Search, spectrum: SpectrumModel, moves: bool) -> Iterator[SpectrumModel]:
+    """Yield models with other turbulence, new lines or lines in other places."""
     excesses = find_excesses(search, spectrum)
     excesses = [excess for excess in excesses if excess[0] > 0.25 * excesses[0][0]]
     while excesses:
-        yield _add_centred(search, spectrum, excesses), _LITTLE
+        yield _add_centred(search, spectrum, excesses)
         excesses = excesses[: len(excesses) // 2]
     if all(c.kind != "drift" for c in spectrum.components):
-        yield _add_drift(search, spectrum), _LITTLE
-    yield from ((trial, _LITTLE) for trial in _bumps(search, spectrum))
+        yield _add_drift(search, spectrum)
+    yield from _bumps(search, spectrum)
     for i, component in enumerate(spectrum.components):
         if moves and component.kind == "line":
-            yield from ((trial, _CLEARLY) for trial in _line_moves(search, spectrum, i))
+            yield from _line_moves(search, spectrum, i)
     if any(c.kind == "slow" for c in spectrum.components):
         lines = [c for c in spectrum.components if c.kind == "line"]
         ground = fit_background(search, spectrum.background.gain, lines)
         if ground is not None:
-            yield ground.spectrum.add(*lines), _LITTLE
+            yield ground.spectrum.add(*lines)
 
 
 def _begin(search: Search) -> FittedModel | None:
@@ -206,7 +204,7 @@ def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
     drifts = [
         search.drift(search.place(c)[0] / (2 * c.damping_ratio), float(np.exp(c.log_power)))
         for c in slow
-        if c.damping_ratio > OVERDAMPED
+        if c.damping_ratio > _OVERDAMPED
     ]
     noise = 2 / search.data.frame_rate_hz * float(np.exp(background.log_noise))
     # the density of a drift of variance P above its corner is 2 P corner / (pi f^2)

@@ -2,9 +2,9 @@
 
 Each axis has been identified alone. A resonance that shakes along a diagonal is then a line on
 either axis, or on the one that shows it. Pairs of resonances at the same frequency, and those of
-one axis that the other may show weakly, are fitted again as one along a direction. What costs more
-so than apart stays apart; so does a line that moves on an ellipse, which no direction describes.
-The sensor gains are held: each axis has found its own before.
+one axis that the other may show weakly, are fitted again as one along a direction, the clearest
+first. What costs more so than apart stays apart; so does a line that moves on an ellipse, which no
+direction describes. The sensor gains are held: each axis has found its own before.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from lbt_synth.identification.fit.spectrum_model import (
 )
 from lbt_synth.identification.fit.whittle import (
     EXACT,
+    HOPE,
     FittedModel,
     contrast,
     invert_information,
@@ -46,6 +47,7 @@ from lbt_synth.identification.stretches import Stretches
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import FloatArray
 
+_AIR = 1  # place of turbulence that the axes share, after that of the first
 _MOST_SHARED = 0.9  # of the turbulence, where a fit begins
 
 Pair = tuple[Component | None, Component | None]  # what is one resonance, on either axis
@@ -100,39 +102,32 @@ def find_shared(search: Search, models: Sequence[FittedModel]) -> FittedModel | 
     ]
     backgrounds = tuple(model.spectrum.background for model in models)
     apart = SpectrumModel(backgrounds, tuple(chain(*rows)))
-    model, shared = _share_turbulence(search, apart), list[Pair]()
-    spectrum, pairs = apart if model is None else model.spectrum, _find_pairs(search, models, rows)
-    while True:  # a line may come to light once a neighbour has its direction
-        trial, trials = spectrum, list(shared)
+    pairs = _find_pairs(search, models, rows)
+    air = _share_turbulence(search, apart)
+    if air is not None:
+        model = _share_lines(search, air.spectrum, pairs) or air
+        rest = contrast(search.data, model.spectrum.exchange(_AIR))
+        if rest - model.contrast > search.price:  # not what lines have in common
+            return model
+    return _share_lines(search, apart, pairs)
+
+
+def _share_lines(
+    search: Search, spectrum: SpectrumModel, pairs: Sequence[Pair]
+) -> FittedModel | None:
+    """Return the fit with all lines that the axes share, None without any."""
+    model, least, before = None, contrast(search.data, spectrum), 0
+    while len(pairs) != before:  # a line may come to light once a neighbour has its direction
+        before = len(pairs)
         for pair in pairs:
-            line = None if pair in shared else _share(search, trial, pair)
-            if line is not None:
-                trials.append(pair)
-                trial = _replace(trial, pair, line)
-        if len(trials) == len(shared):
-            return model
-        better, kept = _keep_asked(search, trial, trials)
-        if better is None or len(kept) <= len(shared):
-            return model
-        model, spectrum, shared = better, better.spectrum, kept
-
-
-def _keep_asked(
-    search: Search, spectrum: SpectrumModel, pairs: list[Pair]
-) -> tuple[FittedModel | None, list[Pair]]:
-    """Fit a model, and take apart what costs more together; None if no fit settles."""
-    while pairs:
-        model = fitting.fit(search, spectrum, accuracy=EXACT)
-        if model is None:
-            return None, []
-        first = len(model.spectrum.components) - len(pairs)
-        spare = [_spare(search, model, first + k, pair) for k, pair in enumerate(pairs)]
-        worst = int(np.argmin(spare))
-        if spare[worst] > 0:
-            return model, pairs
-        spectrum = _release(model.spectrum, first + worst, pairs[worst])
-        pairs = pairs[:worst] + pairs[worst + 1 :]
-    return fitting.fit(search, spectrum, accuracy=EXACT), []
+            line = _share(search, spectrum, pair)
+            trial = line and fitting.fit(search, _replace(spectrum, pair, line), accuracy=EXACT)
+            # one parameter more than a resonance has, in the place of one or two
+            saved = search.price * (1 - pair.count(None)) - search.parameter_price
+            if trial and trial.contrast < least + saved:
+                model, spectrum, least = trial, trial.spectrum, trial.contrast
+                pairs = [other for other in pairs if other is not pair]
+    return model
 
 
 def _replace(spectrum: SpectrumModel, pair: Pair, shared: Component) -> SpectrumModel:
@@ -251,33 +246,7 @@ def _share(search: Search, spectrum: SpectrumModel, pair: Pair) -> Component | N
         announced=next((c.announced for c in members if c.announced), None),
     )
     lost = contrast(data, _replace(spectrum, pair, shared)) - contrast(data, spectrum)
-    return shared if lost < evidence else None
-
-
-def _saved(search: Search, pair: Pair) -> float:
-    """Return the price that is saved where a pair is one resonance, of one parameter more."""
-    return search.price * (sum(c is not None for c in pair) - 1) - search.parameter_price
-
-
-def _release(spectrum: SpectrumModel, place: int, pair: Pair) -> SpectrumModel:
-    """Return the model with a pair, as the first components, in the place of a shared resonance."""
-    rest = spectrum.exchange(place).components
-    apart = tuple(c for c in pair if c is not None)
-    return replace(spectrum, components=(*rest[:1], *apart, *rest[1:]))
-
-
-def _spare(search: Search, model: FittedModel, place: int, pair: Pair) -> float:
-    """Return by how much a model costs more with a pair apart.
-
-    A resonance that one axis alone showed stays as it is on that axis.
-    """
-    if None in pair:
-        axis = 0 if pair[1] is None else 1
-        alone = replace(model.spectrum.components[place].on(axis), axis=axis)
-        pair = (alone, None) if axis == 0 else (None, alone)
-    apart, data = _release(model.spectrum, place, pair), search.merge(model.spectrum)
-    lost = contrast(data, apart) - contrast(data, model.spectrum)
-    return lost + _saved(search, pair)
+    return shared if lost < HOPE * evidence else None
 
 
 def _axis_map(spectrum: SpectrumModel, i: int) -> FloatArray:

@@ -72,7 +72,7 @@ MOST_STEPS = 40
 _ACCEPTED, _POOR, _GOOD = 0.15, 0.25, 0.75  # of what a step should gain
 _ALONG = 1e-4  # cosine below which a secant says nothing
 _WITHIN = 0.99  # of the radius: a longer step ends at it
-_HOPE = 4.0  # times what a full step gains, a fit may still gain
+HOPE = 4.0  # times what is seen before a fit, it may still gain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -399,7 +399,7 @@ def scoring_minimum(
         if gain < accuracy:
             break
         size = float(np.linalg.norm(step))
-        if value - _HOPE * gain > bound and size < _WITHIN * radius:
+        if value - HOPE * gain > bound and size < _WITHIN * radius:
             return None  # a whole step, which can be trusted
         trial = np.clip(x + step, low, high)
         made = evaluate(trial)
