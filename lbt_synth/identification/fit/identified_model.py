@@ -160,8 +160,8 @@ class IdentifiedAxis(Summarised):
         its standard error [nm].
     noise_correlation, noise_correlation_error : float
         Correlation of the noise of neighbouring frames, of a first-order process, and its standard
-        error, or by how much it differs in models that are as likely. The first is 0 where the data
-        do not ask for it. A plant takes white noise of the same rms.
+        error. The first is 0 where the data do not ask for it; the second then says what they would
+        have shown. A plant takes white noise of the same rms.
     sensor_gain : float
         Sensor gain: found or given.
     sensor_gain_error : float or None
@@ -329,6 +329,16 @@ def hold_gain(search: Search, model: FittedModel, error: float) -> FittedModel:
     return replace(model, information=invert_information(covariance))
 
 
+def _colour_error(search: Search, spectrum: SpectrumModel) -> float:
+    """Return the standard error that the colour of white noise would have if it were fitted."""
+    information = derivatives(search.merge(spectrum), spectrum)[2]
+    priors = search.priors(spectrum.with_background(colour=1.0))
+    fixed = np.setdiff1d(np.arange(priors.width.size), priors.free)
+    information[fixed] = information[:, fixed] = 0
+    information[priors.free, priors.free] += 1 / priors.width[priors.free] ** 2
+    return standard_errors(spectrum, invert_information(information)).background.colour
+
+
 def describe_axis(
     search: Search,
     model: FittedModel,
@@ -364,6 +374,7 @@ def describe_axis(
     innovation = float(np.exp(0.5 * np.mean(np.log(fitted * rate / 2))))
     noise = max(float(np.exp(background.log_noise / 2)), _LEAST_NOISE * innovation)
     correlation = float(np.tanh(background.colour))
+    colour = errors.background.colour if background.colour else _colour_error(search, spectrum)
     parts = [resonance for resonance in resonances if resonance.rms_nm * gain > _LEAST_PART * noise]
     corner = float(np.exp(background.log_corner)) / data.angle_s
     corners = (
@@ -385,7 +396,7 @@ def describe_axis(
         noise_nm=noise,
         noise_error_nm=min(noise * errors.background.log_noise / 2, innovation),
         noise_correlation=correlation,
-        noise_correlation_error=max(colour_error, (1 - correlation**2) * errors.background.colour),
+        noise_correlation_error=max(colour_error, (1 - correlation**2) * colour),
         sensor_gain=gain,
         sensor_gain_error=None if gain_error is None else gain * gain_error,
         sensor_gain_note=note,

@@ -43,6 +43,7 @@ from lbt_synth.validation import FloatArray, each_of, real_array, require_instan
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
+_UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be coloured
 OPEN_GAIN = 0.3  # relative error of a gain that a record leaves open
 _POOR_GAIN = 0.1  # relative error from which a note says so, and no later fit begins there
 _JUMP = 8.0  # standard deviations of the change of a correction: no loop makes it
@@ -296,6 +297,12 @@ def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[st
                 f"the noise of axis {i} is not white: neighbouring frames have a correlation of "
                 f"{axis.noise_correlation:.3f} +- {axis.noise_correlation_error:.3f}, which the "
                 "model and its errors hold. Designs take white noise of the same rms"
+            )
+        elif error is not None and axis.noise_correlation_error > _UNSEEN_COLOUR:
+            yield (
+                f"warning: the record does not show whether the noise of axis {i} is white (its "
+                f"correlation is 0 +- {axis.noise_correlation_error:.2g}): noise, sensor gain and "
+                "their errors hold if it is"
             )
         if test.p_value < RARE:
             yield (

@@ -108,6 +108,13 @@ def test_an_ambiguous_gain_has_that_error_and_moves_the_rest() -> None:
     assert wider.components[1].log_power > errors.components[1].log_power
 
 
+def test_white_noise_says_how_well_its_colour_shows() -> None:
+    frames = 8192
+    axis = identify_series(np.random.default_rng(1).standard_normal(frames), frame_rate_hz=RATE)
+    assert axis.noise_correlation == 0
+    assert axis.noise_correlation_error == pytest.approx(1 / np.sqrt(frames), rel=0.25)
+
+
 def disturbance(wind: float, pole: float, rms_nm: float) -> lbt.models.SumSpectrum:
     """Return frozen flow with a drift of first order on top."""
     air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=wind, diameter_m=8.22)
