@@ -260,17 +260,6 @@ def cost(search: Search, model: FittedModel) -> float:
     return model.contrast + total_price(search, model.spectrum) + 0.5 * away**2
 
 
-def simplify(search: Search, model: FittedModel) -> FittedModel:
-    """Return the model without roll-off or colour, where that adds too little."""
-    plainer = []
-    if model.spectrum.background.rolls_off:
-        plainer.append(model.spectrum.without_roll_off())
-    if model.spectrum.background.colour:
-        plainer.append(model.spectrum.with_background(colour=0.0))
-    fits = (fit(search, spectrum) for spectrum in plainer)
-    return likeliest(search, [model, *fits]) or model
-
-
 def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> FittedModel:
     """Drop the components that add less than they must, the least first.
 
@@ -349,7 +338,8 @@ def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumMode
     centre, half = search.place(line)
     if half > 2 * step or centre <= 3 * step:
         return spectrum
-    data = search.data.window(centre - SKIRT * step, centre + SKIRT * step)
+    ends = centre - SKIRT * step, centre + SKIRT * step
+    data = search.data.take(slice(*np.searchsorted(search.data.frequency_hz, ends)))
     rest = density(data, spectrum.exchange(i))
     for shifts in (_SHIFTS, _SHIFTS / 8):  # the place of a sinusoid is known to a part of a bin
         moves = product(np.log1p(shifts * step / centre), _POWERS)

@@ -136,7 +136,7 @@ def find_components(
         if better is None:
             break
         model = better
-    return fitting.prune(search, fitting.simplify(search, model), thorough=start is None)
+    return fitting.prune(search, model, thorough=start is None)
 
 
 def _improve(search: Search, model: FittedModel, *, moves: bool) -> FittedModel | None:
@@ -152,7 +152,7 @@ def _improve(search: Search, model: FittedModel, *, moves: bool) -> FittedModel 
 
 
 def _trials(search: Search, spectrum: SpectrumModel, moves: bool) -> Iterator[SpectrumModel]:
-    """Yield models with other turbulence, new lines or lines in other places."""
+    """Yield models with new lines, other turbulence, lines in other places, or less."""
     excesses = find_excesses(search, spectrum)
     excesses = [excess for excess in excesses if excess[0] > 0.25 * excesses[0][0]]
     while excesses:
@@ -169,6 +169,10 @@ def _trials(search: Search, spectrum: SpectrumModel, moves: bool) -> Iterator[Sp
         ground = fit_background(search, spectrum.background.gain, lines)
         if ground is not None:
             yield ground.spectrum.add(*lines)
+    if spectrum.background.rolls_off:
+        yield spectrum.without_roll_off()
+    if spectrum.background.colour:
+        yield spectrum.with_background(colour=0.0)
 
 
 def _begin(search: Search) -> FittedModel | None:

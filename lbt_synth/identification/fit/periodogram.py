@@ -102,10 +102,6 @@ class LoopPeriodogram:
         means = self._map(lambda values: np.add.reduceat(values, starts, axis=-1) / size)
         return replace(means, count=np.add.reduceat(self.count, starts))
 
-    def window(self, low_hz: float, high_hz: float) -> LoopPeriodogram:
-        """Return the values between two frequencies."""
-        return self.take(slice(*np.searchsorted(self.frequency_hz, [low_hz, high_hz])))
-
     def take(self, inside: BoolArray | slice) -> LoopPeriodogram:
         """Return the values at some frequencies."""
         return replace(self._map(lambda values: values[..., inside]), count=self.count[inside])

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain, count
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -47,7 +47,6 @@ from lbt_synth.identification.stretches import Stretches
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import FloatArray
 
-_AIR = 1  # place of turbulence that the axes share, after that of the first
 _MOST_SHARED = 0.9  # of the turbulence, where a fit begins
 
 Pair = tuple[Component | None, Component | None]  # what is one resonance, on either axis
@@ -95,18 +94,16 @@ def find_shared(search: Search, models: Sequence[FittedModel]) -> FittedModel | 
 
     Turbulence comes first: that of both axes may look like weak parts of lines.
     """
-    named = zip(models, (count(1), count(1000)), strict=True)
-    rows = [
-        [replace(c, axis=i, name=next(names)) for c in model.spectrum.components]
-        for i, (model, names) in enumerate(named)
+    parts = [
+        replace(c, axis=i) for i, model in enumerate(models) for c in model.spectrum.components
     ]
-    backgrounds = tuple(model.spectrum.background for model in models)
-    apart = SpectrumModel(backgrounds, tuple(chain(*rows)))
-    pairs = _find_pairs(search, models, rows)
+    named = tuple(replace(c, name=name) for name, c in enumerate(parts, start=1))
+    apart = SpectrumModel(tuple(model.spectrum.background for model in models), named)
+    pairs = _find_pairs(search, models, named)
     air = _share_turbulence(search, apart)
     if air is not None:
         model = _share_lines(search, air.spectrum, pairs) or air
-        rest = contrast(search.data, model.spectrum.exchange(_AIR))
+        rest = contrast(search.data, model.spectrum.exchange(1))
         if rest - model.contrast > search.price:  # not what lines have in common
             return model
     return _share_lines(search, apart, pairs)
@@ -186,37 +183,36 @@ def _share_turbulence(search: Search, apart: SpectrumModel) -> FittedModel | Non
 
 
 def _find_pairs(
-    search: Search, models: Sequence[FittedModel], named: Sequence[Sequence[Component]]
+    search: Search, models: Sequence[FittedModel], components: Sequence[Component]
 ) -> list[Pair]:
     """Return each resonance, the clearest first, and that of the other axis which may be the same.
 
     Its frequency agrees within errors, or the two overlap.
     """
-    rows: list[tuple[float, int, Component, float]] = []
-    for axis, model in enumerate(models):
-        errors = standard_errors(model.spectrum, model.covariance).components
-        triples = zip(named[axis], model.evidence, errors, strict=True)
-        rows += [
-            (-evidence, axis, c, error.log_frequency)
-            for c, evidence, error in triples
-            if c.kind == "line"
-        ]
-    rows.sort(key=lambda row: row[0])
+    evidence = chain(*(model.evidence for model in models))
+    errors = chain(
+        *(standard_errors(model.spectrum, model.covariance).components for model in models)
+    )
+    rows = [
+        (worth, c, error.log_frequency)
+        for worth, c, error in zip(evidence, components, errors, strict=True)
+        if c.kind == "line"
+    ]
+    rows.sort(key=lambda row: -row[0])
     pairs: list[Pair] = []
     while rows:
-        _, axis, strong, error = rows.pop(0)
+        _, strong, error = rows.pop(0)
         centre, half = search.place(strong)
         near = {}
-        for row in rows:
-            its_centre, its_half = search.place(row[2])
-            reach = max(
-                SURPRISING * centre * float(np.hypot(error, row[3])), 0.5 * (half + its_half)
-            )
-            if row[1] != axis and abs(its_centre - centre) <= reach:
-                near[row[2]] = abs(its_centre - centre)
+        for _, other, its_error in rows:
+            its_centre, its_half = search.place(other)
+            uncertain = SURPRISING * centre * float(np.hypot(error, its_error))
+            apart = abs(its_centre - centre)
+            if other.axis != strong.axis and apart <= max(uncertain, 0.5 * (half + its_half)):
+                near[other] = apart
         partner = min(near, key=near.__getitem__, default=None)
-        rows = [row for row in rows if row[2] is not partner]
-        pairs.append((strong, partner) if axis == 0 else (partner, strong))
+        rows = [row for row in rows if row[1] is not partner]
+        pairs.append((strong, partner) if strong.axis == 0 else (partner, strong))
     return pairs
 
 

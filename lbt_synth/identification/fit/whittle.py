@@ -96,15 +96,14 @@ class FittedModel:
 
 
 def log_smearing(
-    half_width: FloatArray | float, distance: FloatArray
+    half_width: float, distance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the logarithm of the ratio of smeared lines to the lines themselves, (f,).
+    """Return the logarithm of the ratio of a smeared line to the line itself, (f,).
 
-    The half width is one for all, or (f,) as the distance. The derivatives by the logarithm of the
-    width and by the distance follow.
+    The derivatives by the logarithm of the half width and by the distance follow.
     """
     e, b = TAPER / 2, 2 * np.pi / TAPER
-    p = 2 * np.pi * (np.maximum(half_width, _NARROWEST) + 1j * distance)
+    p = 2 * np.pi * (max(half_width, _NARROWEST) + 1j * distance)
     r, s, edge, end = 1 / p, 1 / (p**2 + b**2), np.exp(-e * p), np.exp((2 * e - 1) * p)
     lobes, weight = end * (1 + edge) ** 2 - 2 * edge, (b**2 * r * s) ** 2
     transform = (4 - 6 * e - 2 * r) * r + (e * p + 2 + 2 * b**2 * s) * s + weight * lobes
@@ -150,27 +149,18 @@ def _smear(
     """
     if data.duration_s is None:
         return
-    narrow = []
+    periods = data.frequency_hz * data.duration_s
     for i, c in enumerate(components):
         place = c.frequency / data.angle_s * data.duration_s
-        if c.kind == "line" and c.sections == 1 and c.damping_ratio * place <= WIDE:
-            narrow.append((i, place, c.damping_ratio * place))
-    if not narrow:
-        return
-    centres, half_widths = np.array(narrow).T[1:]
-    at = data.frequency_hz * data.duration_s
-    starts, stops = np.searchsorted(at, [centres - SKIRT, centres + SKIRT])
-    inside = np.concatenate([at[a:b] for a, b in zip(starts, stops, strict=True)])
-    centre, half_width = np.repeat([centres, half_widths], stops - starts, axis=1)
-    more, by_width, by_distance = log_smearing(half_width, inside - centre)
-    factor, by_frequency = np.exp(more), by_width - by_distance * centre
-    end = 0
-    for (i, *_), start, stop in zip(narrow, starts, stops, strict=True):
-        inner = slice(end, end := end + stop - start)
-        density[i, start:stop] *= factor[inner]
+        half_width = c.damping_ratio * place
+        if c.kind != "line" or c.sections > 1 or half_width > WIDE:
+            continue
+        near = slice(*np.searchsorted(periods, [place - SKIRT, place + SKIRT]))
+        more, by_width, by_distance = log_smearing(half_width, periods[near] - place)
+        density[i, near] *= np.exp(more)
         if slopes is not None:
-            slopes[i, 0, start:stop] += by_frequency[inner]
-            slopes[i, 1, start:stop] += by_width[inner]
+            slopes[i, 0, near] += by_width - by_distance * place
+            slopes[i, 1, near] += by_width
 
 
 def _log_fall(
