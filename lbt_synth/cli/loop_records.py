@@ -391,17 +391,17 @@ def marked_note(note: str) -> str:
 def _whiteness_note(axis: IdentifiedAxis) -> str:
     test = axis.whiteness
     if test.white:
-        return f"innovations are white (p = {test.p_value:.2g}, {test.correlation_p_value:.2g})."
+        return f"innovations are white (p = {test.p_value:.2g})."
     return (
         f"innovations are not white: their cumulative power is off by up to "
-        f"{100 * test.deviation:.2g} % (p = {test.p_value:.1g}, of the autocorrelation "
-        f"{test.correlation_p_value:.1g}). The model leaves something out; see the figure."
+        f"{100 * test.deviation:.2g} % (p = {test.p_value:.1g}). The model leaves something out; "
+        "see the figure."
     )
 
 
 def _axis_record(axis: IdentifiedAxis) -> dict[str, Any]:
     turbulence, whiteness = axis.turbulence, axis.whiteness
-    tests = ("deviation", "p_value", "correlation_p_value", "white")
+    tests = ("deviation", "p_value", "white")
     noise = ("noise_nm", "noise_error_nm", "noise_correlation", "noise_correlation_error")
     own = (*noise, "sensor_gain", "sensor_gain_error", "sensor_gain_note")
     return {

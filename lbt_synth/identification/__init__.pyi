@@ -2,8 +2,8 @@ from .accelerometers.transfers import accelerometer_transfers as accelerometer_t
 from .auto import design_from_record as design_from_record
 from .commands.control_law import fit_control_law as fit_control_law
 from .commands.repair import CommandRepair as CommandRepair
-from .diagnosis.diagnosis import Diagnosis as Diagnosis
-from .diagnosis.diagnosis import diagnose as diagnose
+from .diagnosis import Diagnosis as Diagnosis
+from .diagnosis import diagnose as diagnose
 from .fit.identified_model import IdentifiedAxis as IdentifiedAxis
 from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel

@@ -354,7 +354,7 @@ def note_drift(
 def _note_short(seconds: float, model: IdentifiedModel) -> Iterator[str]:
     """Yield what a short record leaves open."""
     if seconds < _SHORT_SECONDS:
-        resolution_hz = max(axis.resolution_hz for axis in model.axes)
+        resolution_hz = max(axis.data.step_hz for axis in model.axes)
         yield (
             f"the record is short ({seconds:.3g} s): it does not tell lines less than "
             f"{resolution_hz:.2g} Hz apart from one. Half a minute shows more"

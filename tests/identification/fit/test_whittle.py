@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import trapezoid
+from scipy.integrate import simpson
 from scipy.optimize import approx_fprime
 from scipy.signal import fftconvolve
 from support.recorded_loops import RATE, integrator_loop, open_record
@@ -25,13 +25,15 @@ from lbt_synth.identification.fit.spectrum_model import (
     SpectrumModel,
 )
 from lbt_synth.identification.fit.whittle import (
+    SKIRT,
     WIDE,
+    Priors,
     contrast,
     density,
     derivatives,
     log_smearing,
     observe_information,
-    smearing_reach,
+    scoring_minimum,
     spectral_matrix,
 )
 
@@ -53,13 +55,13 @@ def correlations() -> tuple[np.ndarray, np.ndarray]:
 def test_smearing_is_the_integral_that_defines_it(width: float, distance: float) -> None:
     t, r = correlations()
     kernel = r * np.exp(-2 * np.pi * width * t) * np.cos(2 * np.pi * distance * t)
-    smeared = 2 * trapezoid(kernel, t)
+    smeared = 2 * simpson(kernel, x=t)
     line = width / np.pi / (width**2 + distance**2)
-    found = log_smearing(width, np.array([distance]))[0][0]
-    assert found == pytest.approx(np.log(smeared / line), abs=5e-3)
+    log_ratio = log_smearing(width, np.array([distance]))[0][0]
+    assert log_ratio == pytest.approx(np.log(smeared / line), abs=1e-4)
 
 
-@given(width=st.floats(1e-8, 25), distance=st.floats(0.02, 390))
+@given(width=st.floats(1e-3, 25), distance=st.floats(0.02, SKIRT))
 @settings(max_examples=10, deadline=None)
 def test_derivatives_of_the_smearing(width: float, distance: float) -> None:
     d = np.array([-distance, distance])
@@ -70,8 +72,7 @@ def test_derivatives_of_the_smearing(width: float, distance: float) -> None:
     )
     assert by_width == pytest.approx(numeric, abs=1e-4)
     numeric = (log_smearing(width, d + h)[0] - log_smearing(width, d - h)[0]) / (2 * h)
-    # the cubics of neighbours meet with the same slope, but not with the same bend
-    assert by_distance == pytest.approx(numeric, rel=1e-3, abs=2e-2)
+    assert by_distance == pytest.approx(numeric, rel=1e-4, abs=1e-4)
     assert by_distance[0] == pytest.approx(-by_distance[1])
 
 
@@ -96,25 +97,9 @@ def test_periodogram_of_a_sinusoid_is_the_taper(frequency: float) -> None:
         assert np.mean(data.power(1.0)[inside]) == pytest.approx(np.mean(model), rel=0.06)
 
 
-@pytest.mark.parametrize("width", [1e-3, 0.02, 0.3, 2.0, 12.0])
-def test_skirts_are_those_of_the_line_beyond_its_reach(width: float) -> None:
-    """In 4096 samples of the taper they were 3 % too high at the end of the table."""
-    (reach,) = smearing_reach(np.array([width]))
-    beyond = np.linspace(reach, 500, 4000)
-    assert np.max(np.abs(log_smearing(width, beyond[beyond < 400])[0]), initial=0) < 0.004
-    t, r = correlations()
-    d = reach + np.arange(8) + 0.5  # at the middle of lobes, whose mean the table has
-    decay = r * np.exp(-2 * np.pi * width * t)
-    smeared = [2 * trapezoid(decay * np.sinc(t) * np.cos(2 * np.pi * at * t), t) for at in d]
-    line = width / np.pi / (width**2 + d**2)
-    aliased = np.sinc(d / (t.size - 1)) ** 2  # of the same sum over samples
-    assert np.mean(smeared * aliased / line) == pytest.approx(1, abs=0.05)
-
-
-def test_wider_lines_reach_less() -> None:
-    reach = smearing_reach(np.append(np.geomspace(1e-12, 1.0, 200), [3.0, WIDE]))
-    assert np.all(np.diff(reach) <= 0)
-    assert reach[0] > 400 > 50 > reach[199] > reach[-1] == 0
+@pytest.mark.parametrize("width", [0.02, 0.3, 2.0, 12.0])
+def test_skirts_are_those_of_the_line_beyond_the_reach(width: float) -> None:
+    assert np.mean(log_smearing(width, SKIRT + np.arange(8))[0]) == pytest.approx(0, abs=0.02)
 
 
 def case(*, drift: bool = False, bump: bool = False) -> tuple[LoopPeriodogram, SpectrumModel]:
@@ -255,6 +240,7 @@ def test_slopes_of_two_axes_are_those_of_differences(both, coupled) -> None:
         ]
     )
     numeric /= 2e-5
+    numeric[[GAIN, BACKGROUND + GAIN]] = 0  # the gains of two axes are held
     assert slope == pytest.approx(numeric, rel=1e-4, abs=1e-5 * np.max(np.abs(numeric)))
 
 
@@ -275,16 +261,9 @@ def test_information_is_the_second_derivative_where_the_data_are_the_model(both,
         for h in 1e-5 * np.eye(theta.size)
     ]
     exact = np.array(rows) / 2e-5
-    assert information == pytest.approx(exact, abs=1e-5 * np.max(exact))
-    # gains change the data, and what they move is exact
-    _, _, information = derivatives(both, coupled)
     gains = [GAIN, BACKGROUND + GAIN]
-    others = [i for i in range(theta.size) if i not in gains]
-    for gain in gains:
-        h = 1e-5 * np.eye(theta.size)[gain]
-        row = derivatives(both, coupled.unpack(theta + h))[1]
-        row = (row - derivatives(both, coupled.unpack(theta - h))[1])[others] / 2e-5
-        assert information[gain][others] == pytest.approx(row, rel=1e-3, abs=1e-5 * max(abs(row)))
+    exact[gains] = exact[:, gains] = 0  # they are held
+    assert information == pytest.approx(exact, abs=1e-5 * np.max(exact))
 
 
 def test_a_component_that_would_leave_the_band_stays_at_its_end(both, coupled) -> None:
@@ -293,3 +272,56 @@ def test_a_component_that_would_leave_the_band_stays_at_its_end(both, coupled) -
     model = fit(Search(data=both, gain=1.0), coupled.exchange(1, wide))
     assert model is not None
     assert model.spectrum.components[1].frequency < np.pi
+
+
+def rosenbrock(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Half the squared residuals of Rosenbrock's valley, and of Gauss and Newton's matrix."""
+    rest = np.array([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+    slope = np.array([[-20 * x[0], 10.0], [-1.0, 0.0]])
+    return 0.5 * float(rest @ rest), slope.T @ rest, slope.T @ slope
+
+
+def free(count: int) -> Priors:
+    return Priors(centre=np.zeros(count), width=np.full(count, np.inf))
+
+
+def test_a_curved_valley_is_followed_to_its_end() -> None:
+    for start in ([-1.2, 1.0], [3.0, -20.0]):
+        found = scoring_minimum(rosenbrock, np.array(start), free(2), accuracy=1e-12)
+        assert found is not None
+        assert found[0] == pytest.approx([1, 1], abs=1e-4)
+
+
+def test_a_fit_that_cannot_reach_a_bound_is_given_up() -> None:
+    def above(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        value, slope, matrix = rosenbrock(x)
+        return value + 7.0, slope, matrix
+
+    start = np.array([-1.2, 1.0])
+    assert scoring_minimum(above, start, free(2), bound=6.9) is None
+    assert scoring_minimum(above, start, free(2), bound=9.0) is not None
+
+
+def test_parameters_without_information_leave_the_steps_finite() -> None:
+    # a component of no power has denormal information, and a step along it overflows
+    scale = np.array([2.0, 1e-311, 1e-300, 1e-16])
+    priors = Priors(centre=np.zeros(4), width=np.full(4, np.inf))
+
+    def bowl(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        value = 0.5 * float(scale @ (x - 1) ** 2) - 1e-9 * float(np.sum(x))
+        return value, scale * (x - 1) - 1e-9, np.diag(scale)
+
+    found = scoring_minimum(bowl, np.array([5.0, 4.0, 3.0, 2.0]), priors)
+    assert found is not None
+    assert np.all(np.isfinite(found[0]))
+    assert found[0][0] == pytest.approx(1, abs=1e-3)
+
+
+def test_a_minimum_beyond_a_bound_lies_on_it() -> None:
+    """What else is free goes on: the valley's floor at x = 0.5 is y = 0.25."""
+    priors = Priors(
+        centre=np.zeros(2), width=np.full(2, np.inf), bounds=(-9.0, np.array([0.5, 9.0]))
+    )
+    found = scoring_minimum(rosenbrock, np.array([-1.2, 1.0]), priors, accuracy=1e-12)
+    assert found is not None
+    assert found[0] == pytest.approx([0.5, 0.25], abs=1e-6)
