@@ -35,13 +35,13 @@ def run(arguments: Namespace) -> Report:
             gamma_ratio=arguments.gamma_ratio,
             imaging=imaging,
             accept_record=arguments.accept_record,
-            command_scale_known=loop_records.is_scale_known(arguments),
+            command_scale_known=loop_records.is_scale_known(record),
             accelerations=values,
             channels=channels,
             progress=count,
             **loop_records.identification_options(arguments, record),
         )
-    found = loop_records.with_repair(arguments, found)
+    found = loop_records.with_repair(record, found)
     report = Report(data={"source": str(arguments.file)})
     loop_records.add_record(report, record)
     loop_records.add_model(report, found.model)

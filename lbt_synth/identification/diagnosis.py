@@ -424,7 +424,7 @@ def diagnose(
     ... )
     >>> diagnosis = lbt.identification.diagnose(record)
     >>> diagnosis.law.kind, [row.part for row in diagnosis.costs]
-    ('pure integrator', ['turbulence', 'measurement noise', 'all'])
+    ('integrator', ['turbulence', 'measurement noise', 'all'])
     """
     require_instance(record, LoopRecord)
     step, designs, notes = progress or (lambda _: None), given or {}, list[str]()

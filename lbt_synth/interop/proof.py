@@ -266,11 +266,13 @@ def _rounding_left(
     gain: float,
 ) -> FloatArray:
     """Variance of the residual that noise in the sums leaves, one per mode."""
-    n, q = hardware.modes, hardware.n_measurements
-    # the noise is measured by a sensor of its own, which sees no phase
-    blind = np.vstack([hardware.sensor, np.zeros((variance.size, n))])
+    n, q = hardware.modes, written.D.shape[-1]
+    # the noise is measured by a sensor of its own, which sees no phase, as channels see none
+    silent = q - hardware.n_measurements + variance.size
+    blind = np.vstack([hardware.sensor, np.zeros((silent, n))])
     both = replace(written, B=np.hstack([written.B, entry.B]), D=np.hstack([written.D, entry.D]))
-    s = close_loop(replace(hardware, sensor_matrix=blind), both, sensor_gain=gain).system
+    path = replace(hardware.own_sensor_alone(), sensor_matrix=blind)
+    s = close_loop(path, both, sensor_gain=gain).system
     B, C, D = s.B[:, n + q :] * np.sqrt(variance), s.C[:n], s.D[:n, n + q :] * np.sqrt(variance)
     return output_variances(C, D, stationary_root(s.A, B))
 

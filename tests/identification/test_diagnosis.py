@@ -27,7 +27,7 @@ from lbt_synth.identification.prediction.comparison import INTEGRATOR, LIMIT, RA
 def test_a_good_record():
     found = line_diagnosis()
     assert found.doubt == ""
-    assert found.law.kind == "pure integrator"
+    assert found.law.kind == "integrator"
     assert found.law.gain[0, 0] == pytest.approx(GAIN)
     assert found.loop.delay_frames == 2
     assert found.loop.spectral_radius < 1
@@ -160,7 +160,7 @@ def test_of_a_good_record():
     """All residuals are those on unseen data; of the model there are shares of a variance."""
     found = line_diagnosis()
     state, residual, advice = found.verdict
-    assert state.startswith("The record is sound: a pure integrator of gain 0.2 ran, stable at")
+    assert state.startswith("The record is sound: an integrator of gain 0.2 ran, stable at")
     ran, best, slow = (found.row(name).replayed for name in (RAN, found.best, INTEGRATOR))
     assert residual.startswith(f"It leaves {ran.text} on unseen data (")
     start, stop = ran.stretches[0]
@@ -234,8 +234,7 @@ def test_a_loop_of_a_law_that_is_late():
     found = replace(found, commands=replace(found.commands, explanation="as given"))
     state = found.verdict[0]
     assert (
-        state
-        == "The record shows no fault, and a pure integrator of gain 0.3, 0.2 ran, 1 frame late."
+        state == "The record shows no fault, and an integrator of gain 0.3, 0.2 ran, 1 frame late."
     )
 
 

@@ -157,7 +157,7 @@ def edited(tmp_path, change, *, resign=True):
         ),
         (lambda a, m: a["COMMANDS"].__setitem__(0, 3.0), False, "does not match its digest"),
         (lambda a, m: m.update(seed=8), False, "does not match its digest"),
-        (lambda a, m: a.pop("COMMANDS"), True, "inconsistent: COMMANDS is missing"),
+        (lambda a, m: a.pop("MEASURE"), True, "inconsistent: MEASURE is missing"),
         (lambda a, m: a.pop("CTRL_B"), True, "inconsistent: CTRL_B is missing"),
         (lambda a, m: m.pop("seed"), True, "inconsistent: seed is missing"),
         (lambda a, m: a.update(EXTRA=np.ones(2)), True, "arrays that no telemetry has: EXTRA"),
