@@ -49,7 +49,6 @@ class BoundOptions(Section):
         json_schema_extra={
             "hint": "At 1 the bound is the least one; far above it the filter is the Kalman "
             "filter.",
-            "slider": [1.0, 3.0],
         },
     )
     horizon: Horizon = 1
