@@ -14,6 +14,7 @@ from support.vibration_config import write_vibration
 
 import lbt_synth as lbt
 from lbt_synth.errors import ConfigError
+from lbt_synth.models import DriftingVibration
 from lbt_synth.studies.robustness import mirror_rows
 
 SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
@@ -117,7 +118,7 @@ def test_one_axis(tmp_path, direction):
 
 def test_a_configuration_may_have_one(tmp_path):
     (found,) = lbt.load_config(drift_file(tmp_path)).truth.vibrations
-    expected = lbt.models.DriftingVibration(start_hz=17, end_hz=23, duration_s=60, rms_nm=797)
+    expected = DriftingVibration(start_hz=17, end_hz=23, duration_s=60, rms_nm=797)
     assert found == expected
     damped = "kind: drift\n      end_hz: 16\n      duration_s: 9\n      damping: 0.01"
     (found,) = lbt.load_config(drift_file(tmp_path, damped)).truth.vibrations
@@ -140,7 +141,7 @@ def test_a_configuration_may_have_one(tmp_path):
     ],
 )
 def test_wrong_keys_are_refused(tmp_path, keys, words):
-    with pytest.raises(lbt.errors.ConfigError, match=words):
+    with pytest.raises(ConfigError, match=words):
         lbt.load_config(drift_file(tmp_path, keys))
 
 
@@ -159,7 +160,7 @@ def test_priors_of_a_configuration(tmp_path):
         ({"spread_hz": 1.0, "lines": 65}, "less than or equal to 64"),
         ({"frequency_hz": 399.0, "spread_hz": 9.0}, r"vibrations\[0\].spread_hz: .*Nyquist"),
     ):
-        with pytest.raises(lbt.errors.ConfigError, match=text):
+        with pytest.raises(ConfigError, match=text):
             lbt.load_config(write_vibration(tmp_path, **keys))
 
 
@@ -200,7 +201,7 @@ def test_wrong_sections_are_refused(tmp_path, old, new, message):
     assert old in text
     path = tmp_path / "a.yaml"
     path.write_text(text.replace(old, new))
-    with pytest.raises(lbt.errors.ConfigError, match=message):
+    with pytest.raises(ConfigError, match=message):
         lbt.load_config(path)
 
 
@@ -245,7 +246,7 @@ def test_a_slow_line_alone_has_small_errors(tmp_path):
 
 def test_a_line_has_one_frequency_error(tmp_path):
     line = LINES[0] | {"frequency_error_hz": 1, "frequency_error_percent": 5}
-    with pytest.raises(lbt.errors.ConfigError, match="one of frequency_error_hz, frequency_error"):
+    with pytest.raises(ConfigError, match="one of frequency_error_hz, frequency_error"):
         lbt.load_config(write_config(tmp_path, minimal_config(truth={"vibrations": [line]})))
 
 

@@ -8,6 +8,7 @@ from support.plants import ROOT
 
 import lbt_synth as lbt
 from lbt_synth.config.load import example_files, telescope_names, telescope_template
+from lbt_synth.errors import ConfigError, ProblemError
 
 NAMES = ("elt", "gemini", "generic", "keck", "lbt", "vlt")
 
@@ -93,7 +94,7 @@ def test_the_example_is_the_papers_table_i(config):
     ],
 )
 def test_mistakes_are_refused_with_their_path(tmp_path, path, value, key, text):
-    with pytest.raises(lbt.errors.ConfigError) as caught:
+    with pytest.raises(ConfigError) as caught:
         lbt.load_config(write_config(tmp_path, change_key(path, value)))
     message = str(caught.value)
     assert text in message
@@ -118,19 +119,19 @@ def test_mistakes_are_refused_with_their_path(tmp_path, path, value, key, text):
     ],
 )
 def test_other_texts_are_refused(tmp_path, content, text):
-    with pytest.raises(lbt.errors.ConfigError, match=text) as caught:
+    with pytest.raises(ConfigError, match=text) as caught:
         lbt.load_config(write_config(tmp_path, content))
     assert "\n" not in str(caught.value)
 
 
 def test_unreadable_files(tmp_path):
-    with pytest.raises(lbt.errors.ConfigError, match="cannot read .*No such file"):
+    with pytest.raises(ConfigError, match="cannot read .*No such file"):
         lbt.load_config(tmp_path / "none.yaml")
-    with pytest.raises(lbt.errors.ConfigError, match="cannot read .*Is a directory"):
+    with pytest.raises(ConfigError, match="cannot read .*Is a directory"):
         lbt.load_config(tmp_path)
     binary = tmp_path / "b.yaml"
     binary.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(lbt.errors.ConfigError, match="is not UTF-8 text: .* at byte"):
+    with pytest.raises(ConfigError, match="is not UTF-8 text: .* at byte"):
         lbt.load_config(binary)
 
 
@@ -265,7 +266,7 @@ def test_what_is_missing_or_does_not_fit_is_said(tmp_path, sections, key, text):
     content = minimal_config(**sections)
     if content["sensor"]["noise_nm"] is None:
         del content["sensor"]["noise_nm"]
-    with pytest.raises(lbt.errors.ConfigError, match=text) as caught:
+    with pytest.raises(ConfigError, match=text) as caught:
         lbt.load_config(write_config(tmp_path, content))
     assert caught.value.path == key
     assert "c.yaml" in str(caught.value)
@@ -290,14 +291,14 @@ def test_what_is_no_configuration_by_far_is_refused(tmp_path):
     ):
         path = tmp_path / "a.yaml"
         path.write_text(text)
-        with pytest.raises(lbt.errors.ConfigError, match=why) as caught:
+        with pytest.raises(ConfigError, match=why) as caught:
             lbt.load_config(path)
         assert len(str(caught.value)) < 300
 
 
 def test_there_is_a_template_of_each_telescope():
     assert telescope_names() == list(NAMES)
-    with pytest.raises(lbt.errors.ProblemError, match="must be one of elt, gemini"):
+    with pytest.raises(ProblemError, match="must be one of elt, gemini"):
         telescope_template("hale")
 
 

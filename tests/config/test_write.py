@@ -12,6 +12,7 @@ from support.plants import ROOT
 import lbt_synth as lbt
 from lbt_synth.config.schema import FileSection
 from lbt_synth.config.write import RAISED, config_text, require_writable_facts
+from lbt_synth.errors import OutputError, ProblemError
 from lbt_synth.identification.accelerometers.transfers import (
     AccelerometerTransfers,
     ChannelRow,
@@ -64,7 +65,7 @@ def test_whatever_is_set_is_read_again(noise, a, angle, frequency, frames, scale
                         "frequency_hz": frequency,
                         "damping": 0.1,
                         "rms_nm": frequency,
-                    },
+                    }
                 ],
             },
             "truth": {"vibrations": "model"} if many else {"vibrations": []},
@@ -85,16 +86,16 @@ def test_whatever_is_set_is_read_again(noise, a, angle, frequency, frames, scale
 )
 def test_comments_that_have_no_place(tmp_path, comments, text):
     settings, _ = lbt.config.identified_config(ONE_AXIS)
-    with pytest.raises(lbt.errors.ProblemError, match=text):
+    with pytest.raises(ProblemError, match=text):
         lbt.config.save_config(tmp_path / "a.yaml", settings, comments=comments)
     assert not list(tmp_path.iterdir())
 
 
 def test_only_configurations_are_written(tmp_path):
-    with pytest.raises(lbt.errors.ProblemError, match="FileSection"):
+    with pytest.raises(ProblemError, match="FileSection"):
         lbt.config.save_config(tmp_path / "a.yaml", {"version": 1})
     settings, _ = lbt.config.identified_config(ONE_AXIS)
-    with pytest.raises(lbt.errors.OutputError, match="cannot write"):
+    with pytest.raises(OutputError, match="cannot write"):
         lbt.config.save_config(tmp_path / "none" / "a.yaml", settings)
 
 
@@ -235,7 +236,7 @@ def test_quiet_axes_have_no_vibrations(tmp_path):
     ],
 )
 def test_models_that_no_configuration_can_hold(model, options, text):
-    with pytest.raises(lbt.errors.ProblemError, match=text):
+    with pytest.raises(ProblemError, match=text):
         lbt.config.identified_config(model, **options)
 
 
@@ -300,5 +301,5 @@ def test_what_is_less_than_a_configuration_holds_is_raised_to_its_least():
 def test_facts_that_no_configuration_can_hold_are_known_before_a_fit(facts, text):
     known = {"frame_rate_hz": 500.0, "delay_frames": None}
     require_writable_facts(1, **known)
-    with pytest.raises(lbt.errors.ProblemError, match=text):
+    with pytest.raises(ProblemError, match=text):
         require_writable_facts(1, **(known | facts))

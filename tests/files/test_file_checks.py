@@ -12,6 +12,7 @@ from support.gain_files import original
 from support.telemetry import full, same
 
 import lbt_synth as lbt
+from lbt_synth.errors import FileError, GainFileError, OutputError, TelemetryError
 from lbt_synth.storage.array_file import npz_bytes
 
 ENDINGS = ("fits", "npz")
@@ -24,7 +25,7 @@ class Kind:
     make: Callable[[], Any]
     save: Callable[..., Any]
     load: Callable[[Any], Any]
-    error: type[lbt.errors.FileError]
+    error: type[FileError]
     is_same: Callable[[Any, Any], bool]
 
 
@@ -39,14 +40,14 @@ KINDS = {
         make=lambda: original("bare"),
         save=lbt.save_gain,
         load=lbt.load_gain,
-        error=lbt.errors.GainFileError,
+        error=GainFileError,
         is_same=is_same_design,
     ),
     "telemetry": Kind(
         make=full,
         save=lbt.files.save_telemetry,
         load=lbt.files.load_telemetry,
-        error=lbt.errors.TelemetryError,
+        error=TelemetryError,
         is_same=same,
     ),
 }
@@ -130,7 +131,7 @@ def test_names_that_cannot_be_read_or_written(tmp_path, kind):
         ("folder.fits", "is a directory"),
         ("x\0y.npz", "null"),
     ):
-        with pytest.raises(lbt.errors.OutputError, match=words):
+        with pytest.raises(OutputError, match=words):
             kind.save(tmp_path / name, kind.make())
 
 
@@ -142,7 +143,7 @@ def test_nothing_half_written_stays(tmp_path, monkeypatch, kind):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(lbt.errors.OutputError, match="cannot write .*No space left on device"):
+    with pytest.raises(OutputError, match="cannot write .*No space left on device"):
         kind.save(path, kind.make())
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["g.fits"]

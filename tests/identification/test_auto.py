@@ -16,6 +16,7 @@ from support.recorded_loops import LINE, RATE, drifting_record, resonant_record,
 from support.wrong_commands import record
 
 import lbt_synth as lbt
+from lbt_synth.errors import CertificateError, InfeasibleError, ProblemError
 from lbt_synth.identification import auto
 from lbt_synth.identification.auto import (
     allowed_gains,
@@ -28,11 +29,12 @@ from lbt_synth.identification.auto import (
 from lbt_synth.identification.prediction.residual import estimate_residual
 from lbt_synth.methods import registry
 from lbt_synth.methods.registry import default_method, gain_robust_method, method_named
+from lbt_synth.models import ARModel
 
 DRIFT_HZ = 500.0
 TITLES = {name: method_named(name).title for name in ("kalman", "hinf", "lqg")}
 USUAL = TITLES["kalman"]
-SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=DRIFT_HZ)
+SLOW = ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=DRIFT_HZ)
 
 
 def test_a_design_is_doubted_where_the_gains_disagree() -> None:
@@ -47,7 +49,7 @@ def test_a_design_is_doubted_where_the_gains_disagree() -> None:
     )
     try:
         notes = lbt.design_from_record(both).notes
-    except lbt.errors.CertificateError as error:
+    except CertificateError as error:
         notes = (str(error),)
     assert any("sensor gain" in note for note in notes)
     given = lbt.design_from_record(first, method="hinf")
@@ -56,22 +58,20 @@ def test_a_design_is_doubted_where_the_gains_disagree() -> None:
 
 def test_a_design_needs_a_delay_and_data():
     noise = np.random.default_rng(0).standard_normal((9000, 1))
-    with pytest.raises(
-        lbt.errors.ProblemError, match="delay of this loop is not known; give delay_frames"
-    ):
+    with pytest.raises(ProblemError, match="delay of this loop is not known; give delay_frames"):
         lbt.design_from_record(
             lbt.identification.loop_record(noise, noise, frame_rate_hz=RATE, unit="nm")
         )
-    with pytest.raises(lbt.errors.ProblemError, match="LoopRecord"):
+    with pytest.raises(ProblemError, match="LoopRecord"):
         lbt.design_from_record(noise)
     short = lbt.identification.loop_record(
         noise[:900], frame_rate_hz=RATE, delay_frames=2, unit="nm"
     )
     with pytest.raises(
-        lbt.errors.ProblemError, match=r"needs 4000 usable frames \(4 s at 1000 Hz\).*got 900 \(0.9"
+        ProblemError, match=r"needs 4000 usable frames \(4 s at 1000 Hz\).*got 900 \(0.9"
     ):
         lbt.design_from_record(short)
-    with pytest.raises(lbt.errors.ProblemError, match="method"):
+    with pytest.raises(ProblemError, match="method"):
         lbt.design_from_record(short, method="magic")
 
 
@@ -273,7 +273,7 @@ def no_robust(monkeypatch) -> None:
     """Let robust synthesis find nothing."""
 
     def fail() -> str:
-        raise lbt.errors.InfeasibleError("too much")
+        raise InfeasibleError("too much")
 
     monkeypatch.setattr(auto, "gain_robust_method", fail)
 
@@ -362,8 +362,6 @@ def test_gains_that_are_too_far_apart_take_robust_synthesis(loop) -> None:
 def test_gains_that_no_design_holds_are_refused(loop, known: bool) -> None:
     _, model = loop
     wide = np.array([[0.02, 0.9]])
-    with pytest.raises(
-        lbt.errors.CertificateError, match=r"the record allows 0.0\d to 0.9"
-    ) as caught:
+    with pytest.raises(CertificateError, match=r"the record allows 0.0\d to 0.9") as caught:
         design_for_gains(model, lambda _: hinf(model), wide, command_scale_known=known)
     assert ("or say --command-scale 1" in str(caught.value)) is not known

@@ -7,13 +7,13 @@ import pytest
 from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.models import ARModel, DriftingVibration, PositionLoop, SinusoidalVibration
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 
-AIR = lbt.models.ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=800)
-SHELL = lbt.models.PositionLoop.from_bandwidth(
-    natural_frequency_hz=50, damping=0.5, bandwidth_hz=300
-)
+AIR = ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=800)
+SHELL = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
 
 
 def line(frequency_hz, damping=0.02):
@@ -40,7 +40,7 @@ def two_axes():
 def disturbed(plant, *, frames, hz=20, seed=0):
     """Total phase and noise, (1, frames, n) each; the vibration is on the first axis."""
     along = tuple(np.eye(plant.hardware.modes)[0])
-    shake = lbt.models.SinusoidalVibration(frequency_hz=hz, rms_nm=300, direction=along)
+    shake = SinusoidalVibration(frequency_hz=hz, rms_nm=300, direction=along)
     truth = lbt.Truth(turbulence=AIR, vibrations=(shake,), noise_nm=15.5)
     drawn = draw_disturbance(truth, plant.hardware, frames=frames, seed=seed)
     return drawn.phase_nm, drawn.noise
@@ -109,9 +109,7 @@ def test_each_filter_is_as_if_it_had_always_run(name):
 
 def test_a_line_that_moves_is_followed_and_a_fixed_filter_does_not():
     plant = axis(18)
-    drift = lbt.models.DriftingVibration(
-        start_hz=18, end_hz=22, duration_s=8, rms_nm=300, direction=(1,)
-    )
+    drift = DriftingVibration(start_hz=18, end_hz=22, duration_s=8, rms_nm=300, direction=(1,))
     truth = lbt.Truth(turbulence=AIR, vibrations=(drift,), noise_nm=15.5)
     tracker = lbt.identification.TrackingController(plant, window_s=2, update_s=0.5)
 
@@ -206,21 +204,21 @@ def test_what_cannot_be_tracked_is_refused():
         ({"update_s": 0}, "update_s must be at least"),
         ({"design": lambda p: lbt.integrator(p.hardware, gain=0.3)}, "only filters of"),
     ):
-        with pytest.raises(lbt.errors.ProblemError, match=words):
+        with pytest.raises(ProblemError, match=words):
             tracked(plant, **options)
-    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
+    with pytest.raises(ProblemError, match="expected a TipTiltPlant"):
         tracked(plant.hardware)
     coupled = axis(20, sensor_matrix=[[1.0], [0.5]])
-    with pytest.raises(lbt.errors.ProblemError, match="each measurement must be of one axis"):
+    with pytest.raises(ProblemError, match="each measurement must be of one axis"):
         tracked(coupled)
     tracker = tracked(plant)
-    with pytest.raises(lbt.errors.DimensionError, match=r"y must have shape \(1,\)"):
+    with pytest.raises(DimensionError, match=r"y must have shape \(1,\)"):
         tracker.step([0.0, 0.0])
     for wrong, words in (
         (["a"], "y must be an array of numbers; got list"),
         ([1j], "y must be real; got complex numbers"),
         ([[1.0], [1.0, 2.0]], "y must be a rectangular array"),
     ):
-        with pytest.raises(lbt.errors.ProblemError, match=words):
+        with pytest.raises(ProblemError, match=words):
             tracker.step(wrong)
     assert np.array_equal(tracker.step([0]), [0.0])  # nothing was taken in

@@ -12,12 +12,8 @@ from support.design_reports import SMALL
 from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
-from lbt_synth.methods.registry import (
-    METHODS,
-    design_label,
-    method_named,
-    reference_methods,
-)
+from lbt_synth.errors import ProblemError
+from lbt_synth.methods.registry import METHODS, design_label, method_named, reference_methods
 
 CONFIG = str(LBT_YAML)
 BUILT_IN = ("hinf", "integrator", "kalman", "lqg", "mixed", "robust")
@@ -37,7 +33,7 @@ def test_methods_by_name(leaky):
     assert [m.name for m in reference_methods(estimators_only=True)] == ["kalman", "hinf"]
     assert leaky.needs_options
     assert not method_named("mixed").needs_options
-    with pytest.raises(lbt.errors.ProblemError, match=r"got 'kalmann'. Did you mean kalman\?"):
+    with pytest.raises(ProblemError, match=r"got 'kalmann'. Did you mean kalman\?"):
         method_named("kalmann")
 
 

@@ -8,9 +8,11 @@ from support.configs import AR, OTHER, minimal_config, write_config
 from support.robust_config import SMALL, robust_writer
 
 import lbt_synth as lbt
-from lbt_synth.errors import ProblemError
+from lbt_synth.design.shaping import VibrationBand
+from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.methods.request import PlantInputs, design_request
+from lbt_synth.models import ARModel, SumSpectrum, TipTiltPlant
 
 
 @pytest.fixture
@@ -83,16 +85,16 @@ def test_the_robust_design_of_an_identified_system(tmp_path):
         ),
     ):
         content["design"] = {"robust": {**robust, **change}}
-        with pytest.raises(lbt.errors.ConfigError, match=text):
+        with pytest.raises(ConfigError, match=text):
             lbt.load_config(write_config(tmp_path, content)).design("robust")
     content["design"] = {"robust": {**robust, "command_step_nm": 500.0}}
     content["model"]["turbulence"] = [AR, OTHER]
-    with pytest.raises(lbt.errors.ConfigError, match="hold under one turbulence for all axes"):
+    with pytest.raises(ConfigError, match="hold under one turbulence for all axes"):
         lbt.load_config(write_config(tmp_path, content)).design("robust")
 
 
 def a_plant_with_lines(*lines):
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
+    slow = ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
     shakes = [
         lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=rms, direction=(1,)) for f, rms in lines
     ]
@@ -118,7 +120,7 @@ def test_the_strongest_lines_of_a_plant_have_bands():
     assert [round(band.rms_nm) for band in section.bands] == [14, 15, 16, 17, 18, 19]
 
 
-def a_plant_with_a_wide_resonance() -> lbt.models.TipTiltPlant:
+def a_plant_with_a_wide_resonance() -> TipTiltPlant:
     plant = a_plant_with_lines((20, 80.0), (50, 30.0))
     wide = lbt.Vibration(frequency_hz=30, damping=0.9, rms_nm=25.0, direction=(1.0,))
     return lbt.tip_tilt_plant(
@@ -152,7 +154,7 @@ def test_a_band_that_covers_a_wide_resonance_takes_its_place():
     plant = a_plant_with_a_wide_resonance()
     wide = {"low_hz": 25.0, "high_hz": 35.0, "rms_nm": 25.0}
     for damping, terms in ((0.6, 2), (0.1, 3)):
-        band = lbt.design.shaping.VibrationBand(**wide, damping=damping)
+        band = VibrationBand(**wide, damping=damping)
         design = lbt.robust(plant, bands=[band], functions=8, states=None, modulus_margin=0.2)
         assert len(design.specifications[0].objective.terms) == terms
 
@@ -160,7 +162,7 @@ def test_a_band_that_covers_a_wide_resonance_takes_its_place():
 def test_the_limit_of_a_design_counts_its_wide_resonances():
     plant = a_plant_with_a_wide_resonance()
     design = lbt.robust(plant, functions=60, states=None, modulus_margin=0.2)
-    wide = lbt.models.SumSpectrum(parts=[plant.turbulence[0], plant.vibrations[-1].ar_model(800)])
+    wide = SumSpectrum(parts=[plant.turbulence[0], plant.vibrations[-1].ar_model(800)])
     truth = lbt.Truth(turbulence=wide, noise_nm=15.5)
     least = lbt.loop.least_residual(plant.hardware, truth, frame_means=True).rms_nm
     assert design.facts().limit_nm == pytest.approx(least, rel=1e-9)

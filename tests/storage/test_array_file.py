@@ -12,6 +12,7 @@ from astropy.io import fits
 from support.record_files import image
 
 import lbt_synth as lbt
+from lbt_synth.errors import FileError, TelemetryError
 from lbt_synth.storage.array_file import (
     digest,
     fits_bytes,
@@ -33,7 +34,7 @@ def test_complex_arrays_do_not_lose_their_imaginary_part(tmp_path):
     arrays["COMMANDS"] = arrays["COMMANDS"] + 5j
     with path.open("wb") as stream:
         np.savez(stream, **arrays)
-    with pytest.raises(lbt.errors.TelemetryError, match="COMMANDS holds no real numbers"):
+    with pytest.raises(TelemetryError, match="COMMANDS holds no real numbers"):
         lbt.files.load_telemetry(path)
 
 
@@ -57,7 +58,7 @@ def test_archives_that_zipfile_does_not_read(tmp_path, field):
     path = tmp_path / "a.npz"
     path.write_bytes(content[:at] + b"\xff\xff" + content[at + 2 :])
     for reader in (lbt.load_gain, lbt.load_record, lbt.files.load_telemetry):
-        with pytest.raises(lbt.errors.FileError, match="broken"):
+        with pytest.raises(FileError, match="broken"):
             reader(path)
 
 

@@ -20,12 +20,14 @@ from support.specula_filters import noise_series, simulate_commands
 
 import lbt_synth as lbt
 from lbt_synth.design.record import record_design
+from lbt_synth.errors import GainFileError, OutputError, ProblemError, SchemaVersionError
 from lbt_synth.files.gain_file.store import (
     load_with_digest,
     require_agreement,
     require_certificate,
     require_same,
 )
+from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 
 ENDINGS = ("fits", "npz")
@@ -109,7 +111,7 @@ def test_round_trip_keeps_every_bit(tmp_path, name, ending):
         for one, other in zip(back.fallbacks, design.fallbacks, strict=True):
             assert one.missing == other.missing
             assert np.array_equal(one.gains, other.gains)
-    if isinstance(back.problem, lbt.models.TipTiltPlant):
+    if isinstance(back.problem, TipTiltPlant):
         assert back.problem.vibrations == design.problem.vibrations
         assert back.problem.motions == design.problem.motions
     if isinstance(design, lbt.design.LqgDesign):
@@ -159,7 +161,7 @@ def scale_gain(document):
     ],
 )
 def test_files_that_were_edited_and_signed_anew_are_refused(tmp_path, name, change, text):
-    error = lbt.errors.SchemaVersionError if "layout" in text else lbt.errors.GainFileError
+    error = SchemaVersionError if "layout" in text else GainFileError
     with pytest.raises(error, match=text):
         lbt.load_gain(edited_file(tmp_path / "g.npz", original(name), change))
 
@@ -185,20 +187,20 @@ def test_files_that_were_edited_and_signed_anew_are_refused(tmp_path, name, chan
 )
 def test_impossible_claims_of_a_gain_file_are_refused(tmp_path, change, text):
     path = edited_file(tmp_path / "g.npz", original("shaped"), lambda d: change(d["meta"]))
-    with pytest.raises(lbt.errors.GainFileError, match=text):
+    with pytest.raises(GainFileError, match=text):
         lbt.load_gain(path)
 
 
 def test_a_file_that_was_edited_and_not_signed_does_not_match_its_digest(tmp_path):
     path = edited_file(tmp_path / "g.npz", original("kalman"), scale_gain, digest_again=False)
-    with pytest.raises(lbt.errors.GainFileError, match="does not match its digest"):
+    with pytest.raises(GainFileError, match="does not match its digest"):
         lbt.load_gain(path)
     path = lbt.save_gain(tmp_path / "g.fits", original("kalman"))
     card = b"RATE_HZ =                800.0"
     content = path.read_bytes()
     assert card in content
     path.write_bytes(content.replace(card, card.replace(b"8", b"9")))
-    with pytest.raises(lbt.errors.GainFileError, match="the checksum of its HDU 0 is wrong"):
+    with pytest.raises(GainFileError, match="the checksum of its HDU 0 is wrong"):
         lbt.load_gain(path)
 
 
@@ -206,17 +208,17 @@ def test_a_header_that_says_something_else_is_found_behind_a_right_checksum(tmp_
     with fits.open(lbt.save_gain(tmp_path / "g.fits", original("kalman"))) as hdus:
         hdus[0].header["RATE_HZ"] = 900.0
         hdus.writeto(tmp_path / "other.fits", checksum=True)
-    with pytest.raises(lbt.errors.GainFileError, match="header.RATE_HZ must be 800.0"):
+    with pytest.raises(GainFileError, match="header.RATE_HZ must be 800.0"):
         lbt.load_gain(tmp_path / "other.fits")
 
 
 def test_only_designs_are_saved(tmp_path):
-    with pytest.raises(lbt.errors.ProblemError, match="design must be a Design; got int"):
+    with pytest.raises(ProblemError, match="design must be a Design; got int"):
         lbt.save_gain(tmp_path / "g.fits", 3)
     twisted = replace(original("kalman"))
     k = twisted.controller
     object.__setattr__(twisted, "controller", replace(k, B=1.001 * k.B))
-    with pytest.raises(lbt.errors.OutputError, match="contradicts itself: B is not what plant"):
+    with pytest.raises(OutputError, match="contradicts itself: B is not what plant"):
         lbt.save_gain(tmp_path / "g.fits", twisted)
     assert not (tmp_path / "g.fits").exists()
 
@@ -349,7 +351,7 @@ def outcome(name, parts, place, new, path):
         return "cannot be written"
     try:
         back = lbt.load_gain(path)
-    except lbt.errors.GainFileError as error:
+    except GainFileError as error:
         return "refused" if "\n" not in str(error) else "refused in many lines"
     if not back.recertify().passed:
         return "refused"
@@ -408,9 +410,9 @@ def test_another_claim_that_holds_has_another_digest(tmp_path):
     unchanged, narrow = (load_with_digest(promise(**band)) for band in ({}, {"low_hz": 9.09}))
     assert narrow[0].recertify().passed
     assert narrow[1] != unchanged[1]
-    with pytest.raises(lbt.errors.GainFileError):  # it leaves more there
+    with pytest.raises(GainFileError):  # it leaves more there
         lbt.load_gain(promise(high_hz=12.0))
-    with pytest.raises(lbt.errors.GainFileError):  # demands that are there twice
+    with pytest.raises(GainFileError):  # demands that are there twice
         lbt.load_gain(
             edited_file(
                 tmp_path / "g.npz",
@@ -437,7 +439,7 @@ def test_a_certificate_that_says_something_else(change, words):
     check = {"name": "radius", "value": 0.5, "limit": 1.0, "computed_by": "eigenvalues"}
     require_certificate([check], [check])
     checks = [] if change is None else [check | change]
-    with pytest.raises((ValueError, lbt.errors.ProblemError), match=re.escape(words)):
+    with pytest.raises((ValueError, ProblemError), match=re.escape(words)):
         require_certificate(checks, [check])
 
 

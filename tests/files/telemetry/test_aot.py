@@ -13,7 +13,9 @@ from astropy.io import fits
 from support.telemetry import full, same
 
 import lbt_synth as lbt
+from lbt_synth.errors import OutputError, TelemetryError
 from lbt_synth.files.telemetry.aot import lost_fields
+from lbt_synth.models import ARModel
 
 pytestmark = pytest.mark.e2e
 
@@ -164,7 +166,7 @@ def test_the_loop_equation_holds_in_the_aot_file(tmp_path):
     """An integrator, from the standard's fields alone: its matrix, its filter, its delay."""
     path = lbt.LoopHardware(frame_rate_hz=500, sensor_matrix=[[1.0, 0.2], [0.0, 0.9], [0.3, 0.1]])
     design = lbt.integrator(path, gain=0.3)
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
+    slow = ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
     truth = lbt.Truth(turbulence=slow, noise_nm=3.0)
     run = lbt.simulate(design.controller, truth, hardware=path, frames=50)
     seen = lbt.files.telemetry_from_simulation(run, path, design=design, sensor_gain=1.0)
@@ -328,7 +330,7 @@ def still(system):
     ],
 )
 def test_files_that_do_not_fit(tmp_path, edit, text):
-    with pytest.raises(lbt.errors.TelemetryError, match=text) as caught:
+    with pytest.raises(TelemetryError, match=text) as caught:
         lbt.files.load_telemetry(foreign(tmp_path, edit=edit)[0])
     assert "\n" not in str(caught.value)
 
@@ -341,7 +343,7 @@ def test_a_file_that_refers_to_others_is_not_followed(tmp_path):
         system.loops[0].commands = aotpy.io.FITSFileImage(tmp_path / "else.fits", 1)
         system.loops[0].commands.time = None
 
-    with pytest.raises(lbt.errors.TelemetryError, match="External image"):
+    with pytest.raises(TelemetryError, match="External image"):
         lbt.files.load_telemetry(foreign(tmp_path, edit=edit)[0])
 
 
@@ -352,7 +354,7 @@ def test_only_the_mark_is_aot(tmp_path):
     units[0].header["AOT-VERS"] = "9.0.0"
     units.writeto(buffer)
     path.write_bytes(buffer.getvalue())
-    with pytest.raises(lbt.errors.TelemetryError, match="Unknown version '9.0.0'"):
+    with pytest.raises(TelemetryError, match="Unknown version '9.0.0'"):
         lbt.files.load_telemetry(path)
 
 
@@ -360,9 +362,9 @@ def test_only_the_mark_is_aot(tmp_path):
 def test_without_aotpy_it_says_what_to_install(tmp_path, monkeypatch):
     path = lbt.files.save_telemetry(tmp_path / "t.aot.fits", full())
     monkeypatch.setitem(sys.modules, "aotpy", None)
-    with pytest.raises(lbt.errors.TelemetryError, match=r'pip install "lbt-synth\[aot\]"'):
+    with pytest.raises(TelemetryError, match=r'pip install "lbt-synth\[aot\]"'):
         lbt.files.load_telemetry(path)
-    with pytest.raises(lbt.errors.OutputError, match=r'pip install "lbt-synth\[aot\]"'):
+    with pytest.raises(OutputError, match=r'pip install "lbt-synth\[aot\]"'):
         lbt.files.save_telemetry(tmp_path / "u.aot.fits", full())
     assert not (tmp_path / "u.aot.fits").exists()
     own = lbt.files.save_telemetry(tmp_path / "t.fits", full())  # needs no extra

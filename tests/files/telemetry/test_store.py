@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from support.telemetry import ENDINGS, SHELL, full, same, telemetries
 
 import lbt_synth as lbt
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import DimensionError, OutputError, ProblemError, TelemetryError
 from lbt_synth.files import Telemetry, load_telemetry, save_telemetry, telemetry_from_simulation
 from lbt_synth.files.telemetry import store
 from lbt_synth.files.telemetry.aot import lost_fields
 from lbt_synth.files.telemetry.telemetry import LAYERS
+from lbt_synth.models import ARModel, SinusoidalVibration
 from lbt_synth.storage import array_file as archive
 
 
@@ -48,11 +49,9 @@ def test_float32_rounds_series_and_nothing_else(tmp_path, ending):
 
 def test_float32_refuses_what_it_cannot_hold(tmp_path):
     seen = Telemetry(frame_rate_hz=1.0, commands=[[1e39]], measurements=[[2.0]])
-    with pytest.raises(
-        lbt.errors.ProblemError, match="commands has values beyond the range of float32"
-    ):
+    with pytest.raises(ProblemError, match="commands has values beyond the range of float32"):
         save_telemetry(tmp_path / "t.fits", seen, precision="float32")
-    with pytest.raises(lbt.errors.ProblemError, match="precision must be one of float64, float32"):
+    with pytest.raises(ProblemError, match="precision must be one of float64, float32"):
         save_telemetry(tmp_path / "t.fits", seen, precision="half")
     assert not list(tmp_path.iterdir())
 
@@ -67,7 +66,7 @@ def test_the_loop_equations_hold_in_the_file_alone(tmp_path, delay, ending):
         sensor_matrix=rng.standard_normal((3, 2)),
         influence_matrix=[[1.0, 0.2], [-0.1, 0.8]],
     )
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
+    slow = ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=500)
     truth = lbt.Truth(turbulence=slow, noise_nm=0.0, sensor_gain=0.6)
     design = lbt.integrator(path, gain=0.2)
     run = lbt.simulate(design.controller, truth, hardware=path, frames=60, cases=2, seed=5)
@@ -108,7 +107,7 @@ def test_the_equation_of_a_moving_mirror_holds_in_the_file_alone(tmp_path, kind)
         influence_matrix=[[1.0, 0.2], [-0.1, 0.8]],
         mirror=SHELL,
     )
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
+    slow = ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
     truth = lbt.Truth(turbulence=slow, noise_nm=3.0)
     design = lbt.integrator(path, gain=0.1)
     run = lbt.simulate(design.controller, truth, hardware=path, frames=120, seed=5)
@@ -169,7 +168,7 @@ def edited(tmp_path, change, *, resign=True):
     ],
 )
 def test_edited_files_are_refused(tmp_path, change, resign, text):
-    with pytest.raises(lbt.errors.TelemetryError, match=text):
+    with pytest.raises(TelemetryError, match=text):
         load_telemetry(edited(tmp_path, change, resign=resign))
 
 
@@ -181,9 +180,9 @@ def test_names_and_formats(tmp_path):
         ("t.aot.fits", "fits", "does not fit the format 'fits'"),
         ("t.fits", "hdf5", "must be one of fits, npz, aot; got 'hdf5'"),
     ):
-        with pytest.raises(lbt.errors.OutputError, match=text):
+        with pytest.raises(OutputError, match=text):
             save_telemetry(tmp_path / name, seen, format=kind)
-    with pytest.raises(lbt.errors.OutputError, match="holds a Telemetry; got int"):
+    with pytest.raises(OutputError, match="holds a Telemetry; got int"):
         save_telemetry(tmp_path / "t.fits", 3)
 
 
@@ -216,7 +215,7 @@ def test_the_fits_file_explains_itself(tmp_path):
 def test_the_camera_gives_telescope_and_strehl_ratio():
     path = lbt.LoopHardware(frame_rate_hz=800)
     design = lbt.integrator(path, gain=0.5)
-    shake = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=200)
+    shake = SinusoidalVibration(frequency_hz=20, rms_nm=200)
     truth = lbt.Truth(turbulence=None, vibrations=(shake,))
     run = lbt.simulate(design.controller, truth, hardware=path, frames=200, cases=2)
     camera = lbt.Imaging(diameter_m=8.22, obstruction=0.11)

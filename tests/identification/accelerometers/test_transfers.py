@@ -11,6 +11,7 @@ from scipy.signal import lfilter
 from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
@@ -141,11 +142,7 @@ def test_a_run_gives_the_motions_back():
     )
     motions = ({"m1": Motion(size=2.0, phase_deg=30)}, {"m1": Motion(size=0.4, phase_deg=-120)})
     sensor = Accelerometer(
-        name="mirror",
-        rate_hz=rate_hz,
-        delay_frames=delay_frames,
-        channels=("m1",),
-        noise_m_s2=1e-3,
+        name="mirror", rate_hz=rate_hz, delay_frames=delay_frames, channels=("m1",), noise_m_s2=1e-3
     )
     suite = SensorSuite(sensors=(sensor,))
     path = lbt.LoopHardware(frame_rate_hz=rate_hz, delay_frames=2, modes=2, suite=suite)
@@ -226,7 +223,7 @@ def test_motions_at_the_frequency_of_a_line_that_do_not_go_with_it_are_not_used(
     ],
 )
 def test_readings_that_are_refused(given, options, words):
-    with pytest.raises(lbt.errors.ProblemError, match=words):
+    with pytest.raises(ProblemError, match=words):
         lbt.identification.accelerometer_transfers(night().model, night().record, given, **options)
 
 

@@ -12,8 +12,10 @@ from support.diagnoses import GAIN, given_design, line_diagnosis, line_record, s
 from support.recorded_loops import LINE
 
 import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
 from lbt_synth.identification.diagnosis.rows import disturbance_lines, line_name
 from lbt_synth.identification.prediction.comparison import INTEGRATOR, LIMIT, RAN
+from lbt_synth.models import ARModel
 
 
 def test_a_good_record():
@@ -115,13 +117,11 @@ def test_a_design_of_another_loop():
     two = lbt.kalman(
         lbt.tip_tilt_plant(
             frame_rate_hz=RATE,
-            turbulence=lbt.models.ARModel(
-                coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE
-            ),
+            turbulence=ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE),
             noise_nm=5.0,
         )
     )
-    with pytest.raises(lbt.errors.ProblemError, match="2 measurements and 2 commands, and the rec"):
+    with pytest.raises(ProblemError, match="2 measurements and 2 commands, and the rec"):
         lbt.identification.diagnose(line_record(), given={"two": two})
 
 

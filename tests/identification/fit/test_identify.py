@@ -28,6 +28,7 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit import identify
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.order_search import find_rivals
+from lbt_synth.models import ARModel, SumSpectrum
 
 RATE = 1000.0
 
@@ -118,7 +119,7 @@ def identify_coloured(
     colour: float, noise: float, seed: int, gain: float = 0.4
 ) -> lbt.identification.IdentifiedAxis:
     """Identify a loop whose noise, of some nm and sensor gain 0.6, has a correlation."""
-    own = lbt.models.ARModel(
+    own = ARModel(
         coefficients=[colour],
         driving_rms_nm=noise / 0.6 * np.sqrt(1 - colour**2),
         frame_rate_hz=RATE,
@@ -127,7 +128,7 @@ def identify_coloured(
         lines=((31.0, 0.004, 30.0),),
         noise=1e-3,
         gain=gain,
-        turbulence=lbt.models.SumSpectrum(parts=[slow(), own]),
+        turbulence=SumSpectrum(parts=[slow(), own]),
         frames=20_000,
         seed=seed,
     )
@@ -161,14 +162,14 @@ def test_a_colour_that_is_hardly_likelier_widens_the_error_of_the_gain() -> None
 def test_a_rough_gain_has_rivals(gain: float, seed: int) -> None:
     """Five seconds under a drift: the gains were 4 to 6 of their errors below the truth."""
     rate, truth_gain, pole = 518.0, 0.95, 0.99984
-    slow = lbt.models.ARModel(
+    slow = ARModel(
         coefficients=[1.99691631, -0.99694883], driving_rms_nm=0.13346734, frame_rate_hz=rate
     )
-    drift = lbt.models.ARModel(
+    drift = ARModel(
         coefficients=[pole], driving_rms_nm=214 * np.sqrt(1 - pole**2), frame_rate_hz=rate
     )
     truth = lbt.Truth(
-        turbulence=lbt.models.SumSpectrum(parts=[slow, drift]),
+        turbulence=SumSpectrum(parts=[slow, drift]),
         vibrations=tuple(
             lbt.Vibration(frequency_hz=f, damping=z, rms_nm=rms, direction=(1.0,))
             for f, z, rms in ((112.0, 0.005, 85.0), (87.4, 0.0026, 84.0), (42.3, 0.0029, 64.0))

@@ -18,6 +18,7 @@ from lbt_synth.identification.fit.physical_parameters import (
     standard_errors,
     whiteness,
 )
+from lbt_synth.models import ARModel, SumSpectrum
 
 GAIN, NOISE_NM = 0.6, 5.0
 
@@ -115,12 +116,12 @@ def test_white_noise_says_how_well_its_colour_shows() -> None:
     assert axis.noise_correlation_error == pytest.approx(1 / np.sqrt(frames), rel=0.25)
 
 
-def disturbance(wind: float, pole: float, rms_nm: float) -> lbt.models.SumSpectrum:
+def disturbance(wind: float, pole: float, rms_nm: float) -> SumSpectrum:
     """Return frozen flow with a drift of first order on top."""
     air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=wind, diameter_m=8.22)
     driving = rms_nm * float(np.sqrt(1 - pole**2))
-    drift = lbt.models.ARModel(coefficients=[pole], driving_rms_nm=driving, frame_rate_hz=RATE)
-    return lbt.models.SumSpectrum(parts=[air, drift])
+    drift = ARModel(coefficients=[pole], driving_rms_nm=driving, frame_rate_hz=RATE)
+    return SumSpectrum(parts=[air, drift])
 
 
 @pytest.mark.parametrize(("wind", "noise_nm"), [(8.0, NOISE_NM), (20.0, 1.0)])

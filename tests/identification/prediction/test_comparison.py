@@ -27,16 +27,18 @@ from support.predictions import (
 )
 
 import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
 from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.models import ARModel
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 
 @cache
 def two_different_axes():
     turbulence = [
-        lbt.models.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE),
-        lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=50.0, frame_rate_hz=RATE),
+        ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE),
+        ARModel(coefficients=[0.9886], driving_rms_nm=50.0, frame_rate_hz=RATE),
     ]
     plant = lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
@@ -95,11 +97,7 @@ def test_the_table():
     )
     # and its replay is what it measured
     again = lbt.identification.replayed_residual(
-        z,
-        ran.controller,
-        plant.hardware,
-        noise_nm=[15.0, 10.0],
-        test=[(begin, end)],
+        z, ran.controller, plant.hardware, noise_nm=[15.0, 10.0], test=[(begin, end)]
     )
     np.testing.assert_allclose(again.measured_nm, part, rtol=0, atol=1e-7)
     gained, error = table["what ran"].replayed.above(table["Kalman"].replayed)
@@ -124,11 +122,7 @@ def test_a_table_of_one_axis():
     z = a_series(SLOW, 9000, rng) + a_series(line.ar_model(RATE), 9000, rng)
     z = (z + 15.5 * rng.standard_normal(z.size))[:, None]
     table = lbt.identification.prediction_against_data(
-        plant,
-        z,
-        {"Kalman": lbt.kalman(plant)},
-        imaging=CAMERA,
-        stretches=[(0, 5000), (5100, 9000)],
+        plant, z, {"Kalman": lbt.kalman(plant)}, imaging=CAMERA, stretches=[(0, 5000), (5100, 9000)]
     )
     assert table.fit == ((0, 4450),)
     assert table.test == ((4450, 5000), (5500, 9000))
@@ -178,7 +172,7 @@ def test_a_limit_that_is_not_known_is_a_note():
 
 def test_the_noise_of_the_table_has_its_correlations():
     S, R = np.array([[1.0, 0.8], [0.3, 1.0]]), 100 * np.array([[1, -0.9], [-0.9, 1]])
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=5.0, frame_rate_hz=RATE)
+    slow = ARModel(coefficients=[0.99], driving_rms_nm=5.0, frame_rate_hz=RATE)
     plant = lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=slow, noise_nm=R, sensor_matrix=S)
     rng = np.random.default_rng(0)
     total = np.column_stack([a_series(slow, 20_000, rng) for _ in range(2)])
@@ -194,7 +188,7 @@ def test_the_noise_of_the_table_has_its_correlations():
 
 
 def test_more_noise_than_the_data_has_is_a_note():
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=5.0, frame_rate_hz=RATE)
+    slow = ARModel(coefficients=[0.99], driving_rms_nm=5.0, frame_rate_hz=RATE)
     rng = np.random.default_rng(0)
     z = (a_series(slow, 8000, rng) + 10 * rng.standard_normal(8000))[:, None]
     path = {"frame_rate_hz": RATE, "turbulence": slow, "modes": 1}
@@ -266,7 +260,7 @@ def test_the_controller_of_the_predictor_gives_its_residual(delay, gain, mirror,
 def test_ar_processes_are_predicted_as_in_closed_form():
     """Two frames ahead: a1 x(k+1) + a2 x(k) with x(k+1) = a1 x(k) + a2 x(k-1)."""
     a1, a2 = 1.6, -0.8
-    model = lbt.models.ARModel(coefficients=[a1, a2], driving_rms_nm=1.0, frame_rate_hz=RATE)
+    model = ARModel(coefficients=[a1, a2], driving_rms_nm=1.0, frame_rate_hz=RATE)
     z = a_series(model, 60_000, np.random.default_rng(0))[:, None]
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     _, coefficients = lbt.identification.least_squares_predictor(z, path, taps=4)
@@ -280,7 +274,7 @@ def test_ar_processes_are_predicted_as_in_closed_form():
 def test_more_taps_come_to_the_limit_and_none_passes_it():
     """By the model, exactly: a predictor that was fitted to a long series, over its length."""
     line = lbt.Vibration(frequency_hz=40, damping=0.05, rms_nm=100, direction=(1,))
-    fast = lbt.models.ARModel(coefficients=[0.95], driving_rms_nm=20.0, frame_rate_hz=RATE)
+    fast = ARModel(coefficients=[0.95], driving_rms_nm=20.0, frame_rate_hz=RATE)
     plant = lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
         turbulence=fast,
@@ -355,7 +349,7 @@ INTEGRATOR = lbt.integrator(PATH, gain=0.3)
     ],
 )
 def test_what_cannot_be_compared_or_predicted_is_refused(call, message):
-    with pytest.raises(lbt.errors.ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message):
         call()
 
 

@@ -30,14 +30,12 @@ from support.predictions import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.identification.prediction.residual import (
-    estimate_residual,
-    replay,
-    settled_test,
-)
+from lbt_synth.errors import ProblemError, UnstableLoopError
+from lbt_synth.identification.prediction.residual import estimate_residual, replay, settled_test
+from lbt_synth.models import ARModel
 
 ONE_MODE = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-SWELL = lbt.models.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE)
+SWELL = ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE)
 
 
 def test_the_standard_errors_are_those_of_many_nights():
@@ -47,7 +45,7 @@ def test_the_standard_errors_are_those_of_many_nights():
     rows = np.r_[0:700, 900:1500]
     noise = np.diag([1.0, 4.0])
     mixing = np.array([[1.0, 0.0], [0.8, 0.6]])
-    model = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=RATE)
+    model = ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=RATE)
     # of y = 0.4 x and of x itself, both with the same noise
     exact = np.array([1, 0.16])[:, None, None] * mixing @ mixing.T * model.rms_nm**2
     seen, errors, paired, paired_errors = [], [], [], []
@@ -84,7 +82,7 @@ def test_the_standard_errors_are_those_of_many_nights():
 def test_the_errors_of_a_pure_sinusoid_are_far_too_large():
     """They are those of Gaussian series; the mean square of a sinusoid hardly scatters."""
     path, rng = lbt.LoopHardware(frame_rate_hz=RATE, modes=1), np.random.default_rng(7)
-    air = lbt.models.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE)
+    air = ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE)
     new = lbt.integrator(path, gain=0.3).controller
     seen, errors = [], []
     for phase in rng.uniform(0, 2 * np.pi, 60):
@@ -191,11 +189,7 @@ def test_a_replay_is_the_run_that_there_would_have_been(delay, gain, mirror, sen
     assert np.array_equal(night.total_nm, would.total_nm)
     z = pseudo_open_loop(night.measurements[0], night.commands[0], path, gain)
     found = lbt.identification.replayed_residual(
-        z,
-        new,
-        replace(path, sensor_matrix=gain * path.sensor),
-        noise_nm=15.5,
-        test=[(2000, 2400)],
+        z, new, replace(path, sensor_matrix=gain * path.sensor), noise_nm=15.5, test=[(2000, 2400)]
     )
     wanted = would.measurements[0, 2000:] @ np.linalg.inv(gain * path.sensor).T
     scale = np.max(np.abs(wanted))
@@ -321,7 +315,7 @@ def test_the_future_changes_nothing_before_it():
 def short_record() -> lbt.identification.LoopRecord:
     """Return one axis for 18 s, in the loop of an integrator."""
     path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=500)
+    slow = ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=500)
     line = lbt.Vibration(frequency_hz=40, damping=0.01, rms_nm=60, direction=(1.0,))
     truth = lbt.Truth(turbulence=slow, vibrations=(line,), noise_nm=5.0, sensor_gain=0.8)
     law = lbt.integrator(path, gain=0.3).controller
@@ -332,7 +326,7 @@ def short_record() -> lbt.identification.LoopRecord:
 
 
 INTEGRATOR = lbt.integrator(PATH, gain=0.3).controller
-REFUSED = (lbt.errors.ProblemError, lbt.errors.UnstableLoopError)
+REFUSED = (ProblemError, UnstableLoopError)
 STRONG = replace(PATH, sensor_matrix=4 * np.eye(2))
 
 
