@@ -7,7 +7,7 @@ import re
 import subprocess
 import sys
 from collections import Counter
-from dataclasses import astuple, replace
+from dataclasses import replace
 from itertools import cycle
 
 import numpy as np
@@ -16,6 +16,7 @@ from astropy.io import fits
 from support.exports import relative
 from support.gain_files import ORIGINALS, edited_file, original
 from support.plants import LBT_YAML, ROOT
+from support.refusals import refused
 from support.specula_filters import noise_series, simulate_commands
 
 import lbt_synth as lbt
@@ -27,7 +28,6 @@ from lbt_synth.files.gain_file.store import (
     require_certificate,
     require_same,
 )
-from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 
 ENDINGS = ("fits", "npz")
@@ -96,47 +96,53 @@ def test_round_trip_keeps_every_bit(tmp_path, name, ending):
     design = original(name)
     back = lbt.load_gain(lbt.save_gain(tmp_path / f"gain.{ending}", design))
     assert type(back) is type(design)
+    assert type(back.problem) is type(design.problem)
+    one, other = record_design(design), record_design(back)
+    assert one.arrays.keys() == other.arrays.keys()
+    assert all(np.array_equal(array, other.arrays[key]) for key, array in one.arrays.items())
+    assert json.dumps(one.meta) == json.dumps(other.meta)
     for field in "ABCD":
         assert np.array_equal(getattr(back.controller, field), getattr(design.controller, field))
     assert back.controller.dt_s == design.controller.dt_s
     assert (back.solver, back.claims) == (design.solver, design.claims)
     assert back.certificate.checks == design.certificate.checks
     assert back.recertify().passed
-    if isinstance(design, lbt.design.FilterDesign):
-        assert type(back.problem) is type(design.problem)
-        for field in ("gain_predictor", "gain_filter"):
-            assert np.array_equal(getattr(back, field), getattr(design, field))
-        for field in "ABCDL":
-            assert np.array_equal(getattr(back.problem, field), getattr(design.problem, field))
-        for one, other in zip(back.fallbacks, design.fallbacks, strict=True):
-            assert one.missing == other.missing
-            assert np.array_equal(one.gains, other.gains)
-    if isinstance(back.problem, TipTiltPlant):
-        assert back.problem.vibrations == design.problem.vibrations
-        assert back.problem.motions == design.problem.motions
-    if isinstance(design, lbt.design.LqgDesign):
-        assert np.array_equal(back.gain_mirror, design.gain_mirror)
     if isinstance(design, lbt.design.ShapedDesign):
         assert back.terms_nm() == design.terms_nm()
     if design.hardware is not None:
         assert back.hardware.suite.is_same(design.hardware.suite)
-        assert back.hardware.delay_frames == design.hardware.delay_frames
-        assert np.array_equal(back.hardware.sensor, design.hardware.sensor)
         assert np.array_equal(back.hardware.mirror_taps, design.hardware.mirror_taps)
-        if design.hardware.mirror is not None:
-            assert astuple(back.hardware.mirror) == astuple(design.hardware.mirror)
-
-
-def test_the_proof_travels_with_the_gain_file(tmp_path, axis_plant):
-    design = lbt.hinf(axis_plant, gamma_ratio=1.1)
-    loaded = lbt.load_gain(lbt.save_gain(tmp_path / "g.npz", design))
-    assert loaded.gamma_infeasible == design.gamma_infeasible
-    assert np.array_equal(loaded.witness.states, design.witness.states)
-    assert loaded.recertify().passed
 
 
 def scale_gain(document):
     document["arrays"]["GAIN_PREDICTOR"][0][0] *= 1.01
+
+
+def arrays(**changes):
+    return lambda document: document["arrays"].update(changes)
+
+
+def meta(**changes):
+    return lambda document: document["meta"].update(changes)
+
+
+def claims(**changes):
+    return lambda document: document["meta"]["claims"].update(changes)
+
+
+def in_specification(*keys, **changes):
+    def change(document):
+        place = document["meta"]["specifications"][0]
+        for key in keys:
+            place = place[key]
+        place.update(changes)
+
+    return change
+
+
+BAND = ("objective", "terms", 1)
+AGAIN = "Design it again with lbt-synth design CONFIG --method METHOD -o FILE."
+SPECIFICATION = "expected a Specification"
 
 
 @pytest.mark.parametrize(
@@ -144,51 +150,43 @@ def scale_gain(document):
     [
         ("kalman", scale_gain, "A is not what plant, loop and gains make"),
         ("kalman", lambda d: d["arrays"].pop("A"), "A is missing"),
-        ("kalman", lambda d: d["arrays"].update(B=[[1.0]]), "B must be"),
-        ("kalman", lambda d: d["arrays"].update(GAIN_FILTER=[[1.0]]), "gain_filter must"),
-        ("kalman", lambda d: d["arrays"].update(A=[[float("nan")]]), "A must be finite"),
+        ("kalman", arrays(B=[[1.0]]), "B must be"),
+        ("kalman", arrays(GAIN_FILTER=[[1.0]]), "gain_filter must"),
+        ("kalman", arrays(A=[[float("nan")]]), "A must be finite"),
         ("kalman", lambda d: d["meta"].pop("certificate"), "certificate is missing"),
-        ("kalman", lambda d: d["meta"].update(problem="riddle"), "riddle"),
-        ("kalman", lambda d: d["meta"].update(delay_frames=-1), "delay_frames must be"),
+        ("kalman", meta(problem="riddle"), "riddle"),
+        ("kalman", meta(delay_frames=-1), "delay_frames must be"),
         ("lqg", lambda d: d["arrays"]["GAIN_MIRROR"].pop(), "gain_mirror must be"),
         (
             "kalman",
-            lambda d: d["meta"].update(schema_version=99, library_version="0.2.0"),
-            "layout version 99, of lbt_synth 0.2.0; this version reads 5. Design it again "
-            "with lbt-synth design CONFIG --method METHOD -o FILE.",
+            meta(schema_version=99, library_version="0.2.0"),
+            f"layout version 99, of lbt_synth 0.2.0; this version reads 5. {AGAIN}",
         ),
-        ("kalman", lambda d: d["meta"].update(schema_version=1), "layout version 1, of"),
+        ("kalman", meta(schema_version=1), "layout version 1, of"),
+        ("shaped", claims(objective_nm=[-1.0]), "must be at least 0"),
+        ("shaped", claims(beauty=1.0), "does not claim beauty"),
+        ("shaped", meta(long_objective_nm=["inf"]), "long_objective_nm must be a number"),
+        ("shaped", claims(objective_nm=[30.0, 30.0]), "one for each mode"),
+        (
+            "shaped",
+            meta(specifications=[{"kind": "ModulusMargin", "at_least": 0.5}]),
+            SPECIFICATION,
+        ),
+        ("shaped", meta(specifications=[3]), SPECIFICATION),
+        ("shaped", in_specification(*BAND, high_hz=900.0), "below the Nyquist"),
+        ("shaped", in_specification(kind="Anything"), "Anything"),
+        ("shaped", in_specification(*BAND, high_hz=12.0), ""),  # it leaves more there
+        ("shaped", lambda d: double_demands(d["meta"]["specifications"][0]), ""),
     ],
 )
 def test_files_that_were_edited_and_signed_anew_are_refused(tmp_path, name, change, text):
     error = SchemaVersionError if "layout" in text else GainFileError
-    with pytest.raises(error, match=text):
-        lbt.load_gain(edited_file(tmp_path / "g.npz", original(name), change))
+    path = edited_file(tmp_path / "g.npz", original(name), change)
+    refused(lambda: lbt.load_gain(path), error, text or None)
 
 
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        (lambda m: m["claims"].update(objective_nm=[-1.0]), "must be at least 0"),
-        (lambda m: m["claims"].update(beauty=1.0), "does not claim beauty"),
-        (lambda m: m.update(long_objective_nm=["inf"]), "long_objective_nm must be a number"),
-        (lambda m: m["claims"].update(objective_nm=[30.0, 30.0]), "one for each mode"),
-        (
-            lambda m: m.update(specifications=[{"kind": "ModulusMargin", "at_least": 0.5}]),
-            "expected a Specification",
-        ),
-        (lambda m: m.update(specifications=[3]), "expected a Specification"),
-        (
-            lambda m: m["specifications"][0]["objective"]["terms"][1].update(high_hz=900.0),
-            "below the Nyquist",
-        ),
-        (lambda m: m["specifications"][0].update(kind="Anything"), "Anything"),
-    ],
-)
-def test_impossible_claims_of_a_gain_file_are_refused(tmp_path, change, text):
-    path = edited_file(tmp_path / "g.npz", original("shaped"), lambda d: change(d["meta"]))
-    with pytest.raises(GainFileError, match=text):
-        lbt.load_gain(path)
+def double_demands(specification):
+    specification["demands"] *= 2
 
 
 def test_a_file_that_was_edited_and_not_signed_does_not_match_its_digest(tmp_path):
@@ -196,16 +194,13 @@ def test_a_file_that_was_edited_and_not_signed_does_not_match_its_digest(tmp_pat
     with pytest.raises(GainFileError, match="does not match its digest"):
         lbt.load_gain(path)
     path = lbt.save_gain(tmp_path / "g.fits", original("kalman"))
-    card = b"RATE_HZ =                800.0"
-    content = path.read_bytes()
+    card, content = b"RATE_HZ =                800.0", path.read_bytes()
     assert card in content
     path.write_bytes(content.replace(card, card.replace(b"8", b"9")))
     with pytest.raises(GainFileError, match="the checksum of its HDU 0 is wrong"):
         lbt.load_gain(path)
-
-
-def test_a_header_that_says_something_else_is_found_behind_a_right_checksum(tmp_path):
-    with fits.open(lbt.save_gain(tmp_path / "g.fits", original("kalman"))) as hdus:
+    # a header that says something else is found behind a right checksum
+    with fits.open(lbt.save_gain(path, original("kalman"))) as hdus:
         hdus[0].header["RATE_HZ"] = 900.0
         hdus.writeto(tmp_path / "other.fits", checksum=True)
     with pytest.raises(GainFileError, match="header.RATE_HZ must be 800.0"):
@@ -400,28 +395,12 @@ def test_no_edit_is_taken_for_another_design(tmp_path, name, capsys):
 
 def test_another_claim_that_holds_has_another_digest(tmp_path):
     """The band's worst frequency is at its other end: from 9.09 Hz on it promises no less."""
-
-    def promise(**band):
-        def change(document):
-            document["meta"]["specifications"][0]["objective"]["terms"][1].update(band)
-
-        return edited_file(tmp_path / "g.npz", original("shaped"), change)
-
-    unchanged, narrow = (load_with_digest(promise(**band)) for band in ({}, {"low_hz": 9.09}))
+    unchanged, narrow = (
+        load_with_digest(edited_file(tmp_path / "g.npz", original("shaped"), change))
+        for change in (in_specification(), in_specification(*BAND, low_hz=9.09))
+    )
     assert narrow[0].recertify().passed
     assert narrow[1] != unchanged[1]
-    with pytest.raises(GainFileError):  # it leaves more there
-        lbt.load_gain(promise(high_hz=12.0))
-    with pytest.raises(GainFileError):  # demands that are there twice
-        lbt.load_gain(
-            edited_file(
-                tmp_path / "g.npz",
-                original("shaped"),
-                lambda d: d["meta"]["specifications"][0].update(
-                    demands=2 * d["meta"]["specifications"][0]["demands"]
-                ),
-            )
-        )
 
 
 @pytest.mark.parametrize(

@@ -18,22 +18,18 @@ def test_a_jump_is_found_noted_and_cut() -> None:
     assert all(note.startswith("warning: 1 jump of the") for note in found.notes)
     assert "the record was cut there" in found.notes[0]
     axis = found.axes[0]
-    assert axis.sensor_gain_error is not None
     assert axis.sensor_gain == pytest.approx(0.6, abs=4 * axis.sensor_gain_error)
     assert axis.noise_nm == pytest.approx(6, abs=4 * axis.noise_error_nm)
 
 
-@pytest.mark.parametrize("lost", [(5008, 6154), (2000, 9000)])
-def test_frames_that_were_lost_do_not_move_the_gain(lost: tuple[int, int]) -> None:
+def test_frames_that_were_lost_do_not_move_the_gain() -> None:
     whole = spliced_record((3,), lines=LINE, frames=20_000)
     y, u = (
-        np.vstack([series[: lost[0]], series[lost[1] :]])
-        for series in (whole.measurements, whole.commands)
+        np.vstack([series[:2000], series[9000:]]) for series in (whole.measurements, whole.commands)
     )
     spliced = lbt.identification.loop_record(y, u, frame_rate_hz=1000, delay_frames=2, unit="nm")
     found = lbt.identify(spliced)
     axis = found.axes[0]
-    assert axis.sensor_gain_error is not None
     assert axis.sensor_gain == pytest.approx(0.6, abs=4 * axis.sensor_gain_error)
     assert axis.sensor_gain_error < 0.05
     assert any("jump" in note for note in found.notes)
