@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 from scipy.optimize import minimize
-from support.continuous_loops import noise_covariance, sinusoid_powers
 from support.lqg import shell, slow_plant
 from support.plants import lbt_axis_plant
 from support.refusals import require_refusals
@@ -16,7 +15,7 @@ from support.refusals import require_refusals
 import lbt_synth as lbt
 from lbt_synth.design.lqg import _pieces, loop_variances, lqg_controller, mirror_core
 from lbt_synth.design.shaping import LoopErrors, ModulusMargin, ResidualVariance, Specification
-from lbt_synth.errors import CertificateError, DimensionError, ProblemError
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.loop.budget import settling_error
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
@@ -131,23 +130,6 @@ def test_no_other_gain_costs_less():
     assert best.fun >= design.objective_nm**2 * (1 - 1e-9)
 
 
-@pytest.mark.parametrize("delay", [2.0, 2.49])
-def test_the_residual_is_that_of_a_run_in_small_steps(delay):
-    """Of waves, by their density in the phase whose means over frames are the process."""
-    quick = ARModel(coefficients=[0.7], driving_rms_nm=60.0, frame_rate_hz=800)
-    plant = slow_plant(delay, shell(sampling_hz=8000.0), vibrations=None, turbulence=quick)
-    controller = lbt.lqg(plant).controller
-    x, weight = np.polynomial.legendre.leggauss(40)
-    hertz = 200 * (1 + x)
-    powers = sinusoid_powers(plant.hardware, controller, hertz, (1.0,), frames=120)
-    density = quick.psd(hertz) / np.sinc(hertz / 800) ** 2
-    noise = noise_covariance(plant.hardware, controller, [15.5], frames=120)
-    expected = np.sqrt(200 * weight @ (density * powers[:, 0, 0]) + noise[0, 0])
-    assert model_rms(plant, controller) == pytest.approx(expected, rel=1e-4)
-    loop = lbt.close_loop(plant.hardware, controller)
-    assert lbt.residual_budget(loop, truth_of(plant)).rms_nm == pytest.approx(expected, rel=1e-4)
-
-
 def test_coupled_matrices_and_redundant_commands():
     sensor = [[1.0, 0.2], [0.0, 0.8], [0.1, 0.1]]
     influence = [[1.0, 0.1, 0.4], [-0.2, 0.9, 0.3]]
@@ -186,23 +168,15 @@ def test_what_is_left_of_the_settled_mirror():
     assert amplitude == pytest.approx(abs(change * command), rel=1e-9)
 
 
-def test_the_other_designs_and_analyses_take_a_moving_mirror():
+def test_the_other_designs_take_a_moving_mirror():
     plant = slow_plant(2.25, shell(300.0), modes=2)
     truth, path = truth_of(plant), plant.hardware
-    integrator, lqg = lbt.design.optimal_integrator(path, truth), lbt.lqg(plant)
-    designs = lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.3, route="riccati"), integrator, lqg
+    integrator = lbt.design.optimal_integrator(path, truth)
     limit = lbt.loop.least_residual(path, truth, frame_means=True).rms_nm
-    for design in designs:
+    for design in (lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.3), integrator, lbt.lqg(plant)):
         loop = lbt.close_loop(path, design.controller)
-        assert loop.is_stable
         assert lbt.residual_budget(loop, truth, frame_means=True).rms_nm >= limit * (1 - 1e-9)
     assert lbt.loop.stable_sensor_gains(path, integrator.controller)[1] > 1
-    grid = {"errors_hz": [0.0], "sensor_gains": [1.0], "delay_errors_frames": [0.0, 0.1]}
-    rows = lbt.studies.robustness_map(lqg, truth, lbt.Imaging(diameter_m=8.22), **grid)
-    assert rows.stable.all()
-    late = replace(path, delay_frames=2.35)
-    exact = lbt.residual_budget(lbt.close_loop(late, lqg.controller), truth)
-    assert rows.residual_nm[1, 0, 0] == pytest.approx(exact.rms_nm, rel=1e-6)
 
 
 def test_shaping_takes_a_moving_mirror_and_refuses_its_delay_errors():
@@ -272,14 +246,3 @@ def test_other_disturbances_meet_the_same_loop():
     assert np.trace(error.C @ X @ error.C.T) == pytest.approx(residual, rel=1e-8)
     rms = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), moved).rms_nm
     assert rms == pytest.approx(np.sqrt(residual), rel=0.05)  # a line is straight in the model
-
-
-@pytest.mark.parametrize("field", ["gain_predictor", "gain_state", "gain_mirror", "objective_nm"])
-def test_changed_gains_fail_the_certificate(field):
-    design = lbt.lqg(slow_plant(2.0, shell()))
-    assert design.recertify().passed
-    changes = {field: getattr(design, field) * (1 + 1e-4)}
-    if field in design.claims:
-        changes = {"claims": {**design.claims, **changes}}
-    with pytest.raises(CertificateError):
-        replace(design, **changes).recertify().require()

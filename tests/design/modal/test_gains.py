@@ -53,11 +53,16 @@ def test_agrees_with_the_best_integrator_of_one_mode(air, delay, noise, sensor_g
         frequency_hz=[0, 1, 5, 30, 31, 32, 400], density_nm2_hz=[4e4, 4e4, 50, 1, 90, 0.5, 0.01]
     )
     known = {"noise_nm": noise, "sensor_gain": sensor_gain}
+    sharp = replace(LINE, damping=1e-4).ar_model(RATE)
     gains = modal_gains(
-        [air, table, ar1], frame_rate_hz=RATE, delay_frames=delay, vibrations={2: LINE}, **known
+        [air, table, ar1, sharp],
+        frame_rate_hz=RATE,
+        delay_frames=delay,
+        vibrations={2: LINE},
+        **known,
     )
     moving = replace(LINE, rms_nm=LINE.rms_nm / np.sinc(20 / RATE))
-    for i, (spectrum, lines) in enumerate([(air, ()), (table, ()), (ar1, (moving,))]):
+    for i, (spectrum, lines) in enumerate([(air, ()), (table, ()), (ar1, (moving,)), (sharp, ())]):
         truth = lbt.Truth(turbulence=spectrum, vibrations=lines, **known)
         gain, rms_nm = best_integrator(path, truth)
         assert gains.rms_nm[i] == pytest.approx(rms_nm, rel=1e-6)
@@ -114,17 +119,6 @@ def test_minimum_between_the_points(a, b, delta):
     best = minimize_scalar(lambda log: function(np.exp(log)), bounds=bounds, options=options)
     assert value[0] == pytest.approx(best.fun, rel=1e-9)
     assert place[0] == pytest.approx(np.exp(best.x), rel=1e-4)
-
-
-def test_sharp_peaks_of_arrays_are_those_of_models():
-    line = replace(LINE, damping=1e-4)
-    model = line.ar_model(RATE)
-    known = {"noise_nm": 15.5, "frame_rate_hz": RATE}
-    stacked = modal_gains(ModalTurbulence.of([model]), **known)
-    assert stacked.rms_nm == pytest.approx(modal_gains([model], **known).rms_nm, rel=1e-6)
-    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-    truth = lbt.Truth(turbulence=model, noise_nm=15.5)
-    assert stacked.rms_nm[0] == pytest.approx(best_integrator(path, truth)[1], rel=1e-6)
 
 
 @pytest.mark.parametrize(("bandwidth", "delay"), [(60.0, 2.4), (250.0, 2)])

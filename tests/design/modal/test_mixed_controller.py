@@ -7,7 +7,6 @@ from support.interaction import interaction
 from support.modal import tip_tilt_filter
 from support.refusals import require_refusals
 
-import lbt_synth as lbt
 from lbt_synth.design.modal import MixedController, reconstructor
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 
@@ -53,32 +52,6 @@ def test_commands_are_the_callers():
     mixed = MixedController(gains=[1.0, 1.0])
     mixed.step([1.0, 2.0])[:] = 1e9
     assert mixed.step([0.0, 0.0]).tolist() == [1.0, 2.0]
-
-
-def test_fifty_modes_in_the_loop_agree_with_the_linear_loop():
-    n, q = 50, 90
-    D, plant = interaction(q, n), tip_tilt_filter().problem
-    hardware = lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=D)
-    mixed = MixedController(
-        filter=tip_tilt_filter(), gains=np.linspace(0.2, 0.6, n), reconstructor=reconstructor(D)
-    )
-    truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
-    kept = {"hardware": hardware, "frames": 200, "seed": 1, "settle_frames": 50}
-    stepped, linear = (lbt.simulate(law, truth, **kept) for law in (mixed, mixed.as_controller()))
-    assert stepped.residual_nm.shape == (1, 200, n)
-    assert np.allclose(stepped.residual_nm, linear.residual_nm, atol=1e-7)
-    assert np.allclose(stepped.commands, linear.commands, atol=1e-7)
-
-
-def test_modes_count_for_themselves_only():
-    """Any order of the modes gives the same commands in that order."""
-    rng = np.random.default_rng(0)
-    gains, order = rng.uniform(0, 1, 7), rng.permutation(7)
-    one = MixedController(filter=tip_tilt_filter(), gains=gains, filtered=(0, 1))
-    at = [int(np.flatnonzero(order == i)[0]) for i in (0, 1)]
-    other = MixedController(filter=tip_tilt_filter(), gains=gains[order], filtered=at)
-    for y in rng.standard_normal((20, 7)):
-        assert np.array_equal(one.step(y)[order], other.step(y[order]))
 
 
 def test_a_step_of_672_modes_enters_as_many_functions_as_one_of_two():

@@ -72,8 +72,6 @@ def test_derivatives_of_the_smearing(width: float, distance: float) -> None:
     assert by_distance[0] == pytest.approx(-by_distance[1])
 
 
-
-
 def test_periodogram_of_a_sinusoid_is_the_taper() -> None:
     n, rate, rms, width, frequency = 48_000, 800.0, 100.0, 1e-8, 123.4567
     y = rms * np.sqrt(2) * np.cos(2 * np.pi * frequency * np.arange(n) / rate + 0.3)
