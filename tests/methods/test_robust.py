@@ -73,7 +73,9 @@ def test_the_robust_design_of_an_identified_system(tmp_path):
     design()  # with the model's turbulence, as there is no atmosphere
     with pytest.raises(ConfigError, match="atmosphere is missing: design.robust.turbulence"):
         design(turbulence="frozen_flow")
-    with pytest.raises(ConfigError, match=r"telescope is missing: design.robust.bands\[0\].rms_mas"):
+    with pytest.raises(
+        ConfigError, match=r"telescope is missing: design.robust.bands\[0\].rms_mas"
+    ):
         design(turbulence="model", bands=[band | {"rms_mas": 9.0}])
     content["model"]["turbulence"] = [AR, OTHER]
     with pytest.raises(ConfigError, match="hold under one turbulence for all axes"):

@@ -11,8 +11,8 @@ from scipy.signal import lfilter
 from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
-from lbt_synth.identification import accelerometer_transfers, loop_record
 from lbt_synth.errors import ProblemError
+from lbt_synth.identification import accelerometer_transfers, loop_record
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
@@ -104,8 +104,7 @@ def test_errors_count_that_of_the_sensor_gain():
     axes = tuple(replace(axis, sensor_gain_error=0.05) for axis in it.model.axes)
     unsure = replace(it.model, axes=axes)
     exact, found = (
-        accelerometer_transfers(model, it.record, channel)
-        for model in (it.model, unsure)
+        accelerometer_transfers(model, it.record, channel) for model in (it.model, unsure)
     )
     for known, row in zip(exact.transfers, found.transfers, strict=True):
         assert row.motion_nm_per_nm == known.motion_nm_per_nm
