@@ -112,8 +112,6 @@ def test_no_other_file_names_a_method():
             assert not strings & set(BUILT_IN), path
 
 
-
-
 def test_an_option_that_no_method_has(tmp_path, capsys):
     study = tmp_path / "study.yaml"
     text = STUDY.format(config=CONFIG, leak=5.0).replace("leaky", "hinf")

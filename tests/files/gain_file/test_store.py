@@ -259,8 +259,6 @@ def test_specula_commands_what_our_simulator_does(simulated_designs, specula_run
     assert relative(series[name][1], stepped) < LIMITS[precision]
 
 
-
-
 # What a design does not depend on: words, what its solver said, values of checks (rounding).
 NOTES = {"solver", "assumptions", "library_version", "bound_programme", "long_objective_nm"}
 NOTES |= {"long_functions", "value", "computed_by", "configuration"}

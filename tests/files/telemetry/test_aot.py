@@ -12,10 +12,9 @@ from astropy.io import fits
 from support.telemetry import full, same
 
 import lbt_synth as lbt
-from lbt_synth.files import load_telemetry, save_telemetry
 from lbt_synth.errors import OutputError, TelemetryError
+from lbt_synth.files import load_telemetry, save_telemetry
 from lbt_synth.files.telemetry.aot import lost_fields
-from lbt_synth.models import ARModel
 
 pytestmark = pytest.mark.e2e
 
@@ -65,7 +64,11 @@ def test_the_file_says_what_the_telemetry_says(tmp_path):
     seen = full()
     system = strictly_read(save_telemetry(tmp_path / "t.aot.fits", seen))
     telescope, (star,), (sensor,) = system.main_telescope, system.sources, system.wavefront_sensors
-    (mirror,), (loop,), (camera,) = system.wavefront_correctors, system.loops, system.scoring_cameras
+    (mirror,), (loop,), (camera,) = (
+        system.wavefront_correctors,
+        system.loops,
+        system.scoring_cameras,
+    )
     (card,) = system.metadata
     ours, modes_to_measurements = json.loads(card.value), loop.modes_to_measurements.data
     for thing, kind in (
