@@ -26,7 +26,6 @@ from lbt_synth.identification.fit.spectrum_model import (
 )
 from lbt_synth.identification.fit.whittle import (
     SKIRT,
-    WIDE,
     Priors,
     contrast,
     density,
@@ -64,32 +63,20 @@ def test_smearing_is_the_integral_that_defines_it(width: float, distance: float)
 @given(width=st.floats(1e-3, 25), distance=st.floats(0.02, SKIRT))
 @settings(max_examples=10, deadline=None)
 def test_derivatives_of_the_smearing(width: float, distance: float) -> None:
-    d = np.array([-distance, distance])
+    d, h = np.array([-distance, distance]), 1e-6
     _, by_width, by_distance = log_smearing(width, d)
-    h = 1e-6
-    numeric = (log_smearing(width * np.exp(h), d)[0] - log_smearing(width * np.exp(-h), d)[0]) / (
-        2 * h
-    )
-    assert by_width == pytest.approx(numeric, abs=1e-4)
-    numeric = (log_smearing(width, d + h)[0] - log_smearing(width, d - h)[0]) / (2 * h)
-    assert by_distance == pytest.approx(numeric, rel=1e-4, abs=1e-4)
+    numeric = log_smearing(width * np.exp(h), d)[0] - log_smearing(width * np.exp(-h), d)[0]
+    assert by_width == pytest.approx(numeric / (2 * h), abs=1e-4)
+    numeric = log_smearing(width, d + h)[0] - log_smearing(width, d - h)[0]
+    assert by_distance == pytest.approx(numeric / (2 * h), rel=1e-4, abs=1e-4)
     assert by_distance[0] == pytest.approx(-by_distance[1])
 
 
-def test_wide_lines_are_as_they_are() -> None:
-    value, _, _ = log_smearing(WIDE, np.linspace(-100, 100, 201))
-    assert np.max(np.abs(value)) < 0.02
-
-
-@pytest.mark.parametrize("frequency", [20.0, 123.4567])
-def test_periodogram_of_a_sinusoid_is_the_taper(frequency: float) -> None:
-    n, rate, rms = 48_000, 800.0, 100.0
-    k = np.arange(n)
-    y = rms * np.sqrt(2) * np.cos(2 * np.pi * frequency * k / rate + 0.3)
+def test_periodogram_of_a_sinusoid_is_the_taper() -> None:
+    n, rate, rms, width, frequency = 48_000, 800.0, 100.0, 1e-8, 123.4567
+    y = rms * np.sqrt(2) * np.cos(2 * np.pi * frequency * np.arange(n) / rate + 0.3)
     data = loop_periodogram(y, None, frame_rate_hz=rate, stretches=[(0, n)])
-    assert data.duration_s is not None
     d = (data.frequency_hz - frequency) * data.duration_s
-    width = 1e-8
     for low, high in ((0, 1.5), (1.5, 4), (4, 10), (10, 20), (20, 40)):
         inside = (np.abs(d) >= low) & (np.abs(d) < high)
         line = width / np.pi / (width**2 + d[inside] ** 2)
@@ -102,20 +89,32 @@ def test_skirts_are_those_of_the_line_beyond_the_reach(width: float) -> None:
     assert np.mean(log_smearing(width, SKIRT + np.arange(8))[0]) == pytest.approx(0, abs=0.02)
 
 
+def component(kind: str, hertz: float, log_odds: float, rms: float, **changes: object) -> Component:
+    logs = (float(np.log(hertz * W)), log_odds, 2 * float(np.log(rms)))
+    return dataclasses.replace(Component(kind, *logs), **changes)
+
+
+def line(frequency: float, ratio: float, rms: float, **changes: object) -> Component:
+    return component("line", frequency, float(np.log(ratio / (1 - ratio))), rms, **changes)
+
+
 def case(*, drift: bool = False, bump: bool = False) -> tuple[LoopPeriodogram, SpectrumModel]:
     y, c = integrator_loop(lines=((40, 0.01, 30),), frames=4096)
     data = loop_periodogram(y[:, 0], c[:, 0], frame_rate_hz=RATE, stretches=[(0, len(y))])
-    turbulence = Component("turbulence", np.log(1.1 * W), np.log(0.5), np.log(200.0**2))
-    line = Component("line", np.log(39 * W), np.log(0.02 / 0.98), np.log(15.0**2))
-    components = [turbulence, line]
+    components = [component("turbulence", 1.1, np.log(0.5), 200.0), line(39, 0.02, 15.0)]
     if bump:
-        odds = np.log(0.2 / 0.8)
-        components.append(Component("line", np.log(90 * W), odds, np.log(20.0**2), sections=3))
+        components.append(line(90, 0.2, 20.0, sections=3))
     if drift:
-        components.append(Component("drift", np.log(20 * W), np.log(300.0), np.log(50.0**2)))
-        components.append(Component("slow", np.log(3 * W), 0.3, np.log(50.0**2)))
+        components.append(component("drift", 20, np.log(300.0), 50.0))
+        components.append(component("slow", 3, 0.3, 50.0))
     background = Background(np.log(0.7), np.log(30), 0.3, np.log(20 * W))
     return data, SpectrumModel((background,), tuple(components))
+
+
+def differences(function, theta: np.ndarray, step: float = 1e-5) -> np.ndarray:
+    """Return the central differences of a function by each parameter."""
+    steps = step * np.eye(theta.size)
+    return np.array([(function(theta + h) - function(theta - h)) / (2 * step) for h in steps])
 
 
 @pytest.mark.parametrize("drift", [False, True])
@@ -131,25 +130,16 @@ def test_gradient_and_information_of_the_likelihood(drift: bool) -> None:
     numeric = approx_fprime(theta, lambda x: contrast(data, spectrum.unpack(x)), 1e-6)
     assert slope == pytest.approx(numeric, rel=2e-3, abs=1e-3 * np.max(np.abs(numeric)))
     # the rows of the gain are exact second derivatives
-    step = 1e-5 * np.eye(theta.size)[GAIN]
-    row = (gradient(theta + step) - gradient(theta - step)) / 2e-5
+    row = differences(gradient, theta)[GAIN]
     assert information[GAIN] == pytest.approx(row, rel=1e-4, abs=1e-4 * np.max(np.abs(row)))
     # the others are those of the model where the data are the model
-    pure = dataclasses.replace(
-        data,
-        measured=density(data, spectrum),
-        crossed=np.zeros_like(data.crossed),
-        corrected=np.zeros_like(data.corrected),
-    )
+    zero = np.zeros_like(data.crossed)
+    known = {"measured": density(data, spectrum), "crossed": zero, "corrected": zero}
+    pure = dataclasses.replace(data, **known)
     _, flat, expected = derivatives(pure, spectrum)
     assert flat == pytest.approx(0, abs=1e-8)
-    rows = np.array(
-        [
-            (gradient(theta + h, pure) - gradient(theta - h, pure)) / 2e-5
-            for h in 1e-5 * np.eye(theta.size)[1:]
-        ]
-    )
-    assert expected[1:, 1:] == pytest.approx(rows[:, 1:], rel=1e-3, abs=1e-3 * np.max(rows))
+    rows = differences(lambda x: gradient(x, pure), theta)[1:, 1:]
+    assert expected[1:, 1:] == pytest.approx(rows, rel=1e-3, abs=1e-3 * np.max(rows))
 
 
 @pytest.mark.parametrize(("drift", "taper"), [(False, False), (True, True)])
@@ -160,41 +150,29 @@ def test_second_derivatives_of_the_likelihood(drift: bool, taper: bool) -> None:
         data = dataclasses.replace(data, duration_s=None)
     search = Search(data=data)
     model = fit(search, start, accuracy=1e-8)
-    assert model is not None
     merged, priors = search.merge(model.spectrum), search.priors(model.spectrum)
-    theta, step = model.spectrum.pack(), 1e-4
 
-    def gradient(change: np.ndarray) -> np.ndarray:
-        return derivatives(merged, model.spectrum.unpack(theta + change))[1]
+    def gradient(theta: np.ndarray) -> np.ndarray:
+        return derivatives(merged, model.spectrum.unpack(theta))[1]
 
-    rows = [(gradient(h) - gradient(-h)) / (2 * step) for h in step * np.eye(theta.size)]
+    rows = differences(gradient, model.spectrum.pack(), 1e-4)
     free = np.ix_(priors.free, priors.free)  # but for the damping of a drift
-    expected = np.array(rows)[free] + np.diag(1 / priors.width[priors.free] ** 2)
-    found = observe_information(merged, model, priors).information[free]
-    scale = np.sqrt(np.abs(np.diag(found)))
-    assert found / np.outer(scale, scale) == pytest.approx(
-        expected / np.outer(scale, scale), abs=2e-2 if taper else 1e-3
-    )
-    assert found == pytest.approx(found.T, rel=1e-12)
-
-
-def line(frequency: float, ratio: float, rms: float, **changes: object) -> Component:
-    odds = float(np.log(ratio / (1 - ratio)))
-    logs = (float(np.log(frequency * W)), odds, 2 * float(np.log(rms)))
-    return dataclasses.replace(Component("line", *logs), **changes)
+    expected = rows[free] + np.diag(1 / priors.width[priors.free] ** 2)
+    information = observe_information(merged, model, priors).information[free]
+    scale = np.sqrt(np.abs(np.diag(information)))
+    scales = np.outer(scale, scale)
+    accuracy = 2e-2 if taper else 1e-3
+    assert information / scales == pytest.approx(expected / scales, abs=accuracy)
+    assert information == pytest.approx(information.T, rel=1e-12)
 
 
 @pytest.fixture(scope="module")
 def both() -> LoopPeriodogram:
     """Return the periodogram of two axes in a loop."""
     record = open_record(((LINE, 0),), frames=4096)
-    corrections = np.random.default_rng(5).standard_normal(record.measurements.shape)
-    return loop_periodogram(
-        record.measurements,
-        corrections + 0.1 * record.measurements[:, ::-1],
-        frame_rate_hz=RATE,
-        stretches=[(0, record.frames)],
-    )
+    y = record.measurements
+    corrections = np.random.default_rng(5).standard_normal(y.shape) + 0.1 * y[:, ::-1]
+    return loop_periodogram(y, corrections, frame_rate_hz=RATE, stretches=[(0, record.frames)])
 
 
 @pytest.fixture
@@ -204,8 +182,8 @@ def coupled() -> SpectrumModel:
         Background(np.log(gain), np.log(40), colour, np.log(30 * W))
         for gain, colour in ((0.7, 0.1), (1.3, 0.0))
     )
-    slow = Component("turbulence", np.log(1.1 * W), np.log(0.5), np.log(280.0**2))
-    drift = Component("drift", np.log(20 * W), np.log(300.0), np.log(50.0**2), axis=1)
+    slow = component("turbulence", 1.1, np.log(0.5), 280.0)
+    drift = component("drift", 20, np.log(300.0), 50.0, axis=1)
     shared = line(41, 0.02, 35, axis=None, log_ratio=2 * np.log(25 / 35), sign=-1.0)
     components = (slow, line(70, 0.05, 20), dataclasses.replace(slow, axis=1), drift, shared)
     return SpectrumModel(backgrounds, components)
@@ -231,36 +209,22 @@ def test_axes_without_shared_resonances_are_separate(both, coupled) -> None:
 
 
 def test_slopes_of_two_axes_are_those_of_differences(both, coupled) -> None:
-    theta = coupled.pack()
-    _, slope, _ = derivatives(both, coupled)
-    numeric = np.array(
-        [
-            contrast(both, coupled.unpack(theta + h)) - contrast(both, coupled.unpack(theta - h))
-            for h in 1e-5 * np.eye(theta.size)
-        ]
-    )
-    numeric /= 2e-5
+    numeric = differences(lambda x: contrast(both, coupled.unpack(x)), coupled.pack())
     numeric[[GAIN, BACKGROUND + GAIN]] = 0  # the gains of two axes are held
+    slope = derivatives(both, coupled)[1]
     assert slope == pytest.approx(numeric, rel=1e-4, abs=1e-5 * np.max(np.abs(numeric)))
 
 
 def test_information_is_the_second_derivative_where_the_data_are_the_model(both, coupled) -> None:
-    matrix = spectral_matrix(both, coupled)
+    matrix, theta = spectral_matrix(both, coupled), coupled.pack()
     zero, between = np.zeros_like(both.measured), np.zeros_like(both.between)
     between[0, 0] = matrix[0, 1]
     measured = np.array([matrix[0, 0], matrix[1, 1]])
-    pure = dataclasses.replace(
-        both, measured=measured, crossed=zero, corrected=zero, between=between
-    )
-    theta = coupled.pack()
+    known = {"measured": measured, "crossed": zero, "corrected": zero, "between": between}
+    pure = dataclasses.replace(both, **known)
     _, slope, information = derivatives(pure, coupled)
     assert slope == pytest.approx(0, abs=1e-7)
-    rows = [
-        derivatives(pure, coupled.unpack(theta + h))[1]
-        - derivatives(pure, coupled.unpack(theta - h))[1]
-        for h in 1e-5 * np.eye(theta.size)
-    ]
-    exact = np.array(rows) / 2e-5
+    exact = differences(lambda x: derivatives(pure, coupled.unpack(x))[1], theta)
     gains = [GAIN, BACKGROUND + GAIN]
     exact[gains] = exact[:, gains] = 0  # they are held
     assert information == pytest.approx(exact, abs=1e-5 * np.max(exact))
@@ -270,7 +234,6 @@ def test_a_component_that_would_leave_the_band_stays_at_its_end(both, coupled) -
     """Noise that falls towards the Nyquist frequency draws a wide component beyond it."""
     wide = Component("line", np.log(3.1), 0.0, 2 * np.log(20.0))
     model = fit(Search(data=both, gain=1.0), coupled.exchange(1, wide))
-    assert model is not None
     assert model.spectrum.components[1].frequency < np.pi
 
 
