@@ -174,6 +174,8 @@ def _predicted_residuals(
             raise ProblemError(
                 f"designs must be Controllers or Designs; got {type(design).__name__} for {name!r}."
             )
+        if isinstance(design, Design) and design.other_sensors:
+            continue  # the model says nothing of what they read
         loop = close_loop(model.hardware, controller)
         loop.require_stable()
         residuals[name] = [_residual_density(model, loop, i) for i in range(len(model.axes))]
@@ -195,7 +197,7 @@ def _residual_density(model: IdentifiedModel, loop: ClosedLoop, i: int) -> Float
 
 def _noise_density(axis: IdentifiedAxis) -> float:
     """Density of the noise, in units of the phase [nm^2/Hz]."""
-    return 2 / axis.frame_rate_hz * (axis.noise_nm / axis.sensor_gain) ** 2
+    return 2 / axis.data.frame_rate_hz * (axis.noise_nm / axis.sensor_gain) ** 2
 
 
 def _noise_text(axis: IdentifiedAxis) -> str:
@@ -282,7 +284,7 @@ def _draw_innovations(panel: Panel, axis: IdentifiedAxis, frequency: dict[str, o
     y_axis = {"label": "power up to f", "unit": "%", "low": -reach, "high": reach}
     panel.set_axes(frequency, y_axis, title="innovations, less white noise")
     panel.span("99 % of white noise", -bound, bound, "y")
-    panel.curve("excess", test.frequency_hz, excess, width=1.0, quiet=True)
+    panel.curve("excess", axis.frequency_hz, excess, width=1.0, quiet=True)
 
 
 SEGMENT = 2048  # frames of a segment of the spectra, at most
