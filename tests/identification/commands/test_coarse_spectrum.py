@@ -43,11 +43,6 @@ def test_the_record_as_given_is_the_likeliest(coarse) -> None:
     np.testing.assert_allclose(gain[:, 0], 0.7, rtol=0.1)
 
 
-def test_commands_that_do_not_reach_the_measurements_are_less_likely(coarse) -> None:
-    contrast, _ = coarse.compare([CommandRepair()])
-    assert np.sum(contrast[:, 1]) > np.sum(contrast[:, 0]) + 100
-
-
 def white(seed: int, n: int = 1) -> np.ndarray:
     return np.random.default_rng(seed).standard_normal((FRAMES, n))
 
@@ -56,23 +51,6 @@ def axis_of(y: np.ndarray, guesses: np.ndarray) -> CoarseAxis:
     """The coarse axis of one measurement (frames,) and guesses (frames, n)."""
     f, z, n = coarse_transforms(np.column_stack([y, guesses]), [(0, FRAMES)], RATE)
     return CoarseAxis(f, z[0], z[1:], independent=n, frame_rate_hz=RATE)
-
-
-def test_the_square_of_a_transform_is_a_density() -> None:
-    f, z, _ = coarse_transforms(3.0 * white(0), [(0, FRAMES)], RATE)
-    density = np.mean(abs(z[0]) ** 2, axis=0)
-    assert np.mean(density) == pytest.approx(2 * 9.0 / RATE, rel=0.03)
-    t = np.arange(FRAMES) / RATE
-    f, z, _ = coarse_transforms(50 * np.sin(2 * np.pi * 40 * t)[:, None], [(0, FRAMES)], RATE)
-    power = np.sum(np.mean(abs(z[0]) ** 2, axis=0)) * (f[1] - f[0])
-    assert power == pytest.approx(50**2 / 2, rel=0.01)
-
-
-def test_a_mean_slope_does_not_show() -> None:
-    y = white(1)
-    sloped = y + 0.5 * np.arange(FRAMES)[:, None] + 1e4
-    one, other = (coarse_transforms(x, [(0, FRAMES)], RATE)[1] for x in (y, sloped))
-    np.testing.assert_allclose(one, other, atol=1e-9)
 
 
 def test_the_contrast_of_white_noise_lies_between_its_bounds() -> None:
@@ -84,18 +62,6 @@ def test_the_contrast_of_white_noise_lies_between_its_bounds() -> None:
     mean = np.average(power, weights=count)
     only_noise = np.sum(count) * (np.log(mean) + 1) + rest
     assert least < contrast <= only_noise + 0.1
-
-
-def test_bands_are_as_wide_beside_a_peak_at_the_lowest_frequencies() -> None:
-    f, z, n = coarse_transforms(white(2), [(0, FRAMES)], RATE)
-    plain = CoarseAxis(f, z[0], z, independent=n, frame_rate_hz=RATE)
-    peaked = z[0].copy()
-    peaked[:, 4:7] *= 30.0
-    found = CoarseAxis(f, peaked, z, independent=n, frame_rate_hz=RATE)
-    assert len(found.shapes) > len(plain.shapes)
-    assert found.bands.count.size <= plain.bands.count.size
-    total = np.sum(found.bands.count) + np.sum(found.peaks.count)
-    assert total == pytest.approx(n * f.size)
 
 
 def test_the_right_correction_is_found_with_its_gain() -> None:
@@ -117,9 +83,9 @@ def test_the_right_correction_is_found_with_its_gain() -> None:
     assert np.all(contrast[2:] > contrast[0] + 100)
 
 
-@pytest.mark.parametrize("rate_hz", [1e-3, 0.8, 10.0])
-def test_slow_loops_have_whole_segments(rate_hz):
+def test_slow_loops_have_whole_segments():
     """Six seconds are few frames there, or none: 0.8 may be a rate in kHz."""
+    rate_hz = 0.8
     series = np.random.default_rng(0).standard_normal((2000, 1))
     f, z, independent = coarse_transforms(series, [(0, 1500)], rate_hz)
     assert z.shape == (1, 2, f.size)

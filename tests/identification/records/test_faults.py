@@ -47,20 +47,12 @@ def high(t):
 @pytest.mark.parametrize(
     "line", [None, sinusoid, burst, high], ids=lambda f: getattr(f, "__name__", "none")
 )
-@pytest.mark.parametrize("noise", [0.5, 15.5])
 @pytest.mark.parametrize("step", [None, 1.0, 30.0], ids=["fine", "1 nm", "30 nm"])
-def test_strong_lines_and_coarse_numbers_are_no_faults(line, noise, step):
-    y = turbulence(60_000, noise=noise, line=line)
+def test_strong_lines_and_coarse_numbers_are_no_faults(line, step):
+    y = turbulence(30_000, noise=0.5 if step is None else 15.5, line=line)
     y = y if step is None else step * np.round(y / step)
     seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert findings(seen) == []
-
-
-@pytest.mark.parametrize("step", [None, 1.0, 10.0])
-def test_a_pure_sinusoid_is_no_fault(step):
-    y = sinusoid(np.arange(40_000) / RATE)
-    y = y if step is None else step * np.floor(y / step)
-    assert findings(lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")) == []
 
 
 def test_resonances_and_closed_loops_are_no_faults():
@@ -115,9 +107,9 @@ def test_a_range_that_is_cut_off_is_found(ends):
     assert np.array_equal(seen.usable, cut == y)
 
 
-@pytest.mark.parametrize("scatter", [0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 2.0])
+@pytest.mark.parametrize("scatter", [0.3, 0.5, 1.0])
 def test_clean_coarse_series_are_not_saturated(scatter):
-    for seed in range(5):
+    for seed in range(3):
         y = np.round(scatter * np.random.default_rng(seed).standard_normal(20_000))
         seen = lbt.identification.loop_record(y, frame_rate_hz=500.0, unit="nm")
         assert not [found for found in seen.health.findings if found.kind == "saturated"]
