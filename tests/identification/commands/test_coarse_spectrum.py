@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from support.control_laws import ordinary_loop
-from support.wrong_commands import record
 
 from lbt_synth.identification.commands.coarse_spectrum import (
     CoarseAxis,
-    CoarseRecord,
     _segments,
     find_spectral_peaks,
 )
-from lbt_synth.identification.commands.repair import CommandRepair
-from lbt_synth.identification.commands.verdict import list_repairs
 from lbt_synth.identification.fit.periodogram import segment_transforms
 
 RATE, FRAMES = 1000.0, 24_000
@@ -22,25 +17,6 @@ RATE, FRAMES = 1000.0, 24_000
 
 def coarse_transforms(series: np.ndarray, stretches: list, rate: float) -> tuple:
     return segment_transforms(series, _segments(stretches, rate), rate, levelled=True)
-
-
-@pytest.fixture(scope="module")
-def coarse() -> CoarseRecord:
-    return CoarseRecord(record(*ordinary_loop()))
-
-
-def test_a_matrix_mixes_the_axes(coarse) -> None:
-    plain = coarse.transform(CommandRepair())
-    mixed = coarse.transform(CommandRepair(matrix=(0.0, 1.0, 2.0, 1.0)))
-    np.testing.assert_allclose(mixed[0], plain[1])
-    np.testing.assert_allclose(mixed[1], 2 * plain[0] + plain[1])
-
-
-def test_the_record_as_given_is_the_likeliest(coarse) -> None:
-    axis_contrast, gain = coarse.compare(list_repairs(2, 2.0))
-    contrast = axis_contrast.sum(axis=0)[:-1]
-    assert np.all(contrast[1:] > contrast[0] + 5)
-    np.testing.assert_allclose(gain[:, 0], 0.7, rtol=0.1)
 
 
 def white(seed: int, n: int = 1) -> np.ndarray:

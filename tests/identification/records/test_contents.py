@@ -11,7 +11,7 @@ import pytest
 from astropy.io import fits
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.record_files import csv, hdus, image, write_csv
+from support.record_files import csv, write_csv
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
@@ -40,14 +40,6 @@ def test_damage(tmp_path, name, content, words):
     with pytest.raises(lbt.errors.TelemetryError, match=words) as caught:
         lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
     assert "Traceback" not in str(caught.value)
-
-
-@pytest.mark.parametrize("size", [2000, 6000])
-def test_truncated_files(tmp_path, series, size):
-    path = hdus(tmp_path / "a.fits", image("POL", np.tile(series[0], (10, 1)), "nm"))
-    path.write_bytes(path.read_bytes()[:size])
-    with pytest.raises(lbt.LbtSynthError, match=r"a\.fits"):
-        lbt.load_record(path, frame_rate_hz=RATE)
 
 
 FRAMES = 60
@@ -88,15 +80,6 @@ def test_nulls_of_scaled_columns_and_images(tmp_path):
         seen = lbt.load_record(path, columns=chosen)
         assert np.flatnonzero(~seen.usable).tolist() == [10]
     assert lbt.load_record(scaled).measurements[11, 0] == pytest.approx(3 - 9.98)
-
-
-def test_nulls_of_ascii_columns(tmp_path):
-    column = fits.Column("POL", "F10.3", array=1.5 * np.arange(40), null="---", unit="nm")
-    path = hdus(tmp_path / "a.fits", fits.TableHDU.from_columns([column]), FPS=RATE)
-    path.write_bytes(path.read_bytes().replace(b"     4.500", b"       ---"))
-    seen = lbt.load_record(path)
-    assert np.flatnonzero(~seen.usable).tolist() == [3]
-    assert seen.measurements[4, 0] == 6.0
 
 
 def test_a_name_and_a_header_of_two_units(tmp_path, series):

@@ -19,22 +19,21 @@ RATE = 500.0
 
 @pytest.mark.parametrize(
     "kind",
-    ["csv", "tsv", "semicolon", "blanks", "fits images", "turned", "fits table", "npz", "npy"],
+    ["csv", "blanks", "turned", "fits table", "npz", "npy"],
 )
 def test_every_format_gives_the_same_record(tmp_path, series, kind):
     y, u = series
     options = {"delay_frames": 2}
     names = ["time_s", "y0_nm", "y1_nm", "u0_nm", "u1_nm"]
     columns = [np.arange(60) / RATE, *y.T, *u.T]
-    if kind in ("csv", "tsv", "semicolon", "blanks"):
-        sign = {"csv": ",", "tsv": "\t", "semicolon": ";", "blanks": " "}[kind]
+    if kind in ("csv", "blanks"):
+        sign = {"csv": ",", "blanks": " "}[kind]
         path = write_csv(tmp_path / "a.csv", names, columns, sign=sign)
-    elif kind in ("fits images", "turned"):
-        turn = (lambda a: a.T) if kind == "turned" else (lambda a: a)
+    elif kind == "turned":
         path = hdus(
             tmp_path / "a.fits",
-            image("RESIDUALS", turn(y), "nm"),
-            image("COMMANDS", turn(u).astype(">f8"), "nm"),
+            image("RESIDUALS", y.T, "nm"),
+            image("COMMANDS", u.T.astype(">f8"), "nm"),
             FRAMRATE=RATE,
         )
     elif kind == "fits table":
@@ -90,11 +89,6 @@ def test_telemetry_of_ours(tmp_path):
         ):
             with pytest.raises(ProblemError, match=words):
                 lbt.load_record(file, **options)
-    damaged = bytearray((tmp_path / "a.fits").read_bytes())
-    damaged[12_000] ^= 1
-    (tmp_path / "b.fits").write_bytes(damaged)
-    with pytest.raises(TelemetryError, match=r"b\.fits"):
-        lbt.load_record(tmp_path / "b.fits")
 
 
 @pytest.mark.e2e
@@ -414,9 +408,8 @@ def telemetry(frames=60, **changes):
     return lbt.files.Telemetry(**{**fields, **changes})
 
 
-@pytest.mark.parametrize("axes", [1, 2])
-def test_telemetry_of_a_simulation_with_matrices(axes):
-    rng = np.random.default_rng(3)
+def test_telemetry_of_a_simulation_with_matrices():
+    axes, rng = 2, np.random.default_rng(3)
     path = lbt.LoopHardware(
         frame_rate_hz=FAST,
         delay_frames=2.25,
@@ -454,18 +447,6 @@ def test_slopes_with_their_modes_and_without():
         axes=(0, 1),
     )
     assert np.allclose(seen.measurements, phase[:, :2])
-    # a reconstructor of another gain is taken out
-    half = lbt.load_record(
-        telemetry(
-            measurements=slopes @ R.T / 2,
-            slopes=slopes,
-            interaction_matrix=S,
-            reconstructor=R / 2,
-            commands=phase,
-        ),
-        axes=(0, 1),
-    )
-    assert np.allclose(half.measurements, phase[:, :2])
     with pytest.raises(
         ProblemError,
         match=r"has 8 measurements and 3 modes: slopes without modal .*slopes @ R.T",
