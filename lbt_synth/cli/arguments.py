@@ -438,6 +438,12 @@ def _add_record(parser: ArgumentParser) -> None:
 def identify(parser: ArgumentParser) -> None:
     """Identify turbulence, vibrations, noise and sensor gain from a record."""
     _add_record(parser)
+    _add_accelerometers(parser)
+    add_output(parser, "configuration to write (.yaml)")
+
+
+def _add_accelerometers(parser: ArgumentParser) -> None:
+    """Add accelerometers beside a record."""
     moving = parser.add_argument_group("accelerometers")
     text = "NPY or CSV with one column per channel and one row per frame of the record"
     add_option(moving, "--accelerometers", str, text)
@@ -445,7 +451,6 @@ def identify(parser: ArgumentParser) -> None:
     add_option(moving, "--accelerometer-rate-hz", float, text)
     text = f"their unit: {', '.join(M_S2)} (default: that of the headings, else m/s2)"
     add_option(moving, "--acceleration-unit", tuple(M_S2), text, metavar="UNIT")
-    add_output(parser, "configuration to write (.yaml)")
 
 
 def auto(parser: ArgumentParser) -> None:
@@ -453,6 +458,7 @@ def auto(parser: ArgumentParser) -> None:
     from lbt_synth.methods.registry import default_method, record_methods
 
     _add_record(parser)
+    _add_accelerometers(parser)
     text = (
         f"default: {default_method()}, unless another of the quick ones leaves clearly less of the "
         "frames after its training"

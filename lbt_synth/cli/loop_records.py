@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lbt_synth.cli.arguments import given_options
+from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config
 from lbt_synth.config.write import RAISED, config_text, require_writable_facts
@@ -228,6 +228,15 @@ def _expected_lines(arguments: Namespace) -> FloatArray:
     return np.reshape(lines, (-1, 2))
 
 
+def require_comparable(arguments: Namespace, record: LoopRecord | SpectrumRecord) -> None:
+    """Refuse accelerometers beside a spectrum, and what is said of none."""
+    if arguments.accelerometers is None:
+        for option in given_options(arguments, "accelerometer_rate_hz", "acceleration_unit"):
+            raise ProblemError(f"{option_name(option)} goes with --accelerometers.")
+    elif isinstance(record, SpectrumRecord):
+        raise ProblemError("accelerometers are compared with the recorded series; got a spectrum.")
+
+
 def read_accelerations(arguments: Namespace, record: LoopRecord) -> Readings:
     """Read the accelerometers of the command line."""
     return load_readings(
@@ -393,17 +402,17 @@ def marked_note(note: str) -> str:
 def _whiteness_note(axis: IdentifiedAxis) -> str:
     test = axis.whiteness
     if test.white:
-        return f"innovations are white (p = {test.p_value:.2g}, {test.correlation_p_value:.2g})."
+        return f"innovations are white (p = {test.p_value:.2g})."
     return (
         f"innovations are not white: their cumulative power is off by up to "
-        f"{100 * test.deviation:.2g} % (p = {test.p_value:.1g}, of the autocorrelation "
-        f"{test.correlation_p_value:.1g}). The model leaves something out; see the figure."
+        f"{100 * test.deviation:.2g} % (p = {test.p_value:.1g}). The model leaves something out; "
+        "see the figure."
     )
 
 
 def _axis_record(axis: IdentifiedAxis) -> dict[str, Any]:
     turbulence, whiteness = axis.turbulence, axis.whiteness
-    tests = ("deviation", "p_value", "correlation_p_value", "white")
+    tests = ("deviation", "p_value", "white")
     noise = ("noise_nm", "noise_error_nm", "noise_correlation", "noise_correlation_error")
     own = (*noise, "sensor_gain", "sensor_gain_error", "sensor_gain_note")
     return {

@@ -190,7 +190,6 @@ class CoarseAxis:
             corrected=np.mean(guesses.real**2 + guesses.imag**2, axis=1),
             count=np.full(power.size, independent),
             frame_rate_hz=frame_rate_hz,
-            resolution_hz=step,
         )
         bands, self.peaks = every.take(~is_peak), every.take(is_peak)
         self.bands = bands.merge(_bands(bands.frequency_hz, step))
