@@ -176,7 +176,8 @@ def explain_commands(
     scale = np.ones(record.axes)
     if not choice.unrelated.any():
         scale = _scale(record, law, choice, limits)
-    is_hidden = bool(np.any(choice.gain < usual[0] / _WRONG_GAIN))
+    is_low = choice.gain < usual[0] / _WRONG_GAIN
+    is_hidden = bool(np.any(scale < 1) or (sure is None and np.any(is_low)))
     if doubt := _doubt_choice(record, law, choice, is_hidden):
         return refuse(explanation=doubt)
     off = choice.repair.shift_frames and choice.repair.shift_frames + lag
@@ -253,12 +254,8 @@ def record_law(record: LoopRecord) -> ControlLaw | None:
     if record.commands is None:
         return None
     with suppress(ProblemError):
-        return fit_control_law(
-            record.measurements,
-            record.commands,
-            usable=record.measured,
-            commanded=record.commanded,
-        )
+        good = record.measured & record.commanded
+        return fit_control_law(record.measurements, record.commands, usable=good)
     return None
 
 
@@ -498,15 +495,13 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
 
 def wrong_scale(scale: FloatArray, gain: FloatArray) -> str:
     """Return the words for commands that need a factor on each axis, (axes,)."""
-    sizes = [
-        f"{1 / factor:g} times too large" if factor < 1 else f"{factor:g} times too small"
-        for factor in scale
+    one = not np.ptp(scale)
+    words = [
+        f"{'they' if one else f'those of axis {axis}'} are "
+        f"{max(factor, 1 / factor):g} times too {'large' if factor < 1 else 'small'}"
+        for axis, factor in enumerate(scale.tolist())
+        if factor != 1
     ]
-    words = f"they are {sizes[0]}"
-    if np.ptp(scale):
-        pairs = zip(sizes, scale, strict=True)
-        words = " and ".join(
-            f"those of axis {i} are {size}" for i, (size, factor) in enumerate(pairs) if factor != 1
-        )
     gains = ", ".join(f"{value:.3g}" for value in gain)
-    return f"{words} (with them the sensor has a gain of {gains})"
+    text = " and ".join(words[:1] if one else words)
+    return f"{text} (with them the sensor has a gain of {gains})"
