@@ -75,8 +75,6 @@ class LoopRecord:
         What was found in the series.
     notes : tuple of str, optional
         How they were read, and what changes with time.
-    jitter_frames : float, optional
-        Rms distance of the times of the rows from the regular grid [frames].
     diameter_m, obstruction, imaging_wavelength_um : float, optional
         Telescope diameter [m], its central obstruction as a fraction of it, and the wavelength of
         the image [um].
@@ -121,7 +119,6 @@ class LoopRecord:
     commanded: BoolArray
     faults: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
-    jitter_frames: float | None = None
     diameter_m: Positive | None = None
     obstruction: Obstruction | None = None
     imaging_wavelength_um: Positive | None = None
@@ -175,7 +172,6 @@ class LoopRecord:
             usable=int(np.sum(self.usable)),
             findings=self.faults + findings_in(self.unknown_corrections(), NOT_KNOWN, "frames"),
             notes=self.notes,
-            jitter_frames=self.jitter_frames,
         )
 
     @property
@@ -265,6 +261,7 @@ class LoopRecord:
         A cubic spline through the pseudo-open-loop measurements for this sensor gain fills the
         holes of at most 3 frames, if they are no more than 1 % of the record.
         """
+        series, frame = self.pseudo_open_loop(sensor_gain), np.arange(self.frames)
         holes = runs(~self.usable)
         inside = (holes[:, 0] > 0) & (holes[:, 1] < self.frames)
         holes = holes[inside & (holes[:, 1] - holes[:, 0] <= BRIDGED_FRAMES)]
@@ -272,7 +269,6 @@ class LoopRecord:
         count = int(np.sum(bridges))
         if not 0 < count <= FEW * self.frames or self.bridges is not None:
             return self
-        series, frame = self.pseudo_open_loop(sensor_gain), np.arange(self.frames)
         series[bridges] = CubicSpline(frame[self.usable], series[self.usable])(frame[bridges])
         y = self.known_gains(sensor_gain) * (series - self.corrections())
         note = f"{count} frames in {len(holes)} holes of at most {BRIDGED_FRAMES} were interpolated"
