@@ -153,7 +153,7 @@ def explain_commands(
     commands = record.commands[record.usable]
     still = np.all(commands == commands[:1], axis=0)
     if still.any() and not still.all():
-        return _explain_moving(record, record.commands, still, shown, known)
+        return _explain_moving(record, still, shown, known)
     law = None if shown is None or shown.kind == "none" else shown
     refuse = partial(CommandVerdict, gain=np.full(record.axes, np.nan), law=shown)
     sure = law if law is not None and law.is_sure else None
@@ -260,14 +260,11 @@ def record_law(record: LoopRecord) -> ControlLaw | None:
 
 
 def _explain_moving(
-    record: LoopRecord,
-    commands: FloatArray,
-    still: BoolArray,
-    law: ControlLaw | None,
-    known: FloatArray | None,
+    record: LoopRecord, still: BoolArray, law: ControlLaw | None, known: FloatArray | None
 ) -> CommandVerdict:
-    """Explain the commands (frames, axes) of the axis that moves; the other loop was open."""
-    one = replace(record, measurements=record.measurements[:, ~still], commands=commands[:, ~still])
+    """Explain the commands of the axis that moves; the other loop was open."""
+    y, u = record.measurements[:, ~still], np.asarray(record.commands)[:, ~still]
+    one = replace(record, measurements=y, commands=u)
     verdict = explain_commands(one, sensor_gain=None if known is None else known[~still].tolist())
     gain = np.full(still.size, np.nan)
     gain[~still] = verdict.gain
