@@ -1,9 +1,4 @@
-"""The verdict on commands: faults are named with what repairs them, good records pass.
-
-The factor of commands, against gains that are drawn around plausible ones.
-
-A second opinion by the model of the fit.
-"""
+"""The verdict on commands: faults are named with what repairs them, good records pass."""
 
 from __future__ import annotations
 
@@ -70,8 +65,9 @@ def test_a_fault_is_named_and_repaired(fault) -> None:
         assert explain_commands(repair_commands(wrong, verdict.repair)).accepted
 
 
-@pytest.mark.parametrize("delay", [1.0, 2.5])
+@pytest.mark.parametrize("delay", [2.5, 3.0])
 def test_a_wrong_delay(delay) -> None:
+    """The coarse spectrum alone finds a delay of 1.5 frames likelier than 2.5, by 121."""
     verdict = explain_commands(spliced_record(lines=LINE, frames=20_000).with_delay(delay))
     if delay == 2.5:  # 20 s of one axis hardly tell half a frame
         assert verdict.accepted
