@@ -146,7 +146,6 @@ def fit_control_law(
     commands: ArrayLike,
     *,
     usable: ArrayLike | None = None,
-    commanded: ArrayLike | None = None,
 ) -> ControlLaw:
     """Return the law with the least order that explains commands by measurements.
 
@@ -159,8 +158,6 @@ def fit_control_law(
         Measurements y(k) and commands u(k) of one or two axes, in the same unit.
     usable : (frames,) bool array_like, optional
         Frames whose values are good; all by default.
-    commanded : (frames,) bool array_like, optional
-        Frames whose commands are good, where ``usable`` is only of the measurements.
 
     Returns
     -------
@@ -184,17 +181,14 @@ def fit_control_law(
     y = matrix(measurements, "measurements")
     why = f"to match measurements {y.shape}"
     u = matrix(commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
-    measured = np.ones(len(y), dtype=np.bool_) if usable is None else np.array(usable)
-    moved = np.array(measured if commanded is None else commanded)
-    for flags in (measured, moved):
-        if flags.dtype != np.bool_ or flags.shape != (len(y),):
-            raise DimensionError(
-                f"usable must be {len(y)} truth values, one per frame; got {flags.dtype} "
-                f"{flags.shape}."
-            )
+    good = np.ones(len(y), dtype=np.bool_) if usable is None else np.array(usable)
+    if good.dtype != np.bool_ or good.shape != (len(y),):
+        raise DimensionError(
+            f"usable must be {len(y)} truth values, one per frame; got {good.dtype} {good.shape}."
+        )
     for column in u.T:
-        moved &= ~find_saturated(column, moved)
-    series = _Series(y, u, measured, moved, np.ones(len(y), dtype=np.bool_))
+        good &= ~find_saturated(column, good)
+    series = _Series(y, u, good, np.ones(len(y), dtype=np.bool_))
     law = _search(series)
     for _ in range(2):  # jumps hide the other frames that do not follow the law
         odd = _odd_frames(series, law)
@@ -209,8 +203,7 @@ class _Series(NamedTuple):
 
     y: FloatArray  # (frames, axes)
     u: FloatArray  # (frames, axes)
-    measured: BoolArray  # (frames,)
-    commanded: BoolArray  # (frames,)
+    good: BoolArray  # (frames,)
     lawful: BoolArray  # (frames,), whose command is a result of the law
 
     def rows(self, order: int, lags: range) -> IntArray:
@@ -219,12 +212,10 @@ class _Series(NamedTuple):
         start, stop = max(order, 1, lags[-1]), min(frames, frames + lags[0])
         if stop <= start:
             return np.zeros(0, dtype=np.int64)
-        good = self.lawful[start:stop].copy()
-        for lag in range(max(order, 1) + 1):
-            good &= self.commanded[start - lag : stop - lag]
-        for lag in lags:
-            good &= self.measured[start - lag : stop - lag]
-        return start + np.flatnonzero(good)
+        complete = self.lawful[start:stop].copy()
+        for lag in range(min(lags[0], 0), start + 1):
+            complete &= self.good[start - lag : stop - lag]
+        return start + np.flatnonzero(complete)
 
 
 def _odd_frames(series: _Series, law: ControlLaw) -> BoolArray:

@@ -153,7 +153,7 @@ def explain_commands(
     commands = record.commands[record.usable]
     still = np.all(commands == commands[:1], axis=0)
     if still.any() and not still.all():
-        return _explain_moving(record, record.commands, still, shown, known)
+        return _explain_moving(record, still, shown, known)
     law = None if shown is None or shown.kind == "none" else shown
     refuse = partial(CommandVerdict, gain=np.full(record.axes, np.nan), law=shown)
     sure = law if law is not None and law.is_sure else None
@@ -176,7 +176,8 @@ def explain_commands(
     scale = np.ones(record.axes)
     if not choice.unrelated.any():
         scale = _scale(record, law, choice, limits)
-    is_hidden = bool(np.any(choice.gain < usual[0] / _WRONG_GAIN))
+    is_low = choice.gain < usual[0] / _WRONG_GAIN
+    is_hidden = bool(np.any(scale < 1) or (sure is None and np.any(is_low)))
     if doubt := _doubt_choice(record, law, choice, is_hidden):
         return refuse(explanation=doubt)
     off = choice.repair.shift_frames and choice.repair.shift_frames + lag
@@ -253,24 +254,17 @@ def record_law(record: LoopRecord) -> ControlLaw | None:
     if record.commands is None:
         return None
     with suppress(ProblemError):
-        return fit_control_law(
-            record.measurements,
-            record.commands,
-            usable=record.measured,
-            commanded=record.commanded,
-        )
+        good = record.measured & record.commanded
+        return fit_control_law(record.measurements, record.commands, usable=good)
     return None
 
 
 def _explain_moving(
-    record: LoopRecord,
-    commands: FloatArray,
-    still: BoolArray,
-    law: ControlLaw | None,
-    known: FloatArray | None,
+    record: LoopRecord, still: BoolArray, law: ControlLaw | None, known: FloatArray | None
 ) -> CommandVerdict:
-    """Explain the commands (frames, axes) of the axis that moves; the other loop was open."""
-    one = replace(record, measurements=record.measurements[:, ~still], commands=commands[:, ~still])
+    """Explain the commands of the axis that moves; the other loop was open."""
+    y, u = record.measurements[:, ~still], np.asarray(record.commands)[:, ~still]
+    one = replace(record, measurements=y, commands=u)
     verdict = explain_commands(one, sensor_gain=None if known is None else known[~still].tolist())
     gain = np.full(still.size, np.nan)
     gain[~still] = verdict.gain
@@ -498,15 +492,13 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
 
 def wrong_scale(scale: FloatArray, gain: FloatArray) -> str:
     """Return the words for commands that need a factor on each axis, (axes,)."""
-    sizes = [
-        f"{1 / factor:g} times too large" if factor < 1 else f"{factor:g} times too small"
-        for factor in scale
+    one = not np.ptp(scale)
+    words = [
+        f"{'they' if one else f'those of axis {axis}'} are "
+        f"{max(factor, 1 / factor):g} times too {'large' if factor < 1 else 'small'}"
+        for axis, factor in enumerate(scale.tolist())
+        if factor != 1
     ]
-    words = f"they are {sizes[0]}"
-    if np.ptp(scale):
-        pairs = zip(sizes, scale, strict=True)
-        words = " and ".join(
-            f"those of axis {i} are {size}" for i, (size, factor) in enumerate(pairs) if factor != 1
-        )
     gains = ", ".join(f"{value:.3g}" for value in gain)
-    return f"{words} (with them the sensor has a gain of {gains})"
+    text = " and ".join(words[:1] if one else words)
+    return f"{text} (with them the sensor has a gain of {gains})"

@@ -24,7 +24,6 @@ class Clock(NamedTuple):
     frame_rate_hz: float
     frame_of_row: IntArray  # (rows,), from 0, never falling; equal for rows of the same time
     notes: list[str]
-    jitter_frames: float | None = None  # rms distance of the times from the grid; None without any
 
 
 def build_clock(
@@ -56,7 +55,9 @@ def build_clock(
         notes = _compare_rates(rate, rate_of_times, int(frame[-1]), float(np.ptp(off)))
         if _quantum(times) * rate > 1 + SAME_FRAME and np.any(np.diff(times) == 0):
             return Clock(rate, frame, [_NOT_USED])
-    return Clock(rate, frame, notes, float(np.std(off)) if rows > 2 else None)
+    if (jitter := float(np.std(off))) > _EXACT:
+        notes.append(f"the times lie {jitter:.2g} frames rms beside a regular grid")
+    return Clock(rate, frame, notes)
 
 
 def _compare_rates(rate: float, rate_of_times: float, frames: int, loose: float) -> list[str]:
