@@ -52,29 +52,16 @@ def test_inequality_finds_the_same_level(seed):
     assert infeasible_control_level(plant, witness) == pytest.approx(least, rel=1e-6)
 
 
-def test_unseen_disturbance_at_one_instant():
-    """What is pushed and not measured is left: z = 2 w."""
-    plant = lbt.linear.GeneralizedPlant(
-        A=0.5, B1=[[0.0, 1.0]], B2=1.0, C1=0.0, C2=1.0, D11=[[2.0, 0.0]], D12=1.0, D21=[[0.0, 1.0]]
+def test_what_is_pushed_and_not_measured_is_left_and_what_is_controlled_is_not():
+    """z = 2 w; three measurements of three disturbances; square D12, D21 and stable zeros."""
+    one = {"A": 0.5, "B2": 1.0, "D12": 1.0}
+    unseen = GeneralizedPlant(
+        **one, B1=[[0.0, 1.0]], C1=0.0, C2=1.0, D11=[[2.0, 0.0]], D21=[[0.0, 1.0]]
     )
-    assert lbt.hinf_controller(plant).gamma_least == pytest.approx(2.0, rel=1e-8)
-
-
-def test_least_level_of_nothing_left():
-    """Three measurements of three disturbances and a control of the only error."""
-    plant = lbt.linear.GeneralizedPlant(
-        A=0.5, B1=np.ones((1, 3)), B2=1.0, C1=1.0, C2=np.zeros((3, 1)), D12=1.0, D21=np.eye(3)
-    )
-    assert lbt.hinf_controller(plant).gamma_least < 1e-9
-
-
-@pytest.mark.parametrize("seed", [8, 23])
-def test_a_least_variance_of_nothing(seed):
-    """Zeros are stable and D12, D21 square: the least variance leaves rounding."""
-    plant = sampled_plant(seed, n=3)
-    assert plant.D12.shape[0] == plant.D12.shape[1]
-    assert plant.D21.shape[0] == plant.D21.shape[1]
-    assert lbt.hinf_controller(plant).gamma_least < 1e-9
+    assert lbt.hinf_controller(unseen).gamma_least == pytest.approx(2.0, rel=1e-8)
+    seen = GeneralizedPlant(**one, B1=np.ones((1, 3)), C1=1.0, C2=np.zeros((3, 1)), D21=np.eye(3))
+    for plant in (seen, sampled_plant(8, n=3), sampled_plant(23, n=3)):
+        assert lbt.hinf_controller(plant).gamma_least < 1e-9
 
 
 # the loop of the first is far from normal, the second is refused next to its least level
