@@ -246,10 +246,7 @@ def rehearse(parser: ArgumentParser) -> None:
     _add_target(parser)
     text = "what a loop recorded (default: a disturbance drawn from the file's own truth)"
     add_option(parser, "--record", str, text, metavar="FILE", dest="file")
-    _add_missing_facts(parser)
-    _add_repairs(parser)
-    text = "sensor gain of the record (default: the one that the gain file assumes)"
-    add_option(parser, "--sensor-gain", float, text)
+    _add_reading(parser)
     add_shared(parser, "--stroke")
     add_option(parser, "--frames", int, "frames to draw where there is no record (default 8000)")
     add_option(parser, "--seed", int, "seed of what is drawn", 1)
@@ -332,9 +329,9 @@ def simulate(parser: ArgumentParser) -> None:
 
 
 def telemetry(parser: ArgumentParser) -> None:
-    """Show what a telemetry file holds, and write it in another format."""
-    parser.add_argument("file", help="telemetry (.fits or .npz; FITS of the AOT standard, too)")
-    add_shared(parser, "--unit")
+    """Show what a telemetry file or a record holds, and write it as telemetry."""
+    parser.add_argument("file", help="telemetry, or a record of series (FITS, NPY, NPZ or CSV)")
+    _add_reading(parser)
     add_output(parser, "file to write (.fits, .npz or .aot.fits)", required=False)
     endings = ("fits", "npz", "aot")
     add_option(parser, "--format", endings, "of the file to write (default: its ending)")
@@ -370,9 +367,13 @@ def _add_simulator(parser: ArgumentParser) -> None:
     add_output(parser, "directory to write into")
 
 
-def _add_missing_facts(parser: ArgumentParser) -> None:
-    """Add what a record's file may not say."""
-    facts = parser.add_argument_group("what the file does not say")
+def _add_reading(parser: ArgumentParser) -> None:
+    """Add what a record's file may not say, and what its commands need."""
+    facts = parser.add_argument_group(
+        "reading the record",
+        "What its file does not say, and what its commands need, in this order, to be those that "
+        "the mirror followed. The telemetry that lbt-synth telemetry -o writes says all of it.",
+    )
     add_option(facts, "--kind", ("closed-loop", "open-loop", "spectrum"))
     add_option(facts, "--frame-rate-hz", float, "frame rate [Hz]")
     add_option(facts, "--delay-frames", float, "total delay [frames]")
@@ -387,27 +388,23 @@ def _add_missing_facts(parser: ArgumentParser) -> None:
     text = "columns by name or number from 0, as in measurements=tip,tilt commands=3,4 times="
     add_option(facts, "--columns", str, text, nargs="+", metavar="ROLE=NAME")
     add_option(facts, "--axes", int, "which of several columns or modes, from 0", nargs="+")
-
-
-def _add_repairs(parser: ArgumentParser) -> None:
-    """Add what the commands of a record need."""
-    text = "what the commands need, in this order, to be those that the mirror followed"
-    needs = parser.add_argument_group("what the commands need", text)
-    add_switch(needs, "--command-increments", "they are increments: add them up")
-    text = "frames by which they move to later frames, or to earlier ones below 0"
-    add_option(needs, "--command-shift-frames", int, text, 0)
-    add_switch(needs, "--swap-axes", "exchange those of the two axes")
-    add_option(needs, "--command-sign", int, "1 or -1, of both axes or of each", nargs="+")
-    text = "matrix from them to the axes of the measurements, row after row"
-    add_option(needs, "--command-matrix", float, text, nargs="+", metavar="NUMBER")
-    text = "factor, of both axes or of each; 1 says that they were recorded as large as applied"
-    add_option(needs, "--command-scale", float, text, nargs="+")
+    text = "sensor gain that is known, of both axes or of each"
+    add_option(facts, "--sensor-gain", float, text, nargs="+")
+    add_switch(facts, "--command-increments", "the commands are increments: add them up")
+    text = "frames by which the commands move to later frames, or to earlier ones below 0"
+    add_option(facts, "--command-shift-frames", int, text, 0)
+    add_switch(facts, "--swap-axes", "exchange the commands of the two axes")
+    text = "1 or -1 on the commands, of both axes or of each"
+    add_option(facts, "--command-sign", int, text, nargs="+")
+    text = "matrix from the commands to the axes of the measurements, row after row"
+    add_option(facts, "--command-matrix", float, text, nargs="+", metavar="NUMBER")
+    text = "factor on the commands, of both axes or of each; 1 says that they were recorded as "
+    add_option(facts, "--command-scale", float, text + "large as applied", nargs="+")
 
 
 def _add_prior_knowledge(parser: ArgumentParser) -> None:
     """Add what is known before an identification."""
     known = parser.add_argument_group("what is known beforehand")
-    add_option(known, "--sensor-gain", float, "sensor gain, of both axes or of each", nargs="+")
     text = "noise per frame of the loop's sensor [nm], beside a spectrum that has none"
     add_option(known, "--noise-nm", float, text, nargs="+")
     add_option(known, "--lines-hz", float, "frequencies of vibrations [Hz]", nargs="+")
@@ -424,8 +421,7 @@ def _add_series(parser: ArgumentParser) -> None:
         help="what the loop recorded: telemetry, or FITS, NPY, NPZ or CSV with measurements "
         "and commands, or an open-loop series (identify: or a spectrum)",
     )
-    _add_missing_facts(parser)
-    _add_repairs(parser)
+    _add_reading(parser)
     _add_prior_knowledge(parser)
     add_shared(parser, "--wavelength-um")
 
@@ -442,6 +438,12 @@ def _add_record(parser: ArgumentParser) -> None:
 def identify(parser: ArgumentParser) -> None:
     """Identify turbulence, vibrations, noise and sensor gain from a record."""
     _add_record(parser)
+    _add_accelerometers(parser)
+    add_output(parser, "configuration to write (.yaml)")
+
+
+def _add_accelerometers(parser: ArgumentParser) -> None:
+    """Add accelerometers beside a record."""
     moving = parser.add_argument_group("accelerometers")
     text = "NPY or CSV with one column per channel and one row per frame of the record"
     add_option(moving, "--accelerometers", str, text)
@@ -449,7 +451,6 @@ def identify(parser: ArgumentParser) -> None:
     add_option(moving, "--accelerometer-rate-hz", float, text)
     text = f"their unit: {', '.join(M_S2)} (default: that of the headings, else m/s2)"
     add_option(moving, "--acceleration-unit", tuple(M_S2), text, metavar="UNIT")
-    add_output(parser, "configuration to write (.yaml)")
 
 
 def auto(parser: ArgumentParser) -> None:
@@ -457,6 +458,7 @@ def auto(parser: ArgumentParser) -> None:
     from lbt_synth.methods.registry import default_method, record_methods
 
     _add_record(parser)
+    _add_accelerometers(parser)
     text = (
         f"default: {default_method()}, unless another of the quick ones leaves clearly less of the "
         "frames after its training"

@@ -12,7 +12,7 @@ from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import LoopRecord, design_from_record
 from lbt_synth.identification.auto import LEAST_SECONDS, RecordedDesign
 from lbt_synth.identification.prediction.comparison import RAN
-from lbt_synth.loop import Imaging, close_loop, loop_margins
+from lbt_synth.loop import Imaging, loop_margins
 
 
 def run(arguments: Namespace) -> Report:
@@ -23,6 +23,10 @@ def run(arguments: Namespace) -> Report:
         loop_records.read_record(arguments, LEAST_SECONDS), "auto tests its design on"
     )
     choose_unit(arguments, record.diameter_m)
+    loop_records.require_comparable(arguments, record)
+    channels, values, notes = None, None, tuple[str, ...]()
+    if arguments.accelerometers is not None:
+        channels, values, notes = loop_records.read_accelerations(arguments, record)
     imaging = loop_records.record_imaging(arguments, record)
     with count_progress(total=3, what="identifying and designing") as count:
         found = design_from_record(
@@ -31,17 +35,23 @@ def run(arguments: Namespace) -> Report:
             gamma_ratio=arguments.gamma_ratio,
             imaging=imaging,
             accept_record=arguments.accept_record,
-            command_scale_known=loop_records.is_scale_known(arguments),
+            command_scale_known=loop_records.is_scale_known(record),
+            accelerations=values,
+            channels=channels,
             progress=count,
             **loop_records.identification_options(arguments, record),
         )
-    found = loop_records.with_repair(arguments, found)
+    found = loop_records.with_repair(record, found)
     report = Report(data={"source": str(arguments.file)})
     loop_records.add_record(report, record)
     loop_records.add_model(report, found.model)
     report.data["method"] = found.design.method
+    report.notes += [f"note: {note}." for note in notes]
+    if found.channels:
+        title = "Accelerometers: residual on the second half of the record"
+        report.add_rows("accelerometers", title, list(found.channels))
     _add_comparison(report, found, record, imaging)
-    loop = close_loop(found.model.hardware, found.design.controller)
+    loop = found.design.close(found.model.hardware)
     report.data["certificate"] = found.design.certificate.passed
     report.notes.append(
         f"certified: spectral radius of the loop {loop.spectral_radius:.6f}, modulus margin "

@@ -139,6 +139,7 @@ def run_show(arguments: Namespace) -> Report:
     add_moving_gain(report, design)
     report.data |= {"file": arguments.gain, "digest": digest}
     unproved = ["route and status of the solver"]
+    unproved += ["what its record shows"] * (design.method == "predictor")
     unproved += ["assumptions"] * bool(design.assumptions)
     unproved += ["configuration, and so the truth"] * bool(design.configuration)
     report.data["not_proved"] = unproved

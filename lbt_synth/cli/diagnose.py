@@ -14,7 +14,7 @@ from lbt_synth.cli.streams import count_progress
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import Diagnosis, LoopRecord, diagnose
 from lbt_synth.identification.commands.control_law import ControlLaw
-from lbt_synth.identification.diagnosis.rows import disturbance_lines, live_axes
+from lbt_synth.identification.diagnosis import disturbance_lines, live_axes
 from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.rows import json_record

@@ -5,10 +5,9 @@ from __future__ import annotations
 from argparse import Namespace
 
 from lbt_synth.cli import loop_records
-from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report
-from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.errors import LbtSynthError
 from lbt_synth.identification import LoopRecord, SpectrumRecord, accelerometer_transfers, identify
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 
@@ -18,7 +17,7 @@ def run(arguments: Namespace) -> Report:
     places = loop_records.find_places(arguments, arguments.output)
     record = loop_records.read_record(arguments)
     choose_unit(arguments, record.diameter_m)
-    _require_comparable(arguments, record)
+    loop_records.require_comparable(arguments, record)
     options = loop_records.identification_options(arguments, record)
     doubts: tuple[str, ...] = ()
     if isinstance(record, LoopRecord):
@@ -42,12 +41,3 @@ def run(arguments: Namespace) -> Report:
     report.notes += [loop_records.marked_note(doubt) for doubt in doubts]
     loop_records.write_files(report, places, arguments, record, model, accelerometers=found)
     return report
-
-
-def _require_comparable(arguments: Namespace, record: LoopRecord | SpectrumRecord) -> None:
-    """Refuse accelerometers beside a spectrum, and what is said of none."""
-    if arguments.accelerometers is None:
-        for option in given_options(arguments, "accelerometer_rate_hz", "acceleration_unit"):
-            raise ProblemError(f"{option_name(option)} goes with --accelerometers.")
-    elif isinstance(record, SpectrumRecord):
-        raise ProblemError("accelerometers are compared with the recorded series; got a spectrum.")

@@ -27,7 +27,7 @@ from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.records import simulation_figure
 from lbt_synth.storage.rows import Facts, fact, facts
-from lbt_synth.validation import FloatArray, integer, number
+from lbt_synth.validation import FloatArray, integer
 
 _FRAMES = 8000  # of a drawn disturbance
 _DRAWN = ("frames", "seed")  # options that only a drawn disturbance has
@@ -150,8 +150,8 @@ def _recorded(arguments: Namespace, design: Design) -> _Series:
     require_length(record, frames=_FEWEST, seconds=0)
     choose_unit(arguments, record.diameter_m)
     gains = _assumed_gains(design, record.axes)
-    if arguments.sensor_gain is not None:
-        gains = np.full(record.axes, number(arguments.sensor_gain, "--sensor-gain", above=0))
+    if record.stated_gain:
+        gains = record.known_gains(record.stated_gain)
     start, stop = max(record.stretches(), key=lambda pair: pair[1] - pair[0])
     commands = record.commands
     ran = None

@@ -103,7 +103,7 @@ def run(arguments: Namespace) -> Report:
         draw = partial(sensor_failure_figure, segments=places, exact_nm=exact_nm)
     else:
         simulation, segments = _simulate(arguments, design, truth, config, settle, sizes), []
-        title += ": the first second above, mean spectrum of all runs below"
+        title += ": the first second, and spectra of all runs"
         draw = partial(simulation_figure)
     strehls = simulation.strehl(config.imaging)
     report = _describe_simulation(

@@ -488,8 +488,7 @@ def spread_labels(places: FloatArray, width: float) -> FloatArray:
     # pushed to the right where they are crowded, and back from the end
     right = np.maximum.accumulate(np.maximum(places, least) - steps) + steps
     ends = 1 - least[::-1]
-    left = np.minimum.accumulate((np.minimum(right, ends) - steps)[::-1])[::-1] + steps
-    return np.asarray(left)
+    return np.asarray(np.minimum.accumulate((np.minimum(right, ends) - steps)[::-1])[::-1] + steps)
 
 
 def _cell_edges(centres: FloatArray) -> FloatArray:

@@ -29,7 +29,7 @@ def test_a_page_of_text(capsys, night):
     status, text, error = run(capsys, "diagnose", night, *FACTS)
     assert (status, error) == (0, "")
     lines = text.splitlines()
-    assert lines[0].startswith("The record is sound: a pure integrator of gain 0.2 ran")
+    assert lines[0].startswith("The record is sound: an integrator of gain 0.2 ran")
     assert lines[2].startswith("First change the controller: the ")
     assert len(lines) < 66
     for caption in (
@@ -49,7 +49,7 @@ def test_a_gain_file_the_page_and_json(capsys, night, tmp_path):
     assert (status, error) == (0, "")
     data = json.loads(text)
     assert data["doubt"] is None
-    assert data["control_law"]["kind"] == "pure integrator"
+    assert data["control_law"]["kind"] == "integrator"
     assert any(note.startswith("mine promises") for note in data["notes"])
     assert {row["name"] for row in data["residuals"]} > {"mine", data["best"], "what ran"}
     assert data["costs"][-1]["part"] == "all"

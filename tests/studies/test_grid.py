@@ -23,7 +23,7 @@ from lbt_synth.errors import NumericalError, OutputError
 from lbt_synth.storage import array_file
 from lbt_synth.storage.thread_limits import WorkerPool
 from lbt_synth.studies import run_study
-from lbt_synth.studies.grid import Sweep
+from lbt_synth.studies.grid import Sweep, evaluate
 
 
 def test_a_sweep_knows_what_is_missing(tmp_path):
@@ -36,18 +36,39 @@ def test_a_sweep_knows_what_is_missing(tmp_path):
     assert sweep.missing() == [(0, 2), (6, 9), (10, 12)]
     results, failures, seconds = sweep.read(sweep.paths()[4, 6])
     assert (results.tolist(), failures, seconds) == ([[4], [5]], [(4, "a", "why")], 0.5)
+    begun = sweep.folder / ".lbt_synth.0123456789abcdef.0.tmp"
+    begun.write_bytes(b"half")
     seen, counts = [], []
 
-    def evaluate(start, stop):
+    def count(start, stop):
         seen.append((start, stop))
         return {"a": np.arange(start, stop)}, []
 
-    run, computed = sweep.run(evaluate, lambda rows: rows, part_rows=2, progress=counts.append)
+    run, computed = sweep.run(count, lambda rows: rows, part_rows=2, progress=counts.append)
     assert seen == [(0, 2), (6, 8), (8, 9), (10, 12)]  # a fixed number, and less at an end
     assert run.results.ravel().tolist() == list(range(12))
     assert run.failures == [(2, "a", "why"), (4, "a", "why"), (9, "a", "why")]
     assert (computed, counts) == (7, [5, 2, 2, 1, 2])
+    assert not begun.exists()  # what a killed process had begun to write
     assert sweep.run(None, lambda rows: rows, part_rows=2)[1] == 0
+
+
+def late(number, seconds):
+    time.sleep(seconds)
+    return number**2
+
+
+def fails(number):
+    raise RuntimeError("no such thing.")
+
+
+def test_a_grid_in_memory_is_in_the_order_of_its_samples():
+    samples = [(i, 0.05 * (i == 0)) for i in range(9)]
+    assert list(evaluate(late, iter(samples))) == [i * i for i in range(9)]
+    with ThreadPoolExecutor(3) as pool:
+        assert list(evaluate(late, iter(samples), pool)) == [i * i for i in range(9)]
+        with pytest.raises(NumericalError, match=r"rows 0 to 0 .*RuntimeError: no such thing"):
+            list(evaluate(fails, [(1,)], pool))
 
 
 def test_a_part_is_believed_by_its_digest_alone(tmp_path):
@@ -57,9 +78,15 @@ def test_a_part_is_believed_by_its_digest_alone(tmp_path):
     arrays, text = array_file.read_npz(path.read_bytes())
     with pytest.raises(OutputError, match="is of another study"):
         replace(sweep, digest="e" * 64).read(path)
-    path.write_bytes(array_file.npz_bytes({"RESULTS": 1.001 * arrays["RESULTS"]}, text))
-    with pytest.raises(OutputError, match="is damaged. Delete it"):
-        sweep.read(path)
+    content = path.read_bytes()
+    changed = array_file.npz_bytes({"RESULTS": 1.001 * arrays["RESULTS"]}, text)
+    for damage in (changed, content[:-30], content[:200] + b"x" + content[201:], b""):
+        path.write_bytes(damage)
+        with pytest.raises(OutputError, match="is damaged. Delete it"):
+            sweep.read(path)
+    path.with_name("0000000001-0000000002.npz").write_bytes(content)
+    with pytest.raises(OutputError, match="has rows that are in"):
+        sweep.paths()
 
 
 def wrong(study, values, start):
@@ -75,16 +102,16 @@ def raises(study, values, start):
 
 
 @pytest.mark.parametrize(
-    ("evaluate", "message"),
+    ("function", "message"),
     [
         (wrong, r"rows 0 to 3 have no result \(ValueError"),
         (short, r"rows 0 to 3 have no result \(ValueError: 3 rows\)"),
         (raises, r"rows 0 to 3 have no result \(RuntimeError: no such thing\)"),
     ],
 )
-def test_evaluations_that_are_none(tmp_path, evaluate, message):
+def test_evaluations_that_are_none(tmp_path, function, message):
     with pytest.raises(NumericalError, match=message):
-        run_study(load_small_study(tmp_path), make_folder(tmp_path), evaluate=evaluate)
+        run_study(load_small_study(tmp_path), make_folder(tmp_path), evaluate=function)
 
 
 def test_any_executor(tmp_path):

@@ -186,7 +186,6 @@ def expected_periodogram(air: lbt.models.Spectrum, noise: float, gain: float) ->
         corrected=np.abs(loop) ** 2 * measured,
         count=np.ones(f.size),
         frame_rate_hz=RATE,
-        resolution_hz=1 / 60,
     )
 
 

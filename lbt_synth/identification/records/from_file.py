@@ -34,8 +34,9 @@ from lbt_synth.storage.input_files import LARGEST_TEXT_BYTES, open_input
 from lbt_synth.validation import FloatArray, IntArray, choice
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of this package, and of the AOT standard
-_TELEMETRY_ARRAYS = {"META", "COMMANDS", "MEASURE"}
+_TELEMETRY_ARRAYS = {"META", "MEASURE"}
 _FOREIGN = "timing"  # key of metadata in telemetry of other programs
+_STATED_GAIN, _READ_WITH = "stated_sensor_gain", "commands_read_with"  # of a record that was read
 _CONDITION = float(np.finfo(np.float64).eps ** -0.5)  # beyond, an inverse is half rounding
 _SAME_TIME = 0.25  # of a step, within which two rows are of one frame
 
@@ -119,16 +120,17 @@ def load_record(
     }
     if kind is not None:
         choice(kind, "kind", tuple(KINDS))
-    of_telemetry = kind in (None, "closed_loop") and columns is None and commands is None
+    of_telemetry = columns is None and commands is None
     if isinstance(source, Telemetry):
         _require_series(of_telemetry, averages)
-        return _telemetry_record(source, axes=axes, source=source.name or "telemetry", **given)
+        given["source"] = source.name or "telemetry"
+        return _telemetry_record(source, kind=kind, axes=axes, **given)
     path = Path(source)
     given["source"] = str(path)
     with name_in_errors(path):
-        if _is_telemetry(path):
+        if is_telemetry(path):
             _require_series(of_telemetry, averages)
-            return _telemetry_record(load_telemetry(path), axes=axes, **given)
+            return _telemetry_record(load_telemetry(path), kind=kind, axes=axes, **given)
         contents = read_contents(path)
         if commands is not None:
             _join_commands(contents, Path(commands))
@@ -143,15 +145,16 @@ def _require_series(of_telemetry: bool, averages: int | None) -> None:
     """Refuse what telemetry and series do not take."""
     if not of_telemetry:
         raise ProblemError(
-            "telemetry holds measurements and commands: kind must be closed_loop or left out, and "
-            "neither columns nor commands may be given. Choose its modes with axes."
+            "telemetry says what its series are: neither columns nor commands may be given. Choose "
+            "its modes with axes."
         )
     if averages is not None:
         raise ProblemError("averages are only for a spectrum; got a record of series.")
 
 
-def _is_telemetry(path: Path) -> bool:
+def is_telemetry(path: str | os.PathLike[str]) -> bool:
     """Whether a file is telemetry of this package or of the AOT standard."""
+    path = Path(path)
     try:
         if path.suffix.lower() in FITS:
             with open_input(path, TelemetryError) as stream:
@@ -167,7 +170,12 @@ def _is_telemetry(path: Path) -> bool:
 
 
 def _telemetry_record(
-    telemetry: Telemetry, *, axes: Sequence[int] | None, mirror: PositionLoop | None, **given: Any
+    telemetry: Telemetry,
+    *,
+    kind: str | None,
+    axes: Sequence[int] | None,
+    mirror: PositionLoop | None,
+    **given: Any,
 ) -> LoopRecord:
     """Make a record of tip and tilt; ``given`` are facts, None where the telemetry has to tell.
 
@@ -176,14 +184,17 @@ def _telemetry_record(
     measurements stay as they were recorded, and the sensor gain of the record is what they show of
     a unit of phase.
     """
-    n = telemetry.modes
+    n, is_open = telemetry.modes, telemetry.commands is None
+    if kind not in (None, stored := "open_loop" if is_open else "closed_loop"):
+        raise ProblemError(f"this telemetry is of kind {stored}; got {kind}. Leave kind out.")
     chosen = choose_axes(axes, n, "modes")
     facts = {name: value for name in FACTS if (value := getattr(telemetry, name)) is not None}
     contents = Contents(facts={name: {"the telemetry": value} for name, value in facts.items()})
-    roles = {role: _modal_columns(telemetry, role, chosen, contents.notes) for role in _MATRICES}
+    held = [role for role in _MATRICES if getattr(telemetry, role) is not None]
+    roles = {role: _modal_columns(telemetry, role, chosen, contents.notes) for role in held}
     if telemetry.times_s is not None:
         roles["times"] = [Column(name="times_s", values=telemetry.times_s, unit="s")]
-    if max(n, telemetry.measurements.shape[1], telemetry.commands.shape[1]) > len(chosen):
+    if max(n, telemetry.measurements.shape[1], telemetry.n_commands) > len(chosen):
         contents.notes.append(f"axes are modes {', '.join(map(str, chosen))} of {n}")
     if _FOREIGN in telemetry.metadata:
         contents.notes.append(
@@ -191,7 +202,31 @@ def _telemetry_record(
         )
     mirror = telemetry.mirror if mirror is None else mirror
     record = build_loop(roles, contents, mirror=mirror, **given)
-    return replace(record, imaging_wavelength_um=telemetry.imaging_wavelength_um)
+    gains = tuple(map(float, str(telemetry.metadata.get(_STATED_GAIN, "")).split()))
+    return replace(
+        record,
+        imaging_wavelength_um=telemetry.imaging_wavelength_um,
+        stated_gain=tuple(gains[k] for k in chosen) if len(gains) == n else gains,
+        read_with=str(telemetry.metadata.get(_READ_WITH, "")),
+    )
+
+
+def telemetry_of_record(record: LoopRecord) -> Telemetry:
+    """Return a record as telemetry, from which it can be read again without any other fact."""
+    y, u = record.measurements, record.commands
+    gains = " ".join(f"{gain:.9g}" for gain in record.stated_gain)
+    stated = {_STATED_GAIN: gains, _READ_WITH: record.read_with}
+    return Telemetry(
+        frame_rate_hz=record.frame_rate_hz,
+        delay_frames=record.delay_frames,
+        mirror=None if record.delay_frames is None else record.mirror,
+        measurements=np.where(record.measured[:, None], y, np.nan),
+        commands=None if u is None else np.where(record.commanded[:, None], u, np.nan),
+        diameter_m=record.diameter_m,
+        obstruction=record.obstruction,
+        imaging_wavelength_um=record.imaging_wavelength_um,
+        metadata={name: text for name, text in stated.items() if text},
+    )
 
 
 def _modal_columns(seen: Telemetry, role: str, chosen: list[int], notes: list[str]) -> list[Column]:
@@ -238,7 +273,7 @@ def _is_gains(response: FloatArray, seen: Telemetry) -> bool:
 
 def _influence(seen: Telemetry) -> FloatArray | None:
     """Return the matrix from commands to modes, None for the identity."""
-    n, m, influence = seen.modes, seen.commands.shape[1], seen.influence_matrix
+    n, m, influence = seen.modes, seen.n_commands, seen.influence_matrix
     if influence is None and m != n:
         raise ProblemError(
             f"this telemetry has {m} commands of {n} modes, and no influence matrix (modes, "

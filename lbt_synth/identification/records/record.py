@@ -77,6 +77,10 @@ class LoopRecord:
         Where it is from.
     bridges : (frames,) bool array_like, optional
         Frames whose pseudo-open loop was interpolated, which are usable.
+    stated_gain : tuple of float, optional
+        Sensor gain of all axes, or of each, as somebody knows it.
+    read_with : str, optional
+        Options by which its commands were made those that the mirror followed.
 
     Raises
     ------
@@ -116,6 +120,8 @@ class LoopRecord:
     imaging_wavelength_um: Positive | None = None
     source: str = ""
     bridges: BoolArray | None = None
+    stated_gain: tuple[float, ...] = ()
+    read_with: str = ""
     usable: BoolArray = field(init=False)
 
     def __post_init__(self) -> None:

@@ -95,8 +95,8 @@ class ParameterSection(Section):
 
     @model_validator(mode="after")
     def _one_distribution(self) -> ParameterSection:
-        given = [v is not None for v in (self.fixed, self.uniform, self.normal, self.list_)]
-        if sum(given) != 1:
+        laws = [v is not None for v in (self.fixed, self.uniform, self.normal, self.list_)]
+        if sum(laws) != 1:
             raise ValueError("expected a number or exactly one of fixed, uniform, normal, list")
         if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
             low, high = self.uniform
@@ -177,8 +177,8 @@ class ControllerSection(Section):
         """Where it comes from, for people."""
         if self.file is not None:
             return self.file
-        given = ", ".join(f"{name} {value}" for name, value in self.options.items())
-        method = f"{self.design} ({given})" if given else f"{self.design}"
+        options = ", ".join(f"{name} {value}" for name, value in self.options.items())
+        method = f"{self.design} ({options})" if options else f"{self.design}"
         return f"{method} for {'each sample' if self.for_ == 'sample' else 'the configuration'}"
 
     @model_validator(mode="after")

@@ -38,7 +38,7 @@ SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
 def test_commands_by_a_matrix(change, structure, signs):
     y, u = ordinary_loop()
     law = fit_control_law(y, u @ change.T)
-    assert (law.kind, law.lag_frames, law.order) == ("pure integrator", 0, 1)
+    assert (law.kind, law.lag_frames, law.order) == ("integrator", 0, 1)
     np.testing.assert_allclose(law.gain, change @ RAN, atol=1e-9 * np.abs(change).max())
     assert (law.axes_kind, law.signs) == (structure, signs)
     np.testing.assert_allclose(law.leak, 1.0, atol=1e-9)
@@ -50,14 +50,14 @@ def test_commands_by_a_matrix(change, structure, signs):
 def test_commands_that_are_shifted(late):
     y, u = ordinary_loop()
     law = fit_control_law(y[5:-5], np.roll(u, late, axis=0)[5:-5])
-    assert (law.kind, law.lag_frames) == ("pure integrator", late)
+    assert (law.kind, law.lag_frames) == ("integrator", late)
     np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
 
 
 def test_commands_between_two_frames():
     y, u = ordinary_loop()
     law = fit_control_law(y[1:], 0.7 * u[1:] + 0.3 * u[:-1])
-    assert (law.kind, law.lag_frames) == ("pure integrator", 0)
+    assert (law.kind, law.lag_frames) == ("integrator", 0)
     np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
     # a shift of the band-limited series has no law of finite order
     phase = np.exp(-2j * np.pi * 0.5 * np.fft.rfftfreq(len(u)))
@@ -97,14 +97,14 @@ def test_commands_of_another_night_have_no_law():
     [
         (
             SteppedLaw([[0.4, 0.1], [-0.1, 0.3]]),
-            "pure integrator",
+            "integrator",
             [1.0],
             [[0.4, 0.1], [-0.1, 0.3]],
         ),
-        (SteppedLaw(0.4, leak=0.99), "leaky integrator", [0.99], 0.4 * np.eye(2)),
+        (SteppedLaw(0.4, leak=0.99), "integrator", [0.99], 0.4 * np.eye(2)),
         (SteppedLaw(0.3, again=0.02), "double integrator", [1.0, 1.0], 0.006 * np.eye(2)),
-        (SteppedLaw(0.4, limit_nm=300), "pure integrator", [1.0], 0.4 * np.eye(2)),
-        (SteppedLaw(0.4, limit_nm=300, wind_up=True), "pure integrator", [1.0], 0.4 * np.eye(2)),
+        (SteppedLaw(0.4, limit_nm=300), "integrator", [1.0], 0.4 * np.eye(2)),
+        (SteppedLaw(0.4, limit_nm=300, wind_up=True), "integrator", [1.0], 0.4 * np.eye(2)),
     ],
 )
 def test_laws_of_low_order(controller, kind, poles, gain):
@@ -154,33 +154,24 @@ def test_coarse_commands_and_those_in_single_precision():
     y, u = ordinary_loop()
     coarse = fit_control_law(y, 3.0 * np.round(u / 3.0))
     assert (coarse.kind, coarse.lag_frames, coarse.axes_kind) == (
-        "pure integrator",
+        "integrator",
         0,
         "diagonal",
     )
-    assert np.all(np.abs(coarse.gain - RAN) < 5 * coarse.gain_error)
+    np.testing.assert_allclose(coarse.gain, RAN, atol=0.005)
     # two roundings of variance 9/12, of the increments' variance
     assert coarse.residual == pytest.approx(
         np.mean(1.5 / np.var(np.diff(u, axis=0), axis=0)), rel=0.1
     )
     single = fit_control_law(y.astype(np.float32), (u + 1e4).astype(np.float32))
-    assert (single.kind, single.exact) == ("pure integrator", True)
-
-
-def test_errors_cover_the_gain_under_dither():
-    deviations = []
-    for seed in range(25):
-        law = fit_control_law(*run_law(SteppedLaw(0.3, dither_nm=4.0), frames=1500, seed=seed))
-        assert (law.lag_frames, law.axes_kind) == (0, "diagonal")
-        deviations.append((law.gain - 0.3 * np.eye(2)) / law.gain_error)
-    assert 0.75 < np.sqrt(np.mean(np.square(deviations))) < 1.3
+    assert (single.kind, single.exact) == ("integrator", True)
 
 
 def test_a_loop_that_is_shaken_by_its_commands_is_not_read_backwards():
     law = fit_control_law(*run_law(SteppedLaw(0.4, dither_nm=20.0)))
     assert law.lag_frames == 0
     assert law.residual > 0.5
-    assert np.all(np.abs(law.gain - 0.4 * np.eye(2)) < 5 * law.gain_error)
+    np.testing.assert_allclose(law.gain, 0.4 * np.eye(2), atol=0.02)
 
 
 def test_frames_that_follow_no_law():
@@ -193,7 +184,7 @@ def test_frames_that_follow_no_law():
     u[5000:] -= 4000.0  # an offload
     spoilt = fit_control_law(np.delete(y, 7777, axis=0), np.delete(u, 7777, axis=0))
     for law in (holes, spoilt):
-        assert law.kind == "pure integrator"
+        assert law.kind == "integrator"
         np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
 
 
@@ -210,7 +201,7 @@ def test_of_a_record():
     record = spliced_record(frames=4000, gain=0.25)
     law = record_law(record)
     assert law is not None
-    assert (law.kind, law.lag_frames) == ("pure integrator", 0)
+    assert (law.kind, law.lag_frames) == ("integrator", 0)
     assert law.gain == pytest.approx(0.25)
 
 
@@ -230,11 +221,9 @@ def test_diagonals():
     assert classify_matrix([[-2.0]]) == ("diagonal", (-1,))
 
 
-def test_errors_and_tolerance_count_as_zero():
-    near = [[0.4, 0.03], [-0.03, 0.4]]
-    assert classify_matrix(near)[0] == "general"
-    assert classify_matrix(near, 0.01)[0] == "diagonal"
-    assert classify_matrix(near, 0.2)[0] == "zero"
+def test_small_elements_count_as_zero():
+    assert classify_matrix([[0.4, 0.03], [-0.03, 0.4]])[0] == "general"
+    assert classify_matrix([[0.4, 0.015], [-0.015, 0.4]])[0] == "diagonal"
     assert classify_matrix(np.zeros((2, 2))) == ("zero", (0, 0))
 
 

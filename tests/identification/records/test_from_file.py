@@ -86,7 +86,7 @@ def test_telemetry_of_ours(tmp_path):
         assert lbt.load_record(file, axes=[1]).axes == 1
         for options, words in (
             ({"frame_rate_hz": 801}, f"{name}: frame_rate_hz must be that of the telemetry, 800"),
-            ({"kind": "open_loop"}, "kind must be closed_loop"),
+            ({"kind": "open_loop"}, "is of kind closed_loop; got open_loop"),
             ({"columns": {"measurements": 0}}, "neither columns nor commands"),
         ):
             with pytest.raises(lbt.errors.ProblemError, match=words):
