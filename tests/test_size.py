@@ -24,7 +24,7 @@ LINES = {
     "loop": 4905,
     "methods": 920,
     "models": 4400,
-    "report": 4590,
+    "report": 4398,
     "storage": 1049,
     "studies": 3050,
     "errors, validation": 642,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import time
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.plants import LBT_YAML, lbt_axis_plant
 from support.studies import (
     assert_whole,
     evaluate_quickly,
@@ -19,6 +21,7 @@ from support.studies import (
     part_rows,
 )
 
+import lbt_synth as lbt
 from lbt_synth.errors import NumericalError, OutputError
 from lbt_synth.storage import array_file
 from lbt_synth.storage.thread_limits import WorkerPool
@@ -69,6 +72,30 @@ def test_a_grid_in_memory_is_in_the_order_of_its_samples():
         assert list(evaluate(late, iter(samples), pool)) == [i * i for i in range(9)]
         with pytest.raises(NumericalError, match=r"rows 0 to 0 .*RuntimeError: no such thing"):
             list(evaluate(fails, [(1,)], pool))
+
+
+class Elsewhere(ThreadPoolExecutor):
+    """An executor that gets everything in bytes, as one of processes does."""
+
+    def submit(self, fn, *args):
+        return super().submit(*pickle.loads(pickle.dumps((fn, *args))))
+
+
+def test_tables_of_designs_are_the_same_elsewhere():
+    config = lbt.load_config(LBT_YAML)
+    plant, met = lbt_axis_plant(modes=1), (config.truth, config.imaging)
+    design = config.design("integrator", gain=0.3)
+    errors = {"errors_hz": [-1.0, 0.0]}
+
+    def tables(**how):
+        yield list(lbt.studies.robustness(config.plant, *met, **errors, **how))
+        yield lbt.studies.limits({"slow": design}, config.hardware, *met, **errors, **how).rows
+        yield [p.gamma for p in lbt.studies.tradeoff(plant, points=2, **how)]
+        gains = {"sensor_gains": np.linspace(0.1, 1, 70), "delay_errors_frames": [0, 0.5]}
+        yield lbt.studies.robustness_map(design, *met, **errors, **gains, **how).strehl.tolist()
+
+    with Elsewhere(2) as pool:
+        assert list(tables(executor=pool)) == list(tables())
 
 
 def test_a_part_is_believed_by_its_digest_alone(tmp_path):

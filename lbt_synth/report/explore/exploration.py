@@ -128,7 +128,7 @@ def _method_knobs(config: Config) -> Iterator[Knob]:
     yield Knob("gamma_ratio", "gamma ratio", "", 1.0, 3.0, ratio, edit, methods=bounded)
     for name, method in METHODS.items():
         section, methods = section_of(method, config), frozenset({name})
-        if hasattr(section, "modulus_margin") and hasattr(section, "bands"):
+        if getattr(section, "bands", None):
             margin = float(section.modulus_margin)
             edit = _scaled("design", name, "modulus_margin", default=margin)
             yield Knob("modulus", "modulus margin", "", 0.2, 0.8, margin, edit, methods=methods)

@@ -166,16 +166,16 @@ def _controller_statistics(
     """Return the statistics of one controller, with the order of each parameter's values."""
     places = np.flatnonzero(samples["evaluated"])
     strehl, unstable = samples["strehl"][places], samples["unstable"][places]
-    mean, error = mean_and_error(strehl)
+    n = len(strehl)
     worst = places[np.lexsort((rows[places], strehl, ~unstable))[:_MOST_WORST]]
     return ControllerStatistics(
         controller=controller,
-        samples=len(strehl),
-        failed=len(samples["strehl"]) - len(strehl),
+        samples=n,
+        failed=len(samples["strehl"]) - n,
         unstable=int(np.count_nonzero(unstable)),
         unstable_share=share(unstable),
-        mean=mean,
-        mean_error=error,
+        mean=float(np.mean(strehl)) if n else np.nan,
+        mean_error=float(np.std(strehl, ddof=1)) / n**0.5 if n > 1 else np.nan,
         strehl=percentiles(strehl, PERCENTS),
         residual_nm=percentiles(samples["residual_nm"][places], PERCENTS),
         worst=tuple(worst.tolist()),
@@ -264,13 +264,6 @@ def share(where: BoolArray) -> Interval:
     count = int(np.count_nonzero(where))
     ends = binomtest(count, len(where)).proportion_ci(CONFIDENCE, method="exact")
     return Interval(value=count / len(where), low=float(ends.low), high=float(ends.high))
-
-
-def mean_and_error(values: FloatArray) -> tuple[float, float]:
-    """Return the mean and its standard error for independent samples; nan if too few."""
-    n = len(values)
-    mean = float(np.mean(values)) if n else np.nan
-    return mean, float(np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else np.nan
 
 
 def _sensitivity(values: FloatArray, order: IntArray, samples: Samples) -> dict[str, float]:
