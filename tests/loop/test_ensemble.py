@@ -22,6 +22,7 @@ from lbt_synth.models import (
 
 WRONG = [
     ({"sensor_gain": 0.0}, ProblemError, "sensor_gain must be above 0"),
+    ({"noise_nm": -1.0}, ProblemError, "noise_nm must be at least 0"),
     ({"delay_frames": [2, 20.5]}, ProblemError, "at least 1 and at most 20"),
     ({"sensor_gain": [1, 1], "noise_nm": [1, 1, 1]}, DimensionError, "one entry per loop"),
     ({"sensor_gain": []}, DimensionError, "at least one loop"),

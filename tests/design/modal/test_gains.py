@@ -10,13 +10,19 @@ from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 from support.modal import RATE, integrator_residuals, integrator_run
 from support.refusals import refused, require_refusals
-from support.series import ar_series
 
 import lbt_synth as lbt
 from lbt_synth.design.modal import modal_gains, modal_gains_from_telemetry
 from lbt_synth.design.modal.gains import _minimise
 from lbt_synth.errors import DimensionError, NonFiniteError, NumericalError, ProblemError
 from lbt_synth.models import ARModel, ModalTurbulence, PositionLoop, TabulatedSpectrum
+
+
+def ar_series(coefficients, driving, modes, frames, rng):
+    """Stationary series of one process, (modes, frames)."""
+    white = driving * rng.standard_normal((modes, frames + 30_000))
+    return lfilter([1.0], [1.0, *(-np.array(coefficients))], white, axis=1)[:, 30_000:]
+
 
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=200.0, direction=(1,))
 

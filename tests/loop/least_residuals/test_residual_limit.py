@@ -212,6 +212,8 @@ def second(rate_hz, delay_frames, noise_nm):
 
 
 def test_the_bound_of_two_sensors_is_met_by_quick_ones_and_passed_by_none():
+    calm, suite = {"turbulence": ar(0.99)}, lbt.models.SensorSuite(sensors=(second(RATE, 2, 3.0),))
+    assert variance(path(suite=suite), **calm) == variance(path(), **calm)  # its own has no noise
     left, least = variances_of_sensors([second(RATE, 2, 9.0)], sensor_gain=0.6)
     assert least == pytest.approx(left, rel=1e-7)
     for divisor, delay_frames in ((2, 2), (5, 3.2)):
