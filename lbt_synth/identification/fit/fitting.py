@@ -18,6 +18,7 @@ from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.spectrum_model import (
     BACKGROUND,
     COLOUR,
+    GAIN,
     Component,
     Kind,
     SpectrumModel,
@@ -149,8 +150,9 @@ class Search:
         centre, width = np.array(rows).T
         priors = Priors(centre=centre, width=width)
         low, high = (np.full(centre.size, end) for end in priors.bounds)
-        colours = BACKGROUND * np.arange(len(spectrum.axes)) + COLOUR
-        low[colours], high[colours] = 0.0, _MOST_COLOUR
+        axes = BACKGROUND * np.arange(len(spectrum.axes))
+        low[axes + GAIN], high[axes + GAIN] = np.log(2 * GAINS["above"]), np.log(GAINS["below"] / 2)
+        low[axes + COLOUR], high[axes + COLOUR] = 0.0, _MOST_COLOUR
         for i, c in enumerate(spectrum.components):
             if c.kind == "line":
                 low[spectrum.place(i)] = self.log_angle(_LOWEST * self.data.step_hz)

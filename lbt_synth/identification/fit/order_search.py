@@ -19,7 +19,6 @@ from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
 from lbt_synth.identification.fit.fitting import (
     GAIN_STEP,
-    GAINS,
     PLAUSIBLE_GAINS,
     TYPICAL_GAIN,
     Search,
@@ -205,15 +204,10 @@ def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
     data, background = search.merge(spectrum), spectrum.background
     slow = [c for c in spectrum.components if c.kind not in ("line", "drift")]
     lines = [c for c in spectrum.components if c.kind == "line"]
-    drifts = [
-        search.drift(search.place(c)[0] / (2 * c.damping_ratio), float(np.exp(c.log_power)))
-        for c in slow
-        if c.damping_ratio > _OVERDAMPED
-    ]
     noise = 2 / search.data.frame_rate_hz * float(np.exp(background.log_noise))
     # the density of a drift of variance P above its corner is 2 P corner / (pi f^2)
     powers = noise * np.square(_CROSSINGS_HZ) * np.pi / (2 * fitting.DRIFT_HZ)
-    drifts += [search.drift(fitting.DRIFT_HZ, power) for power in powers.tolist()]
+    drifts = [search.drift(fitting.DRIFT_HZ, power) for power in powers.tolist()]
     variance = float(np.sum(np.exp([c.log_power for c in slow])))
     starts = [replace(c, kind="turbulence") for c in slow]
     starts += [
@@ -343,10 +337,6 @@ def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[Spe
     """Yield other beginnings for a line: elsewhere in its band, or as two lines."""
     data, line, step = search.data, spectrum.components[i], search.data.step_hz
     centre, half = search.place(line)
-    centred = fitting.centre_line(search, spectrum, i)
-    moved_by = centred.components[i].log_frequency - line.log_frequency
-    if abs(moved_by) * centre > 0.4 * step:
-        yield centred
     reach = max(10 * half, 20 * step)
     lowest = min(max(centre - reach, search.lowest_line_hz), centre)
     start, stop = np.searchsorted(data.frequency_hz, [lowest, centre + reach])
@@ -364,11 +354,7 @@ def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[Spe
 def fit_background(
     search: Search, gain: float, lines: Sequence[Component] = ()
 ) -> FittedModel | None:
-    """Fit turbulence and noise beside lines at a sensor gain; None if no fit settles.
-
-    A gain that a free fit ran away to counts as the nearest that a sensor may have.
-    """
-    gain = float(np.clip(gain, 2 * GAINS["above"], GAINS["below"] / 2))
+    """Fit turbulence and noise beside lines at a sensor gain; None if no fit settles."""
     smooth = _smooth_background(search.data, gain)
     f, d, rate = smooth.frequency_hz, smooth.measured, smooth.frame_rate_hz
     white = max(float(np.median(d[f >= 0.6 * f[-1]])) * rate / 2, float(np.finfo(float).tiny))
