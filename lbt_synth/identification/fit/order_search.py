@@ -83,14 +83,8 @@ def find_models(
                     rival = fitting.fit(search, held.spectrum)
                     rivals += [] if rival is None else [rival]
         best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
-    near = [
-        rival
-        for rival in rivals
-        if any(
-            cost(search, rival) - cost(search, best) < _AS_LIKELY
-            for cost in (fitting.cost, _cost_of_noise)
-        )
-    ]
+    limit = _cost_of_noise(search, best) + _AS_LIKELY
+    near = [rival for rival in rivals if fitting.cost(search, rival) < limit]
     return (best if best is model else fitting.prune(search, best, thorough=True)), near
 
 
@@ -208,6 +202,11 @@ def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
     # the density of a drift of variance P above its corner is 2 P corner / (pi f^2)
     powers = noise * np.square(_CROSSINGS_HZ) * np.pi / (2 * fitting.DRIFT_HZ)
     drifts = [search.drift(fitting.DRIFT_HZ, power) for power in powers.tolist()]
+    drifts += [
+        search.drift(search.place(c)[0] / (2 * c.damping_ratio), float(np.exp(c.log_power)))
+        for c in slow
+        if c.damping_ratio > _OVERDAMPED
+    ]
     variance = float(np.sum(np.exp([c.log_power for c in slow])))
     starts = [replace(c, kind="turbulence") for c in slow]
     starts += [
@@ -337,6 +336,10 @@ def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[Spe
     """Yield other beginnings for a line: elsewhere in its band, or as two lines."""
     data, line, step = search.data, spectrum.components[i], search.data.step_hz
     centre, half = search.place(line)
+    centred = fitting.centre_line(search, spectrum, i)
+    moved_by = centred.components[i].log_frequency - line.log_frequency
+    if abs(moved_by) * centre > 0.4 * step:
+        yield centred
     reach = max(10 * half, 20 * step)
     lowest = min(max(centre - reach, search.lowest_line_hz), centre)
     start, stop = np.searchsorted(data.frequency_hz, [lowest, centre + reach])
