@@ -270,13 +270,13 @@ def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> Fitt
     """
     trials, spectrum = [], model.spectrum
     data = search.merge(spectrum)
-    whole = contrast(data, spectrum)
+    least = contrast(data, spectrum)
     for i, component in enumerate(spectrum.components):
         neighbour = _overlapping(search, spectrum, i)
         less = _drop(data, spectrum, i, neighbour)
         if less is not None:
             required = required_evidence(search, spectrum, i)
-            spare = contrast(data, less) - whole - HOPE * required
+            spare = contrast(data, less) - least - HOPE * required
             patient = thorough and (neighbour is not None or not component.is_narrow)
             if patient or spare <= 0:
                 trials.append((spare, required, less, None if patient else model))

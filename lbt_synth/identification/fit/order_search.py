@@ -222,10 +222,10 @@ def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
 
 def _add_centred(search: Search, spectrum: SpectrumModel, new: Sequence[Excess]) -> SpectrumModel:
     """Return the model with more components, each where it fits best."""
-    whole = spectrum.add(*(component for _, component in new))
-    for i in range(len(spectrum.components), len(whole.components)):
-        whole = fitting.centre_line(search, whole, i)
-    return whole
+    model = spectrum.add(*(component for _, component in new))
+    for i in range(len(spectrum.components), len(model.components)):
+        model = fitting.centre_line(search, model, i)
+    return model
 
 
 def _add_announced(search: Search, model: FittedModel) -> FittedModel:
@@ -238,7 +238,7 @@ def _add_announced(search: Search, model: FittedModel) -> FittedModel:
     step, spectrum = search.data.step_hz, model.spectrum
     seen = density(search.data, spectrum)
     for f, error in search.announced:
-        known = (search.log_angle(f), max(error, 0.1 * step) / f)
+        prior = (search.log_angle(f), max(error, 0.1 * step) / f)
         level = float(np.interp(f, search.data.frequency_hz, seen))
         line = search.component("line", f, 0.01, level * max(0.01 * f, step))
         place = len(spectrum.components)
@@ -246,7 +246,7 @@ def _add_announced(search: Search, model: FittedModel) -> FittedModel:
             if c.kind == "line" and abs(search.place(c)[0] - f) < 3 * max(error, step):
                 place, line = i, spectrum.components[i]
                 break
-        spectrum = spectrum.exchange(place, replace(line, announced=known))
+        spectrum = spectrum.exchange(place, replace(line, announced=prior))
     announced = fitting.fit(search, spectrum)
     return model if announced is None else fitting.prune(search, announced)
 
@@ -276,7 +276,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
     The highest of the lines may stand upon a bump of the others.
     """
     components, data = spectrum.components, search.merge(spectrum)
-    whole = contrast(data, spectrum)
+    least = contrast(data, spectrum)
     lines = [
         i
         for i, c in enumerate(components)
@@ -305,7 +305,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
             bump = _bump([components[i] for i in group], sections)
             trial = replace(spectrum, components=(*others, bump))
             rough = 1.0 if len(group) == 1 else _ROUGH
-            if contrast(data, trial) < whole + rough * search.price:
+            if contrast(data, trial) < least + rough * search.price:
                 yield trial
 
 
