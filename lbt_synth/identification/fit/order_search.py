@@ -83,8 +83,14 @@ def find_models(
                     rival = fitting.fit(search, held.spectrum)
                     rivals += [] if rival is None else [rival]
         best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
-    limit = _cost_of_noise(search, best) + _AS_LIKELY
-    near = [rival for rival in rivals if fitting.cost(search, rival) < limit]
+    near = [
+        rival
+        for rival in rivals
+        if any(
+            cost(search, rival) - cost(search, best) < _AS_LIKELY
+            for cost in (fitting.cost, _cost_of_noise)
+        )
+    ]
     return (best if best is model else fitting.prune(search, best, thorough=True)), near
 
 
