@@ -18,7 +18,7 @@ LINES = {
     "config": 1876,
     "design": 7570,
     "files": 1608,
-    "identification": 10080,
+    "identification": 9800,
     "interop": 4360,
     "linear": 5874,
     "loop": 4905,

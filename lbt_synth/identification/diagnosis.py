@@ -6,7 +6,7 @@ errors; the model says only how the variance of one divides among the parts of t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -138,7 +138,7 @@ def _judge_channel(
 def law_facts(law: ControlLaw) -> Facts:
     """Return a control law in words."""
     is_none = law.kind == "none"
-    leak = ", ".join(_distinct(f"{value:.5g}" for value in law.leak if np.isfinite(value)))
+    leak = ", ".join(dict.fromkeys(f"{pole:.5g}" for pole in law.leak if np.isfinite(pole)))
     none = "none: the commands do not follow from the measurements"
     axes = "" if is_none or len(law.gain) == 1 else law.axes_kind
     unexplained = 0.0 if law.exact else law.residual
@@ -152,12 +152,6 @@ def law_facts(law: ControlLaw) -> Facts:
         residual=fact(unexplained, "unexplained", unit="%", scale=100, format=".2g"),
         coherence=fact(law.coherence),
     )
-
-
-def _distinct(texts: Iterable[str]) -> list[str]:
-    """Return texts, or one of them where all are the same."""
-    listed = list(texts)
-    return listed[:1] if len(set(listed)) == 1 else listed
 
 
 def loop_facts(model: IdentifiedModel, running: Controller | None) -> Facts:
@@ -179,8 +173,8 @@ def loop_facts(model: IdentifiedModel, running: Controller | None) -> Facts:
             modulus, crossover = margins.modulus, margins.crossover_hz
     return facts(
         delay_frames=fact(model.delay_frames, "delay", unit="frames"),
-        sensor_gain=fact(", ".join(_distinct(gains)), "sensor gain"),
-        sensor_gain_note=fact(", ".join(_distinct(notes))),
+        sensor_gain=fact(", ".join(dict.fromkeys(gains)), "sensor gain"),
+        sensor_gain_note=fact(", ".join(dict.fromkeys(notes))),
         spectral_radius=fact(radius, "spectral radius", format=".5f"),
         stable_gains=fact(stable, "stable sensor gains"),
         modulus=fact(modulus, "modulus margin", format=".3f"),

@@ -18,6 +18,7 @@ from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.spectrum_model import (
     BACKGROUND,
     COLOUR,
+    GAIN,
     Component,
     Kind,
     SpectrumModel,
@@ -149,8 +150,9 @@ class Search:
         centre, width = np.array(rows).T
         priors = Priors(centre=centre, width=width)
         low, high = (np.full(centre.size, end) for end in priors.bounds)
-        colours = BACKGROUND * np.arange(len(spectrum.axes)) + COLOUR
-        low[colours], high[colours] = 0.0, _MOST_COLOUR
+        axes = BACKGROUND * np.arange(len(spectrum.axes))
+        low[axes + GAIN], high[axes + GAIN] = np.log(2 * GAINS["above"]), np.log(GAINS["below"] / 2)
+        low[axes + COLOUR], high[axes + COLOUR] = 0.0, _MOST_COLOUR
         for i, c in enumerate(spectrum.components):
             if c.kind == "line":
                 low[spectrum.place(i)] = self.log_angle(_LOWEST * self.data.step_hz)
@@ -268,13 +270,13 @@ def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> Fitt
     """
     trials, spectrum = [], model.spectrum
     data = search.merge(spectrum)
-    whole = contrast(data, spectrum)
+    least = contrast(data, spectrum)
     for i, component in enumerate(spectrum.components):
         neighbour = _overlapping(search, spectrum, i)
         less = _drop(data, spectrum, i, neighbour)
         if less is not None:
             required = required_evidence(search, spectrum, i)
-            spare = contrast(data, less) - whole - HOPE * required
+            spare = contrast(data, less) - least - HOPE * required
             patient = thorough and (neighbour is not None or not component.is_narrow)
             if patient or spare <= 0:
                 trials.append((spare, required, less, None if patient else model))

@@ -266,14 +266,14 @@ class IdentifiedModel(Summarised):
     @property
     def parts(self) -> tuple[IdentifiedLine, ...]:
         """All resonances, each once and with its direction: those of each axis, then the shared."""
-        each = zip(np.eye(len(self.axes)).tolist(), self.axes, strict=True)
-        own = [
-            replace(part, direction=tuple(along))
-            for along, axis in each
-            for part in axis.parts
-            if part.direction is None
+        directions = np.eye(len(self.axes)).tolist()
+        alone = [
+            replace(line, direction=tuple(direction))
+            for direction, axis in zip(directions, self.axes, strict=True)
+            for line in axis.parts
+            if line.direction is None
         ]
-        return (*own, *self.shared)
+        return (*alone, *self.shared)
 
     def plant(self) -> TipTiltPlant:
         """Return the plant of a design: independent processes, those of both axes once."""
@@ -364,8 +364,7 @@ def describe_axis(
         _describe_line(search, model, i, errors, covariance, densities[i], fitted)
         for i in range(len(spectrum.components))
     ]
-    own = len(resonances) - len(directions)
-    for i, (direction, error) in enumerate(directions, start=own):
+    for i, (direction, error) in enumerate(directions, start=len(resonances) - len(directions)):
         resonances[i] = replace(resonances[i], direction=direction, direction_error_deg=error)
     smooth = fitted.copy()
     for resonance, line in zip(resonances, densities[1:], strict=True):

@@ -19,7 +19,6 @@ from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
 from lbt_synth.identification.fit.fitting import (
     GAIN_STEP,
-    GAINS,
     PLAUSIBLE_GAINS,
     TYPICAL_GAIN,
     Search,
@@ -205,15 +204,15 @@ def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
     data, background = search.merge(spectrum), spectrum.background
     slow = [c for c in spectrum.components if c.kind not in ("line", "drift")]
     lines = [c for c in spectrum.components if c.kind == "line"]
-    drifts = [
+    noise = 2 / search.data.frame_rate_hz * float(np.exp(background.log_noise))
+    # the density of a drift of variance P above its corner is 2 P corner / (pi f^2)
+    powers = noise * np.square(_CROSSINGS_HZ) * np.pi / (2 * fitting.DRIFT_HZ)
+    drifts = [search.drift(fitting.DRIFT_HZ, power) for power in powers.tolist()]
+    drifts += [
         search.drift(search.place(c)[0] / (2 * c.damping_ratio), float(np.exp(c.log_power)))
         for c in slow
         if c.damping_ratio > _OVERDAMPED
     ]
-    noise = 2 / search.data.frame_rate_hz * float(np.exp(background.log_noise))
-    # the density of a drift of variance P above its corner is 2 P corner / (pi f^2)
-    powers = noise * np.square(_CROSSINGS_HZ) * np.pi / (2 * fitting.DRIFT_HZ)
-    drifts += [search.drift(fitting.DRIFT_HZ, power) for power in powers.tolist()]
     variance = float(np.sum(np.exp([c.log_power for c in slow])))
     starts = [replace(c, kind="turbulence") for c in slow]
     starts += [
@@ -229,10 +228,10 @@ def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
 
 def _add_centred(search: Search, spectrum: SpectrumModel, new: Sequence[Excess]) -> SpectrumModel:
     """Return the model with more components, each where it fits best."""
-    whole = spectrum.add(*(component for _, component in new))
-    for i in range(len(spectrum.components), len(whole.components)):
-        whole = fitting.centre_line(search, whole, i)
-    return whole
+    model = spectrum.add(*(component for _, component in new))
+    for i in range(len(spectrum.components), len(model.components)):
+        model = fitting.centre_line(search, model, i)
+    return model
 
 
 def _add_announced(search: Search, model: FittedModel) -> FittedModel:
@@ -245,7 +244,7 @@ def _add_announced(search: Search, model: FittedModel) -> FittedModel:
     step, spectrum = search.data.step_hz, model.spectrum
     seen = density(search.data, spectrum)
     for f, error in search.announced:
-        known = (search.log_angle(f), max(error, 0.1 * step) / f)
+        prior = (search.log_angle(f), max(error, 0.1 * step) / f)
         level = float(np.interp(f, search.data.frequency_hz, seen))
         line = search.component("line", f, 0.01, level * max(0.01 * f, step))
         place = len(spectrum.components)
@@ -253,7 +252,7 @@ def _add_announced(search: Search, model: FittedModel) -> FittedModel:
             if c.kind == "line" and abs(search.place(c)[0] - f) < 3 * max(error, step):
                 place, line = i, spectrum.components[i]
                 break
-        spectrum = spectrum.exchange(place, replace(line, announced=known))
+        spectrum = spectrum.exchange(place, replace(line, announced=prior))
     announced = fitting.fit(search, spectrum)
     return model if announced is None else fitting.prune(search, announced)
 
@@ -283,7 +282,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
     The highest of the lines may stand upon a bump of the others.
     """
     components, data = spectrum.components, search.merge(spectrum)
-    whole = contrast(data, spectrum)
+    least = contrast(data, spectrum)
     lines = [
         i
         for i, c in enumerate(components)
@@ -312,7 +311,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
             bump = _bump([components[i] for i in group], sections)
             trial = replace(spectrum, components=(*others, bump))
             rough = 1.0 if len(group) == 1 else _ROUGH
-            if contrast(data, trial) < whole + rough * search.price:
+            if contrast(data, trial) < least + rough * search.price:
                 yield trial
 
 
@@ -364,11 +363,7 @@ def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[Spe
 def fit_background(
     search: Search, gain: float, lines: Sequence[Component] = ()
 ) -> FittedModel | None:
-    """Fit turbulence and noise beside lines at a sensor gain; None if no fit settles.
-
-    A gain that a free fit ran away to counts as the nearest that a sensor may have.
-    """
-    gain = float(np.clip(gain, 2 * GAINS["above"], GAINS["below"] / 2))
+    """Fit turbulence and noise beside lines at a sensor gain; None if no fit settles."""
     smooth = _smooth_background(search.data, gain)
     f, d, rate = smooth.frequency_hz, smooth.measured, smooth.frame_rate_hz
     white = max(float(np.median(d[f >= 0.6 * f[-1]])) * rate / 2, float(np.finfo(float).tiny))

@@ -174,12 +174,7 @@ def _share_turbulence(search: Search, apart: SpectrumModel) -> FittedModel | Non
         sign=1.0 if coherence > 0 else -1.0,
     )
     spectrum = replace(apart, components=(*components[:1], shared, *components[1:]))
-    model = fitting.fit(search, spectrum, accuracy=EXACT)
-    if model is None:
-        return None
-    data = search.merge(model.spectrum)
-    saved = contrast(data, apart) - contrast(data, model.spectrum)
-    return model if saved > search.price else None
+    return fitting.fit(search, spectrum, accuracy=EXACT)
 
 
 def _find_pairs(

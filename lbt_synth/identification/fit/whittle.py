@@ -414,10 +414,10 @@ def _best_step(
     The first is that of the minimum without a radius, the second that of this step. The curvature
     (p, p) counts by its absolute value.
     """
-    whole, info = dposv(curvature, -gradient)[1:]
-    if info == 0 and float(np.linalg.norm(whole)) <= radius:
-        gain = -0.5 * float(gradient @ whole)
-        return whole, gain, gain
+    newton, info = dposv(curvature, -gradient)[1:]
+    if info == 0 and float(np.linalg.norm(newton)) <= radius:
+        gain = -0.5 * float(gradient @ newton)
+        return newton, gain, gain
     size, axes = np.linalg.eigh(curvature)
     size, slope = np.maximum(np.abs(size), _LEAST_INFORMATION), gradient @ axes
     step = _trust_step(slope, size, radius)
