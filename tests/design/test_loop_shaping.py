@@ -235,7 +235,8 @@ def test_a_fraction_of_the_delay_costs_what_lies_between_whole_ones():
     for delay in (2, 2.49, 3):
         path = replace(config.hardware, delay_frames=delay)
         plant = replace(config.plant, hardware=path)
-        design = lbt.robust(plant, bands=[line], turbulence=config.truth.turbulence)
+        known = {"turbulence": config.truth.turbulence, "functions": 40, "states": None}
+        design = lbt.robust(plant, bands=[line], **known)
         loop = lbt.close_loop(path, design.controller)
         residuals.append(lbt.residual_budget(loop, config.truth).rms_nm)
         assert lbt.loop_margins(loop).delay_frames > 1
