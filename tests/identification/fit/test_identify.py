@@ -387,6 +387,9 @@ def test_innovations_that_are_not_white_are_noted() -> None:
     record = spliced_record(lines=((40, 0.01, 30.0),), frames=8192)
     for most_lines, count in ((0, 1), (5, 0)):
         model = lbt.identify(record, sensor_gain=0.6, most_lines=most_lines)
+        (axis,) = model.axes
+        assert len(axis.lines) == axis.whiteness.white == 1 - count
+        assert (axis.whiteness.p_value < 1e-6) == count
         notes = [note for note in model.notes if "are not white" in note]
         assert len(notes) == count
         assert all("standard errors do not cover" in note for note in notes)
