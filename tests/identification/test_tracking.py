@@ -52,8 +52,7 @@ def run(controller, plant, series):
 
 
 PLANTS = {
-    "delay 1": axis(20, delay_frames=1),
-    "a slow mirror": axis(20, mirror=SHELL),
+    "a slow mirror": axis(20, mirror=SHELL, delay_frames=1),
     "two axes": TWO_AXES,
 }
 
