@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.plants import lbt_axis_plant, random_problem, with_own_noise
-from support.random_plants import random_plant
 from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
@@ -245,23 +244,6 @@ def test_a_horizon_is_a_delay_of_the_loop(make, options):
         assert make(bare, horizon=horizon, **options).rms == pytest.approx(direct.rms, rel=1e-9)
     with pytest.raises(ProblemError, match="delay of 1 to 100 frames; got -1"):
         make(p, horizon=-1, **options)
-
-
-@pytest.mark.study
-def test_designs_of_random_plants(capsys):
-    """Kalman and H-infinity designs of 1,000 plants are certified, the least gamma bracketed."""
-    rng, gaps = np.random.default_rng(0), []
-    for _ in range(1000):
-        plant = random_plant(rng)
-        design = lbt.hinf(plant, gamma_ratio=1.2, route="riccati")
-        assert lbt.kalman(plant).certificate.passed
-        assert design.certificate.passed
-        gaps.append(design.gamma_least / design.gamma_infeasible - 1)
-    with capsys.disabled():
-        print(
-            f"\ngap of the least gamma, median and largest: {np.median(gaps):.2g} {max(gaps):.2g}"
-        )
-    assert max(gaps) < 1e-5
 
 
 def test_noise_far_below_the_signal_is_left_to_the_equation():

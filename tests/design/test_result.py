@@ -109,12 +109,6 @@ def test_wrong_arguments_are_refused_in_words(config, design):
     )
 
 
-def test_a_robust_design_needs_no_bands(config):
-    robust = lbt.robust(config.plant, sensor_gain=(0.8, 1.1), functions=8, states=None)
-    low, high = lbt.loop.stable_sensor_gains(config.hardware, robust)
-    assert low < 0.8 < 1.1 < high
-
-
 def test_designs_are_frozen(design):
     with pytest.raises(FrozenInstanceError):
         design.method = "other"

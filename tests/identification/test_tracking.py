@@ -52,8 +52,7 @@ def run(controller, plant, series):
 
 
 PLANTS = {
-    "delay 1": axis(20, delay_frames=1),
-    "a slow mirror": axis(20, mirror=SHELL),
+    "a slow mirror": axis(20, mirror=SHELL, delay_frames=1),
     "two axes": TWO_AXES,
 }
 
@@ -93,7 +92,7 @@ def test_a_line_that_moves_is_followed_and_a_fixed_filter_does_not():
     moves = {"start_hz": 18, "end_hz": 22, "duration_s": 8}
     drift = DriftingVibration(**moves, rms_nm=300, direction=(1,))
     truth = lbt.Truth(turbulence=AIR, vibrations=(drift,), noise_nm=15.5)
-    tracker = TrackingController(plant, window_s=2, update_s=0.5)
+    tracker = TrackingController(plant, window_s=2, update_s=0.75)
 
     def residual(controller):
         settings = {"hardware": plant.hardware, "frames": 7200, "settle_frames": 1600, "seed": 2}
@@ -145,15 +144,13 @@ def test_measurements_that_are_not_numbers_hold_the_command_and_spoil_a_window()
     plant = axis(20)
     tracker = TrackingController(plant, window_s=1.0, update_s=0.5)
     total, noise = disturbed(plant, frames=2400)
-    clean = run(tracker, plant, (total, noise))
+    clean = run(tracker, plant, (total[:, :500], noise[:, :500]))
     noise[0, [500, 501, 700], 0] = [np.nan, np.inf, -np.inf]
+    noise[0, 1300:1320] = np.nan
     out = run(tracker, plant, (total, noise))
     assert out[500, 1] == out[501, 1] == out[499, 1]
     assert out[700, 1] == out[699, 1]
-    assert np.array_equal(out[:500], clean[:500])
-    assert [update.reason for update in tracker.history] == [""] * 5
-    noise[0, 1300:1320] = np.nan
-    run(tracker, plant, (total, noise))
+    assert np.array_equal(out[:500], clean)
     reasons = [update.reason for update in tracker.history]
     assert [bool(reason) for reason in reasons] == [False, False, True, True, False]
     assert "got 2.5 %" in reasons[2]

@@ -2,7 +2,6 @@
 
 import io
 import json
-import random
 import struct
 import zipfile
 
@@ -75,33 +74,10 @@ def table_file(*, sums=True):
     return stream.getvalue()
 
 
-def values(content):
-    """Return all cards and data of FITS content."""
-    with open_fits(content) as units:
-        return [(repr(u.header), None if u.data is None else u.data.tobytes()) for u in units]
-
-
 def test_files_of_other_programs_are_read_with_and_without_checksums():
     for content in (table_file(), table_file(sums=False), table_file() + bytes(2880)):
         with open_fits(content) as units:
             assert [unit.name for unit in units] == ["PRIMARY", "R", "Y"]
-
-
-def test_every_flipped_bit_of_an_hdu_with_a_checksum_is_found_or_changes_nothing():
-    content, draw, refused = table_file(), random.Random(1), 0
-    original = values(content)
-    for _ in range(100):
-        at = draw.randrange(len(content))
-        damaged = bytearray(content)
-        damaged[at] ^= 1 << draw.randrange(8)
-        card = bytes(content[at - at % 80 :][:80])
-        if card.startswith((b"CHECKSUM", b"DATASUM")):  # without these there is nothing to check
-            continue
-        try:
-            assert values(bytes(damaged)) == original  # behind END
-        except ValueError:
-            refused += 1
-    assert refused > 50
 
 
 @pytest.mark.parametrize("sums", [True, False])
@@ -112,19 +88,15 @@ def test_fits_content_that_is_cut_or_goes_on_is_refused(sums):
             pass
 
 
-@pytest.mark.parametrize("value", ["p" * 200, "several words, " * 12 + "end"])
-def test_long_strings_go_on_in_further_cards(value):
-    header = fits.Header.fromstring(fits_bytes({"LONG": value, "NEXT": 1}, {}).decode())
-    assert (header["LONG"], header["NEXT"]) == (value, 1)
-
-
 def test_the_same_content_gives_the_same_bytes():
-    cards, arrays = {"VERSION": (1, "layout")}, {"A": np.eye(2), "B": np.ones(3, dtype="f4")}
+    cards = {"VERSION": (1, "layout"), "LONG": "several words, " * 12 + "end"}
+    arrays = {"A": np.eye(2), "B": np.ones(3, dtype="f4")}
     more = {"headers": {"A": {"BUNIT": "nm"}}, "comments": ["note"]}
     one, other = (fits_bytes(cards, arrays, "text", **more) for _ in range(2))
     assert one == other
     with open_fits(one) as units:
         assert units[0].header["COMMENT"][0] == "note"
+        assert units[0].header["LONG"] == cards["LONG"]
         assert units["A"].header["BUNIT"] == "nm"
         assert units["B"].data.dtype == ">f4"
     read, text = read_fits(one)

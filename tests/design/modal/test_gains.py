@@ -60,13 +60,8 @@ def test_agrees_with_the_best_integrator_of_one_mode(air, delay, noise, sensor_g
     )
     known = {"noise_nm": noise, "sensor_gain": sensor_gain}
     sharp = replace(LINE, damping=1e-4).ar_model(RATE)
-    gains = modal_gains(
-        [air, table, ar1, sharp],
-        frame_rate_hz=RATE,
-        delay_frames=delay,
-        vibrations={2: LINE},
-        **known,
-    )
+    loop = {"frame_rate_hz": RATE, "delay_frames": delay, "vibrations": {2: LINE}}
+    gains = modal_gains([air, table, ar1, sharp], **loop, **known)
     moving = replace(LINE, rms_nm=LINE.rms_nm / np.sinc(20 / RATE))
     for i, (spectrum, lines) in enumerate([(air, ()), (table, ()), (ar1, (moving,)), (sharp, ())]):
         truth = lbt.Truth(turbulence=spectrum, vibrations=lines, **known)

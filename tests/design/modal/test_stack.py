@@ -149,13 +149,7 @@ def test_stepped_modes_are_the_linear_controller_of_all(kind, delay):
 
 @pytest.mark.parametrize(
     ("kind", "frame_means"),
-    [
-        ("integrators", True),
-        ("integrators", False),
-        ("filters", False),
-        ("mixed", True),
-        ("both", False),
-    ],
+    [("integrators", True), ("filters", False), ("mixed", True), ("both", False)],
 )
 def test_exact_residuals_are_those_of_the_budget(kind, frame_means):
     n, delay = 5, 2.4

@@ -142,6 +142,7 @@ def in_specification(*keys, **changes):
 BAND = ("objective", "terms", 1)
 AGAIN = "Design it again with lbt-synth design CONFIG --method METHOD -o FILE."
 SPECIFICATION = "expected a Specification"
+MARGIN = {"kind": "ModulusMargin", "at_least": 0.5}
 
 
 @pytest.mark.parametrize(
@@ -166,11 +167,7 @@ SPECIFICATION = "expected a Specification"
         ("shaped", claims(beauty=1.0), "does not claim beauty"),
         ("shaped", meta(long_objective_nm=["inf"]), "long_objective_nm must be a number"),
         ("shaped", claims(objective_nm=[30.0, 30.0]), "one for each mode"),
-        (
-            "shaped",
-            meta(specifications=[{"kind": "ModulusMargin", "at_least": 0.5}]),
-            SPECIFICATION,
-        ),
+        ("shaped", meta(specifications=[MARGIN]), SPECIFICATION),
         ("shaped", meta(specifications=[3]), SPECIFICATION),
         ("shaped", in_specification(*BAND, high_hz=900.0), "below the Nyquist"),
         ("shaped", in_specification(kind="Anything"), "Anything"),

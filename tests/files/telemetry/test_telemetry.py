@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from support.refusals import require_refusals
 from support.telemetry import full
 
 import lbt_synth as lbt
@@ -18,24 +19,15 @@ def test_hardware_of_slopes_is_seen_through_the_reconstructor():
     assert np.array_equal(bare.hardware.sensor, np.eye(2))
 
 
-@pytest.mark.parametrize(
-    ("changes", "text"),
-    [
-        ({"delay_frames": None, "mirror": None}, "does not tell the delay"),
-        (
-            {
-                "influence_matrix": None,
-                "commands": np.ones((6, 3)),
-                "controller": None,
-                "integrator_gains": None,
-            },
-            "3 commands of 2 modes, and no influence_matrix",
-        ),
-    ],
-)
-def test_hardware_that_is_not_known(changes, text):
-    with pytest.raises(ProblemError, match=text):
-        _ = full(**changes).hardware
+def test_hardware_that_is_not_known():
+    known = {"influence_matrix": None, "controller": None, "integrator_gains": None}
+    late, wide = full(delay_frames=None, mirror=None), full(**known, commands=np.ones((6, 3)))
+    require_refusals(
+        [
+            (lambda: late.hardware, ProblemError, "does not tell the delay"),
+            (lambda: wide.hardware, ProblemError, "3 commands of 2 modes, and no influence_matrix"),
+        ]
+    )
 
 
 @pytest.mark.parametrize(
@@ -54,10 +46,7 @@ def test_hardware_that_is_not_known(changes, text):
         ({"psf_pixel_mas": 0}, "psf_pixel_mas must be above 0"),
         ({"imaging_wavelength_um": -1}, "imaging_wavelength_um must be above 0"),
         ({"seed": 1.5}, "seed must be an integer"),
-        (
-            {"commands": [1.0, 2.0]},
-            r"commands must be 2-D \(frame, command\) and not empty; got shape \(2,\)",
-        ),
+        ({"commands": [1.0, 2.0]}, r"must be 2-D \(frame, command\) and not empty; got .*\(2,\)"),
         ({"measurements": None}, "measurements must be an array of numbers"),
         ({"measurements": np.zeros((5, 2))}, "measurements must have 6 frames to match commands"),
         ({"measurements": np.zeros((6, 0))}, r"measurements must be 2-D .* not empty; got"),
@@ -87,10 +76,7 @@ def test_hardware_that_is_not_known(changes, text):
         ({"metadata": {"a": float("inf")}}, "metadata must be finite; got inf for 'a'"),
         ({"integrator_gains": [0.4]}, "integrator_gains must have 2 commands to match commands"),
         ({"controller": 3}, "expected a Controller; got int"),
-        (
-            {"frame_rate_hz": 801.0, "mirror": None},
-            "controller must run at 801 Hz; got one for 800 Hz",
-        ),
+        ({"frame_rate_hz": 801.0, "mirror": None}, "must run at 801 Hz; got one for 800 Hz"),
     ],
 )
 def test_what_does_not_fit_is_refused(changes, text):

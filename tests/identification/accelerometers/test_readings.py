@@ -41,8 +41,7 @@ def test_faster_readings_are_averaged():
 
 def test_rates_that_leave_no_frame_are_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((100, 2)))
-    refused = ((1e9, "Is the rate right"), (0, "above 0"), (999, "at least once a frame"))
-    for rate_hz, words in refused:
+    for rate_hz, words in ((1e9, "Is the rate right"), (0, "above 0"), (999, "once a frame")):
         with pytest.raises(ProblemError, match=words):
             load_readings(tmp_path / "a.npy", RATE, rate_hz=rate_hz)
 

@@ -146,7 +146,7 @@ def test_a_run_gives_the_motions_back():
     suite = SensorSuite(sensors=(Accelerometer(name="mirror", noise_m_s2=1e-3, **timing),))
     path = lbt.LoopHardware(frame_rate_hz=rate_hz, delay_frames=2, modes=2, suite=suite)
     truth = lbt.Truth(turbulence=None, vibrations=lines, motions=motions)
-    size, rng = {"frames": 40_000, "cases": 1, "zero_frame": 0}, np.random.default_rng(1)
+    size, rng = {"frames": 30_000, "cases": 1, "zero_frame": 0}, np.random.default_rng(1)
     _, drawn = draw_phase(truth, path, rng=rng, oscillators=True, **size)
     read = draw_others(truth, path, drawn, rng, **size)[0, 1:]
     # the wavefront sensor measures in frame k the phase of frame k - 1

@@ -25,18 +25,6 @@ def shaking(degrees: float, *, hz: float = 31.0, rms: float = 60.0) -> lbt.Vibra
     return lbt.Vibration(frequency_hz=hz, damping=0.006, rms_nm=rms, direction=direction)
 
 
-def test_a_line_along_a_diagonal_is_one_line() -> None:
-    degrees = -70.0
-    model = lbt.identify(open_record(((shaking(degrees), 0),)))
-    (line,) = model.shared
-    assert line.kind == "line"
-    assert line.direction_deg == pytest.approx(degrees, abs=4 * line.direction_error_deg)
-    assert 0 < line.direction_error_deg < 0.5
-    assert line.frequency_hz == pytest.approx(31, abs=4 * line.frequency_error_hz)
-    assert line.rms_nm == pytest.approx(60, abs=3 * line.rms_error_nm)
-    assert model.parts == (line,)
-
-
 def test_a_weak_part_of_a_line_belongs_to_it() -> None:
     """Tilt alone does not show its 0.7 nm."""
     record = open_record(((shaking(1.0, rms=40), 0),), noise=12.0)
@@ -101,18 +89,21 @@ def model() -> lbt.identification.IdentifiedModel:
     return lbt.identify(open_record(((DIAGONAL, 0), (TILT, 0)), seed=1))
 
 
-def test_each_axis_shows_its_share(model):
+def test_a_line_along_a_diagonal_is_one_line_of_which_each_axis_shows_its_share(model):
     (line,) = model.shared
+    assert line.kind == "line"
+    assert line.direction_deg == pytest.approx(ANGLE, abs=4 * line.direction_error_deg)
+    assert 0 < line.direction_error_deg < 0.5
+    assert line.frequency_hz == pytest.approx(31, abs=4 * line.frequency_error_hz)
+    assert line.rms_nm == pytest.approx(60, abs=3 * line.rms_error_nm)
     shares = [axis.lines[0] for axis in model.axes]
-    assert [share.direction for share in shares] == [line.direction] * 2
     for share, part in zip(shares, line.direction, strict=True):
+        assert share.direction == line.direction
         assert share.rms_nm == pytest.approx(part * line.rms_nm)
-        assert share.frequency_hz == line.frequency_hz
-        assert share.damping == line.damping
+        assert (share.frequency_hz, share.damping) == (line.frequency_hz, line.damping)
         assert share.evidence == line.evidence > 100
     own = model.axes[1].lines[1]
-    assert own.direction is None
-    assert own.direction_deg is None
+    assert own.direction is own.direction_deg is None
     assert own.vibration().direction == (1.0, 0.0)
 
 

@@ -52,7 +52,7 @@ def two_different_axes():
         noise_nm=np.diag([15.0, 10.0]) ** 2,
         sensor_gain=0.6,
     )
-    frames, rng = 30_000, np.random.default_rng(6)
+    frames, rng = 20_000, np.random.default_rng(6)
     total = [
         a_series(model, frames, rng) + a_series(line.ar_model(RATE), frames, rng)
         for model, line in zip(turbulence, LINES, strict=True)
@@ -90,7 +90,7 @@ def test_the_table():
     assert row.total_nm2 > limit.model_nm**2 - 4 * row.total_error_nm2
     # what ran: its own measurements on the same frames, and its replay is what it measured
     begin, end = table.test[0]
-    assert (begin, end) == (15_000, 30_000)  # the first half is enough to warm up
+    assert (begin, end) == (10_000, 20_000)  # the first half is enough to warm up
     part = y[begin:end] / 0.6
     variance = np.mean(part**2, axis=0) - np.array([15.0, 10.0]) ** 2 / 0.36
     np.testing.assert_allclose(table["what ran"].replayed.variance_nm2, variance, rtol=1e-9)
