@@ -74,9 +74,8 @@ class Method:
     build: Callable[[DesignInputs, Any], Design]  # a certified design
     design: str  # the class of its designs, "module:class", with its arrays, claims and checks
     section: type[Section] | None = None  # ``design.<name>`` of a configuration
-    # from a plant alone, and an interval of relative sensor gains at which its design has to be
-    # stable, or None, to a section with defaults; None if it takes a configuration
-    plant_section: Callable[[TipTiltPlant, tuple[float, float] | None], Section] | None = None
+    # from a plant alone to a section with defaults; None if it takes a configuration
+    plant_section: Callable[[TipTiltPlant], Section] | None = None
     exclusive: frozenset[str] = frozenset()  # options of which at most one is given
     configurable: frozenset[str] = frozenset()  # those whose default a configuration can give
     estimator: bool = True  # whether the design depends on the vibrations of the plant

@@ -257,11 +257,6 @@ def record_methods() -> list[str]:
     return [m.name for m in usable if not m.needs_options]
 
 
-def gain_robust_method() -> str:
-    """Return the name of the method that designs for a plant and an interval of sensor gains."""
-    return next(n for n, m in METHODS.items() if m.plant_section is not None)
-
-
 def default_method() -> str:
     """Return the name of the method that is designed unless another is named."""
     return reference_methods(estimators_only=True)[0].name

@@ -144,7 +144,6 @@ class PlantInputs:
     design_defaults: Mapping[str, Any] = field(default_factory=dict)
     atmosphere: None = None
     sensor_gain: float = 1.0
-    sensor_gains: tuple[float, float] | None = None  # to be stable at, relative to the plant's
     predict: Callable[[], Design] | None = None  # the design of the record, where there is one
 
     @property
@@ -160,7 +159,7 @@ class PlantInputs:
     def method_section(self, name: str) -> Any:
         """Return the section that a method makes of a plant, None if it makes none."""
         make = method_named(name).plant_section
-        return None if make is None else make(self.plant, self.sensor_gains)
+        return None if make is None else make(self.plant)
 
     def record_design(self) -> Design:
         """Return the design of the record that the plant was identified from."""

@@ -32,7 +32,6 @@ _AXES: dict[Axis, int] = {"tip": 0, "tilt": 1}
 _MOST_BANDS = 6  # around lines of a plant
 _BAND = 0.02  # half width of such a band, over its frequency
 _PLANT_FUNCTIONS = 30  # of the parameter for a plant, which is not reduced: that takes longer
-_GAIN_BAND, _GAIN_MARGIN, _GAIN_FUNCTIONS = 0.003, 0.25, 60  # if only the gain is uncertain
 _PLAIN = {"moving_gain", "modulus_margin", "delay_error_frames", "functions", "pole"}
 _PLAIN |= {"states", "loss"}  # options that robust takes as they are
 
@@ -249,21 +248,17 @@ def _list_demands(
     return demands
 
 
-def _plant_section(
-    plant: TipTiltPlant, sensor_gains: tuple[float, float] | None = None
-) -> RobustSection:
+def _plant_section(plant: TipTiltPlant) -> RobustSection:
     """Return bands around the strongest lines of a plant, those that overlap as one.
 
-    With sensor gains, these are what is uncertain, and the bands are narrow. Wide resonances need
-    no band, and would swallow those of the lines.
+    Wide resonances need no band, and would swallow those of the lines.
     """
-    share = _BAND if sensor_gains is None else _GAIN_BAND
     narrow = [line for line in plant.vibrations if line.damping <= WIDE_DAMPING]
     lines = sorted(narrow or plant.vibrations, key=lambda line: -line.rms_nm)
     nyquist_hz = plant.hardware.frame_rate_hz / 2
     bands: list[BandSection] = []
     for line in sorted(lines[:_MOST_BANDS], key=lambda line: line.frequency_hz):
-        half = max(share * line.frequency_hz, line.damping * line.frequency_hz)
+        half = max(_BAND * line.frequency_hz, line.damping * line.frequency_hz)
         low, high = max(line.frequency_hz - half, 0.0), min(line.frequency_hz + half, nyquist_hz)
         axis, rms_nm, damping = _axis(line), line.rms_nm, line.damping
         last = bands[-1] if bands else None
@@ -278,15 +273,7 @@ def _plant_section(
         )
     if not bands:
         raise ProblemError("a robust controller is for vibrations; the plant has none.")
-    if sensor_gains is None:
-        return RobustSection(bands=bands, functions=_PLANT_FUNCTIONS, states=None)
-    return RobustSection(
-        bands=bands,
-        sensor_gain=[min(sensor_gains[0], 1.0), max(sensor_gains[1], 1.0)],
-        modulus_margin=_GAIN_MARGIN,
-        functions=_GAIN_FUNCTIONS,
-        states=None,
-    )
+    return RobustSection(bands=bands, functions=_PLANT_FUNCTIONS, states=None)
 
 
 def _axis(line: Vibration) -> Axis:

@@ -142,7 +142,7 @@ def section_of(method: Method, config: Config) -> Any:
     """Return a method's section of a configuration, else one made for its plant; None if none."""
     section = config.method_section(method.name)
     if section is None and method.plant_section is not None and config.plant.vibrations:
-        section = method.plant_section(config.plant, None)
+        section = method.plant_section(config.plant)
     return section
 
 
