@@ -262,6 +262,17 @@ def cost(search: Search, model: FittedModel) -> float:
     return model.contrast + total_price(search, model.spectrum) + 0.5 * away**2
 
 
+def simplify(search: Search, model: FittedModel) -> FittedModel:
+    """Return the model without roll-off or colour, where that adds too little."""
+    plainer = []
+    if model.spectrum.background.rolls_off:
+        plainer.append(model.spectrum.without_roll_off())
+    if model.spectrum.background.colour:
+        plainer.append(model.spectrum.with_background(colour=0.0))
+    fits = (fit(search, spectrum) for spectrum in plainer)
+    return likeliest(search, [model, *fits]) or model
+
+
 def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> FittedModel:
     """Drop the components that add less than they must, the least first.
 

@@ -135,7 +135,7 @@ def find_components(
         if better is None:
             break
         model = better
-    return fitting.prune(search, model, thorough=start is None)
+    return fitting.prune(search, fitting.simplify(search, model), thorough=start is None)
 
 
 def _improve(search: Search, model: FittedModel, *, moves: bool) -> FittedModel | None:
@@ -151,7 +151,7 @@ def _improve(search: Search, model: FittedModel, *, moves: bool) -> FittedModel 
 
 
 def _trials(search: Search, spectrum: SpectrumModel, moves: bool) -> Iterator[SpectrumModel]:
-    """Yield models with new lines, other turbulence, lines in other places, or less."""
+    """Yield models with new lines, other turbulence, or lines in other places."""
     excesses = find_excesses(search, spectrum)
     excesses = [excess for excess in excesses if excess[0] > 0.25 * excesses[0][0]]
     while excesses:
@@ -168,10 +168,6 @@ def _trials(search: Search, spectrum: SpectrumModel, moves: bool) -> Iterator[Sp
         ground = fit_background(search, spectrum.background.gain, lines)
         if ground is not None:
             yield ground.spectrum.add(*lines)
-    if spectrum.background.rolls_off:
-        yield spectrum.without_roll_off()
-    if spectrum.background.colour:
-        yield spectrum.with_background(colour=0.0)
 
 
 def _begin(search: Search) -> FittedModel | None:
