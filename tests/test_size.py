@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 265,
     "public names": 230,
     "tuned constants": 660,
-    "lines of tests": 37910,
+    "lines of tests": 37911,
     "words of docs": 75543,
 }
 
