@@ -149,6 +149,11 @@ class ClosedLoop(Summarised):
         n, m = self.hardware.modes, self.hardware.n_commands
         return self._subsystem(slice(n, n + m), slice(None))
 
+    def steering(self) -> StateSpace:
+        """System from the total phase to the command."""
+        n, m = self.hardware.modes, self.hardware.n_commands
+        return self._subsystem(slice(n, n + m), slice(n))
+
     def _subsystem(self, outputs: slice, inputs: slice) -> StateSpace:
         s = self.system
         B, C, D = s.B[..., inputs], s.C[..., outputs, :], s.D[..., outputs, inputs]

@@ -116,7 +116,7 @@ def a_plant_with_a_wide_resonance() -> TipTiltPlant:
 def test_a_wide_resonance_has_no_band_and_is_a_disturbance():
     """Its band swallowed those of the lines: the design left 1.6 times the residual."""
     plant = a_plant_with_a_wide_resonance()
-    inputs = PlantInputs(plant=plant, sensor_gains=(0.8, 1.2))
+    inputs = PlantInputs(plant=plant)
     bands = inputs.method_section("robust").bands
     assert [(band.rms_nm, band.damping) for band in bands] == [(80.0, 0.01), (30.0, 0.01)]
     design = design_request("robust", {}).build(inputs)

@@ -19,10 +19,15 @@ from scipy.linalg import cho_factor, cho_solve
 
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.predictor import PredictorDesign, predictor_design, regression_filter
+from lbt_synth.design.shaping.channel import held_fraction
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.identification.accelerometers.readings import Channels
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
-from lbt_synth.identification.prediction.residual import gather, replay, settle_frames
+from lbt_synth.identification.prediction.residual import (
+    gather,
+    run_from_rest,
+    settle_frames,
+)
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, cut_stretches
 from lbt_synth.linear import Controller
@@ -239,22 +244,28 @@ def regress(
     runs = record.stretches() if stretches is None else stretches
     base = kalman(noisier(model, noise).plant()).controller
     series = record.pseudo_open_loop(model.sensor_gains)
-    loop, lead = close_loop(path, base), len(path.mirror_taps)
+    steering = close_loop(path, base).steering()
+    late, taps = held_fraction(path), path.mirror_taps
+    if late:  # the target of a command is the mean phase of its hold, which lies in two frames
+        taps = np.eye(1, path.mirror_system.lead + 1, path.mirror_system.lead)[0]
+    first = max(TAPS + len(taps), settle_frames(path))
     beside = np.zeros((record.frames, 0)) if channels is None else channels.values
 
     def lay(series: FloatArray, runs: Stretches, beside: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the signals, what the base leaves, and the measurements, zero outside of runs."""
-        left = replay(loop, series, runs)
-        seen, corrected = (
-            np.where(np.isfinite(left), part, 0.0) for part in (series, series - left)
-        )
-        past = past_corrections(path.mirror_taps, np.hstack([seen, beside]))
-        return np.hstack([corrected, past]), left, seen
+        """Return signals, what the base leaves of the targets, series and targets, 0 outside."""
+        commands = run_from_rest(steering, series, runs, first)  # u(k-1) in row k
+        inside = np.isfinite(commands[:, :1])
+        seen, moved = np.where(inside, series, 0.0), np.where(inside, commands, 0.0)
+        target = late * np.vstack([seen[1:], seen[-1:]]) + (1 - late) * seen
+        moved = np.vstack([moved[1:], moved[-1:]]) @ path.influence.T
+        corrected = past_corrections(taps, moved)
+        past = past_corrections(taps, np.hstack([seen, beside]))
+        return np.hstack([corrected, past]), target - corrected, seen, target
 
-    signals, left, seen = lay(series, runs, beside)
+    signals, left, seen, _ = lay(series, runs, beside)
     readings = np.hstack([seen @ path.sensor.T, beside])
-    first = max(TAPS + lead, settle_frames(path))
-    kept = tuple((start + first, stop) for start, stop in runs if stop - start > first)
+    end = bool(late)  # whose target is beyond the run
+    kept = tuple((start + first, stop - end) for start, stop in runs if stop - start > first + end)
     count = sum(stop - start for start, stop in kept)
     if count < 2 * TAPS * _PARTS:
         raise ProblemError(
@@ -271,9 +282,9 @@ def regress(
         drawn = np.random.default_rng(_SEED).standard_normal((count + first, path.modes))
         drawn *= deviation * np.sqrt(noise**2 - 1)
         silence = np.zeros((len(drawn), beside.shape[1]))
-        heard, left, seen = lay(drawn, ((0, len(drawn)),), silence)
+        heard, left, _, target = lay(drawn, ((0, len(drawn)),), silence)
         for place, (a, b) in enumerate(pairwise(edges)):
-            more = lagged_moments(heard, left - seen, ((first + a, first + b),), TAPS)
+            more = lagged_moments(heard, left - target, ((first + a, first + b),), TAPS)
             moments[place] += replace(more, frames=0)
     return Regression(
         hardware=path if channels is None else channels.hardware(path),

@@ -22,7 +22,7 @@ from lbt_synth.identification.stretches import (
     checked_stretches,
     cut_stretches,
 )
-from lbt_synth.linear import Controller
+from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl
 from lbt_synth.models import LoopHardware
@@ -343,16 +343,24 @@ def replay(
     z(k) stands for phi_tot(k-1), without noise: the residual of frame k-1 is e(k). A loop that
     reads channels is given their readings (frames, c), which come in the frame of the measurement.
     """
-    path, driven, first = loop.rejection(), series, settle_frames(loop.hardware)
+    path, driven = loop.rejection(), series
     if loop.reads_others and readings is not None:
         path = loop.rejection_with_channels()
         driven = np.hstack([series, np.vstack([readings[:1], readings[:-1]])])
-    constant = path.frequency_response([0.0])[0].real  # what the loop leaves of a constant
-    residual = np.full(series.shape, np.nan)
+    return run_from_rest(path, driven, runs, settle_frames(loop.hardware))
+
+
+def run_from_rest(path: StateSpace, driven: FloatArray, runs: Stretches, first: int) -> FloatArray:
+    """Return the outputs of a stable system, nan outside of runs.
+
+    Each run begins in the equilibrium for the mean of its first frames.
+    """
+    constant = path.frequency_response([0.0])[0].real
+    outputs = np.full((len(driven), len(path.C)), np.nan)
     for start, stop in runs:
         mean = np.mean(driven[start : min(stop, start + first)], axis=0)
-        residual[start:stop] = filter_series(path, driven[start:stop] - mean) + constant @ mean
-    return residual
+        outputs[start:stop] = filter_series(path, driven[start:stop] - mean) + constant @ mean
+    return outputs
 
 
 def mean_covariance(one: FloatArray, other: FloatArray, stretches: Stretches) -> FloatArray:
