@@ -45,12 +45,14 @@ def run(arguments: Namespace) -> Report:
         [table_entry(*pair) for pair in rows if pair[0].table == table] for table in ("II", "III")
     )
     filters = paper_filters()
-    files = write_paper(folder, rows, filters)
+    files = _write_paper(folder, rows, filters)
     ratio = filters[1].gamma_requested / filters[1].gamma_least
-    columns = {
-        method: rms_difference([e for e in third if e.method == method])
-        for method in dict.fromkeys(entry.method for entry in third)
-    }
+    by_method = [
+        (number, method, [entry for entry in entries if entry.method == method])
+        for number, entries in (("II", second), ("III", third))
+        for method in dict.fromkeys(entry.method for entry in entries)
+    ]
+    columns = {method: rms_difference(entries) for n, method, entries in by_method if n == "III"}
     with own_display_unit():  # JSON stays in nm
         parameters = parameter_rows()
     report = Report(
@@ -63,10 +65,25 @@ def run(arguments: Namespace) -> Report:
                 dict(zip(("name", "value", "origin"), row, strict=True)) for row in parameters
             ],
         },
-        notes=[
-            "Table III, rms difference: "
-            + ", ".join(f"{design_title(m)} {d:.2f} points" for m, d in columns.items()),
-            f"H-infinity: bound at {ratio:.3f} times the least at 20 Hz",
+        verdict=[
+            f"Table III, {design_title(method)}: {points:.2f} points rms from the paper."
+            for method, points in columns.items()
+        ],
+        notes=[f"H-infinity: bound at {ratio:.3f} times the least at 20 Hz"],
+    )
+    headings = ("table", "method", "rows", "rms difference", "largest difference")
+    report.add_table(
+        "Strehl ratios [%] at 2.2 um, ours less the paper's",
+        headings,
+        [
+            (
+                number,
+                design_title(method),
+                len(entries),
+                f"{rms_difference(entries):.2f}",
+                f"{max((e.difference for e in entries), key=abs):+.1f}",
+            )
+            for number, method, entries in by_method
         ],
     )
     report.add_table("Parameters", ("parameter", "value", "origin"), parameter_rows())
@@ -91,7 +108,7 @@ def _add_comparison(report: Report, title: str, entries: list[Facts]) -> None:
     report.add_table(title, headings, lines.values())
 
 
-def write_paper(
+def _write_paper(
     folder: Path,
     rows: list[tuple[PaperRow, RobustnessRow]],
     filters: tuple[FilterDesign, FilterDesign],

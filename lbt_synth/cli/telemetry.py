@@ -72,8 +72,12 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
         }
     )
     seconds = telemetry.frames / telemetry.frame_rate_hz
+    report.verdict.append(
+        f"A loop of {count_text(telemetry.modes, 'mode')} at {telemetry.frame_rate_hz:g} Hz, for "
+        f"{seconds:.6g} s ({telemetry.frames} frames)."
+    )
     report.add_table(
-        f"{telemetry.frames} frames, {seconds:.6g} s, {count_text(telemetry.modes, 'mode')}",
+        "What the file holds",
         ("array", "shape", "axes", "unit", "rms"),
         [
             (

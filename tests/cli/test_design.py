@@ -15,6 +15,7 @@ from support.robust_config import SMALL, robust_writer
 import lbt_synth as lbt
 from lbt_synth.cli.design import describe_design
 from lbt_synth.cli.main import main
+from lbt_synth.cli.output import Report
 from lbt_synth.files.gain_file.store import load_with_digest
 
 CONFIG = str(LBT_YAML)
@@ -36,8 +37,7 @@ def test_design(tmp_path, capsys, options, method):
     status, text, error = run(capsys, "design", CONFIG, *options, "-o", out)
     assert (status, error) == (0, "")
     assert lbt.load_gain(out).method == method
-    assert "Certificate" in text
-    assert "modulus margin" in text
+    assert re.search(r"(\d+) of \1 checks passed\.", " ".join(text.split()))
 
 
 def test_default_ratio_comes_from_the_configuration(tmp_path, capsys):
@@ -85,7 +85,7 @@ def test_design_show_verify_sigma_and_simulate_take_a_robust_design(small, tmp_p
     gain, picture = str(tmp_path / "robust.fits"), str(tmp_path / "sigma.png")
     config = small()
     assert main(["design", config, "--method", "robust", "-o", gain]) == 0
-    assert "modulus margin" in capsys.readouterr().out
+    capsys.readouterr()
     assert main(["show", gain, "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["method"] == "robust"
@@ -198,15 +198,13 @@ def test_a_fragile_design_does_not_pass_without_a_word(tmp_path, capsys):
     for method in ("kalman", "lqg"):  # the image does not pay for commands that alternate
         status, out, _ = run(capsys, "design", config, "--method", method, "-o", gain)
         assert status == 0
-        assert "make this loop unstable" not in out
+        assert "make this loop unstable" not in " ".join(out.split())
     plant = lbt.load_config(config).plant
     late = lbt.integrator(plant.hardware, gain=0.99 * lbt.design.integrator_gain_limit(2.5))
     warned = run(capsys, "show", lbt.save_gain(gain, late))[1]
-    assert re.search(
-        r"warning: 0\.0\d+ frames \(\S+ us\) more delay make this loop unstable", warned
-    )
+    assert re.match(r"0\.0\d+ frames \(\S+ us\) more delay make this loop unstable", warned)
     status, out, _ = run(capsys, "design", LBT_YAML, "--method", "integrator", "-o", gain)
-    assert "a sensor gain that is off by 0.78 dB makes this loop unstable" in out
+    assert out.startswith("A sensor gain that is off by 0.78 dB makes this loop unstable.")
 
 
 @pytest.mark.parametrize("late", [0.0, np.inf])
@@ -216,13 +214,14 @@ def test_the_time_of_a_fragile_delay_needs_no_margin_on_the_other_side(monkeypat
 
     monkeypatch.setattr("lbt_synth.cli.design.loop_margins", fragile)
     hardware = lbt.LoopHardware(frame_rate_hz=1000, modes=1)
-    notes = describe_design(lbt.integrator(hardware, gain=0.5)).notes
-    assert any("0.04 frames (40 us) less delay make this loop unstable" in note for note in notes)
+    report = Report()
+    describe_design(report, lbt.integrator(hardware, gain=0.5))
+    assert "0.04 frames (40 us) less delay make this loop unstable" in " ".join(report.verdict)
 
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
 def test_show_and_verify(capsys, gains, name):
-    status, text, _ = run(capsys, "show", gains[name], "--matrices")
+    status, text, _ = run(capsys, "show", gains[name], "--matrices", "--verbose")
     assert status == 0
     assert "stable gain factors, from" in text
     lines = text.splitlines()
@@ -247,7 +246,7 @@ def test_show_prints_the_cost(tmp_path, capsys, monkeypatch, name):
     gain = lbt.save_gain(tmp_path / "kalman.fits", kalman)
     monkeypatch.setattr("lbt_synth.cli.design.load_with_digest", lambda path: (design, "0"))
     cost = lbt.interop.frame_cost(design)
-    status, text, _ = run(capsys, "show", gain)
+    status, text, _ = run(capsys, "show", gain, "--verbose")
     assert status == 0
     assert re.search(rf"multiplications per frame +{cost.multiplications}\b", text)
     assert re.search(rf"coefficients +{cost.coefficients}\b", text)
@@ -260,7 +259,7 @@ def test_show_says_what_is_only_the_files_word(tmp_path, capsys):
     bare = lbt.integrator(config.hardware, gain=0.4)
     for design, more in ((bare, ""), (config.design("integrator", gain=0.4), "; configuration")):
         path = lbt.save_gain(tmp_path / "i.npz", design)
-        status, text, _ = run(capsys, "show", path)
+        status, text, _ = run(capsys, "show", path, "--verbose")
         assert status == 0
         assert f"not proved, the file's word: route and status of the solver{more}" in text
         assert f"digest {load_with_digest(path)[1]}" in text
@@ -268,7 +267,7 @@ def test_show_says_what_is_only_the_files_word(tmp_path, capsys):
 
 @pytest.mark.parametrize("command", ["show", "verify"])
 def test_intervals_of_a_gain_that_moves(capsys, gains, command):
-    _, text, _ = run(capsys, command, gains["kalman"])
+    _, text, _ = run(capsys, command, gains["kalman"], "--verbose")
     assert "proved while it moves at any speed, from" in text
     _, text, _ = run(capsys, command, gains["kalman"], "--json")
     moving = json.loads(text)["moving_gain"]

@@ -1,4 +1,4 @@
-"""The commands end-to-end and end-to-end-table."""
+"""The command end-to-end, for a gain file and for tables of the paper."""
 
 import importlib.metadata
 import json
@@ -70,7 +70,7 @@ def test_without_the_extra_the_command_says_how_to_get_it(monkeypatch, tmp_path,
     lbt.save_gain(gain, lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.5))
     for arguments in (
         ["end-to-end", CONFIG, str(gain), "-o", str(tmp_path / "run")],
-        ["end-to-end-table", CONFIG, "-o", str(tmp_path / "table"), "--tables", "II"],
+        ["end-to-end", CONFIG, "--tables", "II", "-o", str(tmp_path / "table"), "--tables", "II"],
     ):
         assert main(arguments) == 2
         assert 'pip install "lbt-synth[e2e]"' in capsys.readouterr().err
@@ -88,9 +88,7 @@ def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
     design = lbt.integrator(slow, gain=0.1)
     gain = lbt.save_gain(tmp_path / "i.fits", design)
     monkeypatch.setattr(end_to_end_commands, "specula_version", lambda: "1.1")
-    seen = end_to_end_commands._telemetry(
-        run, design, SimpleNamespace(key="k"), SimpleNamespace(gain=str(gain))
-    )
+    seen = end_to_end_commands._telemetry(run, design, SimpleNamespace(key="k"), str(gain))
     seen = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "t.fits", seen))
     assert np.array_equal(seen.hardware.mirror_taps, slow.mirror_taps)
     assert "with the mirror taps c" in seen.convention
@@ -104,7 +102,7 @@ def test_a_loop_that_ran_away_ends_in_words(monkeypatch, tmp_path, capsys, setup
         tmp_path / "i.fits", lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.1)
     )
     monkeypatch.setattr(end_to_end_commands, "specula_version", lambda: "1.1")
-    monkeypatch.setattr(end_to_end_commands, "calibrate_setup", lambda *_: None)
+    monkeypatch.setattr(end_to_end_commands, "_calibrate", lambda *_: None)
     monkeypatch.setattr(lbt.interop.EndToEndSetup, "run", lambda *_, **__: lost)
     assert main(["end-to-end", CONFIG, str(gain), "-o", str(tmp_path / "run")]) == 1
     captured = capsys.readouterr()
@@ -128,7 +126,7 @@ def test_a_loop_that_ran_away_ends_in_words(monkeypatch, tmp_path, capsys, setup
 )
 def test_bad_input_at_the_command_line(tmp_path, capsys, arguments):
     out = tmp_path / "table"
-    assert main(["end-to-end-table", CONFIG, *arguments, "-o", str(out)]) == 2
+    assert main(["end-to-end", CONFIG, *arguments, "--tables", "II", "-o", str(out)]) == 2
     captured = capsys.readouterr()
     assert captured.err.startswith("lbt-synth: error:")
     assert captured.out == ""
@@ -203,7 +201,7 @@ def test_a_table_that_was_killed_goes_on(tmp_path, cache):
         sys.executable,
         "-m",
         "lbt_synth.cli.main",
-        "end-to-end-table",
+        "end-to-end",
         str(config),
         "-o",
         str(out),
@@ -240,3 +238,11 @@ def test_a_table_that_was_killed_goes_on(tmp_path, cache):
     }
     lines = (out / "table_ii.csv").read_text().splitlines()
     assert len(lines) == 7
+
+
+@pytest.mark.parametrize("files", [(), ("a.fits", "b.fits")])
+def test_a_run_takes_one_gain_file(tmp_path, capsys, files):
+    assert main(["end-to-end", CONFIG, *files, "-o", str(tmp_path / "run")]) == 2
+    got = ", ".join(files) or "none"
+    assert f"takes one gain file; got {got}." in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()

@@ -14,8 +14,8 @@ from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
 from lbt_synth.cli import main as command_line
+from lbt_synth.cli.arguments import COMMANDS, build_parser
 from lbt_synth.cli.main import main
-from lbt_synth.cli.parser import COMMANDS, build_parser
 from lbt_synth.config.schema import FileSection
 
 CONFIG = str(LBT_YAML)
@@ -110,7 +110,7 @@ def test_shells_complete_every_option():
     short, full = names["tradeoff"]
     assert short == full >= {"--json", "--points", "--taps", "-o", "--output"}
     short, full = names["study"]
-    assert short == {"-h", "--help", "--json"}
+    assert short == {"-h", "--help", "--json", "--verbose"}
     assert full > short | {"--jobs", "--dask", "--dry-run", "--row"}
 
 
@@ -137,7 +137,7 @@ def loaded_after(code):
     "code",
     [
         "import lbt_synth",
-        "from lbt_synth.cli.parser import build_parser; build_parser().format_help()",
+        "from lbt_synth.cli.arguments import build_parser; build_parser().format_help()",
     ],
 )
 def test_imports_are_quick(code):

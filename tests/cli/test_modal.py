@@ -13,7 +13,9 @@ import lbt_synth as lbt
 
 def test_modal(tmp_path, capsys):
     table, figure = tmp_path / "m.csv", tmp_path / "m.png"
-    status, text, error = run(capsys, "modal", LBT_YAML, "--modes", 60, "-o", table, "-o", figure)
+    status, text, error = run(
+        capsys, "modal", LBT_YAML, "--modes", 60, "-o", table, "-o", figure, "--verbose"
+    )
     assert (status, error) == (0, "")
     for words in ("By radial order", "optimised gains", "Kalman filters", "assumed", "written"):
         assert words in text
@@ -47,7 +49,7 @@ def test_modal_without_a_pyramid(tmp_path, capsys):
     config = tmp_path / "c.yaml"
     plain = text[:start] + "  noise_nm: 12.0\n\n" + text[end:]
     config.write_text(plain)
-    status, out, _ = run(capsys, "modal", config, "--modes", 5)
+    status, out, _ = run(capsys, "modal", config, "--modes", 5, "--verbose")
     assert status == 0
     assert "12 nm on every mode" in out
     config.write_text(plain.replace("mirror:\n  modes: 672                        # (I)\n", ""))
@@ -75,7 +77,7 @@ def test_modal_knows_the_local_loop(capsys):
     control = lbt.design.modal.MixedController(gains=gains.gains)
     left = lbt.design.modal.modal_residuals(control, air, hardware=gains.hardware, **known)
     assert np.allclose(left, gains.rms_nm, rtol=1e-6)
-    status, text, _ = run(capsys, "modal", slow, "--modes", 5)
+    status, text, _ = run(capsys, "modal", slow, "--modes", 5, "--verbose")
     assert "the Kalman filters know its real positions" in text
 
 

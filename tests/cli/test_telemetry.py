@@ -53,7 +53,7 @@ def test_simulate_writes_its_first_case(tmp_path, capsys, gain):
         capsys, "simulate", LBT_YAML, gain, "--frames", 50, "--telemetry", tmp_path / "u.fits"
     )
     assert status == 0
-    assert "u.fits (telemetry of case 0)" in text
+    assert "u.fits" in text
 
 
 def test_what_is_in_a_file(capsys, night):
@@ -92,7 +92,7 @@ def test_conversion_between_formats(tmp_path, capsys, night):
     out = tmp_path / "copy.npz"
     status, text, _ = run(capsys, "telemetry", night, "-o", out)
     assert status == 0
-    assert f"written: {out} (telemetry)" in text
+    assert f"written: {out}" in text
     assert same(lbt.files.load_telemetry(night), lbt.files.load_telemetry(out))
     short = tmp_path / "short.fits"
     assert run(capsys, "telemetry", out, "-o", short, "--precision", "float32")[0] == 0

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 
 import numpy as np
 import pytest
@@ -38,8 +39,7 @@ def test_export_c_at_the_terminal(tmp_path, capsys, designs, gains):
         capsys, "export", gains["kalman"], "--for", "c", "-o", out, "--precision", "single"
     )
     assert (status, error) == (0, "")
-    assert f"written: {out}" in text
-    assert f"written: {out.with_suffix('.h')}" in text
+    assert re.search(r"(\d) of \1 checks passed\.", " ".join(text.split()))
     assert sha256 in out.read_text()
     certificate = json.loads((tmp_path / "ctl.c.certificate.json").read_text())
     assert certificate["gain_sha256"] == sha256
@@ -73,7 +73,7 @@ def test_export_pyrtc_at_the_terminal(tmp_path, capsys, gains):
     for _ in range(2):  # into a new folder, and over its files
         status, text, _ = run(capsys, *arguments)
         assert status == 0
-        assert text.count("written: ") == 4
+        assert "written: 4 files, " in text
     found = json.loads(run(capsys, *arguments, "--json")[1])
     assert {check["passed"] for check in found["checks"]} == {True}
 
@@ -142,7 +142,7 @@ def files(tmp_path_factory):
 
 def test_a_record_is_rehearsed_beside_what_ran(capsys, files):
     folder, night = files
-    words = ("rehearse", folder / "bare.fits", "--for", "dao", "--record", folder / "night.fits")
+    words = ("rehearse", folder / "night.fits", folder / "bare.fits", "--for", "dao")
     status, text, error = run(capsys, *words, "--sensor-gain", 0.7, "--json")
     assert (status, error) == (0, ""), error
     data = json.loads(text)
@@ -166,7 +166,7 @@ def test_the_file_that_made_a_record_leaves_what_ran(tmp_path, capsys):
     assert run(capsys, "design", config, "--method", "kalman", "-o", gain)[0] == 0
     words = ("simulate", config, gain, "--frames", 6000, "--cases", 1, "--telemetry", night)
     assert run(capsys, *words)[0] == 0
-    rehearsed = run(capsys, "rehearse", gain, "--for", "c", "--record", night, "--json")
+    rehearsed = run(capsys, "rehearse", night, gain, "--for", "c", "--json")
     target, _, ran = json.loads(rehearsed[1])["loops"]
     assert target["residual_nm"] == pytest.approx(ran["residual_nm"], rel=1e-3)
     found = json.loads(run(capsys, "diagnose", night, gain, "--json")[1])
@@ -182,8 +182,8 @@ def test_without_a_record_the_truth_of_the_file_is_drawn(tmp_path, capsys, files
     words = ("rehearse", gain, "--for", "dao", "--frames", 1500, "--stroke", 900)
     status, text, error = run(capsys, *words, "--unit", "mas", "-o", figure)
     assert (status, error) == (0, "")
-    assert "1500 frames of its own truth; Strehl ratio at 2.2 um" in text
-    assert "residual [mas rms]" in text
+    assert text.startswith("On 1500 frames of its own truth: ")
+    assert " mas rms (in dao) and " in text
     assert "what ran" not in text
     assert figure.read_bytes().startswith(b"\x89PNG")
     data = json.loads(run(capsys, *words, "--json")[1])
@@ -199,17 +199,17 @@ def test_without_a_record_the_truth_of_the_file_is_drawn(tmp_path, capsys, files
     ("words", "message"),
     [
         (("bare.fits", "--for", "dao"), "holds no configuration to draw"),
-        (("gain.fits", "--for", "dao", "--record", "none.fits"), "none.fits"),
+        (("none.fits", "gain.fits", "--for", "dao"), "none.fits"),
         (("gain.fits", "--for", "doa"), "invalid choice"),
         (("gain.fits", "--for", "dao", "--frames", "-1"), "--frames must be at least 1; got -1"),
         (("gain.fits", "--for", "dao", "--stroke", "1e300"), "--stroke must be at most 1e+30"),
         (("gain.fits", "--for", "dao", "--frames", "0"), "--frames must be at least 1; got 0"),
-        (("gain.fits", "--for", "dao", "--kind", "open-loop"), "--kind goes with --record"),
-        (("gain.fits", "--for", "dao", "--sensor-gain", "0.5"), "--sensor-gain goes with --record"),
-        (("gain.fits", "--for", "dao", "--swap-axes"), "--swap-axes goes with --record"),
+        (("gain.fits", "--for", "dao", "--kind", "open-loop"), "--kind goes with a record"),
+        (("gain.fits", "--for", "dao", "--sensor-gain", "0.5"), "--sensor-gain goes with a record"),
+        (("gain.fits", "--for", "dao", "--swap-axes"), "--swap-axes goes with a record"),
         (
-            ("gain.fits", "--for", "dao", "--record", "night.fits", "--frames", "900"),
-            "--frames goes without --record",
+            ("night.fits", "gain.fits", "--for", "dao", "--frames", "900"),
+            "--frames goes without a record",
         ),
         (("gain.fits", "--for", "dao", "--wavelength-um", "0"), "--wavelength-um must be above 0"),
     ],
