@@ -5,7 +5,6 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from lbt_synth.cli.loop_inputs import (
     say_residual,
     truth_at_sensor_gain,
 )
-from lbt_synth.cli.output import Report, spread_indices
+from lbt_synth.cli.output import PERCENT, RMS, Report, spread_indices
 from lbt_synth.cli.streams import track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
@@ -44,8 +43,6 @@ from lbt_synth.validation import FloatArray, IntArray, agree, frozen_copy, integ
 
 _SHOWN = 8  # sensor gains of a map, and taps of a mirror, that are printed of more
 _ERRORS = 12  # errors of a frequency that are printed without --verbose
-_PERCENT: dict[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}
-_RMS: dict[str, Any] = {"unit": "nm", "format": ".1f"}
 
 
 def run_compare(arguments: Namespace) -> Report:
@@ -75,11 +72,10 @@ def _compared(design: Design, row: LimitRow, config: Config) -> Facts:
     loop = design.close(config.hardware, sensor_gain=config.truth.sensor_gain)
     margins = loop_margins(loop) if row.stable and not loop.reads_others else None
     cost = None if design.other_sensors else frame_cost(design).multiplications
-    rms = _RMS | {"missing": "unstable"}
     return facts(
         design=fact(row.design, "design"),
-        residual_nm=fact(row.residual_nm, "residual", **rms),
-        strehl=fact(row.strehl, "Strehl", **_PERCENT),
+        residual_nm=fact(row.residual_nm, "residual", missing="unstable", **RMS),
+        strehl=fact(row.strehl, "Strehl", **PERCENT),
         **margin_columns(margins),
         n_states=fact(design.controller.n_states, "states"),
         multiplications=fact(cost, "products per frame"),
@@ -287,8 +283,8 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
     columns = [
         facts(
             error_hz=fact(errors[place], "error", unit="Hz", format="+.2f"),
-            **{f"{n}_strehl": fact(r[place].strehl, n, **_PERCENT) for n, r in by_method.items()},
-            **{f"{n}_nm": fact(r[place].residual_nm, n, **_RMS) for n, r in by_method.items()},
+            **{f"{n}_strehl": fact(r[place].strehl, n, **PERCENT) for n, r in by_method.items()},
+            **{f"{n}_nm": fact(r[place].residual_nm, n, **RMS) for n, r in by_method.items()},
         )
         for place in places
     ]
@@ -444,8 +440,8 @@ def _map_lines(
                 sensor_gain=fact(grid.sensor_gains[j], "sensor gain", format=".3f"),
                 delay_error=fact(delay, "delay error", unit="frames", format="+g"),
                 stable=fact(stable, "stable"),
-                centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **_PERCENT),
-                worst=fact(strehls[worst], "worst Strehl", **_PERCENT),
+                centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **PERCENT),
+                worst=fact(strehls[worst], "worst Strehl", **PERCENT),
                 worst_hz=fact(at_hz, "at", unit="Hz", format="+.2f"),
                 low=fact(low, "stable gains, from", format=".4g"),
                 high=fact(high, "to", format=".4g"),

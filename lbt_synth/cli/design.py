@@ -177,7 +177,7 @@ def run_verify(arguments: Namespace) -> Report:
         verdict=[
             f"{arguments.gain}: {'verified' if passed else 'NOT VERIFIED'}. {say_checks(checks)}"
         ],
-        notes=[f"digest {digest}"],
+        notes=[f"note: digest {digest}"],
         passed=passed,
     )
     report.add_rows("checks", "Certificate", checks, hidden=("computed_by",))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.engine import run_in_parts
 from lbt_synth.cli.loop_inputs import load_design, load_designs, load_shown
-from lbt_synth.cli.output import Report, json_value
+from lbt_synth.cli.output import PERCENT, Report, json_value
 from lbt_synth.cli.streams import count_progress
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
@@ -96,11 +97,10 @@ def run(arguments: Namespace) -> Report:
 def _run_facts(loop_run: EndToEndRun, design: Design, calibration: Calibration, gain: str) -> Facts:
     """Return the main numbers of a run, and what it ran."""
     numbers, rms = loop_run.summary(), {"unit": "nm rms", "format": ".1f"}
-    percent = {"unit": "%", "scale": 100, "format": ".2f"}
-    headings: dict[str, tuple[str, dict[str, Any]]] = {
-        "strehl": ("Strehl ratio", percent),
-        "strehl_error": ("  standard error", percent | {"unit": "points"}),
-        "other_modes_strehl": ("  without tip and tilt", percent),
+    headings: dict[str, tuple[str, Mapping[str, Any]]] = {
+        "strehl": ("Strehl ratio", PERCENT),
+        "strehl_error": ("  standard error", {**PERCENT, "unit": "points"}),
+        "other_modes_strehl": ("  without tip and tilt", PERCENT),
         "tip_rms_nm": ("tip", rms),
         "tilt_rms_nm": ("tilt", rms),
         "other_modes_rms_nm": ("all other modes", rms),

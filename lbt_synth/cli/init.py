@@ -59,8 +59,8 @@ def run(arguments: Namespace) -> Report:
     report.note_files(write_together({at: text.encode() for at, text in contents.items()}))
     method = default_method()
     report.verdict.append(
-        f"Next, put in your own numbers, then lbt-synth design {file} --method {method} "
-        f"-o {file.with_name(f'{file.stem}_{method}.fits')}"
+        f"Next, put in your own numbers; then lbt-synth design {file} --method {method} "
+        f"-o {file.with_name(f'{file.stem}_{method}.fits')} makes a controller."
     )
     return report
 

@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from lbt_synth import models
 from lbt_synth.cli.loop_inputs import load_shown
-from lbt_synth.cli.output import Report
+from lbt_synth.cli.output import RMS, Report
 from lbt_synth.config import Config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_residuals
 from lbt_synth.errors import ConfigError
@@ -21,7 +21,6 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.validation import FloatArray, integer
 
-_RMS: dict[str, Any] = {"unit": "nm", "format": ".1f"}
 _MIRROR_NOTE = (
     "mirror: its local loop on every mode; the Kalman filters know its real positions, but command "
     "their estimates as if it were there at once (lbt-synth mirror, design lqg: tip and tilt "
@@ -166,12 +165,12 @@ def _order_rows(
             facts(
                 radial_order=fact(int(order), "radial order"),
                 modes=fact(int(which.sum()), "modes"),
-                turbulence_nm=fact(_total_rms(turbulence[which]), "turbulence", **_RMS),
+                turbulence_nm=fact(_total_rms(turbulence[which]), "turbulence", **RMS),
                 noise_nm=fact(float(noise[which][0]), "noise per mode", unit="nm", format=".2f"),
                 gain=fact(float(gains[which].mean()), "mean gain", format=".3f"),
-                uniform_nm=fact(uniform, "one gain", **_RMS),
-                optimised_nm=fact(optimised, "optimised gains", **_RMS),
-                kalman_nm=fact(filtered, "Kalman", **_RMS),
+                uniform_nm=fact(uniform, "one gain", **RMS),
+                optimised_nm=fact(optimised, "optimised gains", **RMS),
+                kalman_nm=fact(filtered, "Kalman", **RMS),
             )
         )
     return rows

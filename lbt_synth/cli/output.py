@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
@@ -38,6 +38,9 @@ _BRIEF_WIDTH, _BRIEF_LINES, _BRIEF_ROWS = 100, 25, 12  # without --verbose: a sc
 _WRITTEN = "written: "
 _URGENT = ("warning", "note")  # the notes that are printed without --verbose, in this order
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
+# how the facts of commands print a Strehl ratio, and a residual
+PERCENT: Mapping[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}
+RMS: Mapping[str, Any] = {"unit": "nm", "format": ".1f"}
 
 
 @dataclass(kw_only=True)

@@ -150,7 +150,7 @@ def _say_held_out(
     best, name = made.held_out[made.name], made.name
     report.data |= {"gain_over_what_ran": None, "wavelength_um": imaging.wavelength_um}
     after = nm_text(best.replayed_nm, ".1f")
-    said = f"{name} leaves {after} rms on unseen data"
+    said = f"The {name} leaves {after} rms on unseen data"
     if record.commands is not None:
         ran = made.held_out[RAN]
         said += f", where what ran left {nm_text(ran.replayed_nm, '.1f')}"

@@ -17,7 +17,7 @@ from lbt_synth.cli.loop_inputs import (
     loop_difference_notes,
     truth_at_sensor_gain,
 )
-from lbt_synth.cli.output import Report, require_figure, write_telemetry
+from lbt_synth.cli.output import PERCENT, RMS, Report, require_figure, write_telemetry
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
@@ -65,8 +65,6 @@ def parse_drop(text: str) -> Drop:
     return Drop(unit=unit, **ends, reading=reading or READINGS[0])
 
 
-_RMS: dict[str, Any] = {"unit": "nm", "format": ".1f"}
-_PERCENT: dict[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}
 _PARTS = {"turbulence": "turbulence", "vibration": "vibration", "noise": "noise"}
 _PARTS |= {"within": "within frames"}  # of a residual
 
@@ -214,18 +212,18 @@ def _describe(one: _Run, imaging: Imaging) -> Facts:
     return facts(
         design=fact(one.name, "design"),
         residual_simulated_nm=fact(
-            float(np.sqrt(np.mean(simulation.rms_nm**2))), "residual", **_RMS
+            float(np.sqrt(np.mean(simulation.rms_nm**2))), "residual", **RMS
         ),
-        residual_exact_nm=fact(residual_nm, "exact", **_RMS),
-        strehl_simulated=fact(float(np.mean(one.strehls)), "Strehl", **_PERCENT),
-        strehl_exact=fact(None if exact is None else strehl(exact, imaging), "exact", **_PERCENT),
+        residual_exact_nm=fact(residual_nm, "exact", **RMS),
+        strehl_simulated=fact(float(np.mean(one.strehls)), "Strehl", **PERCENT),
+        strehl_exact=fact(None if exact is None else strehl(exact, imaging), "exact", **PERCENT),
         **{
-            f"{part}_nm": fact(getattr(exact, f"{part}_nm", None), word, **_RMS)
+            f"{part}_nm": fact(getattr(exact, f"{part}_nm", None), word, **RMS)
             for part, word in _PARTS.items()
         },
         limit_nm=fact(one.limit_nm, unit="nm"),
         above_limit_percent=fact(above, unit="%"),
-        command_rms=fact(command_rms, "commands", **_RMS),
+        command_rms=fact(command_rms, unit="nm"),
         clipped=fact(one.clipped),
     )
 

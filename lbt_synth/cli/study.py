@@ -12,7 +12,7 @@ import numpy as np
 from lbt_synth import studies
 from lbt_synth.cli.engine import choose_engine, run_in_parts
 from lbt_synth.cli.loop_inputs import load_shown
-from lbt_synth.cli.output import Report
+from lbt_synth.cli.output import PERCENT, Report
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
@@ -122,15 +122,14 @@ def _say_study(statistics: StudyStatistics) -> list[str]:
 
 def _controller_table(statistics: StudyStatistics) -> Table:
     """Return a line for each controller."""
-    percent = {"unit": "%", "scale": 100, "format": ".2f"}
     rms = {"unit": "nm rms", "format": ".1f"}
     rows = [
         facts(
             controller=fact(one.controller, "controller"),
-            unstable=fact(one.unstable_share.value, "unstable", **percent),
-            mean=fact(one.mean, "mean Strehl", **percent),
-            low=fact(one.strehl[_LOW].value, f"{_LOW:g} % below", **percent),
-            median=fact(one.strehl[50.0].value, "median", **percent),
+            unstable=fact(one.unstable_share.value, "unstable", **PERCENT),
+            mean=fact(one.mean, "mean Strehl", **PERCENT),
+            low=fact(one.strehl[_LOW].value, f"{_LOW:g} % below", **PERCENT),
+            median=fact(one.strehl[50.0].value, "median", **PERCENT),
             residual=fact(one.residual_nm[50.0].value, "median residual", **rms),
             failed=fact(one.failed, "failed"),
         )

@@ -13,7 +13,7 @@ import numpy as np
 from lbt_synth.cli.arguments import command_options, given_options, option_name
 from lbt_synth.cli.loop_inputs import choose_unit, load_design, load_shown
 from lbt_synth.cli.loop_records import load_series, record_imaging, require_series
-from lbt_synth.cli.output import Report, require_figure, say_checks
+from lbt_synth.cli.output import PERCENT, Report, require_figure, say_checks
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError
@@ -151,7 +151,7 @@ def _describe(
         first_nm=fact(axes[0], "first axis", **rms),
         second_nm=fact(second, "second axis", **rms),
         residual_nm=fact(float(np.linalg.norm(axes)), "residual", **rms),
-        strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
+        strehl=fact(ratio, "Strehl", **PERCENT),
         largest_command_nm=fact(largest_nm, "largest command", unit="nm", format=".1f"),
         clipped_frames=fact(clipped, "clipped frames"),
     )

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from support.commands import run
 from support.exports import lbt_config, turn_states
-from support.plants import LBT_YAML, ROOT, lbt_axis_plant
-from support.robust_config import SMALL, robust_writer
+from support.plants import LBT_YAML, ROOT
+from support.robust_config import robust_writer
 
 import lbt_synth as lbt
 from lbt_synth.cli.design import describe_design
@@ -55,27 +55,6 @@ def test_a_small_margin_gets_a_note(tmp_path, capsys):
     assert "note: the modulus margin 0.0751 is small" in out
 
 
-@pytest.fixture(scope="module")
-def plant():
-    return lbt_axis_plant()
-
-
-@pytest.fixture(scope="module")
-def ends(plant):
-    return lbt.hinf(plant, route="riccati"), lbt.kalman(plant)
-
-
-def test_bounds_without_a_limit(plant, ends, tmp_path, capsys):
-    assert lbt.mixed(plant, gamma_ratio=1e300 / ends[0].gamma_least).rms == ends[1].rms
-    assert lbt.mixed(plant, rms=1e200).gamma == ends[0].gamma
-    target = str(tmp_path / "m.npz")
-    for size in ("1e30", "1e200"):
-        assert (
-            main(["design", str(LBT_YAML), "--method", "mixed", "--rms", size, "-o", target]) == 0
-        )
-    capsys.readouterr()
-
-
 @pytest.fixture
 def small(tmp_path):
     return robust_writer(tmp_path)
@@ -99,66 +78,6 @@ def test_design_show_verify_sigma_and_simulate_take_a_robust_design(small, tmp_p
     assert "Strehl ratio" in capsys.readouterr().out
 
 
-def test_an_infeasible_file_names_what_clashes(small, tmp_path, capsys):
-    section = (
-        SMALL
-        + """    modulus_margin: 0.8
-    attenuation:
-      - {low_hz: 0.0, high_hz: 60.0, at_most: 0.2}
-"""
-    )
-    gain = tmp_path / "none.fits"
-    assert main(["design", small(section), "--method", "robust", "-o", str(gain)]) == 1
-    error = capsys.readouterr().err
-    assert "these demands cannot hold" in error
-    assert "attenuation to 0.2 in 0-60 Hz" in error
-    assert not gain.exists()
-
-
-@pytest.mark.parametrize(
-    ("section", "message"),
-    [
-        ("\n  gamma_ratio: 1.2\n", "the key design.robust is missing"),
-        (
-            SMALL.replace("high_hz: 21.0", "high_hz: 18.0"),
-            "design.robust.bands[0]: high_hz must be above 19",
-        ),
-        (SMALL.replace("high_hz: 21.0", "high_hz: 500.0"), "below the Nyquist frequency 400 Hz"),
-        (SMALL.replace("rms_mas: 10.0", "rms_mas: -1.0"), "design.robust.bands[0].rms_mas"),
-        (
-            SMALL + "    attenuation:\n      - {low_hz: 3.0, high_hz: 2.0, at_most: 0.5}\n",
-            "small.yaml: design.robust.attenuation[0]: high_hz must be above 3",
-        ),
-        (
-            SMALL
-            + "    mirror_uncertainty:\n      - {low_hz: 3.0, high_hz: 600.0, relative: 0.5}\n",
-            "design.robust: a band must lie below the Nyquist frequency 400 Hz; got 3 to 600 Hz",
-        ),
-        (SMALL.replace("rms_mas: 10.0", "rms: 10.0"), "unknown key design.robust.bands[0].rms"),
-        (
-            SMALL + "    sensor_gain: [1.1, 1.3]\n",
-            "design.robust.sensor_gain: must hold model.sensor_gain, 1; got 1.1 to 1.3",
-        ),
-        (SMALL + "    modulus_margin: 1.5\n", "design.robust.modulus_margin"),
-        (SMALL.replace("functions: 16", "functions: 1000"), "functions must be at most 400"),
-    ],
-)
-def test_a_bad_section_is_refused_with_its_key(small, tmp_path, capsys, section, message):
-    gain = tmp_path / "none.fits"
-    assert main(["design", small(section), "--method", "robust", "-o", str(gain)]) == 2
-    assert message in capsys.readouterr().err
-    assert not gain.exists()
-
-
-@pytest.mark.parametrize(
-    "option", [["--gamma", "3"], ["--horizon", "2"], ["--taps", "4"], ["--route", "lmi"]]
-)
-def test_options_of_other_methods_are_refused(small, tmp_path, capsys, option):
-    argv = ["design", small(), "--method", "robust", *option, "-o", str(tmp_path / "x.fits")]
-    assert main(argv) == 2
-    assert option[0] in capsys.readouterr().err
-
-
 SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
 
 
@@ -166,30 +85,6 @@ def test_a_filter_that_ignores_the_dynamics_says_so(tmp_path, capsys):
     gain = str(tmp_path / "kalman.npz")
     assert main(["design", str(SLOW_YAML), "--method", "kalman", "-o", gain]) == 0
     assert "as if the mirror settled at once" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("method", "option", "value", "text"),
-    [
-        (
-            "kalman",
-            "--gamma",
-            "200",
-            "--gamma goes with --method hinf or mixed; got --method kalman",
-        ),
-        ("kalman", "--taps", "3", "--taps goes with --method mixed; got --method kalman"),
-        (
-            "mixed",
-            "--route",
-            "lmi",
-            "--route goes with --method hinf or kalman; got --method mixed",
-        ),
-    ],
-)
-def test_an_option_of_another_method_is_refused(tmp_path, capsys, method, option, value, text):
-    target = str(tmp_path / "p.fits")
-    assert main(["design", CONFIG, "--method", method, option, value, "-o", target]) == 2
-    assert text in capsys.readouterr().err
 
 
 def test_a_fragile_design_does_not_pass_without_a_word(tmp_path, capsys):

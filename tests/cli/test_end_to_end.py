@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +18,7 @@ from support.small_telescope import needs_specula, small_config
 import lbt_synth as lbt
 from lbt_synth.cli import end_to_end as end_to_end_commands
 from lbt_synth.cli.main import main
-from lbt_synth.errors import ConfigError, MissingExtraError, ProblemError
+from lbt_synth.errors import MissingExtraError, ProblemError
 
 
 @pytest.fixture(scope="module")
@@ -30,29 +29,6 @@ def setup():
 @pytest.fixture(scope="module")
 def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("cache")
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "match"),
-    [
-        ("outer_scale_m: 22.0", "outer_scale_m: null", "outer_scale_m must be a length"),
-        ("turbulence: frozen_flow", "turbulence: none", "truth.turbulence must be frozen_flow"),
-        ("mirror:\n  modes: 672 ", "mirror: {}\n# ", "mirror.modes is missing"),
-        ("subapertures_across: 30", "subapertures_across: 80", "pixels must be even"),
-        ("pixels: 60", "pixels: 61", "pixels must be even"),
-    ],
-)
-def test_configurations_that_cannot_be_simulated(tmp_path, capsys, old, new, match):
-    text = Path(CONFIG).read_text()
-    assert old in text
-    file = tmp_path / "c.yaml"
-    file.write_text(text.replace(old, new, 1))
-    config = lbt.load_config(file)
-    with pytest.raises(ConfigError, match=match):
-        _ = config.end_to_end
-    assert main(["end-to-end", str(file), "x.fits", "-o", str(tmp_path / "run")]) == 2
-    assert "lbt-synth: error:" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("found", [None, "1.0.3", "1.2.0"])
@@ -112,17 +88,7 @@ def test_a_loop_that_ran_away_ends_in_words(monkeypatch, tmp_path, capsys, setup
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        ["--seeds", "0"],
-        ["--jobs", "0"],
-        ["--frames", "1"],
-        ["--settle-frames", "10"],
-        ["--seed", "-1"],
-        ["--seed", "5000000000"],
-        ["--pixels", "7"],
-        ["nowhere.fits"],
-    ],
+    "arguments", [["--seeds", "0"], ["--jobs", "0"], ["--seed", "-1"], ["nowhere.fits"]]
 )
 def test_bad_input_at_the_command_line(tmp_path, capsys, arguments):
     out = tmp_path / "table"

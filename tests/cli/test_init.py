@@ -21,7 +21,7 @@ def here(tmp_path, monkeypatch):
 def test_a_telescope_is_written_with_its_schema(here, capsys, telescope):
     status, out, error = run(capsys, "init", "--telescope", telescope)
     assert (status, error) == (0, "")
-    assert f"Next, put in your own numbers, then lbt-synth design {telescope}.yaml" in out
+    assert f"Next, put in your own numbers; then lbt-synth design {telescope}.yaml" in out
     text = (here / f"{telescope}.yaml").read_text()
     assert text.startswith("# yaml-language-server: $schema=lbt-synth.schema.json\n")
     assert json.loads((here / "lbt-synth.schema.json").read_text()) == lbt.config.config_schema()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 
 import numpy as np
@@ -229,25 +230,52 @@ def test_an_output_that_is_an_input_is_refused(
     assert (tmp_path / taken).samefile(source)
 
 
-@pytest.mark.parametrize(
-    ("command", "arguments", "source"),
-    [
-        ("export", ("gain.fits", "--for", "dao", "-o", "gain.fits"), "gain.fits"),
-        ("simulate", ("config.yaml", "gain.fits", "--telemetry", "./gain.fits"), "gain.fits"),
-        ("telemetry", ("series.fits", "-o", "../DIR/series.fits"), "series.fits"),
-        pytest.param(
-            *("telemetry", ("series.fits", "--format", "aot", "-o", "series.fits"), "series.fits"),
-            marks=pytest.mark.e2e,
-        ),
-    ],
+SCREEN = (
+    "design lbt.yaml --method kalman -o k.fits",
+    "design lbt.yaml --method hinf -o h.fits",
+    "design lbt.yaml --method integrator -o i.fits",
+    "show k.fits",
+    "verify h.fits",
+    "compare lbt.yaml k.fits h.fits i.fits",
+    "plot sigma k.fits h.fits i.fits -o s.png",
+    "plot step k.fits h.fits",
+    "limits lbt.yaml k.fits",
+    "robustness lbt.yaml",
+    "robustness lbt.yaml k.fits h.fits",
+    "tradeoff lbt.yaml --points 7",
+    "mirror lbt_slow_mirror.yaml",
+    "modal lbt.yaml --modes 120",
+    "simulate lbt.yaml k.fits i.fits --frames 3300 --cases 2",
+    "simulate lbt.yaml k.fits --frames 3300 --telemetry night.fits",
+    "telemetry night.fits",
+    "identify night.fits -o m.yaml --no-figure",
+    "auto night.fits -o a.fits --no-figure",
+    "diagnose night.fits k.fits",
+    "export k.fits --for c -o c.c",
+    "rehearse night.fits k.fits --for c",
+    "report lbt.yaml k.fits h.fits -o r.html",
+    "study study.yaml -o study --dry-run",
+    "study study.yaml -o study",
+    "paper -o paper",
+    "init --telescope vlt",
+    "design several_sensors.yaml --method kalman -o n.fits",
+    "simulate several_sensors.yaml n.fits --drop m1@2s --frames 3300",
 )
-def test_the_same_file_by_its_name(
-    tmp_path, capsys, monkeypatch, originals, command, arguments, source
-):
+
+
+def test_a_command_fits_on_a_screen(tmp_path, capsys, monkeypatch):
+    """Every command on the examples, in their order, says its point first: a sentence."""
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(originals, tmp_path, dirs_exist_ok=True)
-    before = (tmp_path / source).read_bytes()
-    status, _, error = run(capsys, command, *(a.replace("DIR", tmp_path.name) for a in arguments))
-    assert status == 2
-    assert f"must not replace the input {source}" in error
-    assert (tmp_path / source).read_bytes() == before
+    shutil.copytree(ROOT / "examples", tmp_path, dirs_exist_ok=True)
+    study = tmp_path / "study.yaml"
+    study.write_text(re.sub(r"(?m)^samples: .*$", "samples: 256", study.read_text()))
+    for words in SCREEN:
+        status, text, error = run(capsys, *words.split())
+        lines = text.splitlines()
+        assert (status, error) == (0, ""), words
+        assert 0 < len(lines) <= 25, words
+        assert max(map(len, lines)) <= 100, words
+        verdict = re.split(r"\n\n|\n(?:note|warning|written): ", text)[0]
+        assert re.fullmatch(r"\S.*\.", verdict.strip(), re.DOTALL), words
+    served = {"explore", "end-to-end"}  # one runs until it is ended, one needs an extra
+    assert {words.split()[0] for words in SCREEN} | served == set(COMMANDS)

@@ -59,39 +59,6 @@ def test_identify_writes_a_configuration_that_designs(tmp_path, capsys, recorded
     assert run(capsys, "verify", gain)[0] == 0
 
 
-@pytest.mark.parametrize("ending", ["npy", "npz", "csv", "fits"])
-def test_series_of_any_format(tmp_path, capsys, recorded_loop, ending):
-    run_, _, _ = recorded_loop
-    y, u = run_.measurements[0, :6000], run_.commands[0, :6000]
-    file = tmp_path / f"night.{ending}"
-    options: tuple[object, ...] = FACTS
-    if ending == "npy":
-        np.save(file, np.hstack([y, u]))
-        options += ("--columns", "measurements=0,1", "commands=2,3")
-    elif ending == "npz":
-        np.savez(file, measurements=y, commands=u)
-    elif ending == "csv":
-        options += ("--columns", "times=")  # they stand still
-        np.savetxt(
-            file,
-            np.hstack([np.zeros((len(y), 1)), y, u]),
-            delimiter=",",
-            comments="",
-            header="time,tip_nm,tilt_nm,command_tip_nm,command_tilt_nm",
-        )
-    else:
-        from astropy.io import fits
-
-        parts = [fits.PrimaryHDU(), fits.ImageHDU(y, name="MEASUREMENTS")]
-        fits.HDUList([*parts, fits.ImageHDU(u, name="COMMANDS")]).writeto(file)
-    status, text, error = run(
-        capsys, "identify", file, "-o", tmp_path / "m.yaml", "--no-figure", "--json", *options
-    )
-    assert (status, error) == (0, "")
-    tip = json.loads(text)["axes"][0]
-    assert tip["vibrations"][0]["frequency_hz"] == pytest.approx(LINE_HZ, abs=0.2)
-
-
 def test_a_line_along_a_diagonal_is_one_row(tmp_path, capsys):
     line = lbt.Vibration(frequency_hz=31, damping=0.006, rms_nm=60, direction=(0.8, -0.6))
     file = tmp_path / "night.npy"
@@ -140,38 +107,17 @@ def test_a_spectrum(tmp_path, capsys):
 
 
 def test_lists_announce_lines(tmp_path, capsys, recorded_night):
-    (tmp_path / "plain.txt").write_text("31.0 0.1\n")
     (tmp_path / "named.csv").write_text("error_hz,frequency_hz\n0.1,31.0\n,77\n")
-    for options in (
-        ("--lines-file", tmp_path / "plain.txt"),
-        ("--lines-file", tmp_path / "named.csv"),
-        ("--lines-hz", 31, 77),
-    ):
-        status, text, error = run(
-            capsys,
-            "identify",
-            recorded_night,
-            "-o",
-            tmp_path / "m.yaml",
-            "--no-figure",
-            "--json",
-            *options,
-        )
+    words = (recorded_night, "-o", tmp_path / "m.yaml", "--no-figure", "--json")
+    for options in (("--lines-file", tmp_path / "named.csv"), ("--lines-hz", 31, 77)):
+        status, text, error = run(capsys, "identify", *words, *options)
         assert (status, error) == (0, "")
         (line,) = json.loads(text)["axes"][0]["vibrations"]
         assert line["announced"]
         assert line["frequency_hz"] == pytest.approx(LINE_HZ, abs=0.2)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "frequency_hz,error_hz\n20,0.1\n,0.2\n",
-        "f_hz,frequency_hz\n20,20\n",
-        "error_hz\n20\n",
-        "1,2,3\n",
-    ],
-)
+@pytest.mark.parametrize("text", ["frequency_hz,error_hz\n20,0.1\n,0.2\n", "1,2,3\n"])
 def test_lists_of_lines_that_are_refused(tmp_path, capsys, recorded_night, text):
     (tmp_path / "lines.csv").write_text(text)
     options = ("-o", tmp_path / "m.yaml", "--lines-file", tmp_path / "lines.csv")
@@ -261,24 +207,9 @@ def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
     ("options", "words"),
     [
         (("-o", "m.txt"), "must end in .yaml"),
-        (("-o", "m.yaml", "--figure", "m.gif"), "must end in .png"),
-        (("-o", "m.yaml", "--figure", "x.png", "--no-figure"), "not both"),
-        (("-o", "nowhere/m.yaml"), "no directory"),
-        (("-o", "m.yaml", "--frame-rate-hz", "900"), "must be that of the telemetry"),
         (("-o", "m.yaml", "--columns", "a"), "takes ROLE=NAME"),
-        (
-            ("-o", "m.yaml", "--sensor-gain", "1", "2", "3"),
-            "one number, or one per measurement (2)",
-        ),
-        (("-o", "m.yaml", "--sensor-gain", "0"), "--sensor-gain must be"),
-        (("-o", "m.yaml", "--lines-hz", "800"), "announced frequency"),
-        (("-o", "m.yaml", "--lines-hz", "20", "--lines-error-hz", "-1"), "must be at least 0"),
-        (("-o", "m.yaml", "--lines-file", "none.txt"), "cannot read"),
-        (("-o", "m.yaml", "--accelerometers", "none.npy"), "cannot read"),
         (("-o", "m.yaml", "--acceleration-unit", "g"), "goes with --accelerometers"),
-        (("-o", "m.yaml", "--most-lines", "-1"), "--most-lines must be"),
         (("-o", "m.yaml", "--wavelength-um", "0"), "--wavelength-um must be above 0"),
-        (("-o", "m.yaml", "--kind", "spectrum"), "kind"),
     ],
 )
 def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, brief_night, options, words):
@@ -290,50 +221,15 @@ def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, brief_night, op
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_short_record_is_refused_with_the_length_it_needs(tmp_path, capsys):
-    np.save(tmp_path / "y.npy", np.random.default_rng(0).standard_normal(900))
-    for command, output in (("identify", "m.yaml"), ("auto", "t.fits")):
-        status, _, error = run(
-            capsys,
-            command,
-            tmp_path / "y.npy",
-            "-o",
-            tmp_path / output,
-            "--kind",
-            "open-loop",
-            "--frame-rate-hz",
-            500,
-            "--delay-frames",
-            2,
-            "--unit",
-            "nm",
-        )
-        assert status == 2
-        assert f"needs {1024 if command == 'identify' else 2000} usable frames" in error
-
-
 def test_a_sinusoid_without_noise_is_no_crash(tmp_path, capsys, monkeypatch) -> None:
     evaluations = []
     plain = whittle.derivatives
     monkeypatch.setattr(
         whittle, "derivatives", lambda *given: evaluations.append(0) or plain(*given)
     )
-    series = 100 * np.sin(2 * np.pi * 0.05 * np.arange(8192))
-    np.save(tmp_path / "s.npy", series)
-    status, _, error = run(
-        capsys,
-        "identify",
-        tmp_path / "s.npy",
-        "--kind",
-        "open-loop",
-        "--unit",
-        "nm",
-        "--frame-rate-hz",
-        1000,
-        "-o",
-        tmp_path / "s.yaml",
-        "--no-figure",
-    )
+    np.save(tmp_path / "s.npy", 100 * np.sin(2 * np.pi * 0.05 * np.arange(8192)))
+    words = ("--kind", "open-loop", "--no-figure", "-o", tmp_path / "s.yaml", *FACTS)
+    status, _, error = run(capsys, "identify", tmp_path / "s.npy", *words)
     assert status in (0, 2)
     assert "Traceback" not in error
     assert 0 < len(evaluations) < 10_000  # the search ends
@@ -386,31 +282,15 @@ def test_auto_tests_its_design_on_unseen_data(made, recorded_loop):
 
 
 def test_auto_says_what_it_found(capsys, recorded_night, tmp_path):
-    out = tmp_path / "h.npz"
-    status, text, error = run(
-        capsys,
-        "auto",
-        recorded_night,
-        "-o",
-        out,
-        "--method",
-        "hinf",
-        "--gamma-ratio",
-        1.3,
-        "--no-figure",
-        "--model",
-        tmp_path / "m.yml",
-        "--sensor-gain",
-        GAIN,
-    )
+    options = ("--method", "hinf", "--gamma-ratio", 1.3, "--sensor-gain", GAIN, "--no-figure")
+    files = ("-o", tmp_path / "h.npz", "--model", tmp_path / "m.yml")
+    status, text, error = run(capsys, "auto", recorded_night, *options, *files)
     assert (status, error) == (0, "")
     said = " ".join(text.split())
     assert re.match(
-        r"H-infinity filter leaves [\d.]+ nm rms on unseen data, where what ran left [\d.]+ nm",
+        r"The H-infinity filter leaves [\d.]+ nm rms on unseen data, where what ran left [\d.]+ nm",
         said,
     )
-    assert "sensor gain given." in text
-    assert "H-infinity filter" in text
     assert "Kalman filter" not in text
     assert not (tmp_path / "h.png").exists()
     assert (tmp_path / "m.yml").is_file()
@@ -418,48 +298,24 @@ def test_auto_says_what_it_found(capsys, recorded_night, tmp_path):
 
 def test_an_open_loop_series_and_one_axis(tmp_path, capsys, recorded_loop):
     run_, _, _ = recorded_loop
-    file = tmp_path / "open.npy"
     noise = np.random.default_rng(0).standard_normal(len(run_.total_nm[0]))
-    np.save(file, run_.total_nm[0][:, 0] + NOISE * noise)
-    status, text, error = run(
-        capsys,
-        "auto",
-        file,
-        "-o",
-        tmp_path / "t.fits",
-        "--kind",
-        "open-loop",
-        "--frame-rate-hz",
-        1000,
-        "--delay-frames",
-        2,
-        "--unit",
-        "nm",
-        "--no-figure",
-    )
+    np.save(tmp_path / "open.npy", run_.total_nm[0][:, 0] + NOISE * noise)
+    words = ("--kind", "open-loop", "--no-figure", "-o", tmp_path / "t.fits", *FACTS)
+    status, text, error = run(capsys, "auto", tmp_path / "open.npy", *words)
     assert (status, error) == (0, "")
     assert "what ran" not in text
-    assert "H-infinity filter" in text
     assert "note: the Kalman filter stays: " in text
     assert lbt.load_config(tmp_path / "t.yaml").plant.hardware.modes == 1
 
 
 def test_auto_refuses_what_it_cannot_do(tmp_path, capsys, recorded_night):
     for options, words in (
-        (("-o", tmp_path / "t.fits", "--gamma-ratio", 0.5), "--gamma-ratio must be at least 1"),
-        (
-            ("-o", tmp_path / "t.fits", "--method", "kalman", "--gamma-ratio", 1.1),
-            "--gamma-ratio goes with method hinf or mixed; got method kalman",
-        ),
-        (("-o", tmp_path / "t.fits", "--lines-hz", "nan"), "--lines-hz must be finite; got nan"),
-        (("-o", tmp_path / "t.fits", "--lines-hz", 12, "-5"), "--lines-hz must be above 0; got -5"),
-        (("-o", tmp_path / "t.txt"), "must end in"),
-        (("-o", tmp_path / "t.fits", "--model", tmp_path / "t.fits"), "must end in .yaml"),
-        (("-o", tmp_path / "t.fits", "--model", tmp_path / "t.json"), "must end in .yaml"),
+        (("--method", "kalman", "--gamma-ratio", 1.1), "--gamma-ratio goes with method hinf or"),
+        (("--lines-hz", 12, "-5"), "--lines-hz must be above 0; got -5"),
+        (("--model", tmp_path / "t.fits"), "must end in .yaml"),
     ):
-        status, _, error = run(capsys, "auto", recorded_night, *options)
-        assert status == 2
-        assert words in error
+        status, _, error = run(capsys, "auto", recorded_night, "-o", tmp_path / "t.fits", *options)
+        assert (status, words in error) == (2, True)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -495,9 +351,6 @@ def test_names_that_no_text_can_hold(tmp_path, capsys) -> None:
     assert "note: the record is short (9 s): it does not tell lines less than 0.11 Hz apart" in said
 
 
-FACTS = ("--frame-rate-hz", RATE, "--delay-frames", 2, "--unit", "nm")
-
-
 def write(path, change=1.0, frames=None, **more):
     record = line_record()
     y, u = record.measurements[:frames], record.commands[:frames]
@@ -511,20 +364,19 @@ def night(tmp_path_factory):
 
 
 def test_a_page_of_text(capsys, night):
-    status, text, error = run(capsys, "diagnose", night, *FACTS)
+    status, text, error = run(capsys, "diagnose", night, *FACTS, "--verbose")
     assert (status, error) == (0, "")
-    lines = text.splitlines()
-    assert lines[0].startswith("The record is sound: a pure integrator of gain 0.2 ran")
-    assert lines[2].startswith("First change the controller: the ")
-    assert len(lines) < 66
+    said = " ".join(text.split())
+    assert said.startswith("The record is sound: a pure integrator of gain 0.2 ran")
     for caption in (
+        "First change the controller: the ",
         "Record: 8.188 s at 1000 Hz. 8186 of 8188 frames are usable",
         "Control law in use, from y to u",
         "Vibrations",
         "What each part leaves by the model of the first half (best design: ",
         "Residual on the second half of the record",
     ):
-        assert caption in " ".join(text.split())
+        assert caption in said
 
 
 def test_a_gain_file_the_page_and_json(capsys, night, tmp_path):
@@ -547,11 +399,10 @@ def test_a_gain_file_the_page_and_json(capsys, night, tmp_path):
 def test_a_record_that_lies_is_still_diagnosed(capsys, tmp_path):
     status, text, _ = run(capsys, "diagnose", write(tmp_path / "n.npz", -1.0, 3000), *FACTS)
     assert status == 0
-    assert text.startswith(
-        "The commands are not those that the mirror followed: they have the opposite sign.\n"
-        "Nothing can be said of its residual.\nFirst read the record with --command-sign -1.\n"
+    assert " ".join(text.split()).startswith(
+        "The commands are not those that the mirror followed: they have the opposite sign. "
+        "Nothing can be said of its residual. First read the record with --command-sign -1. "
     )
-    assert "-0.2" in text
     assert "Vibrations" not in text
 
 
@@ -562,7 +413,7 @@ def test_a_dead_axis_leaves_the_other(capsys, tmp_path):
     np.savez(path, measurements=y, commands=np.hstack([record.commands] * 2))
     status, text, _ = run(capsys, "diagnose", path, *FACTS)
     assert status == 0
-    assert text.startswith("The record has faults: the tilt measurement is dead.\nIt leaves ")
+    assert text.startswith("The record has faults: the tilt measurement is dead. It leaves ")
     assert "note: the rest is of the axis that lives: the other one is dead" in text
 
 
@@ -579,7 +430,9 @@ def test_the_clock(capsys, tmp_path):
         measurements=record.measurements[kept],
         commands=record.commands[kept],
     )
-    status, text, _ = run(capsys, "diagnose", path, "--delay-frames", 2, "--unit", "nm")
+    status, text, _ = run(
+        capsys, "diagnose", path, "--delay-frames", 2, "--unit", "nm", "--verbose"
+    )
     assert status == 0
     assert "clock jitter 0.02 frames rms" in " ".join(text.split())
     assert "11 missing (frames)" in " ".join(text.split())

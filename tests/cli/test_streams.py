@@ -138,7 +138,7 @@ def test_characters_that_an_encoding_lacks_are_escaped(monkeypatch, gains):
     )
     status, out, error = run_in(monkeypatch, "ascii", "show", gains["kalman"])
     assert (status, error) == (0, "")
-    assert "\n  design" in out
+    assert "\n  quantity" in out
     assert "\n -----" in out
     assert "\\u" not in out
 

@@ -197,20 +197,6 @@ def test_an_interrupt_ends_it_at_once(tmp_path):
     assert not list(folder.rglob(".*.npz*"))
 
 
-def test_two_in_one_directory(tmp_path, capsys):
-    path = study_file(tmp_path, samples="300000", parameters=PARAMETERS)
-    folder = tmp_path / "out"
-    first = started(path, "-o", folder)
-    try:
-        wait_for(lambda: len(part_rows(folder)) >= 1, seconds=120)
-        status, _, error = run(capsys, "study", path, "-o", folder)
-        assert status == 2
-        assert "another computation is running in" in error
-    finally:
-        first.kill()
-        first.communicate()
-
-
 @pytest.mark.e2e
 def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
     path = study_file(tmp_path, samples="40", parameters=PARAMETERS)

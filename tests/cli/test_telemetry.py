@@ -57,7 +57,7 @@ def test_simulate_writes_its_first_case(tmp_path, capsys, gain):
 
 
 def test_what_is_in_a_file(capsys, night):
-    status, text, error = run(capsys, "telemetry", night)
+    status, text, error = run(capsys, "telemetry", night, "--verbose")
     assert (status, error) == (0, "")
     seen = full(name="LBT")
     for words in (

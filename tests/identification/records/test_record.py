@@ -233,3 +233,10 @@ def test_frames_before_the_first_commands_are_not_lost():
     seen = loop_record(y, np.zeros((100, 1)), frame_rate_hz=RATE, delay_frames=2.5, unit="nm")
     assert seen.lost == pytest.approx(1 / 97)
     assert seen.with_delay(1.0).lost == pytest.approx(1 / 99)
+
+
+def test_its_text_is_three_lines():
+    lines = repr(loop_record(np.ones((100, 2)), frame_rate_hz=RATE, unit="nm")).splitlines()
+    assert len(lines) == 3
+    assert "100 frames of measurements" in lines[0]
+    assert "2 axes at 1000 Hz" in lines[1]
