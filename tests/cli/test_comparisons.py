@@ -149,17 +149,6 @@ def test_wrong_commands_of_mirror(capsys, gains):
         assert (status, text in err) == (2, True)
 
 
-def test_robustness(tmp_path, capsys):
-    table, figure = tmp_path / "r.csv", tmp_path / "r.png"
-    status, text, _ = run(capsys, "robustness", CONFIG, "-o", table, "-o", figure)
-    assert status == 0
-    assert "error [Hz]" in text
-    lines = table.read_text().splitlines()
-    assert lines[0].startswith("error_hz,method,strehl,residual_nm")
-    assert len(lines) == 31
-    assert figure.exists()
-
-
 @pytest.fixture(scope="module")
 def settings():
     return lbt.load_config(LBT_YAML)
@@ -280,7 +269,6 @@ def test_another_delay_in_the_configuration_gets_a_note(tmp_path, capsys, files)
 
 
 BAD = [
-    ((CONFIG, "KALMAN", "KALMAN"), "given once"),
     ((CONFIG, "none.fits"), "cannot read none.fits"),
     ((CONFIG, "WALK"), "walk is a filter of a bare estimation problem"),
     ((CONFIG, "AXIS"), "axis must be for the configuration's 2 axes; got a design for 1"),

@@ -279,3 +279,26 @@ def test_a_command_fits_on_a_screen(tmp_path, capsys, monkeypatch):
         assert re.fullmatch(r"\S.*\.", verdict.strip(), re.DOTALL), words
     served = {"explore", "end-to-end"}  # one runs until it is ended, one needs an extra
     assert {words.split()[0] for words in SCREEN} | served == set(COMMANDS)
+
+
+def test_what_is_printed_is_cut_to_a_screen(capsys):
+    """Warnings come before notes; rows are from end to end, and of facts the first."""
+    report = Report(verdict=["The point.", f"A sentence of {' many words' * 20}."])
+    report.add_table("Table", ("row", "value"), [(f"r{i}", i) for i in range(40)])
+    report.notes = ["remark", *(f"note: {i}" for i in range(30)), "warning: look"]
+    report.note_files(["a.png", "b.csv"])
+    report.print()
+    lines = capsys.readouterr().out.splitlines()
+    assert (len(lines), max(map(len, lines)) <= 100) == (25, True)
+    assert lines[0].startswith("The point. A sentence")
+    rows = [line.split()[0] for line in lines if re.match(r"  r\d", line)]
+    assert (len(rows), rows[0], rows[-1]) == (12, "r0", "r39")
+    assert lines.index("warning: look") < lines.index("note: 0")
+    assert lines[-2:] == ["... more with --verbose", "written: a.png, b.csv"]
+    report.print(verbose=True)
+    text = capsys.readouterr().out
+    assert all(word in text for word in ("remark", "r17", "note: 29"))
+    report.tables.clear()
+    report.add_table("Facts", ("quantity", "value"), [(f"q{i}", i) for i in range(40)])
+    report.print()
+    assert re.findall(r"  (q\d+)", capsys.readouterr().out) == [f"q{i}" for i in range(12)]
