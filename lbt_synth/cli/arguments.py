@@ -30,30 +30,18 @@ if TYPE_CHECKING:  # slow to import for --help
     from lbt_synth.methods.method import Method
 
 _SHARED = """
-  config
-    config | | configuration file (YAML)
-  gain
-    gain | | gain file (.fits or .npz)
-  gains
-    gains | nargs:* meta:gain | gain files (.fits or .npz)
-  gains+
-    gains | nargs:+ meta:gain | gain files (.fits or .npz)
-  unit
-    --unit | @units | what tables, figures and pages show wavefronts in (default: the
-        configuration's, else nm; JSON and CSV stay in nm)
-  outputs
-    -o --output | repeat | table (.csv) or figure (.png, .pdf, .svg); repeatable
-  pdf
-    --pdf | meta:FILE | write the same as a PDF, too (.pdf)
-  jobs
-    --jobs | int =1 | processes
-  stroke
-    --stroke | float | largest command that the mirror applies [nm]
-  wavelength
-    --wavelength-um | float | of Strehl ratios (default: the file's, or 2.2)
-  target
-    --for | @targets nargs:? meta:NAME dest:target required target | the program that loads the
-        file; without NAME, list what each computes, and end
+  config | config | | configuration file (YAML)
+  gain | gain | | gain file (.fits or .npz)
+  gains | gains | nargs:* meta:gain | gain files (.fits or .npz)
+  gains+ | gains | nargs:+ meta:gain | gain files (.fits or .npz)
+  unit | --unit | @units | of wavefronts (default: the configuration's, else nm; JSON has nm)
+  outputs | -o --output | repeat | table (.csv) or figure (.png, .pdf, .svg); repeatable
+  pdf | --pdf | meta:FILE | write the same as a PDF, too (.pdf)
+  jobs | --jobs | int =1 | processes
+  stroke | --stroke | float | largest command that the mirror applies [nm]
+  wavelength | --wavelength-um | float | of Strehl ratios (default: the file's, or 2.2)
+  target | --for | @targets nargs:? meta:NAME dest:target required target | the program
+        that loads the file; without NAME, list what each computes
   facts
     > what the file does not say
     --kind | closed-loop/open-loop/spectrum
@@ -66,27 +54,22 @@ _SHARED = """
     --obstruction | float | as a fraction of the diameter
     --averages | int | periodograms that a spectrum is the mean of
     --commands | | another file, with the commands
-    --columns | nargs:+ meta:ROLE=NAME | columns by name or number from 0, as in
-        measurements=tip,tilt commands=3,4 times=
+    --columns | nargs:+ meta:ROLE=NAME | by name or number, as measurements=tip,tilt times=
     --axes | int nargs:+ | which of several columns or modes, from 0
     > what the commands need: in this order, to be those that the mirror followed
     --command-increments | switch | they are increments: add them up
-    --command-shift-frames | int =0 | frames by which they move to later frames, or to earlier ones
-        below 0
+    --command-shift-frames | int =0 | frames by which they move to later frames
     --swap-axes | switch | exchange those of the two axes
     --command-sign | int nargs:+ | 1 or -1, of both axes or of each
-    --command-matrix | float nargs:+ meta:NUMBER | matrix from them to the axes of the
-        measurements, row after row
-    --command-scale | float nargs:+ | factor, of both axes or of each; 1 says that they were
-        recorded as large as applied
+    --command-matrix | float nargs:+ meta:NUMBER | to the axes of the measurements, row after row
+    --command-scale | float nargs:+ | factor, of both axes or of each; 1: as large as applied
   series
-    file | | what the loop recorded: telemetry, or FITS, NPY, NPZ or CSV with measurements and
-        commands, or an open-loop series (identify: or a spectrum)
+    file | | telemetry, or FITS, NPY, NPZ or CSV with what a loop measured and commanded, or an
+        open-loop series (identify: or a spectrum)
     facts
     > what is known beforehand
     --sensor-gain | float nargs:+ | sensor gain, of both axes or of each
-    --noise-nm | float nargs:+ | noise per frame of the loop's sensor [nm], beside a spectrum that
-        has none
+    --noise-nm | float nargs:+ | noise per frame of the sensor [nm], beside a spectrum without
     --lines-hz | float nargs:+ | frequencies of vibrations [Hz]
     --lines-error-hz | float =0.1 | standard error of --lines-hz [Hz]
     --lines-file | | text file with one frequency per row [Hz]
@@ -104,8 +87,7 @@ _TABLE = """
 start: a configuration to begin with
   init | init | Write a commented configuration to begin with, a schema or a script for the shell.
     --telescope | @telescopes | published numbers and their sources (default generic: assumed ones)
-    --from | meta:RECORD dest:source | telemetry, for what it knows: timing, telescope, noise,
-        turbulence and lines
+    --from | meta:RECORD dest:source | telemetry, for all that it knows of its loop
     --examples | switch | write the examples of the documentation instead (folder)
     --schema | switch | print the JSON schema for editors instead (.json)
     --completion | bash/zsh/fish | print the script with which a shell completes commands instead
@@ -120,12 +102,10 @@ look: what a design does in the loop, and what could be better
     unit config gains+ outputs
   plot | plot | Plot loops of one or several designs in a classical view, and print their margins.
     unit
-    kind | sigma/bode/nyquist/nichols/step | sigma: largest singular values; bode: gain and phase
-        over frequency; nyquist: loops in the complex plane; nichols: gain over phase; step:
-        residual and command after a step
+    kind | sigma/bode/nyquist/nichols/step | the view: sigma has the largest singular values,
+        step the residual and the command after a step
     gains+
-    --gain-factor | float =1 | factor on the sensor gain that each design assumes, at which the
-        loops are closed
+    --gain-factor | float =1 | factor on the sensor gain that each design assumes
     outputs
   simulate | simulate | Close the loop in the time domain, beside the exact answer.
     unit config gains+
@@ -147,11 +127,9 @@ look: what a design does in the loop, and what could be better
     -o --output | required | page to write, one file that opens offline (.html)
   explore | pages | Open a page of sliders in the browser, beside designs.
     unit config gains
-    --host | =localhost | name or address to serve at (default localhost: this machine only; others
-        can write files with the page)
+    --host | =localhost | to serve at (default localhost: this machine only; others can write files)
     --port | int =5006 | port to serve at, 0 for any that is free
-    --origin | repeat meta:HOST:PORT | host:port under which a browser reaches the page through a
-        tunnel; repeatable
+    --origin | repeat meta:HOST:PORT | under which a tunnel reaches the page; repeatable
     -o --output | =. | directory that the page saves into (default: this one)
   limits | comparisons | Show how far designs are from the least residual of any linear controller.
     unit config gains outputs
@@ -170,32 +148,25 @@ look: what a design does in the loop, and what could be better
         the design [frames] (default: the configuration's, else 0)
     >
     outputs
-  tradeoff | comparisons | Design filters from the least norm to the least variance, and compare
-        them.
+  tradeoff | comparisons | Design filters from the least norm to the least variance.
     unit config
-    --points | int =9 | levels of the norm, at least 2, from the least of any filter to the Kalman
-        filter's
-    --taps | int =16 | past innovations that the mixed filters (least variance at each norm) weigh,
-        1 to 64
+    --points | int =9 | levels of the norm, at least 2, from the least to the Kalman filter's
+    --taps | int =16 | past innovations that the mixed filters weigh, 1 to 64
     outputs
-  study | study | Try controllers on many samples of what the loop may meet; resumes if started
-        again.
+  study | study | Try controllers on many samples of what the loop may meet; resumes.
     unit
     study | meta:file | study file (YAML)
     -o --output | required | directory of the study
     > one of
     jobs
-    --dask | meta:ADDRESS | Dask scheduler that runs it instead, as tcp://host:8786; it can run code
-        here: trust it
+    --dask | meta:ADDRESS | Dask scheduler, as tcp://host:8786; it can run code here: trust it
     >
-    --dask-tls | nargs:3 meta:CA,CERT,KEY | files of the authority, certificate and key for a
-        scheduler at tls://host:8786
+    --dask-tls | nargs:3 meta:CA,CERT,KEY | files for a scheduler at tls://host:8786
     --pdf | switch | write the page as a PDF, too (summary.pdf)
     > one of
     --dry-run | switch | say how many samples and how long, and write nothing
     --row | int | recompute one row, and write it as a configuration
-  mirror | comparisons | Show the step of the mirror's local loop, and what ignoring its dynamics
-        costs.
+  mirror | comparisons | Show how the mirror settles, and what ignoring its dynamics costs.
     unit config
     --tolerance | float =0.1 | half width of the band in which the mirror counts as settled
     outputs
@@ -220,18 +191,15 @@ records: from what a loop recorded to a model and a design
     record
     > accelerometers
     --accelerometers | | NPY or CSV with one column per channel and one row per frame of the record
-    --accelerometer-rate-hz | float | their rate (default: that of the file's times or header, else
-        the frame rate) [Hz]
-    --acceleration-unit | @accelerations meta:UNIT | their unit: m/s2, mm/s2, um/s2, g, mg (default:
-        that of the headings, else m/s2)
+    --accelerometer-rate-hz | float | their rate [Hz] (default: the file's, or the frame rate)
+    --acceleration-unit | @accelerations meta:UNIT | m/s2, mm/s2, um/s2, g, mg (default: of
+        the headings, else m/s2)
     >
     -o --output | required | configuration to write (.yaml)
   auto | records | Go from a record to a gain file: identify, design, certify, test on unseen data.
     record
-    --method | @record_methods | default: kalman, unless another of the quick ones leaves clearly
-        less of the frames after its training
-    --gamma-ratio | float | norm as a multiple of the least norm, for methods with a bound (default
-        1.2)
+    --method | @record_methods | default: kalman, unless another quick one leaves less
+    --gamma-ratio | float | bound of the norm as a multiple of the least (default 1.2)
     --model | | configuration to write (default: the output's name, .yaml)
     -o --output | required | gain file (.fits or .npz)
   diagnose | records | Say what ran in a record, what is wrong, what it costs, and what to change.
@@ -242,21 +210,18 @@ records: from what a loop recorded to a model and a design
 at the telescope: a gain file in another program
   export | targets | Write the controller of a gain file for a real-time computer.
     gain target
-    --form | plain/estimator | c: plain assumes that commands are applied, estimator is given those
-        that were (default plain)
+    --form | plain/estimator | c: as of simulate (default plain)
     --precision | double/single | c: type of all numbers (default double)
     --name | | c: prefix of the C names (default: the output's name without its ending)
     --order | int | dao: M of the RTC's configuration (default 20)
     --modes | int | c, cacao, dao, pyrtc: modes of the RTC (default: those of the design)
-    --other-gain | float | the same: gain of an integrator for each further mode (default: no
-        command)
+    --other-gain | float | gain of an integrator for each further mode (default: none)
     --steps | int | cacao: frames of history (default: as many as the loss needs)
-    --loss | float | cacao: relative loss of residual that chooses them (default 0.01, the most)
+    --loss | float | cacao: loss of residual that chooses them (default 0.01, the most)
     -o --output | required | file to write: .c (the .h goes beside it), .mat, .fits or .npy, and its
         certificate; pyrtc: folder
   rehearse | targets | Run a gain file in the arithmetic of another program, in the loop.
-    file | nargs:? meta:record | what a loop recorded (default: a disturbance drawn from the gain
-        file's own truth)
+    file | nargs:? meta:record | what a loop recorded (default: a draw of the file's truth)
     gain target facts
     >
     --sensor-gain | float | sensor gain of the record (default: the one that the gain file assumes)
@@ -315,7 +280,10 @@ def _read_commands() -> Iterator[tuple[str, Command]]:
             group = title
 
 
-_BLOCKS = {title.strip(): arguments for title, arguments in _blocks(_SHARED)}
+_BLOCKS = {
+    title.split()[0]: [title.partition(" | ")[2]] if "|" in title else arguments
+    for title, arguments in _blocks(_SHARED)
+}
 COMMANDS = dict(_read_commands())
 
 

@@ -20,7 +20,7 @@ from lbt_synth.cli.loop_inputs import (
     say_residual,
     truth_at_sensor_gain,
 )
-from lbt_synth.cli.output import PERCENT, RMS, Report, spread_indices
+from lbt_synth.cli.output import BRIEF_ROWS, PERCENT, RMS, Report, spread_indices
 from lbt_synth.cli.streams import track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
@@ -40,9 +40,6 @@ from lbt_synth.studies import LimitRow
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, default_methods, mirror_rows
 from lbt_synth.validation import FloatArray, IntArray, agree, frozen_copy, integer, number
-
-_SHOWN = 8  # sensor gains of a map, and taps of a mirror, that are printed of more
-_ERRORS = 12  # errors of a frequency that are printed without --verbose
 
 
 def run_compare(arguments: Namespace) -> Report:
@@ -232,8 +229,8 @@ def run_mirror(arguments: Namespace) -> Report:
             limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
         ),
     )
-    taps = [f"{tap:.4f}" for tap in hardware.mirror_taps[:_SHOWN]]
-    more = ", ..." * (hardware.mirror_taps.size > _SHOWN)
+    taps = [f"{tap:.4f}" for tap in hardware.mirror_taps[:BRIEF_ROWS]]
+    more = ", ..." * (hardware.mirror_taps.size > BRIEF_ROWS)
     report.notes.append(f"weights of u(k), u(k-1), ... in exposure k: {', '.join(taps)}{more}")
     return report
 
@@ -279,7 +276,7 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
     by_method = {name: [row for row in rows if row.method == name] for name in methods}
     caption = f"Robustness to the vibration frequency; {config.imaging.label}"
     centre = int(np.argmin(np.abs(errors)))
-    places = spread_indices(len(errors), _ERRORS, centre)
+    places = spread_indices(len(errors), centre)
     columns = [
         facts(
             error_hz=fact(errors[place], "error", unit="Hz", format="+.2f"),
@@ -338,7 +335,7 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
     title = f"{config.imaging.label}, over {where}"
     report.tables.append(row_table(f"At a sensor gain of {gains[real]:.3g}: {title}", lines))
     report.verdict = _say_maps(maps, lines, where)
-    shown = spread_indices(gains.size, _SHOWN, real)
+    shown = spread_indices(gains.size, real)
     for name, grid in maps.items():
         rows = list(_map_lines(name, grid, shown, intervals[name]))
         report.tables.append(row_table(f"{name}: {title}", rows))

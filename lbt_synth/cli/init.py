@@ -120,23 +120,21 @@ def _section(name: str, template: str) -> re.Match[str] | None:
 
 def _script(arguments: Namespace) -> Report:
     """Print the schema of a configuration or the completion of a shell, or write it."""
-    name, ending = ("--schema", ".json") if arguments.schema else ("--completion", "")
+    asked = "--schema" if arguments.schema else "--completion"
     others = {"--telescope": arguments.telescope, "--from": arguments.source}
     others |= {"--examples": arguments.examples, "--force": arguments.force}
-    others |= {"--completion": arguments.completion and arguments.schema}
+    others |= {"--completion": arguments.schema and arguments.completion}
     if given := [option for option, value in others.items() if value]:
-        raise ProblemError(f"{name} goes with -o alone; got {', '.join(given)}. Leave it out.")
-    if arguments.schema:
-        data = config_schema()
-        text = json.dumps(data, indent=1)
-    else:
+        raise ProblemError(f"{asked} goes with -o alone; got {', '.join(given)}. Leave it out.")
+    data, text = config_schema(), json.dumps(config_schema(), indent=1)
+    if not arguments.schema:
         text = _completion(arguments.completion)
         data = {"shell": arguments.completion, "script": text}
     if arguments.output is None:
         return Report(data=data, text=text)
     output = Path(arguments.output)
-    if ending:
-        require_ending(output, "a schema", (ending,))
+    if arguments.schema:
+        require_ending(output, "a schema", (".json",))
     require_writable(output)
     report = Report()
     report.note_written(write_atomically(output, f"{text}\n".encode()))

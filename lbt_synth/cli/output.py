@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # which few commands need
     from lbt_synth.files import Telemetry
 
 _WIDTH = 200  # columns of --verbose where the output is no terminal
-_BRIEF_WIDTH, _BRIEF_LINES, _BRIEF_ROWS = 100, 25, 12  # without --verbose: a screen
+_BRIEF_WIDTH, _BRIEF_LINES, BRIEF_ROWS = 100, 25, 12  # without --verbose: a screen
 _WRITTEN = "written: "
 _URGENT = ("warning", "note")  # the notes that are printed without --verbose, in this order
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
@@ -168,11 +168,11 @@ def _wrapped(text: str, room: int) -> list[str]:
     return [line.replace("\u00a0", " ") for line in lines]
 
 
-def spread_indices(count: int, most: int, *kept: int) -> IntArray:
-    """Return places from end to end of a list, at most some, with those that are to be kept."""
-    if count <= most:
+def spread_indices(count: int, *kept: int) -> IntArray:
+    """Return the places of the rows that are printed of a list: from end to end, and some more."""
+    if count <= BRIEF_ROWS:
         return np.arange(count)
-    places = np.linspace(0, count - 1, most - len(kept)).round().astype(np.int64)
+    places = np.linspace(0, count - 1, BRIEF_ROWS - len(kept)).round().astype(np.int64)
     return np.unique([*places, *kept])
 
 
@@ -182,10 +182,10 @@ def _thinned(table: Table) -> Table:
     They are from end to end, and of facts, which are in the order of their weight, the first.
     """
     count = len(table.rows)
-    if count <= _BRIEF_ROWS:
+    if count <= BRIEF_ROWS:
         return table
     facts = table.headings[0] == "quantity"
-    places = np.arange(_BRIEF_ROWS) if facts else spread_indices(count, _BRIEF_ROWS)
+    places = np.arange(BRIEF_ROWS) if facts else spread_indices(count)
     rows = tuple(table.rows[place] for place in places)
     caption = f"{table.caption} ({len(rows)} of {count} rows; the others with --verbose)"
     return replace(table, caption=caption, rows=rows)

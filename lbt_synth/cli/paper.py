@@ -15,7 +15,7 @@ from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import loop_figure, robustness_figure
 from lbt_synth.storage.atomic_files import make_directory, write_atomically
 from lbt_synth.storage.display_unit import own_display_unit
-from lbt_synth.storage.rows import Facts, csv_rows, json_record
+from lbt_synth.storage.rows import csv_rows, json_record
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies import RobustnessRow
 from lbt_synth.studies.paper import (
@@ -88,24 +88,21 @@ def run(arguments: Namespace) -> Report:
     )
     report.add_table("Parameters", ("parameter", "value", "origin"), parameter_rows())
     for number, entries in (("II", second), ("III", third)):
-        _add_comparison(report, f"Table {number}: Strehl ratio [%] at 2.2 um", entries)
+        report.add_table(
+            f"Table {number}: Strehl ratio [%] at 2.2 um",
+            ("row", "method", "ours", "paper", "difference"),
+            [
+                (
+                    e.label,
+                    design_title(e.method),
+                    *map("{:.1f}".format, (e.ours, e.paper)),
+                    f"{e.difference:+.1f}",
+                )
+                for e in entries
+            ],
+        )
     report.note_files(files)
     return report
-
-
-def _add_comparison(report: Report, title: str, entries: list[Facts]) -> None:
-    """Add a table with the methods side by side."""
-    methods = dict.fromkeys(entry.method for entry in entries)
-    headings, lines = ["row"], {entry.label: [entry.label] for entry in entries}
-    for method in methods:
-        headings += [f"{design_title(method)}, ours", "paper", "difference"]
-    for entry in entries:  # in the order of the methods within each row
-        lines[entry.label] += [
-            f"{entry.ours:.1f}",
-            f"{entry.paper:.1f}",
-            f"{entry.difference:+.1f}",
-        ]
-    report.add_table(title, headings, lines.values())
 
 
 def _write_paper(

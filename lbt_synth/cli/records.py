@@ -10,7 +10,7 @@ from lbt_synth import identification
 from lbt_synth.cli import loop_records
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs
-from lbt_synth.cli.output import Report, say_checks
+from lbt_synth.cli.output import BRIEF_ROWS, Report, say_checks
 from lbt_synth.cli.streams import count_progress
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files.gain_file.store import require_gain_name
@@ -29,7 +29,6 @@ if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not
 
 
 _STEPS = 3  # that diagnose and auto count
-_SHOWN = 12  # vibrations that are printed without --verbose, those that move most
 
 
 def run_identify(arguments: Namespace) -> Report:
@@ -90,7 +89,7 @@ def _say_model(report: Report, model: IdentifiedModel, record: LoopRecord | Spec
             f"{nm_text(strongest.rms_nm, '.1f')} rms at {strongest.frequency_hz:.2f} Hz."
         )
         table = model_tables(model)[-1]
-        rows = [table.rows[place] for place in order[:_SHOWN]]
+        rows = [table.rows[place] for place in order[:BRIEF_ROWS]]
         caption = f"{table.caption}, the strongest first"
         report.tables.insert(0, replace(table, caption=caption, rows=tuple(rows)))
     report.verdict += [said, f"What the model does not explain {leaves}."]
