@@ -54,8 +54,8 @@ def run_compare(arguments: Namespace) -> Report:
         frames = min(row.delay_frames, row.early_frames)
         decibels = min(row.gain_less_db, row.gain_more_db)
         report.verdict.append(
-            f"{row.design} has the largest margin, and survives {frames:.2g} frames of delay and "
-            f"{decibels:.2g} dB of sensor gain either way."
+            f"{row.design} has the largest margin, and survives {frames:.2g} frames of delay or "
+            f"{decibels:.2g} dB of sensor gain, either way."
         )
     caption = f"In the truth of {config.source.name}; {config.imaging.label}"
     report.add_rows("designs", caption, rows, figure=lambda: limits_figure(study))
