@@ -73,8 +73,8 @@ def run(arguments: Namespace) -> Report:
         f"{nm_text(tip_nm, '.1f')} rms of tip and {nm_text(tilt_nm, '.1f')} of tilt left."
     )
     report.add_facts(
-        f"End to end: {system.modes} modes, {loop_run.frames} frames after "
-        f"{loop_run.settle_frames}, seed {loop_run.seed}",
+        f"End to end, Strehl ratio at {system.imaging_wavelength_um:g} um: {system.modes} modes, "
+        f"{loop_run.frames} frames after {loop_run.settle_frames}, seed {loop_run.seed}",
         _run_facts(loop_run, design, calibration, gain),
     )
     if unread := unread_sensors(design):
