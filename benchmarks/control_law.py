@@ -17,18 +17,18 @@ from lbt_synth.models.resonance_spectrum import coefficients
 
 COS, SIN = np.cos(np.radians(30)), np.sin(np.radians(30))
 ROTATION = np.array([[COS, -SIN], [SIN, COS]])
-GOOD = ("pure integrator", 0, "diagonal", (1, 1))
+GOOD = ("integrator", 0, "diagonal", (1, 1))
 EXPECTED = {
     "as given": GOOD,
-    "opposite sign": ("pure integrator", 0, "diagonal", (-1, -1)),
-    "swapped axes": ("pure integrator", 0, "swapped", (1, 1)),
-    "rotated by 30 degrees": ("pure integrator", 0, "general", (0, 0)),
+    "opposite sign": ("integrator", 0, "diagonal", (-1, -1)),
+    "swapped axes": ("integrator", 0, "swapped", (1, 1)),
+    "rotated by 30 degrees": ("integrator", 0, "general", (0, 0)),
     "1000 times too large": GOOD,
     "half": GOOD,
-    "2 frames early": ("pure integrator", -2, "diagonal", (1, 1)),
-    "1 frame early": ("pure integrator", -1, "diagonal", (1, 1)),
-    "1 frame late": ("pure integrator", 1, "diagonal", (1, 1)),
-    "2 frames late": ("pure integrator", 2, "diagonal", (1, 1)),
+    "2 frames early": ("integrator", -2, "diagonal", (1, 1)),
+    "1 frame early": ("integrator", -1, "diagonal", (1, 1)),
+    "1 frame late": ("integrator", 1, "diagonal", (1, 1)),
+    "2 frames late": ("integrator", 2, "diagonal", (1, 1)),
     "increments": ("proportional", 0, "diagonal", (1, 1)),
     "another night": ("none",),
     "clipped, 10 % of the frames": GOOD,

@@ -18,7 +18,14 @@ from pathlib import Path
 from statistics import median, quantiles
 
 import lbt_synth as lbt
-from lbt_synth.report.explore.exploration import explore, fulfil, judge, new_view, show_design
+from lbt_synth.report.explore.exploration import (
+    explore,
+    judge,
+    move,
+    moved_knobs,
+    new_view,
+    show_design,
+)
 
 sys.path.insert(0, "tests")  # what opens the page is what the tests use
 
@@ -46,7 +53,7 @@ def processor(path: Path, method: str) -> None:
     wish = method, {"gain": 0.9, "noise": 20.0}
     view = new_view(exploration, *wish)
     steps = {
-        "configuration": lambda: fulfil(*wish, exploration.knobs, start),
+        "configuration": lambda: move(start, method, moved_knobs(exploration, *wish)),
         "certified design": lambda: view.config.design(view.request),
         "what is shown": lambda: show_design(view.design, view.config, start, 0.0),
         "verdict": lambda: judge(view),

@@ -14,7 +14,6 @@ CASES = {
         1,
     ),
     "a module that is skipped": ("import pytest\npytest.importorskip('no_such_package')", None),
-    "no test at all": ("", 5),
 }
 
 

@@ -42,8 +42,9 @@ _SHARED = """
   wavelength | --wavelength-um | float | of Strehl ratios (default: the file's, or 2.2)
   target | --for | @targets nargs:? meta:NAME dest:target required target | the program
         that loads the file; without NAME, list what each computes
-  facts
-    > what the file does not say
+  reading
+    > reading the record: what its file does not say, and what its commands need, in this order,
+        to be those that the mirror followed; what lbt-synth telemetry -o writes says all of it
     --kind | closed-loop/open-loop/spectrum
     --frame-rate-hz | float | frame rate [Hz]
     --delay-frames | float | total delay [frames]
@@ -56,7 +57,7 @@ _SHARED = """
     --commands | | another file, with the commands
     --columns | nargs:+ meta:ROLE=NAME | by name or number, as measurements=tip,tilt times=
     --axes | int nargs:+ | which of several columns or modes, from 0
-    > what the commands need: in this order, to be those that the mirror followed
+    --sensor-gain | float nargs:+ | sensor gain that is known, of both axes or of each
     --command-increments | switch | they are increments: add them up
     --command-shift-frames | int =0 | frames by which they move to later frames
     --swap-axes | switch | exchange those of the two axes
@@ -66,9 +67,8 @@ _SHARED = """
   series
     file | | telemetry, or FITS, NPY, NPZ or CSV with what a loop measured and commanded, or an
         open-loop series (identify: or a spectrum)
-    facts
+    reading
     > what is known beforehand
-    --sensor-gain | float nargs:+ | sensor gain, of both axes or of each
     --noise-nm | float nargs:+ | noise per frame of the sensor [nm], beside a spectrum without
     --lines-hz | float nargs:+ | frequencies of vibrations [Hz]
     --lines-error-hz | float =0.1 | standard error of --lines-hz [Hz]
@@ -82,6 +82,12 @@ _SHARED = """
     --accept-record | switch | go on although the commands do not reach the measurements as given
     --figure | | figure to write (default: the output's name, .png)
     --no-figure | switch | write no figure
+  accelerometers
+    > accelerometers
+    --accelerometers | | NPY or CSV with one column per channel and one row per frame of the record
+    --accelerometer-rate-hz | float | their rate [Hz] (default: the file's, or the frame rate)
+    --acceleration-unit | @accelerations meta:UNIT | m/s2, mm/s2, um/s2, g, mg (default: of
+        the headings, else m/s2)
 """
 _TABLE = """
 start: a configuration to begin with
@@ -181,23 +187,20 @@ prove: what a gain file holds, and whether it is true
   verify | design | Recompute the certificate of a gain file.
     gain
 records: from what a loop recorded to a model and a design
-  telemetry | telemetry | Show what a telemetry file holds, and write it in another format.
-    file | | telemetry (.fits or .npz; FITS of the AOT standard, too)
-    unit
+  telemetry | telemetry | Show what telemetry or a record holds, and write it as telemetry.
+    file | | telemetry, or a record of series (FITS, NPY, NPZ or CSV)
+    reading
+    >
     -o --output | | file to write (.fits, .npz or .aot.fits)
     --format | fits/npz/aot | of the file to write (default: its ending)
     --precision | float64/float32 | of the series written (default float64)
   identify | records | Identify turbulence, vibrations, noise and sensor gain from a record.
-    record
-    > accelerometers
-    --accelerometers | | NPY or CSV with one column per channel and one row per frame of the record
-    --accelerometer-rate-hz | float | their rate [Hz] (default: the file's, or the frame rate)
-    --acceleration-unit | @accelerations meta:UNIT | m/s2, mm/s2, um/s2, g, mg (default: of
-        the headings, else m/s2)
+    record accelerometers
     >
     -o --output | required | configuration to write (.yaml)
   auto | records | Go from a record to a gain file: identify, design, certify, test on unseen data.
-    record
+    record accelerometers
+    >
     --method | @record_methods | default: kalman, unless another quick one leaves less
     --gamma-ratio | float | bound of the norm as a multiple of the least (default 1.2)
     --model | | configuration to write (default: the output's name, .yaml)
@@ -222,9 +225,8 @@ at the telescope: a gain file in another program
         certificate; pyrtc: folder
   rehearse | targets | Run a gain file in the arithmetic of another program, in the loop.
     file | nargs:? meta:record | what a loop recorded (default: a draw of the file's truth)
-    gain target facts
+    gain target reading
     >
-    --sensor-gain | float | sensor gain of the record (default: the one that the gain file assumes)
     stroke
     --frames | int | frames to draw where there is no record (default 8000)
     --seed | int =1 | seed of what is drawn

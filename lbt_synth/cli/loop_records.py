@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lbt_synth.cli.arguments import given_options
+from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.output import Report
 from lbt_synth.config import identified_config
 from lbt_synth.config.write import RAISED, config_text, require_writable_facts
@@ -45,6 +45,11 @@ _FACTS = (  # that a file may not hold
     *("delay_frames", "unit", "command_unit", "diameter_m", "obstruction"),
     *("axes", "averages", "commands"),
 )
+_READING = (  # options that say how a record is read
+    *_FACTS,
+    *("kind", "frame_rate_hz", "columns", "sensor_gain", "command_increments", "swap_axes"),
+    *("command_shift_frames", "command_sign", "command_matrix", "command_scale"),
+)
 
 
 def read_record(
@@ -67,6 +72,11 @@ def require_series(record: LoopRecord | SpectrumRecord, what: str) -> LoopRecord
     return record
 
 
+def is_read_anew(arguments: Namespace) -> bool:
+    """Return whether the command line says anything about how a record is read."""
+    return any(getattr(arguments, name) not in (None, False, 0) for name in _READING)
+
+
 def load_series(
     arguments: Namespace, axes: Sequence[int] | None = None
 ) -> LoopRecord | SpectrumRecord:
@@ -82,17 +92,7 @@ def load_series(
         columns=_parse_columns(arguments.columns),
         **facts,
     )
-    repair = _given_repair(arguments)
-    if not repair.options:
-        return record
-    if isinstance(record, SpectrumRecord):
-        raise ProblemError(f"a spectrum has no commands; leave {repair.options} out.")
-    return repair_commands(record, repair)
-
-
-def _given_repair(arguments: Namespace) -> CommandRepair:
-    """Return what the command line says that the commands need."""
-    return CommandRepair(
+    repair = CommandRepair(
         increments=arguments.command_increments,
         shift_frames=arguments.command_shift_frames,
         swap_axes=arguments.swap_axes,
@@ -100,29 +100,40 @@ def _given_repair(arguments: Namespace) -> CommandRepair:
         matrix=tuple(arguments.command_matrix or ()),
         scale=arguments.command_scale or 1.0,
     )
+    if isinstance(record, SpectrumRecord):
+        if repair.options:
+            raise ProblemError(f"a spectrum has no commands; leave {repair.options} out.")
+        return record
+    options = repair.options
+    if arguments.command_scale is not None and not repair.scales:
+        options = f"{options} --command-scale 1".strip()
+    return replace(
+        repair_commands(record, repair) if repair.options else record,
+        read_with=" ".join(filter(None, (record.read_with, options))),
+        stated_gain=tuple(arguments.sensor_gain or record.stated_gain),
+    )
 
 
-def is_scale_known(arguments: Namespace) -> bool:
-    """Return whether the command line says at which size commands were recorded."""
-    return arguments.command_scale is not None or arguments.command_matrix is not None
+def is_scale_known(record: LoopRecord) -> bool:
+    """Return whether somebody said at which size commands were recorded."""
+    return "--command-scale" in record.read_with or "--command-matrix" in record.read_with
 
 
 def judge_record(arguments: Namespace, record: LoopRecord) -> tuple[str, ...]:
     """Refuse a record whose commands do not reach its measurements; return notes on others."""
     if record.commands is None:
         return ()
-    verdict = explain_commands(record, sensor_gain=arguments.sensor_gain)
+    verdict = explain_commands(record, sensor_gain=record.stated_gain or None)
     if not arguments.accept_record:
         verdict.require_accepted()
     return (*verdict.notes, *(f"warning: it is assumed that {word}" for word in verdict.overruled))
 
 
-def with_repair(arguments: Namespace, made: RecordedDesign) -> RecordedDesign:
+def with_repair(record: LoopRecord, made: RecordedDesign) -> RecordedDesign:
     """Return what was made of a record, with the repair of its commands as an assumption."""
-    options = _given_repair(arguments).options
-    if not options:
+    if not record.read_with:
         return made
-    words = f"the commands of the record were read with {options}"
+    words = f"the commands of the record were read with {record.read_with}"
     design = replace(made.design, assumptions=(words, *made.design.assumptions))
     return replace(made, design=design)
 
@@ -192,7 +203,7 @@ def identification_options(
         return options | {"noise_nm": arguments.noise_nm}
     if arguments.noise_nm is not None:
         raise ProblemError("--noise-nm is for spectra; the noise of a series is found in it.")
-    return options | {"sensor_gain": arguments.sensor_gain}
+    return options | {"sensor_gain": record.stated_gain or None}
 
 
 def _expected_lines(arguments: Namespace) -> FloatArray:
@@ -215,6 +226,15 @@ def _expected_lines(arguments: Namespace) -> FloatArray:
             )
         lines += [(row[0], np.nansum(row[1:])) for row in table]
     return np.reshape(lines, (-1, 2))
+
+
+def require_comparable(arguments: Namespace, record: LoopRecord | SpectrumRecord) -> None:
+    """Refuse accelerometers beside a spectrum, and what is said of none."""
+    if arguments.accelerometers is None:
+        for option in given_options(arguments, "accelerometer_rate_hz", "acceleration_unit"):
+            raise ProblemError(f"{option_name(option)} goes with --accelerometers.")
+    elif isinstance(record, SpectrumRecord):
+        raise ProblemError("accelerometers are compared with the recorded series; got a spectrum.")
 
 
 def read_accelerations(arguments: Namespace, record: LoopRecord) -> Readings:
@@ -382,17 +402,17 @@ def marked_note(note: str) -> str:
 def _whiteness_note(axis: IdentifiedAxis) -> str:
     test = axis.whiteness
     if test.white:
-        return f"innovations are white (p = {test.p_value:.2g}, {test.correlation_p_value:.2g})."
+        return f"innovations are white (p = {test.p_value:.2g})."
     return (
         f"innovations are not white: their cumulative power is off by up to "
-        f"{100 * test.deviation:.2g} % (p = {test.p_value:.1g}, of the autocorrelation "
-        f"{test.correlation_p_value:.1g}). The model leaves something out; see the figure."
+        f"{100 * test.deviation:.2g} % (p = {test.p_value:.1g}). The model leaves something out; "
+        "see the figure."
     )
 
 
 def _axis_record(axis: IdentifiedAxis) -> dict[str, Any]:
     turbulence, whiteness = axis.turbulence, axis.whiteness
-    tests = ("deviation", "p_value", "correlation_p_value", "white")
+    tests = ("deviation", "p_value", "white")
     noise = ("noise_nm", "noise_error_nm", "noise_correlation", "noise_correlation_error")
     own = (*noise, "sensor_gain", "sensor_gain_error", "sensor_gain_note")
     return {

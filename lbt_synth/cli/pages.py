@@ -5,16 +5,12 @@ from __future__ import annotations
 import re
 import sys
 from argparse import Namespace
-from collections.abc import Mapping
 from pathlib import Path
 
 from lbt_synth.cli.loop_inputs import load_designs, load_shown, named_difference_notes
 from lbt_synth.cli.output import Report
-from lbt_synth.config import Config
-from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.report import design_page, design_report, write_page
-from lbt_synth.report.designs.page import sensors_page
 from lbt_synth.report.designs.report import WORDS, design_facts, good_range, verdict
 from lbt_synth.report.explore.exploration import explore, new_view
 from lbt_synth.report.page.html import require_page_names
@@ -36,8 +32,6 @@ def run_report(arguments: Namespace) -> Report:
     config = load_shown(arguments)
     designs = load_designs(arguments.gains, any_sensors=True)
     files = dict(zip(designs, arguments.gains, strict=True))
-    if any(design.other_sensors for design in designs.values()):
-        return _report_sensors(arguments, config, designs, files)
     assessed = design_report(config, designs, gain_files=files)
     page = design_page(assessed, title=arguments.title)
     written = write_page(page, arguments.output, pdf=arguments.pdf)
@@ -63,30 +57,8 @@ def run_report(arguments: Namespace) -> Report:
         },
         verdict=[verdict(assessed)],
         tables=[row_table(f"Designs in the loop of {config.source.name}", rows)],
-        notes=[f"note: {one.name}: {n}" for one in assessed.assessments for n in one.notes],
+        notes=named_difference_notes(config, designs),
     )
-    report.note_files(written)
-    return report
-
-
-def _report_sensors(
-    arguments: Namespace, config: Config, designs: Mapping[str, Design], files: Mapping[str, str]
-) -> Report:
-    """Write the page of designs of several sensors, which have no one transfer function."""
-    several = [name for name, design in designs.items() if design.other_sensors]
-    if len(several) < len(designs):
-        alone = ", ".join(name for name in designs if name not in several)
-        raise ProblemError(
-            f"a page is of designs of several sensors, or of the loop's own sensor alone; got "
-            f"{', '.join(several)} of the first kind and {alone} of the second. lbt-synth limits "
-            "takes both."
-        )
-    page, study = sensors_page(config, designs, gain_files=files, title=arguments.title)
-    written = write_page(page, arguments.output, pdf=arguments.pdf)
-    report = Report()
-    caption = f"Designs in the loop of {config.source.name}; {config.imaging.label}"
-    report.add_rows("rows", caption, study.rows, hidden=("worst_nm", "above_band_limit_percent"))
-    report.notes += named_difference_notes(config, designs)
     report.note_files(written)
     return report
 

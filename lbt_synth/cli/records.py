@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from lbt_synth import identification
 from lbt_synth.cli import loop_records
-from lbt_synth.cli.arguments import given_options, option_name
+from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs
 from lbt_synth.cli.output import BRIEF_ROWS, Report, say_checks
 from lbt_synth.cli.streams import count_progress
@@ -17,7 +17,7 @@ from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import IdentifiedModel, LoopRecord, SpectrumRecord
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.identification.fit.identified_model import model_tables
-from lbt_synth.loop import Imaging, close_loop, loop_margins
+from lbt_synth.loop import Imaging, loop_margins
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import json_record
@@ -36,7 +36,7 @@ def run_identify(arguments: Namespace) -> Report:
     places = loop_records.find_places(arguments, arguments.output)
     record = loop_records.read_record(arguments)
     choose_unit(arguments, record.diameter_m)
-    _require_comparable(arguments, record)
+    loop_records.require_comparable(arguments, record)
     options = loop_records.identification_options(arguments, record)
     doubts: tuple[str, ...] = ()
     if isinstance(record, SpectrumRecord):  # it does not hold the timing of the loop
@@ -63,15 +63,6 @@ def run_identify(arguments: Namespace) -> Report:
     report.notes += [loop_records.marked_note(doubt) for doubt in doubts]
     loop_records.write_files(report, places, arguments, record, model, accelerometers=transfers)
     return report
-
-
-def _require_comparable(arguments: Namespace, record: LoopRecord | SpectrumRecord) -> None:
-    """Refuse accelerometers beside a spectrum, and what is said of none."""
-    if arguments.accelerometers is None:
-        for option in given_options(arguments, "accelerometer_rate_hz", "acceleration_unit"):
-            raise ProblemError(f"{option_name(option)} goes with --accelerometers.")
-    elif isinstance(record, SpectrumRecord):
-        raise ProblemError("accelerometers are compared with the recorded series; got a spectrum.")
 
 
 def _say_model(report: Report, model: IdentifiedModel, record: LoopRecord | SpectrumRecord) -> None:
@@ -105,6 +96,10 @@ def run_auto(arguments: Namespace) -> Report:
         loop_records.read_record(arguments, LEAST_SECONDS), "auto tests its design on"
     )
     choose_unit(arguments, record.diameter_m)
+    loop_records.require_comparable(arguments, record)
+    channels, values, notes = None, None, tuple[str, ...]()
+    if arguments.accelerometers is not None:
+        channels, values, notes = loop_records.read_accelerations(arguments, record)
     imaging = loop_records.record_imaging(arguments, record)
     with count_progress(total=_STEPS, what="identifying and designing") as count:
         made = identification.design_from_record(
@@ -113,11 +108,13 @@ def run_auto(arguments: Namespace) -> Report:
             gamma_ratio=arguments.gamma_ratio,
             imaging=imaging,
             accept_record=arguments.accept_record,
-            command_scale_known=loop_records.is_scale_known(arguments),
+            command_scale_known=loop_records.is_scale_known(record),
+            accelerations=values,
+            channels=channels,
             progress=count,
             **loop_records.identification_options(arguments, record),
         )
-    made = loop_records.with_repair(arguments, made)
+    made = loop_records.with_repair(record, made)
     design, table = made.design, made.held_out
     report = Report(data={"source": str(arguments.file), "method": design.method})
     report.add_rows(
@@ -129,7 +126,11 @@ def run_auto(arguments: Namespace) -> Report:
     _say_held_out(report, made, record, imaging)
     loop_records.add_record(report, record)
     loop_records.add_model(report, made.model)
-    loop = close_loop(made.model.hardware, design.controller)
+    report.notes += [f"note: {note}." for note in notes]
+    if made.channels:
+        title = "Accelerometers: residual on the second half of the record"
+        report.add_rows("accelerometers", title, list(made.channels))
+    loop = design.close(made.model.hardware)
     report.verdict += [
         say_checks(design.certificate.checks),
         f"The loop has a modulus margin of {loop_margins(loop).modulus:.3f}.",
@@ -172,7 +173,7 @@ def _say_held_out(
 
 def run_diagnose(arguments: Namespace) -> Report:
     """Diagnose a record, with a design to try on it if one is given, and write the page."""
-    from lbt_synth.identification.diagnosis.rows import live_axes  # with it come the methods
+    from lbt_synth.identification.diagnosis import live_axes  # with it come the methods
     from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
 
     if arguments.output is not None:
@@ -216,7 +217,7 @@ def _load_series(arguments: Namespace, axes: list[int] | None = None) -> LoopRec
 
 def _diagnosis_data(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return a diagnosis for JSON; what could not be said is null or empty."""
-    from lbt_synth.identification.diagnosis.rows import disturbance_lines
+    from lbt_synth.identification.diagnosis import disturbance_lines
 
     model, law, loop = diagnosis.model, diagnosis.law, diagnosis.loop
     commands = diagnosis.commands

@@ -157,7 +157,7 @@ def _draw(one: _Run) -> Any:
         return sensor_failure_figure(
             one.simulation, title=title, segments=places, exact_nm=exact_nm
         )
-    title += ": the first second above, mean spectrum of all runs below"
+    title += ": the first second, and spectra of all runs"
     return simulation_figure(one.simulation, title=title)
 
 

@@ -33,7 +33,7 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import listing_text
-from lbt_synth.validation import FloatArray, integer, number
+from lbt_synth.validation import FloatArray, integer
 
 _OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps", "loss")
 _FRAMES = 8000  # of a drawn disturbance
@@ -188,8 +188,8 @@ def _recorded(arguments: Namespace, design: Design) -> _Series:
     require_length(record, frames=_FEWEST, seconds=0)
     choose_unit(arguments, record.diameter_m)
     gains = _assumed_gains(design, record.axes)
-    if arguments.sensor_gain is not None:
-        gains = np.full(record.axes, number(arguments.sensor_gain, "--sensor-gain", above=0))
+    if record.stated_gain:
+        gains = record.known_gains(record.stated_gain)
     start, stop = max(record.stretches(), key=lambda pair: pair[1] - pair[0])
     commands = record.commands
     ran = None

@@ -1,4 +1,4 @@
-"""The command telemetry: what a telemetry file holds, and other formats of it."""
+"""The command telemetry: what telemetry or a record holds, and telemetry written of it."""
 
 from __future__ import annotations
 
@@ -7,12 +7,15 @@ from dataclasses import asdict
 
 import numpy as np
 
+from lbt_synth.cli import loop_records
+from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report, write_telemetry
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry, load_telemetry
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.files.telemetry.telemetry import LAYERS
+from lbt_synth.identification.records.from_file import is_telemetry, telemetry_of_record
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
 from lbt_synth.storage.rows import Facts, fact, fact_table, facts, json_record, json_units
@@ -21,17 +24,25 @@ from lbt_synth.validation import FloatArray
 
 
 def run(arguments: Namespace) -> Report:
-    """Show a telemetry file, and write it in another format."""
+    """Show telemetry, or a record as telemetry, and write it."""
     output = arguments.output
     if output is None and (arguments.format or arguments.precision):
         raise ProblemError("--format and --precision are of what -o writes; give -o FILE.")
     if output is not None:
         require_telemetry_name(output, arguments.format)
-        require_writable(output, inputs=[arguments.file])
-    telemetry = load_telemetry(arguments.file)
+        named = given_options(arguments, "file", "commands")
+        require_writable(output, inputs=list(named.values()))
+    notes: list[str] = []
+    if is_telemetry(arguments.file) and not loop_records.is_read_anew(arguments):
+        telemetry = load_telemetry(arguments.file)
+    else:
+        record = loop_records.require_series(loop_records.load_series(arguments), "telemetry holds")
+        telemetry = telemetry_of_record(record)
+        notes = [record.health.summary(), *(f"note: {note}" for note in record.health.notes)]
     choose_unit(arguments, telemetry.diameter_m)
     report = _describe_telemetry(telemetry)
     report.data["file"] = arguments.file
+    report.notes += notes
     if "timing" not in telemetry.metadata:  # of another program
         report.notes.append(telemetry.convention)
     if output is not None:
@@ -122,4 +133,4 @@ def _loop_facts(telemetry: Telemetry) -> Facts:
 
 def _rms(series: FloatArray) -> float:
     """Return the root of the mean over frames of the sum of squares over columns."""
-    return float(np.sqrt(np.sum(np.mean(series**2, axis=0))))
+    return float(np.sqrt(np.sum(np.nanmean(series**2, axis=0))))

@@ -21,5 +21,6 @@ from .mixed import mixed as mixed
 from .output_feedback import h2_controller as h2_controller
 from .output_feedback import hinf_controller as hinf_controller
 from .output_feedback import mixed_controller as mixed_controller
+from .predictor import PredictorDesign as PredictorDesign
 from .result import Design as Design
 from .result import SolverReport as SolverReport

@@ -135,9 +135,12 @@ def _pack_parameters(name: str, parameters: tuple[Controller, ...]) -> DesignRec
 
 
 def _unpack_parameters(name: str, record: DesignRecord) -> tuple[Controller, ...]:
-    modes = len(record.meta["specifications"])
-    direct = np.zeros((1, 1))
-    return tuple(record.controller(f"YOULA{mode + 1}_", D=direct) for mode in range(modes))
+    arrays = record.arrays
+    count = sum(key.startswith("YOULA") and key.endswith("_A") for key in arrays)
+    prefixes = [f"YOULA{place + 1}_" for place in range(count)]
+    sizes = [(len(arrays[f"{at}C"]), arrays[f"{at}B"].shape[1]) for at in prefixes]
+    pairs = zip(prefixes, sizes, strict=True)
+    return tuple(record.controller(prefix, D=np.zeros(size)) for prefix, size in pairs)
 
 
 def _pack_witness(name: str, witness: Witness | None) -> DesignRecord:

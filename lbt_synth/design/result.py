@@ -270,7 +270,8 @@ class Design(Summarised, ABC):
             said = Facts((*self.CLAIMS, *self.DERIVED), facts.values)
             return Summary(tables=[without_units(fact_table("Design", said, passed))], notes=notes)
         loop = close_loop(self.hardware, self)
-        margins = [loop_margins(loop)] if loop.is_stable and not self.other_sensors else []
+        alone = not loop.feedback().reads_others
+        margins = [loop_margins(loop)] if loop.is_stable and alone else []
         return Summary(
             tables=[fact_table("Design", facts, *margins, passed, only=_BRIEFLY)],
             notes=notes,

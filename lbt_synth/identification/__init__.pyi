@@ -2,14 +2,13 @@ from .accelerometers.transfers import accelerometer_transfers as accelerometer_t
 from .auto import design_from_record as design_from_record
 from .commands.control_law import fit_control_law as fit_control_law
 from .commands.repair import CommandRepair as CommandRepair
-from .diagnosis.diagnosis import Diagnosis as Diagnosis
-from .diagnosis.diagnosis import diagnose as diagnose
+from .diagnosis import Diagnosis as Diagnosis
+from .diagnosis import diagnose as diagnose
 from .fit.identified_model import IdentifiedAxis as IdentifiedAxis
 from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identify import identify as identify
 from .prediction.comparison import PredictionTable as PredictionTable
-from .prediction.comparison import least_squares_predictor as least_squares_predictor
 from .prediction.comparison import prediction_against_data as prediction_against_data
 from .prediction.residual import ResidualEstimate as ResidualEstimate
 from .prediction.residual import replayed_residual as replayed_residual

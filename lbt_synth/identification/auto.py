@@ -10,14 +10,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design import Design
-from lbt_synth.errors import CertificateError, NumericalError, ProblemError, SynthesisError
+from lbt_synth.design import Design, PredictorDesign
+from lbt_synth.design.result import require_hardware
+from lbt_synth.errors import CertificateError, NumericalError, SynthesisError
+from lbt_synth.identification.accelerometers.readings import Channels, channels_beside
 from lbt_synth.identification.commands.repair import CommandRepair
 from lbt_synth.identification.commands.verdict import (
     could_have_run,
@@ -28,7 +31,17 @@ from lbt_synth.identification.commands.verdict import (
 from lbt_synth.identification.fit.fitting import GAIN_STEP, PLAUSIBLE_GAINS, POSSIBLE_GAINS
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.fit.identify import OPEN_GAIN, identify
-from lbt_synth.identification.prediction.comparison import PredictionTable, compare_designs
+from lbt_synth.identification.prediction.comparison import (
+    PredictionTable,
+    compare_designs,
+    unseen_claims,
+)
+from lbt_synth.identification.prediction.regression import (
+    ChannelValue,
+    channel_values,
+    noisier,
+    regress,
+)
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
@@ -37,12 +50,11 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget, stable_sensor_gains
 from lbt_synth.methods.registry import (
     default_method,
-    gain_robust_method,
     method_named,
     record_methods,
 )
 from lbt_synth.methods.request import PlantInputs, design_request, option_owners
-from lbt_synth.models import LoopHardware, TipTiltPlant
+from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import FloatArray, choice, require_instance
@@ -50,6 +62,9 @@ from lbt_synth.validation import FloatArray, choice, require_instance
 _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
+DELAY_ERROR = 0.1  # frames, by which every design of a record may be off
+_MOST_NOISE = 10  # octaves of noise, by which a filter trusts its sensor no more
+_HALVINGS = 3  # of an octave: to a tenth of the noise that is assumed
 _MISFIT = 1.5  # factor by which a gain may be off where the model leaves something out
 
 
@@ -63,6 +78,7 @@ class RecordedDesign(Summarised):
     # residuals on the second half: what ran, a design from the first half, references
     held_out: PredictionTable
     name: str  # row of the design in held_out, the title of its method
+    channels: tuple[ChannelValue, ...] = ()  # what each accelerometer is worth, if they are read
     notes: tuple[str, ...]  # warnings about the design
 
     @property
@@ -89,6 +105,8 @@ def design_from_record(
     imaging: Imaging | None = None,
     accept_record: bool = False,
     command_scale_known: bool = False,
+    accelerations: ArrayLike | None = None,
+    channels: Sequence[str] | None = None,
     progress: Callable[[int], None] | None = None,
     **options: Any,
 ) -> RecordedDesign:
@@ -119,6 +137,11 @@ def design_from_record(
     command_scale_known : bool, optional
         The commands were recorded at the size that was applied. No record can tell; by default a
         design is also stable at half the sensor gain.
+    accelerations : (frames, channels) array_like, optional
+        Readings of accelerometers [m/s^2], a row per frame of the record: what the computer has
+        when it has the measurement of that row. NaN where one is missing. A predictor reads them.
+    channels : sequence of str, optional
+        Names of the channels; channel1, channel2, ... by default.
     progress : callable, optional
         Called with 1 after each of 3 steps.
     **options
@@ -159,6 +182,11 @@ def design_from_record(
     True
     """
     defaults = {} if gamma_ratio is None else {"gamma_ratio": gamma_ratio}
+    beside = None
+    if accelerations is not None:
+        require_instance(record, LoopRecord)
+        beside = channels_beside(record, accelerations, channels)
+        record = beside.within(record)
     seconds = _require_able(record, method, defaults)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
@@ -172,7 +200,7 @@ def design_from_record(
     names = quick_methods() if method is None else [method]
     requests = {name: {} if method else method_named(name).reference_options for name in names}
     held_out, designs = compare_designs(
-        record, half, requests, defaults=defaults, imaging=imaging or Imaging()
+        record, half, requests, defaults=defaults, imaging=imaging or Imaging(), channels=beside
     )
     if not designs:
         raise NumericalError(f"no design holds the loop: {'; '.join(held_out.notes)}.")
@@ -183,9 +211,12 @@ def design_from_record(
         notes.append(note)
     step(1)
     model = identify(record, start=half, **options)
+    predictor = None
+    if method_named(method).of_record:
+        predictor = _Predictor(record, half, model, beside)
     made, price = design_for_gains(
         model,
-        lambda assumed: _design(method, assumed, defaults),
+        predictor.design if predictor else partial(_design, method, model, defaults),
         allowed_gains(record, model) if finds_gain else None,
         command_scale_known=command_scale_known,
     )
@@ -196,19 +227,53 @@ def design_from_record(
         half_model=half,
         held_out=held_out,
         name=method_named(method).title,
+        channels=predictor.channel_values() if predictor else (),
         notes=(
             *notes,
             *price,
             *_compare_gains(model, half),
-            *note_drift(record, model.plant(), made.controller),
+            *note_drift(record, model.plant(), made),
             *_note_short(seconds, model),
         ),
     )
 
 
-def _design(method: str, model: IdentifiedModel, defaults: Mapping[str, Any]) -> Design:
-    """Return the design of a method for a model."""
-    inputs = PlantInputs(plant=model.plant(), design_defaults=defaults)
+class _Predictor:
+    """The predictors of a whole record; what they claim is what those of its first half leave."""
+
+    def __init__(
+        self,
+        record: LoopRecord,
+        half: IdentifiedModel,
+        model: IdentifiedModel,
+        channels: Channels | None,
+    ) -> None:
+        self._half, self._model = half, model
+        self._claims = partial(unseen_claims, record, half, channels=channels)
+        self._fit = partial(regress, record, channels=channels)
+        self._first, self._later = split_halves(record.stretches(), record.frames)
+        self._penalty = self._fit(model).penalty
+
+    def design(self, noise: float = 1.0) -> Design:
+        """Return the design that assumes a multiple of the model's noise."""
+        half = self._fit(self._half, stretches=self._first, noise=noise)
+        claims = self._claims(half.design(self._penalty))
+        return self._fit(self._model, noise=noise).design(self._penalty, **claims)
+
+    def channel_values(self) -> tuple[ChannelValue, ...]:
+        """Return what each channel is worth on the second half of the record."""
+        noise_nm2 = float(np.sum(np.array([axis.noise_nm for axis in self._half.axes]) ** 2))
+        past, unseen = (
+            self._fit(self._half, stretches=part) for part in (self._first, self._later)
+        )
+        return tuple(channel_values(past, unseen, self._penalty, noise_nm2))
+
+
+def _design(
+    method: str, model: IdentifiedModel, defaults: Mapping[str, Any], noise: float = 1.0
+) -> Design:
+    """Return the design of a method for a model, and a multiple of its noise."""
+    inputs = PlantInputs(plant=noisier(model, noise).plant(), design_defaults=defaults)
     return design_request(method, {}).build(inputs)
 
 
@@ -259,12 +324,16 @@ def _compare_gains(model: IdentifiedModel, half: IdentifiedModel) -> Iterator[st
             )
 
 
-def note_drift(record: LoopRecord, plant: TipTiltPlant, controller: Controller) -> Iterator[str]:
+def note_drift(
+    record: LoopRecord, plant: TipTiltPlant, controller: Controller | Design
+) -> Iterator[str]:
     """Yield a note on each axis whose offset and drift leave much beside its residual.
 
     The fit sees a drift in its lowest frequencies only, and an offset not at all. The filter sees
     both, and what it does not reject at zero frequency stays in the residual for ever.
     """
+    if isinstance(controller, Design) and controller.other_sensors:
+        return
     loop = close_loop(plant.hardware, controller)
     budget = residual_budget(loop, plant, frame_means=True)
     residual_nm = np.sqrt(np.diag(budget.total_nm2))
@@ -285,7 +354,7 @@ def note_drift(record: LoopRecord, plant: TipTiltPlant, controller: Controller) 
 def _note_short(seconds: float, model: IdentifiedModel) -> Iterator[str]:
     """Yield what a short record leaves open."""
     if seconds < _SHORT_SECONDS:
-        resolution_hz = max(axis.resolution_hz for axis in model.axes)
+        resolution_hz = max(axis.data.step_hz for axis in model.axes)
         yield (
             f"the record is short ({seconds:.3g} s): it does not tell lines less than "
             f"{resolution_hz:.2g} Hz apart from one. Half a minute shows more"
@@ -355,116 +424,119 @@ def _gains_between(start: float, end: float) -> FloatArray:
     return np.geomspace(start, end, int(np.ceil(abs(np.log(end / start)) / GAIN_STEP)) + 1)
 
 
-def unstable_gains(
-    hardware: LoopHardware, controller: Controller, gains: FloatArray
-) -> FloatArray | None:
-    """Return sensor gains within intervals (axes, 2) at which a loop is unstable.
+def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:
+    """Return sensor gains within intervals (axes, 2) at which the loop of a design is unstable.
 
-    Each corner of the box is tried, and all common factors on the gains of the hardware that its
-    sides allow: exact for axes that decouple. None if the loop is stable at all of them.
+    Each corner of the box is tried, and all common factors on the gains of the design that its
+    sides allow: exact for axes that decouple; both with the delay of the design, and at a tenth of
+    a frame from it. None if the loop is stable at all of them.
     """
-    for corner in product(*gains):
-        path = replace(hardware, sensor_matrix=np.diag(corner))
-        if not close_loop(path, controller).is_stable:
-            return np.array(corner)
-    assumed = np.diag(hardware.sensor)
+    loop = design.close(require_hardware(design, "an interval of gains")).feedback()
+    delay, assumed = loop.hardware.delay_frames, np.diag(loop.hardware.sensor)
     factors = gains / assumed[:, None]
-    low, high = stable_sensor_gains(hardware, controller)
-    for factor in (np.min(factors), np.max(factors)):
-        if not low < factor < high:
-            return np.asarray(factor * assumed)
+    for late in (0.0, DELAY_ERROR, -min(DELAY_ERROR, delay - 1)):
+        path = replace(loop.hardware, delay_frames=delay + late)
+        for corner in product(*gains):
+            turned = replace(path, sensor_matrix=np.diag(corner))
+            if not close_loop(turned, loop.controller).is_stable:
+                return np.array(corner)
+        low, high = stable_sensor_gains(path, loop.controller)
+        for factor in (np.min(factors), np.max(factors)):
+            if not low < factor < high:
+                return np.asarray(factor * assumed)
     return None
 
 
 def design_for_gains(
     model: IdentifiedModel,
-    design: Callable[[IdentifiedModel], Design],
+    design: Callable[[float], Design],
     allowed: FloatArray | None,
     *,
     command_scale_known: bool,
 ) -> tuple[Design, tuple[str, ...]]:
     """Return a design that is stable at all sensor gains that a record allows, and notes.
 
-    Its first assumption says which gains these are. Commands that were recorded at half their size
-    look like twice the sensor gain, and no record can tell; so unless the scale of the commands is
-    known, half of the gains are possible, and each axis may have those of both. Where the design
-    for the fitted gain is unstable at one of them, the best of the designs that assume another gain
-    takes its place, or a robust one.
+    ``design`` makes one that assumes a multiple of the model's noise. Its first assumption says
+    which gains are possible. Commands that were recorded at half their size look like twice the
+    sensor gain, and no record can tell; so unless the scale of the commands is known, half of the
+    gains are possible, and each axis may have those of both. Where the design is unstable at one of
+    them, or with a delay a tenth of a frame off, the one that assumes the least more noise and is
+    stable takes its place: the more noise, the less a filter trusts its sensor.
     """
-    usual = design(model)
-    if allowed is None:
-        return usual, ()
-    intervals = allowed
-    assumed = (
-        f"the sensor gain lies within {_in_words(allowed)}, as the record and its model allow; "
-        "the loop is stable at all of these"
-    )
-    if command_scale_known:
-        assumed += ". The commands were recorded at the size that was applied, as was stated"
-    else:
-        intervals = np.tile([allowed.min() / 2, allowed.max()], (len(allowed), 1))
-        assumed += " and at half of them, should the commands be recorded at half their size"
-        if np.ptp(allowed, axis=0).any():
-            assumed += ", and each axis at those of both, because they differ"
-    bad = unstable_gains(model.hardware, usual.controller, intervals)
+    usual, assumed = design(1.0), list[str]()
+    intervals = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1)
+    if allowed is not None:
+        intervals = allowed
+        text = (
+            f"the sensor gain lies within {_in_words(allowed)}, as the record and its model allow; "
+            "the loop is stable at all of these"
+        )
+        if command_scale_known:
+            text += ". The commands were recorded at the size that was applied, as was stated"
+        else:
+            intervals = np.tile([allowed.min() / 2, allowed.max()], (len(allowed), 1))
+            text += " and at half of them, should the commands be recorded at half their size"
+            if np.ptp(allowed, axis=0).any():
+                text += ", and each axis at those of both, because they differ"
+        assumed.append(text)
+    bad = unstable_gains(usual, intervals)
     if bad is None:
-        return replace(usual, assumptions=(assumed, *usual.assumptions)), ()
-    safe = _assume_another(model, design, intervals) or _robust(model, intervals)
+        return replace(usual, assumptions=(*assumed, *usual.assumptions)), ()
+    safe = _assume_noise(design, intervals)
+    advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
     if safe is None:
         gain = ", ".join(f"{value:.3g}" for value in bad)
-        advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
         raise CertificateError(
-            f"the loop of the design is unstable at the sensor gain {gain}, and the record allows "
-            f"{_in_words(intervals)}. Record with a higher loop gain, look for jumps in the "
-            f"record, give the sensor gain{advice}."
+            f"the loop of the design is unstable at the sensor gain {gain}, or there with a delay "
+            f"{DELAY_ERROR:g} frames off, and the record allows {_in_words(intervals)}. Record "
+            f"with a higher loop gain, look for jumps in it, give the sensor gain{advice}."
         )
     note = (
-        f"to be stable at sensor gains of {_in_words(intervals)}, the design leaves "
-        f"{nm_text(_residual_nm(safe, model))} in the model; without that it would leave "
-        f"{nm_text(_residual_nm(usual, model))}"
+        f"to be stable at sensor gains of {_in_words(intervals)}, and with a delay up to "
+        f"{DELAY_ERROR:g} frames off, the design leaves {nm_text(_residual_nm(safe, model))}; "
+        f"without that it would leave {nm_text(_residual_nm(usual, model))}"
     )
     wanted = list[str]()
-    if not command_scale_known:
+    if allowed is not None and not command_scale_known:
         wanted.append("--command-scale 1 if the commands were recorded at the size applied")
-    if any((axis.sensor_gain_error or 0.0) > OPEN_GAIN * axis.sensor_gain for axis in model.axes):
+    if allowed is not None and np.any(allowed[:, 1] > (1 + DIFFERENT * OPEN_GAIN) * allowed[:, 0]):
         wanted.append("--sensor-gain, which the record leaves open")
     if wanted:
         note = f"warning: {note}. Give {' or '.join(wanted)}"
-    return replace(safe, assumptions=(assumed, *safe.assumptions)), (note,)
+    return replace(safe, assumptions=(*assumed, *safe.assumptions)), (note,)
 
 
-def _assume_another(
-    model: IdentifiedModel, design: Callable[[IdentifiedModel], Design], intervals: FloatArray
+def _assume_noise(design: Callable[[float], Design], intervals: FloatArray) -> Design | None:
+    """Return the design of least more noise that is stable at all gains; None if there is none."""
+    stable, low, high = None, 0.0, 1.0  # binary logarithms of factors
+    while stable is None and high <= _MOST_NOISE:
+        stable = _if_stable(design, 2.0**high, intervals)
+        low, high = (low, high) if stable else (high, high + 1)
+    for _ in range(_HALVINGS if stable else 0):
+        middle = (low + high) / 2
+        nearer = _if_stable(design, 2.0**middle, intervals)
+        low, high = (low, middle) if nearer else (middle, high)
+        stable = nearer or stable
+    return stable
+
+
+def _if_stable(
+    design: Callable[[float], Design], factor: float, intervals: FloatArray
 ) -> Design | None:
-    """Return the better of the designs for the nearest gains, below and above, stable at all."""
-    fitted, stable = float(np.exp(np.mean(np.log(model.sensor_gains)))), []
-    for end in (float(np.min(intervals)), float(np.max(intervals))):
-        for gain in _gains_between(fitted, end)[1:].tolist():
-            axes = tuple(replace(axis, sensor_gain=gain) for axis in model.axes)
-            with suppress(SynthesisError):
-                careful = design(replace(model, axes=axes))
-                if unstable_gains(model.hardware, careful.controller, intervals) is None:
-                    stable.append(careful)
-                    break
-    return min(stable, key=lambda careful: _residual_nm(careful, model), default=None)
+    """Return the design that assumes more noise, if there is one and it is stable at all gains."""
+    with suppress(SynthesisError):
+        careful = design(factor)
+        if unstable_gains(careful, intervals) is None:
+            return careful
+    return None
 
 
 def _residual_nm(design: Design, model: IdentifiedModel) -> float:
-    """Return what a design leaves in a model; infinite where its loop is unstable."""
+    """Return what a design claims of its record, or else leaves in a model; inf if unstable."""
+    if isinstance(design, PredictorDesign):
+        return design.expected_residual_nm or np.nan
     loop = close_loop(model.hardware, design.controller)
     return residual_budget(loop, model.truth()).rms_nm if loop.is_stable else float("inf")
-
-
-def _robust(model: IdentifiedModel, intervals: FloatArray) -> Design | None:
-    """Return a design by robust synthesis over the gains; None where there is none."""
-    factors = intervals / np.array(model.sensor_gains)[:, None]
-    gains = float(np.min(factors)), float(np.max(factors))
-    inputs = PlantInputs(plant=model.plant(), sensor_gains=gains)
-    with suppress(SynthesisError, ProblemError):  # a plant without lines has no such design
-        design = design_request(gain_robust_method(), {}).build(inputs)
-        if unstable_gains(model.hardware, design.controller, intervals) is None:
-            return design
-    return None
 
 
 def _in_words(intervals: FloatArray) -> str:

@@ -219,7 +219,7 @@ def mode_variances(design: Design, loop: ClosedLoop, rows: slice) -> FloatArray:
     """Variance of some outputs of the loop, one each, under what the design is for."""
     s, rate = loop.system, loop.hardware.frame_rate_hz
     seen = replace(loop, system=replace(s, C=s.C[rows], D=s.D[rows]))
-    n, q = loop.hardware.modes, loop.hardware.n_measurements
+    n, q = loop.hardware.modes, loop.controller.D.shape[-1]
     if design.mode_specifications:
         return _shaped_variances(design, seen)
     drive = np.sqrt(1 - POLE**2)
@@ -266,11 +266,13 @@ def _rounding_left(
     gain: float,
 ) -> FloatArray:
     """Variance of the residual that noise in the sums leaves, one per mode."""
-    n, q = hardware.modes, hardware.n_measurements
-    # the noise is measured by a sensor of its own, which sees no phase
-    blind = np.vstack([hardware.sensor, np.zeros((variance.size, n))])
+    n, q = hardware.modes, written.D.shape[-1]
+    # the noise is measured by a sensor of its own, which sees no phase, as channels see none
+    silent = q - hardware.n_measurements + variance.size
+    blind = np.vstack([hardware.sensor, np.zeros((silent, n))])
     both = replace(written, B=np.hstack([written.B, entry.B]), D=np.hstack([written.D, entry.D]))
-    s = close_loop(replace(hardware, sensor_matrix=blind), both, sensor_gain=gain).system
+    path = replace(hardware.own_sensor_alone(), sensor_matrix=blind)
+    s = close_loop(path, both, sensor_gain=gain).system
     B, C, D = s.B[:, n + q :] * np.sqrt(variance), s.C[:n], s.D[:n, n + q :] * np.sqrt(variance)
     return output_variances(C, D, stationary_root(s.A, B))
 
@@ -348,7 +350,7 @@ def rehearsal_error(design: Design, other: Any) -> float:
 
 def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
     """Return the commands of the controller itself, and the readings of several sensors."""
-    if not design.other_sensors:
+    if not design.other_sensors or design.plant is None:
         return _rehearse(design, design.controller.start()), None
     plant, (starts, length) = design.problem, _absences(design)
     rate = plant.hardware.frame_rate_hz

@@ -129,11 +129,15 @@ class RunningController:
         self.state, self.phase = np.zeros(len(self._phases[0][0])), 0
 
     def miss(self, missing: Iterable[str]) -> None:
-        """Go on with the fall-back for sensors that are not read; with all for none."""
+        """Go on with the fall-back for sensors that are not read; with all for none.
+
+        Of those that read none of them, it is the one that reads most.
+        """
         names = frozenset(missing)
-        if names and names not in self.fallbacks:
+        enough = sorted((known for known in self.fallbacks if names <= known), key=len)
+        if names and not enough:
             raise ProblemError(f"there is no filter without {', '.join(sorted(names))}.")
-        controller = self.fallbacks[names] if names else self.controller
+        controller = self.fallbacks[enough[0]] if names else self.controller
         self._phases = list(zip(*controller.stacks(), strict=True))
 
     def step(self, y: ArrayLike, applied: ArrayLike | None = None) -> FloatArray:

@@ -69,6 +69,19 @@ class ClosedLoop(Summarised):
         """Whether the controller reads other sensors beside the loop's own."""
         return reads_others(self.hardware, self.controller)
 
+    def feedback(self) -> ClosedLoop:
+        """Return the loop of its own sensor alone where it reads accelerometers beside that.
+
+        No command moves what accelerometers read: margins are those of the loop without them. A
+        loop of other wavefront sensors, or of a longer period, is returned as it is.
+        """
+        hardware, k = self.hardware, self.controller
+        if not self.reads_others or hardware.suite.wavefront or k.period > 1:
+            return self
+        q = hardware.n_measurements
+        own = replace(k, B=k.B[:, :q], D=k.D[:, :q])
+        return close_loop(hardware.own_sensor_alone(), own, sensor_gain=self.sensor_gain)
+
     @property
     def spectral_radius(self) -> float:
         """Largest modulus of the closed loop's poles: of a period."""
@@ -115,6 +128,16 @@ class ClosedLoop(Summarised):
         """System from the total phase to the residual."""
         n = self.hardware.modes
         return self._subsystem(slice(n), slice(n))
+
+    def rejection_with_channels(self) -> StateSpace:
+        """System from the total phase, and what all other sensors read of it, to the residual.
+
+        Readings of accelerometers are no part of the loop: they enter as their noise does.
+        """
+        n, q = self.hardware.modes, self.hardware.n_measurements
+        whole = self._subsystem(slice(n), slice(None))
+        kept = np.r_[:n, n + q : whole.B.shape[-1]]
+        return replace(whole, B=whole.B[..., kept], D=whole.D[..., kept])
 
     def noise_propagation(self) -> StateSpace:
         """System from the measurement noise to the residual."""
@@ -312,45 +335,62 @@ def loop_matrices(
     return A0, A1, inputs, outputs0, outputs1, direct
 
 
-def youla_controller(hardware: LoopHardware, parameter: Controller) -> Controller:
+def youla_controller(
+    hardware: LoopHardware, parameter: Controller, *, stored: bool = False
+) -> Controller:
     """Return the controller from y to u of a filter from the pseudo-open-loop ybar to u.
 
     The measurement that there would be without any correction is known, ``ybar(k) = y(k) +
     sensor_matrix influence_matrix (c[0] u(k-1) + c[1] u(k-2) + ...)`` with the mirror's taps c.
     Every controller that stabilises the loop is a stable filter from it to u, in which the closed
     loop is affine (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans. Autom. Control 21, 319
-    (1976), doi:10.1109/TAC.1976.1101223).
+    (1976), doi:10.1109/TAC.1976.1101223). Readings of other sensors, which no command moves, may
+    follow ybar. Stored, the last command is a state of its own, whichever output it was.
     """
-    m, q = hardware.n_commands, hardware.n_measurements
-    if (len(parameter.C), parameter.B.shape[1]) != (m, q):
+    return _with_correction(hardware, parameter, 1.0, stored=stored)
+
+
+def youla_parameter(hardware: LoopHardware, controller: Controller) -> Controller:
+    """Return the filter from ybar to u of a controller: what :func:`youla_controller` undoes."""
+    return _with_correction(hardware, controller, -1.0, stored=False)
+
+
+def _with_correction(
+    hardware: LoopHardware, parameter: Controller, sign: float, *, stored: bool
+) -> Controller:
+    """Return a filter whose first inputs have the correction of its own commands added."""
+    m, q, readings = hardware.n_commands, hardware.n_measurements, parameter.B.shape[1]
+    if len(parameter.C) != m or readings < q:
         raise DimensionError(
             f"the filter must map {q} measurements to {m} commands; got "
-            f"{parameter.B.shape[1]} to {len(parameter.C)}."
+            f"{readings} to {len(parameter.C)}."
         )
     A, B, C, D = parameter.A, parameter.B, parameter.C, parameter.D
     mirror, n = hardware.mirror_system.whole, len(A)
     A_mirror, B_mirror, C_mirror = mirror.repeated(m)
     # Without feedthrough the last command is read from the state: u(k-1) = C x(k)
-    stored = m if np.any(D) else 0
-    size = n + stored + mirror.n_states * m
-    last = np.zeros((m, size))  # reads u(k-1) from the state [x, u(k-1) if stored, mirror]
-    if stored:
+    held = m if stored or np.any(D) else 0
+    size = n + held + mirror.n_states * m
+    last = np.zeros((m, size))  # reads u(k-1) from the state [x, u(k-1) if held, mirror]
+    if held:
         last[:, n : n + m] = np.eye(m)
     else:
         last[:, :n] = C
     position = mirror.D * last
-    position[:, n + stored :] += C_mirror
-    correction = hardware.sensor @ hardware.influence @ position  # ybar = y + correction s
+    position[:, n + held :] += C_mirror
+    seen = np.zeros((readings, m))
+    seen[:q] = sign * hardware.sensor @ hardware.influence
+    correction = seen @ position  # ybar = y + correction s
     next_mirror = B_mirror @ last
-    next_mirror[:, n + stored :] += A_mirror
+    next_mirror[:, n + held :] += A_mirror
     next_filter = np.hstack([A, np.zeros((n, size - n))]) + B @ correction
-    rows, entry = [next_filter], np.zeros((size, q))
+    rows, entry = [next_filter], np.zeros((size, readings))
     entry[:n] = B
-    if stored:
+    if held:
         rows.append(C @ next_filter + D @ correction)
         entry[n : n + m] = C @ B + D
-    applied = entry @ (mirror.D * hardware.sensor @ hardware.influence)
-    applied[n + stored :] += B_mirror
+    applied = entry @ (mirror.D * seen)
+    applied[n + held :] += B_mirror
     # the rows that read u(k-1) from the old state read u(k) from the new one
-    whole, D = np.vstack([*rows, next_mirror]), np.zeros((m, q))
+    whole, D = np.vstack([*rows, next_mirror]), np.zeros((m, readings))
     return Controller(A=whole, B=entry, C=last, D=D, dt_s=hardware.dt_s, applied=applied)

@@ -354,6 +354,7 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
     """
     require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
+    loop = loop.feedback()
     low, high = stable_sensor_gains(loop.hardware, loop.controller, nominal=loop.sensor_gain)
     crossings = gain_crossings(loop)
     delay, early = (delay_margin_frames(loop, sign=sign) for sign in (1, -1))

@@ -59,6 +59,9 @@ class DesignInputs(Protocol):
     def size_nm(self, entry: Any, key: str) -> float:
         """Return the size of an entry with ``rms_nm`` or ``rms_mas`` [nm rms wavefront]."""
 
+    def record_design(self) -> Design:
+        """Return the design that a record shows beyond its model; refuse what has no record."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
@@ -77,6 +80,7 @@ class Method:
     exclusive: frozenset[str] = frozenset()  # options of which at most one is given
     configurable: frozenset[str] = frozenset()  # those whose default a configuration can give
     estimator: bool = True  # whether the design depends on the vibrations of the plant
+    of_record: bool = False  # whether it takes a record, beside the plant identified from it
     batched: bool = False  # whether a study designs it for many samples at once
     slow: bool = False  # whether it takes many seconds: an automatic choice leaves it out
     reference_rank: int | None = None  # among those that studies compare designs with

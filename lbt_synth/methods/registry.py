@@ -49,7 +49,6 @@ class BoundOptions(Section):
         json_schema_extra={
             "hint": "At 1 the bound is the least one; far above it the filter is the Kalman "
             "filter.",
-            "slider": [1.0, 3.0],
         },
     )
     horizon: Horizon = 1
@@ -156,6 +155,10 @@ def _build_integrator(inputs: DesignInputs, options: IntegratorOptions) -> Integ
     return integrator(inputs.hardware, gain=gain, law=law)
 
 
+def _build_predictor(inputs: DesignInputs, options: Section) -> Design:
+    return inputs.record_design()
+
+
 KALMAN = Method(
     name="kalman",
     title="Kalman filter",
@@ -210,7 +213,18 @@ INTEGRATOR = Method(
     reference_rank=0,
     compared_options={"phase_margin_deg": 45.0},  # one that a telescope would run
 )
-METHODS = {method.name: method for method in (HINF, INTEGRATOR, KALMAN, LQG, MIXED, ROBUST)}
+PREDICTOR = Method(
+    name="predictor",
+    title="least-squares predictor",
+    label="predictor",
+    options=Section,
+    build=_build_predictor,
+    design="lbt_synth.design.predictor:PredictorDesign",
+    estimator=False,
+    of_record=True,
+)
+_ALL = HINF, INTEGRATOR, KALMAN, LQG, MIXED, PREDICTOR, ROBUST
+METHODS = {method.name: method for method in _ALL}
 
 
 def method_named(name: str) -> Method:
@@ -238,8 +252,9 @@ def design_label(name: str) -> str:
 
 
 def record_methods() -> list[str]:
-    """Return the names of the methods that need no more than a plant identified from a record."""
-    return [n for n, m in METHODS.items() if m.estimator and not m.needs_options]
+    """Return the names of the methods that need no more than a record, and its model."""
+    usable = [m for m in METHODS.values() if m.estimator or m.of_record]
+    return [m.name for m in usable if not m.needs_options]
 
 
 def gain_robust_method() -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 
 
+RECORD_NEEDED = (
+    "the method predictor is made of a record; got a plant or a configuration alone. Try lbt-synth "
+    "auto RECORD --method predictor, or design_from_record(record, method='predictor')."
+)
 _SHORT_WORDS = {
     "greater than or equal to": "at least",
     "less than or equal to": "at most",
@@ -141,6 +145,7 @@ class PlantInputs:
     atmosphere: None = None
     sensor_gain: float = 1.0
     sensor_gains: tuple[float, float] | None = None  # to be stable at, relative to the plant's
+    predict: Callable[[], Design] | None = None  # the design of the record, where there is one
 
     @property
     def hardware(self) -> LoopHardware:
@@ -156,6 +161,12 @@ class PlantInputs:
         """Return the section that a method makes of a plant, None if it makes none."""
         make = method_named(name).plant_section
         return None if make is None else make(self.plant, self.sensor_gains)
+
+    def record_design(self) -> Design:
+        """Return the design of the record that the plant was identified from."""
+        if self.predict is None:
+            raise ProblemError(RECORD_NEEDED)
+        return self.predict()
 
     def size_nm(self, entry: Any, key: str) -> float:
         """Return the size of an entry, which must give it in nm."""

@@ -100,7 +100,6 @@ class RobustSection(Section):
         ge=1e-3,
         lt=1,
         description="least modulus margin at model.sensor_gain",
-        json_schema_extra={"slider": [0.2, 0.8]},
     )
     noise_peak: Ratio | None = Field(
         default=None, description="largest amplification of noise at any frequency"

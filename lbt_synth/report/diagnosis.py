@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lbt_synth.identification import Diagnosis
-from lbt_synth.identification.diagnosis.rows import law_facts
+from lbt_synth.identification.diagnosis import law_facts
 from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import draw_bars
@@ -59,8 +59,6 @@ def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, list[Table]]:
     """Return the tables of a diagnosis by their sections, without those of what is not known."""
     record, health = diagnosis.record, diagnosis.record.health
     text = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
-    if health.jitter_frames is not None:
-        text += f", clock jitter {health.jitter_frames:.2g} frames rms"
     channels = [row_table(f"Record: {text}. {health.summary()}", diagnosis.channels)]
     # what a correction lacks is a consequence of other faults, and of the beginning
     if faults := [finding for finding in health.findings if finding.kind != NOT_KNOWN]:

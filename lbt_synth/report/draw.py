@@ -142,11 +142,7 @@ def drawing(
     The panels are those of a new figure, or stand on the user's own axes.
     """
     with house_style():
-        if axes is None:
-            places = _new_places(heights_in, columns)
-        else:
-            places = _own_places(axes, len(heights_in))
-        panels = [Panel(place) for place in places]
+        panels = [Panel(place) for place in _places(heights_in, columns, axes)]
         yield panels
         for panel in panels:
             panel.finish()
@@ -173,27 +169,24 @@ def drawing(
         _SERIES[figure] = tuple(one for panel in panels for one in panel.series)
 
 
-def _new_places(heights_in: Sequence[float], columns: int) -> list[Axes]:
-    """Return the axes of a new figure, row by row."""
+def _places(heights_in: Sequence[float], columns: int, axes: OwnAxes) -> list[Axes]:
+    """Return the axes of a new figure, row by row, or the user's own, one per panel."""
+    from matplotlib.axes import Axes as Place
     from matplotlib.figure import Figure
 
+    if axes is not None:
+        own = list(np.ravel(np.asarray(axes, dtype=object)))
+        if len(own) != len(heights_in) or not all(isinstance(place, Place) for place in own):
+            kinds = ", ".join(type(place).__name__ for place in own) or "none"
+            raise ProblemError(
+                f"axes must be {len(heights_in)} matplotlib Axes, one per panel; got {len(own)} "
+                f"({kinds})."
+            )
+        return own
     rows = [max(heights_in[i : i + columns]) for i in range(0, len(heights_in), columns)]
     figure = Figure(figsize=(_WIDTH_IN, sum(rows) + _AROUND_IN * len(rows)), layout="constrained")
     grid = figure.add_gridspec(len(rows), columns, height_ratios=rows)
     return [figure.add_subplot(grid[divmod(i, columns)]) for i in range(len(heights_in))]
-
-
-def _own_places(axes: OwnAxes, count: int) -> list[Axes]:
-    """Return the user's axes as a list, one per panel."""
-    from matplotlib.axes import Axes as Place
-
-    places = list(np.ravel(np.asarray(axes, dtype=object)))
-    if len(places) != count or not all(isinstance(place, Place) for place in places):
-        kinds = ", ".join(type(place).__name__ for place in places) or "none"
-        raise ProblemError(
-            f"axes must be {count} matplotlib Axes, one per panel; got {len(places)} ({kinds})."
-        )
-    return places
 
 
 def _legend_entries(panels: Sequence[Panel]) -> tuple[list[Any], list[str]]:
@@ -292,27 +285,43 @@ class Panel:
         x: ArrayLike,
         y: ArrayLike,
         *,
+        look: int | None = 0,
+        line: bool = True,
+        dash: int | None = None,
+        width: float = 1.6,
+        opacity: float = 1.0,
+        marker: str | None = None,
+        filled: bool = True,
+        size: float = 5.0,
+        step: str = "default",
+        error: ArrayLike | None = None,
         quiet: bool = False,
         numbers: bool = True,
-        error: ArrayLike | None = None,
-        step: str = "default",
-        **look: Any,
     ) -> None:
         """Draw points, (n,) each, joined by a line or not; nan breaks the line.
 
         Without a name, or without ``numbers``, it is a guide to the eye that is in no table; a
-        quiet one is in tables but not in the legend, one without points in the legend only.
-        ``error`` are half lengths of error bars, ``look`` is as in :func:`line_style`.
+        quiet one is in tables but not in the legend, one without points in the legend only. A
+        marker is one of matplotlib's, or "own" for that of the look; ``dash`` is the number of its
+        dashes, 0 is solid and None that of the look. Sizes and widths are in points, ``error`` are
+        half lengths of error bars.
         """
         along, up = self._shown("x", x), self._shown("y", y)
-        style = line_style(**look)
-        label = f"_{name}" if quiet else _label(name)
-        (line,) = self.axes.plot(along, up, drawstyle=step, label=label, **style)
-        if "marker" in style:
+        strokes, shade = dashes(look if dash is None else dash), colour(look)
+        style: dict[str, Any] = {"color": shade, "linewidth": width}
+        style["linestyle"] = ((0, strokes) if strokes else "-") if line else "none"
+        if opacity < 1:
+            style["alpha"] = opacity
+        if marker is not None:
+            style |= {"marker": marker_of(look) if marker == "own" else marker, "markersize": size}
+            style |= {"markerfacecolor": shade if filled else "none"}
+            style |= {"markeredgewidth": 0.4 if filled and line else 1.2}
             self.axes.margins(x=_ROOM)
+        label = f"_{name}" if quiet else _label(name)
+        self.axes.plot(along, up, drawstyle=step, label=label, **style)
         if error is not None:
             half = self._shown("y", error)
-            self.axes.vlines(along, up - half, up + half, color=line.get_color(), linewidth=1.0)
+            self.axes.vlines(along, up - half, up + half, color=shade, linewidth=1.0)
         if name and numbers and along.size:
             self._note(name, along, up)
 
@@ -488,8 +497,7 @@ def spread_labels(places: FloatArray, width: float) -> FloatArray:
     # pushed to the right where they are crowded, and back from the end
     right = np.maximum.accumulate(np.maximum(places, least) - steps) + steps
     ends = 1 - least[::-1]
-    left = np.minimum.accumulate((np.minimum(right, ends) - steps)[::-1])[::-1] + steps
-    return np.asarray(left)
+    return np.asarray(np.minimum.accumulate((np.minimum(right, ends) - steps)[::-1])[::-1] + steps)
 
 
 def _cell_edges(centres: FloatArray) -> FloatArray:
@@ -504,39 +512,6 @@ def _cell_edges(centres: FloatArray) -> FloatArray:
 def _label(name: str) -> str:
     """Return a label of a legend; without the space, a leading underscore would leave it out."""
     return f" {name}" if name.startswith("_") else name
-
-
-def line_style(
-    look: int | None = 0,
-    *,
-    line: bool = True,
-    marker: str | None = None,
-    filled: bool = True,
-    size: float = 5.0,
-    width: float = 1.6,
-    opacity: float = 1.0,
-    dash: int | None = None,
-) -> dict[str, Any]:
-    """Return the style of a curve in a look.
-
-    A marker is one of matplotlib's, or "own" for that of the look; sizes and widths are in points.
-    ``dash`` is the number of its dashes, 0 is solid and None that of the look.
-    """
-    strokes = dashes(look if dash is None else dash)
-    style: dict[str, Any] = {
-        "color": colour(look),
-        "linewidth": width,
-        "alpha": opacity if opacity < 1 else None,
-        "linestyle": ((0, strokes) if strokes else "-") if line else "none",
-    }
-    if marker is not None:
-        style |= {
-            "marker": marker_of(look) if marker == "own" else marker,
-            "markersize": size,
-            "markerfacecolor": colour(look) if filled else "none",
-            "markeredgewidth": 0.4 if filled and line else 1.2,
-        }
-    return style
 
 
 def _fill_style(look: int | None) -> dict[str, Any]:

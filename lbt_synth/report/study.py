@@ -28,7 +28,7 @@ from lbt_synth.report.page.html import (
     survival_blocks,
 )
 from lbt_synth.storage.tables import Table
-from lbt_synth.storage.words import count_text, duration_text, listing_text
+from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies import Study
 from lbt_synth.studies.grid import Failure
 from lbt_synth.studies.study.statistics import (
@@ -47,7 +47,7 @@ from lbt_synth.studies.study.statistics import (
 from lbt_synth.validation import FloatArray
 
 _POINTS = 400  # of a cumulative distribution
-_BINS = 30  # of a histogram, and along either axis of a map, at most
+_BINS = 30  # along either axis of a map, at most
 _PER_CELL = 8  # samples in a cell of a map on average, at least
 _MOST_FAILURES = 10  # that are listed
 _PARAMETERS = 5  # of a worst sample: with row and Strehl ratio, they fill a sheet
@@ -152,11 +152,11 @@ def _summary_blocks(
         if one.unstable
     )
     failed = ", ".join(f"{c.controller} {c.failed}" for c in statistics.controllers if c.failed)
-    done, whole = statistics.samples, study.samples
+    done, total = statistics.samples, study.samples
     blocks: list[Block] = [
         Notice(text=text, tone=tone)
         for text, tone, is_so in (
-            (paragraph("incomplete", done=done, samples=whole), "bad", done < whole),
+            (paragraph("incomplete", done=done, samples=total), "bad", done < total),
             (f"Unstable loops: {unstable}.", "bad", unstable),
             (f"Evaluations that failed, and are in none of the figures: {failed}.", "bad", failed),
             (
@@ -212,7 +212,7 @@ def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
 
 
 def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names) -> list[Block]:
-    """Show the parameters and their histograms."""
+    """List the parameters, and what was drawn of them."""
     settings = study.settings
     texts = {name: section.text for name, section in settings.parameters.items()}
     rows = [
@@ -229,7 +229,6 @@ def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names
         f"{study.samples} samples (sampling: {settings.sampling}, seed: {settings.seed}, "
         f"evaluation: {settings.evaluation}).",
         Table(caption="Parameters", headings=headings, rows=tuple(rows), words=(1, 2)),
-        *_histogram_chart(values, names),
     ]
 
 
@@ -327,24 +326,6 @@ def _distribution_chart(samples: Mapping[str, Samples]) -> list[Chart]:
                 plain.curve(name, x, y, **style)
                 tail.curve(name, x[1:], y[1:], **style)
     return [chart("distribution", plain.figure)]
-
-
-def _histogram_chart(parameters: Mapping[str, FloatArray], names: Names) -> list[Chart]:
-    """Histograms of the parameters that vary."""
-    varying = {name: values for name, values in parameters.items() if np.ptp(values) > 0}
-    if not varying:
-        return []
-    with drawing([1.7] * len(varying), columns=min(len(varying), 3)) as panels:
-        for panel, (name, values) in zip(panels, varying.items(), strict=True):
-            panel.set_axes({"label": names[name]}, {"label": "samples", "unit": "%", "low": 0})
-            bins = int(np.clip(np.sqrt(values.size), 4, _BINS))
-            counts, edges = np.histogram(values, bins=bins)
-            x = np.repeat(edges, 2)
-            y = np.concatenate(([0.0], np.repeat(100 * counts / values.size, 2), [0.0]))
-            panel.area("", x, np.zeros_like(y), y)
-            panel.curve("samples [%]", x, y, dash=0, quiet=True)
-    listed_names = listing_text([names[name] for name in varying])
-    return [chart("parameters", panels[0].figure, names=listed_names)]
 
 
 def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:

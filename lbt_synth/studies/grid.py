@@ -1,8 +1,9 @@
 """One grid: samples, a function of one of them or of a stack, an executor, and parts on disk.
 
-What a loop leaves has the same columns for one loop and for a stack of them. A part holds the
-results of a fixed number of consecutive rows in a file that is named by them: a sweep that was
-killed at any moment goes on with the rows that no part has.
+What a loop leaves has the same columns for one loop and for a stack of them. A grid of a few
+samples is in memory (:func:`evaluate`). One of many is a :class:`Sweep`: a part holds the results
+of a fixed number of consecutive rows in a file that is named by them, and a sweep that was killed
+at any moment goes on with the rows that no part has.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent import futures
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 import numpy as np
 
@@ -37,6 +38,7 @@ from lbt_synth.validation import FloatArray
 Rows = tuple[int, int]  # the first, and the one after the last
 Failure = tuple[int, str, str]  # a row, the controller without a result on it, and why
 Result = tuple[dict[str, FloatArray], list[Failure]]  # columns of some rows (b,), and failures
+Answer = TypeVar("Answer")
 RESIDUALS = {"residual_nm": "rms_nm"} | {  # columns, and the attributes of what has them
     name: name for name in ("turbulence_nm", "vibration_nm", "noise_nm", "within_nm")
 }
@@ -111,18 +113,18 @@ class Sweep:
         try:
             arrays, text = array_file.read_npz(read_bytes(path, OutputError))
             meta = json.loads(text)
-            whole = meta["digest"] == array_file.digest(arrays, meta)
+            intact = meta["digest"] == array_file.digest(arrays, meta)
             results, sweep = arrays["RESULTS"], meta["sweep"]
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             refuse(path, f"is damaged. {_DELETE}", error)
         start, stop = map(int, path.stem.split("-"))
-        if whole and sweep != self.digest:
+        if intact and sweep != self.digest:
             refuse(
                 path,
                 "is of another study: other settings, inputs, or another version of lbt_synth. "
                 "Name another directory, or delete it.",
             )
-        if not whole or results.shape != (stop - start, len(self.columns)):
+        if not intact or results.shape != (stop - start, len(self.columns)):
             refuse(path, f"is damaged. {_DELETE}")
         return Part(results, [tuple(failure) for failure in meta["failures"]], meta["seconds"])
 
@@ -138,14 +140,10 @@ class Sweep:
     ) -> tuple[Part, int]:
         """Evaluate what is missing; return all rows, and how many of them were computed now.
 
-        An executor has two parts a worker in flight, so that none waits; without one the parts run
-        here. Each is written as it comes.
+        Without an executor the parts run here. Each is written as it comes.
         """
         folder, count = make_directory(self.folder, parents=False), progress or (lambda rows: None)
-        in_flight = 1
-        if executor is not None:
-            most = getattr(executor, "_max_workers", None)
-            in_flight = 2 * (workers or most or os.cpu_count() or 1)
+        in_flight = _in_flight(executor, workers)
         # more parts than are in flight, so that no worker waits long for the last
         share = -(-self.rows // (2 * in_flight + 2))
         with exclusive_lock(folder, "computation"):
@@ -162,8 +160,8 @@ class Sweep:
                 for start, stop in missing
                 for first in range(start, stop, size)
             )
-            tasks = ((rows, function, arguments(rows)) for rows in waiting)
-            for rows, result, seconds in _compute(tasks, executor, in_flight):
+            tasks = ((rows, arguments(rows)) for rows in waiting)
+            for rows, result, seconds in _compute(function, tasks, executor, in_flight):
                 with _explain_failure(rows):
                     self.write(rows, result, seconds)
                 count(rows[1] - rows[0])
@@ -173,20 +171,47 @@ class Sweep:
         return Part(results, failures, sum(part.seconds for part in parts)), computed
 
 
+def evaluate(
+    function: Callable[..., Answer],
+    samples: Iterable[tuple[Any, ...]],
+    executor: futures.Executor | None = None,
+) -> Iterator[Answer]:
+    """Yield what a function returns for the arguments of each sample, in the order of samples.
+
+    The function and the arguments of an executor must be such that other processes can read them.
+    """
+    tasks = (((i, i + 1), arguments) for i, arguments in enumerate(samples))
+    early: dict[int, Answer] = {}
+    following = 0
+    for (row, _), answer, _ in _compute(function, tasks, executor, _in_flight(executor)):
+        early[row] = answer
+        while following in early:
+            yield early.pop(following)
+            following += 1
+
+
+def _in_flight(executor: futures.Executor | None, workers: int | None = None) -> int:
+    """Return how many tasks an executor has at once: two a worker, so that none waits."""
+    if executor is None:
+        return 1
+    return 2 * (workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
+
+
 def _compute(
-    tasks: Iterator[tuple[Rows, Callable[..., Result], tuple[Any, ...]]],
+    function: Callable[..., Answer],
+    tasks: Iterator[tuple[Rows, tuple[Any, ...]]],
     executor: futures.Executor | None,
     in_flight: int,
-) -> Iterator[tuple[Rows, Result, float]]:
+) -> Iterator[tuple[Rows, Answer, float]]:
     """Yield results as they come; if one task fails as a whole, the others are given up."""
-    for rows, function, arguments in tasks if executor is None else ():
+    for rows, arguments in tasks if executor is None else ():
         with _explain_failure(rows):
             result, seconds = timed(function, *arguments)
         yield rows, result, seconds
-    running: dict[futures.Future[tuple[Result, float]], Rows] = {}
+    running: dict[futures.Future[tuple[Answer, float]], Rows] = {}
     try:
         while executor is not None:
-            for rows, function, arguments in islice(tasks, in_flight - len(running)):
+            for rows, arguments in islice(tasks, in_flight - len(running)):
                 with _explain_failure(rows):
                     running[executor.submit(timed, function, *arguments)] = rows
             if not running:
@@ -206,7 +231,7 @@ def refuse(path: Path, why: str, cause: Exception | None = None) -> NoReturn:
     raise OutputError(f"{path} {why}", path=path) from cause
 
 
-def timed(function: Callable[..., Result], *arguments: Any) -> tuple[Result, float]:
+def timed(function: Callable[..., Answer], *arguments: Any) -> tuple[Answer, float]:
     """Call a function, and return its result and its seconds."""
     before = time.perf_counter()
     result = function(*arguments)
@@ -224,6 +249,6 @@ def _explain_failure(rows: Rows) -> Iterator[None]:
         text = f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(": .")
         raise NumericalError(
             f"rows {rows[0]} to {rows[1] - 1} have no result ({text}): a process died, perhaps out "
-            "of memory, or has another lbt_synth than this one. What is finished is kept: start "
+            "of memory, or has another lbt_synth than this one. What is written is kept: start "
             "the study again, perhaps with fewer jobs, and it goes on from there."
         ) from error

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
@@ -27,7 +28,7 @@ from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
-from lbt_synth.studies.grid import loop_columns
+from lbt_synth.studies.grid import evaluate, loop_columns
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 if TYPE_CHECKING:
@@ -95,6 +96,10 @@ class LimitStudy:
     # (designs, s): residual of each design at each shift [nm rms]; nan if unstable
     residual_nm: FloatArray
     frequency_hz: float | None  # frequency of the truth's vibrations, if it is one
+    # beside reference designs: what is wrong with a design in this truth, by its name, and why
+    # references are missing
+    warnings: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 def limits(
@@ -104,6 +109,7 @@ def limits(
     imaging: Imaging,
     *,
     errors_hz: Sequence[float] = (0.0,),
+    executor: Executor | None = None,
 ) -> LimitStudy:
     """Evaluate designs exactly and compare them with the limits.
 
@@ -121,6 +127,8 @@ def limits(
         True frequency less that of the model [Hz], of the vibration that moves most; the others
         move in proportion (``truth.frequency_errors_hz``), over the whole range between the
         extremes.
+    executor : concurrent.futures.Executor, optional
+        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Returns
     -------
@@ -165,32 +173,12 @@ def limits(
         rest = replace(truth, vibrations=(), motions=(), frequency_errors_hz=None)
         least_worst = partial(least_worst_residual, alone, rest, band_hz=band_hz)
         band = limit_or_none(partial(least_worst, rms_nm=line.rms_nm, direction=line.direction))
-    rows, curves = [], []
-    for name, design in designs.items():
-        loop = design.close(hardware, sensor_gain=truth.sensor_gain)
-        numbers = loop_columns(loop, truth, imaging)
-        residual_nm = numbers["residual_nm"]
-        curve = _residual_curve(loop, truth, shifts, residual_nm)
-        worst_nm = float(np.max(curve)) if shifts.size else residual_nm
-        margin_deg = np.nan
-        if loop.is_stable and not loop.reads_others:
-            margin_deg = phase_margin_deg(loop)
-        limit_nm, band_nm = (  # of the loop's own sensor
-            np.nan if bound is None or loop.reads_others else bound.rms_nm
-            for bound in (limit, band)
-        )
-        row = {
-            "design": name,
-            "above_limit_percent": above_percent(residual_nm, limit_nm),
-            "worst_nm": worst_nm,
-            "above_band_limit_percent": above_percent(worst_nm, band_nm),
-            "phase_margin_deg": margin_deg,
-            "stable": loop.is_stable,
-        }
-        rows.append(fill_row(LimitRow, SimpleNamespace(**numbers), design, **row))
-        curves.append(curve)
+    bounds_nm = tuple(np.nan if bound is None else bound.rms_nm for bound in (limit, band))
+    met = hardware, truth, imaging
+    samples = ((name, design, met, shifts, bounds_nm) for name, design in designs.items())
+    rows, curves = zip(*evaluate(_limit_row, samples, executor), strict=True)
     return LimitStudy(
-        rows=tuple(rows),
+        rows=rows,
         limit=limit,
         band=band,
         band_hz=band_hz,
@@ -198,6 +186,36 @@ def limits(
         residual_nm=frozen_copy(curves),
         frequency_hz=truth.lines_hz[0] if len(truth.lines_hz) == 1 else None,
     )
+
+
+def _limit_row(
+    name: str,
+    design: Design,
+    met: tuple[LoopHardware, Truth, Imaging],
+    shifts: FloatArray,
+    bounds_nm: tuple[float, ...],
+) -> tuple[LimitRow, FloatArray]:
+    """Return the row of a design beside the two limits, and its residual at each shift, (s,)."""
+    hardware, truth, imaging = met
+    loop = design.close(hardware, sensor_gain=truth.sensor_gain)
+    numbers = loop_columns(loop, truth, imaging)
+    residual_nm = numbers["residual_nm"]
+    curve = _residual_curve(loop, truth, shifts, residual_nm)
+    worst_nm = float(np.max(curve)) if shifts.size else residual_nm
+    margin_deg, (limit_nm, band_nm) = np.nan, bounds_nm
+    if loop.reads_others:  # the limits are those of the loop's own sensor
+        limit_nm = band_nm = np.nan
+    elif loop.is_stable:
+        margin_deg = phase_margin_deg(loop)
+    row = {
+        "design": name,
+        "above_limit_percent": above_percent(residual_nm, limit_nm),
+        "worst_nm": worst_nm,
+        "above_band_limit_percent": above_percent(worst_nm, band_nm),
+        "phase_margin_deg": margin_deg,
+        "stable": loop.is_stable,
+    }
+    return fill_row(LimitRow, SimpleNamespace(**numbers), design, **row), curve
 
 
 def _frequency_shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
@@ -222,26 +240,19 @@ def _residual_curve(
     return np.asarray(np.sqrt(residual_nm**2 - first + np.array(others)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TruthComparison:
-    """Designs in the truth of a configuration."""
-
-    rows: tuple[LimitRow, ...]  # the designs, then the reference designs that are none of them
-    # the least residual of any linear controller; None where the modes do not decouple
-    limit: ResidualLimit | None
-    # what is wrong with a design in this truth: an unstable loop, a residual far above what the
-    # design expects, and demands that cost residual
-    warnings: Mapping[str, tuple[str, ...]]
-    notes: tuple[str, ...]  # why reference designs are missing
-
-
 def compare_in_truth(
-    designs: Mapping[str, Design], config: Config, *, without: Collection[str] = ()
-) -> TruthComparison:
+    designs: Mapping[str, Design],
+    config: Config,
+    *,
+    without: Collection[str] = (),
+    errors_hz: Sequence[float] = (0.0,),
+) -> LimitStudy:
     """Compare designs in the stationary truth of a configuration with its reference designs.
 
     These are the integrator of least residual, the Kalman filter and the H-infinity filter; some
-    methods are left out if the designs are those already.
+    methods are left out, and so is one that leaves the same as a design. Warnings say what is wrong
+    with a design in this truth: an unstable loop, a residual far above what the design expects, and
+    demands that cost residual.
     """
     references: dict[str, Design] = {}
     notes = []
@@ -253,14 +264,17 @@ def compare_in_truth(
             references[name] = config.design(method.name, **method.reference_options)
         except LbtSynthError as error:
             notes.append(f"{method.name} is left out: {error}")
-    study = limits({**designs, **references}, config.hardware, config.truth, config.imaging)
+    loop = config.hardware, config.truth, config.imaging
+    study = limits({**designs, **references}, *loop, errors_hz=errors_hz)
     ours, theirs = study.rows[: len(designs)], study.rows[len(designs) :]
     there = np.array([row.residual_nm for row in ours])
     others = [row for row in theirs if not np.isclose(row.residual_nm, there, rtol=1e-6).any()]
     better = {row.design: (references[row.design], row.residual_nm) for row in others}
-    return TruthComparison(
-        rows=(*ours, *others),
-        limit=study.limit,
+    rows = (*ours, *others)
+    return replace(
+        study,
+        rows=rows,
+        residual_nm=frozen_copy(study.residual_nm[[study.rows.index(row) for row in rows]]),
         warnings={
             row.design: tuple(_warnings(designs[row.design], row, config, better)) for row in ours
         },

@@ -282,9 +282,9 @@ def modal_row(
     loop = close_loop(row.hardware, row.design.controller, sensor_gain=sensor_gain)
     truth = replace(row.truth, sensor_gain=sensor_gain)
     numbers = loop_columns(loop, truth, camera or imaging(), frame_means=True)
-    given = {"method": row.method, "error_hz": row.error_hz or 0.0, "stable": loop.is_stable}
-    given["gamma"] = getattr(row.design, "gamma", math.nan)
-    return fill_row(RobustnessRow, **numbers | given)
+    named = {"method": row.method, "error_hz": row.error_hz or 0.0, "stable": loop.is_stable}
+    named["gamma"] = getattr(row.design, "gamma", math.nan)
+    return fill_row(RobustnessRow, **numbers | named)
 
 
 def table_entry(row: PaperRow, modal: RobustnessRow) -> Facts:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.config import Config
 from lbt_synth.design import (
     Design,
+    FilterDesign,
     central_filter,
     hinf,
     kalman,
@@ -54,7 +56,7 @@ from lbt_synth.storage.rows import (
     percent_column,
     table_row,
 )
-from lbt_synth.studies.grid import loop_columns, residual_columns
+from lbt_synth.studies.grid import evaluate, loop_columns, residual_columns
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
@@ -66,6 +68,9 @@ from lbt_synth.validation import (
     require_instance,
 )
 
+_Loop: TypeAlias = tuple[Design, LoopHardware, Truth, Imaging]
+# true vibrations, each with its frequencies [Hz] under e errors, (e,)
+_MovedLines: TypeAlias = Sequence[tuple[Vibration | SinusoidalVibration, FloatArray]]
 FAMILIES = (MIXED.name, "central")
 _CROWDING = 1.5  # above 1, points are denser near the least norm
 _GAINS_AT_ONCE = 64  # of a map
@@ -98,6 +103,7 @@ def robustness(
     methods: Sequence[str] | None = None,
     gamma_ratio: float = 1.2,
     hold: str = "driving",
+    executor: Executor | None = None,
 ) -> Iterator[RobustnessRow]:
     """Design at each frequency error and evaluate exactly against the same truth.
 
@@ -119,6 +125,8 @@ def robustness(
         H-infinity bound as a multiple of each row's least gamma.
     hold : {"driving", "rms"}, optional
         What the model keeps of a vibration when its frequency moves.
+    executor : concurrent.futures.Executor, optional
+        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Yields
     ------
@@ -136,10 +144,8 @@ def robustness(
     --------
     >>> import lbt_synth as lbt
     >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> found = lbt.studies.robustness(
-    ...     config.plant, config.truth, config.imaging, errors_hz=[0, 3], methods=["kalman"]
-    ... )
-    >>> rows = list(found)
+    >>> loop = config.plant, config.truth, config.imaging
+    >>> rows = list(lbt.studies.robustness(*loop, errors_hz=[0, 3], methods=["kalman"]))
     >>> rows[0].strehl > rows[1].strehl
     True
     """
@@ -150,15 +156,24 @@ def robustness(
     names = default_methods() if methods is None else methods
     for name in names:
         choice(name, "method", record_methods())
-    for error in errors_hz:
-        number(error, "errors_hz")
-        shifts = [-truth.frequency_shift_hz(line.frequency_hz, error) for line in plant.vibrations]
-        moved = retuned_plant(plant, shifts, hold=hold)
-        for name in names:
-            design = reference_design(name, moved, {"gamma_ratio": gamma_ratio})
-            loop = design.close(plant.hardware, sensor_gain=truth.sensor_gain)
-            numbers = loop_columns(loop, truth, imaging) | {"stable": loop.is_stable}
-            yield fill_row(RobustnessRow, design, error_hz=float(error), **numbers)
+    errors = [number(error, "errors_hz") for error in errors_hz]
+    model = {"gamma_ratio": gamma_ratio, "hold": hold}
+    loop = plant, truth, imaging
+    samples = ((loop, model, error, name) for error in errors for name in names)
+    yield from evaluate(_robustness_row, samples, executor)
+
+
+def _robustness_row(
+    loop: tuple[TipTiltPlant, Truth, Imaging], model: dict[str, Any], error_hz: float, method: str
+) -> RobustnessRow:
+    """Design for lines that are moved by an error, and close the real loop."""
+    plant, truth, imaging = loop
+    shifts = [-truth.frequency_shift_hz(line.frequency_hz, error_hz) for line in plant.vibrations]
+    moved = retuned_plant(plant, shifts, hold=model["hold"])
+    design = reference_design(method, moved, {"gamma_ratio": model["gamma_ratio"]})
+    closed = design.close(plant.hardware, sensor_gain=truth.sensor_gain)
+    numbers = loop_columns(closed, truth, imaging) | {"stable": closed.is_stable}
+    return fill_row(RobustnessRow, design, error_hz=error_hz, **numbers)
 
 
 def default_methods() -> list[str]:
@@ -192,6 +207,7 @@ def robustness_map(
     sensor_gains: ArrayLike,
     delay_errors_frames: ArrayLike = (0.0,),
     hardware: LoopHardware | None = None,
+    executor: Executor | None = None,
 ) -> RobustnessMap:
     """Evaluate one design exactly over frequency errors, sensor gains and delay errors.
 
@@ -212,6 +228,8 @@ def robustness_map(
         Real delay less that of the design [frames].
     hardware : LoopHardware, optional
         Loop to close; that of the design by default.
+    executor : concurrent.futures.Executor, optional
+        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Returns
     -------
@@ -229,16 +247,16 @@ def robustness_map(
     --------
     >>> import lbt_synth as lbt
     >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> found = lbt.studies.robustness_map(
+    >>> image = lbt.studies.robustness_map(
     ...     lbt.kalman(config.plant),
     ...     config.truth,
     ...     config.imaging,
     ...     errors_hz=[0, 3],
     ...     sensor_gains=[0.5, 1.0, 9.0],
     ... )
-    >>> found.strehl.shape, found.stable[0].tolist()
+    >>> image.strehl.shape, image.stable[0].tolist()
     ((1, 3, 2), [True, True, False])
-    >>> bool(found.strehl[0, 1, 0] > found.strehl[0, 1, 1])
+    >>> bool(image.strehl[0, 1, 0] > image.strehl[0, 1, 1])
     True
     """
     for value, kind in ((design, Design), (truth, Truth), (imaging, Imaging)):
@@ -258,47 +276,53 @@ def robustness_map(
         hint=f"The design's delay of {hardware.delay_frames:g} frames and the error together must "
         f"lie between 1 and {LONGEST_DELAY}.",
     )
-    if not truth.vibrations and np.any(errors != 0):
+    if not truth.vibrations and (errors.size > 1 or errors[0] != 0):
         raise ProblemError(
             "a frequency error needs a vibration in the truth; got a truth without any."
         )
-    lines = list(_moved_lines(truth, errors, hardware))
-    noise_nm = truth.noise_per_measurement(hardware.n_measurements)[None]
+    lines = _moved_lines(truth, errors, hardware)
+    pieces = np.array_split(gains, -(-gains.size // _GAINS_AT_ONCE))
+    loop = design, hardware, truth, imaging
+    samples = ((loop, lines, float(delay), piece) for delay in delays for piece in pieces)
+    stacks = list(evaluate(_map_columns, samples, executor))
     size = delays.size, gains.size, errors.size
-    maps = {name: np.empty(size) for name in ("strehl", "residual_nm", "stable")}
-    for d, delay in enumerate(delays):
-        for start in range(0, gains.size, _GAINS_AT_ONCE):
-            some = slice(start, start + _GAINS_AT_ONCE)
-            count = gains[some].size
-            ensemble = LoopEnsemble(
-                sensor_gain=np.repeat(gains[some], errors.size),
-                delay_frames=hardware.delay_frames + delay,
-                noise_nm=noise_nm,
-                turbulence=truth.turbulence,
-                vibrations=tuple(
-                    replace(ensemble_vibration(line), frequency_hz=np.tile(frequencies, count))
-                    for line, frequencies in lines
-                ),
-            )
-            loops = ensemble_residuals(design.controller, hardware, ensemble)
-            columns = residual_columns(loops, imaging)
-            for name, numbers in maps.items():
-                numbers[d, some] = columns[name].reshape(count, errors.size)
+    strehl, residual_nm, stable = (
+        read_only(np.concatenate([stack[name] for stack in stacks]).reshape(size))
+        for name in ("strehl", "residual_nm", "stable")
+    )
     return RobustnessMap(
         errors_hz=errors,
         sensor_gains=gains,
         delay_errors_frames=delays,
-        strehl=read_only(maps["strehl"]),
-        residual_nm=read_only(maps["residual_nm"]),
-        stable=read_only(maps["stable"][..., 0] == 1),
+        strehl=strehl,
+        residual_nm=residual_nm,
+        stable=read_only(stable[..., 0] == 1),
         band_hz=_errors_in_band(design, truth),
     )
 
 
-def _moved_lines(
-    truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
-) -> Iterator[tuple[Vibration | SinusoidalVibration, FloatArray]]:
-    """Yield the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
+def _map_columns(
+    loop: _Loop, lines: _MovedLines, delay_error_frames: float, gains: FloatArray
+) -> dict[str, FloatArray]:
+    """Return what the loops of all gains leave with lines at all frequencies, by column."""
+    design, hardware, truth, imaging = loop
+    errors = lines[0][1].size if lines else 1
+    ensemble = LoopEnsemble(
+        sensor_gain=np.repeat(gains, errors),
+        delay_frames=hardware.delay_frames + delay_error_frames,
+        noise_nm=truth.noise_per_measurement(hardware.n_measurements)[None],
+        turbulence=truth.turbulence,
+        vibrations=tuple(
+            replace(ensemble_vibration(line), frequency_hz=np.tile(frequencies, gains.size))
+            for line, frequencies in lines
+        ),
+    )
+    return residual_columns(ensemble_residuals(design.controller, hardware, ensemble), imaging)
+
+
+def _moved_lines(truth: Truth, errors_hz: FloatArray, hardware: LoopHardware) -> _MovedLines:
+    """Return the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
+    moved: list[tuple[Vibration | SinusoidalVibration, FloatArray]] = []
     nyquist_hz, shares = hardware.frame_rate_hz / 2, truth.frequency_shifts_hz(1.0)
     for line, share in zip(stationary_vibrations(truth.vibrations), shares, strict=True):
         checked_direction(line, hardware)
@@ -310,7 +334,8 @@ def _moved_lines(
                 f"error of {errors_hz[wrong][0]:.6g} Hz, which moves the one at "
                 f"{line.frequency_hz:.6g} Hz to {frequencies[wrong][0]:.6g} Hz."
             )
-        yield line, frequencies
+        moved.append((line, frequencies))
+    return moved
 
 
 def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
@@ -348,7 +373,7 @@ def run_failures(
     Between failures and returns there is a segment, with a row that has its exact residual, too:
     nan where the loop is unstable, a reading is frozen, or a vibration drifts.
     """
-    filters, rate = design.controllers, config.hardware.frame_rate_hz
+    rate = config.hardware.frame_rate_hz
     hardware = replace(config.hardware, suite=require_hardware(design, "a run").suite)
     simulation = simulate(
         design,
@@ -360,32 +385,38 @@ def run_failures(
         settle_frames=config.settings.simulation.settle_frames,
         drops=drops,
     )
-    rows = []
-    for segment in run_segments(drops, frames / rate):
-        loop = close_loop(
-            hardware,
-            filters[frozenset(segment.missing)],
-            sensor_gain=truth.sensor_gain,
-            blind=(*segment.missing, *segment.wrong),
-        )
-        # a frozen reading adds an offset of its own
-        exact = loop.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
-        first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
-        part = simulation.part(first, last)
-        exact_nm = residual_budget(loop, truth).rms_nm if exact else np.nan
-        ratio = float(np.mean(part.strehl(config.imaging))) if loop.is_stable else np.nan
-        rms, second = {"unit": "nm rms", "format": ".2f"}, {"unit": "s", "format": "g"}
-        row = facts(
-            start_s=fact(segment.start_s, "from", **second),
-            end_s=fact(segment.end_s, "to", **second),
-            sensors=fact(segment.text or "none", "sensors that fail"),
-            residual_nm=fact(float(np.sqrt(np.mean(part.rms_nm**2))), "simulated", **rms),
-            exact_nm=fact(exact_nm, "exact, once settled", **rms),
-            strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
-            stable=fact(loop.is_stable, "stable"),
-        )
-        rows.append((segment, row))
-    return simulation, rows
+    segments = run_segments(drops, frames / rate)
+    loop = design, hardware, truth, config.imaging
+    samples = ((loop, simulation, segment) for segment in segments)
+    return simulation, list(zip(segments, evaluate(_segment_row, samples), strict=True))
+
+
+def _segment_row(loop: _Loop, simulation: Simulation, segment: Segment) -> Facts:
+    """Return what a loop leaves while some sensors fail, in a run and exactly."""
+    design, hardware, truth, imaging = loop
+    closed = close_loop(
+        hardware,
+        design.controllers[frozenset(segment.missing)],
+        sensor_gain=truth.sensor_gain,
+        blind=(*segment.missing, *segment.wrong),
+    )
+    # a frozen reading adds an offset of its own
+    exact = closed.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
+    rate = hardware.frame_rate_hz
+    first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
+    run = simulation.part(first, last)
+    exact_nm = residual_budget(closed, truth).rms_nm if exact else np.nan
+    ratio = float(np.mean(run.strehl(imaging))) if closed.is_stable else np.nan
+    rms, second = {"unit": "nm rms", "format": ".2f"}, {"unit": "s", "format": "g"}
+    return facts(
+        start_s=fact(segment.start_s, "from", **second),
+        end_s=fact(segment.end_s, "to", **second),
+        sensors=fact(segment.text or "none", "sensors that fail"),
+        residual_nm=fact(float(np.sqrt(np.mean(run.rms_nm**2))), "simulated", **rms),
+        exact_nm=fact(exact_nm, "exact, once settled", **rms),
+        strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
+        stable=fact(closed.is_stable, "stable"),
+    )
 
 
 def mirror_rows(
@@ -411,21 +442,24 @@ def mirror_rows(
         "kalman, real positions": kalman(plant),
         regulated.method: regulated,
     }
-    rows = []
-    for name, design in designs.items():
-        loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-        numbers = loop_columns(loop, truth, imaging)
-        unsettled_nm = settling_error(loop, truth).rms_nm if loop.is_stable else np.nan
-        rms: dict[str, Any] = {"unit": "nm", "format": ".2f"}
-        row = facts(
-            design=fact(name, "design"),
-            stable=fact(loop.is_stable),
-            residual_nm=fact(numbers["residual_nm"], "residual", missing="unstable", **rms),
-            strehl=fact(numbers["strehl"], "Strehl", unit="%", scale=100, format=".2f"),
-            unsettled_nm=fact(unsettled_nm, "settled less real position", **rms),
-        )
-        rows.append(row)
-    return tuple(rows)
+    samples = ((name, (design, hardware, truth, imaging)) for name, design in designs.items())
+    return tuple(evaluate(_mirror_row, samples))
+
+
+def _mirror_row(name: str, loop: _Loop) -> Facts:
+    """Return what a design leaves on a moving mirror."""
+    design, hardware, truth, imaging = loop
+    closed = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+    numbers = loop_columns(closed, truth, imaging)
+    unsettled_nm = settling_error(closed, truth).rms_nm if closed.is_stable else np.nan
+    rms: dict[str, Any] = {"unit": "nm", "format": ".2f"}
+    return facts(
+        design=fact(name, "design"),
+        stable=fact(closed.is_stable),
+        residual_nm=fact(numbers["residual_nm"], "residual", missing="unstable", **rms),
+        strehl=fact(numbers["strehl"], "Strehl", unit="%", scale=100, format=".2f"),
+        unsettled_nm=fact(unsettled_nm, "settled less real position", **rms),
+    )
 
 
 def tradeoff(
@@ -433,6 +467,7 @@ def tradeoff(
     *,
     points: int = 9,
     taps: int = 16,
+    executor: Executor | None = None,
 ) -> Iterator[Facts]:
     """Return filters from the least norm to the least variance, and examine their loops.
 
@@ -447,6 +482,8 @@ def tradeoff(
         Levels of the norm, at least 2.
     taps : int, optional
         Length of the mixed filters' impulse response.
+    executor : concurrent.futures.Executor, optional
+        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Yields
     ------
@@ -483,26 +520,41 @@ def tradeoff(
     length = require_taps(taps)
     least, best = hinf(problem, route="riccati"), kalman(problem)
     spread = max(best.gamma / least.gamma_least, 1.0)
-    for i, share in enumerate(np.linspace(0, 1, count) ** _CROWDING):
-        level = least.gamma_least * float(spread**share)
-        for family in FAMILIES:
-            if i in (0, count - 1):
-                design = least if i == 0 else best
-            elif family == MIXED.name:
-                design = mixed(problem, gamma=level, taps=length)
-            else:
-                design = central_filter(problem, gamma=level)
-            margins: Any = SimpleNamespace(gain_low=np.nan, gain_high=np.nan, modulus=np.nan)
-            if design.hardware is not None:
-                margins = loop_margins(close_loop(design.hardware, design.controller))
-            size, ratio = {"unit": "nm", "format": ".2f"}, design.gamma / least.gamma_least
-            yield facts(
-                family=fact(family, "filter"),
-                gamma=fact(design.gamma, "norm", **size),
-                gamma_ratio=fact(max(ratio, 1.0), "norm / least", format=".4f"),
-                rms=fact(design.rms, "rms", **size),
-                gain_low=fact(margins.gain_low, "gain from", format=".3f"),
-                gain_high=fact(margins.gain_high, "gain to", format=".3f"),
-                modulus=fact(margins.modulus, "modulus margin", format=".3f"),
-                design=fact(design),
-            )
+    levels = least.gamma_least * spread ** (np.linspace(0, 1, count) ** _CROWDING)
+    ends = {0: least, count - 1: best}
+    samples = (
+        (problem, family, ends.get(i, float(level)), length, least.gamma_least)
+        for i, level in enumerate(levels)
+        for family in FAMILIES
+    )
+    yield from evaluate(_front_point, samples, executor)
+
+
+def _front_point(
+    problem: EstimationProblem,
+    family: str,
+    level: float | FilterDesign,
+    taps: int,
+    gamma_least: float,
+) -> Facts:
+    """Design a filter of a norm, unless it is one already, and examine its loop."""
+    if isinstance(level, FilterDesign):
+        design = level
+    elif family == MIXED.name:
+        design = mixed(problem, gamma=level, taps=taps)
+    else:
+        design = central_filter(problem, gamma=level)
+    margins: Any = SimpleNamespace(gain_low=np.nan, gain_high=np.nan, modulus=np.nan)
+    if design.hardware is not None:
+        margins = loop_margins(close_loop(design.hardware, design.controller))
+    size, ratio = {"unit": "nm", "format": ".2f"}, design.gamma / gamma_least
+    return facts(
+        family=fact(family, "filter"),
+        gamma=fact(design.gamma, "norm", **size),
+        gamma_ratio=fact(max(ratio, 1.0), "norm / least", format=".4f"),
+        rms=fact(design.rms, "rms", **size),
+        gain_low=fact(margins.gain_low, "gain from", format=".3f"),
+        gain_high=fact(margins.gain_high, "gain to", format=".3f"),
+        modulus=fact(margins.modulus, "modulus margin", format=".3f"),
+        design=fact(design),
+    )

@@ -195,7 +195,7 @@ def test_a_design_for_another_loop_is_refused(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("host", "message"),
     [
-        ("localhost", "--port {port} is in use"),
+        ("localhost", "--port {port}: Address already in use"),
         ("no.such.host.invalid", "cannot serve at --host"),
         (64 * "a", "cannot serve at --host"),
     ],

@@ -367,7 +367,7 @@ def test_a_page_of_text(capsys, night):
     status, text, error = run(capsys, "diagnose", night, *FACTS, "--verbose")
     assert (status, error) == (0, "")
     said = " ".join(text.split())
-    assert said.startswith("The record is sound: a pure integrator of gain 0.2 ran")
+    assert said.startswith("The record is sound: an integrator of gain 0.2 ran")
     for caption in (
         "First change the controller: the ",
         "Record: 8.188 s at 1000 Hz. 8186 of 8188 frames are usable",
@@ -386,7 +386,7 @@ def test_a_gain_file_the_page_and_json(capsys, night, tmp_path):
     assert (status, error) == (0, "")
     data = json.loads(text)
     assert data["doubt"] is None
-    assert data["control_law"]["kind"] == "pure integrator"
+    assert data["control_law"]["kind"] == "integrator"
     assert any(note.startswith("mine promises") for note in data["notes"])
     assert {row["name"] for row in data["residuals"]} > {"mine", data["best"], "what ran"}
     assert data["costs"][-1]["part"] == "all"
@@ -419,7 +419,7 @@ def test_a_dead_axis_leaves_the_other(capsys, tmp_path):
 
 def test_the_clock(capsys, tmp_path):
     record = line_record()
-    jitter = 2e-5 * np.random.default_rng(0).standard_normal(record.frames)
+    jitter = 5e-5 * np.random.default_rng(0).standard_normal(record.frames)
     kept = np.ones(record.frames, dtype=bool)
     kept[100::800] = False
     write_times = np.arange(record.frames) / RATE + jitter
@@ -434,7 +434,6 @@ def test_the_clock(capsys, tmp_path):
         capsys, "diagnose", path, "--delay-frames", 2, "--unit", "nm", "--verbose"
     )
     assert status == 0
-    assert "clock jitter 0.02 frames rms" in " ".join(text.split())
     assert "11 missing (frames)" in " ".join(text.split())
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import logging
+import os
 import signal
 import subprocess
 import sys
@@ -12,12 +13,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import run
-from support.processes import alive, wait_for
 from support.studies import TWO, assert_whole, part_rows, read_table, study_file
 
 import lbt_synth as lbt
 from lbt_synth.cli.study import _estimate as estimate
 from lbt_synth.studies.study.sample import evaluate_samples
+
+
+def wait_for(condition, seconds=30.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.02)
+
+
+def alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+
 
 PARAMETERS = (
     "{'truth.vibrations[0].rms_nm': {uniform: [100, 900]}, truth.sensor_gain: {uniform: [0.5, 1]}, "

@@ -112,13 +112,73 @@ def test_conversion_to_the_standard_says_what_is_lost(tmp_path, capsys, night):
     assert json.loads(text)["lost"] == []
 
 
+READING = (
+    *("--columns", "measurements=a,b", "commands=c,d", "times=", "--unit", "mas"),
+    *("--command-unit", "nm", "--diameter-m", 8.22, "--obstruction", 0.2, "--delay-frames", 2),
+    *("--frame-rate-hz", 1000, "--command-sign", -1, "--command-scale", 2, "--sensor-gain", 0.7),
+)
+
+
+def test_a_record_is_read_once(tmp_path, capsys, recorded_loop):
+    """What was said of a file is in the telemetry of it: no command needs to be told again."""
+    loop, _, _ = recorded_loop
+    y, u = loop.measurements[0, :6000] / lbt.models.nm_per_mas(8.22), -loop.commands[0, :6000] / 2
+    y[1000:1002], y[2000, 1] = np.nan, 1e4
+    table, night = tmp_path / "night.csv", tmp_path / "night.fits"
+    stamps = np.zeros((6000, 1))
+    np.savetxt(table, np.hstack([stamps, y, u]), delimiter=",", comments="", header="time,a,b,c,d")
+    status, text, error = run(capsys, "telemetry", table, *READING, "-o", night)
+    assert (status, error) == (0, "")
+    assert f"written: {night}" in text
+    assert "6000 frames are usable" in text
+    models, designs = [], []
+    for name, options in (("a", (table, *READING)), ("b", (night,))):
+        model = tmp_path / f"{name}.yaml"
+        assert run(capsys, "identify", *options, "-o", model, "--no-figure")[0] == 0
+        models.append(model.read_text().split("\n", 1)[1])
+        gain = tmp_path / f"{name}.fits"
+        status, text, _ = run(
+            capsys, "auto", *options, "-o", gain, "--no-figure", "--method", "kalman"
+        )
+        assert status == 0
+        assert "assumes: the commands of the record were read with --command-sign -1" in text
+        designs.append(lbt.load_gain(gain))
+    assert models[0].replace("night.csv", "") == models[1].replace("night.fits", "")
+    assert np.array_equal(designs[0].controller.A, designs[1].controller.A)
+    assert designs[0].assumptions == designs[1].assumptions
+    status, text, _ = run(capsys, "diagnose", night)
+    assert status == 0
+    assert "The record is sound" in text
+    status, text, _ = run(capsys, "telemetry", night)
+    assert status == 0
+    assert "--command-sign -1 --command-scale 2" in text
+
+
+def test_an_open_loop_is_read_once_and_a_spectrum_is_not(tmp_path, capsys):
+    y = 20 * np.random.default_rng(0).standard_normal((300, 2))
+    np.save(tmp_path / "y.npy", y)
+    options = ("--kind", "open-loop", "--unit", "nm", "--frame-rate-hz", 500)
+    night = tmp_path / "y.npz"
+    assert run(capsys, "telemetry", tmp_path / "y.npy", *options, "-o", night)[0] == 0
+    record = lbt.load_record(night)
+    assert (record.commands, record.frame_rate_hz) == (None, 500)
+    assert np.array_equal(record.measurements, y)
+    with pytest.raises(lbt.errors.ProblemError, match="is of kind open_loop; got closed_loop"):
+        lbt.load_record(night, kind="closed_loop")
+    spectrum = tmp_path / "s.csv"
+    spectrum.write_text("f_hz,psd_nm2_hz\n1,2\n2,3\n")
+    status, _, error = run(capsys, "telemetry", spectrum)
+    assert status == 2
+    assert "telemetry holds recorded series; got a spectrum" in error
+
+
 def test_bad_input_is_one_line(tmp_path, capsys, night, gain):
     damaged = tmp_path / "damaged.fits"
     damaged.write_bytes(night.read_bytes()[:-2880])
     for arguments, words in (
         (("telemetry", tmp_path / "none.fits"), "No such file or directory"),
         (("telemetry", damaged), "is no telemetry file, or it is damaged"),
-        (("telemetry", gain), "is not a telemetry file"),
+        (("telemetry", gain), "names do not tell what the columns are"),
         (("telemetry", night, "--format", "npz"), "--format and --precision are of what -o writes"),
         (("telemetry", night, "--precision", "float32"), "--format and --precision"),
         (("telemetry", night, "-o", tmp_path / "t.txt"), "must end in .fits, .npz or .aot.fits"),

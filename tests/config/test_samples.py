@@ -6,6 +6,7 @@ from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.config.samples import array_keys, build_ensemble, parse_path, with_arrays
+from lbt_synth.errors import ProblemError
 
 COUNT = 4
 
@@ -75,5 +76,5 @@ def test_what_designs_assume_does_not_change_the_loops():
     ],
 )
 def test_real_delays_and_noises_that_no_loop_has(errors):
-    with pytest.raises(lbt.errors.ProblemError):
+    with pytest.raises(ProblemError):
         ensemble_of({}, **errors)

@@ -4,46 +4,40 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.exact_covariance import exact_covariance
+from support.rational import exact_covariance
 
 import lbt_synth as lbt
 from lbt_synth.design.certificate import certify_error, certify_filter
+from lbt_synth.errors import CertificateError, DimensionError, ProblemError
+from lbt_synth.linear import StateSpace
 from lbt_synth.linear.infeasibility_proof import Witness
 
 
 def test_certificate_checks_are_independent(axis_plant):
     design = lbt.hinf(axis_plant, gamma_ratio=1.2)
-    names = [check.name for check in design.certificate.checks]
-    assert "spectral radius of the filter" in names
-    assert "norm of the estimation error over its bound, less 1" in names
-    assert "spectral radius of the closed loop" in names
+    assert {
+        "spectral radius of the filter",
+        "norm of the estimation error over its bound, less 1",
+        "spectral radius of the closed loop",
+    } <= {check.name for check in design.certificate.checks}
     assert design.recertify().passed
     tighter = replace(design, claims={**design.claims, "gamma_requested": 0.99 * design.gamma})
-    with pytest.raises(lbt.errors.CertificateError, match="norm of the estimation error"):
+    with pytest.raises(CertificateError, match="norm of the estimation error"):
         tighter.recertify().require()
     assert not certify_filter(axis_plant, np.full((4, 1), 9.0)).passed
 
 
 def test_a_variance_that_rounding_has_spoilt_is_not_certified():
     """Two Lyapunov equations that sum it in different orders have to agree."""
-    rng = np.random.default_rng(0)
-    spoilt = 0
+    rng, spoilt = np.random.default_rng(0), 0
     for _ in range(40):
-        turn = (
-            rng.standard_normal((4, 4))
-            @ np.diag([1, 1e-3, 1e-6, 1e-9])
-            @ rng.standard_normal((4, 4))
-        )
+        one, other = rng.standard_normal((2, 4, 4))
+        turn = one @ np.diag([1, 1e-3, 1e-6, 1e-9]) @ other
         A = turn @ np.diag([0.5, 0.4, 0.3, 0.2]) @ np.linalg.inv(turn)
-        problem = lbt.EstimationProblem(
-            A=A,
-            B=rng.standard_normal((4, 5)),
-            C=rng.standard_normal((1, 4)),
-            D=rng.standard_normal((1, 5)),
-            L=rng.standard_normal((1, 4)),
-        )
+        parts = {name: rng.standard_normal(size) for name, size in (("B", (4, 5)), ("C", (1, 4)))}
+        parts |= {name: rng.standard_normal(size) for name, size in (("D", (1, 5)), ("L", (1, 4)))}
         try:
-            design = lbt.kalman(problem)
+            design = lbt.kalman(lbt.EstimationProblem(A=A, **parts))
         except lbt.LbtSynthError:
             spoilt += 1
             continue
@@ -54,22 +48,13 @@ def test_a_variance_that_rounding_has_spoilt_is_not_certified():
 
 @pytest.mark.parametrize("apart", [2.0**-10, 2.0**-14])
 def test_variance_of_a_system_far_from_normal(apart):
-    """Two modes of nearly the same direction: coefficients of 6,500, and sums that cancel."""
+    """Two modes have nearly the same direction: coefficients of 6,500, and sums that cancel."""
     modes = np.array([[1.0, 1.0], [1.0, 1.0 + apart]])
     A = modes @ np.diag([0.9, 0.5]) @ np.linalg.inv(modes)
-    system = lbt.linear.StateSpace(A=A, B=[[1.0], [0.0]], C=[[1.0, 0.0]], D=[[0.0]])
-    certificate = certify_error(system)
+    certificate = certify_error(StateSpace(A=A, B=[[1.0], [0.0]], C=[[1.0, 0.0]], D=[[0.0]]))
     assert certificate.passed
-    assert certificate.rms**2 == pytest.approx(
-        float(exact_covariance(A, np.eye(2, 1))[0, 0]), rel=2e-7
-    )
-
-
-def test_a_level_of_zero_claims_nothing():
-    problem = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    nothing = Witness(states=np.zeros((1, 1)), disturbances=np.zeros((2, 1)))
-    assert lbt.design.certify_infeasible(problem, 0.0, nothing).passed
-    assert not lbt.design.certify_infeasible(problem, 1e-3, nothing).passed
+    exact = float(exact_covariance(A, np.eye(2, 1))[0, 0])
+    assert certificate.rms**2 == pytest.approx(exact, rel=2e-7)
 
 
 @pytest.mark.parametrize(("off", "passes"), [(0.7e-6, True), (1.5e-6, False)])
@@ -83,11 +68,14 @@ def test_a_gain_beside_the_optimal_one_is_refused_from_a_millionth_on(axis_plant
 
 def test_what_is_no_witness_of_the_problem_is_refused():
     problem = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    with pytest.raises(lbt.errors.ProblemError, match="expected a Witness.*; got tuple"):
-        lbt.design.certify_infeasible(problem, 1.0, (np.zeros((1, 1)), np.zeros((2, 1))))
-    wide = Witness(states=np.zeros((2, 1)), disturbances=np.zeros((2, 1)))
-    with pytest.raises(
-        lbt.errors.DimensionError,
-        match=r"1 rows of states, 2 rows of disturbances .*; got \(2, 1\) and \(2, 1\)",
-    ):
-        lbt.design.certify_infeasible(problem, 1.0, wide)
+    certify = lbt.design.certify_infeasible
+    nothing, wide = (
+        Witness(states=np.zeros((n, 1)), disturbances=np.zeros((2, 1))) for n in (1, 2)
+    )
+    assert certify(problem, 0.0, nothing).passed  # a level of zero claims nothing
+    assert not certify(problem, 1e-3, nothing).passed
+    with pytest.raises(ProblemError, match="expected a Witness.*; got tuple"):
+        certify(problem, 1.0, (np.zeros((1, 1)), np.zeros((2, 1))))
+    words = r"1 rows of states, 2 rows of disturbances .*; got \(2, 1\) and \(2, 1\)"
+    with pytest.raises(DimensionError, match=words):
+        certify(problem, 1.0, wide)

@@ -9,31 +9,43 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.plants import lbt_axis_plant, random_problem, with_own_noise
 from support.random_plants import random_plant
+from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
+from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 
 KALMAN_NM, LEAST_GAMMA_NM = 135.958, 155.5373
+SEEDS = st.integers(0, 10_000)
 
 
 def test_the_numbers_of_the_lbt(axis_plant):
-    assert lbt.kalman(axis_plant).rms == pytest.approx(KALMAN_NM, rel=1e-5)
-    least = {m: lbt.hinf(axis_plant, route=m).gamma for m in ("lmi", "riccati")}
-    assert least["riccati"] == pytest.approx(LEAST_GAMMA_NM, rel=1e-5)
-    assert least["lmi"] == pytest.approx(least["riccati"], rel=1e-6)
+    """The stable sensor gains of the Kalman filter are [.075, 1.9], at 1.05 gamma_min [.70, 1.6]."""
+    kalman = lbt.kalman(axis_plant)
+    assert kalman.rms == pytest.approx(KALMAN_NM, rel=1e-5)
+    least = {m: lbt.hinf(axis_plant, route=m) for m in ("lmi", "riccati")}
+    assert least["riccati"].gamma == pytest.approx(LEAST_GAMMA_NM, rel=1e-5)
+    assert least["lmi"].gamma == pytest.approx(least["riccati"].gamma, rel=1e-6)
+    near = lbt.hinf(axis_plant, gamma_ratio=1.05)
+    for design, gains, accuracy in ((kalman, (0.075, 1.9), 0.03), (near, (0.70, 1.6), 0.05)):
+        stable = lbt.loop.stable_sensor_gains(axis_plant.hardware, design.controller)
+        assert stable == pytest.approx(gains, abs=accuracy)
+    # at the least gamma the error is all-pass
+    error = axis_plant.error_system(least["riccati"].gain_predictor)
+    sigma = lbt.linear.largest_singular_values(error, np.linspace(0.1, 400, 200))
+    assert np.ptp(sigma) / sigma.mean() < 1e-4
 
 
 def test_both_routes_bracket_slow_wind_shake_of_thousands_of_nanometres():
-    """Poles of modulus 0.9999 on both axes, with 8 um beside noise of 3 nm: the ELT's template."""
+    """The ELT's template has poles of modulus 0.9999, and 8 um beside noise of 3 nm."""
+    slow = lbt.models.ARModel(
+        coefficients=[1.998866, -0.99887], driving_rms_nm=0.85, frame_rate_hz=1000.0
+    )
+    shakes = [
+        lbt.Vibration(frequency_hz=f, damping=0.3, rms_nm=rms, direction=way)
+        for f, rms, way in ((0.75, 340.0, (1, 0)), (0.3, 8090.0, (0, 1)))
+    ]
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=1000.0,
-        turbulence=lbt.models.ARModel(
-            coefficients=[1.998866, -0.99887], driving_rms_nm=0.85, frame_rate_hz=1000.0
-        ),
-        vibrations=[
-            lbt.Vibration(frequency_hz=0.75, damping=0.3, rms_nm=340.0, direction=(1, 0)),
-            lbt.Vibration(frequency_hz=0.3, damping=0.3, rms_nm=8090.0, direction=(0, 1)),
-        ],
-        noise_nm=2.7,
+        frame_rate_hz=1000.0, turbulence=slow, vibrations=shakes, noise_nm=2.7
     )
     lmi, riccati = (lbt.hinf(plant, gamma_ratio=1.2, route=m) for m in ("lmi", "riccati"))
     assert riccati.gamma_least == pytest.approx(lmi.gamma_least, rel=1e-7)
@@ -41,7 +53,7 @@ def test_both_routes_bracket_slow_wind_shake_of_thousands_of_nanometres():
     assert lmi.gamma == pytest.approx(riccati.gamma, rel=1e-5)
 
 
-@pytest.mark.parametrize("ratio", [1.02, 1.2, 2.0])
+@pytest.mark.parametrize("ratio", [1.02, 2.0])
 def test_hinf_by_lmi_is_the_central_filter_of_the_riccati_equation(axis_plant, ratio):
     gamma = ratio * LEAST_GAMMA_NM
     lmi, riccati = (lbt.hinf(axis_plant, gamma=gamma, route=m) for m in ("lmi", "riccati"))
@@ -51,8 +63,8 @@ def test_hinf_by_lmi_is_the_central_filter_of_the_riccati_equation(axis_plant, r
     assert lmi.gamma_requested == gamma
 
 
-@settings(max_examples=15)
-@given(seed=st.integers(0, 10_000), n=st.integers(1, 4), q=st.integers(1, 2), l=st.integers(1, 2))
+@settings(max_examples=8)
+@given(seed=SEEDS, n=st.integers(1, 4), q=st.integers(1, 2), l=st.integers(1, 2))
 def test_both_routes_agree_on_problems_without_a_telescope(seed, n, q, l):
     problem = random_problem(np.random.default_rng(seed), n, q, l=l)
     kalman, sdp = lbt.kalman(problem), lbt.kalman(problem, route="sdp")
@@ -74,78 +86,49 @@ def test_scalar_hinf_against_a_search():
     assert least <= norms.min() * (1 + 1e-9)
 
 
-def test_at_the_least_gamma_the_error_is_all_pass(axis_plant):
-    design = lbt.hinf(axis_plant, route="riccati")
-    error = axis_plant.error_system(design.gain_predictor)
-    sigma = lbt.linear.largest_singular_values(error, np.linspace(0.1, 400, 200))
-    assert np.ptp(sigma) / sigma.mean() < 1e-4
+def test_refusals(axis_plant):
+    def hinf(plant=axis_plant, **options):
+        return lambda: lbt.hinf(plant, **options)
 
-
-def test_hinf_costs_sensor_gain_robustness(axis_plant):
-    """Kalman [.075, 1.9], 1.05 gamma_min [.70, 1.6]."""
-    low, high = lbt.loop.stable_sensor_gains(axis_plant.hardware, lbt.kalman(axis_plant).controller)
-    assert (low, high) == pytest.approx((0.075, 1.9), abs=0.03)
-    design = lbt.hinf(axis_plant, gamma_ratio=1.05)
-    low, high = lbt.loop.stable_sensor_gains(axis_plant.hardware, design.controller)
-    assert (low, high) == pytest.approx((0.70, 1.6), abs=0.05)
-
-
-def test_gamma_below_the_least_names_the_least(axis_plant):
-    for route in ("lmi", "riccati"):
-        with pytest.raises(
-            lbt.errors.InfeasibleError, match=r"at least 155\.537.*got 150"
-        ) as caught:
-            lbt.hinf(axis_plant, gamma=150, route=route)
-        assert caught.value.gamma == 150
-        assert caught.value.gamma_least == pytest.approx(LEAST_GAMMA_NM, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        ({"gamma": 200, "gamma_ratio": 1.2}, "gamma or gamma_ratio, not both"),
-        ({"gamma": -1}, "gamma must be above 0"),
-        ({"gamma": np.nan}, "gamma must be finite"),
-        ({"gamma_ratio": 0.9}, "gamma_ratio must be at least 1; got 0.9"),
-        ({"route": "magic"}, "route must be one of lmi, riccati; got 'magic'"),
-    ],
-)
-def test_wrong_arguments_are_refused(axis_plant, arguments, text):
-    with pytest.raises(lbt.errors.ProblemError, match=text):
-        lbt.hinf(axis_plant, **arguments)
-
-
-def test_nothing_to_estimate_is_refused():
     known = lbt.EstimationProblem(A=0.5, B=[[0.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    with pytest.raises(lbt.errors.ProblemError, match="must have an estimation error"):
-        lbt.hinf(known)
+    bare = "expected an EstimationProblem.*got ndarray"
+    require_refusals(
+        [
+            (hinf(gamma=200, gamma_ratio=1.2), ProblemError, "gamma or gamma_ratio, not both"),
+            (hinf(gamma=-1), ProblemError, "gamma must be above 0"),
+            (hinf(gamma=np.nan), ProblemError, "gamma must be finite"),
+            (hinf(gamma=1e300), ProblemError, "at most"),
+            (hinf(gamma_ratio=0.9), ProblemError, "gamma_ratio must be at least 1; got 0.9"),
+            (hinf(route="magic"), ProblemError, "must be one of lmi, riccati; got 'magic'"),
+            (hinf(known), ProblemError, "must have an estimation error"),
+            (hinf(np.eye(2)), ProblemError, bare),
+            (lambda: lbt.kalman(np.eye(2)), ProblemError, bare),
+        ]
+    )
     assert lbt.kalman(known).rms == 0
-
-
-def test_a_mirror_without_vibration_needs_no_special_case():
-    turbulence = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=800)
-    plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=turbulence, noise_nm=15)
-    assert lbt.kalman(plant).certificate.passed
-    assert lbt.hinf(plant, gamma_ratio=1.2).certificate.passed
+    for route in ("lmi", "riccati"):
+        low = refused(hinf(gamma=150, route=route), InfeasibleError, r"least 155\.537.*got 150")
+        assert low.gamma == 150
+        assert low.gamma_least == pytest.approx(LEAST_GAMMA_NM, rel=1e-5)
 
 
 def test_units_do_not_matter():
-    """The same problem in metres and in nanometres."""
+    """The same problem is posed in metres and in nanometres."""
     nano = lbt_axis_plant()
     metre = lbt.EstimationProblem(A=nano.A, B=nano.B * 1e-9, C=nano.C, D=nano.D * 1e-9, L=nano.L)
-    for make in (
-        lbt.kalman,
-        lambda p: lbt.kalman(p, route="sdp"),
-        lambda p: lbt.hinf(p, gamma_ratio=1.2),
+    for make, options in (
+        (lbt.kalman, {}),
+        (lbt.kalman, {"route": "sdp"}),
+        (lbt.hinf, {"gamma_ratio": 1.2}),
     ):
-        one, other = make(nano), make(metre)
+        one, other = make(nano, **options), make(metre, **options)
         assert np.allclose(one.gain_predictor, other.gain_predictor, rtol=1e-6)
         assert other.rms == pytest.approx(one.rms * 1e-9, rel=1e-6)
 
 
-@pytest.mark.parametrize("noise_nm", [1e-3, 2.5e-3, 1.0, 1e3])
+@pytest.mark.parametrize("noise_nm", [1e-3, 1e3])
 def test_least_gamma_over_six_decades_of_noise(noise_nm):
-    """Both routes, also where the measurement is all but exact."""
+    """Both routes agree, also where the measurement is all but exact."""
     base = lbt_axis_plant()
     plant = lbt.EstimationProblem(
         A=base.A, B=base.B, C=base.C, D=base.D * noise_nm / 15.5, L=base.L
@@ -167,7 +150,7 @@ def test_unstable_modes_that_no_noise_drives():
             assert lbt.hinf(problem, route=route).gamma == pytest.approx(least, rel=1e-6)
 
 
-@pytest.mark.parametrize("seed", [33, 5, 8, 13, 21])
+@pytest.mark.parametrize("seed", [33, 5])
 def test_many_sensors_of_one_state_at_the_least_gamma(seed):
     rng = np.random.default_rng(seed)
     C = rng.standard_normal((3, 1))
@@ -178,60 +161,43 @@ def test_many_sensors_of_one_state_at_the_least_gamma(seed):
 
 
 def test_weakly_driven_modes_and_odd_units_are_not_refused():
-    weak = lbt.EstimationProblem(
-        A=np.diag([1.0, 0.5]), B=[[1e-6, 0, 0], [0, 1, 0]], C=[[1, 1]], D=[[0, 0, 1]], L=[[1, 1]]
-    )
+    known = {"A": np.diag([1.0, 0.5]), "D": [[0, 0, 1]]}
+    weak = lbt.EstimationProblem(**known, B=[[1e-6, 0, 0], [0, 1, 0]], C=[[1, 1]], L=[[1, 1]])
     assert lbt.kalman(weak).certificate.passed
     c = 1e-11
-    units = lbt.EstimationProblem(
-        A=np.diag([1.0, 0.5]), B=[[1 / c, 0, 0], [0, 1, 0]], C=[[c, 1]], D=[[0, 0, 1]], L=[[c, 1]]
-    )
+    units = lbt.EstimationProblem(**known, B=[[1 / c, 0, 0], [0, 1, 0]], C=[[c, 1]], L=[[c, 1]])
     assert lbt.kalman(units).rms == pytest.approx(1.6689, abs=1e-4)
 
 
 def test_a_very_large_bound_is_the_kalman_filter(axis_plant):
-    kalman = lbt.kalman(axis_plant)
     for route in ("lmi", "riccati"):
         design = lbt.hinf(axis_plant, gamma_ratio=1e6, route=route)
-        assert design.rms == pytest.approx(kalman.rms, rel=1e-6)
-    with pytest.raises(lbt.errors.ProblemError, match="at most"):
-        lbt.hinf(axis_plant, gamma=1e300)
+        assert design.rms == pytest.approx(KALMAN_NM, rel=5e-6)
 
 
 def test_a_filter_below_the_infeasible_level_does_not_leave_the_library(monkeypatch, axis_plant):
     module = sys.modules["lbt_synth.design.hinf"]
     honest = module.infeasible_level
     monkeypatch.setattr(module, "infeasible_level", lambda *parts: 1.001 * honest(*parts))
-    with pytest.raises(lbt.errors.NumericalError, match="no filter should have a norm below"):
+    with pytest.raises(NumericalError, match="no filter should have a norm below"):
         lbt.hinf(axis_plant, route="riccati")
-
-
-def test_only_problems_are_designed_for():
-    for make in (lbt.kalman, lbt.hinf):
-        with pytest.raises(
-            lbt.errors.ProblemError, match="expected an EstimationProblem.*got ndarray"
-        ):
-            make(np.eye(2))
 
 
 def test_many_states_take_the_equation_by_default():
     lines = [lbt.Vibration(frequency_hz=12.0 + 3 * i, damping=0.01, rms_nm=20.0) for i in range(9)]
     slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
-    routes = {}
-    for count in (2, 9):
+    for count, route in ((0, "lmi"), (2, "lmi"), (9, "riccati")):
         plant = lbt.tip_tilt_plant(
-            frame_rate_hz=800, turbulence=slow, vibrations=lines[:count], noise_nm=15.0
+            frame_rate_hz=800, turbulence=slow, vibrations=lines[:count] or None, noise_nm=15.0
         )
         design = lbt.hinf(plant, gamma_ratio=1.2)
-        routes[plant.A.shape[0]] = design.solver.route
+        assert design.solver.route == route
+        assert (len(plant.A) > 20) == (route == "riccati")
         assert design.certificate.passed
-    small, large = sorted(routes)
-    assert small <= 20 < large
-    assert (routes[small], routes[large]) == ("lmi", "riccati")
 
 
-@settings(max_examples=15)
-@given(seed=st.integers(0, 10_000), n=st.integers(1, 3))
+@settings(max_examples=5)
+@given(seed=SEEDS, n=st.integers(1, 3))
 def test_more_measurements_lower_the_least_gamma(seed, n):
     p = with_own_noise(random_problem(np.random.default_rng(seed), n))
     least = [lbt.hinf(p, horizon=h, route="riccati").gamma_least for h in (-1, 0, 1, 2)]
@@ -239,8 +205,8 @@ def test_more_measurements_lower_the_least_gamma(seed, n):
         assert earlier <= later * (1 + 1e-9)
 
 
-@settings(max_examples=15)
-@given(seed=st.integers(0, 10_000), n=st.integers(1, 3))
+@settings(max_examples=8)
+@given(seed=SEEDS, n=st.integers(1, 3))
 def test_hinf_filter_form_against_its_own_riccati_condition(seed, n):
     """Hassibi, Sayed, Kailath: the filter of a level exists iff P^-1 + C'R^-1 C - L'L / g^2 > 0."""
     p = with_own_noise(random_problem(np.random.default_rng(seed), n))
@@ -261,42 +227,39 @@ def test_hinf_filter_form_against_its_own_riccati_condition(seed, n):
     assert not exists(0.99 * least)
 
 
-@pytest.mark.parametrize("method", ["kalman", "hinf"])
-def test_a_horizon_is_a_delay_of_the_loop(method):
-    """Plant with delay 2, filter or two-step prediction: the loops of delay 1 and 3."""
-    make = {
-        "kalman": lbt.kalman,
-        "hinf": lambda p, **k: lbt.hinf(p, gamma_ratio=1.2, route="riccati", **k),
-    }[method]
-    for horizon, delay in ((0, 1), (2, 3), (3, 4)):
-        shifted = make(lbt_axis_plant(), horizon=horizon)
-        direct = make(lbt_axis_plant(delay_frames=delay))
+@pytest.mark.parametrize(
+    ("make", "options"),
+    [(lbt.kalman, {}), (lbt.hinf, {"gamma_ratio": 1.2, "route": "riccati"})],
+)
+def test_a_horizon_is_a_delay_of_the_loop(make, options):
+    """On a plant of delay 2, filter and two-step prediction are the loops of delay 1 and 3."""
+    p = lbt_axis_plant()
+    bare = lbt.EstimationProblem(A=p.A, B=p.B, C=p.C, D=p.D, L=p.L, dt_s=p.dt_s)
+    for horizon, delay in ((0, 1), (3, 4)):
+        shifted = make(p, horizon=horizon, **options)
+        direct = make(lbt_axis_plant(delay_frames=delay), **options)
         assert shifted.hardware.delay_frames == delay
         assert shifted.rms == pytest.approx(direct.rms, rel=1e-10)
         assert shifted.gamma == pytest.approx(direct.gamma, rel=1e-9)
         # and of the general construction, which knows nothing of telescopes
-        p = lbt_axis_plant()
-        bare = lbt.EstimationProblem(A=p.A, B=p.B, C=p.C, D=p.D, L=p.L, dt_s=p.dt_s)
-        assert make(bare, horizon=horizon).rms == pytest.approx(direct.rms, rel=1e-9)
-    with pytest.raises(lbt.errors.ProblemError, match="delay of 1 to 100 frames; got -1"):
-        make(lbt_axis_plant(), horizon=-1)
+        assert make(bare, horizon=horizon, **options).rms == pytest.approx(direct.rms, rel=1e-9)
+    with pytest.raises(ProblemError, match="delay of 1 to 100 frames; got -1"):
+        make(p, horizon=-1, **options)
 
 
 @pytest.mark.study
 def test_designs_of_random_plants(capsys):
-    """Kalman and H-infinity designs of 1,000 plants, certified, the least gamma bracketed."""
-    rng = np.random.default_rng(0)
-    gaps = []
+    """Kalman and H-infinity designs of 1,000 plants are certified, the least gamma bracketed."""
+    rng, gaps = np.random.default_rng(0), []
     for _ in range(1000):
         plant = random_plant(rng)
-        assert lbt.kalman(plant).certificate.passed
         design = lbt.hinf(plant, gamma_ratio=1.2, route="riccati")
+        assert lbt.kalman(plant).certificate.passed
         assert design.certificate.passed
         gaps.append(design.gamma_least / design.gamma_infeasible - 1)
     with capsys.disabled():
         print(
-            f"\n1000 plants: gap of the least gamma, median {np.median(gaps):.2g}, 99th percentile "
-            f"{np.percentile(gaps, 99):.2g}, largest {max(gaps):.2g}"
+            f"\ngap of the least gamma, median and largest: {np.median(gaps):.2g} {max(gaps):.2g}"
         )
     assert max(gaps) < 1e-5
 
@@ -304,7 +267,7 @@ def test_designs_of_random_plants(capsys):
 def test_noise_far_below_the_signal_is_left_to_the_equation():
     """The inequality's gain is singular there; the equation needs no inverse."""
     quiet = lbt.EstimationProblem(A=0.5, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1e-6]], L=1.0)
-    with pytest.raises(lbt.errors.NumericalError, match="riccati"):
+    with pytest.raises(NumericalError, match="riccati"):
         lbt.hinf(quiet, horizon=0, route="lmi")
     design = lbt.hinf(quiet, horizon=0)
     assert design.solver.route == "riccati"

@@ -2,29 +2,27 @@
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from support.gain_files import original
+from support.refusals import require_refusals
 from support.telemetry import full, same
 
 import lbt_synth as lbt
+from lbt_synth.errors import FileError, GainFileError, OutputError, TelemetryError
 from lbt_synth.storage.array_file import npz_bytes
 
-ENDINGS = ("fits", "npz")
 
-
-@dataclass(frozen=True)
-class Kind:
+class Kind(NamedTuple):
     """A kind of file, and what its tests write."""
 
     make: Callable[[], Any]
     save: Callable[..., Any]
     load: Callable[[Any], Any]
-    error: type[lbt.errors.FileError]
+    error: type[FileError]
     is_same: Callable[[Any, Any], bool]
 
 
@@ -34,21 +32,12 @@ def is_same_design(one, other):
     )
 
 
+save, load = lbt.files.save_telemetry, lbt.files.load_telemetry
 KINDS = {
-    "gains": Kind(
-        make=lambda: original("bare"),
-        save=lbt.save_gain,
-        load=lbt.load_gain,
-        error=lbt.errors.GainFileError,
-        is_same=is_same_design,
+    "gain": Kind(
+        lambda: original("bare"), lbt.save_gain, lbt.load_gain, GainFileError, is_same_design
     ),
-    "telemetry": Kind(
-        make=full,
-        save=lbt.files.save_telemetry,
-        load=lbt.files.load_telemetry,
-        error=lbt.errors.TelemetryError,
-        is_same=same,
-    ),
+    "telemetry": Kind(full, save, load, TelemetryError, same),
 }
 
 
@@ -57,7 +46,7 @@ def kind(request):
     return KINDS[request.param]
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("ending", ["fits", "npz"])
 def test_truncated_files_are_refused_and_flipped_bits_found_or_harmless(tmp_path, kind, ending):
     content = kind.save(tmp_path / f"a.{ending}", kind.make()).read_bytes()
     assert kind.save(tmp_path / f"b.{ending}", kind.make()).read_bytes() == content
@@ -68,7 +57,7 @@ def test_truncated_files_are_refused_and_flipped_bits_found_or_harmless(tmp_path
             kind.load(path)
         assert "\n" not in str(caught.value)
         assert caught.value.path == path
-    refused, places = 0, np.linspace(0, size - 1, 61).astype(int)
+    refused, places = 0, np.linspace(0, size - 1, 31).astype(int)
     for place in places:
         damaged = bytearray(content)
         damaged[place] ^= 0xFF if place % 2 else 1 << int(place) % 8
@@ -85,53 +74,51 @@ def test_foreign_files_are_refused(tmp_path, kind):
     fits.PrimaryHDU(np.ones((4, 4))).writeto(picture)
     np.savez(other, a=np.ones(3))
     np.savez(pickled, META=np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    (tmp_path / "notes.npz").write_bytes(npz_bytes({}, '{"schema": "recipes"}'))
-    (tmp_path / "prose.npz").write_bytes(npz_bytes({}, "[1, 2]"))
+    schema = next(name for name, value in KINDS.items() if value is kind)
+    head = f'"schema": "lbt_synth {schema} file"'
+    for i, text in enumerate(
+        (
+            '{"schema": "recipes"}',
+            "[1, 2]",
+            "null",
+            "[" * 100_000,
+            f'{{{head}, "x": NaN}}',
+            f"{{{head}, {head}}}",
+            "\x00",
+        )
+    ):
+        (tmp_path / f"hostile{i}.npz").write_bytes(npz_bytes({}, text))
     for stranger in KINDS.values():
         if stranger is not kind:
             stranger.save(tmp_path / "stranger.npz", stranger.make())
     for path in tmp_path.iterdir():
-        with pytest.raises(kind.error, match=f"{path.name} is "):
+        with pytest.raises(kind.error, match=path.name):
             kind.load(path)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "null",
-        "[" * 100_000,
-        '{"schema": "lbt_synth SCHEMA file", "x": NaN}',
-        '{"schema": "lbt_synth SCHEMA file", "schema": "lbt_synth SCHEMA file"}',
-        "\x00",
-    ],
-)
-def test_hostile_metadata(tmp_path, kind, text):
-    path = tmp_path / "h.npz"
-    schema = "gain" if kind.load is lbt.load_gain else "telemetry"
-    path.write_bytes(npz_bytes({}, text.replace("SCHEMA", schema)))
-    with pytest.raises(kind.error):
-        kind.load(path)
 
 
 def test_names_that_cannot_be_read_or_written(tmp_path, kind):
     (tmp_path / "folder.fits").mkdir()
-    for name, words in (
-        ("g.txt", "must end in .fits, .npz.*; got 'g.txt'"),
-        ("g.json", "must end in .fits, .npz.*; got 'g.json'"),
-        ("none.fits", "cannot read .*No such file"),
-        ("folder.fits", "cannot read"),
-        ("x\0y.npz", "null"),
-    ):
-        with pytest.raises(kind.error, match=words):
-            kind.load(tmp_path / name)
-    for name, words in (
-        ("g.txt", "must end in .fits, .npz.*; got 'g.txt'"),
-        ("nowhere/g.fits", "cannot write .*No such file or directory"),
-        ("folder.fits", "is a directory"),
-        ("x\0y.npz", "null"),
-    ):
-        with pytest.raises(lbt.errors.OutputError, match=words):
-            kind.save(tmp_path / name, kind.make())
+    rows = [
+        (lambda n=name: kind.load(tmp_path / n), kind.error, words)
+        for name, words in (
+            ("g.txt", "must end in .fits, .npz.*; got 'g.txt'"),
+            ("g.json", "must end in .fits, .npz.*; got 'g.json'"),
+            ("none.fits", "cannot read .*No such file"),
+            ("folder.fits", "cannot read"),
+            ("x\0y.npz", "null"),
+        )
+    ]
+    made = kind.make()
+    rows += [
+        (lambda n=name: kind.save(tmp_path / n, made), OutputError, words)
+        for name, words in (
+            ("g.txt", "must end in .fits, .npz.*; got 'g.txt'"),
+            ("nowhere/g.fits", "cannot write .*No such file or directory"),
+            ("folder.fits", "is a directory"),
+            ("x\0y.npz", "null"),
+        )
+    ]
+    require_refusals(rows)
 
 
 def test_nothing_half_written_stays(tmp_path, monkeypatch, kind):
@@ -142,7 +129,7 @@ def test_nothing_half_written_stays(tmp_path, monkeypatch, kind):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(lbt.errors.OutputError, match="cannot write .*No space left on device"):
+    with pytest.raises(OutputError, match="cannot write .*No space left on device"):
         kind.save(path, kind.make())
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["g.fits"]

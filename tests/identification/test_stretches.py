@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
 from lbt_synth.identification.stretches import cut_stretches
 
 
@@ -19,7 +20,7 @@ def test_halves_are_apart_and_in_order(lengths, share):
     stretches = [(int(a), int(b)) for a, b in zip(ends[::2], ends[1::2], strict=False)]
     usable = frames_in(stretches)
     if int(share * len(usable)) == 0:
-        with pytest.raises(lbt.errors.ProblemError, match="frames to fit and to test on"):
+        with pytest.raises(ProblemError, match="frames to fit and to test on"):
             lbt.identification.split_halves(stretches, int(ends[-1]), fit_share=share)
         return
     fit, test = lbt.identification.split_halves(stretches, int(ends[-1]), fit_share=share)
@@ -50,5 +51,5 @@ def test_cuts_are_those_of_the_usable_frames():
     ],
 )
 def test_stretches_that_are_refused(arguments, message):
-    with pytest.raises(lbt.errors.ProblemError, match=message):
+    with pytest.raises(ProblemError, match=message):
         lbt.identification.split_halves(*arguments)

@@ -1,23 +1,24 @@
 """The tracking controller in the loop: change-overs without a bump, a drift, failures."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support.recorded_runs import recorded_run
+from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.identification import TrackingController
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.models import ARModel, DriftingVibration, PositionLoop, SinusoidalVibration
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 
-AIR = lbt.models.ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=800)
-SHELL = lbt.models.PositionLoop.from_bandwidth(
-    natural_frequency_hz=50, damping=0.5, bandwidth_hz=300
-)
+AIR = ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=800)
+SHELL = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
 
 
-def line(frequency_hz, damping=0.02):
-    return lbt.Vibration(frequency_hz=frequency_hz, damping=damping, rms_nm=300, direction=(1,))
+def line(frequency_hz, damping=0.02, direction=(1,)):
+    known = {"damping": damping, "rms_nm": 300, "direction": direction}
+    return lbt.Vibration(frequency_hz=frequency_hz, **known)
 
 
 def axis(frequency_hz, **changes):
@@ -25,53 +26,35 @@ def axis(frequency_hz, **changes):
     return lbt.tip_tilt_plant(**(settings | changes), vibrations=[line(frequency_hz)])
 
 
-def two_axes():
-    return lbt.tip_tilt_plant(
-        frame_rate_hz=800,
-        turbulence=AIR,
-        noise_nm=15.5,
-        delay_frames=2.4,
-        vibrations=[replace(line(20), direction=(1, 0.5))],
-        sensor_matrix=np.diag([0.8, 1.1]),
-        influence_matrix=[[1, 0.2], [0, 0.9]],
-    )
+TWO_AXES = lbt.tip_tilt_plant(
+    frame_rate_hz=800,
+    turbulence=AIR,
+    noise_nm=15.5,
+    delay_frames=2.4,
+    vibrations=[line(20, direction=(1, 0.5))],
+    sensor_matrix=np.diag([0.8, 1.1]),
+    influence_matrix=[[1, 0.2], [0, 0.9]],
+)
 
 
-def disturbed(plant, *, frames, hz=20, seed=0):
-    """Total phase and noise, (1, frames, n) each; the vibration is on the first axis."""
+def disturbed(plant, *, frames, hz=20):
+    """Return total phase and noise, (1, frames, n) each; the vibration is on the first axis."""
     along = tuple(np.eye(plant.hardware.modes)[0])
-    shake = lbt.models.SinusoidalVibration(frequency_hz=hz, rms_nm=300, direction=along)
+    shake = SinusoidalVibration(frequency_hz=hz, rms_nm=300, direction=along)
     truth = lbt.Truth(turbulence=AIR, vibrations=(shake,), noise_nm=15.5)
-    drawn = draw_disturbance(truth, plant.hardware, frames=frames, seed=seed)
+    drawn = draw_disturbance(truth, plant.hardware, frames=frames, seed=0)
     return drawn.phase_nm, drawn.noise
 
 
-class Watched:
-    """A controller, what it measured and what it commanded."""
-
-    def __init__(self, controller):
-        self.controller = controller
-        self.reset()
-
-    def reset(self):
-        self.controller.reset()
-        self.measured, self.commands = [], []
-
-    def step(self, y):
-        self.measured.append(np.array(y))
-        self.commands.append(self.controller.step(y))
-        return self.commands[-1]
-
-
 def run(controller, plant, series):
-    """Residual and commands, (frames, n + m)."""
+    """Return residual, commands and measurements, (frames, n + m + q)."""
     return recorded_run(controller, plant.hardware, *series)[0]
 
 
 PLANTS = {
     "delay 1": axis(20, delay_frames=1),
     "a slow mirror": axis(20, mirror=SHELL),
-    "two axes": two_axes(),
+    "two axes": TWO_AXES,
 }
 
 
@@ -84,22 +67,20 @@ def test_each_filter_is_as_if_it_had_always_run(name):
         made.append(lbt.kalman(problem))
         return made[-1]
 
-    tracker = lbt.identification.TrackingController(
-        plant, window_s=1.0, update_s=0.75, design=design
+    tracker = TrackingController(plant, window_s=1.0, update_s=0.75, design=design)
+    n = plant.hardware.modes
+    _, commands, measured = np.split(
+        run(tracker, plant, disturbed(plant, frames=1600, hz=22)), [n, 2 * n], axis=1
     )
-    watched = Watched(tracker)
-    run(watched, plant, disturbed(plant, frames=1600, hz=22))
     assert [update.reason for update in tracker.history] == [""] * 2
     assert len({design.gain_predictor.tobytes() for design in made}) == 3
-    commands, scale = np.array(watched.commands), np.max(np.abs(watched.commands))
-    before = np.zeros_like(commands[0])
+    scale, last = np.max(np.abs(commands)), np.vstack([0 * commands[:1], commands])
     starts = [0, 800, 1400, 1600]  # a filter runs from the frame after its update on
     for number, filter_design in enumerate(made):
         beside, cold = filter_design.estimator.start(), filter_design.controller.start()
         begun = []
-        for k, y in enumerate(watched.measured):
-            last = commands[k - 1] if k else before
-            expected = filter_design.hardware.projector @ beside.step(np.concatenate([y, last]))
+        for k, y in enumerate(measured):
+            expected = filter_design.hardware.projector @ beside.step(np.r_[y, last[k]])
             if starts[number] <= k < starts[number + 1]:
                 assert commands[k] == pytest.approx(expected, rel=0, abs=1e-9 * scale)
                 begun.append(np.max(np.abs(cold.step(y) - commands[k])))
@@ -109,68 +90,60 @@ def test_each_filter_is_as_if_it_had_always_run(name):
 
 def test_a_line_that_moves_is_followed_and_a_fixed_filter_does_not():
     plant = axis(18)
-    drift = lbt.models.DriftingVibration(
-        start_hz=18, end_hz=22, duration_s=8, rms_nm=300, direction=(1,)
-    )
+    moves = {"start_hz": 18, "end_hz": 22, "duration_s": 8}
+    drift = DriftingVibration(**moves, rms_nm=300, direction=(1,))
     truth = lbt.Truth(turbulence=AIR, vibrations=(drift,), noise_nm=15.5)
-    tracker = lbt.identification.TrackingController(plant, window_s=2, update_s=0.5)
+    tracker = TrackingController(plant, window_s=2, update_s=0.5)
 
-    def left(controller):
+    def residual(controller):
         settings = {"hardware": plant.hardware, "frames": 7200, "settle_frames": 1600, "seed": 2}
         return lbt.simulate(controller, truth, **settings).residual_nm[0, :, 0]
 
-    followed = left(tracker)
-    assert all(update.reason == "" for update in tracker.history)
+    followed = residual(tracker)
     for update in tracker.history:
+        assert update.reason == ""
         true = drift.frequency_hz_at(update.time_s - 2 - 1)  # of the middle of the window
         assert min(abs(hz - true) for hz in update.frequencies_hz) < 0.3
-    last = slice(5600, None)
-    fixed, knowing = (left(lbt.kalman(p).controller) for p in (plant, axis(22)))
-    rms = [np.sqrt(np.mean(series[last] ** 2)) for series in (followed, fixed, knowing)]
+    fixed, knowing = (residual(lbt.kalman(p).controller) for p in (plant, axis(22)))
+    rms = [np.sqrt(np.mean(series[5600:] ** 2)) for series in (followed, fixed, knowing)]
     assert rms[0] < 1.1 * rms[2]
     assert rms[0] < 0.7 * rms[1]
     assert np.max(np.abs(followed)) < 2 * np.max(np.abs(fixed))  # nor is there a bump
 
 
+def raise_error(_):
+    raise np.linalg.LinAlgError("no inverse today")
+
+
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (np.linalg.LinAlgError("no inverse today"), "LinAlgError: no inverse today"),
-        (axis(20, sensor_gain=0.1), "the loop must be stable with the new filter"),
-        (lbt.LoopHardware(frame_rate_hz=800, modes=1), "only filters of a TipTiltPlant"),
+        (raise_error, "LinAlgError: no inverse today"),
+        (lambda _: lbt.kalman(axis(20, sensor_gain=0.1)), "must be stable with the new filter"),
+        (lambda p: lbt.integrator(p.hardware, gain=0.3), "only filters of a TipTiltPlant"),
     ],
 )
 def test_a_filter_that_fails_never_runs(wrong, words):
-    plant, calls = axis(18), []
+    plant, designs = axis(18), iter([lbt.kalman])
 
     def design(problem):
-        calls.append(problem)
-        if len(calls) == 1:
-            return lbt.kalman(problem)
-        if isinstance(wrong, Exception):
-            raise wrong
-        if isinstance(wrong, lbt.LoopHardware):
-            return lbt.integrator(wrong, gain=0.3)
-        return lbt.kalman(wrong)
+        return next(designs, wrong)(problem)
 
-    tracker = lbt.identification.TrackingController(
-        plant, window_s=0.75, update_s=0.25, design=design
-    )
-    total, noise = disturbed(plant, frames=800)
-    found = run(tracker, plant, (total, noise))
-    own = run(lbt.kalman(plant).controller.start(), plant, (total, noise))
-    assert np.allclose(found, own, rtol=0, atol=1e-10 * np.max(np.abs(own)))
+    tracker = TrackingController(plant, window_s=0.75, update_s=0.25, design=design)
+    series = disturbed(plant, frames=800)
+    tracked = run(tracker, plant, series)
+    fixed = run(lbt.kalman(plant).controller.start(), plant, series)
+    assert np.allclose(tracked, fixed, rtol=0, atol=1e-10 * np.max(np.abs(fixed)))
     assert len(tracker.history) == 2
     for update in tracker.history:
         assert words in update.reason
-        assert update.frequencies_hz == (18.0,)
-        assert update.rms_nm == (300.0,)
+        assert (update.frequencies_hz, update.rms_nm) == ((18.0,), (300.0,))
         assert update.noise_nm == (pytest.approx(15.5),)
 
 
 def test_measurements_that_are_not_numbers_hold_the_command_and_spoil_a_window():
     plant = axis(20)
-    tracker = lbt.identification.TrackingController(plant, window_s=1.0, update_s=0.5)
+    tracker = TrackingController(plant, window_s=1.0, update_s=0.5)
     total, noise = disturbed(plant, frames=2400)
     clean = run(tracker, plant, (total, noise))
     noise[0, [500, 501, 700], 0] = [np.nan, np.inf, -np.inf]
@@ -187,40 +160,39 @@ def test_measurements_that_are_not_numbers_hold_the_command_and_spoil_a_window()
 
 
 def test_a_new_line_on_the_other_axis_is_found():
-    plant = two_axes()
-    truth = with_vibrations(
-        plant, [*plant.vibrations, replace(line(41, damping=0.01), direction=(0, 1))]
-    )
-    tracker = lbt.identification.TrackingController(plant, window_s=4.0, update_s=4.0)
+    new = line(41, damping=0.01, direction=(0, 1))
+    truth = with_vibrations(TWO_AXES, [*TWO_AXES.vibrations, new])
+    tracker = TrackingController(TWO_AXES, window_s=4.0, update_s=4.0)
     shaken = lbt.Truth(turbulence=AIR, vibrations=truth.vibrations, noise_nm=15.5)
-    lbt.simulate(tracker, shaken, hardware=plant.hardware, frames=3200, settle_frames=0, seed=3)
+    size = {"frames": 3200, "settle_frames": 0, "seed": 3}
+    lbt.simulate(tracker, shaken, hardware=TWO_AXES.hardware, **size)
     (update,) = tracker.history
     assert min(abs(hz - 41) for hz in update.frequencies_hz) < 0.5
 
 
 def test_what_cannot_be_tracked_is_refused():
     plant = axis(20)
-    tracked = lbt.identification.TrackingController
-    for options, words in (
-        ({"window_s": 0.5}, "window_s must be at least 0.64"),
-        ({"update_s": 0}, "update_s must be at least"),
-        ({"design": lambda p: lbt.integrator(p.hardware, gain=0.3)}, "only filters of"),
-    ):
-        with pytest.raises(lbt.errors.ProblemError, match=words):
-            tracked(plant, **options)
-    with pytest.raises(lbt.errors.ProblemError, match="expected a TipTiltPlant"):
-        tracked(plant.hardware)
     coupled = axis(20, sensor_matrix=[[1.0], [0.5]])
-    with pytest.raises(lbt.errors.ProblemError, match="each measurement must be of one axis"):
-        tracked(coupled)
-    tracker = tracked(plant)
-    with pytest.raises(lbt.errors.DimensionError, match=r"y must have shape \(1,\)"):
-        tracker.step([0.0, 0.0])
-    for wrong, words in (
-        (["a"], "y must be an array of numbers; got list"),
-        ([1j], "y must be real; got complex numbers"),
-        ([[1.0], [1.0, 2.0]], "y must be a rectangular array"),
+    tracker = TrackingController(plant)
+
+    def tracked(plant=plant, **options):
+        return lambda: TrackingController(plant, **options)
+
+    integrate = tracked(design=lambda p: lbt.integrator(p.hardware, gain=0.3))
+    require_refusals(
+        [
+            (tracked(window_s=0.5), ProblemError, "window_s must be at least 0.64"),
+            (tracked(update_s=0), ProblemError, "update_s must be at least"),
+            (integrate, ProblemError, "only filters of"),
+            (tracked(plant.hardware), ProblemError, "expected a TipTiltPlant"),
+            (tracked(coupled), ProblemError, "each measurement must be of one axis"),
+        ]
+    )
+    for y, error, words in (
+        ([0.0, 0.0], DimensionError, r"y must have shape \(1,\)"),
+        (["a"], ProblemError, "y must be an array of numbers; got list"),
+        ([1j], ProblemError, "y must be real; got complex numbers"),
+        ([[1.0], [1.0, 2.0]], ProblemError, "y must be a rectangular array"),
     ):
-        with pytest.raises(lbt.errors.ProblemError, match=words):
-            tracker.step(wrong)
+        refused(lambda y=y: tracker.step(y), error, words)
     assert np.array_equal(tracker.step([0]), [0.0])  # nothing was taken in

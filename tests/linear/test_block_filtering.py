@@ -1,6 +1,5 @@
 """Series of many systems, against their recursion."""
 
-import control
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -34,13 +33,6 @@ def test_block_products_are_the_recursion(seed, n, frames, cases):
             x = system.A @ x + system.B @ u[case, k]
     out = filter_series(system, u)
     assert np.allclose(out, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
-
-
-def test_filter_series_against_python_control(axis_plant):
-    loop = lbt.close_loop(axis_plant.hardware, lbt.kalman(axis_plant).controller)
-    u = np.random.default_rng(0).standard_normal((3000, 2))
-    _, expected = control.forced_response(loop.system.to_control(), U=u.T)
-    assert np.allclose(filter_series(loop.system, u), expected.T, atol=1e-9)
 
 
 @given(seed=st.integers(0, 100), n=st.integers(1, 5), frames=st.integers(0, 70))

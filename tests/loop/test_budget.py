@@ -1,39 +1,170 @@
 """The exact residual of a loop against closed forms, brute force and runs of the loop."""
 
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.integrate import trapezoid
+from scipy.linalg import expm
 from support import predictions
-from support.continuous_loops import noise_covariance, power_of_two_sensors, sinusoid_powers
 from support.plants import lbt_axis_plant
+from support.refusals import require_refusals
 from support.sensor_loops import (
-    AIR,
     FAST,
     MOTIONS,
     RATE_HZ,
+    age_frames,
     example_plant,
+    frames_per_reading,
+    held_mean,
     impulse,
     run_loop,
     simulated_covariances,
 )
 from support.sensor_loops import LINES as SHAKES
 from support.sensor_loops import SLOW as OTHER
-from support.uneven_axes import LINES, LOOPS, QUICK, RATE, SLOW, TABLE, one_axis
+from support.uneven_axes import RATE, SLOW, TABLE
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import kalman_riccati
 from lbt_synth.loop.budget import residual_budget
-from lbt_synth.loop.stable_range import radii_by_gain
 from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
 
-AGELESS = Accelerometer(
-    name="mirror", rate_hz=RATE_HZ, delay_frames=1, channels=("m1", "m2"), noise_m_s2=2e-3
-)
+# Loops in continuous time, run in small steps from their equations, without the package's.
+# The camera sees the phase less the mirror in the middle of each step.
+
+STEPS = 400
+
+
+class _Shell:
+    """A mirror in its local loop, run sample by sample; commands are (runs, m)."""
+
+    def __init__(self, loop, rate_hz, shape):
+        self.loop, self.samples = loop, round(loop.sampling_hz / rate_hz)
+        w, dt = 2 * np.pi * loop.natural_frequency_hz, 1 / loop.sampling_hz
+        motion = np.zeros((3, 3))  # of position, velocity and a held acceleration
+        motion[0, 1], motion[1] = 1.0, (-(w**2), -2 * loop.damping * w, 1.0)
+        per_sample = STEPS // self.samples
+        middles = (np.arange(per_sample) + 0.5) / per_sample
+        self.between = np.stack([expm(motion * dt * part)[0] for part in middles])
+        self.over = expm(motion * dt)
+        self.stiffness = loop.feed_forward * w**2
+        self.x, self.v, self.last = np.zeros((3, *shape), dtype=complex)
+        self.waiting = [np.zeros(shape, dtype=complex)] * loop.delay_samples
+        self.command = np.zeros(shape, dtype=complex)
+
+    def hold(self, command):
+        """Return the positions (STEPS, runs, m) while a command holds."""
+        loop, out = self.loop, []
+        for i in range(self.samples):
+            share = min(1.0, (i + 1) / loop.ramp_samples)
+            r = share * command + (1 - share) * self.command
+            force = self.stiffness * r + loop.proportional_per_s2 * (r - self.x)
+            force = force - loop.derivative_per_s * (self.x - self.last) * loop.sampling_hz
+            self.waiting.append(force)
+            state = np.stack([self.x, self.v, self.waiting.pop(0)])
+            out.append(np.tensordot(self.between, state, axes=1))
+            self.last = self.x
+            self.x, self.v, _ = np.tensordot(self.over, state, axes=1)
+        self.command = command
+        return np.concatenate(out) / loop.static_gain
+
+
+class _Settled:
+    def __init__(self, loop, rate_hz, shape):
+        pass
+
+    def hold(self, command):
+        """Return the positions (STEPS, runs, m) while a command holds."""
+        return np.broadcast_to(command, (STEPS, *command.shape))
+
+
+def image_residuals(hardware, controller, phase, noise, frames, *, sensor_gain=1.0):
+    """Yield the residual (STEPS, runs, n) in each frame of a loop that starts at rest.
+
+    ``phase(t)`` is the phase (STEPS, runs, n) at times t in frames, ``noise`` (runs, q) that of the
+    first reading.
+    """
+    k, m = controller, hardware.n_commands
+    runs = len(noise)
+    kind = _Settled if hardware.mirror is None else _Shell
+    mirror = kind(hardware.mirror, hardware.frame_rate_hz, (runs, m))
+    late = round((hardware.delay_frames - 1) * STEPS)
+    assert abs(late - (hardware.delay_frames - 1) * STEPS) < 1e-9
+    ahead = np.zeros((late + STEPS, runs, m), dtype=complex)  # positions from this frame on
+    state, seen = np.zeros((runs, k.n_states), dtype=complex), np.zeros((runs, hardware.modes))
+    for frame in range(frames):
+        y = sensor_gain * seen @ hardware.sensor.T + (noise if frame == 0 else 0)
+        state = state @ k.A.T + y @ k.B.T
+        ahead[late:] = mirror.hold(state @ k.C.T + y @ k.D.T)
+        times = frame + (np.arange(STEPS) + 0.5) / STEPS
+        residual = phase(times) - ahead[:STEPS] @ hardware.influence.T
+        seen = residual.mean(axis=0)
+        ahead = np.concatenate([ahead[STEPS:], np.zeros((STEPS, runs, m))])
+        yield residual
+
+
+def sinusoid_powers(hardware, controller, frequency_hz, along, *, frames=300, sensor_gain=1.0):
+    """Return what sinusoids of unit power leave in the image, (f, n, n), one by one."""
+    turns = 2j * np.pi * np.asarray(frequency_hz) / hardware.frame_rate_hz
+
+    def phase(times):
+        return np.exp(turns * times[:, None])[..., None] * np.asarray(along)
+
+    noise = np.zeros((len(turns), hardware.n_measurements))
+    for residual in image_residuals(
+        hardware, controller, phase, noise, frames, sensor_gain=sensor_gain
+    ):
+        last = residual  # of a complex wave: its power repeats with the frame
+    return np.real(np.einsum("tfi,tfj->fij", last, last.conj())) / STEPS
+
+
+def noise_covariance(hardware, controller, noise_nm, *, frames=300, sensor_gain=1.0):
+    """Return what white noise (q,) leaves in the image, (n, n): of impulses, one by one."""
+    total, n = 0.0, hardware.modes
+    for residual in image_residuals(
+        hardware,
+        controller,
+        lambda t: np.zeros((STEPS, 1, n)),
+        np.diag(noise_nm),
+        frames,
+        sensor_gain=sensor_gain,
+    ):
+        total = total + np.real(np.einsum("tfi,tfj->ij", residual, residual.conj())) / STEPS
+    return total
+
+
+def power_of_two_sensors(plant, controller, frequency_hz, along, *, frames=480):
+    """Return what a sinusoid of unit power leaves in the image, (n, n), of a settled mirror.
+
+    Beside its own sensor the loop reads one slower wavefront sensor. The mean is over 16 frames.
+    """
+    hardware, (slow,) = plant.hardware, plant.hardware.suite.wavefront
+    n, rows, rate = hardware.modes, hardware.suite.rows(hardware), hardware.frame_rate_hz
+    age, period = age_frames(hardware, slow), frames_per_reading(hardware, slow)
+    late = round((hardware.delay_frames - 1) * STEPS)
+    position = np.zeros(((frames + 8) * STEPS, n), dtype=complex)
+    means, state = np.zeros((frames, n), dtype=complex), np.zeros(controller.n_states)
+    power = np.zeros((n, n))
+    for k in range(frames):
+        y = np.zeros(hardware.n_readings, dtype=complex)
+        y[rows["wavefront"]] = hardware.sensor @ held_mean(means, k, 1, 1)
+        if k % period == 0:
+            y[rows[slow.name]] = slow.sensor_matrix @ held_mean(means, k, age, period)
+        now = controller.phase(k)
+        state = now.A @ state + now.B @ y
+        begin = k * STEPS + late
+        position[begin : begin + STEPS] = hardware.influence @ (now.C @ state + now.D @ y)
+        times = k + (np.arange(STEPS) + 0.5) / STEPS
+        wave = np.exp(2j * np.pi * frequency_hz / rate * times)[:, None] * np.asarray(along)
+        residual = wave - position[k * STEPS : (k + 1) * STEPS]
+        means[k] = residual.mean(axis=0)
+        if k >= frames - 16:
+            power += np.real(residual.T @ residual.conj()) / STEPS / 16
+    return power
+
+
 SELDOM = WavefrontSensor(name="seldom", rate_hz=50, delay_frames=1.3, noise_nm=4)
 THIRD = Accelerometer(
     name="third", rate_hz=RATE_HZ / 3, delay_frames=1, channels=("m1", "m2"), noise_m_s2=2e-3
@@ -46,20 +177,6 @@ SLEEPY = Accelerometer(  # its exposures wait, and end within a frame
 )
 SHELL = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=500)
 AR3 = lbt.models.ARModel(coefficients=[1.2, -0.3, -0.05], driving_rms_nm=20, frame_rate_hz=RATE_HZ)
-
-
-class Anonymous:
-    """A spectrum that hides that it is an AR model, so that it goes through quadrature.
-
-    It is that of the means over frames, or of the phase that has them.
-    """
-
-    def __init__(self, model, *, of_means=True):
-        self.model, self.of_means = model, of_means
-
-    def psd(self, frequency_hz):
-        share = 1.0 if self.of_means else np.sinc(frequency_hz / self.model.frame_rate_hz) ** 2
-        return self.model.psd(frequency_hz) / share
 
 
 class Broad:
@@ -75,56 +192,6 @@ def sinusoid(frequency_hz, rms_nm, direction=(1, 0)):
     )
 
 
-def test_noise_of_an_integrator_has_a_closed_form():
-    """Delay 1: variance g / (2 - g); delay 2: g (from the Jury table) (2 + g) / ((2 - g ...)."""
-    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
-    for g in (0.1, 0.7, 1.6):
-        loop = lbt.close_loop(path, lbt.integrator(path, gain=g).controller)
-        budget = lbt.residual_budget(loop, Truth(turbulence=None, noise_nm=2.0))
-        assert budget.noise_nm**2 == pytest.approx(4 * g / (2 - g), rel=1e-9)
-
-
-@pytest.mark.parametrize("gain", [0.4, 1.0])
-@pytest.mark.parametrize(
-    "model",
-    [
-        lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89, frame_rate_hz=800),
-        lbt.models.ARModel(
-            coefficients=[1.997477, -0.997555], driving_rms_nm=0.37, frame_rate_hz=800
-        ),
-        lbt.Vibration(frequency_hz=17, damping=0.005, rms_nm=300).ar_model(800),
-    ],
-)
-def test_quadrature_agrees_with_the_lyapunov_equation(gain, model):
-    plant = lbt_axis_plant(modes=2)
-    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller, sensor_gain=gain)
-    for frame_means in (True, False):
-        exact, quadrature = (
-            lbt.residual_budget(
-                loop, Truth(turbulence=source, sensor_gain=gain), frame_means=frame_means
-            )
-            for source in (model, Anonymous(model, of_means=frame_means))
-        )
-        for name in ("turbulence_nm2", "within_nm2"):
-            one, other = getattr(exact, name), getattr(quadrature, name)
-            assert np.allclose(other, one, rtol=2e-4, atol=1e-9 * one.max())
-
-
-@pytest.mark.parametrize("half_width", [0.3, 0.03, 0.003])
-def test_narrow_lines_of_a_table_are_not_missed(half_width):
-    """A triangle of unit area: its residual is the rejection at its place."""
-    table = lbt.models.TabulatedSpectrum(
-        frequency_hz=[37.3 - half_width, 37.3, 37.3 + half_width],
-        density_nm2_hz=[0, 100 / half_width, 0],
-    )
-    plant = lbt_axis_plant()
-    loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=0.4).controller)
-    budget = lbt.residual_budget(loop, Truth(turbulence=table))
-    gain, share = abs(loop.sensitivity([37.3])[0, 0, 0]), np.sinc(37.3 / 800)
-    assert budget.turbulence_nm == pytest.approx(10 * gain * share, rel=1e-3)
-    assert budget.within_nm == pytest.approx(10 * np.sqrt(1 - share**2), rel=1e-3)
-
-
 def test_a_measured_spectrum_against_brute_force():
     rng = np.random.default_rng(0)
     f = np.linspace(5, 100, 3393)
@@ -134,6 +201,13 @@ def test_a_measured_spectrum_against_brute_force():
     )
     plant = lbt_axis_plant()
     loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=0.4).controller)
+    # a triangle of unit area leaves the rejection at its place
+    narrow = lbt.models.TabulatedSpectrum(
+        frequency_hz=[37.297, 37.3, 37.303], density_nm2_hz=[0, 100 / 0.003, 0]
+    )
+    left = abs(loop.sensitivity([37.3])[0, 0, 0]) * np.sinc(37.3 / 800)
+    line = lbt.residual_budget(loop, Truth(turbulence=narrow))
+    assert line.turbulence_nm == pytest.approx(10 * left, rel=1e-3)
     fine = np.linspace(5, 100, 3392 * 20 + 1)
     power = np.abs(loop.sensitivity(fine)[:, 0, 0]) ** 2
     share = np.sinc(fine / 800) ** 2
@@ -142,16 +216,6 @@ def test_a_measured_spectrum_against_brute_force():
     assert budget.turbulence_nm**2 == pytest.approx(expected, rel=1e-5)
     expected = trapezoid(table.psd(fine) * (1 - share), fine)
     assert budget.within_nm**2 == pytest.approx(expected, rel=1e-5)
-
-
-def test_a_narrow_resonance_tends_to_the_sinusoid():
-    plant = lbt_axis_plant(modes=2)
-    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
-    along = {"frequency_hz": 18.0, "rms_nm": 100.0, "direction": (0.6, 0.8)}
-    line = Truth(turbulence=None, vibrations=(lbt.models.SinusoidalVibration(**along),))
-    narrow = Truth(turbulence=None, vibrations=(lbt.Vibration(**along, damping=1e-6),))
-    exact, limit = (lbt.residual_budget(loop, t).vibration_nm2 for t in (line, narrow))
-    assert np.allclose(limit, exact, rtol=1e-3)
 
 
 def test_parts_of_the_budget_add_up():
@@ -171,77 +235,6 @@ def test_parts_of_the_budget_add_up():
     assert np.allclose(b.total_nm2, sum(getattr(b, f"{name}_nm2") for name in names))
     lines = sum(np.real(np.outer(a, a.conj())) / 2 for a in b.line_amplitudes_nm)
     assert np.allclose(b.gaussian_nm2, b.total_nm2 - lines)
-
-
-@given(angle=st.floats(0, np.pi))
-def test_a_decoupled_loop_treats_all_directions_alike(angle):
-    plant = lbt_axis_plant(modes=2)
-    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
-    line = lbt.models.SinusoidalVibration(
-        frequency_hz=18, rms_nm=100, direction=(np.cos(angle), np.sin(angle))
-    )
-    budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
-    other = lbt.models.SinusoidalVibration(frequency_hz=18, rms_nm=100)
-    same = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(other,)))
-    assert budget.rms_nm == pytest.approx(same.rms_nm, rel=1e-6)
-
-
-def test_loops_refuse_what_does_not_fit():
-    path = lbt.LoopHardware(frame_rate_hz=800)
-    lazy = lbt.integrator(path, gain=0.3).controller
-    with pytest.raises(DimensionError, match="map 1 measurements to 1 commands; got 2 to 2"):
-        lbt.close_loop(lbt.LoopHardware(frame_rate_hz=800, modes=1), lazy)
-    with pytest.raises(
-        ProblemError, match="must run at the loop's 500 Hz; got one designed for 800"
-    ):
-        lbt.close_loop(lbt.LoopHardware(frame_rate_hz=500), lazy)
-    loop = lbt.close_loop(path, lazy)
-    with pytest.raises(ProblemError, match="truth's sensor gain 0.5; got 1"):
-        lbt.residual_budget(loop, Truth(turbulence=None, sensor_gain=0.5))
-    line = lbt.models.SinusoidalVibration(frequency_hz=10, rms_nm=1, direction=(1, 0, 0))
-    with pytest.raises(DimensionError, match="must have 2 components"):
-        lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
-    fast = lbt.models.SinusoidalVibration(frequency_hz=600, rms_nm=1)
-    with pytest.raises(ProblemError, match="below the Nyquist"):
-        lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(fast,)))
-    other_rate = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=1, frame_rate_hz=100)
-    with pytest.raises(ProblemError, match="must be sampled at the loop's 800 Hz"):
-        lbt.residual_budget(loop, Truth(turbulence=other_rate))
-
-
-uneven = partial(Truth, noise_nm=(15.5, 6.0), sensor_gain=0.8)
-
-
-@pytest.mark.parametrize("spectra", [(SLOW, QUICK), (SLOW, TABLE), (None, QUICK), (TABLE, None)])
-def test_axes_without_coupling_are_loops_of_their_own(spectra):
-    both, single = LOOPS
-    truth = uneven(turbulence=spectra, vibrations=LINES)
-    budget = lbt.residual_budget(
-        lbt.close_loop(both, lbt.integrator(both, gain=0.4).controller, sensor_gain=0.8), truth
-    )
-    limit = lbt.loop.least_residual(both, truth)
-    for axis in (0, 1):
-        loop = lbt.close_loop(single, lbt.integrator(single, gain=0.4).controller, sensor_gain=0.8)
-        alone = one_axis(truth, axis)
-        own = lbt.residual_budget(loop, alone)
-        for name in ("turbulence_nm2", "noise_nm2", "vibration_nm2"):
-            assert getattr(budget, name)[axis, axis] == pytest.approx(
-                getattr(own, name)[0, 0], rel=1e-9
-            ), name
-        assert limit.variance_nm2[axis] == pytest.approx(
-            lbt.loop.least_residual(single, alone).variance_nm2[0], rel=1e-9
-        )
-    assert abs(budget.turbulence_nm2[0, 1]) < 1e-9
-
-
-@settings(max_examples=25, deadline=None)
-@given(st.floats(0.1, 50), st.sampled_from([SLOW, QUICK, TABLE, None]))
-def test_equal_axes_are_one_truth_for_all(noise, spectrum):
-    path = lbt.LoopHardware(frame_rate_hz=RATE)
-    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3).controller)
-    one = lbt.residual_budget(loop, Truth(turbulence=spectrum, noise_nm=noise))
-    each = lbt.residual_budget(loop, Truth(turbulence=[spectrum] * 2, noise_nm=[noise] * 2))
-    np.testing.assert_allclose(each.total_nm2, one.total_nm2, rtol=1e-12, atol=1e-12)
 
 
 def test_coupled_axes_against_the_frequency_response():
@@ -288,36 +281,6 @@ def test_the_budget_of_a_model_is_that_of_its_truth(delay, gain, mirror, sensor)
         np.testing.assert_allclose(again.total_nm2, own.total_nm2, rtol=1e-9, atol=1e-9)
 
 
-def test_noise_that_is_correlated_between_axes():
-    noise = np.array([[200.0, 60.0], [60.0, 100.0]])
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=predictions.RATE, turbulence=predictions.SLOW, noise_nm=noise
-    )
-    design = lbt.kalman(plant)
-    loop = lbt.close_loop(plant.hardware, design.controller)
-    budget = lbt.residual_budget(loop, plant, frame_means=True)
-    assert budget.rms_nm == pytest.approx(design.rms, rel=1e-9)
-
-
-def test_a_budget_of_no_loop_or_no_plant_is_refused():
-    plant = predictions.a_plant()
-    unstable = lbt.close_loop(
-        plant.hardware, lbt.integrator(plant.hardware, gain=0.9).controller, sensor_gain=1.0
-    )
-    wild = lbt.Controller(
-        A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / predictions.RATE
-    )
-    assert unstable.is_stable
-    with pytest.raises(UnstableLoopError):
-        lbt.residual_budget(lbt.close_loop(plant.hardware, wild), plant)
-    with pytest.raises(ProblemError, match="expected a Truth"):
-        lbt.residual_budget(unstable, plant.hardware)
-    with pytest.raises(ProblemError, match="must be a ClosedLoop"):
-        lbt.residual_budget(unstable.system, plant)
-    with pytest.raises(ProblemError, match="expected a TipTiltPlant"):
-        lbt.design.model_integrator(predictions.a_truth())
-
-
 def test_what_is_left_of_strong_slow_lines_keeps_its_digits():
     """It is 1e-5 of the lines; the loop is the optimal one, which leaves the limit."""
     air = lbt.models.ARModel(coefficients=[0.9998], driving_rms_nm=0.01, frame_rate_hz=4000)
@@ -337,38 +300,10 @@ def test_what_is_left_of_strong_slow_lines_keeps_its_digits():
     assert lbt.lqg(plant).certificate.passed
 
 
-@pytest.mark.parametrize("density", [-1.0, 1j, np.nan])
-def test_a_spectrum_that_is_none_is_refused(density):
-    class Odd:
-        def psd(self, frequency_hz):
-            return np.full(frequency_hz.shape, density)
-
-    path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
-    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3))
-    truth = Truth(turbulence=Odd(), noise_nm=1.0)
-    for compute in (
-        lambda: lbt.residual_budget(loop, truth),
-        lambda: lbt.loop.least_residual(path, truth),
-    ):
-        with pytest.raises(ProblemError, match="one finite number of at least 0"):
-            compute()
-
-
 def closed(plant, **facts):
     """Return the controller of the Kalman filter, and its loop."""
     controller = plant.controller(kalman_riccati(plant).gain_predictor)
     return controller, lbt.close_loop(plant.hardware, controller, **facts)
-
-
-@pytest.mark.parametrize("delay", [1, 2, 3])
-@pytest.mark.parametrize("sensors", [(FAST,), (OTHER,), (FAST, OTHER), (SELDOM,)])
-def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
-    plant = example_plant(sensors, delay_frames=delay)
-    P = kalman_riccati(plant).P.reshape(-1, plant.n_states, plant.n_states)
-    _, loop = closed(plant)
-    rms = np.sqrt(np.mean([np.trace(plant.L @ one @ plant.L.T) for one in P]))
-    budget = residual_budget(loop, plant, frame_means=True)
-    assert budget.rms_nm == pytest.approx(rms, rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -376,12 +311,11 @@ def test_the_residual_of_the_model_is_the_error_of_the_filter(delay, sensors):
     [
         ({}, {}),
         ({}, {"sensor_gain": 0.6}),
-        ({}, {"blind": ("truth",)}),
-        ({}, {"blind": ("m1",)}),
+        ({}, {"blind": ("truth", "m1")}),
         ({"delay_frames": 1.5, "turbulence": AR3}, {}),
         ({"delay_frames": 3, "sensors": (HALF, OTHER)}, {}),
-        ({"sensors": (AGELESS,)}, {}),
         ({"sensors": (SLEEPY,)}, {}),
+        ({"sensors": (THIRD, SELDOM), "lines": SHAKES[:1], "motions": MOTIONS[:1]}, {}),
         ({"mirror": SHELL, "influence_matrix": [[2.0, 0.1], [0.3, 1.0]]}, {}),
         ({"sensor_matrix": [[1, 0], [0, 1], [0.5, 0.5]], "noise_nm": [30, 30, 40]}, {}),
     ],
@@ -390,21 +324,18 @@ def test_budgets_are_what_impulses_leave(changes, loop):
     plant = example_plant(**changes)
     controller, own = closed(plant, **loop)
     budget = residual_budget(own, plant, frame_means=True)
+    if not loop and changes.keys().isdisjoint(
+        ("mirror", "turbulence")
+    ):  # the residual of the model is the error of the filter
+        P = kalman_riccati(plant).P.reshape(-1, plant.n_states, plant.n_states)
+        rms = np.sqrt(np.mean([np.trace(plant.L @ one @ plant.L.T) for one in P]))
+        assert budget.rms_nm == pytest.approx(rms, rel=1e-9)
     exact = budget.turbulence_nm2, budget.random_vibration_nm2, budget.noise_nm2
     for one, simulated in zip(exact, simulated_covariances(plant, controller, **loop), strict=True):
         assert np.abs(one - simulated).max() < 1e-8 * np.trace(one)
 
 
-def test_rates_that_do_not_divide_each_other():
-    plant = example_plant((THIRD, SELDOM), lines=SHAKES[:1], motions=MOTIONS[:1])
-    assert plant.period == 60
-    controller, loop = closed(plant)
-    budget = residual_budget(loop, plant)
-    *_, noise = simulated_covariances(plant, controller, frames=200)
-    assert np.abs(budget.noise_nm2 - noise).max() < 1e-8 * np.trace(noise)
-
-
-@pytest.mark.parametrize(("age", "period"), [(0, 1), (1, 1), (1.4, 1), (2.4, 2)])
+@pytest.mark.parametrize(("age", "period"), [(0, 1), (2.4, 2)])
 def test_a_sinusoid_leaves_what_a_run_leaves(age, period):
     fast = Accelerometer(
         name="mirror",
@@ -462,67 +393,6 @@ def test_a_spectrum_leaves_the_spectrum_of_what_impulses_leave():
     np.testing.assert_allclose(budget.turbulence_nm2, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_spectra_and_their_ar_models_agree():
-    plant = example_plant()
-    _, loop = closed(plant)
-    for frame_means in (True, False):
-        one, other = (
-            lbt.residual_budget(loop, Truth(turbulence=source), frame_means=frame_means)
-            for source in (Anonymous(AIR, of_means=frame_means), AIR)
-        )
-        for name in ("turbulence_nm2", "within_nm2"):
-            quadrature, exact = getattr(one, name), getattr(other, name)
-            np.testing.assert_allclose(quadrature, exact, rtol=1e-7, atol=1e-6)
-
-
-def test_the_truth_may_have_another_noise_and_gain():
-    plant = example_plant()
-    controller, loop = closed(plant, sensor_gain=0.8)
-    noisy, calm = (
-        lbt.residual_budget(loop, Truth(turbulence=None, noise_nm=noise, sensor_gain=0.8)).noise_nm2
-        for noise in (75.0, 0.0)
-    )
-    *_, whole = simulated_covariances(plant, controller, sensor_gain=0.8)
-    np.testing.assert_allclose(noisy, whole, rtol=1e-7)
-    assert 0 < np.trace(calm) < np.trace(noisy)
-    assert lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=0.8)).rms_nm > 0
-
-
-def test_an_unstable_loop_has_no_budget():
-    _, loop = closed(example_plant(), sensor_gain=8.0)
-    assert not loop.is_stable
-    with pytest.raises(UnstableLoopError, match=r"an unstable one .* at sensor gain 8\)"):
-        lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=8.0))
-
-
-def test_refusals():
-    plant = example_plant()
-    _, loop = closed(plant)
-    with pytest.raises(ProblemError, match="truth's sensor gain 0.9; got 1"):
-        lbt.residual_budget(loop, Truth(turbulence=AIR, sensor_gain=0.9))
-    with pytest.raises(ProblemError, match="no sensor or channel is called 'm9'"):
-        closed(plant, blind=("m9",))
-    other, _ = closed(example_plant((FAST,)))
-    with pytest.raises(ProblemError, match="6 measurements to 2 commands in a period of 4"):
-        lbt.close_loop(plant.hardware, other)
-    with pytest.raises(ProblemError, match="sensor_gain"):
-        closed(plant, sensor_gain=0.0)
-    drifting = lbt.models.DriftingVibration(
-        start_hz=20, end_hz=30, duration_s=1, damping=0.01, rms_nm=100
-    )
-    with pytest.raises(ProblemError, match="stationary"):
-        lbt.residual_budget(loop, Truth(turbulence=AIR, vibrations=(drifting,)))
-
-
-def test_radii_of_many_gains_are_those_of_their_loops():
-    plant = example_plant(influence_matrix=[[2.0, 0.1], [0.3, 1.0]])
-    controller, _ = closed(plant)
-    gains = np.array([0.2, 0.7, 1.0, 1.7])
-    found = radii_by_gain(plant.hardware, controller)(gains)
-    loops = [closed(plant, sensor_gain=gain)[1].spectral_radius for gain in gains]
-    np.testing.assert_allclose(found, loops, rtol=1e-9)
-
-
 def a_shell(**changes):
     facts = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 150}
     return PositionLoop.from_bandwidth(**(facts | {"sampling_hz": 8000.0} | changes))
@@ -531,33 +401,10 @@ def a_shell(**changes):
 MIRRORS = {"settled": None, "shell": a_shell(), "ramp": a_shell(ramp_samples=4, delay_samples=0)}
 
 
-@pytest.mark.parametrize("delay", [1, 2, 2.25, 2.49, 2.9, 3])
-@pytest.mark.parametrize("mirror", MIRRORS)
+@pytest.mark.parametrize(
+    ("mirror", "delay"), [("settled", 1), ("settled", 2.49), ("shell", 2.9), ("ramp", 3)]
+)
 def test_the_image_has_what_a_run_in_small_steps_leaves(mirror, delay):
-    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, modes=1, mirror=MIRRORS[mirror])
-    controller, hertz = lbt.integrator(path, gain=0.2).controller, np.array([3, 20, 62, 150, 390])
-    powers = sinusoid_powers(path, controller, hertz, (1.0,), frames=150)[:, 0, 0]
-    loop, rms_nm = lbt.close_loop(path, controller), np.array([500.0, 100.0, 50.0, 20.0, 10.0])
-    lines = [sinusoid(f, rms, (1,)) for f, rms in zip(hertz, rms_nm, strict=True)]
-    for line, power in zip(lines, powers, strict=True):
-        budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
-        assert budget.rms_nm**2 == pytest.approx(line.rms_nm**2 * power, rel=1e-4)
-    noise = noise_covariance(path, controller, [15.5], frames=150)[0, 0]
-    whole = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=lines, noise_nm=15.5))
-    assert whole.rms_nm**2 == pytest.approx(rms_nm**2 @ powers + noise, rel=1e-4)
-    assert whole.noise_nm**2 <= noise * (1 + 1e-4)
-    calm = lbt.residual_budget(loop, Truth(turbulence=None, noise_nm=15.5))
-    assert calm.rms_nm**2 == pytest.approx(noise, rel=1e-4)
-    if mirror == "settled":
-        assert calm.within_nm == pytest.approx(0, abs=1e-6)
-        assert whole.within_nm**2 == pytest.approx(
-            rms_nm**2 @ (1 - np.sinc(hertz / 800) ** 2), rel=1e-9
-        )
-
-
-@pytest.mark.parametrize("delay", [2, 2.49])
-@pytest.mark.parametrize("mirror", ["settled", "shell"])
-def test_coupled_modes_have_what_a_run_in_small_steps_leaves(mirror, delay):
     path = lbt.LoopHardware(
         frame_rate_hz=800,
         delay_frames=delay,
@@ -565,77 +412,30 @@ def test_coupled_modes_have_what_a_run_in_small_steps_leaves(mirror, delay):
         influence_matrix=[[1.0, 0.1], [0.3, 0.8]],
         mirror=MIRRORS[mirror],
     )
-    B = 0.3 * np.linalg.pinv(path.sensor @ path.influence) + [[0, 0.05, 0], [0.02, 0, 0]]
+    B = 0.2 * np.linalg.pinv(path.sensor @ path.influence) + [[0, 0.05, 0], [0.02, 0, 0]]
     controller = lbt.Controller(A=np.eye(2), B=B, C=np.eye(2), D=np.zeros((2, 3)), dt_s=1 / 800)
-    along, noise_nm = np.array([0.6, 0.8]), [5.0, 9.0, 15.0]
-    left = 100**2 * sinusoid_powers(path, controller, [62.0], along, frames=150, sensor_gain=0.8)
-    white = noise_covariance(path, controller, noise_nm, frames=150, sensor_gain=0.8)
     loop = lbt.close_loop(path, controller, sensor_gain=0.8)
-    line = sinusoid(62.0, 100.0, tuple(along))
-    for lines, noise, expected in (((line,), 0.0, left[0]), ((), noise_nm, white)):
-        truth = Truth(turbulence=None, vibrations=lines, noise_nm=noise, sensor_gain=0.8)
+    along, hertz, noise_nm = np.array([0.6, 0.8]), [3.0, 62.0, 390.0], [5.0, 9.0, 15.0]
+    facts = {"frames": 150, "sensor_gain": 0.8}
+    waves = 100**2 * sinusoid_powers(path, controller, hertz, along, **facts)
+    white = noise_covariance(path, controller, noise_nm, **facts)
+    lines = tuple(sinusoid(f, 100.0, tuple(along)) for f in hertz)
+    for shaken, noise, expected in (
+        *(((line,), 0.0, wave) for line, wave in zip(lines, waves, strict=True)),
+        ((), noise_nm, white),
+        (lines, noise_nm, waves.sum(axis=0) + white),
+    ):
+        truth = Truth(turbulence=None, vibrations=shaken, noise_nm=noise, sensor_gain=0.8)
         budget = lbt.residual_budget(loop, truth)
         assert np.abs(budget.total_nm2 - expected).max() < 1e-4 * np.trace(expected)
+        if mirror == "settled":
+            within = sum(
+                line.rms_nm**2 * (1 - np.sinc(line.frequency_hz / 800) ** 2) for line in shaken
+            )
+            assert np.trace(budget.within_nm2) == pytest.approx(within, rel=1e-9, abs=1e-9)
 
 
-@pytest.mark.parametrize(("mirror", "delay"), [("settled", 2), ("settled", 2.49), ("shell", 2.25)])
-def test_processes_and_spectra_are_sums_of_waves_in_the_image(mirror, delay):
-    """Of a process each frame has the mean: in the phase there is ``1 / sinc^2`` as much."""
-    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, modes=1, mirror=MIRRORS[mirror])
-    controller = lbt.integrator(path, gain=0.2).controller
-    x, weight = np.polynomial.legendre.leggauss(60)
-    hertz = 200 * (1 + x)
-    powers = sinusoid_powers(path, controller, hertz, (1.0,), frames=150)[:, 0, 0]
-    share = np.sinc(hertz / 800) ** 2
-    model = lbt.models.ARModel(coefficients=[0.7], driving_rms_nm=30, frame_rate_hz=800)
-    line = lbt.Vibration(frequency_hz=60, damping=0.3, rms_nm=100, direction=(1,))
-    loop, shaken = lbt.close_loop(path, controller), line.ar_model(800).psd(hertz)
-    for truth, density in (
-        (Truth(turbulence=model), model.psd(hertz) / share),
-        (Truth(turbulence=Anonymous(model)), model.psd(hertz)),
-        (
-            Truth(turbulence=None, vibrations=(line,)),
-            shaken * np.sinc(60 / 800) ** 2 / share,
-        ),
-    ):
-        expected = 200 * weight @ (density * powers)
-        assert lbt.residual_budget(loop, truth).rms_nm ** 2 == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize("delay", [1, 1.5, 2, 2.25, 2.49, 2.9, 3])
-def test_no_command_follows_a_line_within_a_frame(delay):
-    plant = lbt_axis_plant(delay_frames=delay)
-    line = sinusoid(20, 797, (1,))
-    for gain in (0.05, 0.3):
-        loop = lbt.close_loop(plant.hardware, lbt.integrator(plant.hardware, gain=gain).controller)
-        budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
-        floor = 797**2 * (1 - np.sinc(20 / 800) ** 2)
-        assert budget.within_nm**2 == pytest.approx(floor, rel=1e-9)
-        assert budget.rms_nm**2 > floor
-        means = lbt.residual_budget(
-            loop, Truth(turbulence=None, vibrations=(line,)), frame_means=True
-        )
-        assert means.within_nm == 0.0
-
-
-@pytest.mark.parametrize("sensors", [(FAST, OTHER), (OTHER,)])
-def test_a_loop_of_several_sensors_in_the_image(sensors):
-    """At a whole delay: a run in frames leaves the means, and the rest moves within them."""
-    plant = example_plant(sensors)
-    controller, loop = closed(plant)
-    line = sinusoid(62.5, 200, (3, 4))
-    share, frames = np.sinc(62.5 / RATE_HZ), 400
-    wave = share * np.sqrt(2) * 200 * np.exp(2j * np.pi * 62.5 / RATE_HZ * np.arange(frames))
-    total = np.stack([wave.real, wave.imag], axis=1)[:, :, None] * np.array([0.6, 0.8])
-    left = run_loop(plant, controller, total, np.zeros((frames, 2, plant.hardware.n_readings)))
-    means = np.einsum("fri,frj->ij", left[-16:], left[-16:]) / 32
-    budget = lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,)))
-    floor = 200**2 * (1 - share**2) * np.outer([0.6, 0.8], [0.6, 0.8])
-    np.testing.assert_allclose(budget.vibration_nm2, means, rtol=1e-8)
-    np.testing.assert_allclose(budget.within_nm2, floor, rtol=1e-9)
-
-
-@pytest.mark.parametrize("delay", [2, 2.25, 2.49])
+@pytest.mark.parametrize("delay", [2, 2.49])
 def test_a_loop_of_two_sensors_has_what_a_run_in_small_steps_leaves(delay):
     plant = example_plant((OTHER,), delay_frames=delay)
     controller, loop = closed(plant)
@@ -645,63 +445,57 @@ def test_a_loop_of_two_sensors_has_what_a_run_in_small_steps_leaves(delay):
     np.testing.assert_allclose(budget.vibration_nm2 + budget.within_nm2, expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("delay", [1, 2, 2.25, 2.49, 2.9])
-@pytest.mark.parametrize("mirror", MIRRORS)
-@pytest.mark.parametrize("frame_means", [False, True])
-def test_an_ensemble_leaves_what_its_loops_leave(mirror, delay, frame_means):
-    sensor = [[1.0, 0.2], [-0.1, 0.7]]
-    path = lbt.LoopHardware(
-        frame_rate_hz=800, delay_frames=delay, mirror=MIRRORS[mirror], sensor_matrix=sensor
-    )
-    B = 0.3 * np.linalg.inv(path.sensor @ path.influence) + [[0, 0.05], [0.02, 0]]
-    controller = lbt.Controller(A=np.eye(2), B=B, C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / 800)
-    spectra = [(Broad(), None), (None, SLOW), (QUICK, QUICK), (TABLE, SLOW), None]
-    drawn = [{"damping": 0.01}, {"damping": None}]
-    for spectrum, damped in zip([*spectra, None], [None, None, None, *drawn, None], strict=True):
-        facts = {"frequency_hz": 31.0, "rms_nm": 200.0, "direction": (1, 0.5)}
-        lines, own = [], ()
-        if damped is not None:
-            lines = [lbt.loop.EnsembleVibration(**facts, **damped)]
-            kind = lbt.Vibration if damped["damping"] else lbt.models.SinusoidalVibration
-            own = (kind(**facts, **({k: v for k, v in damped.items() if v})),)
-        gains = [0.7, 1.0]
-        ensemble = lbt.loop.LoopEnsemble(
-            sensor_gain=gains, turbulence=spectrum, noise_nm=9.0, vibrations=lines
-        )
-        found = lbt.loop.ensemble_residuals(controller, path, ensemble, frame_means=frame_means)
-        for i, gain in enumerate(gains):
-            truth = Truth(turbulence=spectrum, noise_nm=9.0, vibrations=own, sensor_gain=gain)
-            loop = lbt.close_loop(path, controller, sensor_gain=gain)
-            budget = lbt.residual_budget(loop, truth, frame_means=frame_means)
-            assert found.rms_nm[i] == pytest.approx(budget.rms_nm, rel=1e-6)
-            for name in ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "within_nm2"):
-                one, other = getattr(found, name)[i], getattr(budget, name)
-                assert np.abs(one - other).max() < 2e-6 * max(np.trace(other), 1e-3), name
+PATH = lbt.LoopHardware(frame_rate_hz=800)
+LAZY = lbt.integrator(PATH, gain=0.3).controller
+LOOP = lbt.close_loop(PATH, LAZY)
+WILD = lbt.Controller(A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / 800)
+OTHER_RATE = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=1, frame_rate_hz=100)
+DRIFTING = lbt.models.DriftingVibration(
+    start_hz=20, end_hz=30, duration_s=1, damping=0.01, rms_nm=100
+)
 
 
-@pytest.mark.parametrize("mirror", ["settled", "shell"])
-@pytest.mark.parametrize("whole", [2, 3])
-def test_a_fraction_of_a_frame_tends_to_the_whole_delay(whole, mirror):
-    line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1,))
-    slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-    truths = [
-        Truth(turbulence=slow),
-        Truth(turbulence=Anonymous(slow)),
-        Truth(turbulence=None, vibrations=(line,)),
-        Truth(turbulence=None, vibrations=(sinusoid(20, 300, (1,)),)),
-        Truth(turbulence=None, noise_nm=15.5),
+class Odd:
+    """A density that is none."""
+
+    def psd(self, frequency_hz):
+        return np.full(np.shape(frequency_hz), -1.0)
+
+
+ODD, FEW = Truth(turbulence=Odd(), noise_nm=1.0), closed(example_plant((FAST,)))[0]
+
+
+def gained(sensor_gain):
+    return closed(example_plant(), sensor_gain=sensor_gain)[1]
+
+
+def met(*lines, turbulence=None, loop=LOOP, **facts):
+    """Ask for the residual of a loop."""
+    return lbt.residual_budget(loop, Truth(turbulence=turbulence, vibrations=lines, **facts))
+
+
+def test_refusals():
+    rows = [
+        (
+            lambda: lbt.close_loop(lbt.LoopHardware(frame_rate_hz=800, modes=1), LAZY),
+            DimensionError,
+            "got 2 to 2",
+        ),
+        (lambda: lbt.close_loop(replace(PATH, frame_rate_hz=500), LAZY), ProblemError, "for 800"),
+        (lambda: met(sensor_gain=0.5), ProblemError, "truth's sensor gain 0.5; got 1"),
+        (lambda: met(sinusoid(10, 1, (1, 0, 0))), DimensionError, "must have 2 components"),
+        (lambda: met(sinusoid(600, 1)), ProblemError, "below the Nyquist"),
+        (lambda: met(turbulence=OTHER_RATE), ProblemError, "sampled at the loop's 800 Hz"),
+        (lambda: met(DRIFTING), ProblemError, "stationary"),
+        (lambda: met(turbulence=Odd()), ProblemError, "one finite number of at least 0"),
+        (lambda: lbt.loop.least_residual(PATH, ODD), ProblemError, "finite number of at least 0"),
+        (lambda: met(loop=lbt.close_loop(PATH, WILD)), UnstableLoopError, "an unstable one"),
+        (lambda: met(loop=gained(8.0), sensor_gain=8.0), UnstableLoopError, "at sensor gain 8"),
+        (lambda: lbt.residual_budget(LOOP, PATH), ProblemError, "expected a Truth"),
+        (lambda: lbt.design.model_integrator(PATH), ProblemError, "expected a TipTiltPlant"),
+        (lambda: met(loop=LOOP.system), ProblemError, "must be a ClosedLoop"),
+        (lambda: closed(example_plant(), blind=("m9",)), ProblemError, "is called 'm9'"),
+        (lambda: lbt.close_loop(example_plant().hardware, FEW), ProblemError, "in a period of 4"),
+        (lambda: gained(0.0), ProblemError, "sensor_gain"),
     ]
-    controller = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.3).controller
-
-    def budgets(delay):
-        path = lbt.LoopHardware(
-            frame_rate_hz=800, delay_frames=delay, modes=1, mirror=MIRRORS[mirror]
-        )
-        loop = lbt.close_loop(path, controller)
-        return [lbt.residual_budget(loop, truth) for truth in truths]
-
-    here = budgets(whole)
-    for delay in (whole - 1e-7, whole + 1e-7):
-        for one, exact in zip(budgets(delay), here, strict=True):
-            assert one.rms_nm == pytest.approx(exact.rms_nm, rel=2e-6)
-            assert one.within_nm == pytest.approx(exact.within_nm, rel=1e-5, abs=1e-4)
+    require_refusals(rows)

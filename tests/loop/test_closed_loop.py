@@ -4,16 +4,16 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.lqg import shell
 from support.plants import ROOT, lbt_axis_plant
 
 import lbt_synth as lbt
 from lbt_synth.loop.closed_loop import youla_controller
 
+SHELL = shell(70, delay_samples=2)
 
-@given(gain=st.floats(0.2, 1.5))
+
+@pytest.mark.parametrize("gain", [0.2, 1.5])
 def test_error_transfer_of_the_lbt(gain):
     """Error ``E = (1-h)/(1-(1-g) h)``, noise ``-z^-1 H/(1-(1-g) h)``, h = z^-2 H."""
     plant = lbt_axis_plant()
@@ -34,16 +34,6 @@ def test_error_transfer_of_the_lbt(gain):
     assert np.allclose(loop.noise_transfer(f)[:, 0, 0], noise, rtol=1e-8)
 
 
-@given(gain=st.floats(0.01, 0.99), delay=st.integers(1, 4))
-def test_integrator_loop_is_its_textbook_transfer_function(gain, delay):
-    g = gain * lbt.design.integrator_gain_limit(delay)
-    path = lbt.LoopHardware(frame_rate_hz=500, delay_frames=delay, modes=1)
-    loop = lbt.close_loop(path, lbt.integrator(path, gain=g).controller)
-    z = np.exp(2j * np.pi * np.array([1.0, 40, 200]) / 500)
-    open_loop = g * z**-delay / (1 - 1 / z)
-    assert np.allclose(loop.sensitivity([1.0, 40, 200])[:, 0, 0], 1 / (1 + open_loop), rtol=1e-9)
-
-
 def test_the_page_says_where_the_settled_design_becomes_unstable(config):
     """Stable at the figure of docs/mirror.md, unstable a tenth of a hertz below."""
     text = (ROOT / "docs" / "mirror.md").read_text(encoding="utf-8")
@@ -55,15 +45,28 @@ def test_the_page_says_where_the_settled_design_becomes_unstable(config):
         assert lbt.close_loop(path, settled.controller).is_stable is stable
 
 
-@pytest.mark.parametrize("delay", [1.0, 1.3, 2.0, 2.5, 3.0, 4.0])
-@pytest.mark.parametrize("feedthrough", [False, True])
-def test_the_closed_loop_is_affine_in_the_filter(delay, feedthrough):
+@pytest.mark.parametrize(
+    ("delay", "feedthrough", "moving"),
+    [
+        (1.0, True, None),
+        (1.3, False, None),
+        (4.0, True, None),
+        (1.0, False, SHELL),
+        (1.4, True, SHELL),
+        (2.5, False, SHELL),
+    ],
+)
+def test_the_closed_loop_is_affine_in_the_filter(delay, feedthrough, moving):
     rng = np.random.default_rng(3)
     A = np.diag([0.9, 0.4, -0.5])
     sensor = np.array([[1.0, 0.2], [0.0, 0.8], [0.1, 0.1]])
     mirror = np.array([[1.0, 0.1], [-0.2, 0.9]])
     path = lbt.LoopHardware(
-        frame_rate_hz=800, delay_frames=delay, sensor_matrix=sensor, influence_matrix=mirror
+        frame_rate_hz=800,
+        delay_frames=delay,
+        sensor_matrix=sensor,
+        influence_matrix=mirror,
+        mirror=moving,
     )
     parameter = lbt.Controller(
         A=A,
@@ -78,8 +81,8 @@ def test_the_closed_loop_is_affine_in_the_filter(delay, feedthrough):
     z = np.exp(2j * np.pi * f / 800)[:, None, None]
     Q = parameter.to_statespace().frequency_response(f)
     M = sum(tap * mirror * z**-i for i, tap in enumerate(path.mirror_taps))
-    np.testing.assert_allclose(loop.sensitivity(f), np.eye(2) - M @ Q @ sensor / z, atol=1e-11)
-    np.testing.assert_allclose(loop.noise_transfer(f), -M @ Q, atol=1e-11)
+    np.testing.assert_allclose(loop.sensitivity(f), np.eye(2) - M @ Q @ sensor / z, atol=1e-10)
+    np.testing.assert_allclose(loop.noise_transfer(f), -M @ Q, atol=1e-10)
 
 
 def test_a_filter_of_another_size_is_refused():
@@ -88,31 +91,3 @@ def test_a_filter_of_another_size_is_refused():
         lbt.errors.DimensionError, match="map 2 measurements to 2 commands; got 1 to 1"
     ):
         youla_controller(path, lbt.Controller(A=0.0, B=1.0, C=1.0, D=0.0, dt_s=1 / 800))
-
-
-@pytest.mark.parametrize("delay", [1.0, 1.4, 2.0, 2.5])
-@pytest.mark.parametrize("feedthrough", [False, True])
-def test_the_loop_with_a_moving_mirror_is_affine_in_the_filter(delay, feedthrough):
-    rng = np.random.default_rng(3)
-    influence = np.array([[1.0, 0.1], [-0.2, 0.9]])
-    path = lbt.LoopHardware(
-        frame_rate_hz=800,
-        delay_frames=delay,
-        influence_matrix=influence,
-        mirror=shell(70, delay_samples=2),
-    )
-    parameter = lbt.Controller(
-        A=np.diag([0.9, 0.4, -0.5]),
-        B=rng.normal(size=(3, 2)),
-        C=rng.normal(size=(2, 3)),
-        D=rng.normal(size=(2, 2)) * feedthrough,
-        dt_s=1 / 800,
-    )
-    loop = lbt.close_loop(path, youla_controller(path, parameter))
-    assert loop.is_stable
-    f = np.array([0.0, 3.0, 20.0, 150.0, 400.0])
-    z = np.exp(2j * np.pi * f / 800)[:, None, None]
-    Q = parameter.to_statespace().frequency_response(f)
-    M = sum(tap * influence * z**-i for i, tap in enumerate(path.mirror_taps))
-    np.testing.assert_allclose(loop.sensitivity(f), np.eye(2) - M @ Q / z, atol=1e-10)
-    np.testing.assert_allclose(loop.noise_transfer(f), -M @ Q, atol=1e-10)

@@ -5,11 +5,12 @@ from dataclasses import replace
 import cvxpy as cp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.lqg import shell
 from support.plants import lbt_axis_plant
 from support.rational import is_positive_definite, rational
+from support.sensor_loops import example_plant
 
 import lbt_synth as lbt
 from lbt_synth.linear.lyapunov import stationary_covariance
@@ -24,11 +25,13 @@ from lbt_synth.loop.stable_range import (
     circle_norm,
     errors_together,
     loop_changes,
+    radii_by_gain,
     stable_range,
     stepped_range,
 )
 
 
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 8))
 def test_ends_of_a_change_of_rank_one_are_where_poles_cross(seed, n):
     rng = np.random.default_rng(seed)
@@ -45,15 +48,6 @@ def test_ends_of_a_change_of_rank_one_are_where_poles_cross(seed, n):
             assert affine_radii(parts, np.array([end]))[0] == pytest.approx(1, abs=1e-8)
 
 
-@pytest.mark.parametrize("width", [1e-2, 1e-4, 1e-6, 1e-8])
-def test_poles_beside_the_circle(width):
-    """The poles of ``z^2 - g z + (1 - width)^2`` pass 1 where g is 1 plus the last term."""
-    A = (1 - width) * np.array([[0.0, 1.0], [-1.0, 0.0]])
-    slope = np.array([[0.0, 0.0], [0.0, 1.0]])
-    _, high = stable_range(affine_parts(A[None], slope[None]), 1e-3)
-    assert high == pytest.approx(1 + (1 - width) ** 2, rel=1e-9)
-
-
 @pytest.mark.parametrize(
     ("low", "high", "nominal"),
     [(0.35, 1.9, 1.0), (0.0, 1.2, 1.0), (0.97, np.inf, 1.0), (0.4, 5.0, 2.0)],
@@ -63,15 +57,27 @@ def test_ends_of_a_stepped_range(low, high, nominal):
     assert found == pytest.approx((low, high), rel=1e-11)
 
 
-def test_a_stable_interval_ends_at_a_narrow_hole():
+def test_narrow_holes_and_poles_beside_the_circle_end_a_range():
     def radii(gains):
         return np.where((gains > 1.3) & (gains < 1.32), 1.5, 0.5)
 
     assert stepped_range(radii) == pytest.approx((0.0, 1.3), rel=1e-11)
     assert np.all(np.isnan(stepped_range(radii, 1.31)))
+    for width in (1e-2, 1e-8):  # poles of z^2 - g z + (1 - width)^2 pass 1
+        A = (1 - width) * np.array([[0.0, 1.0], [-1.0, 0.0]])
+        parts = affine_parts(A[None], np.diag([0.0, 1.0])[None])
+        assert stable_range(parts, 1e-3)[1] == pytest.approx(1 + (1 - width) ** 2, rel=1e-9)
 
 
-@pytest.mark.parametrize("method", ["kalman", "hinf", "integrator"])
+def test_radii_of_many_gains_are_those_of_their_loops():
+    plant = example_plant(influence_matrix=[[2.0, 0.1], [0.3, 1.0]])
+    controller, gains = lbt.kalman(plant).controller, np.array([0.2, 1.0, 1.7])
+    loops = [lbt.close_loop(plant.hardware, controller, sensor_gain=gain) for gain in gains]
+    radii = radii_by_gain(plant.hardware, controller)(gains)
+    np.testing.assert_allclose(radii, [loop.spectral_radius for loop in loops], rtol=1e-9)
+
+
+@pytest.mark.parametrize("method", ["kalman", "integrator"])
 def test_modes_that_mix_have_the_range_of_those_that_do_not(method):
     """A turned sensor and a mirror that turns back: the same loop, followed in steps."""
     turn = np.array([[0.8, -0.6], [0.6, 0.8]])
@@ -91,16 +97,16 @@ def integrator_loop(delay_frames, gain=0.5):
     return lbt.close_loop(path, law)
 
 
-@pytest.mark.parametrize("low", [1e-3, 0.5, 1.0, 3.0])
+@pytest.mark.parametrize("low", [1e-3, 3.0])
 def test_one_state_is_proved_exactly_where_each_constant_gain_is_stable(low):
     """``|1 - g / 2| < 1`` at both ends is necessary and sufficient: gains up to 4."""
     loop = integrator_loop(1)
     assert circle_norm(loop, low=low, high=4 - 1e-5) < CIRCLE_LIMIT
     assert circle_norm(loop, low=low, high=4 + 1e-5) > 1
+    assert circle_norm(integrator_loop(2), low=0.5, high=4.5) == np.inf
 
 
-@pytest.mark.parametrize("low", [0.1, 0.8])
-@pytest.mark.parametrize("high", [0.9, 1.2, 1.35, 1.5])
+@pytest.mark.parametrize(("low", "high"), [(0.1, 1.5), (0.8, 0.9), (0.8, 1.35)])
 def test_an_integrator_of_two_frames_against_its_closed_form(low, high):
     """``T = a / (z^2 - z + a)`` is largest where ``cos = (1 + a) / (4 a)``, or at frequency 0."""
     a, r = 0.5 * (low + high) / 2, (high - low) / (high + low)
@@ -108,10 +114,6 @@ def test_an_integrator_of_two_frames_against_its_closed_form(low, high):
     least = 4 * a * cosine**2 - 2 * (1 + a) * cosine + 1 + (1 - a) ** 2
     expected = r * a / np.sqrt(least)
     assert circle_norm(integrator_loop(2), low=low, high=high) == pytest.approx(expected, rel=1e-9)
-
-
-def test_a_middle_that_is_not_stable_proves_nothing():
-    assert circle_norm(integrator_loop(2), low=0.5, high=4.5) == np.inf
 
 
 def common_lyapunov(A, B):
@@ -145,14 +147,12 @@ def test_a_common_lyapunov_function_exists_inside_and_none_beyond(design):
         assert all(map(is_positive_definite, (exact, *rests))) == proved
 
 
-@pytest.mark.parametrize("modes", [1, 2])
-@pytest.mark.parametrize("design", [lbt.kalman, lambda p: lbt.hinf(p, gamma_ratio=1.2)])
-def test_the_moving_gain_lies_in_the_constant_one_and_axes_count_one_by_one(design, modes):
-    plant = lbt_axis_plant(modes=modes)
-    moving = lbt.loop.moving_gain(lbt.close_loop(plant.hardware, design(plant)))
+def test_the_moving_gain_lies_in_the_constant_one_and_axes_count_one_by_one():
+    plant = lbt_axis_plant(modes=2)
+    moving = lbt.loop.moving_gain(lbt.close_loop(plant.hardware, lbt.kalman(plant)))
     assert moving.constant_low < moving.moving_low < 1 < moving.moving_high < moving.constant_high
     alone = lbt_axis_plant()
-    expected = lbt.loop.moving_gain(lbt.close_loop(alone.hardware, design(alone)))
+    expected = lbt.loop.moving_gain(lbt.close_loop(alone.hardware, lbt.kalman(alone)))
     ends = (moving.moving_low, moving.moving_high)
     assert ends == pytest.approx((expected.moving_low, expected.moving_high), rel=1e-4)
 
@@ -160,14 +160,13 @@ def test_the_moving_gain_lies_in_the_constant_one_and_axes_count_one_by_one(desi
 def test_intervals_are_of_the_sensor_gain_whatever_the_loop_has():
     plant = lbt_axis_plant()
     controller = lbt.kalman(plant).controller
-    loop = lbt.close_loop(plant.hardware, controller, sensor_gain=0.5)
-    moving = lbt.loop.moving_gain(loop)
+    low, high = lbt.loop.stable_sensor_gains(plant.hardware, controller)
+    moving = lbt.loop.moving_gain(lbt.close_loop(plant.hardware, controller, sensor_gain=0.5))
     assert moving.moving_low < 0.5 < moving.moving_high < moving.constant_high
-    expected = lbt.loop.stable_sensor_gains(plant.hardware, controller)
-    assert (moving.constant_low, moving.constant_high) == pytest.approx(expected)
-
-
-def test_an_unstable_loop_is_refused():
+    assert (moving.constant_low, moving.constant_high) == pytest.approx((low, high))
+    inside = [*np.geomspace(low * 1.0001, high * 0.9999, 9), low * 0.999, high * 1.001]
+    loops = [lbt.close_loop(plant.hardware, controller, sensor_gain=gain) for gain in inside]
+    assert [loop.is_stable for loop in loops] == [True] * 9 + [False] * 2
     with pytest.raises(lbt.errors.UnstableLoopError):
         lbt.loop.moving_gain(integrator_loop(2, gain=1.5))
 
@@ -207,9 +206,6 @@ LOOPS = {
     ),
     "two axes": lambda: lbt.hinf(two_axes(2.3), gamma_ratio=1.2),
     "integrator": lambda: lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.8),
-    "one frame": lambda: lbt.integrator(
-        lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=1), gain=0.8
-    ),
 }
 
 
@@ -222,7 +218,7 @@ def test_every_loop_within_the_errors_is_stable(name):
     rng = np.random.default_rng(0)
     late, factor = scale * FRAGILE_FRAMES, 10 ** (scale * FRAGILE_DB / 20)
     signs = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
-    for a, b in [*signs, *rng.uniform(-1, 1, (60, 2)).tolist()]:
+    for a, b in [*signs, *rng.uniform(-1, 1, (12, 2)).tolist()]:
         delay = max(path.delay_frames + a * late, 1.0)
         assert is_stable(path, design.controller, factor**b, delay), (a, b)
     # beyond, the proof is not far from the truth
@@ -247,15 +243,15 @@ def test_a_gain_alone_has_the_exact_interval():
 
 
 def test_loops_that_stand_for_all_are_the_corners_and_whole_delays():
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=2.9)
-    changes = loop_changes(path, low=0.5, high=1.5, delay_frames=0.3)
-    assert {(gain, round(delay, 9)) for gain, delay, _ in changes} == {
-        (g, d) for g in (0.5, 1.5) for d in (2.6, 3.0, 3.2)
-    }
-    assert not loop_changes(path, low=1.0, high=1.0, delay_frames=0.0)
-    short = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=1.0)
+    late, short = (lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=d) for d in (2.9, 1))
+    changes = loop_changes(late, low=0.5, high=1.5, delay_frames=0.3)
+    corners = {(gain, delay) for gain in (0.5, 1.5) for delay in (2.6, 3.0, 3.2)}
+    assert {(gain, round(delay, 9)) for gain, delay, _ in changes} == corners
+    assert not loop_changes(late, low=1.0, high=1.0, delay_frames=0.0)
     delays = {delay for _, delay, _ in loop_changes(short, low=1, high=1, delay_frames=0.5)}
     assert delays == {1.5}  # none is below one frame
+    moving = replace(late, mirror=shell(100, delay_samples=2))
+    assert np.isnan(errors_together(lbt.close_loop(moving, lbt.integrator(moving, gain=0.05))))
 
 
 def test_taps_behind_several_outputs():
@@ -271,8 +267,3 @@ def test_taps_behind_several_outputs():
     turn = np.exp(-2j * np.pi * f / 800)
     expected = (turn[:, None] ** np.arange(3) @ taps)[:, None, None] * system.frequency_response(f)
     np.testing.assert_allclose(append_taps(system, taps).frequency_response(f), expected)
-
-
-def test_a_mirror_with_dynamics_has_no_answer():
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell(100, delay_samples=2))
-    assert np.isnan(errors_together(lbt.close_loop(path, lbt.integrator(path, gain=0.1))))

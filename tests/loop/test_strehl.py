@@ -1,8 +1,10 @@
 """Strehl ratio against FFT optics and closed forms."""
 
+from functools import partial
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 from scipy.special import j0, jv
@@ -24,7 +26,7 @@ def pupil_otf(obstruction, size=512):
     return np.meshgrid(shift, shift), otf / otf.max()
 
 
-@pytest.mark.parametrize("obstruction", [0.0, 0.11, 0.4])
+@pytest.mark.parametrize("obstruction", [0.0, 0.4])
 def test_otf_is_the_autocorrelation_of_the_pupil(obstruction):
     (x, y), otf = pupil_otf(obstruction)
     radius = np.hypot(x, y)
@@ -49,32 +51,16 @@ def test_known_value_and_marechal():
     """300 nm an axis leaves .375, where Marechal says .230."""
     exact = lbt.loop.jitter_strehl(np.eye(2) * 300**2, imaging=CAMERA)
     assert exact == pytest.approx(0.375, abs=1e-3)
+    camera = lbt.Imaging(diameter_m=8.22, other_modes=0.84)
+    still = lbt.loop.jitter_strehl(np.zeros((2, 2)), imaging=camera)
+    assert still == pytest.approx(0.84, rel=1e-12)
+    one = lbt.loop.jitter_strehl([[200.0**2]], imaging=CAMERA, line_amplitudes_nm=[[300.0]])
+    two = lbt.loop.jitter_strehl(
+        np.diag([200.0**2, 0]), imaging=CAMERA, line_amplitudes_nm=[[300.0, 0]]
+    )
+    assert one == pytest.approx(two, rel=1e-12)
     small = lbt.loop.jitter_strehl(np.eye(2) * 20**2, imaging=CAMERA)
     assert small == pytest.approx(np.exp(-2 * (2 * np.pi * 20 / 2200) ** 2), abs=2e-4)
-
-
-@given(angle=st.floats(0, np.pi), sx=st.floats(0, 800), sy=st.floats(0, 800))
-def test_turning_the_jitter_changes_nothing(angle, sx, sy):
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    covariance = np.diag([sx**2, sy**2])
-    one = lbt.loop.jitter_strehl(covariance, imaging=CAMERA)
-    other = lbt.loop.jitter_strehl(turn @ covariance @ turn.T, imaging=CAMERA)
-    assert one == pytest.approx(other, abs=1e-6)
-
-
-@given(small=st.floats(0, 900), more=st.floats(1, 300))
-def test_more_jitter_is_less_strehl(small, more):
-    def at(rms):
-        return lbt.loop.jitter_strehl(np.eye(2) * rms**2, imaging=CAMERA)
-
-    assert 0 < at(small + more) < at(small) <= 1
-
-
-def test_no_jitter_is_the_other_modes():
-    camera = lbt.Imaging(diameter_m=8.22, other_modes=0.84)
-    assert lbt.loop.jitter_strehl(np.zeros((2, 2)), imaging=camera) == pytest.approx(
-        0.84, rel=1e-12
-    )
 
 
 def test_large_jitter_stays_between_zero_and_one():
@@ -95,34 +81,7 @@ def test_large_jitter_stays_between_zero_and_one():
     assert lbt.loop.jitter_strehl(np.eye(2) * 1e12, imaging=camera) == 0  # the image is gone
 
 
-def test_one_axis_is_the_second_one_still():
-    one = lbt.loop.jitter_strehl([[200.0**2]], imaging=CAMERA, line_amplitudes_nm=[[300.0]])
-    two = lbt.loop.jitter_strehl(
-        np.diag([200.0**2, 0]), imaging=CAMERA, line_amplitudes_nm=[[300.0, 0]]
-    )
-    assert one == pytest.approx(two, rel=1e-12)
-
-
-def test_series_of_an_exact_sinusoid():
-    time = np.arange(6000) / 6000
-    series = np.stack([700 * np.cos(2 * np.pi * 7 * time), 300 * np.sin(2 * np.pi * 7 * time)], 1)
-    exact = lbt.loop.jitter_strehl(
-        np.zeros((2, 2)), imaging=CAMERA, line_amplitudes_nm=[[700, -300j]]
-    )
-    assert series_strehl(series, CAMERA) == pytest.approx(exact, abs=1e-5)
-
-
-@pytest.mark.parametrize(("amplitude_nm", "wavelength_um"), [(4000.0, 0.5), (16000.0, 1.65)])
-def test_series_of_a_large_sinusoid(amplitude_nm, wavelength_um):
-    camera = lbt.Imaging(diameter_m=8.22, wavelength_um=wavelength_um)
-    phase = 2 * np.pi * 37 * (np.arange(50_000) + 0.5) / 50_000
-    series = np.stack([amplitude_nm * np.sin(phase), np.zeros(phase.size)], axis=1)
-    exact = lbt.loop.jitter_strehl(
-        np.zeros((2, 2)), imaging=camera, line_amplitudes_nm=[[amplitude_nm, 0]]
-    )
-    assert series_strehl(series, camera) == pytest.approx(exact, rel=1e-6)
-
-
+@settings(max_examples=20)
 @given(st.floats(0, 1e6), st.floats(0, 0.9))
 def test_a_star_that_jumps_between_two_places(jump_nm, obstruction):
     """The image of an annular pupil at its distance, by Bessel functions."""
@@ -135,24 +94,7 @@ def test_a_star_that_jumps_between_two_places(jump_nm, obstruction):
     assert found == pytest.approx(expected, rel=1e-9, abs=1e-14)
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: lbt.loop.jitter_strehl(np.eye(3), imaging=CAMERA),
-        lambda: lbt.loop.jitter_strehl([[1, 0], [0, -1]], imaging=CAMERA),
-        lambda: lbt.loop.jitter_strehl([[np.nan]], imaging=CAMERA),
-        lambda: lbt.loop.jitter_strehl([[1.0]], imaging=CAMERA, line_amplitudes_nm=[[np.inf]]),
-        lambda: series_strehl(np.zeros((10, 3)), CAMERA),
-        lambda: series_strehl(np.zeros(10), CAMERA),
-        lambda: series_strehl([[np.nan, 1]], CAMERA),
-        lambda: lbt.Imaging(diameter_m=8, other_modes=1.2),
-    ],
-)
-def test_wrong_input_is_refused(call):
-    with pytest.raises(lbt.errors.ProblemError):
-        call()
-
-
+@settings(max_examples=10)
 @given(st.floats(0.1, 100), st.floats(1, 400), st.floats(1, 400), st.floats(0.4, 12))
 def test_strehl_in_nm_does_not_know_the_diameter(diameter, x, y, wavelength):
     """A tilt of a nm rms moves the image by 4 a / wavelength, in units of lambda / D."""
@@ -172,12 +114,6 @@ def test_strehl_in_nm_does_not_know_the_diameter(diameter, x, y, wavelength):
     )
     assert by_angle == pytest.approx(angle, rel=1e-12)
     assert cameras[1].cycles_per_nm * x == pytest.approx(by_angle, rel=1e-12)
-
-
-def test_a_camera_of_no_telescope():
-    assert lbt.Imaging().diameter_m is None
-    with pytest.raises(lbt.errors.ProblemError, match="diameter_m"):
-        lbt.Imaging(diameter_m=0)
 
 
 DIMMER_CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11, other_modes=0.9)
@@ -200,9 +136,9 @@ def dense_strehl(covariance, lines, imaging):
 
 def test_many_jitters_are_integrated_as_each_of_them():
     rng = np.random.default_rng(5)
-    count = 300
+    count = 60
     roots = 10 ** rng.uniform(0, 3, (count, 1, 1)) * rng.standard_normal((count, 2, 2))
-    roots[::2] = 10 ** rng.uniform(0, 3, (150, 1, 1)) * np.eye(2)  # the same in all directions
+    roots[::2] = 10 ** rng.uniform(0, 3, (30, 1, 1)) * np.eye(2)  # the same in all directions
     covariances = roots @ np.swapaxes(roots, 1, 2)
     lines = 10 ** rng.uniform(-1, 2.8, (count, 2, 1)) * (
         rng.standard_normal((count, 2, 2)) + 1j * rng.standard_normal((count, 2, 2))
@@ -210,7 +146,7 @@ def test_many_jitters_are_integrated_as_each_of_them():
     covariances[7] = covariances[9]
     small = np.sqrt(np.max(np.diagonal(covariances, axis1=1, axis2=2), axis=1))
     small = (small + np.abs(lines).sum(axis=(1, 2))) * DIMMER_CAMERA.cycles_per_nm < 5
-    assert small.sum() > 200
+    assert small.sum() > 40
     covariances, lines = covariances[small], lines[small]
     found = lbt.loop.jitter_strehl(covariances, imaging=DIMMER_CAMERA, line_amplitudes_nm=lines)
     for i in range(len(found)):
@@ -223,15 +159,19 @@ def test_many_jitters_are_integrated_as_each_of_them():
         assert alone == pytest.approx(found[i], abs=1e-14)
 
 
-def test_many_jitters_of_wrong_sizes():
-    with pytest.raises(
-        lbt.errors.DimensionError, match=r"must be \(3, sinusoids, 2\); got \(2, 1, 2\)"
+def test_wrong_input_is_refused():
+    jitter = partial(lbt.loop.jitter_strehl, imaging=CAMERA)
+    for call in (
+        lambda: jitter(np.eye(3)),
+        lambda: jitter([[1, 0], [0, -1]]),
+        lambda: jitter([[np.nan]]),
+        lambda: jitter([[1.0]], line_amplitudes_nm=[[np.inf]]),
+        lambda: jitter(np.zeros((3, 2, 2)), line_amplitudes_nm=np.zeros((2, 1, 2))),
+        lambda: series_strehl(np.zeros((10, 3)), CAMERA),
+        lambda: series_strehl(np.zeros(10), CAMERA),
+        lambda: series_strehl([[np.nan, 1]], CAMERA),
+        lambda: lbt.Imaging(diameter_m=8, other_modes=1.2),
+        lambda: lbt.Imaging(diameter_m=0),
     ):
-        lbt.loop.jitter_strehl(
-            np.zeros((3, 2, 2)), imaging=DIMMER_CAMERA, line_amplitudes_nm=np.zeros((2, 1, 2))
-        )
-    indefinite = np.stack([np.eye(2), np.diag([1, -1])])
-    with pytest.raises(lbt.errors.DefinitenessError, match="least eigenvalue of -1"):
-        lbt.loop.jitter_strehl(
-            indefinite, imaging=DIMMER_CAMERA, line_amplitudes_nm=np.zeros((2, 0, 2))
-        )
+        with pytest.raises(lbt.errors.ProblemError):
+            call()

@@ -20,10 +20,7 @@ EXAMPLES = [
     for path in sorted((ROOT / "examples").glob("lbt*.yaml"))
 ]
 IMPOSSIBLE = [1e-300, 1e-12, 1e12, 1e200, -1.0, math.nan, math.inf]
-FROM_ZERO = {
-    *("damping", "gain", "leak", "loss", "low_hz", "obstruction"),
-    "read_noise_electrons",
-}
+FROM_ZERO = {*("damping", "gain", "leak", "loss", "low_hz", "obstruction"), "read_noise_electrons"}
 PASS = {(name, value) for name in (*FROM_ZERO, "errors_hz") for value in (1e-300, 1e-12)}
 PASS |= {("errors_hz", -1.0)}  # shifts have a sign
 

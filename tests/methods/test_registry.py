@@ -12,12 +12,8 @@ from support.design_reports import SMALL
 from support.plants import LBT_YAML, ROOT
 
 import lbt_synth as lbt
-from lbt_synth.methods.registry import (
-    METHODS,
-    design_label,
-    method_named,
-    reference_methods,
-)
+from lbt_synth.errors import ProblemError
+from lbt_synth.methods.registry import METHODS, design_label, method_named, reference_methods
 
 CONFIG = str(LBT_YAML)
 BUILT_IN = ("hinf", "integrator", "kalman", "lqg", "mixed", "robust")
@@ -37,7 +33,7 @@ def test_methods_by_name(leaky):
     assert [m.name for m in reference_methods(estimators_only=True)] == ["kalman", "hinf"]
     assert leaky.needs_options
     assert not method_named("mixed").needs_options
-    with pytest.raises(lbt.errors.ProblemError, match=r"got 'kalmann'. Did you mean kalman\?"):
+    with pytest.raises(ProblemError, match=r"got 'kalmann'. Did you mean kalman\?"):
         method_named("kalmann")
 
 
@@ -77,8 +73,6 @@ def test_every_command_takes_a_method_of_the_table(leaky, tmp_path, capsys, monk
     assert shown["matrices"]["A"] == pytest.approx(np.exp(-5 / 800) * np.eye(2))
     assert run(capsys, "verify", gain)[0] == 0
     assert run(capsys, "plot", "sigma", gain, "-o", "sigma.png")[0] == 0
-    status, out, _ = run(capsys, "simulate", small, gain, "--frames", "400", "--cases", "1")
-    assert (status, "Strehl ratio" in out) == (0, True)
     assert run(capsys, "report", small, gain, "-o", "report.html")[0] == 0
     assert "leaky" in Path("report.html").read_text()
 
@@ -111,20 +105,11 @@ def test_a_study_takes_a_method_of_the_table(leaky, tmp_path, capsys):
 
 def test_no_other_file_names_a_method():
     """A method's name stands in the table, and in the design that it makes."""
-    known = {"design", "methods"}
-    named = {
-        str(path.relative_to(ROOT)): sorted(found)
-        for path in (ROOT / "lbt_synth").rglob("*.py")
-        if path.relative_to(ROOT).parts[1] not in known and (found := method_names_in(path))
-    }
-    assert named == {}
-
-
-def method_names_in(path):
-    """Names of methods among the strings of a file that are no docstrings."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    strings = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}
-    return strings & set(BUILT_IN)
+    for path in (ROOT / "lbt_synth").rglob("*.py"):
+        if path.relative_to(ROOT).parts[1] not in ("design", "methods"):
+            tree = ast.parse(path.read_text(encoding="utf-8"))
+            strings = {n.value for n in ast.walk(tree) if isinstance(n, ast.Constant)}
+            assert not strings & set(BUILT_IN), path
 
 
 def test_an_option_that_no_method_has(tmp_path, capsys):

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from types import ModuleType
-
 import mpmath
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
 from scipy.linalg import solve_discrete_lyapunov
-from support.eris import eris_example, eris_record
 
 import lbt_synth as lbt
 
@@ -49,26 +46,7 @@ def test_what_is_no_spectrum_is_refused():
             call()
 
 
-@pytest.fixture(scope="module")
-def example() -> ModuleType:
-    return eris_example()
-
-
-@pytest.fixture(scope="module")
-def seen() -> lbt.identification.SpectrumRecord:
-    return eris_record()
-
-
-def test_parts_of_the_disturbance_are_the_file(seen, example):
-    met = example.disturbance(seen)
-    f = np.concatenate([seen.frequency_hz, seen.frequency_hz[:-1] + 0.009])
-    for i, column in enumerate(seen.spectra):
-        whole = lbt.models.SumSpectrum(parts=[met.background[i], met.lines[i]])
-        assert whole.psd(f) == pytest.approx(column.psd(f), rel=1e-12)
-        moved = example.disturbance(seen, shift_hz=0.5).lines[i]
-        assert moved.psd(f + 0.5) == pytest.approx(met.lines[i].psd(f), rel=1e-9, abs=1e-9)
-
-
+@settings(max_examples=10)
 @given(poles=st.lists(st.floats(-0.95, 0.95), min_size=1, max_size=5))
 def test_variance_against_a_lyapunov_equation(poles):
     coefficients = -np.poly(poles)[1:]
@@ -80,8 +58,7 @@ def test_variance_against_a_lyapunov_equation(poles):
 
 
 @pytest.mark.parametrize(
-    ("frequency_hz", "damping", "rate_hz"),
-    [(0.1, 1e-4, 2000), (0.5, 1e-6, 10_000), (0.2, 1e-5, 3000), (0.1, 1e-3, 2000)],
+    ("frequency_hz", "damping", "rate_hz"), [(0.5, 1e-6, 10_000), (0.1, 1e-3, 2000), (40, 0.9, 800)]
 )
 def test_slow_lines_have_the_rms_they_claim(frequency_hz, damping, rate_hz):
     """By the closed form of order 2, in 50 digits, from the same coefficients."""

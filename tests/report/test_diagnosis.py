@@ -11,7 +11,7 @@ from support.pages import Reader
 import lbt_synth as lbt
 from lbt_synth.report.diagnosis import diagnosis_page
 from lbt_synth.report.draw import figure_series
-from lbt_synth.report.page.html import page_html, write_page
+from lbt_synth.report.page.html import write_page
 
 
 @pytest.fixture(scope="module")
@@ -36,13 +36,6 @@ def test_sections_and_charts(page):
     np.testing.assert_allclose(promised.y, [row.model_nm for row in rows])
     assert figure_series(costs.figure)[0].x[-1] == "all"
     assert len(spectra.figure.axes) == 3
-
-
-def test_words_have_the_signs_of_print(page):
-    reader = Reader(page_html(page).decode())
-    words = [word for tag in ("p", "td", "th", "caption") for word in reader.texts[tag]]
-    assert any("±" in word for word in words)
-    assert not [word for word in words if "+-" in word]
 
 
 def test_files(tmp_path):
@@ -70,10 +63,3 @@ def test_what_is_wrong_comes_first_and_loudly(tmp_path):
     )
     assert page.charts == []
     assert list(page.sections)[:3] == ["Verdict", "Record", "Loop that ran"]
-
-
-def test_names(tmp_path):
-    with pytest.raises(lbt.errors.OutputError, match=r"\.html"):
-        write_page(diagnosis_page(line_diagnosis()), tmp_path / "page.txt")
-    with pytest.raises(lbt.errors.FileError, match="cannot read"):
-        diagnosis_page(line_diagnosis(), [tmp_path / "nowhere"])

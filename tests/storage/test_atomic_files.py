@@ -17,20 +17,6 @@ from lbt_synth.storage.atomic_files import (
 )
 
 
-def test_what_is_not_there_or_no_name_is_no_input(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("a.fits").write_bytes(b"a")
-    refuse_replacing(["b.fits", "\0"], ["a.fits", "none.fits", "\0c"])
-    Path("ring").symlink_to("ring")
-    refuse_replacing(["b.fits"], ["ring"])
-    require_writable("b.fits", inputs=["a.fits"])
-    with pytest.raises(OutputError, match=r"a\.fits must not replace the input \./a\.fits") as one:
-        require_writable("a.fits", inputs=["./a.fits"])
-    assert one.value.path == Path("a.fits")
-    with pytest.raises(OutputError, match="must not replace"):  # before either exists
-        refuse_replacing(["none.fits"], [tmp_path / "x" / ".." / "none.fits"])
-
-
 def write_streamed(path, content):
     with open_atomically(path) as stream:
         stream.write(content)
@@ -40,35 +26,44 @@ def write_two(path, content):
     write_together({path.with_name("other"): content, path: content})
 
 
-@pytest.mark.parametrize("write", [write_atomically, write_streamed, write_two])
-@pytest.mark.parametrize("kind", ["link", "broken link", "pipe", "directory", "long name"])
-def test_only_regular_files_are_replaced(tmp_path, write, kind):
-    mine, target = tmp_path / "mine.txt", tmp_path / "out"
+every_writer = pytest.mark.parametrize("write", [write_atomically, write_streamed, write_two])
+
+
+def test_what_is_not_there_or_no_name_is_no_input(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("a.fits").write_bytes(b"a")
+    Path("ring").symlink_to("ring")
+    refuse_replacing(["b.fits", "\0"], ["a.fits", "none.fits", "\0c", "ring"])
+    require_writable("b.fits", inputs=["a.fits"])
+    with pytest.raises(OutputError, match=r"a\.fits must not replace the input \./a\.fits") as one:
+        require_writable("a.fits", inputs=["./a.fits"])
+    assert one.value.path == Path("a.fits")
+    with pytest.raises(OutputError, match="must not replace"):  # before either exists
+        refuse_replacing(["none.fits"], [tmp_path / "x" / ".." / "none.fits"])
+
+
+@every_writer
+def test_only_regular_files_are_replaced(tmp_path, write):
+    mine = tmp_path / "mine.txt"
     mine.write_text("mine")
-    if kind == "link":
-        target.symlink_to(mine)
-    elif kind == "broken link":
-        target.symlink_to("nowhere")
-    elif kind == "pipe":
-        os.mkfifo(target)
-    elif kind == "directory":
-        target.mkdir()
-    else:
-        target = tmp_path / ("é" * 128)  # 256 bytes
+    (tmp_path / "link").symlink_to(mine)
+    (tmp_path / "broken").symlink_to("nowhere")
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "directory").mkdir()
     before = sorted(os.listdir(tmp_path))
-    for refused in (lambda: write(target, b"new"), lambda: require_writable(target)):
-        with pytest.raises(OutputError, match=r"is a|cannot write"):
-            refused()
+    for name in ("link", "broken", "pipe", "directory", "é" * 128):  # the last has 256 bytes
+        for refused in (lambda p: write(p, b"new"), require_writable):
+            with pytest.raises(OutputError, match=r"is a|cannot write"):
+                refused(tmp_path / name)
     assert mine.read_text() == "mine"
     assert sorted(os.listdir(tmp_path)) == before
 
 
 def test_a_name_may_be_as_long_as_the_system_takes(tmp_path):
-    path = tmp_path / ("a" * 255)
-    assert write_atomically(path, b"whole").read_bytes() == b"whole"
+    assert write_atomically(tmp_path / ("a" * 255), b"all").read_bytes() == b"all"
 
 
-@pytest.mark.parametrize("write", [write_atomically, write_streamed, write_two])
+@every_writer
 def test_permissions_stay(tmp_path, write):
     path, new = tmp_path / "secret", tmp_path / "new"
     path.write_bytes(b"old")
@@ -83,7 +78,7 @@ def test_permissions_stay(tmp_path, write):
     assert stat.S_IMODE(new.stat().st_mode) == 0o640
 
 
-@pytest.mark.parametrize("write", [write_atomically, write_streamed, write_two])
+@every_writer
 def test_a_full_disk_leaves_the_older_file_and_nothing_else(tmp_path, monkeypatch, write):
     path = tmp_path / "out"
     path.write_bytes(b"old")
@@ -105,17 +100,12 @@ def test_an_error_while_writing_is_not_taken_for_one_of_the_file(tmp_path):
 
 
 def test_one_at_a_time_holds_a_directory(tmp_path):
-    with exclusive_lock(tmp_path, "run"):  # noqa: SIM117 - the second is refused
-        with (
-            pytest.raises(OutputError, match="another run is running"),
-            exclusive_lock(tmp_path, "run"),
-        ):
-            pass
+    second = pytest.raises(OutputError, match="another run is running")
+    with exclusive_lock(tmp_path, "run"), second, exclusive_lock(tmp_path, "run"):
+        pass
     with exclusive_lock(tmp_path, "run"):
         pass
-
-
-def test_a_directory_that_takes_no_lock(tmp_path):
-    (tmp_path / ".lock").mkdir()
-    with pytest.raises(OutputError, match=r"\.lock: Is a dir"), exclusive_lock(tmp_path, "run"):
+    (tmp_path / "odd" / ".lock").mkdir(parents=True)
+    no_lock = pytest.raises(OutputError, match=r"\.lock: Is a dir")
+    with no_lock, exclusive_lock(tmp_path / "odd", "run"):
         pass

@@ -5,7 +5,7 @@ import os
 import pytest
 
 import lbt_synth as lbt
-from lbt_synth.errors import FileError
+from lbt_synth.errors import FileError, LbtSynthError
 from lbt_synth.storage.input_files import read_bytes
 
 READERS = {
@@ -32,7 +32,7 @@ def test_what_is_no_regular_file_of_a_bearable_size_is_refused_at_once(tmp_path,
         (tmp_path / ("a" * 300 + ending), "File name"),
         (large, "larger than"),
     ):
-        with pytest.raises(lbt.errors.LbtSynthError, match=f"cannot read .*: .*({words})"):
+        with pytest.raises(LbtSynthError, match=f"cannot read .*: .*({words})"):
             reader(path)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import time
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.plants import LBT_YAML, lbt_axis_plant
 from support.studies import (
     assert_whole,
     evaluate_quickly,
@@ -19,11 +21,12 @@ from support.studies import (
     part_rows,
 )
 
+import lbt_synth as lbt
 from lbt_synth.errors import NumericalError, OutputError
 from lbt_synth.storage import array_file
 from lbt_synth.storage.thread_limits import WorkerPool
 from lbt_synth.studies import run_study
-from lbt_synth.studies.grid import Sweep
+from lbt_synth.studies.grid import Sweep, evaluate
 
 
 def test_a_sweep_knows_what_is_missing(tmp_path):
@@ -36,18 +39,63 @@ def test_a_sweep_knows_what_is_missing(tmp_path):
     assert sweep.missing() == [(0, 2), (6, 9), (10, 12)]
     results, failures, seconds = sweep.read(sweep.paths()[4, 6])
     assert (results.tolist(), failures, seconds) == ([[4], [5]], [(4, "a", "why")], 0.5)
+    begun = sweep.folder / ".lbt_synth.0123456789abcdef.0.tmp"
+    begun.write_bytes(b"half")
     seen, counts = [], []
 
-    def evaluate(start, stop):
+    def count(start, stop):
         seen.append((start, stop))
         return {"a": np.arange(start, stop)}, []
 
-    run, computed = sweep.run(evaluate, lambda rows: rows, part_rows=2, progress=counts.append)
+    run, computed = sweep.run(count, lambda rows: rows, part_rows=2, progress=counts.append)
     assert seen == [(0, 2), (6, 8), (8, 9), (10, 12)]  # a fixed number, and less at an end
     assert run.results.ravel().tolist() == list(range(12))
     assert run.failures == [(2, "a", "why"), (4, "a", "why"), (9, "a", "why")]
     assert (computed, counts) == (7, [5, 2, 2, 1, 2])
+    assert not begun.exists()  # what a killed process had begun to write
     assert sweep.run(None, lambda rows: rows, part_rows=2)[1] == 0
+
+
+def late(number, seconds):
+    time.sleep(seconds)
+    return number**2
+
+
+def fails(number):
+    raise RuntimeError("no such thing.")
+
+
+def test_a_grid_in_memory_is_in_the_order_of_its_samples():
+    samples = [(i, 0.05 * (i == 0)) for i in range(9)]
+    assert list(evaluate(late, iter(samples))) == [i * i for i in range(9)]
+    with ThreadPoolExecutor(3) as pool:
+        assert list(evaluate(late, iter(samples), pool)) == [i * i for i in range(9)]
+        with pytest.raises(NumericalError, match=r"rows 0 to 0 .*RuntimeError: no such thing"):
+            list(evaluate(fails, [(1,)], pool))
+
+
+class Elsewhere(ThreadPoolExecutor):
+    """An executor that gets everything in bytes, as one of processes does."""
+
+    def submit(self, fn, *args):
+        return super().submit(*pickle.loads(pickle.dumps((fn, *args))))
+
+
+def test_tables_of_designs_are_the_same_elsewhere():
+    config = lbt.load_config(LBT_YAML)
+    plant, met = lbt_axis_plant(modes=1), (config.truth, config.imaging)
+    design = config.design("integrator", gain=0.3)
+    errors = {"errors_hz": [-1.0, 0.0]}
+
+    def tables(**how):
+        yield list(lbt.studies.robustness(config.plant, *met, **errors, **how))
+        yield lbt.studies.limits({"slow": design}, config.hardware, *met, **errors, **how).rows
+        yield [p.gamma for p in lbt.studies.tradeoff(plant, points=2, **how)]
+        gains = {"sensor_gains": np.linspace(0.1, 1, 70), "delay_errors_frames": [0, 0.5]}
+        yield lbt.studies.robustness_map(design, *met, **errors, **gains, **how).strehl.tolist()
+
+    with Elsewhere(2) as pool:
+        assert list(tables(executor=pool)) == list(tables())
 
 
 def test_a_part_is_believed_by_its_digest_alone(tmp_path):
@@ -57,9 +105,15 @@ def test_a_part_is_believed_by_its_digest_alone(tmp_path):
     arrays, text = array_file.read_npz(path.read_bytes())
     with pytest.raises(OutputError, match="is of another study"):
         replace(sweep, digest="e" * 64).read(path)
-    path.write_bytes(array_file.npz_bytes({"RESULTS": 1.001 * arrays["RESULTS"]}, text))
-    with pytest.raises(OutputError, match="is damaged. Delete it"):
-        sweep.read(path)
+    content = path.read_bytes()
+    changed = array_file.npz_bytes({"RESULTS": 1.001 * arrays["RESULTS"]}, text)
+    for damage in (changed, content[:-30], content[:200] + b"x" + content[201:], b""):
+        path.write_bytes(damage)
+        with pytest.raises(OutputError, match="is damaged. Delete it"):
+            sweep.read(path)
+    path.with_name("0000000001-0000000002.npz").write_bytes(content)
+    with pytest.raises(OutputError, match="has rows that are in"):
+        sweep.paths()
 
 
 def wrong(study, values, start):
@@ -75,16 +129,16 @@ def raises(study, values, start):
 
 
 @pytest.mark.parametrize(
-    ("evaluate", "message"),
+    ("function", "message"),
     [
         (wrong, r"rows 0 to 3 have no result \(ValueError"),
         (short, r"rows 0 to 3 have no result \(ValueError: 3 rows\)"),
         (raises, r"rows 0 to 3 have no result \(RuntimeError: no such thing\)"),
     ],
 )
-def test_evaluations_that_are_none(tmp_path, evaluate, message):
+def test_evaluations_that_are_none(tmp_path, function, message):
     with pytest.raises(NumericalError, match=message):
-        run_study(load_small_study(tmp_path), make_folder(tmp_path), evaluate=evaluate)
+        run_study(load_small_study(tmp_path), make_folder(tmp_path), evaluate=function)
 
 
 def test_any_executor(tmp_path):

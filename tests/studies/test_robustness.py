@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support import uneven_axes
-from support.drifting import drifting
 from support.figures import legend
 from support.plants import LBT_YAML, lbt_axis_plant
 from support.robustness_maps import evaluate_point
@@ -17,7 +15,7 @@ from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import ARModel, SinusoidalVibration, TabulatedSpectrum
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.report.figures.studies import tradeoff_figure
-from lbt_synth.studies import limits, robustness, robustness_map
+from lbt_synth.studies import robustness, robustness_map
 from lbt_synth.studies.robustness import run_failures
 
 
@@ -52,22 +50,6 @@ def test_the_study_refuses_what_it_cannot_do(config):
     ):
         with pytest.raises(lbt.errors.ProblemError, match=words):
             list(robustness(plant, config.truth, config.imaging, **options))
-
-
-def test_what_needs_a_stationary_truth_refuses_it(config):
-    plant = lbt_axis_plant()
-    truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=(drifting(),), noise_nm=15.5)
-    design = lbt.kalman(plant)
-    loop = lbt.close_loop(plant.hardware, design.controller)
-    camera = lbt.Imaging(diameter_m=8.22)
-    for refused in (
-        lambda: lbt.residual_budget(loop, truth),
-        lambda: robustness_map(design, truth, camera, errors_hz=[0], sensor_gains=[1]),
-        lambda: limits({"kalman": design}, plant.hardware, truth, camera),
-        lambda: list(robustness(plant, truth, camera, errors_hz=[0])),
-    ):
-        with pytest.raises(lbt.errors.ProblemError, match="drifts from 17 to 23 Hz. Simulate it"):
-            refused()
 
 
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11, other_modes=0.9)
@@ -134,16 +116,6 @@ def test_each_point_is_that_of_the_single_evaluator(kalman, air, name):
     assert_as_single(kalman, truth, CAMERA, [-2.5, 1.0], [0.07, 0.6, 1.9])
 
 
-def test_axes_of_their_own_disturbances():
-    truth = lbt.Truth(
-        turbulence=[uneven_axes.SLOW, uneven_axes.TABLE],
-        noise_nm=[15.5, 6.0],
-        vibrations=uneven_axes.LINES,
-    )
-    both = lbt.integrator(uneven_axes.LOOPS[0], gain=0.4)
-    assert_as_single(both, truth, lbt.Imaging(diameter_m=8.22), [0], [0.6, 1.0], rel=1e-8)
-
-
 def test_delay_errors_whole_and_fractional(air):
     truth = lbt.Truth(turbulence=air, vibrations=(sinusoid(),), noise_nm=15.5)
     lazy = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.3)
@@ -173,23 +145,6 @@ def test_an_image_that_is_gone_has_no_strehl(robust, settings):
     assert found.stable.all()
     assert found.residual_nm.min() > 9e4
     assert found.strehl.max() == 0
-
-
-def test_order_and_neighbours_change_nothing(kalman, settings):
-    """A point is the same alone, among others, in any order, and more of them than fit at once."""
-
-    def mapped(errors, gains):
-        return robustness_map(
-            kalman, settings.truth, settings.imaging, errors_hz=errors, sensor_gains=gains
-        )
-
-    many = np.linspace(0.3, 1.2, 91)
-    found = mapped([0, 2, -2], many)
-    turned = mapped([-2, 2, 0], many[::-1])
-    assert found.strehl[0] == pytest.approx(turned.strehl[0][::-1, ::-1], rel=1e-6)
-    assert found.strehl[0, 70, 1] == pytest.approx(
-        mapped([2], [many[70]]).strehl[0, 0, 0], rel=1e-6
-    )
 
 
 def test_each_line_moves_by_its_share(kalman, settings):
@@ -356,14 +311,3 @@ def test_the_front_of_the_lbt(plant):
     assert len(figure.axes) == 2
     assert legend(figure.axes[0])[0] == "least variance at this norm"
     assert figure.axes[1].get_xlabel() == "H∞ norm of the estimation error [nm]"
-
-
-def test_a_front_without_a_loop():
-    walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    points = list(lbt.studies.tradeoff(walk, points=2))
-    assert np.isnan(points[0].gain_low)
-    assert len(tradeoff_figure(points).axes) == 1
-    with pytest.raises(lbt.errors.ProblemError, match="points must be at least 2"):
-        next(lbt.studies.tradeoff(walk, points=1))
-    with pytest.raises(lbt.errors.ProblemError, match="at least one point"):
-        tradeoff_figure([])

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import mpmath
 import numpy as np
 import scipy.linalg
 import slycot
@@ -130,22 +129,3 @@ def peers(e):
         except (np.linalg.LinAlgError, ValueError, ArithmeticError):
             continue
     return answers
-
-
-def exact_solution(e):
-    """Newton's method with 40 digits on the data as they are in double precision."""
-    with mpmath.workdps(40):
-        A, B, Q, R, X = (mpmath.matrix(M.tolist()) for M in (e.A, e.B, e.Q, e.R, e.X))
-        for _ in range(6):
-            gain = mpmath.inverse(R + B.T * X * B) * (B.T * X * A)
-            power = A - B * gain
-            X = Q + gain.T * R * gain
-            for _ in range(60):
-                X, power = X + power.T * X * power, power * power
-        return X
-
-
-def error_in_digits(X, exact):
-    with mpmath.workdps(40):
-        difference = mpmath.matrix(X.tolist()) - exact
-        return float(mpmath.sqrt(sum(x * x for x in difference) / sum(x * x for x in exact)))

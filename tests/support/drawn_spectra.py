@@ -25,7 +25,6 @@ def empty_search() -> Search:
         corrected=zero,
         count=zero + 1.0,
         frame_rate_hz=1000.0,
-        resolution_hz=1 / 60,
     )
     return Search(data=data, gain=1.0)
 

@@ -5,11 +5,7 @@ from functools import cache
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.studies.paper import (
-    all_cases,
-    make_entries,
-    plan_cases,
-)
+from lbt_synth.studies.paper import all_cases, make_entries, plan_cases
 
 CONFIG = "examples/lbt.yaml"
 

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
+from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
 
 RATE = 800.0
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=(1,))
 HUM = lbt.Vibration(frequency_hz=55, damping=0.02, rms_nm=40.0, direction=(1,))
+
+
+@functools.cache
+def tip_tilt_filter(delay_frames: float = 2.0) -> lbt.design.FilterDesign:
+    """The Kalman filter of the LBT's numbers on both axes."""
+    return lbt.kalman(lbt_axis_plant(modes=2, delay_frames=delay_frames))
 
 
 def some_air(n: int, order: int = 1, seed: int = 0) -> lbt.models.ModalTurbulence:

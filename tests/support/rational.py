@@ -21,3 +21,18 @@ def is_positive_definite(matrix) -> bool:
         column = rest[j + 1 :, j] / rest[j, j]
         rest[j + 1 :, j + 1 :] = rest[j + 1 :, j + 1 :] - np.outer(column, rest[j, j + 1 :])
     return True
+
+
+def exact_covariance(A, B):
+    """Covariance of ``x+ = A x + B w`` by Gauss-Jordan elimination, (n, n) of fractions."""
+    n = len(A)
+    A, B = rational(A), rational(B)
+    rows = np.hstack([rational(np.eye(n * n)) - np.kron(A, A), (B @ B.T).reshape(-1, 1)])
+    for i in range(n * n):
+        first = next(j for j in range(i, n * n) if rows[j, i] != 0)
+        rows[[i, first]] = rows[[first, i]]
+        rows[i] = rows[i] / rows[i, i]
+        for j in range(n * n):
+            if j != i:
+                rows[j] = rows[j] - rows[j, i] * rows[i]
+    return rows[:, -1].reshape(n, n)

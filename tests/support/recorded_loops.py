@@ -78,18 +78,6 @@ def resonant_record(seed: int = 0) -> lbt.identification.LoopRecord:
     return _directed_record(500.0, 0.9, 0.4, 5.0, resonances, _air(12.0), seed)
 
 
-def crowded_record(seed: int = 2) -> lbt.identification.LoopRecord:
-    """Return a loop of little noise under two strong resonances at the places of two lines."""
-    resonances = (
-        (106.9, 0.0055, 80.4, 84.9),
-        (142.77, 0.0039, 89.2, 104.1),
-        (104.43, 0.0024, 11.2, 8.1),
-        (94.86, 0.1559, 44.8, 179.9),
-        (103.68, 0.1455, 87.2, 148.3),
-    )
-    return _directed_record(1000.0, 0.491, 0.386, 2.05, resonances, _air(10.06), seed)
-
-
 def hidden_resonance_record(seed: int = 63) -> lbt.identification.LoopRecord:
     """Return a loop of sensor gain 0.995 under a wide resonance that a lower gain explains."""
     resonances = (
@@ -186,7 +174,6 @@ def expected_periodogram(air: lbt.models.Spectrum, noise: float, gain: float) ->
         corrected=np.abs(loop) ** 2 * measured,
         count=np.ones(f.size),
         frame_rate_hz=RATE,
-        resolution_hz=1 / 60,
     )
 
 

@@ -24,6 +24,12 @@ def spec(*demands, objective=BASIC):
     return lbt.design.shaping.Specification(objective=objective, demands=demands)
 
 
+def shaped(*demands, objective=BASIC, path=ONE, functions=20, states=None, **options):
+    """Return the design of a loop for an objective and demands."""
+    specification = spec(*demands, objective=objective)
+    return lbt.design.shape(path, specification, functions=functions, states=states, **options)
+
+
 def random_coefficients(size, seed=0):
     return np.random.default_rng(seed).normal(size=size) * 0.3
 

@@ -3,10 +3,7 @@
 import lbt_synth as lbt
 
 RATE = 800.0
-LOOPS = (
-    lbt.LoopHardware(frame_rate_hz=RATE),
-    lbt.LoopHardware(frame_rate_hz=RATE, modes=1),
-)
+LOOPS = (lbt.LoopHardware(frame_rate_hz=RATE), lbt.LoopHardware(frame_rate_hz=RATE, modes=1))
 SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=60.0, frame_rate_hz=RATE)
 QUICK = lbt.models.ARModel(coefficients=[1.6, -0.65], driving_rms_nm=25.0, frame_rate_hz=RATE)
 TABLE = lbt.models.TabulatedSpectrum(frequency_hz=[1, 20, 120], density_nm2_hz=[900, 400, 3])
@@ -14,22 +11,3 @@ LINES = (
     lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1, 0)),
     lbt.models.SinusoidalVibration(frequency_hz=33, rms_nm=90, direction=(0, 1)),
 )
-
-
-def one_axis(truth, axis):
-    """The same truth on one axis."""
-    lines = []
-    for line in truth.vibrations:
-        if line.direction[axis]:
-            extra = {"damping": line.damping} if isinstance(line, lbt.Vibration) else {}
-            lines.append(
-                type(line)(
-                    frequency_hz=line.frequency_hz, rms_nm=line.rms_nm, direction=(1,), **extra
-                )
-            )
-    return lbt.Truth(
-        turbulence=truth.turbulence[axis],
-        vibrations=lines,
-        noise_nm=truth.noise_nm[axis],
-        sensor_gain=truth.sensor_gain,
-    )

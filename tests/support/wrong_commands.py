@@ -22,10 +22,7 @@ FAULTS = {
     "a tenth": (lambda y, u: (y, 0.1 * u), "--command-scale 10"),
     "late": (lambda y, u: (y[1:], u[:-1]), "--command-shift-frames -1"),
     "early": (lambda y, u: (y[:-2], u[2:]), "--command-shift-frames 2"),
-    "increments": (
-        lambda y, u: (y, np.diff(u, axis=0, prepend=0)),
-        "--command-increments",
-    ),
+    "increments": (lambda y, u: (y, np.diff(u, axis=0, prepend=0)), "--command-increments"),
 }
 
 

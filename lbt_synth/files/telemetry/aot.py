@@ -72,6 +72,8 @@ def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
     from astropy.io import fits
 
     aotpy = require_aotpy(target)
+    if telemetry.commands is None:
+        raise OutputError("the AOT standard holds closed loops; got an open one.", path=target)
     plain, checked = io.BytesIO(), io.BytesIO()
     aotpy.AOTFITSWriter(_to_system(aotpy, telemetry, precision)).get_hdulist().writeto(plain)
     # astropy's checksum of a table is right only once the table has been in a file
@@ -84,7 +86,7 @@ def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
 
 def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
     """Describe telemetry as an ``AOSystem`` of aotpy."""
-    diameter, ratio, m = seen.diameter_m, seen.obstruction, seen.commands.shape[1]
+    diameter, ratio, m = seen.diameter_m, seen.obstruction, seen.n_commands
     telescope = aotpy.MainTelescope(
         "Telescope",
         enclosing_diameter=diameter,
@@ -164,7 +166,7 @@ def _arrays(seen: Telemetry) -> dict[str, FloatArray]:
     metres, axes = 1e-9 if seen.command_unit == "nm" else 1.0, seen.subaperture_axes
     back, response, filters = seen.reconstructor, seen.interaction_matrix, _filters(seen)
     arrays: dict[str, Any] = {
-        "commands": metres * seen.commands,
+        "commands": None if seen.commands is None else metres * seen.commands,
         "measurements": seen.sensed,
         "modal_coefficients": None if seen.slopes is None else seen.measurements,
         "optical_gain": None if seen.sensor_gain is None else [seen.sensor_gain],
@@ -220,7 +222,7 @@ def _header_cards(aotpy: Any, seen: Telemetry) -> list[Any]:
 def _filters(seen: Telemetry) -> tuple[FloatArray, FloatArray, FloatArray] | None:
     if seen.controller is not None:
         return time_filters(seen.controller)
-    gains, (m, q) = seen.integrator_gains, (seen.commands.shape[1], seen.measurements.shape[1])
+    gains, (m, q) = seen.integrator_gains, (seen.n_commands, seen.measurements.shape[1])
     if gains is None or m != q:
         return None
     return np.eye(m), np.outer(gains, [0.0, 1.0]), np.tile([-1.0, 1.0], (m, 1))

@@ -20,6 +20,7 @@ from lbt_synth.validation import (
     Obstruction,
     Positive,
     check_fields,
+    float_array,
     frozen_copy,
     real_array,
     set_fields,
@@ -69,7 +70,8 @@ LAYERS = {  # by their names in files
     "INTGAINS": Layer("integrator_gains", "command", "", "integrator gains"),
     "MIRROR_TAPS": Layer("mirror_taps", "age", "", _TAPS),  # follows from other fields
 }
-REQUIRED = ("commands", "measurements")
+REQUIRED = ("measurements",)
+_WITH_GAPS = ("commands", "measurements")  # in which NaN is a value that was lost
 ARRAYS = tuple(layer for layer in LAYERS.values() if layer.field != "mirror_taps")
 FACTS: Mapping[str, tuple[str, str]] = {  # their cards in a FITS header, those that have one
     "frame_rate_hz": ("RATE_HZ", "[Hz] frame rate"),
@@ -161,11 +163,11 @@ class Telemetry:
     ----------
     frame_rate_hz : float
         Frame rate [Hz].
-    commands : (frames, m) array_like
-        Commands u(k), in ``command_unit``.
     measurements : (frames, q) array_like
         Measurements y(k), in ``measurement_unit``: coefficients of the modes, or what the
-        sensor gave where no ``slopes`` are beside them.
+        sensor gave where no ``slopes`` are beside them. NaN where they were lost.
+    commands : (frames, m) array_like, optional
+        Commands u(k), in ``command_unit``, NaN where they were lost; None for an open loop.
     delay_frames : float, optional
         Total delay d [frames]; None if it is not known.
     mirror : PositionLoop, optional
@@ -238,8 +240,8 @@ class Telemetry:
     """
 
     frame_rate_hz: Positive
-    commands: FloatArray
     measurements: FloatArray
+    commands: FloatArray | None = None
     delay_frames: Annotated[float, ("at_least", 0), ("at_most", 1000)] | None = None
     mirror: PositionLoop | None = None
     residual_nm: FloatArray | None = None
@@ -293,7 +295,14 @@ class Telemetry:
         for layer in ARRAYS:
             if (value := getattr(self, layer.field)) is None and layer.field not in REQUIRED:
                 continue
-            array, axes = real_array(value, layer.field), layer.axes.split(", ")
+            axes = layer.axes.split(", ")
+            if layer.field in _WITH_GAPS:
+                array = frozen_copy(float_array(value, layer.field))
+                real_array(
+                    np.nan_to_num(array, nan=0.0, posinf=np.inf, neginf=-np.inf), layer.field
+                )
+            else:
+                array = real_array(value, layer.field)
             if array.ndim == 0 and len(axes) == 2:
                 array = frozen_copy(array.reshape(1, 1))
             if array.ndim != len(axes) or array.size == 0:
@@ -321,7 +330,7 @@ class Telemetry:
             )
 
     def _check_controller(self, controller: Controller) -> None:
-        m, q = self.commands.shape[1], self.measurements.shape[1]
+        m, q = self.n_commands, self.measurements.shape[1]
         if controller.D.shape != (m, q):
             raise DimensionError(
                 f"controller must map {q} measurements to {m} commands; got "
@@ -336,7 +345,12 @@ class Telemetry:
     @property
     def frames(self) -> int:
         """Number of frames."""
-        return int(self.commands.shape[0])
+        return int(self.measurements.shape[0])
+
+    @property
+    def n_commands(self) -> int:
+        """Number of commands; that of the modes in an open loop."""
+        return self.modes if self.commands is None else int(self.commands.shape[1])
 
     @property
     def modes(self) -> int:
@@ -384,7 +398,7 @@ class Telemetry:
         """
         if self.delay_frames is None:
             raise ProblemError("this telemetry does not tell the delay of its loop.")
-        n, q, m = self.modes, self.measurements.shape[1], self.commands.shape[1]
+        n, q, m = self.modes, self.measurements.shape[1], self.n_commands
         sensor, influence = self.modal_response, self.influence_matrix
         for what, name, missing, size in (
             ("measurements", "interaction", sensor is None, q),

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,15 +20,86 @@ from lbt_synth.identification.records.clock import build_clock
 from lbt_synth.identification.records.columns import Column, seconds_per
 from lbt_synth.identification.records.contents import CLOCKS, Contents, read_contents
 from lbt_synth.identification.records.faults import fill, find_outliers, find_stuck, mark, runs
-from lbt_synth.identification.records.record import BRIDGED_FRAMES
+from lbt_synth.identification.records.record import BRIDGED_FRAMES, LoopRecord
+from lbt_synth.models import LoopHardware
+from lbt_synth.models.sensor_suite import Accelerometer, SensorSuite
 from lbt_synth.storage.display_unit import M_S2
 from lbt_synth.validation import BoolArray, FloatArray, float_array, number
 
+LEAST_M_S2 = 1e-9  # rms, a thousandth of what a quiet accelerometer resolves
 _MISSING = 0.1  # of the frames without a number, from which a channel counts as dead
 _NAME = re.compile(r"\w[\w .+-]*$")
 _SPELLINGS = re.compile(r"\s*/\s*s(\^|\*\*)?2$|\s*/\s*s²$|[ .*]s(\^|\*\*)?-2$")
 
 Readings = tuple[tuple[str, ...], FloatArray, tuple[str, ...]]  # channels, values, notes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Channels:
+    """Accelerometers beside a record, in its frames: what the computer of the loop reads in each.
+
+    The reading of a row is there when the measurement of this row is. Its age in a loop is taken to
+    be that of the measurement, a frame, whatever lies between the clocks.
+    """
+
+    names: tuple[str, ...]
+    values: FloatArray  # (frames, c): readings, zero where one is missing [m/s^2]
+    good: BoolArray  # (frames,): whether all channels that live have a reading
+
+    def within(self, record: LoopRecord) -> LoopRecord:
+        """Return the record, in which frames without a reading are not usable."""
+        bridges = None if record.bridges is None else record.bridges & self.good
+        return replace(record, measured=record.measured & self.good, bridges=bridges)
+
+    def hardware(self, path: LoopHardware) -> LoopHardware:
+        """Return a loop that reads the channels, with the noise of each reading.
+
+        That is at most what their change from frame to frame does not share with the next one.
+        """
+        lively = self.values[self.good]
+        steps = np.diff(lively, n=2, axis=0)
+        noise = np.maximum(np.sqrt(np.median(steps**2, axis=0) / 6), LEAST_M_S2)
+        sensor = Accelerometer(
+            name="accelerometers",
+            rate_hz=path.frame_rate_hz,
+            delay_frames=path.delay_frames,
+            channels=self.names,
+            noise_m_s2=noise,
+        )
+        return replace(path, suite=SensorSuite(sensors=(sensor,)))
+
+
+def channels_beside(
+    record: LoopRecord, accelerations: ArrayLike, names: Sequence[str] | None = None
+) -> Channels:
+    """Return the channels of a record: readings (frames, c) in its frames [m/s^2], and names.
+
+    NaN is a missing reading; what comes after the last frame is not read. A channel without life is
+    left out.
+    """
+    values, good = fill_missing(accelerations)
+    called = channel_names(names, values.shape[1])
+    live = np.std(values[good], axis=0) > LEAST_M_S2 if good.any() else np.zeros(len(called), bool)
+    if not live.any():
+        raise ProblemError(
+            f"accelerometers must move; got nothing but zeros or gaps in {', '.join(called)}. "
+            "Leave them out."
+        )
+    frames = min(record.frames, len(values))
+    laid, there = np.zeros((record.frames, int(live.sum()))), np.zeros(record.frames, bool)
+    laid[:frames], there[:frames] = values[:frames, live], good[:frames]
+    kept = tuple(name for name, lives in zip(called, live, strict=True) if lives)
+    return Channels(names=kept, values=laid, good=there)
+
+
+def channel_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
+    """Return the names of channels; refuse two of one name, or too few."""
+    called = tuple(names or (f"channel{c + 1}" for c in range(count)))
+    if len(called) != count or len(set(called)) < count:
+        raise ProblemError(
+            f"channels must be {count} different names, one per column; got {', '.join(called)}."
+        )
+    return called
 
 
 def load_readings(

@@ -23,7 +23,7 @@ from scipy.special import gammaincc
 
 from lbt_synth.design.filter_design import MOST_UNITS
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.accelerometers.readings import fill_missing
+from lbt_synth.identification.accelerometers.readings import LEAST_M_S2, channel_names, fill_missing
 from lbt_synth.identification.fit.identified_model import (
     DIFFERENT,
     IdentifiedLine,
@@ -39,7 +39,6 @@ from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, 
 _TINY = np.finfo(np.float64).tiny
 _NOTHING = "adds nothing"
 _EXTRA = f"left out, because a design takes {MOST_UNITS - 1} channels"
-_DEAD_M_S2 = 1e-9  # rms, a thousandth of what a quiet accelerometer resolves
 _INDEPENDENT = (1 - 5 * TAPER / 8) ** 2 / (1 - 93 * TAPER / 128)  # of tapered values
 _REACH = 20.0  # half widths of a line, or bins, from its centre to the edge of its band
 _ROUNDS = 20  # of factors and noise, of which each brings them nearer by a factor of two or more
@@ -196,14 +195,14 @@ def accelerometer_transfers(
     (2.0, 'used')
     """
     readings, good = fill_missing(accelerations)
-    names = _check_names(channels, readings.shape[1])
+    names = channel_names(channels, readings.shape[1])
     if len(model.axes) != record.axes:
         raise DimensionError(
             f"model and record must have the same axes; got {len(model.axes)} and {record.axes}."
         )
     alarm = number(false_alarm, "false_alarm", above=0, below=1)
     largest_s = number(largest_shift_s, "largest_shift_s", at_least=0)
-    live = np.std(readings[good], axis=0) > _DEAD_M_S2
+    live = np.std(readings[good], axis=0) > LEAST_M_S2
     places = [i for i, part in enumerate(model.parts) if part.kind == "line"]
     places.sort(key=lambda i: model.parts[i].frequency_hz)
     lines = [model.parts[i] for i in places]
@@ -238,16 +237,6 @@ def accelerometer_transfers(
         age_frames=lag + 1,
         rate_hz=model.frame_rate_hz,
     )
-
-
-def _check_names(channels: Sequence[str] | None, count: int) -> tuple[str, ...]:
-    """Return the names of channels; refuse two of one name, or too few."""
-    names = tuple(channels or (f"channel{c + 1}" for c in range(count)))
-    if len(names) != count or len(set(names)) < count:
-        raise ProblemError(
-            f"channels must be {count} different names, one per column; got {', '.join(names)}."
-        )
-    return names
 
 
 def _transfer_rows(

@@ -25,6 +25,7 @@ from lbt_synth.identification.fit.periodogram import (
     half_angle_square,
     segment_transforms,
 )
+from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
@@ -129,15 +130,13 @@ def find_spectral_peaks(
     frequency_hz: FloatArray, power: FloatArray
 ) -> tuple[BoolArray, FloatArray, FloatArray]:
     """Return the frequencies at peaks (f,), where the peaks are and their widths [Hz], (l,)."""
-    from scipy.ndimage import binary_dilation, label, maximum, median_filter
+    from scipy.ndimage import binary_dilation, binary_propagation, median_filter
 
     log = np.log(np.convolve(np.pad(power, 1, mode="edge"), np.full(3, 1 / 3), mode="valid"))
     above = log - median_filter(log, size=2 * _REACH + 1, mode="nearest")
-    region, count = label(above > np.log(_SKIRT))
-    height = np.array(maximum(above, region, np.arange(1, count + 1)), dtype=np.float64)
-    peaks = 1 + np.flatnonzero(height > np.log(_PEAK))
-    is_peak = np.asarray(binary_dilation(np.isin(region, peaks), iterations=2))
-    edges = np.flatnonzero(np.diff(np.r_[False, is_peak, False].astype(int))).reshape(-1, 2)
+    regions = binary_propagation(above > np.log(_PEAK), mask=above > np.log(_SKIRT))
+    is_peak = np.asarray(binary_dilation(regions, iterations=2))
+    edges = runs(is_peak)
     tops = np.array([a + np.argmax(power[a:b]) for a, b in edges], dtype=np.intp)
     width = np.maximum(2.0, 0.3 * (edges[:, 1] - edges[:, 0]))
     return is_peak, frequency_hz[tops], width * (frequency_hz[1] - frequency_hz[0])
@@ -191,7 +190,6 @@ class CoarseAxis:
             corrected=np.mean(guesses.real**2 + guesses.imag**2, axis=1),
             count=np.full(power.size, independent),
             frame_rate_hz=frame_rate_hz,
-            resolution_hz=step,
         )
         bands, self.peaks = every.take(~is_peak), every.take(is_peak)
         self.bands = bands.merge(_bands(bands.frequency_hz, step))

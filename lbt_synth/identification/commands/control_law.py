@@ -33,12 +33,7 @@ from lbt_synth.validation import (
 )
 
 LawKind: TypeAlias = Literal[
-    "pure integrator",
-    "leaky integrator",
-    "double integrator",
-    "proportional",
-    "higher order",
-    "none",
+    "integrator", "double integrator", "proportional", "higher order", "none"
 ]
 AxisKind: TypeAlias = Literal["diagonal", "swapped", "general", "zero"]
 _LAGS = range(-4, 5)  # frames by which the first measurement may be late
@@ -53,9 +48,6 @@ _SPARE = 0.2  # of the logarithm of what the richest law leaves, which a simple 
 FOLLOWED = 0.1
 _ADDS_UP = 0.2  # distance from 1 of the pole of an integrator, a leaky one included
 
-# weights of past commands (axes, order) and measurements (axes, lags, axes), and the errors of the
-# first of these, (axes,), and of the sums of the others over their lags, (axes, axes)
-_Coefficients: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 _Shape: TypeAlias = tuple[int, range]  # order of a law, and the lags of its measurements
 
 
@@ -76,7 +68,6 @@ class ControlLaw:
     # of the first measurement; negative if commands know measurements of the future
     lag_frames: int
     gain: FloatArray  # (axes, axes); zeros where there is no law
-    gain_error: FloatArray  # (axes, axes), standard errors
     axes_kind: AxisKind  # structure of the gain, as classify_matrix says
     signs: tuple[int, ...]  # of each axis; 0 where the structure has none
     poles: ComplexArray  # (axes, order), the one nearest 1 first
@@ -131,8 +122,9 @@ class ControlLaw:
         """The law in words, but for its lag."""
         if self.kind == "none":
             return "no law"
-        short = f"a {self.kind} of gain {self.gain_text}"
-        return short if self.order <= 1 else f"a law of order {self.order}"
+        if self.order > 1:
+            return f"a law of order {self.order}"
+        return f"{'an integrator' if self.order else 'a proportional law'} of gain {self.gain_text}"
 
     @property
     def lag_text(self) -> str:
@@ -154,7 +146,6 @@ def fit_control_law(
     commands: ArrayLike,
     *,
     usable: ArrayLike | None = None,
-    commanded: ArrayLike | None = None,
 ) -> ControlLaw:
     """Return the law with the least order that explains commands by measurements.
 
@@ -167,8 +158,6 @@ def fit_control_law(
         Measurements y(k) and commands u(k) of one or two axes, in the same unit.
     usable : (frames,) bool array_like, optional
         Frames whose values are good; all by default.
-    commanded : (frames,) bool array_like, optional
-        Frames whose commands are good, where ``usable`` is only of the measurements.
 
     Returns
     -------
@@ -187,22 +176,19 @@ def fit_control_law(
     >>> u = 0.3 * np.cumsum(y[:, ::-1], axis=0)  # axes swapped
     >>> law = fit_control_law(y, u)
     >>> law.kind, law.lag_frames, law.axes_kind, law.gain.round(6).tolist()
-    ('pure integrator', 0, 'swapped', [[0.0, 0.3], [0.3, 0.0]])
+    ('integrator', 0, 'swapped', [[0.0, 0.3], [0.3, 0.0]])
     """
     y = matrix(measurements, "measurements")
     why = f"to match measurements {y.shape}"
     u = matrix(commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
-    measured = np.ones(len(y), dtype=np.bool_) if usable is None else np.array(usable)
-    moved = np.array(measured if commanded is None else commanded)
-    for flags in (measured, moved):
-        if flags.dtype != np.bool_ or flags.shape != (len(y),):
-            raise DimensionError(
-                f"usable must be {len(y)} truth values, one per frame; got {flags.dtype} "
-                f"{flags.shape}."
-            )
+    good = np.ones(len(y), dtype=np.bool_) if usable is None else np.array(usable)
+    if good.dtype != np.bool_ or good.shape != (len(y),):
+        raise DimensionError(
+            f"usable must be {len(y)} truth values, one per frame; got {good.dtype} {good.shape}."
+        )
     for column in u.T:
-        moved &= ~find_saturated(column, moved)
-    series = _Series(y, u, measured, moved, np.ones(len(y), dtype=np.bool_))
+        good &= ~find_saturated(column, good)
+    series = _Series(y, u, good, np.ones(len(y), dtype=np.bool_))
     law = _search(series)
     for _ in range(2):  # jumps hide the other frames that do not follow the law
         odd = _odd_frames(series, law)
@@ -217,8 +203,7 @@ class _Series(NamedTuple):
 
     y: FloatArray  # (frames, axes)
     u: FloatArray  # (frames, axes)
-    measured: BoolArray  # (frames,)
-    commanded: BoolArray  # (frames,)
+    good: BoolArray  # (frames,)
     lawful: BoolArray  # (frames,), whose command is a result of the law
 
     def rows(self, order: int, lags: range) -> IntArray:
@@ -227,12 +212,10 @@ class _Series(NamedTuple):
         start, stop = max(order, 1, lags[-1]), min(frames, frames + lags[0])
         if stop <= start:
             return np.zeros(0, dtype=np.int64)
-        good = self.lawful[start:stop].copy()
-        for lag in range(max(order, 1) + 1):
-            good &= self.commanded[start - lag : stop - lag]
-        for lag in lags:
-            good &= self.measured[start - lag : stop - lag]
-        return start + np.flatnonzero(good)
+        complete = self.lawful[start:stop].copy()
+        for lag in range(min(lags[0], 0), start + 1):
+            complete &= self.good[start - lag : stop - lag]
+        return start + np.flatnonzero(complete)
 
 
 def _odd_frames(series: _Series, law: ControlLaw) -> BoolArray:
@@ -384,20 +367,18 @@ class _Regression:
         residual, moving = self.residual(shape), self.moving
         if np.max(coherence) < FOLLOWED:
             shape, moving = (0, range(1)), []
-        past, taps, past_error, sum_error = self.coefficients(shape, moving)
+        past, taps = self.coefficients(shape, moving)
         poles = _poles(past)
-        kind = _kind(poles, past_error) if moving else "none"
+        kind = _kind(poles) if moving else "none"
         # at low frequencies, but for the poles at 1
         others = poles[:, 2 if kind == "double integrator" else 1 :]
-        scale = np.prod(abs(1 - others), axis=1)[:, None]
-        gain, error = np.sum(taps, axis=1) / scale, sum_error / scale
+        gain = np.sum(taps, axis=1) / np.prod(abs(1 - others), axis=1)[:, None]
         gain[abs(gain) < _EXACT * np.max(abs(gain))] = 0.0
-        axes_kind, signs = classify_matrix(gain, error)
+        axes_kind, signs = classify_matrix(gain)
         return ControlLaw(
             kind=kind,
             lag_frames=shape[1].start,
             gain=read_only(gain),
-            gain_error=read_only(error),
             axes_kind=axes_kind,
             signs=signs,
             poles=read_only(poles),
@@ -407,27 +388,18 @@ class _Regression:
             axis_coherence=read_only(coherence),
         )
 
-    def coefficients(self, shape: _Shape, moving: list[int]) -> _Coefficients:
-        """Return the coefficients of a law, zeros where commands do not move."""
+    def coefficients(self, shape: _Shape, moving: list[int]) -> tuple[FloatArray, FloatArray]:
+        """Return the weights of past commands (axes, order) and measurements (axes, lags, axes)."""
         axes, (order, lags) = self.axes, shape
-        past, past_error = np.zeros((axes, order)), np.zeros(axes)
-        taps, sum_error = np.zeros((axes, len(lags), axes)), np.zeros((axes, axes))
+        past, taps = np.zeros((axes, order)), np.zeros((axes, len(lags), axes))
         for axis in moving:
-            chosen = self.columns(axis, shape)
-            weights, unexplained = self.solve(axis, chosen, order)
+            weights, _ = self.solve(axis, self.columns(axis, shape), order)
             taps[axis] = weights[order:].reshape(len(lags), axes)
-            inverse = np.linalg.pinv(self.factor[:, chosen])
-            scale = self.scale[axis] / self.scale[chosen]
-            spare = max(self.rows - len(chosen), 1)
-            half = scale[:, None] * inverse * np.sqrt(unexplained * self.rows / spare)
-            sums = half[order:].reshape(len(lags), axes, -1).sum(axis=0)
-            sum_error[axis] = np.linalg.norm(sums, axis=1)
             if order:
                 steps = np.append(weights[1:order], 0.0)  # of the increments before
                 past[axis] = np.diff(steps, prepend=0.0)
                 past[axis, 0] += 1 + weights[0]
-                past_error[axis] = float(np.linalg.norm(half[0]))
-        return past, taps, past_error, sum_error
+        return past, taps
 
 
 def _poles(past: FloatArray) -> ComplexArray:
@@ -437,39 +409,29 @@ def _poles(past: FloatArray) -> ComplexArray:
     return np.array([row[np.argsort(abs(row - 1), kind="stable")] for row in padded])
 
 
-def _kind(poles: ComplexArray, past_error: FloatArray) -> LawKind:
+def _kind(poles: ComplexArray) -> LawKind:
     """Return the word for a law with poles (axes, order)."""
-    order, distance = poles.shape[1], abs(poles - 1)
-    if order == 0:
-        return "proportional"
-    if order == 1:
-        is_pure = np.all(distance <= np.maximum(_EXACT, SURPRISING * past_error)[:, None])
-        return "pure integrator" if is_pure else "leaky integrator"
-    if order == 2 and np.all(distance < _ADDS_UP):
+    order = poles.shape[1]
+    if order == 2 and np.all(abs(poles - 1) < _ADDS_UP):
         return "double integrator"
-    return "higher order"
+    kinds: tuple[LawKind, LawKind] = ("proportional", "integrator")
+    return kinds[order] if order <= 1 else "higher order"
 
 
-def classify_matrix(values: ArrayLike, errors: ArrayLike = 0.0) -> tuple[AxisKind, tuple[int, ...]]:
+def classify_matrix(values: ArrayLike) -> tuple[AxisKind, tuple[int, ...]]:
     """Return what a matrix (n, n) of one or two axes does, the first kind that fits, and signs.
 
-    Elements within four standard errors of zero, or below 5 % of the largest one, count as zero.
-    Signs are those on the diagonal, of a swapped matrix on the other one, of each row; 0 of any
-    other.
+    Elements below 5 % of the largest one count as zero. Signs are those on the diagonal, of a
+    swapped matrix on the other one, of each row; 0 of any other.
     """
     g = square(values, "values")
-    doubt = SURPRISING * np.broadcast_to(np.asarray(errors, dtype=float), g.shape)
-    small = _SMALL * np.max(np.abs(g), initial=0.0)
-    least = np.where(np.isfinite(doubt), np.maximum(doubt, small), np.inf)
-    g = np.where(np.abs(g) <= least, 0.0, g)
+    g = np.where(np.abs(g) <= _SMALL * np.max(np.abs(g), initial=0.0), 0.0, g)
     on, off = np.diag(g), (g - np.diag(np.diag(g))).sum(axis=1)
-    kind: AxisKind = "general"
     if not g.any():
-        kind = "zero"
-    elif not off.any() or not on.any():
-        kind = "diagonal" if on.any() else "swapped"
-        return kind, tuple(int(sign) for sign in np.sign(on if on.any() else off))
-    return kind, (0,) * len(g)
+        return "zero", (0,) * len(g)
+    if on.any() and off.any():
+        return "general", (0,) * len(g)
+    return "diagonal" if on.any() else "swapped", tuple(int(sign) for sign in np.sign(on + off))
 
 
 def law_controller(law: ControlLaw, frame_rate_hz: float) -> Controller:

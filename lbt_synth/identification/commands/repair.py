@@ -50,12 +50,13 @@ class CommandRepair:
     swap_axes: bool = False
     sign: tuple[int, ...] = ()
     matrix: tuple[float, ...] = ()
-    scale: float | tuple[float, ...] = 1.0
+    scale: float | Sequence[float] = ()
 
     def __post_init__(self) -> None:
-        given = self.scale if isinstance(self.scale, Sequence) else (self.scale,)
-        scales = tuple(number(scale, "command_scale", above=0) for scale in given)
-        set_fields(self, scale=scales[0] if len(set(scales)) == 1 else scales)
+        factors = self.scale if isinstance(self.scale, Sequence) else (self.scale,)
+        scales = tuple(number(factor, "command_scale", above=0) for factor in factors)
+        scales = scales[:1] if len(set(scales)) == 1 else scales
+        set_fields(self, scale=() if scales == (1.0,) else scales)
         integer(self.shift_frames, "command_shift_frames")
         if any(sign not in (-1, 1) for sign in self.sign):
             raise ProblemError(f"command_sign must be 1 or -1, per axis; got {list(self.sign)}.")
@@ -74,7 +75,7 @@ class CommandRepair:
             "--swap-axes" if self.swap_axes else "",
             f"--command-sign {values(self.sign)}" if self.sign else "",
             f"--command-matrix {values(self.matrix)}" if self.matrix else "",
-            f"--command-scale {values(self._scales)}" if self.scale != 1 else "",
+            f"--command-scale {values(self.scales)}" if self.scales else "",
         ]
         return " ".join(filter(None, words))
 
@@ -99,8 +100,9 @@ class CommandRepair:
         return out
 
     @property
-    def _scales(self) -> tuple[float, ...]:
-        return self.scale if isinstance(self.scale, tuple) else (self.scale,)
+    def scales(self) -> tuple[float, ...]:
+        """The factors, one or one for each axis; empty where nothing is scaled."""
+        return tuple(self.scale) if isinstance(self.scale, Sequence) else (self.scale,)
 
     def turn(self, axes: int) -> FloatArray:
         """Return the matrix that swap, sign, matrix and scale are together."""
@@ -114,25 +116,18 @@ class CommandRepair:
                 f"command_matrix must have {axes**2} numbers for {axes} axes, row after row; "
                 f"got {len(self.matrix)}."
             )
-        out = _diagonal(self._scales, "command_scale", axes)
+        out = np.eye(axes)[::-1] if self.swap_axes else np.eye(axes)
+        out = _per_axis(self.sign, "command_sign", axes) * out
         if self.matrix:
-            out = out @ np.reshape(self.matrix, (axes, axes))
-        if self.sign:
-            out = out @ _diagonal(self.sign, "command_sign", axes)
-        return out @ np.eye(2)[::-1] if self.swap_axes else out
+            out = np.reshape(self.matrix, (axes, axes)) @ out
+        return _per_axis(self.scales, "command_scale", axes) * out
 
 
-def _diagonal(values: Sequence[float], name: str, axes: int) -> FloatArray:
-    """Return a diagonal matrix of one value for all axes, or of one for each."""
-    if len(values) not in (1, axes):
+def _per_axis(values: Sequence[float], name: str, axes: int) -> FloatArray:
+    """Return the factor of each row, (axes, 1), of none, one for all axes, or one for each."""
+    if len(values) not in (0, 1, axes):
         raise ProblemError(f"{name} must be one number, or {axes}; got {list(values)}.")
-    return np.diag(np.broadcast_to(np.array(values, dtype=np.float64), axes))
-
-
-def axes_repair(swapped: bool, signs: tuple[int, ...]) -> CommandRepair:
-    """Return the repair that exchanges axes, and gives each of them its sign."""
-    sign = signs if len(set(signs)) > 1 else (-1,) * (signs[0] < 0)
-    return CommandRepair(swap_axes=swapped, sign=sign)
+    return np.reshape(np.broadcast_to(np.array(values or 1.0, dtype=np.float64), axes), (axes, 1))
 
 
 def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:

@@ -1,8 +1,8 @@
 """The check of a record: whether its commands reach its measurements as given.
 
 The control law says which repairs make it one that somebody runs, and the likelihood of the
-repaired commands decides: by the coarse spectrum, and by the model of the fit where the law does
-not ask for the repair. The law alone decides on records that are too short for a spectrum.
+repaired commands decides: by a coarse spectrum, and by the model of the fit where the law does not
+ask for the repair. A factor of two in the size of commands is left to the gains of the fit.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,19 +32,11 @@ from lbt_synth.identification.commands.control_law import (
 )
 from lbt_synth.identification.commands.repair import (
     CommandRepair,
-    axes_repair,
     repair_commands,
 )
-from lbt_synth.identification.fit.fitting import (
-    GAINS,
-    PLAUSIBLE_GAINS,
-    TYPICAL_GAIN,
-    Search,
-    cost,
-)
+from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, TYPICAL_GAIN, Search, cost
 from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components
 from lbt_synth.identification.fit.periodogram import loop_periodogram
-from lbt_synth.identification.fit.whittle import FittedModel
 from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
@@ -58,14 +49,13 @@ from lbt_synth.validation import BoolArray, FloatArray, frozen_copy, require_ins
 AS_GIVEN = "as given"
 _FIND = "find the commands that belong to these measurements"
 _GIVEN = CommandRepair()
-_COARSE = 1.5  # factor by which a coarse gain may be wrong
 _ODD = CLEAR / 2  # nats that what no law asks for must add, by the model of the fit as well
 _SURPRISING = 3 * CLEAR  # nats that overrule a law with errors
-_WRONG_GAIN = 2.0  # factor beyond a given or plausible gain, which a coarse one does not reach
+_WRONG_GAIN = 2.0  # factor by which a coarse gain may err; another unit is off by its square
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
 _LITTLE = 0.01  # of the gain of a law, which has no inverse; or of the changes of commands, which
 # moves a gain by 10 % if the law leaves them
-_LINES = 10  # at most, of a fit that tells gains apart: more of them take minutes
+_LINES = 10  # at most, of a fit that tells delays apart: more of them take minutes
 _HIDDEN = 1e-7  # distance of poles at two gains that are the same
 _ANY = np.geomspace(1.0, 1e-6, 19)  # gains of a loop that may be of no sensor
 
@@ -163,7 +153,7 @@ def explain_commands(
     commands = record.commands[record.usable]
     still = np.all(commands == commands[:1], axis=0)
     if still.any() and not still.all():
-        return _explain_moving(record, record.commands, still, shown, known)
+        return _explain_moving(record, still, shown, known)
     law = None if shown is None or shown.kind == "none" else shown
     refuse = partial(CommandVerdict, gain=np.full(record.axes, np.nan), law=shown)
     sure = law if law is not None and law.is_sure else None
@@ -176,15 +166,19 @@ def explain_commands(
         law = None if sure is None else replace(sure, lag_frames=0)
     coarse = CoarseRecord(record)
     if not coarse.stretches:
-        return replace(refuse(explanation=AS_GIVEN), **_explain_by_law(record, law, early))
-    plausible = PLAUSIBLE_GAINS
-    if known is not None:
-        plausible = float(np.min(known)) / _WRONG_GAIN, float(np.max(known)) * _WRONG_GAIN
+        repair = CommandRepair(shift_frames=early)
+        note = "the commands were not tested: no stretch of usable frames is long enough"
+        shifted = " and ".join(repair.words())
+        return refuse(explanation=shifted or AS_GIVEN, repair=repair, notes=(note,))
+    usual = PLAUSIBLE_GAINS if known is None else (float(np.min(known)), float(np.max(known)))
+    limits = usual[0] / _WRONG_GAIN**2, usual[1] * _WRONG_GAIN**2
     choice = _choose(coarse, law, lag)
     scale = np.ones(record.axes)
     if not choice.unrelated.any():
-        scale = _scale(coarse, law, choice, plausible)
-    if doubt := _doubt_choice(record, law, choice, scale):
+        scale = _scale(record, law, choice, limits)
+    is_low = choice.gain < usual[0] / _WRONG_GAIN
+    is_hidden = bool(np.any(scale < 1) or (sure is None and np.any(is_low)))
+    if doubt := _doubt_choice(record, law, choice, is_hidden):
         return refuse(explanation=doubt)
     off = choice.repair.shift_frames and choice.repair.shift_frames + lag
     shift = early or (-lag if choice.repair.shift_frames else 0)
@@ -195,7 +189,7 @@ def explain_commands(
     if np.any(scale != 1):
         words.append(wrong_scale(scale, choice.gain))
     gain = choice.gain / scale
-    hidden = (gain <= plausible[0] / _WRONG_GAIN) | (gain >= plausible[1] * _WRONG_GAIN)
+    hidden = (gain <= limits[0]) | (gain >= limits[1])
     return refuse(
         explanation=" and ".join(words) or AS_GIVEN,
         repair=repair,
@@ -207,9 +201,9 @@ def explain_commands(
 
 
 def _doubt_choice(
-    record: LoopRecord, law: ControlLaw | None, choice: _Choice, scale: FloatArray
+    record: LoopRecord, law: ControlLaw | None, choice: _Choice, is_hidden: bool
 ) -> str:
-    """Return what the best repair and scale leave wrong, in words; empty if there is nothing."""
+    """Return what the best repair leaves wrong, in words; empty if there is nothing."""
     if choice.unrelated.all():
         return "they have nothing to do with the measurements, as if of another night"
     if choice.unrelated.any():
@@ -221,7 +215,7 @@ def _doubt_choice(
             "a loop with the law that they follow is unstable at any sensor gain. Check what the "
             "series are"
         )
-    if np.any(scale < 1) and (hiding := _unexplained(law)):
+    if is_hidden and (hiding := _unexplained(law)):
         return (
             f"{hiding}, which hides the sensor gain. Record more digits, cut the record, or give "
             "the sensor gain"
@@ -260,40 +254,22 @@ def record_law(record: LoopRecord) -> ControlLaw | None:
     if record.commands is None:
         return None
     with suppress(ProblemError):
-        return fit_control_law(
-            record.measurements,
-            record.commands,
-            usable=record.measured,
-            commanded=record.commanded,
-        )
+        good = record.measured & record.commanded
+        return fit_control_law(record.measurements, record.commands, usable=good)
     return None
 
 
 def _explain_moving(
-    record: LoopRecord,
-    commands: FloatArray,
-    still: BoolArray,
-    law: ControlLaw | None,
-    known: FloatArray | None,
+    record: LoopRecord, still: BoolArray, law: ControlLaw | None, known: FloatArray | None
 ) -> CommandVerdict:
-    """Explain the commands (frames, axes) of the axis that moves; the other loop was open."""
-    one = replace(record, measurements=record.measurements[:, ~still], commands=commands[:, ~still])
+    """Explain the commands of the axis that moves; the other loop was open."""
+    y, u = record.measurements[:, ~still], np.asarray(record.commands)[:, ~still]
+    one = replace(record, measurements=y, commands=u)
     verdict = explain_commands(one, sensor_gain=None if known is None else known[~still].tolist())
     gain = np.full(still.size, np.nan)
     gain[~still] = verdict.gain
     note = f"the commands of axis {int(np.argmax(still))} stand still: its loop was open"
     return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
-
-
-def _explain_by_law(record: LoopRecord, law: ControlLaw | None, early: int) -> dict[str, Any]:
-    """Return what differs in the verdict where no stretch is long enough for a likelihood."""
-    repairs = list_repairs(record.axes, record.hardware.delay_frames)
-    ordinary = [r for r in repairs if law is not None and law.exact and not _is_unusual(r, law, 0)]
-    repair = replace(next(iter(ordinary), _GIVEN), shift_frames=early)
-    if repair.options:
-        return {"explanation": f"by their law {' and '.join(repair.words())}", "repair": repair}
-    note = "the commands were not tested: no stretch of usable frames is long enough"
-    return {"notes": (note,)}
 
 
 def _doubt_law(law: ControlLaw) -> str:
@@ -322,8 +298,8 @@ def list_repairs(
     The law may ask for a matrix, and for a long shift. A shift moves corrections to frames that
     still follow from the past of the measurements; it stands for another delay, too.
     """
-    signs = list(product((1, -1), repeat=axes))
-    out = [axes_repair(bool(swapped), sign) for swapped in range(axes) for sign in signs]
+    signs = [(), (-1,), *((1, -1), (-1, 1))[: 2 * axes - 2]]
+    out = [CommandRepair(swap_axes=bool(k), sign=sign) for k in range(axes) for sign in signs]
     short_shifts = range(-MOST_SHIFT_FRAMES, MOST_SHIFT_FRAMES + 1)
     shifts = [k for k in short_shifts if k and k >= 1 - lag - delay_frames]
     shifts += [-lag] if lag > MOST_SHIFT_FRAMES else []
@@ -359,10 +335,11 @@ def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
     best = int(np.argmin(contrast + penalty))
     nats = contrast[0] - contrast
     if asked[best]:
-        is_shown = penalty[0] >= _SURPRISING or nats[best] >= CLEAR / 2
+        is_shown = penalty[0] >= _SURPRISING or nats[best] >= _ODD
     else:
         is_shown = (
-            nats[best] >= CLEAR and _fit(coarse, _GIVEN)[0] - _fit(coarse, repairs[best])[0] >= _ODD
+            nats[best] >= CLEAR
+            and _fit_cost(coarse, _GIVEN) - _fit_cost(coarse, repairs[best]) >= _ODD
         )
     best = best if is_shown else 0
     followed = np.zeros(record.axes) if law is None else law.axis_coherence
@@ -452,97 +429,50 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     return float(np.max(abs(poles[moves]))) if moves.any() else np.inf
 
 
-def _fit(
-    coarse: CoarseRecord,
-    repair: CommandRepair,
-    held: FloatArray | None = None,
-    starts: Sequence[FittedModel] = (),
-) -> tuple[float, FloatArray, list[FittedModel]]:
-    """Return the criterion of the fit over all axes, the gains (axes,), and the models.
-
-    A fit that fails has a gain of nan. Gains (axes,) may be held, and models of other gains are
-    starts beside a search, which may miss what they have, such as wide resonances.
-    """
-    record = coarse.record
+def _fit_cost(coarse: CoarseRecord, repair: CommandRepair) -> float:
+    """Return the criterion of a quick fit over all axes; infinite where one fails."""
+    record, total = coarse.record, 0.0
     length = int(SEGMENT_S * record.frame_rate_hz)
     pieces = [
         (start, min(start + length, b))
         for a, b in coarse.stretches
         for start in range(a, max(b - length, a) + 1, length)
     ]
-    total, gains, models = 0.0, np.full(record.axes, np.nan), list[FittedModel]()
-    series = zip(record.measurements.T, coarse.corrections(repair).T, strict=True)
-    for i, (y, c) in enumerate(series):
+    for y, c in zip(record.measurements.T, coarse.corrections(repair).T, strict=True):
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
-        gain = None if held is None else float(np.clip(held[i], GAINS["above"], GAINS["below"]))
-        search = Search(data=data, gain=gain, most_lines=_LINES, gain_error=float("inf"))
+        search = Search(data=data, gain=None, most_lines=_LINES, gain_error=float("inf"))
         try:
-            trials = [find_components(search, rounds=FEW_ROUNDS)]
-            trials += [find_components(search, start.spectrum) for start in starts[i : i + 1]]
+            total += cost(search, find_components(search, rounds=FEW_ROUNDS))
         except NumericalError:
-            return np.inf, gains, []
-        model = min(trials, key=partial(cost, search))
-        models.append(model)
-        total, gains[i] = total + cost(search, model), model.spectrum.background.gain
-    return total, gains, models
+            return np.inf
+    return total
 
 
 def _scale(
-    coarse: CoarseRecord, law: ControlLaw | None, choice: _Choice, plausible: tuple[float, float]
+    record: LoopRecord, law: ControlLaw | None, choice: _Choice, limits: tuple[float, float]
 ) -> FloatArray:
-    """Return the factors (axes,) of commands that make implausible gains plausible ones.
+    """Return the factors (axes,) of commands whose gains lie beyond the limits of another unit.
 
-    Wide resonances that the coarse spectrum lacks move its gains: the fit decides, of commands that
-    are scaled by these.
+    A sure law that runs at a plausible gain refutes commands that are too large: a gain that seems
+    too small is one that lines hide.
     """
-    low, high = plausible
-    one = np.ones(choice.gain.size)
-    if np.all((choice.gain >= low) & (choice.gain <= high)):
-        return one
-    scaled = replace(choice.repair, scale=tuple(choice.gain))
-    free, ratios, models = _fit(coarse, scaled)
-    gains = np.where(np.isfinite(ratios), ratios, 1.0) * choice.gain
-    if np.all((gains >= low) & (gains <= high)):
-        return one
-    if law is not None and law.is_sure:
-        plausible_gains = np.geomspace(low, high, 8)
-        if not could_have_run(choice.repair, plausible_gains, coarse.record, law):
-            return likely_factors(gains, plausible)
-        if np.mean(np.log(gains)) < np.log(low):
-            return one  # commands that are too large come from a law that is too strong
-    # the nearest plausible gains, one for all axes, and the usual one: there may be two optima
-    common, usual = np.exp(np.mean(np.log(gains))) * one, TYPICAL_GAIN * one
-    tries = np.clip([gains, common, usual], low, high).tolist()
-    for tried in dict.fromkeys(map(tuple, tries)):  # each once
-        if _fit(coarse, scaled, tried / choice.gain, models)[0] - free < CLEAR:
-            return one  # they are nearly as likely
-    return likely_factors(gains, plausible)
+    low, high = limits
+    within = (choice.gain >= low) & (choice.gain <= high)
+    is_small = float(np.mean(np.log(choice.gain))) < np.log(low)
+    if is_small and law is not None and law.is_sure:
+        usual = np.geomspace(*PLAUSIBLE_GAINS, 8)
+        within |= could_have_run(choice.repair, usual, record, law)
+    return likely_factors(choice.gain, within)
 
 
-def likely_factors(gains: FloatArray, plausible: tuple[float, float]) -> FloatArray:
-    """Return the likeliest factors of commands with these sensor gains (axes,).
+def likely_factors(gains: FloatArray, within: BoolArray) -> FloatArray:
+    """Return the likeliest factors of commands whose sensor gains (axes,) are not within limits.
 
-    One factor stands for both axes where it makes their gains plausible, and neither is now.
+    They are those between units, or the 2 of a reflection, and one for all where no gain is within.
     """
-    low, high = plausible
-    within = (gains >= low) & (gains <= high)
-    if not within.any():
-        common = _likely_factor(float(np.exp(np.mean(np.log(gains)))), plausible)
-        rest = gains / common
-        if np.all((rest >= low / _COARSE) & (rest <= high * _COARSE)):
-            return np.full(gains.size, common)
-    return np.where(within, 1.0, [_likely_factor(gain, plausible) for gain in gains.tolist()])
-
-
-def _likely_factor(gain: float, plausible: tuple[float, float]) -> float:
-    """Return the factor between units that makes a gain plausible; another one if none does."""
-    low, high = plausible
-    usual = float(np.clip(TYPICAL_GAIN, low, high))
-    for margin in (1.0, _COARSE):
-        fits = [f for f in _FACTORS if low / margin <= gain / f <= high * margin]
-        if fits:
-            return float(min(fits, key=lambda f: abs(np.log(gain / f / usual))))
-    return float(f"{gain / usual:.2g}")
+    means = gains if within.any() else np.exp(np.mean(np.log(gains))) * np.ones(gains.size)
+    away = np.abs(np.log(means[:, None] / np.array(_FACTORS) / TYPICAL_GAIN))
+    return np.where(within, 1.0, np.array(_FACTORS)[np.argmin(away, axis=1)])
 
 
 def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
@@ -551,7 +481,7 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
     The fit shows gains beyond the plausible ones where the coarse model leaves them open.
     """
     accepted = not np.all(gains - SURPRISING * errors > PLAUSIBLE_GAINS[1])
-    scale = np.ones(gains.size) if accepted else likely_factors(gains, PLAUSIBLE_GAINS)
+    scale = likely_factors(gains, np.full(gains.size, accepted))
     return CommandVerdict(
         explanation=AS_GIVEN if accepted else wrong_scale(scale, gains),
         repair=CommandRepair(scale=tuple(scale)),
@@ -562,15 +492,13 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
 
 def wrong_scale(scale: FloatArray, gain: FloatArray) -> str:
     """Return the words for commands that need a factor on each axis, (axes,)."""
-    sizes = [
-        f"{1 / factor:g} times too large" if factor < 1 else f"{factor:g} times too small"
-        for factor in scale
+    one = not np.ptp(scale)
+    words = [
+        f"{'they' if one else f'those of axis {axis}'} are "
+        f"{max(factor, 1 / factor):g} times too {'large' if factor < 1 else 'small'}"
+        for axis, factor in enumerate(scale.tolist())
+        if factor != 1
     ]
-    words = f"they are {sizes[0]}"
-    if np.ptp(scale):
-        pairs = zip(sizes, scale, strict=True)
-        words = " and ".join(
-            f"those of axis {i} are {size}" for i, (size, factor) in enumerate(pairs) if factor != 1
-        )
     gains = ", ".join(f"{value:.3g}" for value in gain)
-    return f"{words} (with them the sensor has a gain of {gains})"
+    text = " and ".join(words[:1] if one else words)
+    return f"{text} (with them the sensor has a gain of {gains})"

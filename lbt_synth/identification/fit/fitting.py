@@ -15,15 +15,21 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.scoring import EXACT, SEARCHED, Priors
 from lbt_synth.identification.fit.spectrum_model import (
+    BACKGROUND,
+    COLOUR,
     Component,
     Kind,
     SpectrumModel,
     damping_parameter,
 )
 from lbt_synth.identification.fit.whittle import (
+    EXACT,
+    HOPE,
+    SEARCHED,
+    SKIRT,
     FittedModel,
+    Priors,
     component_density,
     contrast,
     contrasts,
@@ -46,19 +52,21 @@ GAIN_STEP = 0.05  # of the logarithm of a gain: nearer ones are as good as the s
 TYPICAL_GAIN = 0.7  # of a sensor, before the data say more
 _ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
 _COLOURED = 9.0  # the same of a colour of the noise, which a wrong gain can explain, too
+_MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _WORTH = 1e-3  # of the innovations' variance, by which a line upon a bump must lower it
 _FAR = 2.0  # half widths of a section from the middle of a bump: what lies beyond is not upon it
 _SEED = 0.01  # of the lowest density: noise from which a fit begins at least
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
+_FASTEST_HZ = 10.0  # natural frequency of turbulence: above, it would be a resonance
 _LOWEST = 0.1  # bins: a component below is a slope without a frequency
 _SHIFTS = np.arange(-2, 2.01, 0.25)  # bins by which a narrow line is moved
 _POWERS = np.log([1.0, 4.0, 0.25])  # by which its power changes there
 
 # Priors: mean and standard deviation of logarithms and odds. What the data leave open stays where
-# it makes sense: corners within a factor of e^2, parts of the turbulence within e^1.5 of 1 Hz.
+# it makes sense: corners and frequencies of the turbulence within a factor of e^2.
 _FIXED, _NONE = (0.0, 0.0), (0.0, np.inf)
 STARTING_CORNER_HZ = 50.0
-_CORNER_WIDTH, _DRIFT_WIDTH, _SLOW_WIDTH, _COLOUR_WIDTH = 2.0, 2.0, 1.5, 1.0
+_WIDTH = 2.0
 _DAMPING: dict[Kind, tuple[float, float]] = {
     "turbulence": (float(np.log(0.45)), 4.0),
     "slow": (float(np.log(0.45)), 1.0),
@@ -68,7 +76,7 @@ _DAMPING: dict[Kind, tuple[float, float]] = {
 
 _FINE = 0.02  # of a frequency: a smooth spectrum does not change in such a band
 _WIDEST_HZ, _SHARE = 3.0, 0.1  # of a group, and of what it holds of a line
-_BINS, _SIDELOBES = 10, 64  # on either side of a line that stay single; of a line as narrow as bins
+_BINS = 10  # on either side of a line that stay single; SKIRT of a line as narrow as bins
 RESOLVED = 3  # bins: a narrower line has the sidelobes of the taper, a wider one flanks of its own
 
 
@@ -122,13 +130,16 @@ class Search:
         return self.component("drift", 2 * DRIFT_RATIO * corner_hz, DRIFT_RATIO, power)
 
     def priors(self, spectrum: SpectrumModel) -> Priors:
-        """Return the priors of a fit; lines of two axes stay in the band."""
+        """Return the priors of a fit, in which lines stay in the band.
+
+        Sensors and filters make the noise of neighbouring frames alike, hardly ever opposite.
+        """
         prior = (float(np.log(TYPICAL_GAIN)), self.gain_error)
         gain = prior if self.finds_gain and len(spectrum.axes) == 1 else _FIXED
-        corner = (self.log_angle(STARTING_CORNER_HZ), _CORNER_WIDTH)
+        corner = (self.log_angle(STARTING_CORNER_HZ), _WIDTH)
         rows = list[tuple[float, float]]()
         for axis in spectrum.axes:
-            colour = (0.0, _COLOUR_WIDTH) if axis.colour else _FIXED
+            colour = (0.0, _WIDTH) if axis.colour else _FIXED
             rows += [gain, _NONE, colour, corner if axis.rolls_off else _FIXED]
         for c in spectrum.components:
             ratio = _NONE if c.axis is None and c.kind == "line" else _FIXED
@@ -138,18 +149,22 @@ class Search:
         centre, width = np.array(rows).T
         priors = Priors(centre=centre, width=width)
         low, high = (np.full(centre.size, end) for end in priors.bounds)
+        colours = BACKGROUND * np.arange(len(spectrum.axes)) + COLOUR
+        low[colours], high[colours] = 0.0, _MOST_COLOUR
         for i, c in enumerate(spectrum.components):
-            if c.kind == "line" and len(spectrum.axes) > 1:
+            if c.kind == "line":
                 low[spectrum.place(i)] = self.log_angle(_LOWEST * self.data.step_hz)
                 high[spectrum.place(i)] = _HIGHEST
+            elif c.kind != "drift":
+                high[spectrum.place(i)] = self.log_angle(_FASTEST_HZ)
         return replace(priors, bounds=(low, high))
 
     def _frequency_prior(self, component: Component) -> tuple[float, float]:
         if component.kind == "drift":
-            return self.log_angle(2 * DRIFT_RATIO * DRIFT_HZ), _DRIFT_WIDTH
+            return self.log_angle(2 * DRIFT_RATIO * DRIFT_HZ), _WIDTH
         if component.kind == "line":
             return component.announced or _NONE
-        return self.log_angle(1.0), _SLOW_WIDTH
+        return self.log_angle(1.0), _WIDTH
 
     def _damping_prior(self, component: Component) -> tuple[float, float]:
         """Return the prior, narrower where the taper of a density is not known."""
@@ -162,18 +177,13 @@ class Search:
         centre = component.frequency / self.data.angle_s
         return centre, max(centre * component.damping_ratio, self.data.step_hz)
 
-    def covers(self, component: Component) -> bool:
-        """Whether a component lies between the first bin and the Nyquist frequency."""
-        lowest = self.log_angle(_LOWEST * self.data.step_hz)
-        return component.kind == "drift" or lowest < component.log_frequency < _HIGHEST
-
     def merge(self, spectrum: SpectrumModel) -> LoopPeriodogram:
         """Return means over groups of bins within which a model is nearly constant."""
         f, step = self.data.frequency_hz, self.data.step_hz
         size = np.maximum(step, np.minimum(_FINE * f, _WIDEST_HZ))
         for line in spectrum.lines:
             centre, half_width = self.place(line)
-            fine = _SIDELOBES if half_width < RESOLVED * step else _BINS
+            fine = SKIRT if half_width < RESOLVED * step else _BINS
             reach = fine * step + _WIDEST_HZ / _SHARE / 2  # beyond, this limit is wider
             near = slice(*np.searchsorted(f, [centre - reach, centre + reach]))
             away = np.maximum(np.abs(f[near] - centre) - fine * step, 0)
@@ -193,9 +203,8 @@ def fit(
 ) -> FittedModel | None:
     """Fit all parameters; None if no fit settles.
 
-    Components of one axis that leave the band, from the first bin to the Nyquist frequency, are
-    dropped. A fit is given up where its log-likelihood does not reach that of ``better_than``
-    minus a margin.
+    A fit is given up where its log-likelihood does not reach that of ``better_than`` minus a
+    margin.
     """
     data, bound = search.merge(start), float("inf")
     if len(start.axes) == 1:  # a noise of nothing has no slope
@@ -207,11 +216,6 @@ def fit(
     model = minimise(data, start, search.priors(start), bound=bound, accuracy=accuracy)
     if model is None or model.contrast > bound:
         return None
-    if len(start.axes) > 1:
-        return model
-    inside = model.spectrum.keep(search.covers)
-    if len(inside.components) < len(start.components):
-        return fit(search, inside, better_than=better_than, margin=margin, accuracy=accuracy)
     return replace(model, contrast=contrast(search.data, model.spectrum))
 
 
@@ -256,17 +260,6 @@ def cost(search: Search, model: FittedModel) -> float:
     return model.contrast + total_price(search, model.spectrum) + 0.5 * away**2
 
 
-def simplify(search: Search, model: FittedModel) -> FittedModel:
-    """Return the model without roll-off or colour, where that adds too little."""
-    plainer = []
-    if model.spectrum.background.rolls_off:
-        plainer.append(model.spectrum.without_roll_off())
-    if model.spectrum.background.colour:
-        plainer.append(model.spectrum.with_background(colour=0.0))
-    fits = (fit(search, spectrum) for spectrum in plainer)
-    return likeliest(search, [model, *fits]) or model
-
-
 def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> FittedModel:
     """Drop the components that add less than they must, the least first.
 
@@ -281,7 +274,7 @@ def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> Fitt
         less = _drop(data, spectrum, i, neighbour)
         if less is not None:
             required = required_evidence(search, spectrum, i)
-            spare = contrast(data, less) - whole - 4 * required
+            spare = contrast(data, less) - whole - HOPE * required
             patient = thorough and (neighbour is not None or not component.is_narrow)
             if patient or spare <= 0:
                 trials.append((spare, required, less, None if patient else model))
@@ -345,7 +338,8 @@ def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumMode
     centre, half = search.place(line)
     if half > 2 * step or centre <= 3 * step:
         return spectrum
-    data = search.data.window(centre - _SIDELOBES * step, centre + _SIDELOBES * step)
+    ends = centre - SKIRT * step, centre + SKIRT * step
+    data = search.data.take(slice(*np.searchsorted(search.data.frequency_hz, ends)))
     rest = density(data, spectrum.exchange(i))
     for shifts in (_SHIFTS, _SHIFTS / 8):  # the place of a sinusoid is known to a part of a bin
         moves = product(np.log1p(shifts * step / centre), _POWERS)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
-from itertools import count
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,10 +13,8 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.fitting import (
     GAIN_ERROR,
-    GAIN_STEP,
     LOWEST_LINE_HZ,
     MOST_LINES,
-    PLAUSIBLE_GAINS,
     POSSIBLE_GAINS,
     Search,
     add_evidence,
@@ -27,29 +24,20 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
     IdentifiedLine,
     IdentifiedModel,
+    describe_axis,
+    hold_gain,
 )
-from lbt_synth.identification.fit.jumps import cut_at_jumps, find_correction_jumps, find_jumps
-from lbt_synth.identification.fit.order_search import (
-    OVERDAMPED,
-    find_components,
-    find_models,
-    find_rivals,
-)
+from lbt_synth.identification.fit.order_search import find_components, find_models
 from lbt_synth.identification.fit.periodogram import (
     SHORTEST_SEGMENT,
     LoopPeriodogram,
     loop_periodogram,
 )
-from lbt_synth.identification.fit.physical_parameters import (
-    describe_axis,
-    hold_gain,
-    standard_errors,
-)
 from lbt_synth.identification.fit.shared_lines import couple_axes
-from lbt_synth.identification.fit.whittle import FittedModel
-from lbt_synth.identification.records.faults import RARE
+from lbt_synth.identification.records.faults import MAD, RARE
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
+from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, each_of, real_array, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
@@ -57,9 +45,11 @@ _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some perc
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
 _UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be coloured
 OPEN_GAIN = 0.3  # relative error of a gain that a record leaves open
-_POOR_GAIN = 0.1  # relative error from which a note says so
-_AMBIGUOUS = 2.0  # times the error of a fit to more data: it had rivals
-_LEAST_AVERAGES, _MOST_AVERAGES = 0.25, 1000.0  # of the periodograms in a density
+_POOR_GAIN = 0.1  # relative error from which a note says so, and no later fit begins there
+_JUMP = 8.0  # standard deviations of the change of a correction: no loop makes it
+_AROUND_JUMP = 25  # frames left out on either side: what is nearer is the same jump
+_MOST_JUMPS = 20  # at which a record is cut
+_MOST_AVERAGES = 1000.0  # of the periodograms in a density: nobody takes more
 
 
 def identify(
@@ -167,62 +157,58 @@ def identify(
     if sensor_gain is not None:
         gains = record.known_gains(sensor_gain).tolist()
     pieces = record.stretches() if stretches is None else _usable_stretches(stretches, record)
-    fits, total = count(1), 3 * record.axes  # at first, after a jump, with the mean gain
-
-    def step() -> None:
-        if progress is not None:
-            progress(next(fits), total)
-
-    fit = partial(_fit_axes, record, step, options)
-    early = find_correction_jumps(record.corrections(), pieces)
-    pieces, notes = cut_at_jumps(pieces, early, "commands")
+    pieces, notes = _cut_at_jumps(record.corrections(), pieces)
     starts: Sequence[IdentifiedAxis | None] = start.axes if start else [None] * record.axes
-    axes = fit(pieces, gains, starts)
-    series = record.pseudo_open_loop([axis.sensor_gain for axis in axes])
-    late = find_jumps(series, axes, pieces)
-    cut, late_notes = cut_at_jumps(pieces, late, "pseudo-open loop")
-    if cut != pieces:
-        axes = fit(cut, gains, starts)
-    notes += late_notes
+    report = progress or (lambda done, total: None)
+    series = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
+    axes = list[IdentifiedAxis]()
+    for y, c, gain, axis_start in series:
+        data = axis_periodogram(y, c, record.frame_rate_hz, pieces)
+        axes.append(find_axis(Search(data=data, gain=gain, **options), start=axis_start))
+        report(len(axes), record.axes + 1)
     if len(axes) > 1 and all(axis.sensor_gain_error is not None for axis in axes):
-        axes, note = _pool_gains(axes, step, options)
+        axes, note = _pool_gains(axes, options)
         notes.append(note)
     shared: tuple[IdentifiedLine, ...] = ()
     if len(axes) == 2:
-        axes, shared = couple_axes(record, axes, cut, lowest_line_hz)
-    notes += _find_doubts(axes, most_lines)
-    if progress is not None and next(fits) <= total:
-        progress(total, total)
+        axes, shared = couple_axes(record, axes, pieces, lowest_line_hz)
+    report(record.axes + 1, record.axes + 1)
     return IdentifiedModel(
         axes=tuple(axes),
         shared=shared,
         frame_rate_hz=record.frame_rate_hz,
         delay_frames=next(d for d in (record.delay_frames, delay_frames, _DELAY) if d is not None),
         mirror=record.mirror,
-        notes=tuple(notes),
+        notes=tuple(dict.fromkeys([*notes, *_find_doubts(axes, most_lines)])),
     )
 
 
-def _fit_axes(
-    record: LoopRecord,
-    step: Callable[[], None],
-    options: dict[str, Any],
-    stretches: Stretches,
-    gains: Sequence[float | None],
-    starts: Sequence[IdentifiedAxis | None],
-) -> list[IdentifiedAxis]:
-    """Identify each axis, at its gain or at a free one, and from its start.
+def _cut_at_jumps(corrections: FloatArray, stretches: Stretches) -> tuple[Stretches, list[str]]:
+    """Return stretches without the places where corrections go on elsewhere, and a note.
 
-    ``options`` are those of a search.
+    No spectrum has jumps, and a fit would choose a sensor gain at which they do not show.
     """
-    axes = []
-    series = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
-    for y, c, gain, start in series:
-        data = axis_periodogram(y, c, record.frame_rate_hz, stretches)
-        search = Search(data=data, gain=gain, **options)
-        axes.append(find_axis(search, start=start))
-        step()
-    return axes
+    change = np.abs(np.diff(corrections, axis=0))
+    inside = np.zeros(len(change), dtype=np.bool_)
+    for start, stop in stretches:
+        inside[start : stop - 1] = True
+    scale = MAD * np.median(change[inside], axis=0)
+    size = np.max(change[:, scale > 0] / scale[scale > 0], axis=1, initial=0.0) * inside
+    places = np.flatnonzero(size > _JUMP)
+    if not places.size:
+        return stretches, []
+    jumps = np.split(places, 1 + np.flatnonzero(np.diff(places) > _AROUND_JUMP))
+    note = (
+        f"warning: {count_text(len(jumps), 'jump')} of the commands, the largest at frame "
+        f"{1 + int(np.argmax(size))} with {np.max(size):.0f} standard deviations"
+    )
+    if len(jumps) > _MOST_JUMPS:
+        return stretches, [f"{note}; too many to cut the record there, and the model suffers"]
+    for jump in jumps:
+        low, high = int(jump[0]) + 1 - _AROUND_JUMP, int(jump[-1]) + 1 + _AROUND_JUMP
+        pieces = chain(*(((a, min(b, low)), (max(a, high), b)) for a, b in stretches))
+        stretches = tuple((a, b) for a, b in pieces if b > a)
+    return stretches, [f"{note}; the record was cut there"]
 
 
 def _check_record(
@@ -246,12 +232,6 @@ def _check_record(
     record.corrections()  # refuses a closed loop without a delay
     if start is not None and len(start.axes) != record.axes:
         raise ProblemError(f"start must have {record.axes} axes; got {len(start.axes)}.")
-    for i, series in enumerate(record.measurements[record.usable].T):
-        if series.size and np.ptp(series) == 0:
-            raise ProblemError(
-                f"axis {i} of the record is constant: there is nothing to identify. Choose the "
-                "other axis."
-            )
 
 
 def _usable_stretches(stretches: StretchesLike, record: LoopRecord) -> Stretches:
@@ -264,14 +244,13 @@ def _usable_stretches(stretches: StretchesLike, record: LoopRecord) -> Stretches
 
 
 def _pool_gains(
-    axes: list[IdentifiedAxis], step: Callable[[], None], options: dict[str, Any]
+    axes: list[IdentifiedAxis], options: dict[str, Any]
 ) -> tuple[list[IdentifiedAxis], str]:
     """Fit the axes again with the mean of their gains, if they agree; options are of a search.
 
     An axis that leaves its gain open takes that of the other. What is known of a gain beforehand
-    counts once. Where the gains scatter by more than their
-    errors, the error of the mean is scaled by ``sqrt(chi^2 / (n - 1))`` (Particle Data Group,
-    doi:10.1093/ptep/ptac097, section 5.2.2).
+    counts once. Where the gains scatter by more than their errors, the error of the mean is scaled
+    by ``sqrt(chi^2 / (n - 1))`` (Particle Data Group, doi:10.1093/ptep/ptac097, section 5.2.2).
     """
     gains = np.array([axis.sensor_gain for axis in axes])
     errors = np.array([axis.sensor_gain_error for axis in axes], dtype=float)
@@ -288,26 +267,24 @@ def _pool_gains(
     precision = float(np.sum(weight)) - (len(axes) - 1) / GAIN_ERROR**2
     gain = float(np.exp(mean))
     error = float(np.sqrt(max(scatter, 1.0) / max(precision, 1 / GAIN_ERROR**2)))
-    pooled = []
-    for axis in axes:
-        search = Search(data=axis.data, gain=gain, **options)
-        pooled.append(refit_axis(axis, search, error, _gain_note(error, "mean of the axes")))
-        step()
+    note = _gain_note(error, "mean of the axes")
+    pooled = [
+        refit_axis(axis, Search(data=axis.data, gain=gain, **options), error, note) for axis in axes
+    ]
     return pooled, "one sensor gain for all axes"
 
 
 def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[str]:
     """Yield notes on odd gains, hidden noise, too many lines, and what no model has."""
-    above = set()
+    lowest, _ = POSSIBLE_GAINS
     for i, axis in enumerate(axes):
-        error, (low, high) = axis.sensor_gain_error, POSSIBLE_GAINS
-        if error is not None and not low < axis.sensor_gain < high:
+        gain, error, test = axis.sensor_gain, axis.sensor_gain_error, axis.whiteness
+        if error is not None and not lowest < gain < _CALIBRATED + DIFFERENT * error:
             yield (
-                f"warning: axis {i} has a sensor gain of {axis.sensor_gain:.3g}: are the units, "
-                "signs and axes of the commands right?"
+                f"warning: a sensor has a gain of {lowest:g} to 1; here it is {gain:.3g} +- "
+                f"{error:.2g}. Are the units, signs and axes of the commands right? Those recorded "
+                "at a fraction of what was applied look like that (--command-scale 2 if at half)"
             )
-        elif error is not None and _CALIBRATED + DIFFERENT * error < axis.sensor_gain:
-            above.add(f"{axis.sensor_gain:.3f} +- {error:.3f}")
         if axis.noise_error_nm > _UNSEEN * axis.noise_nm:
             yield f"warning: the noise of axis {i} is not seen under the rest of its spectrum"
         if sum(part.kind != "turbulence" for part in axis.parts) >= most_lines > 0:
@@ -327,20 +304,12 @@ def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[st
                 f"correlation is 0 +- {axis.noise_correlation_error:.2g}): noise, sensor gain and "
                 "their errors hold if it is"
             )
-        test = axis.whiteness
-        if min(test.p_value, test.correlation_p_value) < RARE:
+        if test.p_value < RARE:
             yield (
-                f"warning: the innovations of axis {i} are not white (p = {test.p_value:.2g}, "
-                f"{test.correlation_p_value:.2g}): the model leaves something out, such as noise "
-                "that is not white. The standard errors do not cover that, and the sensor gain may "
-                "be wrong by many of them"
+                f"warning: the innovations of axis {i} are not white (p = {test.p_value:.2g}): "
+                "the model leaves something out, such as noise that is not white. The standard "
+                "errors do not cover that, and the sensor gain may be wrong by many of them"
             )
-    if above:  # gains of both axes in one sentence
-        yield (
-            f"warning: a calibrated sensor has a gain of at most 1; here it is "
-            f"{' and '.join(sorted(above))}. Commands recorded at a fraction of what was applied "
-            "look like that (--command-scale 2 if at half)"
-        )
 
 
 def _identify_spectra(
@@ -351,9 +320,6 @@ def _identify_spectra(
     options: dict[str, Any],
 ) -> IdentifiedModel:
     """Identify each spectrum, between 0 and the Nyquist frequency of the loop."""
-    stated = np.zeros(record.axes)  # 0 where it is that of the spectrum
-    if noise_nm is not None:
-        stated = each_of(noise_nm, "noise_nm", record.axes, above=0)
     rate = frame_rate_hz if frame_rate_hz is not None else record.frame_rate_hz
     if rate is None:
         raise ProblemError(
@@ -362,27 +328,47 @@ def _identify_spectra(
         )
     inside = (record.frequency_hz > 0) & (record.frequency_hz < rate / 2)
     f, densities = record.frequency_hz[inside], record.density_nm2_hz[inside].T
+    if f.size < 32:
+        raise DimensionError(
+            "a spectrum must have at least 32 frequencies above 0 and below half the frame rate, "
+            f"{rate / 2:.6g} Hz; got {f.size}."
+        )
+    steps = np.diff(f)
+    if np.max(steps) > 1.01 * np.min(steps):
+        raise ProblemError(
+            f"frequency_hz must be evenly spaced; got steps of {np.min(steps):.6g} to "
+            f"{np.max(steps):.6g}. Interpolate, or leave the odd part out."
+        )
     if np.any(densities <= 0):
         raise ProblemError(f"density_nm2_hz must be above 0; got {np.min(densities):.6g}.")
-    averages: list[float | None] = [record.averages] * record.axes
-    if record.averages is None:
-        averages = [estimate_averages(density) for density in densities]
-    axes = [
-        _identify_spectrum(f, density, rate, count or 1.0, **options)
-        for density, count in zip(densities, averages, strict=True)
-    ]
-    axes = [
-        replace(axis, noise_nm=noise, noise_error_nm=0.0) if noise else axis
-        for axis, noise in zip(axes, stated.tolist(), strict=True)
-    ]
-    left = int(np.sum(record.frequency_hz >= rate / 2))
-    notes = [f"{left} frequencies beyond {rate / 2:g} Hz were left out"] if left else []
-    notes += [
-        f"the density of axis {i} does not scatter as periodograms do (smoothed, interpolated "
-        "or computed?) and was taken for one of them. Give averages to find weaker lines"
-        for i, count in enumerate(averages)
-        if count is None
-    ]
+    beyond = int(np.sum(record.frequency_hz >= rate / 2))
+    notes = [f"{beyond} frequencies beyond {rate / 2:g} Hz were left out"] if beyond else []
+    axes, zero = [], np.zeros_like(f)
+    for i, density in enumerate(densities):
+        averages = record.averages or _estimate_averages(density)
+        if averages is None:
+            notes.append(
+                f"the density of axis {i} does not scatter as periodograms do (smoothed, "
+                "interpolated or computed?) and was taken for one of them. Give averages to find "
+                "weaker lines"
+            )
+        data = LoopPeriodogram(
+            frequency_hz=f,
+            measured=density,
+            crossed=zero,
+            corrected=zero,
+            count=zero + (averages or 1.0),
+            frame_rate_hz=rate,
+        )
+        search = Search(data=data, gain=1.0, **options)
+        model = add_evidence(search, find_components(search))
+        axes.append(describe_axis(search, model, None, "1: of a spectrum it has no meaning"))
+    if noise_nm is not None:
+        stated = each_of(noise_nm, "noise_nm", record.axes, above=0).tolist()
+        axes = [
+            replace(axis, noise_nm=noise, noise_error_nm=0.0)
+            for axis, noise in zip(axes, stated, strict=True)
+        ]
     return IdentifiedModel(
         axes=tuple(axes),
         frame_rate_hz=rate,
@@ -391,21 +377,39 @@ def _identify_spectra(
     )
 
 
+def _estimate_averages(density: FloatArray) -> float | None:
+    """Return how many periodograms were averaged in a density, by its scatter about a curve.
+
+    The logarithm of a mean of n has the variance ``1 / n + 1 / (2 n^2)``, nearly. None above what
+    anybody averages: otherwise each misfit would count as evidence for a line.
+    """
+    log = np.log(density)
+    # a second difference at a distance hardly sees a curve, and not what neighbours share
+    bend = log[6:] - 2 * log[3:-3] + log[:-6]
+    variance = (MAD * float(np.median(np.abs(bend - np.median(bend))))) ** 2 / 6
+    if variance < 1 / _MOST_AVERAGES:
+        return None
+    return float((1 + np.sqrt(1 + 2 * variance)) / (2 * variance))
+
+
 def find_axis(search: Search, *, start: IdentifiedAxis | None = None) -> IdentifiedAxis:
-    """Identify one axis from its periodogram, and from a model of earlier data."""
-    closed = search.data.closed
-    models = find_models(search, None if start is None else start.fitted_model.spectrum)
-    model = models[0]
+    """Identify one axis from its periodogram, and from a model of earlier data.
+
+    A model whose gain is poorly known is none to start from: another gain may explain as much.
+    """
+    spectrum = None
+    if start is not None and (start.sensor_gain_error or 0.0) < _POOR_GAIN * start.sensor_gain:
+        spectrum = start.fitted_model.spectrum
+    model, near = find_models(search, spectrum)
+    model = add_evidence(search, model)
     if not search.finds_gain:
-        note = "given" if closed else "given: the series is divided by it"
+        note = "given" if search.data.closed else "given: the series is divided by it"
         if search.gain is None:
             note = "1: of an open loop it has no meaning"
-        return describe_axis(search, add_evidence(search, model), None, note)
-    model, near = find_rivals(search, models, other_gains=not _is_clear(model, start))
-    model = add_evidence(search, model)
+        return describe_axis(search, model, None, note)
     background = model.spectrum.background
     rivals = [rival.spectrum.background for rival in near]
-    fit_error = _gain_error(model)
+    fit_error = model.gain_error
     error = max(fit_error, *(abs(rival.log_gain - background.log_gain) for rival in rivals))
     if error > fit_error:  # what the gain moves is as ambiguous
         model = hold_gain(search, model, error)
@@ -426,30 +430,6 @@ def _gain_note(error: float, origin: str) -> str:
     )
 
 
-def _gain_error(model: FittedModel) -> float:
-    """Return the standard error of the logarithm of the gain."""
-    return standard_errors(model.spectrum, model.covariance).background.log_gain
-
-
-def _is_clear(model: FittedModel, start: IdentifiedAxis | None) -> bool:
-    """Whether nothing could explain another gain than that of a model.
-
-    A plausible gain is clear that is well known beside narrow lines, white noise and turbulence
-    that is not overdamped, or was found in earlier data with an error like that of its fit.
-    """
-    background, error = model.spectrum.background, _gain_error(model)
-    earlier = None if start is None else start.sensor_gain_error
-    compared = (
-        start is not None
-        and earlier is not None
-        and earlier < _AMBIGUOUS * error * start.sensor_gain
-    )
-    turbulence, narrow = model.spectrum.components[0], [c.is_narrow for c in model.spectrum.lines]
-    plain = all(narrow) and not background.colour and turbulence.damping_ratio < OVERDAMPED
-    low, high = PLAUSIBLE_GAINS
-    return low <= background.gain <= high and (compared or (plain and error < GAIN_STEP))
-
-
 def refit_axis(axis: IdentifiedAxis, search: Search, error: float, note: str) -> IdentifiedAxis:
     """Fit an axis again at the gain of a search, with its error."""
     model = add_evidence(search, find_components(search, axis.fitted_model.spectrum))
@@ -460,7 +440,7 @@ def axis_periodogram(
     y: FloatArray, c: FloatArray | None, frame_rate_hz: float, stretches: StretchesLike | None
 ) -> LoopPeriodogram:
     """Return the periodogram of measurements and corrections (frames,) of one axis."""
-    pieces = checked_stretches(None if stretches is None else sorted(stretches), y.size)
+    pieces = checked_stretches(stretches, y.size)
     longest = max(stop - begin for begin, stop in pieces)
     if longest < 2 * SHORTEST_SEGMENT:
         raise ProblemError(
@@ -468,7 +448,9 @@ def axis_periodogram(
             f"longest has {longest}. Record more, or bridge short gaps."
         )
     if all(np.ptp(y[begin:stop]) == 0 for begin, stop in pieces):
-        raise ProblemError("the measurement is constant: there is nothing to identify.")
+        raise ProblemError(
+            "a measurement is constant: there is nothing to identify. Choose the other axis."
+        )
     with np.errstate(over="ignore", invalid="ignore"):
         data = loop_periodogram(y, c, frame_rate_hz=frame_rate_hz, stretches=pieces)
         finite = np.all(np.isfinite(data.power(1.0)))
@@ -478,58 +460,3 @@ def axis_periodogram(
             f"{np.max(np.abs(y)):.6g} nm. Check the units."
         )
     return data
-
-
-def _identify_spectrum(
-    frequency_hz: FloatArray,
-    density_nm2_hz: FloatArray,
-    rate_hz: float,
-    averages: float,
-    **options: Any,
-) -> IdentifiedAxis:
-    """Identify one axis from its density (f,) [nm^2/Hz], a mean of independent periodograms."""
-    if frequency_hz.size < 32:
-        raise DimensionError(
-            "a spectrum must have at least 32 frequencies above 0 and below half the frame rate, "
-            f"{rate_hz / 2:.6g} Hz; got {frequency_hz.size}."
-        )
-    steps = np.diff(frequency_hz)
-    if np.max(steps) > 1.01 * np.min(steps):
-        raise ProblemError(
-            f"frequency_hz must be evenly spaced; got steps of {np.min(steps):.6g} to "
-            f"{np.max(steps):.6g}. Interpolate, or leave the odd part out."
-        )
-    zero = np.zeros_like(frequency_hz)
-    data = LoopPeriodogram(
-        frequency_hz=frequency_hz,
-        measured=density_nm2_hz,
-        crossed=zero,
-        corrected=zero,
-        count=zero + averages,
-        frame_rate_hz=rate_hz,
-        resolution_hz=float(np.median(steps)),
-    )
-    search = Search(data=data, gain=1.0, **options)
-    note = "1: of a spectrum it has no meaning"
-    return describe_axis(search, add_evidence(search, find_components(search)), None, note)
-
-
-def estimate_averages(density: FloatArray) -> float | None:
-    """Return how many periodograms were averaged in a density, by its scatter about a curve.
-
-    It is the shape of a gamma distribution. None above what anybody averages: otherwise each
-    misfit would count as evidence for a line, and standard errors would vanish.
-    """
-    from scipy.optimize import brentq
-    from scipy.special import polygamma
-    from scipy.stats import median_abs_deviation
-
-    log = np.log(density)
-    # a second difference at a distance hardly sees a curve, and not what neighbours share
-    bend = log[6:] - 2 * log[3:-3] + log[:-6]
-    scatter = median_abs_deviation(bend, scale=0.6745) ** 2 / 6
-    if scatter < polygamma(1, _MOST_AVERAGES):
-        return None
-    scatter = min(scatter, polygamma(1, _LEAST_AVERAGES))
-    low, high = np.log(_LEAST_AVERAGES) - 1e-6, np.log(_MOST_AVERAGES) + 1e-6
-    return float(np.exp(brentq(lambda x: polygamma(1, np.exp(x)) - scatter, low, high)))

@@ -13,32 +13,37 @@ from dataclasses import replace
 from itertools import pairwise, product
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
-from lbt_synth.identification.fit.fitting import GAIN_STEP, GAINS, TYPICAL_GAIN, Search
+from lbt_synth.identification.fit.fitting import (
+    GAIN_STEP,
+    GAINS,
+    PLAUSIBLE_GAINS,
+    TYPICAL_GAIN,
+    Search,
+)
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.identification.fit.scoring import SEARCHED
 from lbt_synth.identification.fit.spectrum_model import (
     Background,
     Component,
     SpectrumModel,
     damping_parameter,
 )
-from lbt_synth.identification.fit.whittle import FittedModel, contrast, density, minimise
+from lbt_synth.identification.fit.whittle import SEARCHED, FittedModel, contrast, density, minimise
 from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
 from lbt_synth.models.vibration import MOST_SECTIONS
 from lbt_synth.validation import FloatArray
 
-_LITTLE, _CLEARLY = 0.1, 1.0  # log-likelihood that a component or a move must save at least
+_CLEARLY = 1.0  # log-likelihood that a trial must save at least
 FEW_ROUNDS, _MOST_ROUNDS = 3, 12  # of a quick search, and of a whole one
 _HALF = float(np.log(0.5))
 _MOST_SLOW = 2  # parts of the turbulence beside the first
 _COLOUR = 0.3  # of the noise, where a fit begins
-_MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _TURBULENCE = ((0.5, 0.55), (5.0, 0.55), (2.0, 30.0))  # frequency [Hz] and damping: starts of a fit
 _CROSSINGS_HZ = np.geomspace(1.0, 100.0, 5)  # where a drift beside turbulence may meet the noise
-OVERDAMPED = 3.0  # damping ratio of turbulence that may stand for a drift
+_OVERDAMPED = 3.0  # damping ratio of turbulence that may stand for a drift
 _SHARES = (1.0, 0.1)  # of the slow variance in that turbulence
 _WIDEST_LINE = 0.98  # damping ratio
 _BANDS = 80  # of the background
@@ -53,10 +58,13 @@ _AS_LIKELY = 5.0  # log-likelihood by which one of two gains is excluded
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
 
 
-def find_models(search: Search, start: SpectrumModel | None = None) -> list[FittedModel]:
-    """Return the model of one axis, and what explains it as well with another noise.
+def find_models(
+    search: Search, start: SpectrumModel | None = None
+) -> tuple[FittedModel, list[FittedModel]]:
+    """Return the likeliest model of one axis, and all that are as likely.
 
-    Wide resonances and a drift fit most spectra that fall, and so does a colour of the noise.
+    Wide resonances and a drift fit most spectra that fall, and so does a colour of the noise; each
+    of them can explain what a wrong gain leaves. The places of lines cannot.
     """
     model = find_components(search, start)
     spectrum = model.spectrum
@@ -66,44 +74,38 @@ def find_models(search: Search, start: SpectrumModel | None = None) -> list[Fitt
         rival = fitting.fit(search, spectrum.with_background(colour=other.background.colour))
     else:
         rival = find_components(search, other)
-    return sorted([model, *_settled([rival])], key=lambda one: _cost_of_noise(search, one))
-
-
-def find_rivals(
-    search: Search, models: Sequence[FittedModel], *, other_gains: bool
-) -> tuple[FittedModel, list[FittedModel]]:
-    """Return the likeliest of models, also from other gains, and all that are as likely.
-
-    Wide resonances, or a colour of the noise, can explain what a wrong gain leaves; the places of
-    lines cannot.
-    """
-    model, rivals = models[0], list(models)
-    for gain in _OTHER_GAINS if other_gains else ():
-        if abs(np.log(gain) - model.spectrum.background.log_gain) >= GAIN_STEP:
-            with suppress(NumericalError):
-                held = find_components(replace(search, gain=gain), rounds=FEW_ROUNDS)
-                rivals += _settled([fitting.fit(search, held.spectrum)])
-    best, near = min(rivals, key=lambda rival: _cost_of_noise(search, rival)), list[FittedModel]()
-    for rival in rivals:
-        above = (
-            cost(search, rival) - cost(search, best) for cost in (fitting.cost, _cost_of_noise)
+    rivals = [model] if rival is None else [model, rival]
+    best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
+    if search.finds_gain and start is None and not _is_clear(best):
+        for gain in _OTHER_GAINS:
+            if abs(np.log(gain) - best.spectrum.background.log_gain) >= GAIN_STEP:
+                with suppress(NumericalError):
+                    held = find_components(replace(search, gain=gain), rounds=FEW_ROUNDS)
+                    rival = fitting.fit(search, held.spectrum)
+                    rivals += [] if rival is None else [rival]
+        best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
+    near = [
+        rival
+        for rival in rivals
+        if any(
+            cost(search, rival) - cost(search, best) < _AS_LIKELY
+            for cost in (fitting.cost, _cost_of_noise)
         )
-        near += [rival] * (min(above) < _AS_LIKELY)
-    if best is not model:
-        best = fitting.prune(search, best, thorough=True)
-    return best, near
-
-
-def _settled(models: Sequence[FittedModel | None]) -> list[FittedModel]:
-    """Return the fits that settled, of noise that is no drift and has no opposite neighbours.
-
-    Sensors and filters make neighbouring frames alike, hardly ever opposite.
-    """
-    return [
-        model
-        for model in models
-        if model is not None and 0 <= model.spectrum.background.colour < _MOST_COLOUR
     ]
+    return (best if best is model else fitting.prune(search, best, thorough=True)), near
+
+
+def _is_clear(model: FittedModel) -> bool:
+    """Whether nothing could explain another gain than that of a model.
+
+    A plausible gain is clear that is well known beside narrow lines, white noise and turbulence
+    that is not overdamped.
+    """
+    background, turbulence = model.spectrum.background, model.spectrum.components[0]
+    narrow = all(c.is_narrow for c in model.spectrum.lines) and not background.colour
+    low, high = PLAUSIBLE_GAINS
+    plausible = low <= background.gain <= high and model.gain_error < GAIN_STEP
+    return narrow and plausible and turbulence.damping_ratio < _OVERDAMPED
 
 
 def _cost_of_noise(search: Search, model: FittedModel) -> float:
@@ -134,61 +136,43 @@ def find_components(
         if better is None:
             break
         model = better
-    model = fitting.prune(search, fitting.simplify(search, model), thorough=start is None)
-    return _restore_turbulence(search, model)
-
-
-def _restore_turbulence(search: Search, model: FittedModel) -> FittedModel:
-    """Make the strongest slow component the turbulence, where a resonance took its place."""
-    spectrum, lowest = model.spectrum, search.log_angle(search.lowest_line_hz)
-    first = spectrum.components[0]
-    slow = [i for i, c in enumerate(spectrum.components) if c.kind in ("slow", "drift")]
-    if first.log_frequency < lowest or not slow or first.damping_ratio > _WIDEST_LINE:
-        return model
-    i = max(slow, key=lambda k: spectrum.components[k].log_power)
-    damping = damping_parameter("line", first.damping_ratio)
-    exchanged = spectrum.exchange(i, replace(first, kind="line", damping=damping))
-    turbulence = replace(spectrum.components[i], kind="turbulence")
-    restored = fitting.fit(search, exchanged.exchange(0, turbulence))
-    if restored and fitting.cost(search, restored) < fitting.cost(search, model) + search.price:
-        return restored
-    return model
+    return fitting.prune(search, model, thorough=start is None)
 
 
 def _improve(search: Search, model: FittedModel, *, moves: bool) -> FittedModel | None:
     """Return the first trial that is clearly better; None if none is."""
     least, price = fitting.cost(search, model), fitting.total_price(search, model.spectrum)
-    for trial, saved in _trials(search, model.spectrum, moves):
+    for trial in _trials(search, model.spectrum, moves):
         margin = max(0.0, price - fitting.total_price(search, trial))
         better = fitting.fit(search, trial, better_than=model, margin=margin)
-        if better is None or abs(better.spectrum.background.colour) > _MOST_COLOUR:
-            continue
-        better = fitting.prune(search, better)
-        if fitting.cost(search, better) < least - saved:
+        better = None if better is None else fitting.prune(search, better)
+        if better is not None and fitting.cost(search, better) < least - _CLEARLY:
             return better
     return None
 
 
-def _trials(
-    search: Search, spectrum: SpectrumModel, moves: bool
-) -> Iterator[tuple[SpectrumModel, float]]:
-    """Yield models with other turbulence, new lines or other places, and what they must save."""
+def _trials(search: Search, spectrum: SpectrumModel, moves: bool) -> Iterator[SpectrumModel]:
+    """Yield models with new lines, other turbulence, lines in other places, or less."""
     excesses = find_excesses(search, spectrum)
     excesses = [excess for excess in excesses if excess[0] > 0.25 * excesses[0][0]]
     while excesses:
-        yield _add_centred(search, spectrum, excesses), _LITTLE
+        yield _add_centred(search, spectrum, excesses)
         excesses = excesses[: len(excesses) // 2]
     if all(c.kind != "drift" for c in spectrum.components):
-        yield _add_drift(search, spectrum), _LITTLE
-    yield from ((trial, _LITTLE) for trial in _bumps(search, spectrum))
+        yield _add_drift(search, spectrum)
+    yield from _bumps(search, spectrum)
     for i, component in enumerate(spectrum.components):
         if moves and component.kind == "line":
-            yield from ((trial, _CLEARLY) for trial in _line_moves(search, spectrum, i))
+            yield from _line_moves(search, spectrum, i)
     if any(c.kind == "slow" for c in spectrum.components):
         lines = [c for c in spectrum.components if c.kind == "line"]
         ground = fit_background(search, spectrum.background.gain, lines)
         if ground is not None:
-            yield ground.spectrum.add(*lines), _LITTLE
+            yield ground.spectrum.add(*lines)
+    if spectrum.background.rolls_off:
+        yield spectrum.without_roll_off()
+    if spectrum.background.colour:
+        yield spectrum.with_background(colour=0.0)
 
 
 def _begin(search: Search) -> FittedModel | None:
@@ -224,7 +208,7 @@ def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
     drifts = [
         search.drift(search.place(c)[0] / (2 * c.damping_ratio), float(np.exp(c.log_power)))
         for c in slow
-        if c.damping_ratio > OVERDAMPED
+        if c.damping_ratio > _OVERDAMPED
     ]
     noise = 2 / search.data.frame_rate_hz * float(np.exp(background.log_noise))
     # the density of a drift of variance P above its corner is 2 P corner / (pi f^2)
@@ -462,9 +446,9 @@ def _highest_excess(
     """Return a line of the place, width and variance of the highest excess in a band of bins."""
     data, excess = search.data, power[band] - model[band]
     count = max(1, excess.size // 2).bit_length()
-    each = [(2**k, _moving_mean(excess, 2**k)) for k in range(count)]
+    means = [(2**k, uniform_filter1d(excess, 2**k, mode="constant")) for k in range(count)]
     # the smoothing at which the peak is highest over its scatter, which falls with its root
-    _, smooth = max(each, key=lambda one: float(np.max(one[1])) * np.sqrt(one[0]))
+    _, smooth = max(means, key=lambda mean: float(np.max(mean[1])) * np.sqrt(mean[0]))
     peak = int(np.argmax(smooth))
     low_enough = np.flatnonzero(smooth <= 0.5 * smooth[peak])
     low = low_enough[low_enough <= peak].max(initial=0)
@@ -474,11 +458,3 @@ def _highest_excess(
     frequency = float(data.frequency_hz[band.start + peak])
     ratio = min(max(half / frequency, _NARROWEST), widest)
     return search.component("line", frequency, ratio, np.pi * half * height)
-
-
-def _moving_mean(series: FloatArray, width: int) -> FloatArray:
-    """Return the mean over a width around each value, (n,), with zeros beyond the ends."""
-    total = np.cumsum(np.append(0.0, series))
-    last = np.arange(series.size) + (width - 1) // 2 + 1
-    first = np.maximum(last - width, 0)
-    return np.asarray((total[np.minimum(last, series.size)] - total[first]) / width)

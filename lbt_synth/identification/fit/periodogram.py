@@ -46,7 +46,6 @@ class LoopPeriodogram:
     corrected: FloatArray  # (..., f): |C|^2 [nm^2/Hz]; zeros without corrections
     count: FloatArray  # (f,): independent periodograms that each value is the mean of
     frame_rate_hz: float
-    resolution_hz: float  # width of a frequency bin of the transform
     duration_s: float | None = None  # of the tapered segments; None for a density from elsewhere
     # (2, 2, f): the real part of (Y1, C1) times (Y2, C2)* of two axes [nm^2/Hz]
     between: FloatArray | None = None
@@ -65,12 +64,6 @@ class LoopPeriodogram:
     def log_frame_mean(self) -> FloatArray:
         """Logarithm of the power that the mean over a frame leaves, (f,)."""
         return np.asarray(2 * np.log(np.sinc(self.frequency_hz / self.frame_rate_hz)))
-
-    @cached_property
-    def periods(self) -> FloatArray:
-        """Periods of each frequency within a tapered segment, (f,)."""
-        assert self.duration_s is not None
-        return self.frequency_hz * self.duration_s
 
     @cached_property
     def step_hz(self) -> float:
@@ -97,50 +90,17 @@ class LoopPeriodogram:
 
         Its imaginary part says nothing about lines that move along a direction.
         """
-        if len(gains) == 1:
+        if self.between is None:
             return self.power(float(gains[0]))[None, None]
-        crossed = np.tensordot(self._seen(gains, (0, 0)), self._between, 2)
+        crossed = np.einsum("i,ijf,j->f", [1.0, gains[0]], self.between, [1.0, gains[1]])
         first, second = self.power(gains[:, None])
         return np.array([[first, crossed], [crossed, second]])
-
-    def gain_slopes(self, gains: FloatArray, i: int) -> tuple[FloatArray, FloatArray]:
-        """Return the slope of the matrix by the logarithm of gain i, (n, n, f), and its second.
-
-        The second one is that of the density of axis i, (f,).
-        """
-        g = gains[i]
-        crossed, square = (
-            row if row.ndim == 1 else row[i] for row in (self.crossed, self.corrected)
-        )
-        cross, square = 2 * g * crossed, 2 * g**2 * square
-        slope = np.zeros((len(gains), len(gains), cross.size))
-        slope[i, i] = cross + square
-        if len(gains) > 1:
-            turned = (1, 0) if i == 0 else (0, 1)
-            slope[0, 1] = slope[1, 0] = np.tensordot(self._seen(gains, turned), self._between, 2)
-        return slope, cross + 2 * square
-
-    @staticmethod
-    def _seen(gains: FloatArray, slopes: tuple[int, int]) -> FloatArray:
-        """Return the weights of (Y1, C1) times (Y2, C2), or of their slopes by a gain, (2, 2)."""
-        (one, first), (other, second) = zip(gains, slopes, strict=True)
-        return np.outer([1.0 - first, one], [1.0 - second, other])
-
-    @property
-    def _between(self) -> FloatArray:
-        if self.between is None:
-            raise ValueError("the periodogram must be of two axes; it is of one.")
-        return self.between
 
     def merge(self, starts: IntArray) -> LoopPeriodogram:
         """Return the means over groups of neighbours that begin at these indices."""
         size = np.diff(np.append(starts, len(self.frequency_hz)))
         means = self._map(lambda values: np.add.reduceat(values, starts, axis=-1) / size)
         return replace(means, count=np.add.reduceat(self.count, starts))
-
-    def window(self, low_hz: float, high_hz: float) -> LoopPeriodogram:
-        """Return the values between two frequencies."""
-        return self.take(slice(*np.searchsorted(self.frequency_hz, [low_hz, high_hz])))
 
     def take(self, inside: BoolArray | slice) -> LoopPeriodogram:
         """Return the values at some frequencies."""
@@ -152,29 +112,6 @@ class LoopPeriodogram:
         values: Any = {name: change(getattr(self, name)) for name in names}
         between = None if self.between is None else change(self.between)
         return replace(self, **values, between=between)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Whiteness:
-    """Tests of the innovations, whose spectrum is the ratio of periodogram to model.
-
-    The cumulative periodogram is tested by Kolmogorov's distribution (M. S. Bartlett, An
-    Introduction to Stochastic Processes, 1955), the autocorrelation by Box and Pierce's sum of
-    squares (doi:10.1080/01621459.1970.10481180).
-    """
-
-    deviation: float  # largest distance of the cumulative periodogram from the diagonal
-    p_value: float  # probability of a larger one if the innovations were white
-    autocorrelation: FloatArray  # (lags,), from lag 1
-    correlation_p_value: float  # of the sum of squares over these lags
-    frequency_hz: FloatArray  # (f,)
-    cumulative: FloatArray  # (f,), from 0 to 1
-    effective: float  # number of independent values
-
-    @property
-    def white(self) -> bool:
-        """Whether neither test refuses whiteness at 1 %."""
-        return self.p_value > 0.01 and self.correlation_p_value > 0.01
 
 
 def half_angle_square(frequency_hz: FloatArray, frame_rate_hz: float) -> FloatArray:
@@ -241,7 +178,6 @@ def loop_periodogram(
         corrected=np.mean(np.abs(c) ** 2, axis=-2),
         count=np.full(frequency.size, independent),
         frame_rate_hz=frame_rate_hz,
-        resolution_hz=frame_rate_hz / length,
         duration_s=(length - 1) / frame_rate_hz,
         between=between,
     )

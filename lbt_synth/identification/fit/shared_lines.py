@@ -2,36 +2,38 @@
 
 Each axis has been identified alone. A resonance that shakes along a diagonal is then a line on
 either axis, or on the one that shows it. Pairs of resonances at the same frequency, and those of
-one axis that the other may show weakly, are fitted again as one along a direction. What costs more
-so than apart stays apart; so does a line that moves on an ellipse, which no direction describes.
-The sensor gains are held: each axis has found its own before.
+one axis that the other may show weakly, are fitted again as one along a direction, the clearest
+first. What costs more so than apart stays apart; so does a line that moves on an ellipse, which no
+direction describes. The sensor gains are held: each axis has found its own before.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain, count
+from itertools import chain
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.identification.fit import fitting
 from lbt_synth.identification.fit.fitting import Search
-from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
-from lbt_synth.identification.fit.periodogram import loop_periodogram
-from lbt_synth.identification.fit.physical_parameters import (
+from lbt_synth.identification.fit.identified_model import (
+    IdentifiedAxis,
+    IdentifiedLine,
     describe_axis,
     gain_covariance,
     standard_errors,
 )
-from lbt_synth.identification.fit.scoring import EXACT
+from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import (
-    BACKGROUND,
     GAIN,
     Component,
     SpectrumModel,
 )
 from lbt_synth.identification.fit.whittle import (
+    EXACT,
+    HOPE,
     FittedModel,
     contrast,
     invert_information,
@@ -45,12 +47,7 @@ from lbt_synth.identification.stretches import Stretches
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import FloatArray
 
-_UNFITTED = 10.0  # log-likelihood that a fit may add to a line that the axes share
-_HARDLY = 2.0  # the same of one that a single axis shows
-_COHERENT = 0.5  # squared coherence of lines that are worth a fit all the same
-_HIGHEST_HZ = 10.0  # natural frequency of turbulence
 _MOST_SHARED = 0.9  # of the turbulence, where a fit begins
-_LEAST_RATIO = 1e-3  # of the amplitudes, where a fit of a line that one axis shows begins
 
 Pair = tuple[Component | None, Component | None]  # what is one resonance, on either axis
 
@@ -77,82 +74,57 @@ def couple_axes(
     one_gain = axes[0].sensor_gain == axes[1].sensor_gain
     groups = [([0, 1], errors[0])] if one_gain else [([i], errors[i]) for i in range(2)]
     covariance = gain_covariance(search, model, groups)
-    coupled = [_describe_axis(search, model, covariance, i, axis) for i, axis in enumerate(axes)]
-    parts, lines = [list(axis.parts) for axis in coupled], []
-    for k in model.spectrum.shared:
-        frequency_hz = model.spectrum.components[k].frequency / data.angle_s
-        places = [_nearest(axis.parts, frequency_hz) for axis in coupled]
-        shares = [row[place] for row, place in zip(parts, places, strict=True)]
-        line = _describe_line(model.spectrum, covariance, k, shares)
-        for row, place, share in zip(parts, places, shares, strict=True):
-            row[place] = replace(
-                share, direction=line.direction, direction_error_deg=line.direction_error_deg
-            )
-        lines.append(line)
-    lines.sort(key=lambda line: line.frequency_hz)
-    rows = zip(coupled, parts, strict=True)
-    return [replace(axis, parts=tuple(row)) for axis, row in rows], tuple(lines)
+    sizes = [
+        _describe_size(model.spectrum, covariance, j) for j in range(len(model.spectrum.shared))
+    ]
+    coupled = [
+        _describe_axis(search, model, covariance, i, axis, sizes) for i, axis in enumerate(axes)
+    ]
+    lines = []
+    for size in sizes:
+        shares = [p for axis in coupled for p in axis.parts if p.direction == size["direction"]]
+        if shares:  # not of a resonance that has no power on either axis
+            strongest = max(shares, key=lambda share: share.prominence)
+            lines.append(replace(strongest, **size))
+    return coupled, tuple(sorted(lines, key=lambda line: line.frequency_hz))
 
 
 def find_shared(search: Search, models: Sequence[FittedModel]) -> FittedModel | None:
-    """Return the joint fit of two axes with all that they share; None if that is nothing."""
-    named = zip(models, (count(1), count(1000)), strict=True)
-    rows = [
-        [replace(c, axis=i, name=next(names)) for c in model.spectrum.components]
-        for i, (model, names) in enumerate(named)
+    """Return the joint fit of two axes with all that they share; None if that is nothing.
+
+    Turbulence comes first: that of both axes may look like weak parts of lines.
+    """
+    parts = [
+        replace(c, axis=i) for i, model in enumerate(models) for c in model.spectrum.components
     ]
-    backgrounds = tuple(model.spectrum.background for model in models)
-    apart = SpectrumModel(backgrounds, tuple(chain(*rows)))
-    pairs = _find_pairs(search, models, rows)
-    model, shared = _share_lines(search, None, apart, [], pairs)
-    slow = _share_turbulence(search, apart if model is None else model.spectrum)
-    if slow is None:
-        return model
-    # turbulence of both axes may look like weak parts of lines
-    begun, shared = _keep_asked(search, slow.spectrum, shared)
-    model = begun or slow
-    return _share_lines(search, model, model.spectrum, shared, pairs)[0]
+    named = tuple(replace(c, name=name) for name, c in enumerate(parts, start=1))
+    apart = SpectrumModel(tuple(model.spectrum.background for model in models), named)
+    pairs = _find_pairs(search, models, named)
+    air = _share_turbulence(search, apart)
+    if air is not None:
+        model = _share_lines(search, air.spectrum, pairs) or air
+        rest = contrast(search.data, model.spectrum.exchange(1))
+        if rest - model.contrast > search.price:  # not what lines have in common
+            return model
+    return _share_lines(search, apart, pairs)
 
 
 def _share_lines(
-    search: Search,
-    model: FittedModel | None,
-    spectrum: SpectrumModel,
-    shared: list[Pair],
-    pairs: Sequence[Pair],
-) -> tuple[FittedModel | None, list[Pair]]:
-    """Return the fit with all lines that the axes share, and their pairs."""
-    while True:  # a line may come to light once a neighbour has its direction
-        trial, trials = spectrum, list(shared)
+    search: Search, spectrum: SpectrumModel, pairs: Sequence[Pair]
+) -> FittedModel | None:
+    """Return the fit with all lines that the axes share, None without any."""
+    model, least, before = None, contrast(search.data, spectrum), 0
+    while len(pairs) != before:  # a line may come to light once a neighbour has its direction
+        before = len(pairs)
         for pair in pairs:
-            line = None if pair in shared else _share(search, trial, pair)
-            if line is not None:
-                trials.append(pair)
-                trial = _replace(trial, pair, line)
-        if len(trials) == len(shared):
-            return model, shared
-        better, kept = _keep_asked(search, trial, trials)
-        if better is None or len(kept) <= len(shared):
-            return model, shared
-        model, spectrum, shared = better, better.spectrum, kept
-
-
-def _keep_asked(
-    search: Search, spectrum: SpectrumModel, pairs: list[Pair]
-) -> tuple[FittedModel | None, list[Pair]]:
-    """Fit a model, and take apart what costs more together; None if no fit settles."""
-    while pairs:
-        model = fitting.fit(search, spectrum, accuracy=EXACT)
-        if model is None:
-            return None, []
-        first = len(model.spectrum.components) - len(pairs)
-        spare = [_spare(search, model, first + k, pair) for k, pair in enumerate(pairs)]
-        worst = int(np.argmin(spare))
-        if spare[worst] > 0:
-            return model, pairs
-        spectrum = _release(model.spectrum, first + worst, pairs[worst])
-        pairs = pairs[:worst] + pairs[worst + 1 :]
-    return fitting.fit(search, spectrum, accuracy=EXACT), []
+            line = _share(search, spectrum, pair)
+            trial = line and fitting.fit(search, _replace(spectrum, pair, line), accuracy=EXACT)
+            # one parameter more than a resonance has, in the place of one or two
+            saved = search.price * (1 - pair.count(None)) - search.parameter_price
+            if trial and trial.contrast < least + saved:
+                model, spectrum, least = trial, trial.spectrum, trial.contrast
+                pairs = [other for other in pairs if other is not pair]
+    return model
 
 
 def _replace(spectrum: SpectrumModel, pair: Pair, shared: Component) -> SpectrumModel:
@@ -162,33 +134,43 @@ def _replace(spectrum: SpectrumModel, pair: Pair, shared: Component) -> Spectrum
     return replace(spectrum, components=(*rest, shared))
 
 
+def _find_common(
+    data: LoopPeriodogram, spectrum: SpectrumModel, parts: Sequence[int]
+) -> tuple[float, float]:
+    """Return what the axes have in common in components, and what that adds to the log-likelihood.
+
+    It is the excess of the cross-spectrum over that of the model, relative to the geometric mean of
+    the densities of the components.
+    """
+    densities = [part_density(data, spectrum, i) for i in parts]
+    line, matrix = np.sqrt(densities[0] * densities[-1]), spectral_matrix(data, spectrum)
+    weight = data.count * line / (matrix[0, 0] * matrix[1, 1])
+    slope = float(np.sum(weight * (data.matrix(spectrum.gains)[0, 1] - matrix[0, 1])))
+    bend = float(np.sum(weight * line))
+    return slope / bend, slope**2 / bend
+
+
 def _share_turbulence(search: Search, apart: SpectrumModel) -> FittedModel | None:
     """Return the fit with turbulence along a direction beside that of the axes; None if too little.
 
-    It begins with what their coherence says. Its direction is that of the rms of the axes: beside
-    turbulence of the same spectrum the data show no other.
+    It begins with what the axes have in common. Its direction is that of the rms of the axes:
+    beside turbulence of the same spectrum the data show no other.
     """
-    data = search.merge(apart)
     slow = [i for i, c in enumerate(apart.components) if c.kind == "turbulence"]
-    turbulence = [apart.components[i] for i in slow]
-    first, second = (part_density(data, apart, i) for i in slow)
-    matrix = spectral_matrix(data, apart)
-    share = np.sqrt(first * second / (matrix[0, 0] * matrix[1, 1]))
-    crossed = data.matrix(apart.gains)[0, 1] / np.sqrt(matrix[0, 0] * matrix[1, 1])
-    weight = data.count * share**2
-    coherence = float(np.sum(data.count * share * crossed) / np.sum(weight))
-    if coherence**2 * float(np.sum(weight)) < search.price:
+    coherence, evidence = _find_common(search.merge(apart), apart, slow)
+    if evidence < search.price:
         return None
     common = min(abs(coherence), _MOST_SHARED)
+    first, second = (apart.components[i] for i in slow)
     less = float(np.log1p(-common))
     components = [
         c.shift(0.0, 0.0, less) if c.kind == "turbulence" else c for c in apart.components
     ]
     shared = replace(
-        turbulence[0].shift(0.0, 0.0, float(np.log(common))),
+        first.shift(0.0, 0.0, float(np.log(common))),
         kind="slow",
         axis=None,
-        log_ratio=turbulence[1].log_power - turbulence[0].log_power,
+        log_ratio=second.log_power - first.log_power,
         sign=1.0 if coherence > 0 else -1.0,
     )
     spectrum = replace(apart, components=(*components[:1], shared, *components[1:]))
@@ -197,134 +179,97 @@ def _share_turbulence(search: Search, apart: SpectrumModel) -> FittedModel | Non
         return None
     data = search.merge(model.spectrum)
     saved = contrast(data, apart) - contrast(data, model.spectrum)
-    is_slow = search.place(model.spectrum.components[1])[0] < _HIGHEST_HZ
-    return model if is_slow and saved > search.price else None
+    return model if saved > search.price else None
 
 
 def _find_pairs(
-    search: Search, models: Sequence[FittedModel], named: Sequence[Sequence[Component]]
+    search: Search, models: Sequence[FittedModel], components: Sequence[Component]
 ) -> list[Pair]:
     """Return each resonance, the clearest first, and that of the other axis which may be the same.
 
     Its frequency agrees within errors, or the two overlap.
     """
-    rows: list[tuple[float, int, Component, float]] = []
-    for axis, model in enumerate(models):
-        errors = standard_errors(model.spectrum, model.covariance).components
-        triples = zip(named[axis], model.evidence, errors, strict=True)
-        rows += [
-            (-evidence, axis, c, error.log_frequency)
-            for c, evidence, error in triples
-            if c.kind == "line"
-        ]
-    rows.sort(key=lambda row: row[0])
+    evidence = chain(*(model.evidence for model in models))
+    errors = chain(
+        *(standard_errors(model.spectrum, model.covariance).components for model in models)
+    )
+    rows = [
+        (worth, c, error.log_frequency)
+        for worth, c, error in zip(evidence, components, errors, strict=True)
+        if c.kind == "line"
+    ]
+    rows.sort(key=lambda row: -row[0])
     pairs: list[Pair] = []
     while rows:
-        _, axis, strong, error = rows.pop(0)
+        _, strong, error = rows.pop(0)
         centre, half = search.place(strong)
         near = {}
-        for row in rows:
-            its_centre, its_half = search.place(row[2])
-            reach = max(
-                SURPRISING * centre * float(np.hypot(error, row[3])), 0.5 * (half + its_half)
-            )
-            if row[1] != axis and abs(its_centre - centre) <= reach:
-                near[row[2]] = abs(its_centre - centre)
+        for _, other, its_error in rows:
+            its_centre, its_half = search.place(other)
+            uncertain = SURPRISING * centre * float(np.hypot(error, its_error))
+            apart = abs(its_centre - centre)
+            if other.axis != strong.axis and apart <= max(uncertain, 0.5 * (half + its_half)):
+                near[other] = apart
         partner = min(near, key=near.__getitem__, default=None)
-        rows = [row for row in rows if row[2] is not partner]
-        pairs.append((strong, partner) if axis == 0 else (partner, strong))
+        rows = [row for row in rows if row[1] is not partner]
+        pairs.append((strong, partner) if strong.axis == 0 else (partner, strong))
     return pairs
 
 
 def _share(search: Search, spectrum: SpectrumModel, pair: Pair) -> Component | None:
     """Return a resonance along a direction in the place of a pair; None if it is not worth a fit.
 
-    The ratio of the amplitudes is that of the pair, or of a line to what its axis has in common
-    with the other one: the excess of the cross-spectrum over the model's.
+    The ratio of the amplitudes is that of the pair, or what the other axis has in common with a
+    line of one axis.
     """
-    current = {c.name: c for c in spectrum.components}
-    first, second = (None if c is None else current[c.name] for c in pair)
-    pair = (first, second)
-    strong = max((c for c in pair if c is not None), key=lambda c: c.log_power)
+    names = [None if c is None else c.name for c in pair]
+    places = [i for i, c in enumerate(spectrum.components) if c.name in names]
     data = search.merge(spectrum)
-    densities = [
-        part_density(data, spectrum, spectrum.components.index(c)) for c in pair if c is not None
-    ]
-    line = np.sqrt(densities[0] * densities[-1])
-    matrix = spectral_matrix(data, spectrum)
-    weight = data.count * line / (matrix[0, 0] * matrix[1, 1])
-    excess = data.matrix(spectrum.gains)[0, 1] - matrix[0, 1]
-    crossed = float(np.sum(weight * excess) / np.sum(weight * line))
-    ratio = 2 * float(np.log(max(abs(crossed), _LEAST_RATIO)))  # to what the other axis has
-    if first is None:
-        ratio = -ratio
-    elif second is not None:
-        ratio = second.log_power - first.log_power
+    common, evidence = _find_common(data, spectrum, places)
+    if evidence < search.parameter_price:
+        return None
+    members = [spectrum.components[i] for i in places]
+    strong = max(members, key=lambda c: c.log_power)
+    ratio = 2 * float(np.log(abs(common))) * (-1 if pair[0] is None else 1)
+    if len(members) > 1:
+        ratio = members[1].log_power - members[0].log_power
     shared = replace(
         strong,
         axis=None,
-        log_power=strong.log_power - ratio if first is None else first.log_power,
+        log_power=members[0].log_power - ratio * (pair[0] is None),
         log_ratio=ratio,
-        sign=1.0 if crossed >= 0 else -1.0,
-        announced=next((c.announced for c in pair if c is not None and c.announced), None),
+        sign=1.0 if common >= 0 else -1.0,
+        announced=next((c.announced for c in members if c.announced), None),
     )
-    together = _replace(spectrum, pair, shared)
-    lost = contrast(data, together) - contrast(data, spectrum)
-    alone = None in pair
-    coherent = not alone and crossed**2 > _COHERENT
-    hope = _saved(search, pair) + (_HARDLY if alone else _UNFITTED)
-    return shared if coherent or lost < hope else None
-
-
-def _saved(search: Search, pair: Pair) -> float:
-    """Return the price that is saved where a pair is one resonance, of one parameter more."""
-    return search.price * (sum(c is not None for c in pair) - 1) - search.parameter_price
-
-
-def _release(spectrum: SpectrumModel, place: int, pair: Pair) -> SpectrumModel:
-    """Return the model with a pair, as the first components, in the place of a shared resonance."""
-    rest = spectrum.exchange(place).components
-    apart = tuple(c for c in pair if c is not None)
-    return replace(spectrum, components=(*rest[:1], *apart, *rest[1:]))
-
-
-def _spare(search: Search, model: FittedModel, place: int, pair: Pair) -> float:
-    """Return by how much a model costs more with a pair apart.
-
-    A resonance that one axis alone showed stays as it is on that axis.
-    """
-    if None in pair:
-        axis = 0 if pair[1] is None else 1
-        alone = replace(model.spectrum.components[place].on(axis), axis=axis)
-        pair = (alone, None) if axis == 0 else (None, alone)
-    apart, data = _release(model.spectrum, place, pair), search.merge(model.spectrum)
-    lost = contrast(data, apart) - contrast(data, model.spectrum)
-    return lost + _saved(search, pair)
+    lost = contrast(data, _replace(spectrum, pair, shared)) - contrast(data, spectrum)
+    return shared if lost < HOPE * evidence else None
 
 
 def _axis_map(spectrum: SpectrumModel, i: int) -> FloatArray:
-    """Return the derivatives of the parameters (a,) of what axis i shows by all, (p,)."""
-    own = [k for k, c in enumerate(spectrum.components) if c.axis == i]
-    rows = np.eye(spectrum.place(len(spectrum.components)))
-    places = [BACKGROUND * i + np.arange(BACKGROUND)]
-    places += [spectrum.place(k) + np.arange(PARAMETERS) for k in (*own, *spectrum.shared)]
-    matrix = rows[np.concatenate(places)]
-    for row, k in enumerate(spectrum.shared):  # the power on the second axis has the ratio in it
-        at = BACKGROUND + PARAMETERS * (len(own) + row) + PARAMETERS - 1
-        matrix[at, spectrum.place(k) + PARAMETERS] = i
-    return np.asarray(matrix)
+    """Return the derivatives of the parameters (a,) of what axis i shows by all, (a, p).
+
+    They are linear.
+    """
+    theta, shown = spectrum.pack(), spectrum.on(i).pack()
+    rows = [spectrum.unpack(theta + step).on(i).pack() - shown for step in np.eye(theta.size)]
+    return np.transpose(rows)
 
 
 def _describe_axis(
-    search: Search, model: FittedModel, covariance: FloatArray, i: int, alone: IdentifiedAxis
+    search: Search,
+    model: FittedModel,
+    covariance: FloatArray,
+    i: int,
+    alone: IdentifiedAxis,
+    sizes: Sequence[dict[str, Any]],
 ) -> IdentifiedAxis:
     """Return axis i of a joint fit in the units of the phase."""
     spectrum, rows = model.spectrum.on(i), _axis_map(model.spectrum, i)
-    components = model.spectrum.components
-    order = [k for k, c in enumerate(components) if c.axis == i][1:] + list(model.spectrum.shared)
+    order = [k for k, c in enumerate(model.spectrum.components) if c.axis == i][1:]
+    order += model.spectrum.shared
     data = search.merge(model.spectrum)
-    whole = contrast(data, model.spectrum)
-    evidence = [contrast(data, model.spectrum.exchange(k)) - whole for k in order]
+    joint = contrast(data, model.spectrum)
+    evidence = [contrast(data, model.spectrum.exchange(k)) - joint for k in order]
     shown = FittedModel(
         spectrum=spectrum,
         contrast=contrast(alone.data, spectrum),
@@ -337,33 +282,26 @@ def _describe_axis(
         shown,
         None if error is None else error / alone.sensor_gain,
         alone.sensor_gain_note,
+        directions=[(size["direction"], size["direction_error_deg"]) for size in sizes],
     )
 
 
-def _nearest(parts: Sequence[IdentifiedLine], frequency_hz: float) -> int:
-    """Return which resonance is nearest to a frequency."""
-    return int(np.argmin([abs(line.frequency_hz - frequency_hz) for line in parts]))
-
-
-def _describe_line(
-    spectrum: SpectrumModel, covariance: FloatArray, k: int, shares: Sequence[IdentifiedLine]
-) -> IdentifiedLine:
-    """Return shared resonance k, with its size along its direction, from its shares."""
-    first, second = (share.rms_nm for share in shares)
-    rms = float(np.hypot(first, second))
-    along = np.array([first, second * spectrum.components[k].sign]) / rms
-    power = spectrum.place(k) + PARAMETERS - 1
-    slope = np.zeros((2, len(covariance)))  # of the logarithms of both rms
-    slope[:, power] = slope[1, power + 1] = 0.5
-    slope[[0, 1], [GAIN, BACKGROUND + GAIN]] = -1.0
-    logs = slope @ covariance @ slope.T
-    size, turn = along**2, along[0] * along[1] * np.array([-1.0, 1.0])
+def _describe_size(spectrum: SpectrumModel, covariance: FloatArray, j: int) -> dict[str, Any]:
+    """Return the size and the direction of the shared resonance j, with their errors."""
+    component, sizes, rows = spectrum.components[spectrum.shared[j]], [], []
+    for i in range(2):
+        shown, derivatives = spectrum.on(i), _axis_map(spectrum, i)
+        place = len(shown.components) - len(spectrum.shared) + j
+        sizes.append(np.exp(shown.components[place].log_power / 2) / shown.background.gain)
+        rows.append(derivatives[shown.place(place) + PARAMETERS - 1] / 2 - derivatives[GAIN])
+    rms = float(np.hypot(*sizes))
+    along = np.array([1.0, component.sign]) * sizes / rms
+    logs = np.array(rows) @ covariance @ np.transpose(rows)  # of the logarithms of both rms
+    square, turn = along**2, along[0] * along[1] * np.array([-1.0, 1.0])
     error = float(np.degrees(np.sqrt(max(turn @ logs @ turn, 0.0))))
-    return replace(
-        max(shares, key=lambda share: share.prominence),
-        rms_nm=rms,
-        rms_error_nm=rms * float(np.sqrt(size @ logs @ size)),
-        announced=any(share.announced for share in shares),
-        direction=(float(along[0]), float(along[1])),
-        direction_error_deg=error if spectrum.components[k].kind == "line" else None,
-    )
+    return {
+        "rms_nm": rms,
+        "rms_error_nm": rms * float(np.sqrt(square @ logs @ square)),
+        "direction": (float(along[0]), float(along[1])),
+        "direction_error_deg": error if component.kind == "line" else None,
+    }

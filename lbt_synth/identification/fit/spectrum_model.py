@@ -218,7 +218,8 @@ class SpectrumModel:
         return replace(self, components=(*before, *new, *after))
 
     def on(self, i: int) -> SpectrumModel:
-        """Return what axis i shows, its own components first."""
+        """Return what axis i shows, its turbulence first, then its own components."""
         own = [replace(c, axis=0, log_ratio=0.0) for c in self.components if c.axis == i]
+        own.sort(key=lambda c: c.kind != "turbulence")
         shared = [c.on(i) for c in self.components if c.axis is None]
         return SpectrumModel((self.axes[i],), (*own, *shared), self.roll_off_order)

@@ -22,21 +22,27 @@ of the segment's duration, is the Lorentzian smeared by the taper h::
 
     K(g, d) = int e^(-2 pi g |t|) R(t) e^(-2 pi i d t) dt,   R the autocorrelation of h
 
-It is tabulated once. (The same correction for any process is A. M. Sykulski et al., Biometrika
+The taper is a rectangle of width ``1 - e`` folded with half a cosine of width e, its edge. R is
+then made of lines and cosines, and K is twice the real part of its Laplace transform at
+``p = 2 pi (g + i d)``. (The same correction for any process is A. M. Sykulski et al., Biometrika
 106, 251 (2019), doi:10.1093/biomet/asy071.)
+
+Minima are found by scoring: Newton's method with the expected information. Each step is the best
+one of the quadratic form within a trust region (J. Nocedal, S. Wright, Numerical Optimization, 2nd
+ed. (2006), section 4.3). What the full step would gain, half the gradient's square in the metric of
+the inverse information, says how far the minimum is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.linalg.lapack import dposv
 
-from lbt_synth.identification.fit.periodogram import LoopPeriodogram, tukey
-from lbt_synth.identification.fit.scoring import EXACT, Priors, scoring_minimum
+from lbt_synth.identification.fit.periodogram import TAPER, LoopPeriodogram
 from lbt_synth.identification.fit.spectrum_model import (
     BACKGROUND,
     COLOUR,
@@ -54,16 +60,19 @@ from lbt_synth.models.resonance_spectrum import (
 )
 from lbt_synth.validation import FloatArray, IntArray
 
-DIFFERENCE = 1e-4  # of a logarithm
-WIDE = 30.0  # half width above which a line is not smeared
-_FAR = 400.0  # distance beyond which no line is smeared
-_NOTHING = 0.003  # of a line: a change that is neglected, and what is left between lobes
-_NARROWEST = 1e-9
-_WIDTHS = 72
-_LOBES = 64.0  # distance up to which single lobes are resolved
-_STEP = 0.1
-_GROWTH = 1.03  # of the steps beyond, where lobes are averaged
-_SAMPLES = 4096  # of the taper
+DIFFERENCE = 1e-4  # of a logarithm: the step of a numerical derivative
+WIDE = 30.0  # half width [periods] above which smearing changes a line by less than 0.2 %
+SKIRT = 64  # distance [periods] beyond which a sinusoid leaves less than 4e-9 of its peak
+_NARROWEST = 1e-5  # half width [periods]: below, a line is a sinusoid, and p^-2 would be rounding
+SEARCHED, EXACT = 1e-2, 1e-5  # log-likelihood that a step may still gain where a fit ends
+_FARTHEST = 60.0  # of a logarithm: exp stays finite
+_LEAST_INFORMATION = 1e-6  # of a parameter: a step is finite where the data say nothing
+_RADIUS, _LARGEST_RADIUS = 1.0, 8.0  # of the trust region
+MOST_STEPS = 40
+_ACCEPTED, _POOR, _GOOD = 0.15, 0.25, 0.75  # of what a step should gain
+_ALONG = 1e-4  # cosine below which a secant says nothing
+_WITHIN = 0.99  # of the radius: a longer step ends at it
+HOPE = 4.0  # times what is seen before a fit, it may still gain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,83 +89,33 @@ class FittedModel:
         """Covariance of the packed parameters, the inverse of the information, (p, p)."""
         return invert_information(self.information)
 
-
-@lru_cache(maxsize=1)
-def _table() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return knots of log g (w,), a grid of distances (d,), and log K between both.
-
-    The last has the coefficients of polynomials in two variables, cubic in the part of a step of
-    the grid and in log g beyond its knot, the highest power of the latter first:
-    (4, 4, w - 1, d - 1).
-    """
-    h = tukey(_SAMPLES)
-    transform = np.fft.rfft(h, 2 * _SAMPLES)
-    correlation = np.fft.irfft(np.abs(transform) ** 2)[:_SAMPLES]
-    correlation /= correlation[0]
-    t = np.arange(_SAMPLES) / _SAMPLES
-    widths = np.geomspace(_NARROWEST, 1.2 * WIDE, _WIDTHS)
-    places = np.arange(0, _LOBES + _STEP / 2, _STEP).tolist()
-    while places[-1] < 1.05 * _FAR:
-        places.append(places[-1] + _GROWTH * (places[-1] - places[-2]))
-    grid = np.array(places)
-    decaying = 2 / _SAMPLES * correlation * np.exp(-2 * np.pi * np.outer(widths, t))
-    decaying[:, 0] /= 2
-    waves = np.cos(2 * np.pi * np.outer(t, grid))
-    at, mean = decaying @ waves, (decaying * np.sinc(t)) @ waves  # the mean over a lobe
-    # of the taper itself, not of its samples
-    at, mean = (each * np.sinc(grid / _SAMPLES) ** 2 for each in (at, mean))
-    at = np.maximum(at, _NOTHING * mean)  # no fit crosses the zeros between lobes
-    blend = np.clip((grid - _LOBES / 2) / (_LOBES / 2), 0, 1)
-    k = np.maximum(at * (1 - blend) + mean * blend, 1e-14)
-    knots = np.log(widths)
-    value = CubicSpline(knots, np.log(k)).c  # (4, w, d)
-    slope = np.asarray(np.gradient(value, axis=2))
-    rise, (m0, m1) = np.diff(value, axis=2), (slope[..., :-1], slope[..., 1:])
-    powers = [value[..., :-1], m0, 3 * rise - 2 * m0 - m1, m0 + m1 - 2 * rise]
-    return knots, grid, np.stack(powers, axis=1)
-
-
-@lru_cache(maxsize=1)
-def _reaches() -> FloatArray:
-    """Return beyond which distance a line of each tabulated width is hardly changed, (w,)."""
-    knots, grid, table = _table()
-    g, distance = np.exp(knots)[:-1, None], grid[:-1]
-    change = table[-1, 0] + np.log(np.pi / g * (g**2 + distance**2))
-    last = np.max(np.where(np.abs(change) > _NOTHING, grid[1:], 0.0), axis=1)
-    return np.maximum.accumulate(last[::-1])[::-1]
-
-
-def smearing_reach(half_width: FloatArray) -> FloatArray:
-    """Return the distance beyond which lines are hardly changed, (n,)."""
-    knots, *_ = _table()
-    row = np.searchsorted(knots, np.log(np.maximum(half_width, _NARROWEST)), side="right") - 1
-    return _reaches()[np.minimum(row, knots.size - 2)]
+    @property
+    def gain_error(self) -> float:
+        """Standard error of the logarithm of the sensor gain of the first axis."""
+        return float(np.sqrt(max(self.covariance[GAIN, GAIN], 0.0)))
 
 
 def log_smearing(
-    half_width: FloatArray | float, distance: FloatArray
+    half_width: float, distance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the logarithm of the ratio of smeared lines to the lines themselves, (f,).
+    """Return the logarithm of the ratio of a smeared line to the line itself, (f,).
 
-    The half width is one for all, or (f,) as the distance. The derivatives by the logarithm of the
-    width and by the distance follow.
+    The derivatives by the logarithm of the half width and by the distance follow.
     """
-    knots, grid, table = _table()
-    g, size = np.broadcast_to(half_width, distance.shape), np.abs(distance)
-    log_width = np.log(np.maximum(g, _NARROWEST))
-    row = np.minimum(np.searchsorted(knots, log_width, side="right") - 1, knots.size - 2)
-    w = log_width - knots[row]
-    left = np.minimum(np.searchsorted(grid, size, side="right") - 1, grid.size - 2)
-    step = grid[left + 1] - grid[left]
-    x = (size - grid[left]) / step
-    c3, c2, c1, c0 = table.reshape(4, 4, -1).take(row * (grid.size - 1) + left, axis=2)
-    y0, y1, y2, y3 = ((c3 * w + c2) * w + c1) * w + c0
-    v0, v1, v2, v3 = ((3 * c3 * w + 2 * c2) * w + c1) * (g > _NARROWEST)
-    square = g**2 + distance**2
+    e, b = TAPER / 2, 2 * np.pi / TAPER
+    p = 2 * np.pi * (max(half_width, _NARROWEST) + 1j * distance)
+    r, s, edge, end = 1 / p, 1 / (p**2 + b**2), np.exp(-e * p), np.exp((2 * e - 1) * p)
+    lobes, weight = end * (1 + edge) ** 2 - 2 * edge, (b**2 * r * s) ** 2
+    transform = (4 - 6 * e - 2 * r) * r + (e * p + 2 + 2 * b**2 * s) * s + weight * lobes
+    by_lobes = 2 * e * edge - end * (1 + edge) * (1 - 2 * e + edge)
+    slope = (4 * r + 6 * e - 4) * r**2 + (e - 2 * p * s * (e * p + 2 + 4 * b**2 * s)) * s
+    slope += weight * (by_lobes - 2 * lobes * (r + 2 * p * s))
+    g, square = half_width, half_width**2 + distance**2
+    bend = 2 * np.pi * slope / transform.real
     return (
-        y0 + x * (y1 + x * (y2 + x * y3)) + np.log(np.pi / g * square),
-        v0 + x * (v1 + x * (v2 + x * v3)) + (2 * g**2 / square - 1),
-        (y1 + x * (2 * y2 + 3 * x * y3)) / step * np.sign(distance) + 2 * distance / square,
+        np.log(transform.real / (2 - 2.5 * e) * np.pi / g * square),
+        g * bend.real * (g > _NARROWEST) + (2 * g**2 / square - 1),
+        2 * distance / square - bend.imag,
     )
 
 
@@ -190,28 +149,18 @@ def _smear(
     """
     if data.duration_s is None:
         return
-    narrow = []
+    periods = data.frequency_hz * data.duration_s
     for i, c in enumerate(components):
         place = c.frequency / data.angle_s * data.duration_s
-        if c.kind == "line" and c.sections == 1 and c.damping_ratio * place <= WIDE:
-            narrow.append((i, place, c.damping_ratio * place))
-    if not narrow:
-        return
-    centres, half_widths = np.array(narrow).T[1:]
-    at = data.periods
-    reach = smearing_reach(half_widths)
-    starts, stops = np.searchsorted(at, [centres - reach, centres + reach])
-    inside = np.concatenate([at[a:b] for a, b in zip(starts, stops, strict=True)])
-    centre, half_width = np.repeat([centres, half_widths], stops - starts, axis=1)
-    more, by_width, by_distance = log_smearing(half_width, inside - centre)
-    factor, by_frequency = np.exp(more), by_width - by_distance * centre
-    end = 0
-    for (i, *_), start, stop in zip(narrow, starts, stops, strict=True):
-        inner = slice(end, end := end + stop - start)
-        density[i, start:stop] *= factor[inner]
+        half_width = c.damping_ratio * place
+        if c.kind != "line" or c.sections > 1 or half_width > WIDE:
+            continue
+        near = slice(*np.searchsorted(periods, [place - SKIRT, place + SKIRT]))
+        more, by_width, by_distance = log_smearing(half_width, periods[near] - place)
+        density[i, near] *= np.exp(more)
         if slopes is not None:
-            slopes[i, 0, start:stop] += by_frequency[inner]
-            slopes[i, 1, start:stop] += by_width[inner]
+            slopes[i, 0, near] += by_width - by_distance * place
+            slopes[i, 1, near] += by_width
 
 
 def _log_fall(
@@ -280,19 +229,16 @@ def contrasts(data: LoopPeriodogram, gain: float, model: FloatArray) -> FloatArr
 
 
 def _whiten(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return W with ``W S W^T = 1``, (n, n, f), and log det S, (f,), by Cholesky's method."""
-    n = len(matrix)
-    root, inverse = np.zeros_like(matrix), np.zeros_like(matrix)
-    for i in range(n):
-        for j in range(i):
-            rest = matrix[i, j] - np.sum(root[i, :j] * root[j, :j], axis=0)
-            root[i, j] = rest / root[j, j]
-        root[i, i] = np.sqrt(matrix[i, i] - np.sum(root[i, :i] ** 2, axis=0))
-        inverse[i, i] = 1 / root[i, i]
-        for j in range(i):
-            inverse[i, j] = -np.sum(root[i, j:i] * inverse[j:i, j], axis=0) * inverse[i, i]
-    diagonal = np.arange(n)
-    return inverse, 2 * np.sum(np.log(root[diagonal, diagonal]), axis=0)
+    """Return W with ``W S W^T = 1`` of one axis or two, (n, n, f), and log det S, (f,)."""
+    inverse, log_determinant = np.zeros_like(matrix), np.log(matrix[0, 0])
+    inverse[0, 0] = 1 / np.sqrt(matrix[0, 0])
+    if len(matrix) > 1:
+        below = matrix[1, 0] * inverse[0, 0]
+        rest = matrix[1, 1] - below**2
+        inverse[1, 1] = 1 / np.sqrt(rest)
+        inverse[1, 0] = -below * inverse[0, 0] * inverse[1, 1]
+        log_determinant += np.log(rest)
+    return inverse, log_determinant
 
 
 def _vector(matrices: FloatArray) -> FloatArray:
@@ -302,16 +248,8 @@ def _vector(matrices: FloatArray) -> FloatArray:
     """
     if matrices.shape[-2] == 1:
         return np.asarray(matrices[..., 0, :, :])
-    rows, columns, scale = _upper_triangle(matrices.shape[-2])
-    both = matrices[..., rows, columns, :] + matrices[..., columns, rows, :]
-    return np.asarray(scale * both)
-
-
-@lru_cache(maxsize=4)
-def _upper_triangle(n: int) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return rows and columns of the entries of a vector (m,), and half their weights (m, 1)."""
-    rows, columns = np.triu_indices(n)
-    return rows, columns, np.where(rows == columns, 0.5, np.sqrt(0.5))[:, None]
+    between = np.sqrt(0.5) * (matrices[..., 0, 1, :] + matrices[..., 1, 0, :])
+    return np.stack([matrices[..., 0, 0, :], between, matrices[..., 1, 1, :]], axis=-2)
 
 
 def _outer(one: FloatArray, other: FloatArray) -> FloatArray:
@@ -349,8 +287,8 @@ def derivatives(
 ) -> tuple[float, FloatArray, FloatArray]:
     """Return L without the priors, its gradient (p,) and its information matrix (p, p).
 
-    ``held`` (f,) is a density beside that of one axis. The rows of sensor gains are exact second
-    derivatives; there are none by the gains of two axes.
+    ``held`` (f,) is a density beside that of one axis. The row of its sensor gain is of exact
+    second derivatives; there are none by the gains of two axes.
     """
     n, start, root = len(spectrum.axes), spectrum.place(0), np.sqrt(data.count)
     s = data.half_angle_square
@@ -386,13 +324,125 @@ def derivatives(
     flat = rows.reshape(len(rows), -1)
     gradient, information = flat @ (root * (unit - measured)).ravel(), flat @ flat.T
     value = data.count @ (log_determinant + unit.T @ measured)[0]
-    for i in range(n):  # the gains change the data, not the model
-        slope, bend = data.gain_slopes(spectrum.gains, i)
-        by_gain, at = whiten(slope), BACKGROUND * i + GAIN
-        gradient[at] = data.count @ (unit.T @ by_gain)[0]
-        information[at] = information[:, at] = -(flat @ (root * by_gain).ravel())
-        information[at, at] = data.count @ (bend / matrix[0, 0]) if n == 1 else 0.0
+    if n == 1:  # the gain changes the data, not the model
+        gain = spectrum.background.gain
+        by_gain = 2 * gain * (data.crossed + gain * data.corrected) / matrix[0, 0]
+        bend = by_gain + 2 * gain**2 * data.corrected / matrix[0, 0]
+        gradient[GAIN], information[GAIN, GAIN] = data.count @ by_gain, data.count @ bend
+        information[GAIN, 1:] = information[1:, GAIN] = -(flat[1:] @ (root * by_gain))
     return float(value), gradient, information
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Priors:
+    """Normal priors on the packed parameters: a width of infinity is none, 0 fixes one."""
+
+    centre: FloatArray  # (p,): means
+    width: FloatArray  # (p,): standard deviations
+    bounds: tuple[FloatArray | float, FloatArray | float] = (-_FARTHEST, _FARTHEST)  # (p,) each
+
+    @property
+    def free(self) -> IntArray:
+        """Places of the parameters that a fit varies."""
+        return np.flatnonzero(self.width > 0)
+
+
+def scoring_minimum(
+    differentiate: Callable[[FloatArray], tuple[float, FloatArray, FloatArray]],
+    start: FloatArray,
+    priors: Priors,
+    *,
+    bound: float = float("inf"),
+    accuracy: float = EXACT,
+) -> tuple[FloatArray, FloatArray] | None:
+    """Minimise a contrast of the free parameters and their priors, within bounds.
+
+    ``differentiate`` returns the contrast, its gradient and its information matrix. Return the
+    parameters (free,) and the information (free, free); None if the contrast is not finite, or
+    where it is unlikely to fall below ``bound``.
+    """
+    free = priors.free
+    centre, precision = priors.centre[free], 1 / priors.width[free] ** 2
+    low, high = (np.broadcast_to(ends, priors.width.shape)[free] for ends in priors.bounds)
+
+    def evaluate(x: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        value, gradient, information = differentiate(x)
+        away = x - centre
+        return (
+            value + 0.5 * float(np.sum(precision * away**2)),
+            gradient + precision * away,
+            information + np.diag(precision + _LEAST_INFORMATION),
+        )
+
+    x, radius = np.clip(start, low, high), _RADIUS
+    value, gradient, information = evaluate(x)
+    rest = np.zeros_like(information)  # of the second derivatives
+    for _ in range(MOST_STEPS):
+        if not (np.isfinite(value) and np.all(np.isfinite(information))):
+            return None
+        curvature, slope = information + rest, gradient
+        stays = ((x <= low) & (slope > 0)) | ((x >= high) & (slope < 0))  # at a bound
+        if np.any(stays):
+            curvature[stays] = curvature[:, stays] = 0
+            curvature[stays, stays], slope = 1, np.where(stays, 0, slope)
+        step, gain, expected = _best_step(curvature, slope, radius)
+        if gain < accuracy:
+            break
+        size = float(np.linalg.norm(step))
+        if value - HOPE * gain > bound and size < _WITHIN * radius:
+            return None  # a whole step, which can be trusted
+        trial = np.clip(x + step, low, high)
+        made = evaluate(trial)
+        if np.isfinite(made[0]):
+            between = 0.5 * (information + made[2])
+            rest = rest + _secant(made[1] - gradient - (between + rest) @ (trial - x), trial - x)
+        gained = (value - made[0]) / expected
+        if not gained > _POOR:
+            radius = 0.25 * min(radius, size)
+        elif gained > _GOOD and size > _WITHIN * radius:
+            radius = min(2 * radius, _LARGEST_RADIUS)
+        if gained > _ACCEPTED:
+            x, (value, gradient, information) = trial, made
+    return x, information
+
+
+def _best_step(
+    curvature: FloatArray, gradient: FloatArray, radius: float
+) -> tuple[FloatArray, float, float]:
+    """Return the step (p,) that minimises a quadratic form within a radius, and two gains.
+
+    The first is that of the minimum without a radius, the second that of this step. The curvature
+    (p, p) counts by its absolute value.
+    """
+    whole, info = dposv(curvature, -gradient)[1:]
+    if info == 0 and float(np.linalg.norm(whole)) <= radius:
+        gain = -0.5 * float(gradient @ whole)
+        return whole, gain, gain
+    size, axes = np.linalg.eigh(curvature)
+    size, slope = np.maximum(np.abs(size), _LEAST_INFORMATION), gradient @ axes
+    step = _trust_step(slope, size, radius)
+    gain = 0.5 * float(np.sum(slope**2 / size))
+    return axes @ step, gain, -float(slope @ step + 0.5 * step @ (size * step))
+
+
+def _secant(missing: FloatArray, step: FloatArray) -> FloatArray:
+    """Return the symmetric rank-one matrix that maps a step to ``missing``; 0 if nearly normal."""
+    along = float(missing @ step)
+    least = _ALONG * float(np.linalg.norm(missing) * np.linalg.norm(step))
+    return np.outer(missing, missing) / along if abs(along) > least else np.zeros((step.size,) * 2)
+
+
+def _trust_step(slope: FloatArray, curvature: FloatArray, radius: float) -> FloatArray:
+    """Return the step (p,) to the minimum of a quadratic form within a radius, in its axes."""
+    more = 0.0
+    for _ in range(MOST_STEPS):
+        step = -slope / (curvature + more)
+        size = float(np.linalg.norm(step))
+        if size <= 1.001 * radius:
+            break
+        # Newton's method for 1 / size = 1 / radius, from below
+        more += size**2 / float(np.sum(step**2 / (curvature + more))) * (size / radius - 1)
+    return step
 
 
 def minimise(

@@ -1,10 +1,4 @@
-"""Controllers compared on data that nothing was fitted to, beside what the model promises.
-
-One of them is the FIR predictor of a record by least squares. With the mirror's taps c, the series
-``zf(k) = c[0] z(k) + c[1] z(k-1) + ...`` and commands ``u(k) = a[0] z(k) + a[1] z(k-1) + ...``, the
-measured residual is ``e(k) = z(k) - a[0] zf(k-1) - a[1] zf(k-2) - ...``: a linear regression whose
-sum of squares is the one that a replay measures, for any delay and mirror.
-"""
+"""Controllers compared on data that nothing was fitted to, beside what the model promises."""
 
 from __future__ import annotations
 
@@ -13,19 +7,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.identification.accelerometers.readings import Channels
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
+from lbt_synth.identification.prediction.regression import regress
 from lbt_synth.identification.prediction.residual import (
     ResidualEstimate,
     check_series,
     estimate_residual,
     gather,
     inverse_sensor,
-    invert,
     mode_noise,
     replay,
     settled_test,
@@ -36,22 +30,22 @@ from lbt_synth.identification.stretches import Stretches, StretchesLike, split_h
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import (
+    ClosedLoop,
     Imaging,
     close_loop,
     jitter_strehl,
     residual_budget,
 )
-from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import LoopHardware, TipTiltPlant
 from lbt_synth.storage.rows import column, nm_column, table_row
-from lbt_synth.validation import FloatArray, frozen_copy, integer, require_instance
+from lbt_synth.validation import FloatArray, frozen_copy, matrix, require_instance
 
 RAN = "what ran"
 INTEGRATOR = "best integrator"
-PREDICTOR = "least-squares predictor"
+ALONE = "predictor without channels"
 LIMIT = "limit of performance"
 
 
@@ -89,14 +83,14 @@ class PredictionRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PredictionTable:
-    """What ran, controllers, a predictor without a model, and the limit, on the same data.
+    """What ran, controllers, and the limit, on the same data.
 
     Attributes
     ----------
     entries : tuple of PredictionRow
         The rows.
     fit, test : tuple of (start, stop)
-        Frames that the predictor was fitted to, and those that all rows are measured on: the
+        Frames that controllers may be fitted to, and those that all rows are measured on: the
         halves of the usable frames, without the first half second of a stretch.
     notes : tuple of str
         What is left out of the table or cannot be, and why.
@@ -116,90 +110,6 @@ class PredictionTable:
         raise ProblemError(f"the table has the rows {names}; got {name!r}.")
 
 
-def least_squares_predictor(
-    open_loop: ArrayLike,
-    hardware: LoopHardware,
-    *,
-    taps: int = 32,
-    stretches: StretchesLike | None = None,
-) -> tuple[Controller, FloatArray]:
-    """Fit the FIR predictor of least residual of each mode to a record, and make it a controller.
-
-    Parameters
-    ----------
-    open_loop, hardware, stretches
-        As for :func:`replayed_residual`.
-    taps : int, optional
-        Coefficients per mode.
-
-    Returns
-    -------
-    controller : Controller
-        From y(k) to u(k). The filter is its Youla parameter (:func:`youla_controller`): the loop
-        is stable for any coefficients, at the sensor gain of the fit.
-    coefficients : (n, taps) ndarray
-        What z_i(k-l) adds to the correction of mode i that u(k) commands; of least norm where
-        regressors depend on each other.
-
-    Raises
-    ------
-    ProblemError
-        If a value is out of range, sizes clash, or there are fewer frames than coefficients.
-
-    Examples
-    --------
-    Two frames ahead, an AR1 process without noise is predicted by the square of its pole:
-
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2, modes=1)
-    >>> slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=10.0, frame_rate_hz=800)
-    >>> idle = lbt.Controller(A=0.0, B=0.0, C=0.0, D=0.0, dt_s=1 / 800)
-    >>> run = lbt.simulate(idle, lbt.Truth(turbulence=slow), hardware=path, frames=20_000)
-    >>> _, taps = lbt.identification.least_squares_predictor(run.total_nm[0], path, taps=1)
-    >>> bool(abs(taps[0, 0] - 0.81) < 0.02)
-    True
-    """
-    require_instance(hardware, LoopHardware)
-    count = integer(taps, "taps", at_least=1)
-    back, n = inverse_sensor(hardware), hardware.modes
-    need = "a predictor needs a command for every mode, and an influence matrix"
-    to_command = invert(hardware.influence, need)
-    series, parts = check_series(open_loop, n, stretches)
-    blocks = [_regression(series[a:b], hardware.mirror_taps, count) for a, b in parts]
-    X, Z = (np.concatenate(block) for block in zip(*blocks, strict=True))
-    if len(X) < count:
-        raise ProblemError(
-            f"a predictor needs a frame to fit for each of {count} coefficients, beside {count} at "
-            f"the beginning of each stretch; got {len(X)}. Record more, or lower taps."
-        )
-    tolerance = np.finfo(float).eps * (count + 1)
-    fits = [np.linalg.lstsq(X[:, i], Z[:, i], rcond=tolerance)[0] for i in range(n)]
-    coefficients = np.array(fits)
-    # an FIR filter of z from y to u, whose states are the last z
-    parameter = Controller(
-        A=np.eye(n * count, k=-n),
-        B=np.vstack([back, np.zeros((n * (count - 1), n))]),
-        C=to_command @ np.hstack([np.diag(column) for column in coefficients.T]),
-        D=np.zeros((n, n)),
-        dt_s=hardware.dt_s,
-    )
-    return youla_controller(hardware, parameter), frozen_copy(coefficients)
-
-
-def _regression(
-    series: FloatArray, mirror_taps: FloatArray, count: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return regressors ``zf(k-1), zf(k-2), ...`` (rows, n, taps) and targets z(k) (rows, n)."""
-    frames, n = series.shape
-    m = len(mirror_taps)
-    rows = frames - (m - 1) - count  # the first needs zf(k-taps), which needs m values of z
-    if rows < 1:
-        return np.zeros((0, n, count)), np.zeros((0, n))
-    filtered = sliding_window_view(series, m, axis=0) @ mirror_taps[::-1]
-    late = sliding_window_view(filtered, count, axis=0)[:rows, :, ::-1]
-    return np.asarray(late), series[m - 1 + count :]
-
-
 def prediction_against_data(
     plant: TipTiltPlant,
     open_loop: ArrayLike,
@@ -210,12 +120,12 @@ def prediction_against_data(
     running: Controller | Design | None = None,
     noise_error_nm: ArrayLike = 0.0,
     imaging: Imaging | None = None,
-    taps: int = 32,
+    readings: ArrayLike | None = None,
 ) -> PredictionTable:
     """Replay controllers on frames that nothing was fitted to, and compare with the model.
 
-    Other rows are the best integrator by the model, a :func:`least_squares_predictor` from the
-    first half of the frames, and the least residual of any linear controller if the model is true.
+    Other rows are the best integrator by the model, and the least residual of any linear controller
+    of the loop's own sensor if the model is true.
 
     Parameters
     ----------
@@ -232,13 +142,14 @@ def prediction_against_data(
         The controller that ran, if it is known, for what the model says of it.
     imaging : Imaging, optional
         The camera, for Strehl ratios on at most two axes.
-    taps : int, optional
-        Coefficients of the predictor per mode.
+    readings : (frames, c) array_like, optional
+        What accelerometers read in the frames of open_loop [m/s^2], for designs that read them; the
+        model promises nothing of these.
 
     Returns
     -------
     PredictionTable
-        Rows in this order: what ran, best integrator, controllers, predictor, limit.
+        Rows in this order: what ran, best integrator, controllers, limit.
 
     Raises
     ------
@@ -261,7 +172,7 @@ def prediction_against_data(
     ...     plant, y[2:] + u[:-2], {"Kalman": lbt.kalman(plant)}, measurements=y[2:]
     ... )
     >>> [entry.name for entry in table.entries][::2]
-    ['what ran', 'Kalman', 'limit of performance']
+    ['what ran', 'Kalman']
     >>> bool(abs(table["Kalman"].deviations) < 4)
     True
     """
@@ -273,20 +184,20 @@ def prediction_against_data(
     fit, later = split_halves(runs, len(series))
     test = settled_test(runs, later, hardware)
     noise = mode_noise(hardware, plant.R, noise_error_nm)
-    predictor, _ = least_squares_predictor(series, hardware, taps=taps, stretches=fit)
-    designs = {INTEGRATOR: model_integrator(plant), **controllers, PREDICTOR: predictor}
-    if len(designs) < 2 + len(controllers) or {RAN, LIMIT} & set(controllers):
+    designs = {INTEGRATOR: model_integrator(plant), **controllers}
+    if {RAN, INTEGRATOR, LIMIT} & set(controllers):
         raise ProblemError(
-            f"no controller may be called {RAN}, {INTEGRATOR}, {PREDICTOR} or {LIMIT}, as other "
-            f"rows are; got {', '.join(controllers)}. Give other names."
+            f"no controller may be called {RAN}, {INTEGRATOR} or {LIMIT}, as other rows are; got "
+            f"{', '.join(controllers)}. Give other names."
         )
     if running is not None:
         designs[RAN] = running
-    loops = {name: close_loop(hardware, as_controller(x)) for name, x in designs.items()}
+    loops = {name: _close(hardware, design) for name, design in designs.items()}
     stable = {name: loop for name, loop in loops.items() if loop.is_stable}
     unstable = loops.keys() - stable.keys()
     notes = [f"{name} is unstable at the sensor gain of the model" for name in sorted(unstable)]
-    measured = {name: replay(stable[name], series, runs) for name in stable if name != RAN}
+    beside = None if readings is None else matrix(readings, "readings")
+    measured = {n: replay(loop, series, runs, beside) for n, loop in stable.items() if n != RAN}
     if measurements is not None:
         y, _ = check_series(measurements, hardware.n_measurements, test, "measurements")
         if len(y) != len(series):
@@ -299,7 +210,7 @@ def prediction_against_data(
     for name, residual in measured.items():
         estimate = estimate_residual(gather(residual, test), test, *noise)
         promised = None
-        if name in stable:  # as a record has it, in means over frames
+        if name in stable and not stable[name].reads_others:  # in means over frames, as records are
             promised = residual_budget(stable[name], plant, frame_means=True).total_nm2
         rows.append(_build_row(name, estimate, promised, imaging))
     if refuted := [row.name for row in rows if row.replayed and row.replayed.refuted]:
@@ -318,6 +229,13 @@ def prediction_against_data(
     return PredictionTable(entries=tuple(rows), fit=fit, test=test, notes=tuple(notes))
 
 
+def _close(hardware: LoopHardware, design: Controller | Design) -> ClosedLoop:
+    """Close the loop of a model around a controller, or a design with the sensors it reads."""
+    if isinstance(design, Design):
+        return design.close(hardware)
+    return close_loop(hardware, as_controller(design))
+
+
 def compare_designs(
     record: LoopRecord,
     half: IdentifiedModel,
@@ -327,13 +245,20 @@ def compare_designs(
     others: Mapping[str, Controller] | None = None,
     running: Controller | None = None,
     imaging: Imaging | None = None,
+    channels: Channels | None = None,
 ) -> tuple[PredictionTable, dict[str, Design]]:
     """Return what designs for a model of the first half of a record leave of the second.
 
     ``requests`` are the options of methods by their names, and ``others`` further controllers by
-    theirs. The designs with a row are returned by their titles; the others have a note.
+    theirs. The designs with a row are returned by their titles; the others have a note. A predictor
+    reads the channels beside the record, too.
     """
-    inputs = PlantInputs(plant=half.plant(), design_defaults=defaults or {})
+
+    def predict() -> Design:
+        first, _ = split_halves(record.stretches(), record.frames)
+        return regress(record, half, stretches=first, channels=channels).design()
+
+    inputs = PlantInputs(plant=half.plant(), design_defaults=defaults or {}, predict=predict)
     designs, notes = dict[str, Design](), list[str]()
     for method, options in requests.items():
         title = method_named(method).title
@@ -350,12 +275,36 @@ def compare_designs(
         running=running,
         noise_error_nm=[axis.noise_error_nm for axis in half.axes],
         imaging=imaging,
+        readings=None if channels is None else channels.values,
     )
     rows = {row.name for row in table.entries}
     return (
         replace(table, notes=(*notes, *table.notes)),
         {title: design for title, design in designs.items() if title in rows},
     )
+
+
+def unseen_claims(
+    record: LoopRecord, half: IdentifiedModel, design: Design, channels: Channels | None
+) -> dict[str, float]:
+    """Return what a predictor of the first half of a record claims of the second [nm rms].
+
+    A residual that the noise hides is not claimed.
+    """
+    series = record.pseudo_open_loop(half.sensor_gains)
+    runs = record.stretches()
+    test = settled_test(runs, split_halves(runs, len(series))[1], half.hardware)
+    noise = mode_noise(half.hardware, half.plant().R, [a.noise_error_nm for a in half.axes])
+    names, claims = iter(("residual_nm", "alone_nm")), dict[str, float]()
+    for controller in design.controllers.values():
+        loop = close_loop(design.hardware or half.hardware, controller)
+        residual = replay(loop, series, runs, None if channels is None else channels.values)
+        estimate = estimate_residual(gather(residual, test), test, *noise)
+        name = next(names)
+        if estimate.total_nm2 > 0:
+            claims[name] = estimate.rms_nm
+            claims.setdefault("residual_error_nm", estimate.rms_error_nm)
+    return claims
 
 
 def _build_row(

@@ -307,7 +307,7 @@ def settled_test(runs: Stretches, test: Stretches, hardware: LoopHardware) -> St
 
     Refuse a test outside of the runs, or one of less than half a second.
     """
-    settle, kept = _settle_frames(hardware), []
+    settle, kept = settle_frames(hardware), []
     for start, stop in test:
         first = next((a for a, b in runs if a <= start and stop <= b), None)
         if first is None:
@@ -325,7 +325,7 @@ def settled_test(runs: Stretches, test: Stretches, hardware: LoopHardware) -> St
     return tuple(kept)
 
 
-def _settle_frames(hardware: LoopHardware) -> int:
+def settle_frames(hardware: LoopHardware) -> int:
     """Return the frames in which a loop forgets where it began."""
     return max(round(_SETTLE_S * hardware.frame_rate_hz), 1)
 
@@ -335,17 +335,23 @@ def gather(series: FloatArray, stretches: Stretches) -> FloatArray:
     return np.concatenate([series[start:stop] for start, stop in stretches])
 
 
-def replay(loop: ClosedLoop, series: FloatArray, runs: Stretches) -> FloatArray:
+def replay(
+    loop: ClosedLoop, series: FloatArray, runs: Stretches, readings: FloatArray | None = None
+) -> FloatArray:
     """Return the measured residual (frames, n) of a stable loop on a series, nan outside of runs.
 
-    z(k) stands for phi_tot(k-1), without noise: the residual of frame k-1 is e(k).
+    z(k) stands for phi_tot(k-1), without noise: the residual of frame k-1 is e(k). A loop that
+    reads channels is given their readings (frames, c), which come in the frame of the measurement.
     """
-    path, first = loop.rejection(), _settle_frames(loop.hardware)
+    path, driven, first = loop.rejection(), series, settle_frames(loop.hardware)
+    if loop.reads_others and readings is not None:
+        path = loop.rejection_with_channels()
+        driven = np.hstack([series, np.vstack([readings[:1], readings[:-1]])])
     constant = path.frequency_response([0.0])[0].real  # what the loop leaves of a constant
     residual = np.full(series.shape, np.nan)
     for start, stop in runs:
-        mean = np.mean(series[start : min(stop, start + first)], axis=0)
-        residual[start:stop] = filter_series(path, series[start:stop] - mean) + constant @ mean
+        mean = np.mean(driven[start : min(stop, start + first)], axis=0)
+        residual[start:stop] = filter_series(path, driven[start:stop] - mean) + constant @ mean
     return residual
 
 

@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.validation import FloatArray, IntArray, number, real_array
 
+SAME_FRAME = 0.45  # of a frame, by which the step between two times may be off: less than half
+_EXACT = 0.02  # of a frame, within which all times of exact stamps lie on the grid of their rate
 _SAME_RATE = 1e-4  # by which a stated rate may differ from that of the times: a cheap clock
+_MOST_ODD = 0.1  # of the rows, whose steps may be those of lost frames and not of another rate
 _MOST_HOLES = 9  # missing frames over those that are there; more fill the memory
-_CLEAR = 0.45  # of a frame, by which the steps of complete rows may differ
-_NARROW = 0.1  # of a frame, or of the steps: what is less is jitter, or chance
-_COARSE = 0.02  # of a frame: times in smaller steps are not rounded, but jitter
-_FEW = 3  # odd steps that show an order
+_NOT_USED = "the times do not tell frames apart and were not used"
 
 
 class Clock(NamedTuple):
@@ -24,7 +24,6 @@ class Clock(NamedTuple):
     frame_rate_hz: float
     frame_of_row: IntArray  # (rows,), from 0, never falling; equal for rows of the same time
     notes: list[str]
-    jitter_frames: float | None = None  # rms distance of the times from the grid; None without any
 
 
 def build_clock(
@@ -36,21 +35,17 @@ def build_clock(
 ) -> Clock:
     """Lay rows on a regular grid, by their frame numbers (rows,) or times (rows,).
 
-    Times that stand still, or whose steps are longer than a frame, are not used beside a rate.
+    Rows are complete where their number is that of a stated rate, however coarse their times are.
     """
     rate = None if frame_rate_hz is None else number(frame_rate_hz, "frame_rate_hz", above=0)
     times = None if times_s is None else _check_rising(times_s, "times_s", rows)
     frame = np.arange(rows)
     if frame_numbers is not None:
         frame = _frames_from_counter(_check_rising(frame_numbers, "frame_numbers", rows))
-    notes: list[str] = []
-    times = times if rows > 1 else None
-    if times is not None and rate is not None and _tell_nothing(times, rate):
-        times, notes = None, ["the times do not tell frames apart and were not used"]
-    if times is None:
+    if times is None or rows == 1 or (rate is not None and times[0] == times[-1]):
         if rate is None:
             raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
-        return Clock(rate, frame, notes)
+        return Clock(rate, frame, [] if times is None or rows == 1 else [_NOT_USED])
     if frame_numbers is None:
         frame = _frames_from_times(times, rate)
     rate_of_times, off = _fit_rate(times, frame)
@@ -58,19 +53,11 @@ def build_clock(
         rate, notes = rate_of_times, [f"frame rate {rate_of_times:.9g} Hz, from the times"]
     else:
         notes = _compare_rates(rate, rate_of_times, int(frame[-1]), float(np.ptp(off)))
-    return Clock(rate, frame, notes, float(np.std(off)) if rows > 2 else None)
-
-
-def _tell_nothing(times: FloatArray, rate: float) -> bool:
-    """Return whether rows share times that stand still or rise by frames at once, as seconds do.
-
-    The number of rows must be that of the rate.
-    """
-    frames, stamps = float(times[-1] - times[0]) * rate, int(np.sum(np.diff(times) > 0))
-    if not frames or stamps == len(times) - 1:
-        return not frames
-    is_complete = abs(frames - (len(times) - 1)) <= frames / stamps
-    return is_complete and _step(times, rate) > 1
+        if _quantum(times) * rate > 1 + SAME_FRAME and np.any(np.diff(times) == 0):
+            return Clock(rate, frame, [_NOT_USED])
+    if (jitter := float(np.std(off))) > _EXACT:
+        notes.append(f"the times lie {jitter:.2g} frames rms beside a regular grid")
+    return Clock(rate, frame, notes)
 
 
 def _compare_rates(rate: float, rate_of_times: float, frames: int, loose: float) -> list[str]:
@@ -134,81 +121,52 @@ def _require_few_holes(frames: float, rows: int) -> None:
 
 
 def _frames_from_times(times: FloatArray, rate: float | None) -> IntArray:
-    """Return the frame of each row, from 0, by times."""
-    steps = np.diff(times)
-    rising = steps[steps > 0]
-    if rising.size == 0:
+    """Return the frame of each row, from 0, by times.
+
+    Times on the grid of a stated rate are exact. Those that stay within the step to which they are
+    rounded are of complete rows. Others tell frames by their steps, unless these are rounded.
+    """
+    steps, complete = np.diff(times), np.arange(len(times))
+    if times[-1] == times[0]:
         raise ProblemError("times_s must rise; all rows have the same time.")
-    period = float(np.median(rising)) if rate is None else 1 / rate
+    period = float(np.median(steps[steps > 0])) if rate is None else 1 / rate
     _require_few_holes(float(times[-1] - times[0]) / period + 1, len(times))
-    if rising.size == len(steps) and np.ptp(steps) < _CLEAR * float(np.median(steps)):
-        # no frame is missing, whatever the rate is: that is compared afterwards
-        return np.arange(len(times))
-    return _lay_by_steps(times, period) if rate is None else _lay_by_rate(times, rate)
-
-
-def _lay_by_steps(times: FloatArray, period: float) -> IntArray:
-    """Lay rows by the steps in time, for an unknown rate."""
-    steps = np.diff(times) / period
-    counts = np.round(steps)
-    away = np.abs(steps - counts)
-    if np.any(away >= _CLEAR / 2):
+    rounding, place = _quantum(times) / period, (times - times[0]) / period
+    if rate is not None:
+        grid = np.round(place)
+        if rounding < 1 + SAME_FRAME and np.max(np.abs(place - grid)) <= _EXACT:
+            return np.asarray(grid, dtype=np.int64)
+        slack = 1e-6 + 16 * float(np.spacing(np.max(np.abs(times)))) / period
+        late = place - complete
+        # a frame lost before a row is hidden if all later rows are later, by 1 less the rounding
+        ahead = np.minimum.accumulate(late[::-1])[-2::-1] - np.maximum.accumulate(late)[:-1]
+        hides = SAME_FRAME < rounding < 1 + slack and np.any(ahead >= 1 - rounding - slack)
+        if np.ptp(late) <= max(rounding + slack, SAME_FRAME) and not hides:
+            return complete
+    if np.ptp(steps) < SAME_FRAME * float(np.median(steps)):
+        return complete  # whatever the rate is: that is compared afterwards
+    counts = np.round(steps / period)
+    is_ambiguous = rounding > SAME_FRAME
+    if rate is None and is_ambiguous:  # other frames, of rows that are complete at another rate
+        off = _fit_rate(times, complete)[1]
+        odd, spread = float(np.mean(counts != 1)), float(np.ptp(off))
+        is_ambiguous = odd > _MOST_ODD or spread < (1 + SAME_FRAME) * rounding
+    if is_ambiguous:
+        advice = "frame_rate_hz" if rate is None else "a counter of frames"
+        raise ProblemError(
+            f"times_s in steps of {_quantum(times):.6g} s may be rounded: they cannot tell which "
+            f"frames are missing or repeated at {1 / period:.9g} Hz. Give {advice}, or leave the "
+            "times away."
+        )
+    away = np.abs(steps / period - counts)
+    if np.any(away >= SAME_FRAME):
         k = int(np.argmax(away))
         raise ProblemError(
             f"times_s lie on no regular grid of {1 / period:.6g} Hz; row {k + 1} comes "
-            f"{steps[k]:.3g} frames after the one before. Give frame_rate_hz, a counter of frames, "
-            "or leave the times away."
-        )
-    rate, off = _fit_rate(times, np.arange(len(times)))
-    odd = int(np.sum(counts != 1)) if _quantum(times) > _COARSE * period else 0
-    if odd >= _FEW and (odd > _NARROW * len(times) or np.ptp(off) < 1.2 * rate * period):
-        raise ProblemError(
-            f"the steps in time are those of missing or repeated frames at {1 / period:.6g} Hz, or "
-            f"of no such frame at {rate:.6g} Hz: the times may be rounded. Give frame_rate_hz."
+            f"{steps[k] / period:.3g} frames after the one before. Give the right frame_rate_hz, a "
+            "counter of frames, or leave the times away."
         )
     return np.asarray(np.concatenate([[0], np.cumsum(counts)]), dtype=np.int64)
-
-
-def _lay_by_rate(times: FloatArray, rate: float) -> IntArray:
-    """Lay rows on the grid of a known rate, where one layout alone explains their times.
-
-    Rounded to a step, the times of a layout stay within the step of a straight line. Each gap
-    among the parts of a frame at which rows come may be the one where frames begin.
-    """
-    place, step = (times - times[0]) * rate, _step(times, rate)
-    slack = _slack(times, rate)
-    parts = np.sort(place % 1)
-    gaps = np.diff(np.append(parts, parts[0] + 1))
-    wide = np.flatnonzero(gaps > 1 - step - slack)
-    if step <= _COARSE:
-        wide = np.flatnonzero(gaps == max(np.max(gaps), _NARROW))
-    layouts: list[FloatArray] = []
-    for k in wide if step < 1 else ():
-        frame = np.floor(place - (parts[k] + gaps[k] / 2))
-        frame -= frame[0]
-        is_new = not any(np.array_equal(frame, layout) for layout in layouts)
-        if is_new and not np.any(np.diff(frame)[np.diff(times) > 0] <= 0):
-            layouts.append(frame)
-        if len(layouts) > 1:
-            break
-    if len(layouts) != 1:
-        raise ProblemError(
-            f"times_s in steps of {_quantum(times):.6g} s cannot tell which frames are missing or "
-            f"repeated on the grid of {rate:.9g} Hz. Give a counter of frames, or leave the times "
-            "away."
-        )
-    return np.asarray(layouts[0], dtype=np.int64)
-
-
-def _step(times: FloatArray, rate: float) -> float:
-    """Return the step to which times are rounded [frames]; 0 of exact ones, in whole frames."""
-    step = _quantum(times) * rate
-    return 0.0 if abs(step - 1) * len(times) < _slack(times, rate) else step
-
-
-def _slack(times: FloatArray, rate: float) -> float:
-    """Return what double precision leaves open of times [frames]."""
-    return 1e-6 + 16 * rate * float(np.spacing(np.max(np.abs(times))))
 
 
 def _quantum(times: FloatArray) -> float:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -195,12 +195,6 @@ def _add_rows(
 ) -> None:
     """Add the columns of numbered rows; leave out those of texts that no role needs."""
     lines, columns = [line for _, line in rows], [parse_column(name, np.empty(0)) for name in names]
-    with suppress(ValueError):  # the quick way, which knows no gaps
-        numbers = np.loadtxt(lines, delimiter=sign, comments=None, ndmin=2, dtype=np.float64)
-        if numbers.shape == (len(rows), len(names)):
-            pairs = zip(columns, numbers.T, strict=True)
-            out.columns += [replace(column, values=values) for column, values in pairs]
-            return
     table = [line.split() for line in lines] if sign is None else csv.reader(lines, delimiter=sign)
     cells = []
     for (n, _), row in zip(rows, table, strict=True):

@@ -177,8 +177,6 @@ class RecordHealth:
     usable: int  # frames that count as data
     findings: tuple[Finding, ...] = ()  # empty for a clean record
     notes: tuple[str, ...] = ()  # how a file was read, what was repaired, what changes with time
-    # rms distance of the rows' times from the regular grid; None without times
-    jitter_frames: float | None = None
 
     def summary(self) -> str:
         """Return one line: how many frames are usable, and why the others are not."""

@@ -1,4 +1,7 @@
-"""Records from files of any origin, from telemetry, and from a second file with the commands."""
+"""Records from files of any origin, from telemetry, and from a second file with the commands.
+
+The facts and units of the source stand beside those of the call.
+"""
 
 from __future__ import annotations
 
@@ -14,30 +17,50 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError, TelemetryError
 from lbt_synth.files import Telemetry, load_telemetry
-from lbt_synth.identification.records.columns import Column, seconds_per, unit_name
+from lbt_synth.identification.records.clock import SAME_FRAME
+from lbt_synth.identification.records.columns import (
+    VOLTS,
+    Column,
+    density_unit,
+    hz_per,
+    is_angle,
+    nm_per,
+    same_unit,
+    seconds_per,
+    unit_name,
+)
 from lbt_synth.identification.records.contents import (
     CLOCKS,
     FITS,
     KINDS,
     Contents,
+    Roles,
     choose_axes,
+    join_names,
     name_in_errors,
     number_axes,
     read_contents,
     select_series,
 )
-from lbt_synth.identification.records.from_columns import FACTS, build_loop, build_spectrum
+from lbt_synth.identification.records.faults import merge_notes
+from lbt_synth.identification.records.from_series import loop_record
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import read_cards
 from lbt_synth.storage.input_files import LARGEST_TEXT_BYTES, open_input
-from lbt_synth.validation import FloatArray, IntArray, choice
+from lbt_synth.validation import FloatArray, choice, number
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of this package, and of the AOT standard
-_TELEMETRY_ARRAYS = {"META", "COMMANDS", "MEASURE"}
+_TELEMETRY_ARRAYS = {"META", "MEASURE"}
 _FOREIGN = "timing"  # key of metadata in telemetry of other programs
+_STATED_GAIN, _READ_WITH = "stated_sensor_gain", "commands_read_with"  # of a record that was read
 _CONDITION = float(np.finfo(np.float64).eps ** -0.5)  # beyond, an inverse is half rounding
-_SAME_TIME = 0.25  # of a step, within which two rows are of one frame
+_RATES_HZ = (5.0, 1e5)  # plausible for times without a unit
+_FACTS = ("frame_rate_hz", "diameter_m", "delay_frames", "obstruction")
+_UNITS = {
+    "loop": "nm, um, m of wavefront, or mas, arcsec, urad, rad of tilt",
+    "spectrum": "nm^2/Hz, or mas^2/Hz of tilt; nm/sqrt(Hz) of an amplitude",
+}
 
 
 def load_record(
@@ -83,8 +106,8 @@ def load_record(
         What names do not tell: names or numbers (from 0) of columns under "measurements",
         "open_loop", "commands", "times", "frame_numbers", "frequency" or "density".
     commands : path-like, optional
-        Another file, with the commands. Rows are matched by the frame counters of both files,
-        or else by the times of both; without a common clock, row by row.
+        Another file, with the commands. Rows are matched by the frame counters of both files;
+        without these row by row, where the times of both agree.
 
     Returns
     -------
@@ -119,39 +142,41 @@ def load_record(
     }
     if kind is not None:
         choice(kind, "kind", tuple(KINDS))
-    of_telemetry = kind in (None, "closed_loop") and columns is None and commands is None
+    of_telemetry = columns is None and commands is None
     if isinstance(source, Telemetry):
         _require_series(of_telemetry, averages)
-        return _telemetry_record(source, axes=axes, source=source.name or "telemetry", **given)
+        given["source"] = source.name or "telemetry"
+        return _telemetry_record(source, kind=kind, axes=axes, **given)
     path = Path(source)
     given["source"] = str(path)
     with name_in_errors(path):
-        if _is_telemetry(path):
+        if is_telemetry(path):
             _require_series(of_telemetry, averages)
-            return _telemetry_record(load_telemetry(path), axes=axes, **given)
+            return _telemetry_record(load_telemetry(path), kind=kind, axes=axes, **given)
         contents = read_contents(path)
         if commands is not None:
             _join_commands(contents, Path(commands))
         kind, roles = select_series(contents, kind=kind, axes=axes, columns=columns)
         if kind == "spectrum":
-            return build_spectrum(roles, contents, averages=averages, **given)
+            return _build_spectrum(roles, contents, averages=averages, **given)
         _require_series(True, averages)
-        return build_loop(roles, contents, **given)
+        return _build_loop(roles, contents, **given)
 
 
 def _require_series(of_telemetry: bool, averages: int | None) -> None:
     """Refuse what telemetry and series do not take."""
     if not of_telemetry:
         raise ProblemError(
-            "telemetry holds measurements and commands: kind must be closed_loop or left out, and "
-            "neither columns nor commands may be given. Choose its modes with axes."
+            "telemetry says what its series are: neither columns nor commands may be given. Choose "
+            "its modes with axes."
         )
     if averages is not None:
         raise ProblemError("averages are only for a spectrum; got a record of series.")
 
 
-def _is_telemetry(path: Path) -> bool:
+def is_telemetry(path: str | os.PathLike[str]) -> bool:
     """Whether a file is telemetry of this package or of the AOT standard."""
+    path = Path(path)
     try:
         if path.suffix.lower() in FITS:
             with open_input(path, TelemetryError) as stream:
@@ -167,7 +192,12 @@ def _is_telemetry(path: Path) -> bool:
 
 
 def _telemetry_record(
-    telemetry: Telemetry, *, axes: Sequence[int] | None, mirror: PositionLoop | None, **given: Any
+    telemetry: Telemetry,
+    *,
+    kind: str | None,
+    axes: Sequence[int] | None,
+    mirror: PositionLoop | None,
+    **given: Any,
 ) -> LoopRecord:
     """Make a record of tip and tilt; ``given`` are facts, None where the telemetry has to tell.
 
@@ -176,22 +206,49 @@ def _telemetry_record(
     measurements stay as they were recorded, and the sensor gain of the record is what they show of
     a unit of phase.
     """
-    n = telemetry.modes
+    n, is_open = telemetry.modes, telemetry.commands is None
+    if kind not in (None, stored := "open_loop" if is_open else "closed_loop"):
+        raise ProblemError(f"this telemetry is of kind {stored}; got {kind}. Leave kind out.")
     chosen = choose_axes(axes, n, "modes")
-    facts = {name: value for name in FACTS if (value := getattr(telemetry, name)) is not None}
+    facts = {name: value for name in _FACTS if (value := getattr(telemetry, name)) is not None}
     contents = Contents(facts={name: {"the telemetry": value} for name, value in facts.items()})
-    roles = {role: _modal_columns(telemetry, role, chosen, contents.notes) for role in _MATRICES}
+    held = [role for role in _MATRICES if getattr(telemetry, role) is not None]
+    roles = {role: _modal_columns(telemetry, role, chosen, contents.notes) for role in held}
     if telemetry.times_s is not None:
         roles["times"] = [Column(name="times_s", values=telemetry.times_s, unit="s")]
-    if max(n, telemetry.measurements.shape[1], telemetry.commands.shape[1]) > len(chosen):
+    if max(n, telemetry.measurements.shape[1], telemetry.n_commands) > len(chosen):
         contents.notes.append(f"axes are modes {', '.join(map(str, chosen))} of {n}")
     if _FOREIGN in telemetry.metadata:
         contents.notes.append(
             "of another program: that y(k) is of the exposure of frame k-1 is taken for granted"
         )
     mirror = telemetry.mirror if mirror is None else mirror
-    record = build_loop(roles, contents, mirror=mirror, **given)
-    return replace(record, imaging_wavelength_um=telemetry.imaging_wavelength_um)
+    record = _build_loop(roles, contents, mirror=mirror, **given)
+    gains = tuple(map(float, str(telemetry.metadata.get(_STATED_GAIN, "")).split()))
+    return replace(
+        record,
+        imaging_wavelength_um=telemetry.imaging_wavelength_um,
+        stated_gain=tuple(gains[k] for k in chosen) if len(gains) == n else gains,
+        read_with=str(telemetry.metadata.get(_READ_WITH, "")),
+    )
+
+
+def telemetry_of_record(record: LoopRecord) -> Telemetry:
+    """Return a record as telemetry, from which it can be read again without any other fact."""
+    y, u = record.measurements, record.commands
+    gains = " ".join(f"{gain:.9g}" for gain in record.stated_gain)
+    stated = {_STATED_GAIN: gains, _READ_WITH: record.read_with}
+    return Telemetry(
+        frame_rate_hz=record.frame_rate_hz,
+        delay_frames=record.delay_frames,
+        mirror=None if record.delay_frames is None else record.mirror,
+        measurements=np.where(record.measured[:, None], y, np.nan),
+        commands=None if u is None else np.where(record.commanded[:, None], u, np.nan),
+        diameter_m=record.diameter_m,
+        obstruction=record.obstruction,
+        imaging_wavelength_um=record.imaging_wavelength_um,
+        metadata={name: text for name, text in stated.items() if text},
+    )
 
 
 def _modal_columns(seen: Telemetry, role: str, chosen: list[int], notes: list[str]) -> list[Column]:
@@ -238,7 +295,7 @@ def _is_gains(response: FloatArray, seen: Telemetry) -> bool:
 
 def _influence(seen: Telemetry) -> FloatArray | None:
     """Return the matrix from commands to modes, None for the identity."""
-    n, m, influence = seen.modes, seen.commands.shape[1], seen.influence_matrix
+    n, m, influence = seen.modes, seen.n_commands, seen.influence_matrix
     if influence is None and m != n:
         raise ProblemError(
             f"this telemetry has {m} commands of {n} modes, and no influence matrix (modes, "
@@ -285,55 +342,210 @@ def _lay_beside(
 ) -> list[Column]:
     """Return the commands in the rows of the measurements, NaN where there are none.
 
-    Rows are matched by the counters of both files, or else by their times. Without a common clock
-    both files must have equally many rows.
+    Rows are matched by the counters of both files. Without these both files must have equally many
+    rows, of the same times where both have times.
     """
-    sizes = [{len(column.values) for column in columns} for columns in (contents.columns, commands)]
-    for role in CLOCKS:
-        clocks = [c for file in (contents, other) for c in file.columns if c.role == role]
-        if len(clocks) == 2 and [{len(clock.values)} for clock in clocks] == sizes:
-            units = [seconds_per(clock.unit) if role == "times" else 1.0 for clock in clocks]
-            one, two = (unit * clock.values for unit, clock in zip(units, clocks, strict=True))
-            row = _match_rows(one, two, role, path)
-            if not np.array_equal(row, np.arange(len(two))):
-                contents.notes.append(
-                    f"commands were laid beside the measurements by {clocks[1].name}: "
-                    f"{int(np.sum(row >= 0))} of {len(row)} rows have one"
-                )
-            return [replace(c, values=np.where(row < 0, np.nan, c.values[row])) for c in commands]
-    rows = sorted(set.union(*sizes))
+    counters, times = (
+        [c for file in (contents, other) for c in file.columns if c.role == role] for role in CLOCKS
+    )
+    if len(counters) == 2:
+        frame, command_frame = (counter.values for counter in counters)
+        if not (np.all(np.diff(frame) >= 0) and np.all(np.diff(command_frame) > 0)):
+            raise TelemetryError(
+                "the frame numbers of both files must rise from row to row to be matched.",
+                path=path,
+            )
+        row = np.minimum(np.searchsorted(command_frame, frame), len(command_frame) - 1)
+        row = np.where(command_frame[row] == frame, row, -1)
+        if np.mean(row >= 0) < 0.5:
+            raise TelemetryError(
+                f"only {int(np.sum(row >= 0))} of {len(row)} measurements have a command in {path} "
+                f"by their frame numbers; they go from {frame[0]:.12g} to {frame[-1]:.12g} and "
+                f"from {command_frame[0]:.12g} to {command_frame[-1]:.12g}. Give files of the same "
+                "frames.",
+                path=path,
+            )
+        contents.notes.append(
+            f"commands were laid beside the measurements by {counters[1].name}: "
+            f"{int(np.sum(row >= 0))} of {len(row)} rows have one"
+        )
+        return [replace(c, values=np.where(row < 0, np.nan, c.values[row])) for c in commands]
+    rows = sorted({len(column.values) for column in (*contents.columns, *commands)})
     if len(rows) > 1:
         raise TelemetryError(
             f"{path} must have as many frames as the measurements; got "
-            f"{', '.join(map(str, rows))}. Or give both files a counter of frames, or times.",
+            f"{', '.join(map(str, rows))}. Or give both files a counter of frames.",
             path=path,
         )
-    if any(column.role in CLOCKS for column in (*contents.columns, *other.columns)):
-        contents.notes.append(
-            "the files have no clock in common: rows of the same number were taken for one frame"
-        )
+    if len(times) == 2:
+        one, two = (seconds_per(column.unit) * column.values for column in times)
+        if not np.max(np.abs(two - one)) <= SAME_FRAME * np.median(np.diff(one)):
+            raise TelemetryError(
+                f"the times of {path} must be those of the measurements, row by row. Give both "
+                "files a counter of frames, or leave the times away in one of them if the rows do "
+                "belong together.",
+                path=path,
+            )
     return commands
 
 
-def _match_rows(one: FloatArray, other: FloatArray, role: str, path: Path) -> IntArray:
-    """Return the row of the second clock for each row of the first, -1 where there is none."""
-    steps = np.diff(one), np.diff(other)
-    if np.array_equal(one, other) and np.all(steps[0] >= 0):
-        return np.arange(len(one))
-    if not (np.all(steps[0] >= 0) and np.all(steps[1] > 0)):  # no gap does
-        raise TelemetryError(
-            f"the {role} of both files must rise from row to row to be matched, without gaps.",
-            path=path,
+def _build_loop(
+    roles: Roles,
+    contents: Contents,
+    *,
+    unit: str | None,
+    command_unit: str | None,
+    mirror: PositionLoop | None,
+    source: str,
+    **given: Any,
+) -> LoopRecord:
+    """Make a record of series; ``given`` are facts, None where the source has to tell."""
+    (role, columns), commands = next(iter(roles.items())), roles.get("commands")
+    facts = {name: _find_fact(contents, name, given[name]) for name in _FACTS}
+    units = {role: _find_unit(columns, unit, contents)}
+    if commands is not None:
+        units["commands"] = (
+            _find_unit(commands, command_unit, contents, "command_unit") or unit or ""
         )
-    tolerance = _SAME_TIME * min(map(np.median, steps)) if role == "times" else 0.0
-    row = np.searchsorted((other[1:] + other[:-1]) / 2, one, side="right")
-    row = np.where(np.abs(other[row] - one) <= tolerance, row, -1)
-    if np.mean(row >= 0) < 0.5:
-        raise TelemetryError(
-            f"only {int(np.sum(row >= 0))} of {len(one)} measurements have a command in {path} by "
-            f"their {role}; they go from {one[0]:.12g} to {one[-1]:.12g} and from {other[0]:.12g} "
-            f"to {other[-1]:.12g}. Give files of the same frames, or leave the {role} away in one "
-            "of them if the rows do belong together.",
-            path=path,
+    _require_facts(roles, units, facts)
+    (clock,), (counter,) = (roles.get(name, [None]) for name in ("times", "frame_numbers"))
+    times = None if clock is None else seconds_per(clock.unit) * clock.values
+    if clock is not None and not clock.unit:
+        contents.notes.append(f"{clock.name} was taken for seconds")
+    record = loop_record(
+        _stack_columns(columns),
+        None if commands is None else _stack_columns(commands),
+        unit=units[role],
+        command_unit=units.get("commands"),
+        mirror=mirror,
+        times_s=times,
+        frame_numbers=None if counter is None else counter.values,
+        notes=contents.notes,
+        source=source,
+        **facts,
+    )
+    low, high = _RATES_HZ
+    plausible = facts["frame_rate_hz"] is not None or low <= record.frame_rate_hz <= high
+    if clock is not None and not clock.unit and not plausible:
+        raise ProblemError(
+            f"the frame rate would be {record.frame_rate_hz:.6g} Hz with "
+            f"{clock.name or 'the times'} in seconds, and their unit is not given; name it, as in "
+            "time_ms, or give frame_rate_hz."
         )
-    return row
+    return record
+
+
+def _require_facts(
+    roles: Roles, units: Mapping[str, str], facts: Mapping[str, Any], kind: str = "loop"
+) -> None:
+    """Refuse series of which facts are missing, all of them in one message."""
+    bare = [role for role, unit in units.items() if not unit]
+    option = "command_unit" if bare == ["commands"] else "unit"
+    names = join_names([column for role in bare for column in roles[role]])
+    angles = any(map(is_angle, units.values()))
+    no_rate = facts["frame_rate_hz"] is None and "times" not in roles and kind == "loop"
+    no_delay = "commands" in roles and facts["delay_frames"] is None
+    lacks = {
+        f"the unit of {names}: give {option} ({_UNITS[kind]})": bare,
+        "the telescope, by which angles become nm: give diameter_m": (
+            angles and facts["diameter_m"] is None
+        ),
+        "the frame rate: give frame_rate_hz, or the times": no_rate,
+        "the total delay: give delay_frames": no_delay,
+    }
+    missing = [text for text, is_missing in lacks.items() if is_missing]
+    if len(missing) > 1 or bare:
+        volts = VOLTS if bare and option == "command_unit" else {}
+        raise ProblemError(f"nothing tells {'; '.join(missing)}.", **volts)
+
+
+def _find_fact(contents: Contents, name: str, given: Any) -> Any:
+    """Return what was given, or what the source has; refuse two values of a source."""
+    places = contents.facts.get(name, {})
+    values = {where: number(value, f"{where} ({name})") for where, value in places.items()}
+    if given is None:
+        if len(set(values.values())) > 1:
+            listing = ", ".join(f"{value:.9g} by {where}" for where, value in values.items())
+            raise ProblemError(f"the file gives {name} twice: {listing}. Choose one in the call.")
+        for where, value in values.items():
+            contents.notes.append(f"{name} {value:.9g}, by {where}")
+            return int(value) if name == "averages" else value
+        return None
+    wanted = number(given, name)
+    for where, value in values.items():
+        if abs(value - wanted) > 1e-6 * wanted:
+            if name == "frame_rate_hz":
+                raise ProblemError(
+                    f"{name} must be that of {where}, {value:.9g}; got {wanted:.9g}."
+                )
+            contents.notes.append(f"{name} {wanted:.9g} was given; {where} has {value:.9g}")
+    return given
+
+
+def _find_unit(
+    columns: Sequence[Column], stated: str | None, contents: Contents, option: str = "unit"
+) -> str:
+    """Return the unit of some columns by their names or headers, the source, or the call."""
+    places = contents.facts.get(option, contents.facts.get("unit", {}))
+    of_file = list(dict.fromkeys(map(str, places.values())))
+    units = {column.unit or (of_file[0] if of_file else "") for column in columns}
+    if len(units) > 1 or len(of_file) > 1:
+        raise ProblemError(
+            f"{join_names(columns)} must all have the same unit; got "
+            f"{', '.join(sorted(units.union(of_file)))}."
+        )
+    (unit,) = units
+    if unit and stated is not None and not same_unit(unit, stated):
+        raise ProblemError(
+            f"{option} must be that of the data, {unit!r}; got {stated!r}.",
+            at_terminal="Leave it out; --show-unit is the unit of what is shown.",
+        )
+    return str(unit or stated or "")
+
+
+def _stack_columns(chosen: Sequence[Column]) -> FloatArray:
+    sizes = {len(column.values) for column in chosen}
+    if len(sizes) > 1:
+        raise ProblemError(
+            f"{' and '.join(column.name for column in chosen)} must be equally long; got "
+            f"{' and '.join(map(str, sorted(sizes)))} rows."
+        )
+    return np.column_stack([column.values for column in chosen])
+
+
+def _build_spectrum(
+    roles: Roles, contents: Contents, *, unit: str | None, source: str, **given: Any
+) -> SpectrumRecord:
+    """Make a record of densities; ``given`` are facts, None where the source has to tell."""
+    densities, (frequency,) = roles["density"], roles["frequency"]
+    names = ("frame_rate_hz", "diameter_m", "averages")
+    facts = {name: _find_fact(contents, name, given[name]) for name in names}
+    own_unit = _find_unit(densities, unit, contents)
+    _require_facts(roles, {"density": own_unit}, facts, "spectrum")
+    parted = density_unit(own_unit)
+    if parted is None:
+        raise ProblemError(
+            f"the unit of a density is a square over Hz (nm^2/Hz, mas^2/Hz), or a length or angle "
+            f"over sqrt(Hz) (nm/sqrt(Hz)); got {own_unit!r}."
+        )
+    name, power = parted
+    if not frequency.unit:
+        contents.notes.append("frequencies were taken for Hz")
+    table = _stack_columns([frequency, *densities])
+    complete = np.all(np.isfinite(table), axis=1)
+    if not complete.all():
+        contents.notes.append(f"{int(np.sum(~complete))} rows with gaps were left out")
+    table = table[complete]
+    scaled = nm_per(name, diameter_m=facts["diameter_m"]) ** power * table[:, 1:]
+    if power == 1:
+        if np.any(scaled < 0):
+            raise ProblemError("an amplitude density must be at least 0; got a negative one.")
+        contents.notes.append("amplitude densities were squared")
+        scaled = scaled**2
+    return SpectrumRecord(
+        frequency_hz=hz_per(frequency.unit) * table[:, 0],
+        density_nm2_hz=scaled,
+        notes=merge_notes(contents.notes),
+        source=source,
+        **facts,
+    )

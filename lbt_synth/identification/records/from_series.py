@@ -138,7 +138,6 @@ def loop_record(
         commanded=commanded,
         faults=tuple(findings),
         notes=merge_notes(said),
-        jitter_frames=clock.jitter_frames,
         diameter_m=diameter_m,
         obstruction=obstruction,
         source=source,

@@ -7,10 +7,17 @@ from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
-from lbt_synth.identification.records.faults import Finding, RecordHealth, findings_in, runs
+from lbt_synth.identification.records.faults import (
+    Finding,
+    RecordHealth,
+    findings_in,
+    mark,
+    runs,
+)
 from lbt_synth.models import LoopHardware, PositionLoop, TabulatedSpectrum
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import (
@@ -68,8 +75,6 @@ class LoopRecord:
         What was found in the series.
     notes : tuple of str, optional
         How they were read, and what changes with time.
-    jitter_frames : float, optional
-        Rms distance of the times of the rows from the regular grid [frames].
     diameter_m, obstruction, imaging_wavelength_um : float, optional
         Telescope diameter [m], its central obstruction as a fraction of it, and the wavelength of
         the image [um].
@@ -77,6 +82,10 @@ class LoopRecord:
         Where it is from.
     bridges : (frames,) bool array_like, optional
         Frames whose pseudo-open loop was interpolated, which are usable.
+    stated_gain : tuple of float, optional
+        Sensor gain of all axes, or of each, as somebody knows it.
+    read_with : str, optional
+        Options by which its commands were made those that the mirror followed.
 
     Raises
     ------
@@ -110,12 +119,13 @@ class LoopRecord:
     commanded: BoolArray
     faults: tuple[Finding, ...] = ()
     notes: tuple[str, ...] = ()
-    jitter_frames: float | None = None
     diameter_m: Positive | None = None
     obstruction: Obstruction | None = None
     imaging_wavelength_um: Positive | None = None
     source: str = ""
     bridges: BoolArray | None = None
+    stated_gain: tuple[float, ...] = ()
+    read_with: str = ""
     usable: BoolArray = field(init=False)
 
     def __repr__(self) -> str:
@@ -172,7 +182,6 @@ class LoopRecord:
             usable=int(np.sum(self.usable)),
             findings=self.faults + findings_in(self.unknown_corrections(), NOT_KNOWN, "frames"),
             notes=self.notes,
-            jitter_frames=self.jitter_frames,
         )
 
     @property
@@ -259,29 +268,20 @@ class LoopRecord:
     def bridged(self, *, sensor_gain: ArrayLike = 1.0) -> LoopRecord:
         """Return the record with short holes interpolated, and a note.
 
-        The pseudo-open-loop measurement for this sensor gain is interpolated through the two frames
-        on either side (a cubic, or a straight line where there are fewer), the shortest holes
-        first: those of at most 3 frames, up to 1 % of the record.
+        A cubic spline through the pseudo-open-loop measurements for this sensor gain fills the
+        holes of at most 3 frames, if they are no more than 1 % of the record.
         """
-        series, bridges = self.pseudo_open_loop(sensor_gain), np.zeros(self.frames, dtype=np.bool_)
+        series, frame = self.pseudo_open_loop(sensor_gain), np.arange(self.frames)
         holes = runs(~self.usable)
-        holes = holes[(holes[:, 0] > 0) & (holes[:, 1] < self.frames)]
-        lengths = holes[:, 1] - holes[:, 0]
-        order = np.argsort(lengths, kind="stable")
-        short = order[lengths[order] <= BRIDGED_FRAMES]
-        chosen = short[np.cumsum(lengths[short]) <= FEW * self.frames]
-        if not chosen.size or self.bridges is not None:
+        inside = (holes[:, 0] > 0) & (holes[:, 1] < self.frames)
+        holes = holes[inside & (holes[:, 1] - holes[:, 0] <= BRIDGED_FRAMES)]
+        bridges = mark(holes, self.frames)
+        count = int(np.sum(bridges))
+        if not 0 < count <= FEW * self.frames or self.bridges is not None:
             return self
-        for start, stop in holes[chosen]:
-            series[start:stop] = _interpolate_hole(series, self.usable, int(start), int(stop))
-            bridges[start:stop] = True
-        note = (
-            f"{np.sum(bridges)} frames in {len(chosen)} holes of at most {BRIDGED_FRAMES} were "
-            "interpolated"
-        )
-        if beyond := len(short) - len(chosen):
-            note += f"; {beyond} more such holes were left, beyond {100 * FEW:g} %"
+        series[bridges] = CubicSpline(frame[self.usable], series[self.usable])(frame[bridges])
         y = self.known_gains(sensor_gain) * (series - self.corrections())
+        note = f"{count} frames in {len(holes)} holes of at most {BRIDGED_FRAMES} were interpolated"
         return replace(
             self,
             measurements=np.where(bridges[:, None], y, self.measurements),
@@ -289,16 +289,6 @@ class LoopRecord:
             bridges=bridges,
             notes=(*self.notes, note),
         )
-
-
-def _interpolate_hole(series: FloatArray, usable: BoolArray, start: int, stop: int) -> FloatArray:
-    """Interpolate a hole by the polynomial through two frames on either side, or one."""
-    nodes = np.array([start - 2, start - 1, stop, stop + 1])
-    if nodes[0] < 0 or nodes[-1] >= len(series) or not usable[nodes].all():
-        nodes = nodes[1:3]
-    powers = np.vander(nodes - start, increasing=True)
-    inside = np.vander(np.arange(stop - start), nodes.size, increasing=True)
-    return np.asarray(inside @ np.linalg.solve(powers, series[nodes]))
 
 
 def require_length(

@@ -98,18 +98,16 @@ def _to_single(values: FloatArray) -> FloatArray:
 
 def source_terms(design: Design, *, form: str = "plain") -> SourceTerms:
     """Return the coefficients of a design, or of a filter of several sensors and its fall-backs."""
-    if design.other_sensors:
+    if design.other_sensors and design.plant is not None:
         return _filter_terms(design)
-    if form == "plain":
+    if form == "plain" and not design.other_sensors:
         return controller_terms(design.controller)
     require_hardware(design, "the estimator form")  # a bare filter has no commands to be applied
     estimator = estimator_form(design)
     inputs = np.hstack([estimator.B, estimator.applied])
     D = np.zeros((len(estimator.C), inputs.shape[1]))
-    return controller_terms(
-        Controller(A=estimator.A, B=inputs, C=estimator.C, D=D, dt_s=estimator.dt_s),
-        len(estimator.C),
-    )
+    joint = Controller(A=estimator.A, B=inputs, C=estimator.C, D=D, dt_s=estimator.dt_s)
+    return controller_terms(joint, len(estimator.C))
 
 
 def controller_terms(controller: Controller, applied: int = 0) -> SourceTerms:

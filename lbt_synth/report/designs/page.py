@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +15,6 @@ from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.report.designs.report import DesignAssessment, DesignReport, summary_table, verdict
 from lbt_synth.report.draw import Figure, count_columns, drawing, square_in
 from lbt_synth.report.figures.loops import (
-    FREQUENCY,
     draw_bode,
     draw_design,
     draw_sigma,
@@ -26,10 +23,8 @@ from lbt_synth.report.figures.loops import (
 )
 from lbt_synth.report.figures.records import (
     SERIES_S,
-    SPECTRUM,
-    TIME,
-    run_spectra,
     sensor_failure_figure,
+    simulation_figure,
 )
 from lbt_synth.report.figures.studies import (
     FREQUENCY_ERROR,
@@ -49,9 +44,8 @@ from lbt_synth.report.page.html import (
     survival_blocks,
 )
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import fact_table, row_table
+from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.words import count_text, listing_text
-from lbt_synth.studies.limits import TruthComparison, compare_in_truth
 from lbt_synth.studies.robustness import run_failures
 
 
@@ -95,22 +89,18 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
         f"{count_text(len(report.assessments), 'design')}: {listing_text(report.names)}",
         {
             "Summary": _summary_blocks(report),
+            "When sensors fail": _failure_blocks(report),
             "Transfer functions": _transfer_blocks(report),
             "Robustness": _robustness_charts(report),
             "Dynamics": _dynamics_charts(report),
             "Simulation": _simulation_blocks(report),
             "Certificates": _certificate_blocks(report),
         },
-        sources=_sources(report.config, report.gain_files),
+        sources=[
+            (report.config.source, "configuration"),
+            *((path, f"gain file of {name}") for name, path in report.gain_files.items()),
+        ],
     )
-
-
-def _sources(
-    config: Config, gain_files: Mapping[str, str | os.PathLike[str]]
-) -> list[tuple[str | os.PathLike[str], str]]:
-    """Return the files that designs came from, and what each is."""
-    gains = [(path, f"gain file of {name}") for name, path in gain_files.items()]
-    return [(config.source, "configuration"), *gains]
 
 
 def _summary_blocks(report: DesignReport) -> list[Block]:
@@ -136,7 +126,7 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
         verdict(report),
         *survival_blocks({one.name: one.margins for one in report.assessments if one.margins}),
         summary_table(report),
-        *_truth_blocks(report.config, report.truth, ("method", "stable")),
+        *_truth_blocks(report),
         *report.config._summarise().tables,
         *(
             Notice(text=f"{one.name} was {note}")
@@ -146,22 +136,25 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
     ]
 
 
-def _truth_blocks(
-    config: Config, truth: TruthComparison, without: Sequence[str] = ()
-) -> list[Block]:
+def _truth_blocks(report: DesignReport) -> list[Block]:
     """Return the designs beside reference designs, and what is wrong with them in the truth."""
+    config, limits = report.config, report.limits
     caption = f"In the truth of {config.source.name}; {config.imaging.label}"
-    hidden = ("worst_nm", "above_band_limit_percent", *without)
-    stable = {row.design for row in truth.rows if row.stable}
+    hidden = ("worst_nm", "above_band_limit_percent", "method", "stable")
+    stable = {one.name for one in report.stable}
+    blocks: list[Block] = [row_table(caption, limits.rows, without=hidden)]
+    if limits.limit is not None and any(not one.alone for one in report.assessments):
+        least = nm_text(limits.limit.rms_nm, ".1f", unit="nm rms")
+        blocks.append(f"No controller of the loop's own sensor alone leaves less than {least}.")
     return [
-        row_table(caption, truth.rows, without=hidden),
+        *blocks,
         *(
             Notice(text=f"{name}: {text}.")
-            for name, texts in truth.warnings.items()
+            for name, texts in limits.warnings.items()
             if name in stable  # an unstable loop is named above
             for text in texts
         ),
-        *(Notice(text=note) for note in truth.notes),
+        *(Notice(text=note) for note in limits.notes),
     ]
 
 
@@ -180,11 +173,12 @@ def _certificate_blocks(report: DesignReport) -> list[Block]:
 def _transfer_blocks(report: DesignReport) -> list[Block]:
     """Return singular values of the estimation error and of the closed loops, and their margins."""
     lines_hz, gain = report.config.truth.lines_hz, f"{report.real_gain:.4g}"
-    designs = {one.name: one.design for one in report.assessments}
-    loops = {one.name: one.loop for one in report.assessments}
+    alone = [one for one in report.assessments if one.alone]
+    designs = {one.name: one.design for one in alone}
+    loops = {one.name: one.loop for one in alone}
     curves = sigma_curves(designs, loops, lines_hz=lines_hz)
     blocks: list[Block] = []
-    if not report.stable:
+    if alone and not any(one.stable for one in alone):
         loops = {}
         blocks.append("No loop is stable, so none has a rejection or a noise transfer.")
     if loops or any(error is not None for _, error, *_ in curves.values()):
@@ -198,32 +192,36 @@ def _transfer_blocks(report: DesignReport) -> list[Block]:
 
 def _robustness_charts(report: DesignReport) -> list[Chart]:
     """Strehl ratio and residual over the frequency error, and maps with the sensor gain."""
+    maps = {one.name: one.map for one in report.assessments if one.map is not None}
     if report.errors_hz.size == 1:
-        return [_strehl_chart(report)]
+        return [_strehl_chart(report)] if maps else []
     charts = []
+    if any(one.stable for one in report.assessments if one.alone):
+        charts.append(_strehl_chart(report))
     if report.stable:
-        figure = limits_figure(report.limits, over_errors=True)
-        charts = [_strehl_chart(report), chart("limits", figure)]
-    maps = {one.name: one.map for one in report.assessments}
-    figure = robustness_map_figure(maps, real_gain=report.real_gain)
-    return [*charts, chart("map", figure)]
+        charts.append(chart("limits", limits_figure(report.limits, over_errors=True)))
+    if maps:
+        figure = robustness_map_figure(maps, real_gain=report.real_gain)
+        charts.append(chart("map", figure))
+    return charts
 
 
 def _strehl_chart(report: DesignReport) -> Chart:
     """Strehl ratio over the frequency error, or the sensor gain for a truth without vibrations."""
     by_gain = report.errors_hz.size == 1
-    drawn = report.assessments if by_gain else report.stable
+    drawn = [one for one in report.assessments if one.map is not None]
     curves = {
         one.name: (one.map.sensor_gains, 100 * one.map.strehl[0, :, 0])
         if by_gain
         else (report.errors_hz, 100 * one.strehls)
         for one in drawn
+        if one.map is not None and (by_gain or one.stable)
     }
     axis = strehl_axis(np.concatenate([percents for _, percents in curves.values()]))
     with drawing([2.5]) as (panel,):
         panel.set_axes(SENSOR_GAIN if by_gain else FREQUENCY_ERROR, axis)
-        for name in report.names:
-            draw_design(panel, report.names, name, *curves.get(name, ((), None)))
+        for one in drawn:
+            draw_design(panel, report.names, one.name, *curves.get(one.name, ((), None)))
         if by_gain:
             panel.rule("real sensor gain", report.real_gain, dash=3)
     key = "sensor-gain" if by_gain else "robustness"
@@ -232,10 +230,11 @@ def _strehl_chart(report: DesignReport) -> Chart:
 
 def _dynamics_charts(report: DesignReport) -> list[Chart]:
     """Poles, and step responses."""
-    charts = [chart("poles", _draw_poles(report.assessments))]
-    if not report.stable:
+    alone = [one for one in report.assessments if one.alone]
+    charts = [chart("poles", _draw_poles(alone))] if alone else []
+    loops = {one.name: one.loop for one in alone if one.stable}
+    if not loops:
         return charts
-    loops = {one.name: one.loop for one in report.stable}
     frame = f"{1e3 / report.config.hardware.frame_rate_hz:.4g}"
     return [*charts, chart("step", draw_steps(loops), frame=frame)]
 
@@ -265,77 +264,41 @@ def _draw_poles(designs: Sequence[DesignAssessment]) -> Figure:
 
 def _simulation_blocks(report: DesignReport) -> list[Block]:
     """Return series and spectra of the simulated loops."""
-    settings = report.config.settings.simulation
-    runs = [(one, one.run) for one in report.assessments if one.run is not None]
-    if not runs:
-        return ["No loop is stable, so none was simulated."]
-    rate_hz, frames = runs[0][1].frame_rate_hz, runs[0][1].residual_nm.shape[1]
-    shown = min(frames, int(SERIES_S * rate_hz))
-    time_s = np.arange(shown) / rate_hz
-    reach = 1.05 * max(float(np.max(np.abs(run.residual_nm[0, :shown, 0]))) for _, run in runs)
-    residual = {"label": "residual", "unit": "nm", "low": -reach, "high": reach}
-    with drawing([0.95] * len(runs)) as series:
-        for panel, (one, run) in zip(series, runs, strict=True):
-            panel.set_axes(TIME, residual, title=one.name)
-            style: dict[str, Any] = {"look": report.names.index(one.name), "dash": 0}
-            y = run.residual_nm[0, :shown, 0]
-            panel.curve("residual", time_s, y, quiet=True, width=0.9, **style)
-    with drawing([2.2] * len(runs), columns=count_columns(len(runs))) as spectra:
-        for panel, (one, run) in zip(spectra, runs, strict=True):
-            panel.set_axes(FREQUENCY, SPECTRUM, title=one.name)
-            f, opened, simulated, exact = run_spectra(run, one.loop, report.config.truth)
-            panel.curve("before the correction", f, opened, look=None, width=0.8)
-            panel.curve("residual, simulated", f, simulated, look=5, dash=0)
-            panel.curve("residual, exact", f, exact, look=1, width=1.4)
-    return [
-        f"{count_text(settings.cases, 'run')} of {frames} frames each, seed {settings.seed}.",
-        chart("series", series[0].figure, duration=f"{time_s[-1]:.2f}"),
-        chart("spectra", spectra[0].figure),
-    ]
+    settings, truth = report.config.settings.simulation, report.config.truth
+    blocks: list[Block] = []
+    for number, one in enumerate(report.assessments, start=1):
+        if one.run is not None:
+            frames = one.run.residual_nm.shape[1]
+            text = f"{count_text(settings.cases, 'run')} of {frames} frames each, seed "
+            blocks = blocks or [f"{text}{settings.seed}."]
+            exact: dict[str, Any] = {"loop": one.loop, "truth": truth} if one.alone else {}
+            figure = simulation_figure(one.run, title=one.name, **exact)
+            key = f"simulation-{number}"
+            blocks.append(chart(key, figure, group="simulation", name=one.name))
+    return blocks or ["No loop is stable, so none was simulated."]
 
 
-_AWAY_S = 1.0  # that each sensor is missing, and that all are there again
-
-
-def sensors_page(
-    config: Config,
-    designs: Mapping[str, Design],
-    *,
-    gain_files: Mapping[str, str | os.PathLike[str]] = MappingProxyType({}),
-    title: str | None = None,
-) -> tuple[Page, TruthComparison]:
-    """Return the page of designs of several sensors, and what they leave in the truth.
-
-    The truth of the configuration must be stationary. The page gives the digests of the files that
-    designs came from.
-    """
-    compared = compare_in_truth(designs, config)
-    opening = _truth_blocks(config, compared, ("phase_margin_deg",))
-    if compared.limit is not None:
-        least = nm_text(compared.limit.rms_nm, ".1f", unit="nm rms")
-        opening.insert(0, f"No controller of the loop's own sensor alone leaves less than {least}.")
-    sections: dict[str, Sequence[Block]] = {"Summary": opening}
-    for number, (name, design) in enumerate(designs.items(), start=1):
-        failures = design.tables()[0]
-        sections[f"Design {name}"] = (
-            fact_table(name, design.facts()),
-            row_table(failures.title, failures.rows),
-            _failure_chart(config, name, design, f"failures-{number}"),
-            row_table("Certificate, computed again", design.recertify().checks),
-        )
-    heading = title or f"Several sensors for {config.source.name}"
-    sources = _sources(config, gain_files)
-    return new_page(heading, listing_text(list(designs)), sections, sources=sources), compared
+def _failure_blocks(report: DesignReport) -> list[Block]:
+    """Return what designs of several sensors leave while some fail."""
+    blocks: list[Block] = []
+    for number, one in enumerate(report.assessments, start=1):
+        if not one.alone:
+            failures = one.design.tables()[0]
+            blocks += [
+                row_table(f"{one.name}: {failures.title}", failures.rows),
+                _failure_chart(report.config, one.name, one.design, f"failures-{number}"),
+            ]
+    return blocks
 
 
 def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart:
     """Draw a run in which each sensor and channel is missing in turn."""
     units = (OWN_SENSOR, *design.other_sensors)
     drops = [
-        Drop(unit=unit, start_s=(2 * i + 1) * _AWAY_S, end_s=(2 * i + 2) * _AWAY_S)
+        Drop(unit=unit, start_s=(2 * i + 1) * SERIES_S, end_s=(2 * i + 2) * SERIES_S)
         for i, unit in enumerate(units)
     ]
-    seconds = (2 * len(units) + 1) * _AWAY_S
+    seconds = (2 * len(units) + 1) * SERIES_S
     frames, seed = int(seconds * config.hardware.frame_rate_hz), config.settings.simulation.seed
     simulation, rows = run_failures(
         design, config, config.truth, drops, frames=frames, cases=1, seed=seed
@@ -346,5 +309,5 @@ def _failure_chart(config: Config, name: str, design: Design, key: str) -> Chart
         sensor_failure_figure(simulation, [segment for segment, _ in rows], exact_nm),
         group="sensor-failures",
         name=name,
-        away=f"{_AWAY_S:g}",
+        away=f"{SERIES_S:g}",
     )

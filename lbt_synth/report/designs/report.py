@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import label
 
-from lbt_synth import studies
 from lbt_synth.config import Config
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import LbtSynthError, ProblemError
@@ -22,7 +21,6 @@ from lbt_synth.loop import (
     LoopMargins,
     ResidualBudget,
     Simulation,
-    close_loop,
     loop_margins,
     moving_gain,
     residual_budget,
@@ -35,12 +33,13 @@ from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.loop.stable_range import MovingGain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.report.page.html import words
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, columns, fact, facts
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import LimitRow, RobustnessMap, robustness_map
-from lbt_synth.studies.limits import LimitStudy, TruthComparison, compare_in_truth
+from lbt_synth.studies.limits import LimitStudy, compare_in_truth
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _MOST_FRAMES = 8192  # of a run: its series and spectra need no more
@@ -54,25 +53,33 @@ class DesignAssessment:
     design: Design
     loop: ClosedLoop  # with the real sensor gain
     notes: tuple[str, ...]  # how the loop that it was made for differs from this one
-    # None where the loop is unstable: the exact residual, the margins at the real sensor gain, the
-    # intervals around it of a gain that moves, and a run in time
+    # None where the loop is unstable: the exact residual, and a run in time; and, None for several
+    # sensors, too, the margins at the real sensor gain, and the intervals around it of a gain that
+    # moves
     budget: ResidualBudget | None
+    run: Simulation | None
     margins: LoopMargins | None
     moving: MovingGain | None
-    run: Simulation | None
     # interval of real sensor gains with a stable loop, relative to the sensor matrix of the
     # configuration, around the real one, the assumed one, or one of the map; nan for none
     sensor_gains: tuple[float, float]
     checks: tuple[Check, ...]  # the certificate, recomputed
     certificate_error: str  # why it could not be; empty if it could
-    map: RobustnessMap  # Strehl ratio over the frequency error and the real sensor gain
-    strehls: FloatArray  # (e,): Strehl ratio over the frequency error at the real sensor gain
+    # Strehl ratio over the frequency error and the real sensor gain; None for several sensors
+    map: RobustnessMap | None
+    # (e,): Strehl ratio over the frequency error at the real sensor gain; nan where it is unknown
+    strehls: FloatArray
     limits: LimitRow  # residual, Strehl ratio, and how far they are from the limits
 
     @property
     def stable(self) -> bool:
         """Whether the loop is stable at the real sensor gain."""
         return self.loop.is_stable
+
+    @property
+    def alone(self) -> bool:
+        """Whether it reads the loop's own sensor alone, and has transfer functions."""
+        return not self.loop.reads_others
 
     @property
     def certified(self) -> bool:
@@ -92,22 +99,24 @@ def assess_design(
     hardware, truth, settings = config.hardware, config.truth, config.settings.simulation
     real_gain = config.sensor_gain * truth.sensor_gain
     gains = np.unique([*config.settings.robustness.sensor_gains, real_gain])
-    over: dict[str, Any] = {"errors_hz": errors_hz, "sensor_gains": gains / config.sensor_gain}
-    image = robustness_map(design, truth, config.imaging, hardware=hardware, **over)
     checks: tuple[Check, ...] = ()
-    complaint, budget, margins, moving, run = "", None, None, None, None
+    complaint, budget, margins, moving, run, image = "", None, None, None, None, None
     try:
         checks = design.recertify().checks
     except (LbtSynthError, ArithmeticError) as error:
         complaint = str(error)
-    starts = [loop.sensor_gain, 1.0, *image.sensor_gains[image.stable[0]]]
+    starts, strehls = [loop.sensor_gain, 1.0], np.full(errors_hz.size, np.nan)
+    if not loop.reads_others:
+        over: dict[str, Any] = {"errors_hz": errors_hz, "sensor_gains": gains / config.sensor_gain}
+        image = robustness_map(design, truth, config.imaging, hardware=hardware, **over)
+        starts += image.sensor_gains[image.stable[0]].tolist()
+        image = replace(image, sensor_gains=frozen_copy(gains))  # the real ones again
+        strehls = image.strehl[0, int(np.searchsorted(gains, real_gain))]
     low, high = stable_interval(hardware, design.controller, starts)
     if loop.is_stable:
-        budget, margins, moving = (
-            residual_budget(loop, truth),
-            loop_margins(loop),
-            moving_gain(loop),
-        )
+        budget = residual_budget(loop, truth)
+        if not loop.reads_others:
+            margins, moving = loop_margins(loop), moving_gain(loop)
         run = simulate(
             design.controller,
             truth,
@@ -129,8 +138,8 @@ def assess_design(
         sensor_gains=(low * config.sensor_gain, high * config.sensor_gain),
         checks=checks,
         certificate_error=complaint,
-        map=replace(image, sensor_gains=frozen_copy(gains)),  # the real ones again
-        strehls=image.strehl[0, int(np.searchsorted(gains, real_gain))],
+        map=image,
+        strehls=strehls,
         limits=limits,
     )
 
@@ -175,9 +184,9 @@ class DesignReport:
     config: Config  # the configuration
     gain_files: Mapping[str, str | os.PathLike[str]]  # that designs came from, by their names
     assessments: tuple[DesignAssessment, ...]  # one per design, exact
-    # residuals over the frequency error, and what no linear controller goes below
+    # the designs beside reference designs and limits, over the frequency error, and what they were
+    # not made for
     limits: LimitStudy
-    truth: TruthComparison  # the designs beside reference designs, and what they were not made for
     # (e,): frequency errors, truth less design [Hz]; only 0 where the truth has no vibration
     errors_hz: FloatArray
 
@@ -244,23 +253,19 @@ def design_report(
         require_instance(design, Design)
         require_compatible(name, design, config.hardware)
     truth, hardware, errors = config.truth, config.hardware, frequency_errors(config)
-    study = studies.limits(designs, hardware, truth, config.imaging, errors_hz=list(errors))
-    loops = [
-        close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-        for design in designs.values()
-    ]
+    study = compare_in_truth(designs, config, errors_hz=list(errors))
+    loops = [design.close(hardware, sensor_gain=truth.sensor_gain) for design in designs.values()]
     # all settle as the slowest, so that one seed is the same weather for all
-    radii = [loop.spectral_radius for loop in loops if loop.is_stable]
+    radii = [loop.radius_per_frame for loop in loops if loop.is_stable]
     settle_frames = max(map(settling_frames, radii), default=0)
     return DesignReport(
         config=config,
         gain_files=dict(gain_files or {}),
         assessments=tuple(
             assess_design(design, loop, row, config, errors, settle_frames)
-            for design, loop, row in zip(designs.values(), loops, study.rows, strict=True)
+            for design, loop, row in zip(designs.values(), loops, study.rows, strict=False)
         ),
         limits=study,
-        truth=compare_in_truth(designs, config),
         errors_hz=errors,
     )
 
@@ -288,25 +293,7 @@ def refine_values(values: Sequence[float]) -> FloatArray:
     return np.asarray(np.interp(places, np.arange(ordered.size), ordered))
 
 
-_RMS: dict[str, Any] = {"unit": "nm rms", "format": ".1f"}
-_RATIO: dict[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}
-_PARTS = {"turbulence": "turbulence", "vibration": "vibration", "noise": "noise"}  # of a residual
-_PARTS |= {"within": "within frames"}
-_MARGINS = (
-    ("modulus", "modulus margin", ""),
-    ("phase_deg", "phase margin", "deg"),
-    ("delay_frames", "delay margin", "frames"),
-    ("crossover_hz", "highest crossover", "Hz"),
-)
-# of the table of all designs: its groups, by the first of their facts
-_GROUPS = {
-    "origin": "Design",
-    "loop": "In the loop of the configuration",
-    "above_limit_percent": "Distance to the limit of any linear controller",
-    "worst_nm": "Over frequency errors of {}",
-    "modulus": "Margins at the real sensor gain",
-}
-WORDS = (
+WORDS = (  # facts that are texts, made of several numbers
     "origin",
     "certificate",
     "loop",
@@ -321,69 +308,60 @@ _TONES = {"passed": "good", "stable": "good", "FAILED": "bad", "NOT": "bad", "UN
 def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
     """Return the numbers of a design, and those of ``WORDS``, which are texts.
 
-    The page prints what has a help, in this order.
+    How each is called and printed is in the words of pages; the page prints what has a help.
     """
     design, row, margins, moving = one.design, one.limits, one.margins, one.moving
-    limits, gain, ranged = report.limits, report.config.sensor_gain, report.errors_hz.size > 1
+    limits, gain = report.limits, report.config.sensor_gain
+    strehls = np.zeros(0) if one.run is None else one.run.strehl(report.config.imaging)
     factors = None if margins is None else (margins.gain_low, margins.gain_high)
     moves = None if moving is None else (gain * moving.moving_low, gain * moving.moving_high)
-    strehls = np.zeros(0) if one.run is None else one.run.strehl(report.config.imaging)
-    mean = float(np.mean(strehls)) if strehls.size else None
-    scatter = 100 * float(np.std(strehls, ddof=1)) if strehls.size > 1 else None
-    parts = {
-        f"{part}_nm": fact(getattr(one.budget, f"{part}_nm", None), help=f"of that {word}", **_RMS)
-        for part, word in _PARTS.items()
+    budget = one.budget
+    values = {
+        "design": one.name,
+        "method": design.method,
+        "stable": one.stable,
+        "certified": one.certified,
+        "route": design.solver.route,
+        "origin": f"{design.method}, {design.solver.route}",
+        "n_states": design.controller.n_states,
+        "multiplications": frame_cost(design).multiplications if one.alone else None,
+        "gamma": design.gamma,
+        "estimation_rms": design.rms,
+        "certificate": _certificate_word(one),
+        "loop": "stable" if one.stable else "UNSTABLE",
+        "spectral_radius": one.loop.radius_per_frame,
+        "residual_nm": row.residual_nm,
+        "turbulence_nm": budget and budget.turbulence_nm,
+        "vibration_nm": budget and budget.vibration_nm,
+        "noise_nm": budget and budget.noise_nm,
+        "within_nm": budget and budget.within_nm,
+        "strehl": row.strehl,
+        "strehl_simulated": float(np.mean(strehls)) if strehls.size else None,
+        "scatter": 100 * float(np.std(strehls, ddof=1)) if strehls.size > 1 else None,
+        "above_limit_percent": _known(limits.limit) and row.above_limit_percent,
+        "worst_nm": row.worst_nm if report.errors_hz.size > 1 else None,
+        "worst_strehl": float(one.strehls.min()),
+        "good_errors": _interval(good_range(report, one), "+.4g"),
+        "above_band_limit_percent": _known(limits.band) and row.above_band_limit_percent,
+        "modulus": margins and margins.modulus,
+        "phase_deg": margins and margins.phase_deg,
+        "delay_frames": margins and margins.delay_frames,
+        "crossover_hz": margins and margins.crossover_hz,
+        "gain_margin": _interval(factors, ".3g"),
+        "stable_gains": _interval(one.sensor_gains),
+        "moving_gains": _interval(moves),
     }
-    numbers = {
-        name: fact(getattr(margins, name, None), help=text, format=".3g", unit=unit)
-        for name, text, unit in _MARGINS
-    }
-    norm: dict[str, Any] = {"unit": "nm", "format": ".5g"}
-    at_known, anywhere = "frequency known", "frequency anywhere in this range"
-    return facts(
-        design=fact(one.name, "design"),
-        method=fact(design.method, "method"),
-        stable=fact(one.stable, "stable"),
-        certified=fact(one.certified, "certified"),
-        route=fact(design.solver.route),
-        origin=fact(f"{design.method}, {design.solver.route}", help="method, computed by"),
-        n_states=fact(design.controller.n_states, help="states of the controller"),
-        multiplications=fact(frame_cost(design).multiplications, help="multiplications per frame"),
-        gamma=fact(design.gamma, help="achieved gamma, norm of the error in its own model", **norm),
-        estimation_rms=fact(design.rms, help="error in its own model", **_RMS),
-        certificate=fact(_certificate_word(one), help="certificate, recomputed"),
-        loop=fact("stable" if one.stable else "UNSTABLE", help="closed loop"),
-        spectral_radius=fact(
-            one.loop.spectral_radius, format=".6g", help="largest modulus of its poles"
-        ),
-        residual_nm=fact(row.residual_nm, "residual", help="residual, exact", **_RMS),
-        **parts,
-        strehl=fact(row.strehl, "Strehl", help="Strehl ratio, exact", **_RATIO),
-        strehl_simulated=fact(mean, help="Strehl ratio, simulated", **_RATIO),
-        scatter=fact(scatter, help="its scatter between runs", unit="points", format=".2f"),
-        above_limit_percent=_above(row.above_limit_percent, limits.limit, at_known),
-        worst_nm=fact(row.worst_nm if ranged else None, help="worst residual", **_RMS),
-        worst_strehl=fact(
-            float(one.strehls.min()), "worst Strehl", help="worst Strehl ratio", **_RATIO
-        ),
-        good_errors=fact(
-            _interval(good_range(report, one), "+.4g"),
-            help="within 10 % of its best Strehl ratio [Hz]",
-        ),
-        above_band_limit_percent=_above(row.above_band_limit_percent, limits.band, anywhere),
-        **numbers,
-        gain_margin=fact(_interval(factors, ".3g"), help="gain margin, factors"),
-        stable_gains=fact(_interval(one.sensor_gains), help="stable real sensor gains"),
-        moving_gains=fact(_interval(moves), help="proved while the gain moves at any speed"),
-    )
+    bounds = {"limit": _known(limits.limit), "band": _known(limits.band)}
+    entries = {}
+    for name, printing in words("facts").items():
+        text = printing.get("help", "").format(**bounds)
+        entries[name] = fact(values[name], **printing | {"help": text})
+    return facts(**entries)
 
 
-def _above(percent: float, limit: ResidualLimit | BandLimit | None, where: str) -> Any:
-    """Return the fact of percents above a limit, which may say nothing."""
-    if limit is None or not limit.rms_nm > 0:
-        return fact(None)
-    text = f"above the limit of {nm_text(limit.rms_nm, '.1f')}, {where}"
-    return fact(percent, unit="%", format=".0f", help=text)
+def _known(limit: ResidualLimit | BandLimit | None) -> str | None:
+    """Return a limit as a text; None where there is none, or one of 0, above which all is."""
+    return None if limit is None or not limit.rms_nm > 0 else nm_text(limit.rms_nm, ".1f")
 
 
 def _interval(ends: tuple[float, float] | None, spec: str = ".4g") -> str:
@@ -405,9 +383,9 @@ _KEPT = 0.9  # of its best Strehl ratio, within which a design counts as good
 def good_range(report: DesignReport, one: DesignAssessment) -> tuple[float, float] | None:
     """Return between which frequency errors [Hz] a design keeps 90 % of its best Strehl ratio.
 
-    None where it is unstable, or where there is no range of errors.
+    None where it is unstable, reads several sensors, or where there is no range of errors.
     """
-    if not one.stable or report.errors_hz.size == 1:
+    if np.isnan(one.strehls).any() or report.errors_hz.size == 1:
         return None
     runs, _ = label(one.strehls >= _KEPT * np.max(one.strehls))
     good = report.errors_hz[runs == runs[np.argmax(one.strehls)]]
@@ -431,15 +409,13 @@ def verdict(report: DesignReport) -> str:
             f"Least residual: {least} (Strehl ratio {100 * strehl:.1f} %)"
             f"{where if report.config.truth.vibrations else ''}."
         )
-    if report.stable and report.errors_hz.size > 1:
+    worst = {o.name: -100 * float(np.min(o.strehls)) for o in report.stable if o.alone}
+    if worst and report.errors_hz.size > 1:
         first, last = (f"{report.errors_hz[i]:+.4g}" for i in (0, -1))
-        most = _leaders(
-            {one.name: -100 * float(np.min(one.strehls)) for one in report.stable},
-            lambda percent: f"{-percent:.1f} %",
-        )
+        most = _leaders(worst, lambda percent: f"{-percent:.1f} %")
         sentences.append(
             f"Highest Strehl ratio at worst, if their frequencies are wrong by {first} to {last} "
-            f"Hz: {most}."
+            f"Hz{'' if all(o.alone for o in report.stable) else ', of one sensor'}: {most}."
         )
     sentences.append(_certificate_sentence(report))
     # a number stays in one line with its unit
@@ -476,7 +452,7 @@ def summary_table(report: DesignReport) -> Table:
     lines: list[tuple[str | Cell, ...]] = []
     group = ""
     for how in columns(rows[0]):
-        group = _GROUPS.get(how.name, group).format(ends)
+        group = words("groups").get(how.name, group).format(ends=ends)
         texts = [how.text(row) for row in rows]
         if not how.help or set(texts) == {"-"}:
             continue

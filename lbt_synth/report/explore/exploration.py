@@ -1,11 +1,11 @@
 """What can be moved on the page of sliders, and from there to what it shows: pure functions.
 
-A method of synthesis declares the range of an option's slider beside the option, as ``slider``.
+A knob edits numbers of the configuration, so that whatever is seen can be saved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -20,13 +20,13 @@ from lbt_synth.design import Design
 from lbt_synth.linear import hinf_norm, largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import close_loop, loop_margins
-from lbt_synth.methods.method import Method, Section
+from lbt_synth.methods.method import Method
 from lbt_synth.methods.registry import METHODS, default_method, design_title, method_named
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Vibration
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.report.designs.report import frequency_errors, require_compatible
-from lbt_synth.report.figures.loops import frequency_grid
+from lbt_synth.report.figures.loops import FAR, frequency_grid
 from lbt_synth.report.figures.records import SEGMENT, exact_spectrum
 from lbt_synth.storage.display_unit import nm_text, shown_unit
 from lbt_synth.storage.rows import fact, facts, row_table
@@ -39,10 +39,9 @@ from lbt_synth.validation import ComplexArray, FloatArray
 Content: TypeAlias = dict[str, Any]  # of a configuration file
 # puts a value into a file, given the factor on what it was
 Edit: TypeAlias = Callable[[Config, Content, float, float], None]
+Curve: TypeAlias = tuple[FloatArray, FloatArray]  # abscissae and ordinates, in units that are shown
 SHIFT = "shift"  # key of the knob that moves the true lines
-_WIDEST_HZ = 4.0  # half width of a band
-_NEAR = 0.9  # of its frequency, half the widest band around a line
-_MOST_DAMPING = 0.99
+_WIDEST_HZ = 4.0  # half width of a band: telescopes drift by less in a night
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +54,7 @@ class Knob:
     low: float
     high: float
     value: float  # where it stands before it is moved
-    edit: Edit | None = None  # what puts its value into a configuration, or
-    option: str = ""  # the option of the method that it is
+    edit: Edit  # what puts its value into a configuration
     log: bool = False  # whether equal steps are equal factors
     methods: frozenset[str] | None = None  # whose designs alone it changes; None: it is the loop's
 
@@ -72,37 +70,32 @@ class Knob:
 
 def list_knobs(config: Config) -> tuple[Knob, ...]:
     """Return what can be moved in a configuration: the loop and the sky, then the design."""
-    own = (knob for method in METHODS.values() for knob in _method_knobs(method, config))
-    return (*_loop_knobs(config), *_model_knobs(config), *own)
-
-
-def shift_range_hz(config: Config) -> tuple[float, float]:
-    """Return how far the true lines can be moved [Hz]: over the configuration's errors."""
-    errors = frequency_errors(config)
-    return float(errors[0]), float(errors[-1])
+    return (*_loop_knobs(config), *_model_knobs(config), *_method_knobs(config))
 
 
 def _loop_knobs(config: Config) -> Iterator[Knob]:
     """Yield the knobs of what the real loop meets."""
     delay, gain = config.settings.loop.delay_frames, config.truth.sensor_gain * config.sensor_gain
-    edit, most = _setter("loop", "delay_frames"), max(6.0, delay)
+    edit, most = _scaled("loop", "delay_frames", default=delay), max(6.0, delay)
     yield Knob("delay", "total delay", "frames", 1.0, most, delay, edit)
-    yield Knob("gain", "real sensor gain", "", gain / 5, 2.5 * gain, gain, _scale_sensor_gain)
+    edit = _scaled("truth", "sensor_gain", default=1.0)
+    yield Knob("gain", "real sensor gain", "", gain / 5, 2.5 * gain, gain, edit)
     noise_nm = float(np.sqrt(np.mean(np.square(config.noise_nm))))
     if noise_nm > 0:
         yield _factor_knob("noise", "measurement noise", "nm", noise_nm, 10.0, _scale_noise)
-    low, high = shift_range_hz(config)
+    low, high = frequency_errors(config)[[0, -1]].tolist()
     if low < high:
         label = "frequency error, true less assumed"
         yield Knob(SHIFT, label, "Hz", low, high, 0.0, _set_shift)
     air = config.settings.atmosphere
-    if air is not None:
-        for key, label, unit, name in (
-            ("seeing", "seeing", "arcsec", "seeing_arcsec"),
-            ("wind", "wind speed", "m/s", "wind_speed_m_s"),
-        ):
-            edit = _setter("atmosphere", name)
-            yield _factor_knob(key, label, unit, getattr(air, name), 4.0, edit)
+    for key, label, unit, name in (
+        ("seeing", "seeing", "arcsec", "seeing_arcsec"),
+        ("wind", "wind speed", "m/s", "wind_speed_m_s"),
+    ):
+        if air is not None:
+            value = float(getattr(air, name))
+            edit = _scaled("atmosphere", name, default=value)
+            yield _factor_knob(key, label, unit, value, 4.0, edit)
 
 
 def _factor_knob(key: str, label: str, unit: str, value: float, factor: float, edit: Edit) -> Knob:
@@ -120,49 +113,29 @@ def _model_knobs(config: Config) -> Iterator[Knob]:
     damping = float(np.exp(np.mean(np.log([line.damping for line in lines]))))
     knob = _factor_knob("damping", "assumed damping", "", damping, 10.0, _scale_damping)
     yield replace(knob, high=min(knob.high, 0.9), methods=methods)
-    reach = min(_WIDEST_HZ, *(_NEAR * line.frequency_hz for line in lines))
+    reach = min(_WIDEST_HZ, *(0.9 * line.frequency_hz for line in lines))
     value = min(reach, *(line.spread_hz or 0.0 for line in lines))
     methods = frozenset(method.name for method in filters if not method.needs_options)
     label = "half width of assumed bands"
     yield Knob("spread", label, "Hz", 0.0, reach, value, _set_spread, methods=methods)
 
 
-def _method_knobs(method: Method, config: Config) -> Iterator[Knob]:
-    """Yield the knobs of what a method declares a slider for: options, and keys of its section."""
-    methods, section = frozenset({method.name}), section_of(method, config)
-    for name, low, high in _declared_sliders(method.options):
-        option = method.options.model_fields[name]
-        value = option.examples[0] if option.is_required() and option.examples else option.default
-        value = float(config.design_defaults.get(name, value))
-        key, label = f"{method.name}-{name}", _label(name)
-        yield Knob(key, *label, low, high, value, option=name, methods=methods)
-    if section is None:
-        return
-    for name, low, high in _declared_sliders(type(section)):
-        value, edit = float(getattr(section, name)), _setter("design", method.name, name)
-        key, label = f"{method.name}-{name}", _label(name)
-        yield Knob(key, *label, low, high, value, edit, methods=methods)
-    if getattr(section, "bands", None):
-        half = float(np.mean([band.high_hz - band.low_hz for band in section.bands])) / 2
-        edit = partial(_scale_bands, method.name)
-        key, words = f"{method.name}-band", "half width of the bands"
-        knob = _factor_knob(key, words, "Hz", half, 10.0, edit)
-        yield replace(knob, high=max(_WIDEST_HZ, half), methods=methods)
-
-
-def _declared_sliders(kind: type[Section]) -> Iterator[tuple[str, float, float]]:
-    """Yield the fields that declare a slider, with its ends."""
-    for name, field in kind.model_fields.items():
-        extra = field.json_schema_extra
-        if isinstance(extra, dict) and isinstance(ends := extra.get("slider"), list):
-            low, high = (float(str(end)) for end in ends)
-            yield name, low, high
-
-
-def _label(name: str) -> tuple[str, str]:
-    """Return the name of an option as words, and its unit."""
-    words, _, unit = name.rpartition("_")
-    return (words.replace("_", " "), "Hz") if unit == "hz" else (name.replace("_", " "), "")
+def _method_knobs(config: Config) -> Iterator[Knob]:
+    """Yield the knobs of single methods: of the section ``design`` of a configuration."""
+    ratio = float(config.settings.design.gamma_ratio)
+    edit = _scaled("design", "gamma_ratio", default=ratio)
+    bounded = frozenset(name for name, m in METHODS.items() if "gamma_ratio" in m.configurable)
+    yield Knob("gamma_ratio", "gamma ratio", "", 1.0, 3.0, ratio, edit, methods=bounded)
+    for name, method in METHODS.items():
+        section, methods = section_of(method, config), frozenset({name})
+        if getattr(section, "bands", None):
+            margin = float(section.modulus_margin)
+            edit = _scaled("design", name, "modulus_margin", default=margin)
+            yield Knob("modulus", "modulus margin", "", 0.2, 0.8, margin, edit, methods=methods)
+            half = float(np.mean([band.high_hz - band.low_hz for band in section.bands])) / 2
+            edit, label = partial(_scale_bands, name), "half width of the bands"
+            knob = _factor_knob("band", label, "Hz", half, 10.0, edit)
+            yield replace(knob, high=max(_WIDEST_HZ, half), methods=methods)
 
 
 def section_of(method: Method, config: Config) -> Any:
@@ -173,22 +146,17 @@ def section_of(method: Method, config: Config) -> Any:
     return section
 
 
-def _setter(*keys: str) -> Edit:
-    """Return the edit that sets the number at a path of keys."""
+def _scaled(*keys: str, default: float) -> Edit:
+    """Return the edit of the number at a path of keys, or of a list, which keeps proportions."""
 
     def edit(_: Config, content: Content, value: float, factor: float) -> None:
         for key in keys[:-1]:
-            content = content[key]
-        content[keys[-1]] = value
+            content = content.setdefault(key, {})
+        numbers = np.asarray(content.get(keys[-1], default)) * factor
+        # the value of the slider, and not a neighbour by rounding
+        content[keys[-1]] = np.vectorize(lambda number: float(f"{number:.12g}"))(numbers).tolist()
 
     return edit
-
-
-def _scale_sensor_gain(config: Config, content: Content, value: float, factor: float) -> None:
-    """Scale the real sensor gain; gains of several measurements keep their proportions."""
-    truth = content.setdefault("truth", {})
-    gain = truth.get("sensor_gain", 1.0)
-    truth["sensor_gain"] = [factor * g for g in gain] if isinstance(gain, list) else factor * gain
 
 
 def _scale_noise(config: Config, content: Content, value: float, factor: float) -> None:
@@ -213,8 +181,8 @@ def _scale_damping(config: Config, content: Content, value: float, factor: float
     """Scale the damping of the lines of the model; those of the truth stay."""
     _true_lines(config, content)
     for line in content["model"]["vibrations"]:
-        if line["damping"] < _MOST_DAMPING:  # beyond, it is a drift
-            line["damping"] = min(line["damping"] * factor, _MOST_DAMPING)
+        if line["damping"] < 0.99:  # from there on it is a drift
+            line["damping"] = min(line["damping"] * factor, 0.99)
 
 
 def _set_spread(config: Config, content: Content, value: float, factor: float) -> None:
@@ -257,25 +225,12 @@ def _true_lines(config: Config, content: Content) -> list[Content]:
     return truth.setdefault("vibrations", [])  # type: ignore[no-any-return]  # of a file
 
 
-_POINTS, _NEAR_A_LINE = 240, 28  # frequencies of a curve: in all, and on each side of a line
-_SHIFTS = 15  # of the true lines, for which a Strehl ratio is computed
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Shown:
     """What the page shows of a design; nan in an unstable loop."""
 
-    frequency_hz: FloatArray  # (f,)
-    error_nm: FloatArray | None  # (f,): norm of the estimation error; None without an estimate
-    rejection: FloatArray  # (f,): norm from phase to residual
-    noise_transfer: FloatArray  # (f,): norm from noise to residual
-    spectrum_nm2_hz: FloatArray  # (f,): of the residual, sum over the axes
-    broken: ComplexArray  # (q, f): loop gain of each measurement, the others closed
-    poles: ComplexArray  # of the closed loop
-    shift_hz: FloatArray  # (s,): by which the true lines are moved from the start
-    strehls: FloatArray  # (s,): Strehl ratio there, in [0, 1]
-    # where the true lines are now
-    residual_nm: float
+    curves: Mapping[str, Curve]  # by the keys of figures; none of an error without an estimate
+    residual_nm: float  # this and what follows: where the true lines are now
     strehl: float
     modulus: float
 
@@ -293,9 +248,9 @@ class Exploration:
 class View:
     """What a method and sliders give; the first of the designs on show is its own."""
 
-    values: Mapping[str, float]  # of the knobs that were moved, by their keys
     config: Config
     request: DesignRequest
+    moves: str  # the sliders that were moved, as people read them
     shift_hz: float  # of the true lines
     design: Design
     shown: Mapping[str, Shown]
@@ -314,39 +269,25 @@ def explore(config: Config, designs: Mapping[str, Design]) -> Exploration:
 
 
 def moved_knobs(
-    method: str, values: Mapping[str, float], knobs: Sequence[Knob]
+    exploration: Exploration, method: str, values: Mapping[str, float]
 ) -> dict[Knob, float]:
     """Return the knobs that were moved and act on the designs of a method, with values in reach."""
     return {
         knob: min(max(float(values[knob.key]), knob.low), knob.high)
-        for knob in knobs
+        for knob in exploration.knobs
         if knob.key in values and knob.acts_on(method)
     }
 
 
-def fulfil(
-    name: str, values: Mapping[str, float], knobs: Sequence[Knob], config: Config
-) -> tuple[Config, DesignRequest]:
-    """Return the configuration and the request of a method whose knobs were moved.
-
-    ConfigError where they do not fit.
-    """
-    method, moved = method_named(name), moved_knobs(name, values, knobs)
+def move(config: Config, method: str, moved: Mapping[Knob, float]) -> Config:
+    """Return the configuration with knobs at other values; ConfigError where they do not fit."""
     content = config.settings.model_dump(exclude_unset=True)
-    section = None if method.section is None else section_of(method, config)
-    if section is not None and content.setdefault("design", {}).get(name) is None:
-        content["design"][name] = section.model_dump(exclude_unset=True)  # made for its plant
+    section = section_of(method_named(method), config)
+    if section is not None and content.setdefault("design", {}).get(method) is None:
+        content["design"][method] = section.model_dump(exclude_unset=True)  # made for its plant
     for knob, value in moved.items():
-        if knob.edit is not None:
-            knob.edit(config, content, value, value / knob.value if knob.value else 1.0)
-    settings = validate_sections(FileSection, content, config.source)
-    options = {
-        knob.option: moved.get(knob, knob.value)
-        for knob in knobs
-        if knob.option and name in (knob.methods or ())
-    }
-    request = design_request(name, {**method.reference_options, **options})
-    return build_config(settings, config.source), request
+        knob.edit(config, content, value, value / knob.value if knob.value else 1.0)
+    return build_config(validate_sections(FileSection, content, config.source), config.source)
 
 
 def new_view(
@@ -355,23 +296,34 @@ def new_view(
     values: Mapping[str, float] = MappingProxyType({}),
 ) -> View:
     """Design, and return what the page shows of the design and of those to compare with."""
-    name, knobs = method or default_method(), exploration.knobs
-    config, request = fulfil(name, values, knobs, exploration.config)
-    shifts = (v for knob, v in moved_knobs(name, values, knobs).items() if knob.key == SHIFT)
-    design, label, shift_hz = config.design(request), request.method.label, next(shifts, 0.0)
+    name = method or default_method()
+    moved = moved_knobs(exploration, name, values)
+    config = move(exploration.config, name, moved)
+    request = design_request(name, method_named(name).reference_options)
+    design, label = config.design(request), request.method.label
     if label in exploration.designs:
         label += " by the sliders"
+    shift_hz = next((value for knob, value in moved.items() if knob.key == SHIFT), 0.0)
+    moves = (
+        f"{knob.label} {value * knob.shown[1]:.4g} {knob.shown[0]}".rstrip()
+        for knob, value in moved.items()
+    )
     return View(
-        values=values,
         config=config,
         request=request,
+        moves=", ".join(moves),
         shift_hz=shift_hz,
         design=design,
         shown={
-            name: show_design(each, config, exploration.config, shift_hz)
-            for name, each in {label: design, **exploration.designs}.items()
+            title: show_design(one, config, exploration.config, shift_hz)
+            for title, one in {label: design, **exploration.designs}.items()
         },
     )
+
+
+# Frequencies of a curve, in all and on each side of a line, and shifts of the true lines: as many
+# as a page draws in a tenth of a second (benchmarks/explore.py)
+_POINTS, _NEAR_A_LINE, _SHIFTS = 240, 28, 15
 
 
 def show_design(design: Design, config: Config, start: Config, shift_hz: float) -> Shown:
@@ -386,10 +338,9 @@ def show_design(design: Design, config: Config, start: Config, shift_hz: float) 
     grid = frequency_grid(hardware.frame_rate_hz, truth.lines_hz, **density)
     n, m = hardware.modes, hardware.n_commands
     response = loop.system.frequency_response(grid)
-    returned = response[:, n + m :, n:].diagonal(axis1=1, axis2=2).T
-    stable, nothing = loop.is_stable, np.full(grid.size, np.nan)
     lines = {name: getattr(start.truth, name) for name in ("vibrations", "frequency_errors_hz")}
-    shifts = np.unique(np.append(np.linspace(*shift_range_hz(start), _SHIFTS), shift_hz))
+    low, high = frequency_errors(start)[[0, -1]]
+    shifts = np.unique([*np.linspace(low, high, _SHIFTS), shift_hz])
     image = robustness_map(
         design,
         replace(truth, **lines),
@@ -398,23 +349,42 @@ def show_design(design: Design, config: Config, start: Config, shift_hz: float) 
         errors_hz=shifts,
         sensor_gains=[truth.sensor_gain],
     )
+    poles, gains = loop.system.poles, _loop_gains(response[:, n + m :, n:])
+    modulus, power = np.nan, np.full(grid.size, np.nan)
+    rejection, noise = power, power
+    if loop.is_stable:
+        modulus = 1 / float(hinf_norm(loop.output_sensitivity()))
+        power = shown_unit("nm²/Hz")[1] * exact_spectrum(loop, truth, grid, SEGMENT)
+        rejection, noise = (spectral_norms(response[:, :n, s]) for s in (np.s_[:n], np.s_[n:]))
+    curves = {
+        "explore-rejection": (grid, rejection),
+        "explore-noise": (grid, noise),
+        "explore-nyquist": (gains.real, gains.imag),
+        "explore-spectrum": (grid, power),
+        "explore-strehl": (shifts, 100 * image.strehl[0, 0]),
+        "explore-poles": (poles.real, poles.imag),
+    }
+    if design.is_estimator:
+        error = largest_singular_values(design.error_system(), grid)
+        curves["explore-sigma"] = grid, shown_unit("nm")[1] * error
     now = int(np.searchsorted(shifts, shift_hz))
     return Shown(
-        frequency_hz=grid,
-        error_nm=largest_singular_values(design.error_system(), grid)
-        if design.is_estimator
-        else None,
-        rejection=spectral_norms(response[:, :n, :n]) if stable else nothing,
-        noise_transfer=spectral_norms(response[:, :n, n:]) if stable else nothing,
-        spectrum_nm2_hz=exact_spectrum(loop, truth, grid, SEGMENT) if stable else nothing,
-        broken=1 / returned - 1,
-        poles=loop.system.poles,
-        shift_hz=shifts,
-        strehls=image.strehl[0, 0],
+        curves=curves,
         residual_nm=float(image.residual_nm[0, 0, now]),
         strehl=float(image.strehl[0, 0, now]),
-        modulus=1 / float(hinf_norm(loop.output_sensitivity())) if stable else np.nan,
+        modulus=modulus,
     )
+
+
+def _loop_gains(returned: ComplexArray) -> ComplexArray:
+    """Return the loop gains of all measurements, each broken in turn, with gaps between them.
+
+    With the others closed, a response (f, m, m) from noise to measurement is 1 / (1 + gain). What
+    is far outside the plane is cut, as a canvas takes no large numbers.
+    """
+    broken = 1 / returned.diagonal(axis1=1, axis2=2).T - 1
+    near = np.clip(broken.real, -FAR, FAR) + 1j * np.clip(broken.imag, -FAR, FAR)
+    return np.asarray(np.pad(near, ((0, 0), (0, 1)), constant_values=np.nan).ravel())
 
 
 def explored_table(shown: Mapping[str, Shown]) -> Table:
@@ -431,15 +401,6 @@ def explored_table(shown: Mapping[str, Shown]) -> Table:
     return row_table("", rows)
 
 
-def describe_moves(exploration: Exploration, view: View) -> str:
-    """Return the sliders that were moved for a view, as people read them; empty without any."""
-    moved = moved_knobs(view.request.method.name, view.values, exploration.knobs)
-    return ", ".join(
-        f"{knob.label} {value * knob.shown[1]:.4g} {knob.shown[0]}".rstrip()
-        for knob, value in moved.items()
-    )
-
-
 def judge(view: View) -> str:
     """Return the verdict on the design of a view, in sentences."""
     config, controller = view.config, view.design.controller
@@ -449,17 +410,17 @@ def judge(view: View) -> str:
     checks = count_text(len(view.design.certificate.checks), "check")
     certified = f"certified ({checks}), and stable for sensor gains of {low:.3g} to {high:.3g}"
     compared = compare_in_truth({view.name: view.design}, config)
-    own, *others = compared.rows
-    if not own.stable:
+    row, *others = compared.rows
+    if not row.stable:
         return f"{view.name} is {certified}; at {now:.3g} this loop is UNSTABLE."
     margins = loop_margins(close_loop(config.hardware, controller, sensor_gain=gain))
-    residual, strehl = nm_text(own.residual_nm, ".1f", unit="nm rms"), 100 * own.strehl
+    residual, strehl = nm_text(row.residual_nm, ".1f", unit="nm rms"), 100 * row.strehl
     sentences = [f"{view.name} leaves {residual}, Strehl ratio {strehl:.1f} %"]
     if compared.limit is not None:
-        above = f"{own.above_limit_percent:.1f}"
+        above = f"{row.above_limit_percent:.1f}"
         sentences[0] += f", {above} % above the least of any linear controller"
-    best = min(others, key=lambda row: row.residual_nm, default=own)
-    if best.residual_nm < own.residual_nm:
+    best = min(others, key=lambda other: other.residual_nm, default=row)
+    if best.residual_nm < row.residual_nm:
         least = nm_text(best.residual_nm, ".1f")
         sentences.append(f"the {design_title(best.method)} leaves {least} here")
     sentences.append(

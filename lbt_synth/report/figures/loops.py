@@ -23,7 +23,7 @@ _DECADES = 3.6  # of frequency that are drawn, below half the frame rate
 _POINTS = 1200  # of a grid of frequencies
 _LOWEST_DB, _HIGHEST_DB = -40.0, 60.0
 _REACH = 2.5  # of a Nyquist plot from its centre
-_FAR = 8.0  # loop gain beyond which a Nyquist plot draws nothing
+FAR = 3 * _REACH  # loop gain that is outside of it
 _MODULI = (0.3, 0.5, 0.7)  # modulus margins whose contours a Nichols plot has
 _TURN = np.linspace(0, 2 * np.pi, 241)
 _APART = 1e-12  # of a response, that another axis has by rounding
@@ -177,7 +177,7 @@ def sigma_curves(
             error = largest_singular_values(system, grid)
         if name in loops and loops[name].is_stable:
             S, N = loops[name].sensitivity(grid), loops[name].noise_transfer(grid)
-            diagonals = [np.abs(part.diagonal(axis1=1, axis2=2)).T for part in (S, N)]
+            diagonals = [np.abs(response.diagonal(axis1=1, axis2=2)).T for response in (S, N)]
             if _are_apart(S) and _are_apart(N) and not np.allclose(diagonals[0], diagonals[0][0]):
                 for axis, pair in enumerate(zip(*diagonals, strict=True)):
                     curves[axes_name(name, [axis], alone=False)] = grid, None, *pair
@@ -344,7 +344,7 @@ def _draw_plane(panel: Panel, name: str, loop: ClosedLoop) -> None:
         return
     groups = broken_loops(loop)
     for number, broken in enumerate(groups):
-        shown = np.where(np.abs(broken.response) < _FAR, broken.response, np.nan)
+        shown = np.where(np.abs(broken.response) < FAR, broken.response, np.nan)
         label = axes_name("loop", broken.measurements, alone=len(groups) == 1)
         panel.curve(label, shown.real, shown.imag, dash=number)
         pale: dict[str, Any] = {"dash": number, "opacity": 0.35, "numbers": False}

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.signal import freqz, get_window, welch
+from scipy.stats import kstwobign
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
@@ -26,34 +28,43 @@ SPECTRUM = {"label": "power spectrum", "unit": "nm²/Hz", "log": True}
 SERIES_S = 1.0  # of a series, in which single oscillations are seen
 _WINDOW_S = 0.1  # over which the size of the residual is averaged
 _BANDS = 240  # of equal ratio over which the periodogram is averaged
-_KOLMOGOROV = 1.6276  # Kolmogorov's statistic at 1 %
 _NAMES = ("tip", "tilt")
 
 
-def simulation_figure(run: Simulation, *, title: str = "", axes: OwnAxes = None) -> Figure:
-    """Residual series and spectra before and after the correction.
+def simulation_figure(
+    run: Simulation,
+    *,
+    loop: ClosedLoop | None = None,
+    truth: Truth | None = None,
+    title: str = "",
+    axes: OwnAxes = None,
+) -> Figure:
+    """Residual series of the first second of the first case, and spectra.
 
-    The first second of the first case is drawn; the spectra are means over all cases.
+    The spectra, before the correction and after it, are means over all cases and sums over the
+    axes; that of the transfer functions is beside them for a loop and a truth.
     """
-    _, frames, n = run.residual_nm.shape
-    names = _NAMES if n <= 2 else [f"mode {i}" for i in range(1, n + 1)]
-    shown = min(frames, int(np.ceil(SERIES_S * run.frame_rate_hz)))
-    time = np.arange(shown) / run.frame_rate_hz
-    with drawing([PANEL_IN, PANEL_IN], axes=axes) as (series, spectra):
-        series.set_axes(TIME, {"label": "residual", "unit": "nm"}, title=title)
+    frames = min(run.residual_nm.shape[1], int(np.ceil(SERIES_S * run.frame_rate_hz)))
+    with drawing([PANEL_IN, PANEL_IN], columns=2, axes=axes) as (series, spectra):
+        _draw_series(series, run, frames, title)
         spectra.set_axes(FREQUENCY, SPECTRUM)
-        for i, name in zip(range(n), names, strict=False):
-            y = run.residual_nm[0, :shown, i]
-            series.curve(f"{name}, residual", time, y, look=i, width=0.8, opacity=0.8, dash=0)
-            # the residual is solid, what there was before it is dotted
-            for data, word, dash in (
-                (run.total_nm, "open loop", 3),
-                (run.residual_nm, "residual", 0),
-            ):
-                f, s = welch(data[:, :, i], run.frame_rate_hz, nperseg=min(frames, 2048))
-                mean = s.mean(axis=0)[1:]
-                spectra.curve(f"{name}, {word}", f[1:], mean, look=i, width=1.0, dash=dash)
+        f, opened, residual = run_spectra(run)
+        spectra.curve("before the correction", f, opened, look=None, width=0.8)
+        spectra.curve("after it", f, residual, look=5, width=1.0, dash=0)
+        if loop is not None and truth is not None:
+            exact = exact_spectrum(loop, truth, f, _segment(run))
+            spectra.curve("after it, exact", f, exact, look=1, width=1.4)
     return series.figure
+
+
+def _draw_series(panel: Panel, run: Simulation, frames: int, title: str) -> None:
+    """Draw the residual of each axis in the first frames of the first case."""
+    n = run.residual_nm.shape[2]
+    names = _NAMES if n <= 2 else [f"mode {i}" for i in range(1, n + 1)]
+    time = np.arange(frames) / run.frame_rate_hz
+    panel.set_axes(TIME, {"label": "residual", "unit": "nm"}, title=title)
+    for i, name in zip(range(n), names, strict=False):
+        panel.curve(name, time, run.residual_nm[0, :frames, i], look=i, width=0.7, dash=0)
 
 
 def sensor_failure_figure(
@@ -64,25 +75,20 @@ def sensor_failure_figure(
     The size is the mean over all cases. ``exact_nm`` is the stationary residual of each segment
     between failures and returns [nm rms], nan where there is none.
     """
-    _, frames, n = run.residual_nm.shape
-    time = np.arange(frames) / run.frame_rate_hz
-    window = max(int(_WINDOW_S * run.frame_rate_hz), 1)
+    frames, window = run.residual_nm.shape[1], max(int(_WINDOW_S * run.frame_rate_hz), 1)
     end = frames // window * window
-    power = np.mean(np.sum(run.residual_nm[:, :end] ** 2, axis=2), axis=0)
+    power = np.mean(np.sum(run.image_nm2[:, :end], axis=2), axis=0)  # as the camera sees it
     rms_nm = np.sqrt(power.reshape(-1, window).mean(axis=1))
-    centres = time[:end].reshape(-1, window).mean(axis=1)
+    centres = (np.arange(rms_nm.size) + 0.5) * window / run.frame_rate_hz
     failures = [segment for segment in segments if segment.text]
     looks = {text: 3 + i for i, text in enumerate(dict.fromkeys(s.text for s in failures))}
     with drawing([PANEL_IN, PANEL_IN]) as (series, size):
-        series.set_axes(TIME, {"label": "residual", "unit": "nm"}, title=title)
+        _draw_series(series, run, frames, title)
         size.set_axes(TIME, {"label": "residual, both axes", "unit": "nm rms", "log": True})
         for panel in (series, size):
             for failure in failures:
                 ends = failure.start_s, failure.end_s
                 panel.span(failure.text, *ends, look=looks[failure.text])
-        for i in range(n):
-            y = run.residual_nm[0, :, i]
-            series.curve(_NAMES[i], time, y, look=i, width=0.5, opacity=0.7, dash=0)
         size.curve(f"in the run, over {_WINDOW_S:g} s", centres, rms_nm, look=0)
         for segment, exact in zip(segments, exact_nm, strict=True):
             if np.isfinite(exact):
@@ -168,6 +174,8 @@ def _predicted_residuals(
             raise ProblemError(
                 f"designs must be Controllers or Designs; got {type(design).__name__} for {name!r}."
             )
+        if isinstance(design, Design) and design.other_sensors:
+            continue  # the model says nothing of what they read
         loop = close_loop(model.hardware, controller)
         loop.require_stable()
         residuals[name] = [_residual_density(model, loop, i) for i in range(len(model.axes))]
@@ -189,7 +197,7 @@ def _residual_density(model: IdentifiedModel, loop: ClosedLoop, i: int) -> Float
 
 def _noise_density(axis: IdentifiedAxis) -> float:
     """Density of the noise, in units of the phase [nm^2/Hz]."""
-    return 2 / axis.frame_rate_hz * (axis.noise_nm / axis.sensor_gain) ** 2
+    return 2 / axis.data.frame_rate_hz * (axis.noise_nm / axis.sensor_gain) ** 2
 
 
 def _noise_text(axis: IdentifiedAxis) -> str:
@@ -270,32 +278,32 @@ def _cumulative_curves(
 def _draw_innovations(panel: Panel, axis: IdentifiedAxis, frequency: dict[str, object]) -> None:
     test = axis.whiteness
     even = np.arange(1, test.cumulative.size + 1) / test.cumulative.size
-    bound = 100 * _KOLMOGOROV / np.sqrt(test.effective)
+    bound = 100 * kstwobign.isf(0.01) / np.sqrt(test.effective)  # of Kolmogorov's statistic
     excess = 100 * (test.cumulative - even)
     reach = max(2 * bound, 1.2 * float(np.max(np.abs(excess))))
     y_axis = {"label": "power up to f", "unit": "%", "low": -reach, "high": reach}
     panel.set_axes(frequency, y_axis, title="innovations, less white noise")
     panel.span("99 % of white noise", -bound, bound, "y")
-    panel.curve("excess", test.frequency_hz, excess, width=1.0, quiet=True)
+    panel.curve("excess", axis.frequency_hz, excess, width=1.0, quiet=True)
 
 
 SEGMENT = 2048  # frames of a segment of the spectra, at most
 
 
-def run_spectra(
-    run: Simulation, loop: ClosedLoop, truth: Truth
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return frequencies [Hz], and spectra before the correction and after it, and the exact one.
+def run_spectra(run: Simulation) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return frequencies [Hz], and the spectra before the correction and after it, (f,) each.
 
-    They are by Welch's method, means over the runs and sums over the axes [nm^2/Hz], (f,). The
-    exact one is by the transfer functions, with the window's image of each sinusoid.
+    They are by Welch's method, means over the runs and sums over the axes [nm^2/Hz].
     """
-    length = min(run.residual_nm.shape[1], SEGMENT)
-    spectra = []
-    for series in (run.total_nm, run.residual_nm):
-        f, density = welch(series, run.frame_rate_hz, nperseg=length, detrend=False, axis=1)
-        spectra.append(density.mean(axis=0).sum(axis=-1)[1:])
-    return f[1:], *spectra, exact_spectrum(loop, truth, f, length)[1:]
+    how: dict[str, Any] = {"nperseg": _segment(run), "detrend": False, "axis": 1}
+    f, opened = welch(run.total_nm, run.frame_rate_hz, **how)
+    _, residual = welch(run.residual_nm, run.frame_rate_hz, **how)
+    return f[1:], *(density.mean(axis=0).sum(axis=-1)[1:] for density in (opened, residual))
+
+
+def _segment(run: Simulation) -> int:
+    """Return how many frames a segment of the spectra of a run has."""
+    return min(int(run.residual_nm.shape[1]), SEGMENT)
 
 
 def exact_spectrum(

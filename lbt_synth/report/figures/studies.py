@@ -20,7 +20,7 @@ from lbt_synth.storage.rows import Facts
 from lbt_synth.studies import RobustnessMap, RobustnessRow
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES
-from lbt_synth.validation import positive, require_instance
+from lbt_synth.validation import FloatArray, positive, require_instance
 
 FREQUENCY_ERROR = {"label": "frequency error, truth less design", "unit": "Hz"}
 SENSOR_GAIN = {"label": "sensor gain", "unit": "-"}
@@ -167,25 +167,34 @@ def robustness_map_figure(
 def limits_figure(study: LimitStudy, *, over_errors: bool = False, axes: OwnAxes = None) -> Figure:
     """Draw the residual of each design over the vibration's frequency or its error, and the limits.
 
-    Unstable designs are named and not drawn. A study in which no vibration moves raises a
-    ProblemError.
+    Designs that leave the same are one curve with their names; unstable ones are named and not
+    drawn. A study in which no vibration moves raises a ProblemError.
     """
     if study.shift_hz.size < 2:
         raise ProblemError(
             "a figure of limits needs a vibration that moves; got a truth without vibrations, or "
             "a single error. Give truth.vibrations and robustness.errors_hz."
         )
-    start_hz, x_axis, names = 0.0, FREQUENCY_ERROR, [row.design for row in study.rows]
+    start_hz, x_axis = 0.0, FREQUENCY_ERROR
     if not over_errors:
         shift = "shift of the vibration that moves most, the others in proportion"
         label = shift if study.frequency_hz is None else "frequency of the true vibration"
         start_hz, x_axis = study.frequency_hz or 0.0, {"label": label, "unit": "Hz"}
-        names = [design_label(name) for name in names]
     order, places = np.argsort(study.shift_hz), np.sort(study.shift_hz) + start_hz
+    curves: list[tuple[str, FloatArray | None]] = []
+    for row, residual_nm in zip(study.rows, study.residual_nm, strict=True):
+        name = row.design if over_errors else design_label(row.design)
+        values = residual_nm[order] if row.stable else None
+        for i, (twin, other) in enumerate(curves):
+            if values is not None and other is not None and np.allclose(values, other, rtol=1e-9):
+                curves[i] = f"{twin} and {name}", other
+                break
+        else:
+            curves.append((name, values))
     with drawing([2.5], axes=axes) as (panel,):
         panel.set_axes(x_axis, {"label": "residual", "unit": "nm rms", "log": True})
-        for name, row, residual_nm in zip(names, study.rows, study.residual_nm, strict=True):
-            draw_design(panel, names, name, places, residual_nm[order] if row.stable else None)
+        for name, values in curves:
+            draw_design(panel, [title for title, _ in curves], name, places, values)
         if study.limit is not None and study.limit.rms_nm > 0:
             panel.rule("limit, frequency known", study.limit.rms_nm, "y", dash=3)
         if study.band is not None:
@@ -279,8 +288,8 @@ def modal_figure(
     if not residuals_nm:
         raise ProblemError("a modal figure needs the residuals of a controller; got none.")
     others = {"turbulence_nm": turbulence_nm, "gains": gains}
-    given = (*residuals_nm.items(), *others.items())
-    curves = {name: positive(values, name) for name, values in given if values is not None}
+    numbers = {**residuals_nm, **others}
+    curves = {n: positive(values, n) for n, values in numbers.items() if values is not None}
     count = curves[next(iter(residuals_nm))].size
     for name, curve in curves.items():
         if curve.shape != (count,) or not count:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
 from html import escape
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
@@ -91,13 +91,13 @@ class Page:
 
 
 @cache
-def words() -> dict[str, dict[str, str]]:
-    """Return the texts of ``words.toml`` by group and name, each on one line."""
+def words(group: str) -> dict[str, Any]:
+    """Return the texts of a group of ``words.toml`` by their names, each on one line."""
     path = files("lbt_synth.report.page") / "words.toml"
-    texts: dict[str, dict[str, str]] = tomllib.loads(path.read_text(encoding="utf-8"))
+    texts: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))[group]
     return {
-        group: {name: " ".join(text.split()) for name, text in own.items()}
-        for group, own in texts.items()
+        name: " ".join(text.split()) if isinstance(text, str) else text
+        for name, text in texts.items()
     }
 
 
@@ -106,7 +106,7 @@ def chart(key: str, figure: Figure, *, group: str = "", **facts: object) -> Char
 
     Its words for those who do not see it say from where to where its curves reach.
     """
-    texts = {name: text.format(**facts) for name, text in words()[group or key].items()}
+    texts = {name: text.format(**facts) for name, text in words(group or key).items()}
     texts["alt"] += "".join(f" {text}." for text in _ranges(figure))
     return Chart(key=key, figure=figure, **texts)
 
@@ -137,7 +137,7 @@ def survival_blocks(margins: Mapping[str, LoopMargins]) -> list[Block]:
 
 def paragraph(name: str, /, **facts: object) -> str:
     """Return the text of a paragraph with facts filled in."""
-    return words()["paragraphs"][name].format(**facts)
+    return str(words("paragraphs")[name]).format(**facts)
 
 
 def new_page(
@@ -199,13 +199,8 @@ def creator_name() -> str:
 
 def program_versions() -> tuple[tuple[str, str], ...]:
     """Return name and version of the programs that make a page."""
-    installed = [("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())]
-    for name in _PROGRAMS:
-        try:
-            installed.append((name, version(name)))
-        except PackageNotFoundError:
-            installed.append((name, "not installed"))
-    return tuple(installed)
+    ours = ("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())
+    return (*ours, *((name, version(name)) for name in _PROGRAMS))
 
 
 _COLUMNS = 6  # that fit a sheet of paper beside the first one of a table

@@ -165,7 +165,7 @@ def run_study(
 
 def part_rows(study: Study) -> int:
     """Return how many rows a part of a study has, at most."""
-    together = all(are_evaluated_together(study, each) for each in study.controllers.values())
+    together = all(are_evaluated_together(study, one) for one in study.controllers.values())
     return _ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE
 
 

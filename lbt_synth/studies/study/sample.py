@@ -104,7 +104,7 @@ def _evaluate_group(
     """Return the columns of samples that differ by numbers of some keys only."""
     config, hardware, _ = make_sample(study, values[0])
     by_name = dict(zip(study.parameter_names, values.T, strict=True))
-    places = [(place, by_name[name]) for name, each in study.places.items() for place in each]
+    places = [(place, by_name[name]) for name, keys_of in study.places.items() for place in keys_of]
     with np.errstate(over="raise", divide="raise", invalid="raise"):
         if design is None:
             matrices = _kalman_matrices([make_sample(study, row)[0].plant for row in values])

@@ -166,16 +166,16 @@ def _controller_statistics(
     """Return the statistics of one controller, with the order of each parameter's values."""
     places = np.flatnonzero(samples["evaluated"])
     strehl, unstable = samples["strehl"][places], samples["unstable"][places]
-    mean, error = mean_and_error(strehl)
+    n = len(strehl)
     worst = places[np.lexsort((rows[places], strehl, ~unstable))[:_MOST_WORST]]
     return ControllerStatistics(
         controller=controller,
-        samples=len(strehl),
-        failed=len(samples["strehl"]) - len(strehl),
+        samples=n,
+        failed=len(samples["strehl"]) - n,
         unstable=int(np.count_nonzero(unstable)),
         unstable_share=share(unstable),
-        mean=mean,
-        mean_error=error,
+        mean=float(np.mean(strehl)) if n else np.nan,
+        mean_error=float(np.std(strehl, ddof=1)) / n**0.5 if n > 1 else np.nan,
         strehl=percentiles(strehl, PERCENTS),
         residual_nm=percentiles(samples["residual_nm"][places], PERCENTS),
         worst=tuple(worst.tolist()),
@@ -233,20 +233,16 @@ def _refuse_where(wrong: BoolArray, values: FloatArray, demand: str) -> None:
 
 def percentiles(values: FloatArray, percents: Sequence[float]) -> dict[float, Interval]:
     """Return percentiles of a sample (n,), with intervals from order statistics."""
-    from scipy.stats import binom
+    from scipy.stats import quantile_test
 
-    n, tail, parts = len(values), (1 - CONFIDENCE) / 2, np.array(percents) / 100
-    if n == 0:
+    if len(values) == 0:
         return dict.fromkeys(percents, _NONE)
-    ordered = np.sort(values)
-    limits = np.concatenate(([np.nan], ordered, [np.nan]))  # none before the first, after the last
-    first = np.array(np.maximum(binom.ppf(tail, n, parts), 0), dtype=np.int64)
-    last = np.array(binom.ppf(1 - tail, n, parts), dtype=np.int64) + 1
-    rows = zip(percents, limits[first].tolist(), limits[last].tolist(), strict=True)
-    return {
-        percent: Interval(value=_interpolate(ordered, percent / 100), low=low, high=high)
-        for percent, low, high in rows
-    }
+    ordered, intervals = np.sort(values), {}
+    for percent in percents:
+        ends: Any = quantile_test(ordered, q=0, p=percent / 100).confidence_interval(CONFIDENCE)
+        value = _interpolate(ordered, percent / 100)
+        intervals[percent] = Interval(value=value, low=float(ends.low), high=float(ends.high))
+    return intervals
 
 
 def _interpolate(ordered: FloatArray, fraction: float) -> float:
@@ -261,22 +257,13 @@ def _interpolate(ordered: FloatArray, fraction: float) -> float:
 
 def share(where: BoolArray) -> Interval:
     """Return the part of the samples (n,) of a mask, with the interval of Clopper and Pearson."""
-    from scipy.special import betaincinv
+    from scipy.stats import binomtest
 
-    count, total = int(np.count_nonzero(where)), len(where)
-    if total == 0:
+    if len(where) == 0:
         return _NONE
-    tail = (1 - CONFIDENCE) / 2
-    low = float(betaincinv(count, total - count + 1, tail)) if count else 0.0
-    high = float(betaincinv(count + 1, total - count, 1 - tail)) if count < total else 1.0
-    return Interval(value=count / total, low=low, high=high)
-
-
-def mean_and_error(values: FloatArray) -> tuple[float, float]:
-    """Return the mean and its standard error for independent samples; nan if too few."""
-    n = len(values)
-    mean = float(np.mean(values)) if n else np.nan
-    return mean, float(np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else np.nan
+    count = int(np.count_nonzero(where))
+    ends = binomtest(count, len(where)).proportion_ci(CONFIDENCE, method="exact")
+    return Interval(value=count / len(where), low=float(ends.low), high=float(ends.high))
 
 
 def _sensitivity(values: FloatArray, order: IntArray, samples: Samples) -> dict[str, float]:

@@ -68,15 +68,6 @@ class NormalSection(Section):
         low, high = self.low, self.high
         return -np.inf if low is None else low, np.inf if high is None else high
 
-    def quantile(self, level: FloatArray) -> FloatArray:
-        """Return the values at levels in [0, 1)."""
-        from scipy.stats import truncnorm
-
-        low, high = ((end - self.mean) / self.deviation for end in self.ends)
-        standard = truncnorm.ppf(np.clip(level, _EDGE, 1 - _EDGE), low, high)
-        with np.errstate(over="ignore"):  # an infinite value is refused later
-            return np.clip(self.mean + self.deviation * standard, *self.ends)
-
 
 class ParameterSection(Section):
     """The distribution of one parameter; a bare number is fixed."""
@@ -95,8 +86,8 @@ class ParameterSection(Section):
 
     @model_validator(mode="after")
     def _one_distribution(self) -> ParameterSection:
-        given = [v is not None for v in (self.fixed, self.uniform, self.normal, self.list_)]
-        if sum(given) != 1:
+        laws = [v is not None for v in (self.fixed, self.uniform, self.normal, self.list_)]
+        if sum(laws) != 1:
             raise ValueError("expected a number or exactly one of fixed, uniform, normal, list")
         if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
             low, high = self.uniform
@@ -135,8 +126,14 @@ class ParameterSection(Section):
 
     def quantile(self, level: FloatArray) -> FloatArray:
         """Return the values below which each share ``level``, in [0, 1), lies."""
+        from scipy.stats import truncnorm
+
         if self.normal is not None:
-            return self.normal.quantile(level)
+            mean, deviation = self.normal.mean, self.normal.deviation
+            cuts = ((end - mean) / deviation for end in self.normal.ends)
+            standard = truncnorm.ppf(np.clip(level, _EDGE, 1 - _EDGE), *cuts)
+            with np.errstate(over="ignore"):  # an infinite value is refused later
+                return np.clip(mean + deviation * standard, *self.normal.ends)
         if self.uniform is not None:
             low, high = self.uniform
             return np.clip(low + level * (high - low), low, high)
@@ -177,8 +174,8 @@ class ControllerSection(Section):
         """Where it comes from, for people."""
         if self.file is not None:
             return self.file
-        given = ", ".join(f"{name} {value}" for name, value in self.options.items())
-        method = f"{self.design} ({given})" if given else f"{self.design}"
+        options = ", ".join(f"{name} {value}" for name, value in self.options.items())
+        method = f"{self.design} ({options})" if options else f"{self.design}"
         return f"{method} for {'each sample' if self.for_ == 'sample' else 'the configuration'}"
 
     @model_validator(mode="after")

@@ -2,42 +2,33 @@
 
 import numpy as np
 import pytest
-from support.shaping import (
-    NOISE,
-    ONE,
-    RATE,
-    SLOW,
-    channel,
-    random_coefficients,
-    spec,
-)
+from support.shaping import NOISE, ONE, RATE, SLOW, channel, random_coefficients, shaped, spec
 
 import lbt_synth as lbt
+from lbt_synth.design import shaping
+from lbt_synth.design.shaping import Attenuation, CommandRms, LoopErrors, MovingSensorGain
 from lbt_synth.design.shaping.channel import mode_loop
 
+DEMANDS = [
+    shaping.ModulusMargin(at_least=0.4),
+    shaping.NoisePeak(at_most=2),
+    Attenuation(low_hz=3, high_hz=9, at_most=0.7),
+    Attenuation(low_hz=3, high_hz=9, at_most=1.4, sensor_gain=0.5),
+    LoopErrors(low=0.4, high=1.0),
+    LoopErrors(low=1.0, high=1.5),
+    shaping.MirrorUncertainty(relative=0.4, low_hz=100, high_hz=400),
+    LoopErrors(delay_frames=0.3),
+    CommandRms(at_most_nm=30, turbulence=SLOW, noise_nm=NOISE),
+    CommandRms(at_most_nm=30, turbulence=SLOW, noise_nm=NOISE, rate=True),
+]
 
-@pytest.mark.parametrize(
-    "demand",
-    [
-        lbt.design.shaping.ModulusMargin(at_least=0.4),
-        lbt.design.shaping.NoisePeak(at_most=2),
-        lbt.design.shaping.Attenuation(low_hz=3, high_hz=9, at_most=0.7),
-        lbt.design.shaping.Attenuation(low_hz=3, high_hz=9, at_most=1.4, sensor_gain=0.5),
-        lbt.design.shaping.LoopErrors(low=0.4, high=1.0),
-        lbt.design.shaping.LoopErrors(low=1.0, high=1.5),
-        lbt.design.shaping.MirrorUncertainty(relative=0.4, low_hz=100, high_hz=400),
-        lbt.design.shaping.LoopErrors(delay_frames=0.3),
-        lbt.design.shaping.CommandRms(at_most_nm=30, turbulence=SLOW, noise_nm=NOISE),
-        lbt.design.shaping.CommandRms(at_most_nm=30, turbulence=SLOW, noise_nm=NOISE, rate=True),
-    ],
-    ids=lambda d: d.label,
-)
-@pytest.mark.parametrize("seed", range(3))
-def test_a_demand_holds_in_the_programme_where_it_holds_in_the_loop(demand, seed):
+
+@pytest.mark.parametrize("demand", DEMANDS, ids=lambda d: d.label)
+def test_a_demand_holds_in_the_programme_where_it_holds_in_the_loop(demand):
     mode = channel()
     grid = spec(demand).grid(mode).with_points(np.linspace(0, 400, 4001))
     constraints = demand.constraints(mode, grid)
-    for size in (0.02, 0.1, 0.3, 1.0, 3.0):
+    for size, seed in ((s, i) for s in (0.02, 0.1, 0.3, 1.0, 3.0) for i in range(3)):
         c = random_coefficients(12, seed) * size
         held = all(
             x.function.value(c) <= x.limit if hasattr(x, "limit") else np.max(x.use(c)) <= 1
@@ -51,64 +42,50 @@ def test_a_demand_holds_in_the_programme_where_it_holds_in_the_loop(demand, seed
             assert held == all(check.passed for check in checks)
 
 
-@pytest.mark.parametrize(("at_most", "gain"), [(1.6, 1.5), (1.9, 1.5), (2.2, 1.3), (1.7, 0.45)])
+@pytest.mark.parametrize(("at_most", "gain"), [(1.9, 1.5), (1.7, 0.45)])
 def test_attenuation_near_the_edge_of_convexity_is_certified(at_most, gain):
-    eager = lbt.design.shaping.ResidualVariance(turbulence=SLOW, noise_nm=2.0)
-    mask = lbt.design.shaping.Attenuation(low_hz=0, high_hz=400, at_most=at_most, sensor_gain=gain)
-    design = lbt.design.shape(ONE, spec(mask, objective=eager), functions=20, states=None)
-    f = np.linspace(0, 400, 8001)
-    loop = lbt.close_loop(ONE, design.controller, sensor_gain=gain)
-    assert np.max(np.abs(loop.sensitivity(f))) < at_most
+    eager = shaping.ResidualVariance(turbulence=SLOW, noise_nm=2.0)
+    mask = Attenuation(low_hz=0, high_hz=400, at_most=at_most, sensor_gain=gain)
+    loop = lbt.close_loop(ONE, shaped(mask, objective=eager).controller, sensor_gain=gain)
+    assert np.max(np.abs(loop.sensitivity(np.linspace(0, 400, 8001)))) < at_most
 
 
-@pytest.mark.parametrize(
-    ("delay", "error"),
-    [(1.0, 1.0), (1.5, 0.3), (2.0, 1.0), (2.3, 0.5), (2.5, 0.5), (2.7, 0.3), (3.0, 0.6)],
-)
+@pytest.mark.parametrize(("delay", "error"), [(1.5, 0.3), (2.0, 1.0), (2.5, 0.5), (3.0, 0.6)])
 def test_a_loop_is_stable_at_every_delay_within_its_error(delay, error):
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1)
-    eager = lbt.design.shaping.ResidualVariance(turbulence=SLOW, noise_nm=1.0)
-    design = lbt.design.shape(
-        path,
-        spec(lbt.design.shaping.LoopErrors(delay_frames=error), objective=eager),
-        functions=20,
-        states=None,
-    )
+    eager = shaping.ResidualVariance(turbulence=SLOW, noise_nm=1.0)
+    design = shaped(LoopErrors(delay_frames=error), objective=eager, path=path)
     for e in np.linspace(-error, error, 41):
         real = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=max(delay + e, 1.0), modes=1)
         assert lbt.close_loop(real, design.controller).is_stable
     if delay == 2.0:  # without the demand it is not
-        free = lbt.design.shape(path, spec(objective=eager), functions=20, states=None)
         late = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=3.0, modes=1)
+        free = shaped(objective=eager, path=path)
         assert not lbt.close_loop(late, free.controller).is_stable
 
 
+LINE = shaping.VibrationBand(low_hz=16, high_hz=24, rms_nm=500)
+
+
 def shape_for_a_gain(kind, low, high):
-    """One design, and the check of a gain that moves in its interval."""
-    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-    line = lbt.design.shaping.VibrationBand(low_hz=16, high_hz=24, rms_nm=500)
-    demand = getattr(lbt.design.shaping, kind)(low=low, high=high)
-    design = lbt.design.shape(path, spec(demand, objective=line), functions=12, states=None)
-    moves = lbt.design.shaping.MovingSensorGain(low=low, high=high)
-    return design, moves.checks(mode_loop(path, design.parameters[0]))[0]
+    """Return one design, and the check of a gain that moves in its interval."""
+    design = shaped(kind(low=low, high=high), objective=LINE, functions=12)
+    moves = MovingSensorGain(low=low, high=high)
+    return design, moves.checks(mode_loop(ONE, design.parameters[0]))[0]
 
 
 def test_a_moving_gain_is_proved_where_constant_ones_are_not_enough():
-    """The circle criterion, on a loop that a switch between stable gains breaks without it."""
-    still, failed = shape_for_a_gain("LoopErrors", 0.3, 1.5)
-    moves, passed = shape_for_a_gain("MovingSensorGain", 0.3, 1.5)
-    assert passed.passed
-    assert not failed.passed
+    """A switch between stable gains breaks the loop that the circle criterion does not prove."""
+    still, failed = shape_for_a_gain(LoopErrors, 0.3, 1.5)
+    moves, passed = shape_for_a_gain(MovingSensorGain, 0.3, 1.5)
+    assert (passed.passed, failed.passed) == (True, False)
     assert passed.name == "circle criterion of a moving gain, 0.3 to 1.5"
     low, high = (
         lbt.close_loop(still.hardware, still, sensor_gain=gain).system for gain in (0.3, 1.5)
     )
     assert max(low.spectral_radius, high.spectral_radius) < 1
-    switched = [
-        np.linalg.matrix_power(low.A, p) @ np.linalg.matrix_power(high.A, q)
-        for p in range(1, 13)
-        for q in range(1, 13)
-    ]
+    power, turns = np.linalg.matrix_power, range(1, 13)
+    switched = [power(low.A, p) @ power(high.A, q) for p in turns for q in turns]
     assert np.max(np.abs(np.linalg.eigvals(switched))) > 1
     assert moves.objective_nm[0] > still.objective_nm[0]
 
@@ -116,19 +93,14 @@ def test_a_moving_gain_is_proved_where_constant_ones_are_not_enough():
 @pytest.mark.parametrize(("low", "high"), [(0.3, 1.0), (1.0, 1.5)])
 def test_a_gain_that_moves_on_one_side_costs_nothing(low, high):
     """The disc is a half-plane then, the same as for a constant gain."""
-    still, check = shape_for_a_gain("LoopErrors", low, high)
+    still, check = shape_for_a_gain(LoopErrors, low, high)
     assert check.passed
-    moves, _ = shape_for_a_gain("MovingSensorGain", low, high)
+    moves, _ = shape_for_a_gain(MovingSensorGain, low, high)
     assert moves.objective_nm == pytest.approx(still.objective_nm, rel=1e-6)
 
 
 def test_a_moving_gain_that_clashes_is_named():
-    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-    line = lbt.design.shaping.VibrationBand(low_hz=16, high_hz=24, rms_nm=500)
-    demands = (
-        lbt.design.shaping.MovingSensorGain(low=0.5, high=3.0),
-        lbt.design.shaping.Attenuation(low_hz=16, high_hz=24, at_most=1e-3),
-    )
+    demands = MovingSensorGain(low=0.5, high=3.0), Attenuation(low_hz=16, high_hz=24, at_most=1e-3)
     with pytest.raises(lbt.errors.InfeasibleError) as caught:
-        lbt.design.shape(path, spec(*demands, objective=line), functions=16, states=None)
+        shaped(*demands, objective=LINE, functions=16)
     assert any("while the sensor gain moves" in text for text in caught.value.conflict)

@@ -7,6 +7,7 @@ import pytest
 from support.telemetry import full
 
 import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, ProblemError
 
 
 def test_hardware_of_slopes_is_seen_through_the_reconstructor():
@@ -33,7 +34,7 @@ def test_hardware_of_slopes_is_seen_through_the_reconstructor():
     ],
 )
 def test_hardware_that_is_not_known(changes, text):
-    with pytest.raises(lbt.errors.ProblemError, match=text):
+    with pytest.raises(ProblemError, match=text):
         _ = full(**changes).hardware
 
 
@@ -93,16 +94,14 @@ def test_hardware_that_is_not_known(changes, text):
     ],
 )
 def test_what_does_not_fit_is_refused(changes, text):
-    with pytest.raises(lbt.errors.ProblemError, match=text):
+    with pytest.raises(ProblemError, match=text):
         full(**changes)
 
 
 def test_a_controller_of_other_sizes_is_refused():
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     one = lbt.integrator(path, gain=0.4).controller
-    with pytest.raises(
-        lbt.errors.DimensionError, match="must map 2 measurements to 2 commands; got 1 to 1"
-    ):
+    with pytest.raises(DimensionError, match="must map 2 measurements to 2 commands; got 1 to 1"):
         full(controller=one)
 
 

@@ -3,12 +3,8 @@
 import numpy as np
 import pytest
 
-import lbt_synth as lbt
-from lbt_synth.identification.accelerometers.readings import (
-    fill_missing,
-    load_readings,
-    resample,
-)
+from lbt_synth.errors import ProblemError, TelemetryError
+from lbt_synth.identification.accelerometers.readings import fill_missing, load_readings, resample
 
 RATE = 1000.0
 FRAMES = 4000
@@ -47,7 +43,7 @@ def test_rates_that_leave_no_frame_are_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.zeros((100, 2)))
     refused = ((1e9, "Is the rate right"), (0, "above 0"), (999, "at least once a frame"))
     for rate_hz, words in refused:
-        with pytest.raises(lbt.errors.ProblemError, match=words):
+        with pytest.raises(ProblemError, match=words):
             load_readings(tmp_path / "a.npy", RATE, rate_hz=rate_hz)
 
 
@@ -84,12 +80,10 @@ def test_units_of_headings_count(tmp_path):
     for unit, factor in (("g", 9.80665), ("m/s^2", 1.0), ("m s-2", 1.0), ("mm/s2", 1e-3)):
         path = write(tmp_path / "a.csv", f"m1 [{unit}],m2 [{unit}]", *series.T)
         np.testing.assert_allclose(load_readings(path, RATE)[1], factor * series, rtol=1e-9)
-    with pytest.raises(lbt.errors.TelemetryError, match="acceleration_unit says g"):
+    with pytest.raises(TelemetryError, match="acceleration_unit says g"):
         load_readings(path, RATE, unit="g")
     path = write(tmp_path / "a.csv", "m1 [mV],m2 [mV]", *series.T)
-    with pytest.raises(
-        lbt.errors.TelemetryError, match="'mV', and acceleration_unit says None. Scale them"
-    ):
+    with pytest.raises(TelemetryError, match="'mV', and acceleration_unit says None. Scale them"):
         load_readings(path, RATE)
     np.testing.assert_allclose(load_readings(path, RATE, unit="mg")[1], 9.80665e-3 * series)
 

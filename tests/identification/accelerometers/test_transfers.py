@@ -11,6 +11,8 @@ from scipy.signal import lfilter
 from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification import accelerometer_transfers, loop_record
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
@@ -43,7 +45,7 @@ def night() -> Night:
         accelerations.append(1e-9 * w**2 * acceleration)
         seen[:, axis] += position[MARGIN - 1 : MARGIN - 1 + FRAMES]
     seen += 8 * rng.standard_normal(seen.shape)
-    record = lbt.identification.loop_record(seen, frame_rate_hz=RATE, unit="nm")
+    record = loop_record(seen, frame_rate_hz=RATE, unit="nm")
     return Night(record, np.array(accelerations), lbt.identify(record))
 
 
@@ -56,9 +58,17 @@ def reading(*factors: float, age: int = 1, noise: float = 0.0, seed: int = 0) ->
 
 
 def find(*channels: np.ndarray, **options) -> AccelerometerTransfers:
-    return lbt.identification.accelerometer_transfers(
-        night().model, night().record, np.column_stack(channels), **options
-    )
+    series = np.column_stack(channels)
+    return accelerometer_transfers(night().model, night().record, series, **options)
+
+
+def require_phases(found: AccelerometerTransfers, age: float) -> None:
+    """Require the phases of readings of an age, taken at the age that was found."""
+    for row in found.transfers:
+        j = line_index(row)
+        phase = 360 * LINES[j][0] / RATE * (found.age_frames - age) + 180 * (j == 1)
+        assert row.useful
+        assert phase_error(row, phase) < 5 * row.phase_error_deg
 
 
 def line_index(row) -> int:
@@ -94,8 +104,7 @@ def test_errors_count_that_of_the_sensor_gain():
     axes = tuple(replace(axis, sensor_gain_error=0.05) for axis in it.model.axes)
     unsure = replace(it.model, axes=axes)
     exact, found = (
-        lbt.identification.accelerometer_transfers(model, it.record, channel)
-        for model in (it.model, unsure)
+        accelerometer_transfers(model, it.record, channel) for model in (it.model, unsure)
     )
     for known, row in zip(exact.transfers, found.transfers, strict=True):
         assert row.motion_nm_per_nm == known.motion_nm_per_nm
@@ -115,52 +124,36 @@ def test_readings_of_any_age_are_laid_beside_the_wavefront(age):
     assert abs(found.shift_frames - (age - 1)) < 4 * found.shift_error_frames < 2
     assert found.age_frames == 1 + round(found.shift_frames)
     assert "by the slope of the phase" in found.shift_text
-    for row in found.transfers:
-        j = line_index(row)
-        phase = 360 * LINES[j][0] / RATE * (found.age_frames - age) + 180 * (j == 1)
-        assert row.useful
-        assert phase_error(row, phase) < 5 * row.phase_error_deg
+    require_phases(found, age)
 
 
 def test_a_fraction_of_a_frame_goes_into_the_phases():
     late = (reading(2.0, -0.7, 1.3) + reading(2.0, -0.7, 1.3, age=2)) / 2
     found = find(late + 1e-3 * np.random.default_rng(0).standard_normal(FRAMES))
     assert found.shift_frames == pytest.approx(0.5, abs=5 * found.shift_error_frames)
-    for row in found.transfers:
-        j = line_index(row)
-        phase = 360 * LINES[j][0] / RATE * (found.age_frames - 1.5) + 180 * (j == 1)
-        assert phase_error(row, phase) < 5 * row.phase_error_deg
+    require_phases(found, 1.5)
 
 
 def test_a_run_gives_the_motions_back():
     """Second differences of samples are smaller than accelerations: by 2 % at 60, 11 % at 150 Hz."""
-    rate_hz, delay_frames = 800.0, 1.4
+    rate_hz, delay_frames, unit = 800.0, 1.4, {"frame_rate_hz": 800.0, "unit": "nm"}
     lines = tuple(
         lbt.Vibration(frequency_hz=f, damping=0.005, rms_nm=60, direction=d)
         for f, d in ((60.0, (1, 0)), (150.0, (0, 1)))
     )
     motions = ({"m1": Motion(size=2.0, phase_deg=30)}, {"m1": Motion(size=0.4, phase_deg=-120)})
-    sensor = Accelerometer(
-        name="mirror",
-        rate_hz=rate_hz,
-        delay_frames=delay_frames,
-        channels=("m1",),
-        noise_m_s2=1e-3,
-    )
-    suite = SensorSuite(sensors=(sensor,))
+    timing = {"rate_hz": rate_hz, "delay_frames": delay_frames, "channels": ("m1",)}
+    suite = SensorSuite(sensors=(Accelerometer(name="mirror", noise_m_s2=1e-3, **timing),))
     path = lbt.LoopHardware(frame_rate_hz=rate_hz, delay_frames=2, modes=2, suite=suite)
     truth = lbt.Truth(turbulence=None, vibrations=lines, motions=motions)
-    size = {"frames": 40_000, "cases": 1, "zero_frame": 0}
-    rng = np.random.default_rng(1)
+    size, rng = {"frames": 40_000, "cases": 1, "zero_frame": 0}, np.random.default_rng(1)
     _, drawn = draw_phase(truth, path, rng=rng, oscillators=True, **size)
-    read = draw_others(truth, path, drawn, rng, **size)
+    read = draw_others(truth, path, drawn, rng, **size)[0, 1:]
     # the wavefront sensor measures in frame k the phase of frame k - 1
     seen = np.stack([np.roll(motion[0], 1) for motion, _ in drawn], axis=1)
     seen += 8 * rng.standard_normal(seen.shape)
-    record = lbt.identification.loop_record(seen[1:], frame_rate_hz=rate_hz, unit="nm")
-    found = lbt.identification.accelerometer_transfers(
-        lbt.identify(record), record, read[0, 1:], largest_shift_s=0.01
-    )
+    record = loop_record(seen[1:], **unit)
+    found = accelerometer_transfers(lbt.identify(record), record, read, largest_shift_s=0.01)
     assert len(found.transfers) == 2
     for row, line, motion in zip(found.transfers, lines, motions, strict=True):
         late = 360 * line.frequency_hz / rate_hz * (found.age_frames - (delay_frames - 1))
@@ -180,18 +173,10 @@ def test_a_shift_that_is_not_sure_moves_no_readings():
 
 
 def test_channels_that_fail_are_named_and_left_out():
-    rng = np.random.default_rng(8)
-    good = reading(2.0, -0.7, 1.3, noise=1e-3)
-    gone = good.copy()
-    gone[: FRAMES // 4] = np.nan
-    found = find(
-        good,
-        np.full(FRAMES, 3.3),
-        1e-3 * rng.integers(0, 2, FRAMES),
-        gone,
-        1e-200 * good,
-        1e-2 * rng.standard_normal(FRAMES),
-    )
+    rng, good = np.random.default_rng(8), reading(2.0, -0.7, 1.3, noise=1e-3)
+    gone = np.where(np.arange(FRAMES) < FRAMES // 4, np.nan, good)
+    flicker, noise = 1e-3 * rng.integers(0, 2, FRAMES), 1e-2 * rng.standard_normal(FRAMES)
+    found = find(good, np.full(FRAMES, 3.3), flicker, gone, 1e-200 * good, noise)
     verdicts = [row.verdict for row in found.channels]
     assert verdicts[1:] == ["dead", "adds nothing", "dead", "dead", "adds nothing"]
     assert [row.channel for row in found.used] == ["channel1"]
@@ -226,8 +211,8 @@ def test_motions_at_the_frequency_of_a_line_that_do_not_go_with_it_are_not_used(
     ],
 )
 def test_readings_that_are_refused(given, options, words):
-    with pytest.raises(lbt.errors.ProblemError, match=words):
-        lbt.identification.accelerometer_transfers(night().model, night().record, given, **options)
+    with pytest.raises(ProblemError, match=words):
+        accelerometer_transfers(night().model, night().record, given, **options)
 
 
 @pytest.mark.study
@@ -237,6 +222,7 @@ def test_a_record_of_39_s_and_5_channels_takes_little_memory():
 from pathlib import Path
 import numpy as np
 import lbt_synth as lbt
+from lbt_synth.identification import accelerometer_transfers, loop_record
 rng = np.random.default_rng(0)
 line = lbt.Vibration(frequency_hz=90, damping=0.02, rms_nm=60).ar_model(1000)
 v = np.zeros(39_002)

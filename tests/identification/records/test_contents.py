@@ -11,7 +11,7 @@ import pytest
 from astropy.io import fits
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.record_files import csv, hdus, image, write_csv
+from support.record_files import csv, write_csv
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
@@ -40,33 +40,6 @@ def test_damage(tmp_path, name, content, words):
     with pytest.raises(lbt.errors.TelemetryError, match=words) as caught:
         lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
     assert "Traceback" not in str(caught.value)
-
-
-@pytest.mark.parametrize("size", [2000, 4000, 6000])
-def test_truncated_files(tmp_path, series, size):
-    path = hdus(tmp_path / "a.fits", image("POL", np.tile(series[0], (10, 1)), "nm"))
-    path.write_bytes(path.read_bytes()[:size])
-    with pytest.raises(lbt.LbtSynthError, match=r"a\.fits"):
-        lbt.load_record(path, frame_rate_hz=RATE)
-
-
-def test_nulls_of_integer_columns(tmp_path):
-    values = np.random.default_rng(0).integers(-500, 500, 40).astype(np.int32)
-    values[7] = -99999
-    table = fits.BinTableHDU.from_columns(
-        [fits.Column("POL", "J", array=values, null=-99999, unit="nm")]
-    )
-    seen = lbt.load_record(hdus(tmp_path / "a.fits", table), frame_rate_hz=RATE)
-    assert np.flatnonzero(~seen.usable).tolist() == [7]
-    assert np.array_equal(seen.measurements[8:, 0], values[8:])
-
-
-def test_no_pickle_is_opened(tmp_path):
-    np.save(tmp_path / "a.npy", np.array([{"y": 1}], dtype=object), allow_pickle=True)
-    np.savez(tmp_path / "b.npz", y=np.array([{"y": 1}], dtype=object))
-    for name in ("a.npy", "b.npz"):
-        with pytest.raises(lbt.errors.TelemetryError, match="cannot read"):
-            lbt.load_record(tmp_path / name, frame_rate_hz=RATE)
 
 
 FRAMES = 60
@@ -107,15 +80,6 @@ def test_nulls_of_scaled_columns_and_images(tmp_path):
         seen = lbt.load_record(path, columns=chosen)
         assert np.flatnonzero(~seen.usable).tolist() == [10]
     assert lbt.load_record(scaled).measurements[11, 0] == pytest.approx(3 - 9.98)
-
-
-def test_nulls_of_ascii_columns(tmp_path):
-    column = fits.Column("POL", "F10.3", array=1.5 * np.arange(40), null="---", unit="nm")
-    path = hdus(tmp_path / "a.fits", fits.TableHDU.from_columns([column]), FPS=RATE)
-    path.write_bytes(path.read_bytes().replace(b"     4.500", b"       ---"))
-    seen = lbt.load_record(path)
-    assert np.flatnonzero(~seen.usable).tolist() == [3]
-    assert seen.measurements[4, 0] == 6.0
 
 
 def test_a_name_and_a_header_of_two_units(tmp_path, series):
@@ -173,15 +137,6 @@ def table_of(text):
     return [column.name for column in found.columns], values, found.notes
 
 
-def test_gaps_and_comments_of_text_tables():
-    names, values, _ = table_of("# mode: closed\ntime_s, y_nm\n0.000, 3.5\n0.001, \n")
-    assert names == ["time_s", "y_nm"]
-    assert np.array_equal(values, [[0.0, 3.5], [0.001, np.nan]], equal_nan=True)
-    found = contents_of("# mode: closed\n# frame_rate_hz: 500\ny_nm\n1.0\n2.0\n")
-    assert list(found.facts) == ["frame_rate_hz"]  # the other comment says nothing that is known
-    assert list(found.facts["frame_rate_hz"]) == ["the comment frame_rate_hz"]
-
-
 @settings(max_examples=40)
 @given(
     rows=st.lists(
@@ -213,11 +168,8 @@ def test_headings_in_comments_and_decimal_commas():
     ("names", "axes"),
     [
         (["y_nm"], 1),
-        (["Y [nm]"], 1),
         (["Residual (nm)"], 1),
-        (["tip_nm", "tilt_nm"], 2),
         (["tilt_nm", "tip_nm"], 2),
-        (["slopes_tip_nm", "slopes_tilt_nm"], 2),
         (["residual_x_nm", "residual_y_nm"], 2),
         (["measurement 1 [nm]", "measurement 2 [nm]"], 2),
         (["y1_nm", "y0_nm"], 2),
@@ -237,7 +189,6 @@ def test_names_of_measurements(tmp_path, series, names, axes):
     ("names", "kind"),
     [
         (["pol_tip_nm", "pol_tilt_nm"], None),
-        (["open_loop_0_nm", "open_loop_1_nm"], None),
         (["disturbance_x [nm]", "disturbance_y [nm]"], None),
         (["y0_nm", "y1_nm"], "open_loop"),
     ],
@@ -311,12 +262,6 @@ def test_axes_of_many_columns(tmp_path):
     assert np.array_equal(seen.commands, u[:, [3, 1]])
     with pytest.raises(ProblemError, match="axes must be one or two different numbers below 5"):
         lbt.load_record(path, unit="nm", axes=(0, 5))
-
-
-def test_axes_may_be_counted_from_one_in_one_of_them(tmp_path, series):
-    y, u = series[0][:, 0], series[1][:, 0]
-    one = csv(tmp_path / "b.csv", y_1_nm=y, y_2_nm=u, u_0_nm=y, u_1_nm=u)
-    assert np.array_equal(lbt.load_record(one, frame_rate_hz=RATE).commands, np.c_[y, u])
 
 
 def test_x_and_y_may_be_a_clock_and_its_series(tmp_path, series):

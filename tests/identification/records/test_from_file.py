@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from types import ModuleType
 
 import numpy as np
 import pytest
 from astropy.io import fits
-from support.eris import ERIS_FILE, eris_example, eris_record
+from support.eris import ERIS_FILE
 from support.record_files import csv, hdus, image, write_csv
 from support.records import SHELL
 
@@ -20,22 +19,21 @@ RATE = 500.0
 
 @pytest.mark.parametrize(
     "kind",
-    ["csv", "tsv", "semicolon", "blanks", "fits images", "turned", "fits table", "npz", "npy"],
+    ["csv", "blanks", "turned", "fits table", "npz", "npy"],
 )
 def test_every_format_gives_the_same_record(tmp_path, series, kind):
     y, u = series
     options = {"delay_frames": 2}
     names = ["time_s", "y0_nm", "y1_nm", "u0_nm", "u1_nm"]
     columns = [np.arange(60) / RATE, *y.T, *u.T]
-    if kind in ("csv", "tsv", "semicolon", "blanks"):
-        sign = {"csv": ",", "tsv": "\t", "semicolon": ";", "blanks": " "}[kind]
+    if kind in ("csv", "blanks"):
+        sign = {"csv": ",", "blanks": " "}[kind]
         path = write_csv(tmp_path / "a.csv", names, columns, sign=sign)
-    elif kind in ("fits images", "turned"):
-        turn = (lambda a: a.T) if kind == "turned" else (lambda a: a)
+    elif kind == "turned":
         path = hdus(
             tmp_path / "a.fits",
-            image("RESIDUALS", turn(y), "nm"),
-            image("COMMANDS", turn(u).astype(">f8"), "nm"),
+            image("RESIDUALS", y.T, "nm"),
+            image("COMMANDS", u.T.astype(">f8"), "nm"),
             FRAMRATE=RATE,
         )
     elif kind == "fits table":
@@ -86,16 +84,11 @@ def test_telemetry_of_ours(tmp_path):
         assert lbt.load_record(file, axes=[1]).axes == 1
         for options, words in (
             ({"frame_rate_hz": 801}, f"{name}: frame_rate_hz must be that of the telemetry, 800"),
-            ({"kind": "open_loop"}, "kind must be closed_loop"),
+            ({"kind": "open_loop"}, "is of kind closed_loop; got open_loop"),
             ({"columns": {"measurements": 0}}, "neither columns nor commands"),
         ):
-            with pytest.raises(lbt.errors.ProblemError, match=words):
+            with pytest.raises(ProblemError, match=words):
                 lbt.load_record(file, **options)
-    damaged = bytearray((tmp_path / "a.fits").read_bytes())
-    damaged[12_000] ^= 1
-    (tmp_path / "b.fits").write_bytes(damaged)
-    with pytest.raises(lbt.errors.TelemetryError, match=r"b\.fits"):
-        lbt.load_record(tmp_path / "b.fits")
 
 
 @pytest.mark.e2e
@@ -125,25 +118,8 @@ def test_gaps_times_and_counters(tmp_path):
     assert seen.frame_rate_hz == 500
     assert np.flatnonzero(~seen.usable).tolist() == [7, 8, 20, 30]
     assert [each.kind for each in seen.health.findings] == ["missing", "not finite"]
-    with pytest.raises(
-        lbt.errors.ProblemError, match=r"a\.csv: frame_rate_hz must be that of the times"
-    ):
+    with pytest.raises(ProblemError, match=r"a\.csv: frame_rate_hz must be that of the times"):
         lbt.load_record(path, kind="open_loop", frame_rate_hz=800)
-
-
-@pytest.mark.parametrize(
-    "card", ["FRAMRATE", "FRAMERAT", "RATE_HZ", "LOOPFREQ", "FPS", "HIERARCH frame_rate_hz"]
-)
-def test_rates_in_headers(tmp_path, series, card):
-    path = hdus(tmp_path / "a.fits", image("POL", series[0], "nm", **{card: RATE}))
-    seen = lbt.load_record(path)
-    assert seen.frame_rate_hz == RATE
-    assert any(note.startswith("frame_rate_hz 500, by") for note in seen.health.notes)
-    with pytest.raises(
-        lbt.errors.ProblemError,
-        match=rf"frame_rate_hz must be that of .*{card.split()[-1]}.*, 500; got 1000",
-    ):
-        lbt.load_record(path, frame_rate_hz=1000)
 
 
 def test_delays_and_diameters_in_headers(tmp_path, series):
@@ -159,6 +135,11 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     )
     seen = lbt.load_record(path)
     assert (seen.delay_frames, seen.diameter_m, seen.obstruction) == (2.5, 8.0, 0.11)
+    assert "frame_rate_hz 500, by FRAMRATE of HDU 0" in seen.health.notes
+    with pytest.raises(ProblemError, match="frame_rate_hz must be that of FRAMRATE of .*; got 100"):
+        lbt.load_record(path, frame_rate_hz=1000)
+    with pytest.raises(ProblemError, match="averages are only for a spectrum"):
+        lbt.load_record(path, averages=3)
     assert np.allclose(seen.measurements, lbt.models.nm_per_mas(8.0) * y)
     other = lbt.load_record(path, delay_frames=3, diameter_m=8.4)
     assert (other.delay_frames, other.diameter_m) == (3.0, 8.4)
@@ -170,46 +151,32 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     seen = lbt.load_record(unsure, frame_rate_hz=RATE)
     assert seen.delay_frames is None
     twice = hdus(tmp_path / "c.fits", image("POL", y, "nm", FPS=400.0), FRAMRATE=RATE)
-    with pytest.raises(lbt.errors.ProblemError, match="the file gives frame_rate_hz twice"):
+    with pytest.raises(ProblemError, match="the file gives frame_rate_hz twice"):
         lbt.load_record(twice)
-
-
-def test_facts_in_comments(tmp_path, series):
-    path = write_csv(
-        tmp_path / "a.csv",
-        ["y", "u"],
-        [series[0][:, 0], series[1][:, 0]],
-        comments=("frame_rate_hz = 500", "unit: um", "delay frames: 2", "by night"),
-    )
-    seen = lbt.load_record(path)
-    assert (seen.frame_rate_hz, seen.delay_frames) == (RATE, 2.0)
-    assert np.allclose(seen.measurements, 1e3 * series[0][:, :1])
 
 
 def test_units_must_be_given(tmp_path, series):
     y, _ = series
     path = write_csv(tmp_path / "a.csv", ["pol"], [y[:, 0]])
-    with pytest.raises(lbt.errors.ProblemError, match="nothing tells the unit of pol: give unit"):
+    with pytest.raises(ProblemError, match="nothing tells the unit of pol: give unit"):
         lbt.load_record(path, frame_rate_hz=RATE)
     assert lbt.load_record(path, frame_rate_hz=RATE, unit="um").measurements[0, 0] == pytest.approx(
         1e3 * y[0, 0]
     )
     named = write_csv(tmp_path / "b.csv", ["pol_nm"], [y[:, 0]])
-    with pytest.raises(
-        lbt.errors.ProblemError, match="unit must be that of the data, 'nm'; got 'mas'"
-    ):
+    with pytest.raises(ProblemError, match="unit must be that of the data, 'nm'; got 'mas'"):
         lbt.load_record(named, frame_rate_hz=RATE, unit="mas", diameter_m=8)
     assert lbt.load_record(named, frame_rate_hz=RATE, unit="nanometer").axes == 1
     mixed = write_csv(tmp_path / "c.csv", ["pol0_nm", "pol1_um"], y.T)
     with pytest.raises(
-        lbt.errors.ProblemError, match="pol0_nm, pol1_um must all have the same unit; got nm, um"
+        ProblemError, match="pol0_nm, pol1_um must all have the same unit; got nm, um"
     ):
         lbt.load_record(mixed, frame_rate_hz=RATE)
     pixels = hdus(tmp_path / "d.fits", image("POL", y, "pixel"), FPS=RATE)
-    with pytest.raises(lbt.errors.ProblemError, match="unit must be one of nm.*got 'pixel'"):
+    with pytest.raises(ProblemError, match="unit must be one of nm.*got 'pixel'"):
         lbt.load_record(pixels)
     angle = hdus(tmp_path / "e.fits", image("POL", y, "arcsec"), FPS=RATE)
-    with pytest.raises(lbt.errors.ProblemError, match=r"e\.fits: angles of tilt.*give diameter_m"):
+    with pytest.raises(ProblemError, match=r"e\.fits: angles of tilt.*give diameter_m"):
         lbt.load_record(angle)
 
 
@@ -247,15 +214,13 @@ def test_amplitude_spectra_and_angles(tmp_path):
     power = write_csv(tmp_path / "b.csv", ["f_hz", "psd"], [f, 0 * f + 3])
     seen = lbt.load_record(power, unit="mas^2/Hz", diameter_m=8.0)
     assert np.allclose(seen.density_nm2_hz, 3 * lbt.models.nm_per_mas(8.0) ** 2)
-    with pytest.raises(
-        lbt.errors.ProblemError, match="unit of a density is a square over Hz.*got 'nm'"
-    ):
+    with pytest.raises(ProblemError, match="unit of a density is a square over Hz.*got 'nm'"):
         lbt.load_record(power, unit="nm")
     assert any(note.startswith("2 rows with gaps") for note in gapped(tmp_path).notes)
     back = write_csv(tmp_path / "d.csv", ["f_hz", "psd_nm2_hz"], [f[::-1], f])
-    with pytest.raises(lbt.errors.ProblemError, match="must increase"):
+    with pytest.raises(ProblemError, match="must increase"):
         lbt.load_record(back)
-    with pytest.raises(lbt.errors.ProblemError, match="below half the frame rate, 30 Hz; got 50"):
+    with pytest.raises(ProblemError, match="below half the frame rate, 30 Hz; got 50"):
         lbt.load_record(
             write_csv(tmp_path / "e.csv", ["f_hz", "psd_nm2_hz"], [f, f]), frame_rate_hz=60
         )
@@ -295,8 +260,6 @@ def gapped(folder):
             {"kind": "spectrum"},
             "needs columns of density and frequency; got y_nm",
         ),
-        (["y_nm", "u_nm", "a", "b"], {"delay_frames": 0}, "delay_frames must be at least 1; got 0"),
-        (["y_nm", "u_nm", "a", "b"], {"delay_frames": "two"}, "delay_frames must be a number"),
         (
             ["y_nm", "u_nm", "a", "b"],
             {"frame_rate_hz": None},
@@ -308,46 +271,19 @@ def gapped(folder):
 def test_what_is_refused(tmp_path, series, names, options, words):
     y, u = series
     path = write_csv(tmp_path / "night.csv", names, [*y.T, *u.T])
-    with pytest.raises(lbt.errors.ProblemError, match=words) as caught:
+    with pytest.raises(ProblemError, match=words) as caught:
         lbt.load_record(path, **{"frame_rate_hz": RATE, **options})
     if "kind must" not in words and "columns must" not in words:
         assert "night.csv" in str(caught.value)
 
 
-def test_a_missing_file():
-    with pytest.raises(lbt.errors.TelemetryError, match=r"cannot read nowhere\.csv: No such file"):
-        lbt.load_record("nowhere.csv")
-
-
 def test_files_without_series(tmp_path):
-    np.savez(tmp_path / "a.npz", frame_rate_hz=3.0)
-    with pytest.raises(lbt.errors.ProblemError, match="holds no series of numbers"):
-        lbt.load_record(tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", cube=np.ones((3, 4, 5)), text=np.array(["a", "b"]))
-    with pytest.raises(lbt.errors.ProblemError, match="holds no series of numbers"):
+    with pytest.raises(ProblemError, match="holds no series of numbers"):
         lbt.load_record(tmp_path / "b.npz")
 
 
 FRAMES = 60
-
-
-def test_telemetry_takes_an_obstruction_and_refuses_averages(tmp_path, series):
-    path = lbt.LoopHardware(frame_rate_hz=800)
-    run = lbt.simulate(
-        lbt.integrator(path, gain=0.3).controller,
-        lbt.Truth(turbulence=None, noise_nm=5.0),
-        hardware=path,
-        frames=99,
-    )
-    file = lbt.files.save_telemetry(
-        tmp_path / "a.fits", lbt.files.telemetry_from_simulation(run, path)
-    )
-    assert lbt.load_record(file, obstruction=0.3).obstruction == 0.3
-    with pytest.raises(lbt.errors.ProblemError, match="averages are only for a spectrum"):
-        lbt.load_record(file, averages=3)
-    plain = csv(tmp_path / "b.csv", pol_nm=series[0][:, 0])
-    with pytest.raises(lbt.errors.ProblemError, match="averages are only for a spectrum"):
-        lbt.load_record(plain, frame_rate_hz=RATE, averages=3)
 
 
 def test_capitals_of_frequencies(tmp_path):
@@ -356,29 +292,15 @@ def test_capitals_of_frequencies(tmp_path):
         path = csv(tmp_path / "a.csv", **{f"f [{unit}]": f, "psd_nm2_hz": f})
         assert np.allclose(lbt.load_record(path).frequency_hz, factor * f)
     path = csv(tmp_path / "a.csv", f_mhz=f, psd_nm2_hz=f)
-    with pytest.raises(
-        lbt.errors.ProblemError, match="must be in one of Hz, kHz, mHz, MHz; got 'mhz'"
-    ):
+    with pytest.raises(ProblemError, match="must be in one of Hz, kHz, mHz, MHz; got 'mhz'"):
         lbt.load_record(path)
 
 
 @pytest.mark.parametrize("step", [1.0, 2.0, 1 / 86.4e6])
 def test_times_that_are_no_seconds(tmp_path, series, step):
     path = csv(tmp_path / "a.csv", time=10 + step * np.arange(FRAMES), pol_nm=series[0][:, 0])
-    with pytest.raises(
-        lbt.errors.ProblemError, match="Hz with time in seconds, and their unit is not gi"
-    ):
+    with pytest.raises(ProblemError, match="Hz with time in seconds, and their unit is not gi"):
         lbt.load_record(path)
-
-
-@pytest.fixture(scope="module")
-def example() -> ModuleType:
-    return eris_example()
-
-
-@pytest.fixture(scope="module")
-def seen() -> lbt.identification.SpectrumRecord:
-    return eris_record()
 
 
 def test_data_come_unchanged_with_their_licence():
@@ -397,19 +319,10 @@ def test_file_without_names_is_read_as_a_spectrum():
         ERIS_FILE, unit="nm^2/Hz", columns={"frequency": 0, "density": (1, 2)}
     )
     assert np.array_equal(by_number.density_nm2_hz, found.density_nm2_hz)
-    with pytest.raises(
-        lbt.errors.ProblemError, match=r"the unit of \[1\], \[2\]: give unit \(nm\^2/Hz"
-    ):
+    with pytest.raises(ProblemError, match=r"the unit of \[1\], \[2\]: give unit \(nm\^2/Hz"):
         lbt.load_record(ERIS_FILE, kind="spectrum")
-    with pytest.raises(lbt.errors.ProblemError, match="say what kind"):
+    with pytest.raises(ProblemError, match="say what kind"):
         lbt.load_record(ERIS_FILE)
-
-
-def test_background_of_the_file_is_a_formula(seen, example):
-    formula = example.BACKGROUND_NM2_HZ / seen.frequency_hz**2
-    same = np.abs(seen.density_nm2_hz / formula[:, None] - 1) < 1e-6
-    assert np.all(same.mean(axis=0) > 0.97)
-    assert same.all(axis=1).mean() == pytest.approx(0.963, abs=0.001)
 
 
 def test_commands_from_another_file(tmp_path, series):
@@ -439,41 +352,26 @@ def test_two_files_are_laid_beside_each_other_by_their_counters(tmp_path, series
     # commands 60 ... 69 are not there: y(k) holds u(k-2)
     assert np.flatnonzero(~seen.usable).tolist() == [0, 1, *range(52, 60)]
     assert any("by frame: 50 of 60 rows have one" in note for note in seen.health.notes)
-    longer = csv(tmp_path / "l.csv", frame=np.arange(70), u_nm=np.append(u, u[:10]))
-    seen = lbt.load_record(mine, commands=longer, frame_rate_hz=RATE, delay_frames=2)
-    assert np.array_equal(seen.commands[:, 0], np.append(u, u[:10])[10:])
-    first = csv(tmp_path / "p.csv", frame=np.arange(10, 50), u_nm=u[:40])
-    seen = lbt.load_record(mine, commands=first, frame_rate_hz=RATE, delay_frames=2)
-    assert any("by frame: 40 of 60 rows have one" in note for note in seen.health.notes)
     far = csv(tmp_path / "f.csv", frame=np.arange(500, 560), u_nm=u)
     with pytest.raises(TelemetryError, match="only 0 of 60 measurements have a command") as caught:
         lbt.load_record(mine, commands=far, frame_rate_hz=RATE)
     assert "they go from 10 to 69 and from 500 to 559" in str(caught.value)
     twice = csv(tmp_path / "t.csv", frame=np.arange(60) // 2 * 2, u_nm=u)
-    with pytest.raises(TelemetryError, match="of both files must rise from row to row"):
+    with pytest.raises(
+        TelemetryError, match="of both files must rise from row to row to be matched"
+    ):
         lbt.load_record(mine, commands=twice, frame_rate_hz=RATE)
-    back = csv(tmp_path / "b.csv", frame=np.arange(60)[::-1], u_nm=u)
-    with pytest.raises(TelemetryError, match="of both files must rise from row to row"):
-        lbt.load_record(mine, commands=back, frame_rate_hz=RATE)
 
 
-def test_two_files_are_laid_beside_each_other_by_their_times(tmp_path, series):
+def test_two_files_without_counters_are_taken_row_by_row_if_their_times_agree(tmp_path, series):
     y, u = series[0][:, 0], series[1][:, 0]
     mine = csv(tmp_path / "y.csv", time_s=np.arange(60) / RATE + 0.02, y_nm=y)
-    theirs = csv(tmp_path / "u.csv", time_ms=np.arange(60) * 1e3 / RATE + 0.1, u_nm=u)
-    seen = lbt.load_record(mine, commands=theirs, delay_frames=2)
-    assert np.array_equal(seen.commands[:50, 0], u[10:])
-    assert seen.frame_rate_hz == pytest.approx(RATE)
-    between = csv(tmp_path / "b.csv", time_ms=np.arange(60) * 1e3 / RATE + 1.0, u_nm=u)
-    with pytest.raises(TelemetryError, match="only 0 of 60 measurements have a command"):
+    theirs = csv(tmp_path / "u.csv", time_ms=np.arange(60) * 1e3 / RATE + 20.1, u_nm=u)
+    for other in (theirs, csv(tmp_path / "n.csv", u_nm=u)):
+        assert np.array_equal(lbt.load_record(mine, commands=other).commands[:, 0], u)
+    between = csv(tmp_path / "b.csv", time_ms=np.arange(60) * 1e3 / RATE + 21.0, u_nm=u)
+    with pytest.raises(TelemetryError, match="must be those of the measurements, row by row"):
         lbt.load_record(mine, commands=between)
-    bare = csv(tmp_path / "n.csv", u_nm=u)
-    seen = lbt.load_record(mine, commands=bare)
-    assert np.array_equal(seen.commands[:, 0], u)
-    assert any("no clock in common" in note for note in seen.health.notes)
-    short = csv(tmp_path / "s.csv", u_nm=u[:-1])
-    with pytest.raises(TelemetryError, match="as many frames as the measurements; got 59, 60"):
-        lbt.load_record(mine, commands=short)
 
 
 def test_both_files_tell_facts_and_each_its_own_unit(tmp_path, series):
@@ -510,9 +408,8 @@ def telemetry(frames=60, **changes):
     return lbt.files.Telemetry(**{**fields, **changes})
 
 
-@pytest.mark.parametrize("axes", [1, 2])
-def test_telemetry_of_a_simulation_with_matrices(axes):
-    rng = np.random.default_rng(3)
+def test_telemetry_of_a_simulation_with_matrices():
+    axes, rng = 2, np.random.default_rng(3)
     path = lbt.LoopHardware(
         frame_rate_hz=FAST,
         delay_frames=2.25,
@@ -533,27 +430,6 @@ def test_telemetry_of_a_simulation_with_matrices(axes):
     )
 
 
-def test_modes_of_many():
-    rng = np.random.default_rng(0)
-    y, u = rng.standard_normal((2, 60, 5))
-    many = telemetry(measurements=y, commands=u, diameter_m=8.0, name="night")
-    with pytest.raises(
-        lbt.errors.ProblemError, match=r"there are 5 modes; say which are tip and tilt: axes="
-    ):
-        lbt.load_record(many)
-    seen = lbt.load_record(many, axes=(1, 0))
-    assert np.array_equal(seen.measurements, y[:, [1, 0]])
-    assert np.array_equal(seen.commands, u[:, [1, 0]])
-    assert "axes are modes 1, 0 of 5" in seen.health.notes
-    assert (seen.diameter_m, seen.source) == (8.0, "night")
-    assert lbt.load_record(many, axes=[3]).axes == 1
-    for bad in ((0, 0), (5,), (0, 1, 2), ()):
-        with pytest.raises(
-            lbt.errors.ProblemError, match="axes must be one or two different numbers below 5"
-        ):
-            lbt.load_record(many, axes=bad)
-
-
 def test_slopes_with_their_modes_and_without():
     rng = np.random.default_rng(0)
     S = rng.standard_normal((8, 3))
@@ -571,33 +447,15 @@ def test_slopes_with_their_modes_and_without():
         axes=(0, 1),
     )
     assert np.allclose(seen.measurements, phase[:, :2])
-    # a reconstructor of another gain is taken out
-    half = lbt.load_record(
-        telemetry(
-            measurements=slopes @ R.T / 2,
-            slopes=slopes,
-            interaction_matrix=S,
-            reconstructor=R / 2,
-            commands=phase,
-        ),
-        axes=(0, 1),
-    )
-    assert np.allclose(half.measurements, phase[:, :2])
     with pytest.raises(
-        lbt.errors.ProblemError,
+        ProblemError,
         match=r"has 8 measurements and 3 modes: slopes without modal .*slopes @ R.T",
     ):
         lbt.load_record(
             telemetry(measurements=slopes, interaction_matrix=S, commands=phase), axes=(0, 1)
         )
-    with pytest.raises(lbt.errors.ProblemError, match="slopes without modal coefficients"):
+    with pytest.raises(ProblemError, match="slopes without modal coefficients"):
         lbt.load_record(telemetry(measurements=slopes, influence_matrix=np.eye(2)))
-
-
-def test_the_timing_of_another_program_is_noted():
-    for metadata, noted in (({}, False), ({"timing": "frames of the program"}, True)):
-        seen = lbt.load_record(telemetry(metadata=metadata), axes=(0, 1))
-        assert any("taken for granted" in note for note in seen.health.notes) is noted
 
 
 @pytest.mark.parametrize(
@@ -621,7 +479,7 @@ def test_the_timing_of_another_program_is_noted():
     ],
 )
 def test_telemetry_that_is_refused(telemetry_changes, options, words):
-    with pytest.raises(lbt.errors.ProblemError, match=words):
+    with pytest.raises(ProblemError, match=words):
         lbt.load_record(telemetry(**telemetry_changes), **options)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.records import ran, record
+from support.records import ran
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
@@ -17,25 +17,6 @@ RATE = 1000.0
 SHELL = lbt.models.PositionLoop.from_bandwidth(
     natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
 )
-
-
-@pytest.mark.parametrize("mirror", [None, SHELL], ids=["settled", "moving"])
-@pytest.mark.parametrize("sensor_gain", [0.4, 1.0, 1.3])
-@pytest.mark.parametrize("delay", [1.0, 2.0, 2.4, 3.0])
-def test_without_noise_it_is_the_phase_before_the_correction(delay, sensor_gain, mirror):
-    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, mirror=mirror)
-    run = ran(path, sensor_gain=sensor_gain)
-    seen = record(run, path)
-    first = len(path.mirror_taps)
-    assert not seen.usable[:first].any()
-    assert seen.usable[first:].all()
-    z = seen.pseudo_open_loop(sensor_gain)[first:]
-    phase = run.total_nm[0, first - 1 : -1]
-    assert np.max(np.abs(z - phase)) < 1e-9 * np.max(np.abs(phase))
-    # what was taken out of it is the correction itself
-    assert np.allclose(
-        seen.corrections()[first:], (run.total_nm - run.residual_nm)[0, first - 1 : -1], atol=1e-8
-    )
 
 
 @settings(max_examples=25)
@@ -69,15 +50,6 @@ def test_with_noise_it_is_phase_and_noise_over_the_gain(delay, gains, noise, mov
     assert np.max(np.abs(z[1:] - expected)) < 1e-9 * np.max(np.abs(expected))
 
 
-def test_an_open_loop_is_its_own_series():
-    y = np.random.default_rng(0).standard_normal((50, 1))
-    seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
-    assert np.array_equal(seen.pseudo_open_loop(), y)
-    assert np.array_equal(seen.pseudo_open_loop(0.5), 2 * y)
-    assert not seen.corrections().any()
-    assert seen.stretches() == ((0, 50),)
-
-
 def test_a_delay_can_come_later():
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2.4)
     run = ran(path)
@@ -96,67 +68,36 @@ def test_a_delay_can_come_later():
     assert [each.kind for each in other.health.findings].count("correction not known") == 1
 
 
-def test_a_spoilt_command_spoils_what_its_correction_enters():
-    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=3.0)
-    run = ran(path)
-    u = run.commands[0].copy()
-    u[50] = np.inf
-    seen = loop_record(run.measurements[0], u, frame_rate_hz=RATE, delay_frames=3, unit="nm")
-    assert np.flatnonzero(~seen.usable).tolist() == [0, 1, 2, 53]
-    assert seen.stretches() == ((3, 53), (54, 300))
-    good = seen.usable
-    z = seen.pseudo_open_loop()
-    assert np.allclose(z[1:][good[1:]], run.total_nm[0, :-1][good[1:]], atol=1e-9)
-    assert np.all(np.isfinite(seen.commands))
-
-
 def test_short_holes_are_bridged_on_the_pseudo_open_loop():
-    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2.4)
-    run = ran(path, frames=2000, sensor_gain=0.6)
-    y = run.measurements[0].copy()
-    y[300, 0] = np.nan
-    y[700:703] = np.nan
-    y[900:904] = np.nan
-    seen = loop_record(y, run.commands[0], frame_rate_hz=RATE, delay_frames=2.4, unit="nm")
+    frame = np.arange(2000)
+    phase = 200 * np.sin(2 * np.pi * 10 * frame / RATE)[:, None]
+    u = np.random.default_rng(0).standard_normal((2000, 1))
+    y = 0.6 * (np.roll(phase, 1, axis=0) - np.roll(u, 2, axis=0))
+    y[300], y[700:703], y[900:904] = np.nan, np.nan, np.nan
+    seen = loop_record(y, u, frame_rate_hz=RATE, delay_frames=2, unit="nm")
     whole = seen.bridged(sensor_gain=0.6)
     assert "4 frames in 2 holes of at most 3 were interpolated" in whole.health.notes
-    assert np.flatnonzero(~whole.usable).tolist() == [0, 1, 2, 900, 901, 902, 903]
-    assert whole.health.usable == 1993
-    z, phase = whole.pseudo_open_loop(0.6), run.total_nm[0]
+    assert np.flatnonzero(~whole.usable).tolist() == [0, 1, 900, 901, 902, 903]
+    z = whole.pseudo_open_loop(0.6)
     assert np.array_equal(z[seen.usable], seen.pseudo_open_loop(0.6)[seen.usable])
-    # a cubic through two frames on either side, to the last bit of a cubic
-    inside = np.array([300, 700, 701, 702])
-    for k, wide in ((300, [298, 299, 301, 302]), (701, [698, 699, 703, 704])):
-        cubic = np.polynomial.polynomial.polyfit(np.array(wide) - k, phase[np.array(wide) - 1], 3)
-        assert np.allclose(z[k], cubic[0], atol=1e-6)
-    # what is left out by a plain interpolation of y would be far off
-    assert np.max(np.abs(z - np.vstack([phase[:1], phase[:-1]]))[inside]) < 60
+    holes = np.array([300, 700, 701, 702])
+    np.testing.assert_allclose(z[holes], phase[holes - 1], atol=0.01)
     # the original stays as it was, and its delay may still change
     assert not seen.usable[300]
     assert not whole.with_delay(2.4).usable[300]
-
-
-def test_bridges_have_a_budget():
-    y = np.random.default_rng(0).standard_normal(600)
-    y[[100, 200, 300]] = np.nan
-    y[400:402] = y[500:503] = y[550:554] = np.nan
-    seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
-    part = seen.bridged()
-    assert part.health.notes[-1] == (
-        "5 frames in 4 holes of at most 3 were interpolated; 1 more such holes were left, beyond 1 %"
-    )
-    assert np.flatnonzero(~part.usable).tolist() == [500, 501, 502, 550, 551, 552, 553]
-    assert part.bridged() is part
+    assert whole.bridged() is whole
     for gain in (0, [1, 1]):
         with pytest.raises(ProblemError, match="must be"):
             seen.bridged(sensor_gain=gain)
 
 
-def test_a_hole_with_one_frame_beside_it_is_bridged_straight():
-    y = np.random.default_rng(0).standard_normal(500)
-    y[:8] = [1.0, 2.0, np.nan, 4.0, np.nan, 7.0, 9.0, 3.0]
-    seen = loop_record(y, frame_rate_hz=RATE, unit="nm").bridged()
-    assert seen.measurements[[2, 4], 0] == pytest.approx([3.0, 5.5])
+def test_more_than_one_hundredth_of_a_record_is_not_bridged():
+    y = np.random.default_rng(0).standard_normal(600)
+    y[100:700:100] = np.nan
+    assert loop_record(y, frame_rate_hz=RATE, unit="nm").bridged().usable.all()
+    y[150:153] = np.nan
+    seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
+    assert seen.bridged() is seen
 
 
 def test_another_delay_keeps_the_mirror_and_drops_the_bridges():
@@ -211,8 +152,8 @@ def test_length():
         require_length(few)
 
 
-@pytest.mark.parametrize("delay", [1.0, 2.0, 2.5])
-def test_commands_before_a_record_do_not_make_it_shorter(delay):
+def test_commands_before_a_record_do_not_make_it_shorter():
+    delay = 2.5
     y = np.random.default_rng(0).standard_normal(5000)
     known = {"frame_rate_hz": RATE, "unit": "nm", "delay_frames": delay}
     whole = loop_record(y, y, **known)
@@ -220,19 +161,9 @@ def test_commands_before_a_record_do_not_make_it_shorter(delay):
     assert require_length(whole, seconds=5) == 5000
     y[int(np.ceil(delay))] = np.nan  # a frame that was lost
     late = loop_record(y, np.zeros(5000), **known)
+    assert (late.first_known, late.lost) == (3, pytest.approx(1 / 4997))
     with pytest.raises(ProblemError, match="needs 5000 usable frames"):
         require_length(late, seconds=5)
-
-
-def test_frames_before_the_first_commands_are_not_lost():
-    """Of 100 frames, 3 % were said to be lost."""
-    y = np.random.default_rng(0).standard_normal((100, 1))
-    seen = loop_record(y, y, frame_rate_hz=RATE, delay_frames=2.5, unit="nm")
-    assert (seen.first_known, seen.lost) == (3, 0.0)
-    y[50] = np.nan
-    seen = loop_record(y, np.zeros((100, 1)), frame_rate_hz=RATE, delay_frames=2.5, unit="nm")
-    assert seen.lost == pytest.approx(1 / 97)
-    assert seen.with_delay(1.0).lost == pytest.approx(1 / 99)
 
 
 def test_its_text_is_three_lines():

@@ -74,8 +74,10 @@ def constraints(rng, c):
     return ours, peer
 
 
-@pytest.mark.parametrize("name", functions(np.random.default_rng(0)))
-@pytest.mark.parametrize("start", [False, True])
+@pytest.mark.parametrize(
+    ("name", "start"),
+    [("sum", True), ("largest", False), ("weighted sum", False), ("largest of two", True)],
+)
 def test_the_optimum_is_that_of_the_statement(name, start):
     rng = np.random.default_rng(1)
     function, c = functions(rng)[name], cp.Variable(SIZE)

@@ -28,7 +28,7 @@ def problem_of(axes, turn=None):
     return lbt.EstimationProblem(A=A, B=B, C=C, D=D, L=C)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_axes_that_have_nothing_in_common_stay_apart(seed):
     """Exactly, whatever the solver leaves; equal axes included, at odd seeds."""
     rng = np.random.default_rng(seed)
@@ -38,23 +38,14 @@ def test_axes_that_have_nothing_in_common_stay_apart(seed):
     turn = rng.permutation(6)
     whole = problem_of(axes, turn)
     other = (turn[:, None] // 3) != np.arange(2)
-    for design in (
-        lbt.kalman(whole, route="sdp"),
-        lbt.hinf(whole, route="lmi"),
-        lbt.hinf(whole, gamma_ratio=1.1, route="lmi"),
-    ):
+    least = lbt.hinf(whole, route="lmi")
+    alone = [lbt.hinf(problem_of([axis]), route="riccati").gamma_least for axis in axes]
+    assert least.gamma_least == pytest.approx(max(alone), rel=1e-6)
+    assert least.gamma_infeasible == pytest.approx(max(alone), rel=1e-6)
+    near = lbt.hinf(whole, gamma_ratio=1.1, route="lmi")
+    for design in (lbt.kalman(whole, route="sdp"), least, near):
         assert not np.any(design.gain_predictor[other])
         assert not np.any(design.gain_filter[other])
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_least_gamma_is_that_of_the_worst_axis(seed):
-    rng = np.random.default_rng(100 + seed)
-    axes = [random_axis(rng), random_axis(rng)]
-    alone = [lbt.hinf(problem_of([axis]), route="riccati").gamma_least for axis in axes]
-    both = lbt.hinf(problem_of(axes), route="lmi")
-    assert both.gamma_least == pytest.approx(max(alone), rel=1e-6)
-    assert both.gamma_infeasible == pytest.approx(max(alone), rel=1e-6)
 
 
 def test_a_level_below_the_least_is_infeasible():

@@ -1,18 +1,11 @@
 """The least gamma and its controller, against SLICOT, closed forms and the inequality."""
 
 import runpy
-from dataclasses import replace
-from functools import cache
 
 import control
 import numpy as np
 import pytest
-from support.generalized_plants import (
-    lightly_damped_plant,
-    random_plant,
-    sampled_plant,
-    stacked,
-)
+from support.generalized_plants import lightly_damped_plant, random_plant, sampled_plant, stacked
 from support.plants import ROOT
 
 import lbt_synth as lbt
@@ -22,12 +15,6 @@ from lbt_synth.linear.output_feedback.lower_bound import infeasible_control_leve
 from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati
 
 slycot = pytest.importorskip("slycot")
-
-
-@cache
-def random_design(seed):
-    """The design of a random plant, which several tests look at."""
-    return lbt.hinf_controller(random_plant(seed))
 
 
 def slicot_norm(plant, gamma):
@@ -41,25 +28,22 @@ def slicot_norm(plant, gamma):
     return float(lbt.hinf_norm(loop)) if loop.spectral_radius < 1 else np.inf
 
 
-# of the last three, an oscillation limits the level, a slack is exactly zero in the search, and X
-# grows without bound next to the level
-@pytest.mark.parametrize("seed", [*range(1, 13), 15, 863, 637])
-def test_slicot_reaches_no_less(seed):
-    plant, least = random_plant(seed), random_design(seed).gamma_least
+# of 15, 863 and 637, an oscillation limits the level, a slack is exactly zero in the search, and X
+# grows without bound next to the level; of 73 and 257, storages differ by twelve orders
+@pytest.mark.parametrize(
+    ("seed", "open_by"),
+    [*((seed, 1e-6) for seed in (1, 2, 4, 7, 12, 15, 863, 637)), (73, 1e-4), (257, 1e-4)],
+)
+def test_slicot_reaches_no_less_and_the_witness_proves_it(seed, open_by):
+    plant = random_plant(seed)
+    design = lbt.hinf_controller(plant)
+    least = design.gamma_least
     assert slicot_norm(plant, least * (1 - 1e-6)) > least * (1 - 1e-6)
     assert slicot_norm(plant, least * 1.01) < least * 1.01
+    assert least * (1 - open_by) < design.gamma_infeasible <= least
 
 
-# of the last two, storages differ by twelve orders: rounding costs the proof some digits
-@pytest.mark.parametrize(
-    ("seed", "open_by"), [*((seed, 1e-6) for seed in range(1, 9)), (73, 1e-4), (257, 1e-4)]
-)
-def test_witness_closes_the_bracket(seed, open_by):
-    design = random_design(seed)
-    assert design.gamma_least * (1 - open_by) < design.gamma_infeasible <= design.gamma_least
-
-
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [0, 3, 5])
 def test_inequality_finds_the_same_level(seed):
     plant = random_plant(seed, n=5, D22=False)
     least = TwoRiccati(plant).least_level().gamma
@@ -68,48 +52,16 @@ def test_inequality_finds_the_same_level(seed):
     assert infeasible_control_level(plant, witness) == pytest.approx(least, rel=1e-6)
 
 
-@pytest.mark.parametrize("seed", [40, 42])
-def test_units_of_measurements_and_controls_do_not_matter(seed):
-    plant = random_plant(seed, n=2)
-    y, u = 10 ** np.linspace(-4, 4, len(plant.C2)), 10 ** np.linspace(3, -3, plant.B2.shape[1])
-    other = replace(
-        plant,
-        C2=y[:, None] * plant.C2,
-        D21=y[:, None] * plant.D21,
-        B2=plant.B2 * u,
-        D12=plant.D12 * u,
-        D22=y[:, None] * plant.D22 * u,
+def test_what_is_pushed_and_not_measured_is_left_and_what_is_controlled_is_not():
+    """z = 2 w; three measurements of three disturbances; square D12, D21 and stable zeros."""
+    one = {"A": 0.5, "B2": 1.0, "D12": 1.0}
+    unseen = GeneralizedPlant(
+        **one, B1=[[0.0, 1.0]], C1=0.0, C2=1.0, D11=[[2.0, 0.0]], D21=[[0.0, 1.0]]
     )
-    design, scaled = lbt.hinf_controller(plant), lbt.hinf_controller(other)
-    assert scaled.gamma_least == pytest.approx(design.gamma_least, rel=1e-7)
-    assert scaled.gamma_infeasible == pytest.approx(design.gamma_infeasible, rel=1e-6)
-    loop = other.closed_loop(scaled.controller)
-    assert float(lbt.hinf_norm(loop)) == pytest.approx(design.gamma_least, rel=1e-7)
-
-
-def test_unseen_disturbance_at_one_instant():
-    """What is pushed and not measured is left: z = 2 w."""
-    plant = lbt.linear.GeneralizedPlant(
-        A=0.5, B1=[[0.0, 1.0]], B2=1.0, C1=0.0, C2=1.0, D11=[[2.0, 0.0]], D12=1.0, D21=[[0.0, 1.0]]
-    )
-    assert lbt.hinf_controller(plant).gamma_least == pytest.approx(2.0, rel=1e-8)
-
-
-def test_least_level_of_nothing_left():
-    """Three measurements of three disturbances and a control of the only error."""
-    plant = lbt.linear.GeneralizedPlant(
-        A=0.5, B1=np.ones((1, 3)), B2=1.0, C1=1.0, C2=np.zeros((3, 1)), D12=1.0, D21=np.eye(3)
-    )
-    assert lbt.hinf_controller(plant).gamma_least < 1e-9
-
-
-@pytest.mark.parametrize("seed", [8, 14, 23, 70])
-def test_a_least_variance_of_nothing(seed):
-    """Zeros are stable and D12, D21 square: the least variance leaves rounding."""
-    plant = sampled_plant(seed, n=3)
-    assert plant.D12.shape[0] == plant.D12.shape[1]
-    assert plant.D21.shape[0] == plant.D21.shape[1]
-    assert lbt.hinf_controller(plant).gamma_least < 1e-9
+    assert lbt.hinf_controller(unseen).gamma_least == pytest.approx(2.0, rel=1e-8)
+    seen = GeneralizedPlant(**one, B1=np.ones((1, 3)), C1=1.0, C2=np.zeros((3, 1)), D21=np.eye(3))
+    for plant in (seen, sampled_plant(8, n=3), sampled_plant(23, n=3)):
+        assert lbt.hinf_controller(plant).gamma_least < 1e-9
 
 
 # the loop of the first is far from normal, the second is refused next to its least level
@@ -121,7 +73,7 @@ def test_lightly_damped_modes_are_certified(seed):
     assert slicot_norm(plant, least * 1.01) < least * 1.01
 
 
-@pytest.mark.parametrize("seed", [126, 194, 288, 322, 365])
+@pytest.mark.parametrize("seed", [126, 322])
 def test_perfect_control_of_lightly_damped_modes_is_certified(seed):
     """What perfect control leaves is rounding: a controller next to it leaves a certified part."""
     plant = lightly_damped_plant(seed)
@@ -131,8 +83,7 @@ def test_perfect_control_of_lightly_damped_modes_is_certified(seed):
     assert design.regularised > 0
 
 
-@pytest.mark.parametrize("hidden", [1e-5, 1e-6, 1e-7, 1e-8, 1e-9])
-@pytest.mark.parametrize("noise", [0.01, 0.1, 0.3])
+@pytest.mark.parametrize(("hidden", "noise"), [(1e-5, 0.3), (1e-6, 0.1), (1e-9, 0.01)])
 def test_a_disturbance_seen_through_a_hidden_state(hidden, noise):
     """The state that is seen gets a small part of the disturbance, and almost no noise.
 
@@ -206,43 +157,7 @@ def test_sb10dd_the_published_digits():
     assert lbt.hinf_controller(plant, gamma=111.294).gamma < 111.294
 
 
-def some_plant(seed: int, *, singular: bool) -> GeneralizedPlant:
-    """An unstable plant of random sizes; of a singular one nothing passes directly."""
-    rng = np.random.default_rng(seed)
-    A = rng.standard_normal((3, 3))
-    A *= 1.05 / max(abs(np.linalg.eigvals(A)))
-    m1, m2, p1, p2 = (int(size) for size in rng.integers(1, 4, 4))
-    through = 0.0 if singular else 1.0
-    B1, B2 = rng.standard_normal((3, m1)), rng.standard_normal((3, m2))
-    C1, C2 = rng.standard_normal((p1, 3)), rng.standard_normal((p2, 3))
-    D11, D12 = rng.standard_normal((p1, m1)), through * rng.standard_normal((p1, m2))
-    D21 = through * rng.standard_normal((p2, m1))
-    return GeneralizedPlant(A=A, B1=B1, B2=B2, C1=C1, C2=C2, D11=D11, D12=D12, D21=D21)
-
-
-def in_units(plant: GeneralizedPlant, z: float, w: float) -> GeneralizedPlant:
-    P = plant
-    return replace(P, B1=w * P.B1, C1=z * P.C1, D11=z * w * P.D11, D12=z * P.D12, D21=w * P.D21)
-
-
-@pytest.mark.parametrize("singular", [False, True])
-@pytest.mark.parametrize("seed", [1, 3, 4, 7, 9])
-def test_levels_scale_with_the_units_of_errors_and_disturbances(seed, singular):
-    plant = some_plant(seed, singular=singular)
-    first = lbt.hinf_controller(plant)
-    least_rms = lbt.h2_controller(plant).rms
-    for z, w in ((1e4, 1e4), (1e-4, 1e-4), (1e5, 1e-5)):
-        other = lbt.hinf_controller(in_units(plant, z, w))
-        assert other.gamma == pytest.approx(z * w * first.gamma, rel=1e-4)
-        assert other.gamma_infeasible == pytest.approx(z * w * first.gamma_infeasible, rel=1e-4)
-        assert other.gamma_infeasible <= other.gamma * (1 + 1e-9)
-        assert lbt.h2_controller(in_units(plant, z, w)).rms == pytest.approx(
-            z * w * least_rms, rel=1e-4
-        )
-
-
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("copies", [1, 2])
+@pytest.mark.parametrize(("seed", "copies"), [(2, 2), (2, 1)])
 def test_a_large_direct_path_that_a_control_cancels(seed, copies):
     """The measurement shows a disturbance of 4360 at once; redundant channels change nothing."""
     rng = np.random.default_rng(seed)
@@ -269,9 +184,8 @@ def test_a_large_direct_path_that_a_control_cancels(seed, copies):
     assert least.gamma == pytest.approx(least.gamma_infeasible, rel=1e-6)
 
 
-@pytest.mark.parametrize("pole", [0.99, 0.9998, 0.999998])
-def test_a_weight_as_a_transfer_function_is_that_in_state_space(pole):
-    dt = 1e-3
+def test_a_weight_as_a_transfer_function_is_that_in_state_space():
+    dt, pole = 1e-3, 0.999998
     plant = control.tf([0.2], [1, -0.8, 0, 0], dt)
     as_ratio = control.tf([0.5, -0.45], [1, -pole], dt)
     as_states = control.ss([[pole]], [[1.0]], [[0.5 * (pole - 0.9)]], [[0.5]], dt)
@@ -282,3 +196,44 @@ def test_a_weight_as_a_transfer_function_is_that_in_state_space(pole):
     assert levels[0].gamma == pytest.approx(levels[1].gamma, rel=1e-5)
     for level in levels:
         assert level.gamma_infeasible == pytest.approx(level.gamma_least, rel=1e-3)
+
+
+def some_plant(seed, *, through):
+    """An unstable plant of any sizes, whose D12 and D21 may be zero."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((3, 3))
+    m1, m2, p1, p2 = (int(size) for size in rng.integers(1, 4, 4))
+    B1, B2 = rng.standard_normal((3, m1)), rng.standard_normal((3, m2))
+    C1, C2 = rng.standard_normal((p1, 3)), rng.standard_normal((p2, 3))
+    D11, D12 = rng.standard_normal((p1, m1)), through * rng.standard_normal((p1, m2))
+    D21 = through * rng.standard_normal((p2, m1))
+    A *= 1.05 / max(abs(np.linalg.eigvals(A)))
+    return GeneralizedPlant(A=A, B1=B1, B2=B2, C1=C1, C2=C2, D11=D11, D12=D12, D21=D21)
+
+
+@pytest.mark.parametrize(
+    "plant", [some_plant(3, through=0), some_plant(4, through=1), random_plant(42, n=2)]
+)
+def test_levels_scale_with_the_units_of_all_signals(plant):
+    size_y, size_u = np.linspace(-4, 4, len(plant.C2)), np.linspace(3, -3, plant.B2.shape[1])
+    design, least_rms = lbt.hinf_controller(plant), lbt.h2_controller(plant).rms
+    for z, w, part in ((1e4, 1e4, 0), (1e5, 1e-5, 1)):
+        y, u = 10 ** (part * size_y), 10 ** (part * size_u)
+        other = GeneralizedPlant(
+            A=plant.A,
+            B1=w * plant.B1,
+            B2=plant.B2 * u,
+            C1=z * plant.C1,
+            C2=y[:, None] * plant.C2,
+            D11=z * w * plant.D11,
+            D12=z * plant.D12 * u,
+            D21=w * y[:, None] * plant.D21,
+            D22=y[:, None] * plant.D22 * u,
+        )
+        scaled = lbt.hinf_controller(other)
+        assert scaled.gamma == pytest.approx(z * w * design.gamma, rel=1e-4)
+        assert scaled.gamma_infeasible == pytest.approx(z * w * design.gamma_infeasible, rel=1e-4)
+        assert scaled.gamma_infeasible <= scaled.gamma * (1 + 1e-9)
+        norm = float(lbt.hinf_norm(other.closed_loop(scaled.controller)))
+        assert norm == pytest.approx(scaled.gamma, rel=1e-6)
+        assert lbt.h2_controller(other).rms == pytest.approx(z * w * least_rms, rel=1e-4)

@@ -6,28 +6,18 @@ import scipy.linalg
 import slycot
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.darex import (
-    EXAMPLES,
-    error_in_digits,
-    exact_solution,
-    example_2_1,
-    example_2_4,
-    example_2_5,
-    peers,
-    relative,
-)
+from support.darex import EXAMPLES, example_2_5, peers, relative
 from support.plants import lbt_axis_plant
+from support.refusals import require_refusals
 
 import lbt_synth as lbt
+from lbt_synth.errors import DetectabilityError, InfeasibleError
+from lbt_synth.linear.riccati import dare
 
 
 def residual(A, B, Q, R, S, X):
     gain = np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A + S.T)
     return A.T @ X @ A - X + Q - (A.T @ X @ B + S) @ gain
-
-
-def test_golden_ratio():
-    assert lbt.solve_dare(1, 1, 1, 1).X[0, 0] == pytest.approx((1 + np.sqrt(5)) / 2, rel=1e-15)
 
 
 @given(a=st.floats(-3, 3), q=st.floats(1e-6, 1e6), r=st.floats(1e-6, 1e6))
@@ -54,18 +44,6 @@ def test_random_equations_against_scipy(seed, n, m):
     assert np.linalg.norm(residual(A, B, Q, R, S, solution.X), 1) / scale < 1e-10
 
 
-@given(seed=st.integers(0, 10_000))
-def test_similarity_and_scaling(seed):
-    rng = np.random.default_rng(seed)
-    A, B = rng.standard_normal((4, 4)), rng.standard_normal((4, 2))
-    Q, R = np.eye(4), np.eye(2)
-    X = lbt.solve_dare(A, B, Q, R).X
-    T = np.linalg.qr(rng.standard_normal((4, 4)))[0]
-    turned = lbt.solve_dare(T.T @ A @ T, T.T @ B, T.T @ Q @ T, R).X
-    assert np.allclose(T @ turned @ T.T, X, rtol=1e-8, atol=1e-8 * np.abs(X).max())
-    assert np.allclose(lbt.solve_dare(A, B, 1e6 * Q, 1e6 * R).X, 1e6 * X, rtol=1e-8)
-
-
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -87,6 +65,24 @@ def test_wrong_equations_are_refused(arguments, text):
         lbt.solve_dare(*arguments)
 
 
+BAD = np.array([[[0.5]], [[2.0]], [[0.5]]]), np.array([[[1.0]], [[0.0]], [[1.0]]])
+
+
+def test_equations_without_a_solution_are_refused():
+    solve, hidden = lbt.solve_dare, DetectabilityError
+    undriven = lbt.EstimationProblem(A=1.0, B=[[0.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
+    rows = [
+        (lambda: solve(*BAD, 1, 1), hidden, r"equation 1: \(A, B\) must be stabilis.* at 2"),
+        (lambda: solve(BAD[0][None], BAD[1][None], 1, 1), hidden, r"equation \(0, 1\)"),
+        (lambda: lbt.kalman(undriven), hidden, r"driven by noise; the mode of A at 1\+0j"),
+        (lambda: solve(1, 1, 0, 1), hidden, "Q must see every mode on the unit circle"),
+        # a stabilising X that changes the signs of the weight is no H-infinity solution
+        (lambda: solve(0.0, 1.0, 2.0, -1.0), InfeasibleError, "as many negative eigenvalues as R"),
+        (lambda: solve(0.0, 0.5, -2.0, -1.0), InfeasibleError, "X must be positive semidefinite"),
+    ]
+    require_refusals(rows)
+
+
 def random_stack(seed, count, n, m):
     rng = np.random.default_rng(seed)
     W = rng.standard_normal((count, n + m, n + m))
@@ -95,7 +91,17 @@ def random_stack(seed, count, n, m):
     return A, B, W[:, :n, :n], W[:, n:, n:], W[:, :n, n:]
 
 
-@settings(max_examples=10)
+def test_leading_dimensions_are_broadcast():
+    A, B, Q, R, _ = random_stack(1, 4, 3, 1)
+    many = lbt.solve_dare(A[0], B[0], Q, R[0])
+    assert many.X.shape == (4, 3, 3)
+    assert np.allclose(many.X[2], lbt.solve_dare(A[0], B[0], Q[2], R[0]).X, rtol=1e-12)
+    empty = lbt.solve_dare(A[:0], B[0], Q[0], R[0])
+    assert empty.X.shape == (0, 3, 3)
+    assert empty.residual == empty.error == 0
+
+
+@settings(max_examples=5)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 5), m=st.integers(1, 3))
 def test_a_stack_is_its_equations_one_by_one(seed, n, m):
     parts = random_stack(seed, 6, n, m)
@@ -111,25 +117,6 @@ def test_a_stack_is_its_equations_one_by_one(seed, n, m):
         where = np.unravel_index(i, (2, 3))
         assert np.allclose(stack.X[where], one.X, rtol=1e-13, atol=1e-13 * np.abs(one.X).max())
         assert one.X.shape == (n, n)
-
-
-def test_leading_dimensions_are_broadcast():
-    A, B, Q, R, _ = random_stack(1, 4, 3, 1)
-    many = lbt.solve_dare(A[0], B[0], Q, R[0])
-    assert many.X.shape == (4, 3, 3)
-    assert np.allclose(many.X[2], lbt.solve_dare(A[0], B[0], Q[2], R[0]).X, rtol=1e-12)
-    assert lbt.solve_dare(A[:0], B[0], Q[0], R[0]).X.shape == (0, 3, 3)
-
-
-def test_one_bad_equation_of_a_stack_is_named():
-    A = np.array([[[0.5]], [[2.0]], [[0.5]]])
-    B = np.array([[[1.0]], [[0.0]], [[1.0]]])
-    with pytest.raises(
-        lbt.errors.DetectabilityError, match=r"equation 1: \(A, B\) must be stabilis.* at 2"
-    ):
-        lbt.solve_dare(A, B, 1, 1)
-    with pytest.raises(lbt.errors.DetectabilityError, match=r"equation \(0, 1\)"):
-        lbt.solve_dare(A[None], B[None], 1, 1)
 
 
 @given(seed=st.integers(0, 10_000), n=st.integers(2, 6), m=st.integers(1, 2))
@@ -177,30 +164,12 @@ def test_indefinite_weights_against_slycot(seed, n):
     assert np.linalg.eigvalsh(solution.X)[0] > 0
 
 
-def test_an_indefinite_level_that_cannot_be_met_is_refused():
-    """x+ = 0.9 x + w + u, z = x: below the least level of state feedback there is no X."""
-    met = lbt.solve_dare(0.9, [[1.0, 1.0]], 1, np.diag([-4.0, 1.0]))
-    assert met.X[0, 0] > 0
-    with pytest.raises(
-        (lbt.errors.InfeasibleError, lbt.errors.NumericalError, lbt.errors.DetectabilityError)
-    ):
-        lbt.solve_dare(0.9, [[1.0, 1.0]], 1, np.diag([-0.5, 1.0]))
-
-
-def test_a_saddle_with_the_wrong_signs_is_refused(monkeypatch):
-    """A stabilising X that changes the signs of the weight is no H-infinity solution."""
-    with pytest.raises(lbt.errors.InfeasibleError, match="as many negative eigenvalues as R"):
-        lbt.solve_dare([[0.0]], [[1.0]], [[2.0]], [[-1.0]])
-    with pytest.raises(lbt.errors.InfeasibleError, match="X must be positive semidefinite"):
-        lbt.solve_dare([[0.0]], [[0.5]], [[-2.0]], [[-1.0]])
-
-
 def test_badly_scaled_states_are_balanced():
     """States in units of 1e-6 to 1e6 times their own: the same solution, to rounding."""
     rng = np.random.default_rng(4)
     plant = lbt_axis_plant(damping=1e-4)
     exact = lbt.solve_dare(plant.A.T, plant.C.T, plant.Q, plant.R).X
-    for _ in range(20):
+    for _ in range(5):
         units = 10.0 ** rng.uniform(-6, 6, 4)
         A, C = plant.A * units[:, None] / units, plant.C / units
         found = lbt.solve_dare(A.T, C.T, plant.Q * np.outer(units, units), plant.R)
@@ -210,35 +179,18 @@ def test_badly_scaled_states_are_balanced():
         )
 
 
-def test_the_chain_is_reported_when_everything_fails(monkeypatch):
-    import lbt_synth.linear.riccati.dare as module
-
+def test_a_later_route_takes_over_and_all_are_named_where_none_does(monkeypatch):
     def nothing(equations):
-        return np.full_like(equations.Q, np.nan), np.zeros(len(equations.Q), dtype=np.int64)
+        return np.full_like(equations.Q, np.nan), np.ones(len(equations.Q), dtype=np.int64)
 
-    monkeypatch.setattr(module, "ROUTES", (("one", nothing), ("two", nothing)))
-    with pytest.raises(lbt.errors.NumericalError, match="one, two gave no stable closed loop"):
-        lbt.solve_dare(0.5, 1, 1, 1)
-
-
-def test_a_later_route_takes_over(monkeypatch):
-    import lbt_synth.linear.riccati.dare as module
-
-    def wrong(equations):
-        return 2 * np.ones_like(equations.Q) * 1e9, np.ones(len(equations.Q), dtype=np.int64)
-
-    routes = dict(module.ROUTES)
-    monkeypatch.setattr(
-        module,
-        "ROUTES",
-        (
-            ("broken", lambda e: (np.full_like(e.Q, np.nan), wrong(e)[1])),
-            ("schur", routes["schur"]),
-        ),
-    )
+    schur = dict(dare.ROUTES)["schur"]
+    monkeypatch.setattr(dare, "ROUTES", (("broken", nothing), ("schur", schur)))
     solution = lbt.solve_dare(1, 1, 1, 1)
     assert solution.X[0, 0] == pytest.approx((1 + np.sqrt(5)) / 2, rel=1e-14)
     assert solution.route == "schur"
+    monkeypatch.setattr(dare, "ROUTES", (("one", nothing), ("two", nothing)))
+    with pytest.raises(lbt.errors.NumericalError, match="one, two gave no stable closed loop"):
+        lbt.solve_dare(0.5, 1, 1, 1)
 
 
 def test_sizes_from_1e_minus_300_to_1e300():
@@ -255,21 +207,13 @@ def test_sizes_from_1e_minus_300_to_1e300():
             lbt.solve_dare(*numbers)
 
 
-@pytest.mark.parametrize("weight", [1e-8, 1e-12, 1e-16, 1e-20])
+@pytest.mark.parametrize("weight", [1e-8, 1e-20])
 def test_a_pole_next_to_the_circle_is_accurate(weight):
     """x^2 = weight (x + 1): the pole is 1 / (1 + x), the closer the smaller the weight."""
     exact = (weight + np.sqrt(weight**2 + 4 * weight)) / 2
     solution = lbt.solve_dare(1, 1, weight, 1)
     assert solution.X[0, 0] == pytest.approx(exact, rel=1e-14)
     assert 1 - abs(solution.poles[0]) == pytest.approx(exact / (1 + exact), rel=1e-5)
-
-
-def test_empty_stacks():
-    empty = lbt.solve_dare(
-        np.zeros((0, 2, 2)), np.zeros((0, 2, 1)), np.zeros((0, 2, 2)), np.zeros((0, 1, 1))
-    )
-    assert empty.X.shape == (0, 2, 2)
-    assert empty.residual == empty.error == 0
 
 
 def test_the_estimated_error_is_of_the_size_of_the_error():
@@ -295,15 +239,6 @@ def test_known_solutions(example):
     assert error <= 10 * max(best, ROUNDING)
     assert error < 1e-12
     assert np.max(np.abs(solution.poles)) < 1
-
-
-@pytest.mark.parametrize("example", [example_2_1(1e6), example_2_4(1e6)], ids=lambda e: e.name)
-def test_ten_times_better_than_the_peers(example):
-    """Against the exact solution of the rounded data: the printed one is only as good as those."""
-    exact = exact_solution(example)
-    ours = error_in_digits(lbt.solve_dare(example.A, example.B, example.Q, example.R).X, exact)
-    best = min(error_in_digits(X, exact) for X in peers(example).values())
-    assert ours <= max(0.1 * best, ROUNDING / 2)  # which processors round differently
 
 
 def test_parts_that_share_nothing_are_solved_apart():
@@ -334,29 +269,6 @@ def test_parts_that_share_nothing_are_solved_apart():
     assert joined.X[-1, -1] == pytest.approx(1 / (1 - 0.25))
 
 
-def test_undetectable_pairs_name_the_mode():
-    with pytest.raises(
-        lbt.errors.DetectabilityError, match=r"mode of A at 1.2.*no measurement sees it"
-    ):
-        lbt.kalman(
-            lbt.EstimationProblem(
-                A=np.diag([1.2, 0.5]), B=np.eye(2, 3), C=[[0, 1]], D=[[0, 0, 1]], L=[[1, 1]]
-            )
-        )
-    with pytest.raises(lbt.errors.DetectabilityError, match=r"must be stabilisable.*at 2"):
-        lbt.solve_dare(np.diag([2.0, 0.5]), [[0.0], [1.0]], np.eye(2), 1)
-
-
-def test_an_undriven_mode_on_the_unit_circle_is_refused():
-    with pytest.raises(lbt.errors.DetectabilityError, match="must be driven by noise") as caught:
-        lbt.kalman(lbt.EstimationProblem(A=1.0, B=[[0.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0))
-    assert caught.value.eigenvalue == pytest.approx(1)
-    with pytest.raises(
-        lbt.errors.DetectabilityError, match="Q must see every mode on the unit circle"
-    ):
-        lbt.solve_dare(1, 1, 0, 1)
-
-
 def test_a_unit_circle_zero_of_a_singular_problem_is_named():
     """R = 0 and a plant with the zero z = 1: its cost does not see a slow drift of the input."""
     A = np.array([[0.5, 0.0], [1.0, 0.3]])
@@ -370,8 +282,7 @@ def test_a_unit_circle_zero_of_a_singular_problem_is_named():
     assert caught.value.eigenvalue == pytest.approx(1)
 
 
-@pytest.mark.parametrize("seed", range(8))
-@pytest.mark.parametrize("size", [1, 2, 3])
+@pytest.mark.parametrize(("seed", "size"), [(0, 1), (1, 2), (2, 3)])
 def test_undriven_blocks_on_the_unit_circle_are_named(seed, size):
     """Defective, and turned at random: their eigenvalues are found 1e-5 off the circle."""
     rng = np.random.default_rng(seed)
@@ -403,15 +314,7 @@ def test_undriven_blocks_on_the_unit_circle_are_named(seed, size):
             lbt.solve_dare(problem.A.T, problem.C.T, problem.Q, problem.R)
 
 
-def test_an_undriven_mode_that_decays_slowly_is_let_be():
-    for gap in (1e-3, 1e-6, 1e-8):
-        p = lbt.EstimationProblem(
-            A=[[1 - gap, 0], [0, 0.5]], B=[[0, 0], [1, 0]], C=[[1, 1]], D=[[0, 1]], L=[[1, 1]]
-        )
-        assert np.max(np.abs(lbt.kalman(p).poles)) == pytest.approx(1 - gap, rel=1e-12)
-
-
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", range(10))
 def test_no_solution_is_made_up_where_a_pole_is_on_the_circle(seed):
     """Unweighted modes at 1, single or double, in bases that hide them."""
     rng = np.random.default_rng(seed)

@@ -6,12 +6,10 @@ import cvxpy as cp
 import mpmath
 import numpy as np
 import pytest
-import scipy.linalg
-import slycot
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.periodic_problems import lifted_problem, random_periodic_problem, relative_distance
-from support.plants import lbt_axis_plant, random_problem
+from support.plants import random_problem
 
 import lbt_synth as lbt
 from lbt_synth.design.certificate import certify_filter
@@ -20,32 +18,6 @@ from lbt_synth.linear import EstimationProblem, infeasible_level
 from lbt_synth.linear.infeasibility_proof import worst_invisible_disturbance
 from lbt_synth.linear.riccati import filtering
 from lbt_synth.linear.riccati.filtering import gamma_riccati, kalman_riccati, least_gamma
-
-
-def test_an_ordinary_plant_that_scipy_refuses():
-    """AR2 turbulence and a lightly damped vibration."""
-    turbulence = lbt.models.ARModel(
-        coefficients=[1.997477, -0.997555], driving_rms_nm=0.37, frame_rate_hz=800
-    )
-    line = lbt.Vibration(frequency_hz=20, damping=1e-4, rms_nm=800, direction=(1,))
-    refused = 0
-    for noise in np.geomspace(1e-2, 1e3, 12):
-        plant = lbt.tip_tilt_plant(
-            frame_rate_hz=800, turbulence=turbulence, vibrations=[line], noise_nm=noise, modes=1
-        )
-        solution = kalman_riccati(plant)
-        assert solution.residual < 1e-12
-        try:
-            scipy.linalg.solve_discrete_are(plant.A.T, plant.C.T, plant.Q, plant.R)
-        except (np.linalg.LinAlgError, ValueError):
-            refused += 1
-    assert refused > 0
-
-
-def test_kalman_riccati_against_slycot(axis_plant):
-    p = axis_plant
-    X = slycot.sb02od(4, 1, p.A.T, p.C.T, p.Q, p.R, "D")[0]
-    assert np.allclose(kalman_riccati(p).P, X, rtol=1e-6, atol=1e-6 * np.abs(X).max())
 
 
 def test_a_measurement_that_is_not_read_is_left_out():
@@ -68,13 +40,7 @@ def test_a_measurement_that_is_not_read_is_left_out():
     assert gamma_riccati(partial, 0.5 * some[0]) is None
 
 
-def test_gamma_riccati_tends_to_the_kalman_filter(axis_plant):
-    kalman = kalman_riccati(axis_plant)
-    near = gamma_riccati(axis_plant, 1e9)
-    assert np.allclose(near.gain_predictor, kalman.gain_predictor, rtol=1e-9)
-    assert np.allclose(near.P, kalman.P, rtol=1e-9)
-
-
+@settings(max_examples=10)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 5), q=st.integers(1, 2), l=st.integers(1, 2))
 def test_gamma_filters_keep_their_bound(seed, n, q, l):
     """At any feasible level the recomputed norm stays below it, noise correlated or not."""
@@ -111,27 +77,21 @@ def closed_form(a, q, r, horizon):
     return np.sqrt(q + a**2 * r)
 
 
-@pytest.mark.parametrize("horizon", [0, 1])
-@pytest.mark.parametrize("a", [0.0, 0.3, -0.7, 0.9, 0.99, 0.9999, 1.0, -1.0, 1.2, -1.5])
-def test_scalar_closed_forms(a, horizon):
-    for q in (1.0, 1e-4, 1e4):
-        for r in (1.0, 1e-4, 25.0):
-            exact = closed_form(a, q, r, horizon)
-            design = lbt.hinf(scalar(a, q, r), horizon=horizon, route="riccati")
-            assert design.gamma_least == pytest.approx(exact, rel=1e-8)
-            assert design.gamma_infeasible == pytest.approx(exact, rel=1e-8)
+CORNERS = [(a, 1.0, 1.0) for a in (0.0, 0.3, -0.7, 0.9, 0.9999, 1.0, -1.0, 1.2, -1.5)]
+CORNERS += [(a, q, r) for a in (0.3, 0.9, 1.2) for q, r in ((1e-4, 25.0), (1e4, 1e-4))]
 
 
 @pytest.mark.parametrize("horizon", [0, 1])
-def test_scalar_closed_forms_by_lmi(horizon):
-    for a, q, r in ((0.3, 1, 25), (0.9, 1, 1), (1.0, 1, 1), (1.2, 1, 4)):
+def test_scalar_closed_forms(horizon):
+    for i, (a, q, r) in enumerate(CORNERS):
         exact = closed_form(a, q, r, horizon)
-        design = lbt.hinf(scalar(a, q, r), horizon=horizon)
-        assert design.gamma_least == pytest.approx(exact, rel=1e-7)
-        assert design.gamma_infeasible == pytest.approx(exact, rel=1e-7)
+        for route, rel in (("riccati", 1e-8), ("lmi", 1e-7))[: 2 if i % 4 == 1 else 1]:
+            design = lbt.hinf(scalar(a, q, r), horizon=horizon, route=route)
+            assert design.gamma_least == pytest.approx(exact, rel=rel), (a, q, r)
+            assert design.gamma_infeasible == pytest.approx(exact, rel=rel), (a, q, r)
 
 
-@settings(max_examples=25)
+@settings(max_examples=12)
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 5), q=st.integers(1, 2), l=st.integers(1, 2))
 def test_the_bracket_is_closed(seed, n, q, l):
     problem = random_problem(np.random.default_rng(seed), n, q, l=l)
@@ -143,15 +103,6 @@ def test_the_bracket_is_closed(seed, n, q, l):
     assert lmi.gamma_infeasible <= riccati.gamma_least * (1 + 1e-9)
     assert riccati.gamma_infeasible <= lmi.gamma_least * (1 + 1e-9)
     assert lmi.gamma_least == pytest.approx(riccati.gamma_least, rel=1e-6)
-
-
-def test_both_routes_agree_on_the_lbt():
-    for modes in (1, 2):
-        plant = lbt_axis_plant(modes=modes)
-        riccati, lmi = lbt.hinf(plant, route="riccati"), lbt.hinf(plant)
-        assert riccati.gamma_least / riccati.gamma_infeasible - 1 < 1e-10
-        assert lmi.gamma_least == pytest.approx(riccati.gamma_least, rel=1e-7)
-        assert lmi.gamma_infeasible == pytest.approx(riccati.gamma_least, rel=1e-7)
 
 
 def whole_lmi_is_feasible(problem, gamma):
@@ -178,7 +129,7 @@ def whole_lmi_is_feasible(problem, gamma):
     return margin.value > 1e-9
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_bracket_against_the_textbook_inequality(seed):
     problem = random_problem(np.random.default_rng(seed), 3)
     design = lbt.hinf(problem, route="riccati")
@@ -186,7 +137,7 @@ def test_the_bracket_against_the_textbook_inequality(seed):
     assert not whole_lmi_is_feasible(problem, 0.99 * design.gamma_infeasible)
 
 
-@settings(max_examples=20)
+@settings(max_examples=5)
 @given(seed=st.integers(0, 10_000))
 def test_the_bracket_does_not_depend_on_the_units_of_states(seed):
     rng = np.random.default_rng(seed)
@@ -255,56 +206,25 @@ def test_an_oscillation_without_damping_or_drive_is_still_refused():
         lbt.solve_dare(A.T, undriven.C.T, undriven.Q, undriven.R)
 
 
-def recursion(problem, periods):
-    """Return the covariance of the prediction error after some periods, measurement first."""
-    P = np.eye(problem.n_states)
-    for k in range(periods * problem.period):
-        A, B, C, D = problem.read_parts(k % problem.period)
-        innovation, cross = C @ P @ C.T + D @ D.T, A @ P @ C.T + B @ D.T
-        P = A @ P @ A.T + B @ B.T - cross @ np.linalg.solve(innovation, cross.T)
-        P = (P + P.T) / 2
-    return P
-
-
-def repeated(problem, period):
-    """Return a problem with a period of 1 as one with a longer period."""
-    parts = {name: np.tile(getattr(problem, name), (period, 1, 1)) for name in "ABCD"}
-    return EstimationProblem(**parts, L=problem.L)
-
-
 def proved(problem, start, solution, level):
     """Return the level that the worst disturbance against a solution proves infeasible."""
     witness = worst_invisible_disturbance(problem, solution.P, level, start.P)
     return infeasible_level(problem, witness, start.P)
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", range(8))
 def test_kalman_filter_of_the_lifted_problem(seed):
     problem = random_periodic_problem(seed)
     solution = kalman_riccati(problem)
+    covariances = problem.error_system(solution.gain_predictor).covariances()
+    assert relative_distance(covariances, solution.P) < 1e-9
     lifted = kalman_riccati(lifted_problem(problem))
     assert relative_distance(solution.P[0], lifted.P) < 1e-9
     assert not np.any(solution.gain_predictor.transpose(0, 2, 1)[~problem.read])
     assert not np.any(solution.gain_filter.transpose(0, 2, 1)[~problem.read])
 
 
-@pytest.mark.parametrize("seed", range(0, 24, 3))
-def test_kalman_filter_of_a_recursion(seed):
-    problem = random_periodic_problem(seed)
-    assert relative_distance(kalman_riccati(problem).P[0], recursion(problem, 300)) < 1e-9
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_covariances_of_all_phases_are_those_of_the_gains(seed):
-    problem = random_periodic_problem(seed)
-    solution = kalman_riccati(problem)
-    assert (
-        relative_distance(problem.error_system(solution.gain_predictor).covariances(), solution.P)
-        < 1e-9
-    )
-
-
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_gain_of_the_measurement_update_without_correlation(seed):
     """Then the predictor's gain is that of the filter, and a step of the plant."""
     problem = random_periodic_problem(seed)
@@ -318,24 +238,7 @@ def test_the_gain_of_the_measurement_update_without_correlation(seed):
         assert relative_distance(alone.A @ solution.gain_filter, solution.gain_predictor) < 1e-9
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_hinf_of_matrices_that_repeat(seed):
-    one = random_problem(np.random.default_rng(seed), 4, 2, l=2)
-    expected = lbt.hinf(one, route="riccati")
-    problem = repeated(one, 3)
-    start = kalman_riccati(problem)
-    upper = lbt.hinf_norm(one.error_system(start.gain_predictor[0])).upper
-    low, high, solution = least_gamma(problem, lower=0.0, upper=upper, start=start)
-    assert high * (1 - 1e-9) <= low <= high
-    assert high * (1 - 1e-6) < proved(problem, start, solution, high) <= high
-    assert high == pytest.approx(expected.gamma_least, rel=1e-8)
-    central, single = gamma_riccati(problem, 1.1 * high), gamma_riccati(one, 1.1 * high)
-    for t in range(3):
-        assert relative_distance(central.gain_predictor[t], single.gain_predictor) < 1e-7
-        assert relative_distance(central.gain_filter[t], single.gain_filter) < 1e-7
-
-
-@pytest.mark.parametrize("seed", range(0, 24, 4))
+@pytest.mark.parametrize("seed", range(0, 12, 4))
 def test_the_error_of_an_hinf_filter_is_below_its_level(seed):
     problem = random_periodic_problem(seed)
     start = kalman_riccati(problem)
@@ -370,11 +273,6 @@ def test_a_mode_that_no_reading_sees():
     )
     with pytest.raises(DetectabilityError, match=r"1\.21.*no measurement sees it"):
         kalman_riccati(hidden)
-
-
-def test_a_walk_that_nothing_drives():
-    with pytest.raises(DetectabilityError, match="driven by noise"):
-        kalman_riccati(walk(B=[[[0.0, 0.0]]]))
 
 
 def test_an_equation_that_is_not_solved(monkeypatch):

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.limits import RATE, Anonymous, ar, budget, path
-from support.plants import lbt_axis_plant
+from support.limits import RATE, Anonymous, ar, path
 
 import lbt_synth as lbt
 from lbt_synth.loop.least_residuals import band_limit as band_module
@@ -63,55 +62,18 @@ def test_the_density_found_is_the_hardest(config):
     assert hardest == pytest.approx(limit.rms_nm, rel=1e-3)
 
 
-@pytest.mark.parametrize("frame_means", [False, True])
-@pytest.mark.parametrize("delay", [1, 2, 2.7, 3])
-def test_designs_stay_above_the_band_limit(delay, frame_means):
-    plant = lbt_axis_plant(delay_frames=delay, damping=0.05)
-    still = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
-    known = {"band_hz": (17, 23), "rms_nm": 500, "direction": (1,), "frame_means": frame_means}
-    if delay % 1 and not frame_means:
+@pytest.mark.parametrize("delay", [1, 2.7, 3])
+def test_a_controller_reaches_the_band_limit(delay):
+    still = lbt.Truth(turbulence=ar(0.9886, driving=89.0), noise_nm=15.5)
+    band = {"band_hz": (17, 23), "rms_nm": 500, "direction": (1,)}
+    means = lbt.loop.least_worst_residual(path(delay), still, **band, frame_means=True)
+    assert means.rms_nm <= means.achieved_nm < means.rms_nm * (1 + 1e-7)
+    if delay % 1:
         with pytest.raises(lbt.errors.ProblemError, match="known for whole frames of delay"):
-            lbt.loop.least_worst_residual(plant.hardware, still, **known)
-        return
-    limit = lbt.loop.least_worst_residual(plant.hardware, still, **known)
-    assert limit.rms_nm <= limit.achieved_nm < limit.rms_nm * (1 + (1e-7 if frame_means else 0.02))
-    for design in (lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.1, route="riccati")):
-        worst = max(
-            budget(
-                design,
-                replace(
-                    still,
-                    vibrations=(
-                        lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=500, direction=(1,)),
-                    ),
-                ),
-                frame_means=frame_means,
-            ).rms_nm
-            for f in (17, 18.5, 20, 21.5, 23)
-        )
-        assert worst > limit.rms_nm
-
-
-@pytest.mark.parametrize("frame_means", [False, True])
-def test_narrow_bands_tend_to_the_known_frequency(frame_means):
-    line = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,))
-    still = lbt.Truth(turbulence=ar(0.99), noise_nm=3.0)
-    known = lbt.loop.least_residual(
-        path(), replace(still, vibrations=(line,)), frame_means=frame_means
-    ).rms_nm
-    found = [
-        lbt.loop.least_worst_residual(
-            path(),
-            still,
-            band_hz=(20, 20 + width),
-            rms_nm=100,
-            direction=(1,),
-            frame_means=frame_means,
-        ).rms_nm
-        for width in (10, 1, 1e-2, 1e-5)
-    ]
-    assert found[0] > found[1] > found[2] > found[3] > known
-    assert found[3] == pytest.approx(known, rel=1e-4)
+            lbt.loop.least_worst_residual(path(delay), still, **band)
+    else:
+        image = lbt.loop.least_worst_residual(path(delay), still, **band)
+        assert image.rms_nm <= image.achieved_nm < image.rms_nm * 1.02
 
 
 def test_band_without_noise():
@@ -120,6 +82,14 @@ def test_band_without_noise():
     limit = lbt.loop.least_worst_residual(path(), still, **known, frame_means=True)
     least = lbt.loop.least_residual(path(), still, frame_means=True)
     assert least.rms_nm < limit.rms_nm <= limit.achieved_nm
+    line = lbt.models.SinusoidalVibration(frequency_hz=15, rms_nm=100, direction=(1,))
+    noisy = lbt.Truth(turbulence=ar(0.99), noise_nm=3.0)
+    for frame_means in (True, False):  # a narrow band tends to the known frequency
+        met = replace(noisy, vibrations=(line,))
+        known_nm = lbt.loop.least_residual(path(), met, frame_means=frame_means).rms_nm
+        narrow = known | {"band_hz": (15, 15 + 1e-9), "frame_means": frame_means}
+        found_nm = lbt.loop.least_worst_residual(path(), noisy, **narrow).rms_nm
+        assert known_nm < found_nm == pytest.approx(known_nm, rel=1e-4)
     calm = lbt.Truth(turbulence=None)
     silent = lbt.loop.least_worst_residual(path(), calm, **known, frame_means=True)
     assert silent.rms_nm == 0.0
@@ -131,13 +101,10 @@ def test_band_without_noise():
     ("arguments", "text"),
     [
         ({"band_hz": (20,)}, "must be two frequencies"),
-        ({"band_hz": 20}, "must be two frequencies"),
         ({"band_hz": (25, 20)}, "must increase"),
         ({"band_hz": (20, 20)}, "For a known frequency"),
         ({"band_hz": (20, 400)}, "below the Nyquist frequency 400"),
         ({"band_hz": (0, 20)}, "above 0"),
-        ({"band_hz": (10, float("nan"))}, "finite"),
-        ({"rms_nm": -1}, "rms_nm must be above 0"),
         ({"direction": (1, 0)}, "must have 1 components"),
         ({"direction": (0,)}, "not zero"),
     ],
@@ -161,14 +128,3 @@ def test_a_search_that_does_not_settle(monkeypatch):
             direction=(1,),
         )
     assert caught.value.residual > 0
-
-
-def test_a_band_may_be_very_narrow():
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
-    truth = lbt.Truth(turbulence=slow, noise_nm=10.0)
-    known = lbt.loop.least_residual(path, truth, frame_means=True).rms_nm
-    narrow = lbt.loop.least_worst_residual(
-        path, truth, band_hz=(20, 20 + 1e-9), rms_nm=100, direction=(1,), frame_means=True
-    )
-    assert known <= narrow.rms_nm < known * 1.01

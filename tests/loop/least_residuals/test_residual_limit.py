@@ -1,30 +1,42 @@
 """The least residual against closed forms, Riccati equations and every stable design."""
 
-from dataclasses import replace
-
 import mpmath
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
-from support.limits import RATE, Anonymous, ar, budget, path, variance
-from support.plants import lbt_axis_plant
+from support.limits import RATE, ar, path, variance
+from support.lqg import shell
+from support.refusals import require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.design.result import model_limits
-from lbt_synth.loop.closed_loop import youla_controller
+from lbt_synth.errors import CoupledModesError, ProblemError
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 
 
-@pytest.mark.parametrize("delay", [1, 2, 3, 6, 20])
-@pytest.mark.parametrize("a", [-0.9, 0.0, 0.5, 0.999])
-def test_ar1_without_noise(delay, a):
-    expected = 4 * sum(a ** (2 * k) for k in range(delay))
-    assert variance(path(delay), turbulence=ar(a, driving=2.0)) == pytest.approx(expected, rel=1e-9)
+def test_processes_whose_variance_is_known():
+    for delay, a in ((1, 0.5), (2, -0.9), (6, 0.999), (20, 0.5)):
+        expected = 4 * sum(a ** (2 * k) for k in range(delay))
+        left = variance(path(delay), turbulence=ar(a, driving=2.0))
+        assert left == pytest.approx(expected, rel=1e-9)
+    for delay in (1, 2.7, 5):  # what is white cannot be corrected
+        white = ar(0.0, driving=3.0)
+        assert variance(path(delay), turbulence=white, noise_nm=2) == pytest.approx(9)
+    table = lbt.models.TabulatedSpectrum(frequency_hz=[1, 50], density_nm2_hz=[3, 3])
+    assert variance(path(), turbulence=table) == 0.0  # a band without noise is known for ever
+    assert variance(path(), turbulence=table, noise_nm=1.0) > 0.1
+    assert variance(path(), turbulence=None, noise_nm=5.0) == 0.0
 
 
-@pytest.mark.parametrize("noise", [1e-6, 1e-3, 1.0, 1e3, 1e6])
-@pytest.mark.parametrize("delay", [1, 2, 4])
+def test_a_sensor_gain_is_a_scale_of_the_noise():
+    model = {"turbulence": ar(1.5, -0.8)}
+    base = variance(path(), **model, noise_nm=0.4)
+    for gain in (0.3, 2.0):
+        weak = variance(path(), **model, noise_nm=0.4 * gain, sensor_gain=gain)
+        believed = variance(path(sensor_matrix=[[gain]]), **model, noise_nm=0.4 * gain)
+        assert (weak, believed) == pytest.approx((base, base), rel=1e-9)
+
+
+@pytest.mark.parametrize(("noise", "delay"), [(1e-6, 1), (1e-3, 2), (1.0, 4), (1e6, 2)])
 def test_ar1_with_noise_to_the_last_digits(noise, delay):
     """The scalar Riccati equation solved in 60 digits; the limit may be far below the noise."""
     a = 0.99
@@ -39,41 +51,9 @@ def test_ar1_with_noise_to_the_last_digits(noise, delay):
     assert found == pytest.approx(expected, rel=1e-9)
 
 
-def test_golden_ratio_of_the_random_walk():
-    """Equal steps and noise: an error of one step ahead of the golden ratio."""
-    found = variance(path(1), turbulence=ar(1 - 1e-9), noise_nm=1.0)
-    assert found == pytest.approx((1 + np.sqrt(5)) / 2, rel=1e-8)
-
-
-@pytest.mark.parametrize("delay", [1, 2.7, 5])
-def test_white_disturbance_cannot_be_corrected(delay):
-    assert variance(path(delay), turbulence=ar(0.0, driving=3.0), noise_nm=2) == pytest.approx(9)
-
-
-def test_nothing_to_correct():
-    assert variance(path(), turbulence=None, noise_nm=5.0) == 0.0
-
-
-def test_a_band_limited_process_without_noise_is_known_for_ever():
-    table = lbt.models.TabulatedSpectrum(frequency_hz=[1, 50], density_nm2_hz=[3, 3])
-    assert variance(path(), turbulence=table) == 0.0
-    assert variance(path(), turbulence=table, noise_nm=1.0) > 0.1
-
-
-def test_a_noisy_ideal_low_pass_process():
-    """Phi is 1 + r below half of Nyquist and r above: all cosine integrals are known."""
-    r, edge = 0.3, 200.0
-    psd = Anonymous(lambda f: np.where(f < edge, 1 / 400.0, 0.0))
-    psd.breakpoints_hz = np.array([edge])
-    lift = np.log1p(1 / r)
-    sigma2 = r * np.exp(lift / 2)
-    f1 = lift * np.sin(np.pi / 2) / np.pi
-    found = variance(path(2), turbulence=psd, noise_nm=np.sqrt(r))
-    assert found == pytest.approx(sigma2 * (1 + f1**2) - r, rel=1e-9)
-
-
-@pytest.mark.parametrize("delay", [1.7, 2.51, 2.7, 3.9, 2.999, 6.6])
-@pytest.mark.parametrize("noise", [0.0, 0.4])
+@pytest.mark.parametrize(
+    ("delay", "noise"), [(1.7, 0.4), (2.51, 0.0), (2.5, 0.4), (2.999, 0.4), (6.6, 0.4)]
+)
 def test_fractions_against_the_wiener_filter_on_a_grid(delay, noise):
     """``E = int S - |[conj(Theta) S / conj(F)]_+|^2`` by FFT, the all-pass factor kept whole."""
     model = ar(1.5, -0.8)
@@ -97,19 +77,7 @@ def test_fractions_against_the_wiener_filter_on_a_grid(delay, noise):
     )
 
 
-def test_fractions_meet_the_whole_delays():
-    model = {"turbulence": ar(1.5, -0.8), "noise_nm": 0.4}
-    whole = [variance(path(d), **model) for d in (2, 3)]
-    for delay in (2.1, 2.5):
-        assert variance(path(delay), **model) == pytest.approx(whole[0], rel=1e-12)
-    assert variance(path(2.5 + 1e-9), **model) == pytest.approx(whole[0], rel=1e-7)
-    assert variance(path(3 - 1e-9), **model) == pytest.approx(whole[1], rel=1e-7)
-    rising = [variance(path(d), **model) for d in np.linspace(2.5, 3, 21)]
-    assert np.all(np.diff(rising) > 0)
-
-
-@pytest.mark.parametrize("delay", [1, 2, 3])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("delay", "seed"), [(1, 0), (2, 1), (3, 2), (3, 5)])
 def test_kalman_filters_reach_the_limit(delay, seed):
     rng = np.random.default_rng(seed)
     roots = rng.uniform(0.1, 0.999, 3) * np.exp(1j * rng.uniform(0, np.pi, 3))
@@ -139,22 +107,6 @@ def test_kalman_filters_reach_the_limit(delay, seed):
     assert limit.change < 1e-6
 
 
-@pytest.mark.parametrize("delay", [1.3, 2.5, 2.7])
-def test_kalman_filters_of_fractional_delays_stay_above(delay):
-    plant = lbt_axis_plant(delay_frames=delay)
-    design = lbt.kalman(plant)
-    truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
-    limit = lbt.loop.least_residual(plant.hardware, truth, frame_means=True).rms_nm
-    assert limit < budget(design, truth).rms_nm < 1.08 * limit
-    loop = lbt.close_loop(plant.hardware, design.controller)
-    left = lbt.residual_budget(loop, plant)
-    residual, limit, above = model_limits(design).values()
-    assert residual == pytest.approx(left.rms_nm)  # not its estimation error
-    assert residual**2 > design.rms**2
-    assert above == pytest.approx(100 * (residual / limit - 1))
-    assert 0 <= above < 0.5
-
-
 def moving_power(spectra, frame_rate_hz, *, of_means):
     """Return what moves within the frames of phases with such spectra, by a sum."""
     f = np.linspace(0, frame_rate_hz / 2, 400_001)[1:]
@@ -163,26 +115,7 @@ def moving_power(spectra, frame_rate_hz, *, of_means):
     return np.sum(density * (1 / share - 1 if of_means else 1 - share)) * (f[1] - f[0])
 
 
-def test_kalman_of_the_example(config):
-    design = lbt.kalman(config.plant)
-    residual_nm, limit_nm, above = model_limits(design).values()
-    models = [line.ar_model(RATE) for line in config.plant.vibrations]
-    power = moving_power([*config.plant.turbulence, *models], RATE, of_means=True)
-    assert design.rms == pytest.approx(192.619, abs=1e-3)
-    assert residual_nm**2 == pytest.approx(design.rms**2 + power, rel=1e-6)
-    assert limit_nm == pytest.approx(residual_nm, rel=1e-9)
-    assert abs(above) < 1e-6
-    as_truth = lbt.Truth(
-        turbulence=config.plant.turbulence[0],
-        vibrations=config.plant.vibrations,
-        noise_nm=config.noise_nm,
-    )
-    means = lbt.loop.least_residual(config.hardware, as_truth, frame_means=True)
-    assert means.rms_nm == pytest.approx(design.rms)
-
-
-def test_limit_of_the_example_and_a_filter_that_comes_close(config):
-    """A Kalman filter with a long AR model of the true spectrum, against 10.84 nm of means."""
+def test_limit_of_the_example(config):
     hardware, (line, *_) = config.hardware, config.truth.vibrations
     means = lbt.loop.least_residual(hardware, config.truth, frame_means=True).rms_nm
     assert means == pytest.approx(10.8414, abs=1e-4)
@@ -191,75 +124,14 @@ def test_limit_of_the_example_and_a_filter_that_comes_close(config):
     air = moving_power([config.truth.turbulence] * hardware.modes, RATE, of_means=False)
     assert limit.within_nm2.sum() == pytest.approx(floor + air, rel=1e-4)
     assert limit.rms_nm**2 == pytest.approx(means**2 + floor + air, rel=3e-2)
-    still = replace(config.truth, vibrations=())
-    f = (np.arange(1 << 17) + 0.5) / (1 << 17) * RATE / 2
-    lags = np.arange(17)
-    # a little white noise makes the long model smooth
-    cosines = np.stack([np.cos(2 * np.pi * f / RATE * lag) for lag in lags])
-    covariance = cosines @ (still.turbulence.psd(f) + 0.2**2 / 400) * (RATE / 2 / f.size)
-    from scipy.linalg import solve_toeplitz
-
-    a = solve_toeplitz(covariance[:-1], covariance[1:])
-    driving = np.sqrt(covariance[0] - a @ covariance[1:])
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=ar(*a, driving=driving), noise_nm=config.noise_nm
-    )
-    design = lbt.kalman(plant)
-    for frame_means in (True, False):
-        least = lbt.loop.least_residual(hardware, still, frame_means=frame_means).rms_nm
-        assert least < budget(design, still, frame_means=frame_means).rms_nm < 1.05 * least
-
-
-@settings(max_examples=40)
-@given(
-    gain=st.floats(0.02, 0.9),
-    delay=st.sampled_from([1, 1.4, 2, 2.8, 3]),
-    noise=st.sampled_from([0.0, 0.01, 1.0, 100.0]),
-    seed=st.integers(0, 99),
-    frame_means=st.booleans(),
-)
-def test_no_design_passes_the_limit(gain, delay, noise, seed, frame_means):
-    rng = np.random.default_rng(seed)
-    line = lbt.Vibration(frequency_hz=rng.uniform(2, 380), damping=0.01, rms_nm=5.0, direction=(1,))
-    truth = lbt.Truth(
-        turbulence=ar(rng.uniform(-0.9, 0.99)),
-        vibrations=(line,),
-        noise_nm=noise,
-        sensor_gain=rng.uniform(0.5, 1.0),
-    )
-    hardware = path(delay)
-    limit = lbt.loop.least_residual(hardware, truth, frame_means=frame_means).rms_nm
-    by_hand = lbt.integrator(hardware, gain=gain * lbt.design.integrator_gain_limit(delay))
-    left = budget(by_hand, truth, frame_means=frame_means)
-    assert left.rms_nm >= limit * (1 - 1e-9)
-    poles = np.diag(rng.uniform(-0.9, 0.9, 3))
-    parameter = lbt.Controller(
-        A=poles,
-        B=rng.standard_normal((3, 1)),
-        C=rng.standard_normal((1, 3)),
-        D=rng.standard_normal((1, 1)),
-        dt_s=1 / RATE,
-    )
-    loop = lbt.close_loop(
-        hardware, youla_controller(hardware, parameter), sensor_gain=truth.sensor_gain
-    )
-    assume(loop.is_stable)
-    left = lbt.residual_budget(loop, truth, frame_means=frame_means)
-    assert left.rms_nm >= limit * (1 - 1e-9)
-
-
-@given(noise=st.floats(0.01, 100), factor=st.floats(1.01, 10), gain=st.floats(0.2, 3))
-def test_noise_scale_and_sensor_gain(noise, factor, gain):
-    model = {"turbulence": ar(1.5, -0.8)}
-    base = variance(path(), **model, noise_nm=noise)
-    assert variance(path(), **model, noise_nm=noise * factor) > base
-    assert variance(path(3), **model, noise_nm=noise) > base
-    scaled = variance(path(), turbulence=ar(1.5, -0.8, driving=factor), noise_nm=noise * factor)
-    assert scaled == pytest.approx(factor**2 * base, rel=1e-9)
-    weak = variance(path(), **model, noise_nm=noise * gain, sensor_gain=gain)
-    assert weak == pytest.approx(base, rel=1e-9)
-    believed = variance(path(sensor_matrix=[[gain]]), **model, noise_nm=noise * gain)
-    assert believed == pytest.approx(base, rel=1e-9)
+    design = lbt.kalman(config.plant)
+    residual_nm, limit_nm, above = model_limits(design).values()
+    models = [line.ar_model(RATE) for line in config.plant.vibrations]
+    power = moving_power([*config.plant.turbulence, *models], RATE, of_means=True)
+    assert design.rms == pytest.approx(192.619, abs=1e-3)
+    assert residual_nm**2 == pytest.approx(design.rms**2 + power, rel=1e-6)
+    assert limit_nm == pytest.approx(residual_nm, rel=1e-9)
+    assert abs(above) < 1e-6
 
 
 def test_a_sinusoid_of_known_frequency_costs_what_moves_within_a_frame():
@@ -284,16 +156,6 @@ def test_a_sinusoid_of_known_frequency_costs_what_moves_within_a_frame():
     assert narrow[2] == pytest.approx(with_line, rel=1e-2)
 
 
-def test_kolmogorov_turbulence(air):
-    endless = replace(air, outer_scale_m=None)
-    hardware = path(modes=2)
-    one, other = (
-        lbt.loop.least_residual(hardware, lbt.Truth(turbulence=a, noise_nm=15.5)).rms_nm
-        for a in (air, endless)
-    )
-    assert one < other < 1.2 * one
-
-
 def coupled_plant(ratio=2.0, **options):
     """A line along a diagonal over turbulence of another size on either axis."""
     slow = [ar(1.98, -0.9805, driving=driving) for driving in (1.0, ratio)]
@@ -303,7 +165,7 @@ def coupled_plant(ratio=2.0, **options):
     )
 
 
-@pytest.mark.parametrize("delay", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("delay", [1.0, 3.0])
 def test_coupled_modes_have_the_limit_of_the_best_filter(delay):
     plant = coupled_plant(delay_frames=delay)
     limit = least_model_residual(plant)
@@ -314,11 +176,6 @@ def test_coupled_modes_have_the_limit_of_the_best_filter(delay):
     alone, nearly = (least_model_residual(coupled_plant(r, delay_frames=delay)) for r in (1, 1.001))
     assert nearly.rms_nm == pytest.approx(alone.rms_nm, rel=1e-3)
     assert nearly.rms_nm > alone.rms_nm
-
-
-def test_coupled_modes_without_a_limit_are_refused():
-    with pytest.raises(lbt.errors.CoupledModesError, match="modes that decouple"):
-        least_model_residual(coupled_plant(delay_frames=2.4))
 
 
 def variances_of_sensors(sensors, *, delay=2.0, lines=(), sensor_gain=1.0, own_noise=20.0):
@@ -354,18 +211,15 @@ def second(rate_hz, delay_frames, noise_nm):
     )
 
 
-@pytest.mark.parametrize("sensor_gain", [1.0, 0.6])
-def test_the_bound_of_two_sensors_of_each_frame_is_met(sensor_gain):
-    left, least = variances_of_sensors([second(RATE, 2, 9.0)], sensor_gain=sensor_gain)
+def test_the_bound_of_two_sensors_is_met_by_quick_ones_and_passed_by_none():
+    calm, suite = {"turbulence": ar(0.99)}, lbt.models.SensorSuite(sensors=(second(RATE, 2, 3.0),))
+    assert variance(path(suite=suite), **calm) == variance(path(), **calm)  # its own has no noise
+    left, least = variances_of_sensors([second(RATE, 2, 9.0)], sensor_gain=0.6)
     assert least == pytest.approx(left, rel=1e-7)
-
-
-@pytest.mark.parametrize(("divisor", "delay_frames"), [(2, 2), (5, 2), (5, 3.2), (20, 2)])
-def test_no_filter_of_a_slow_sensor_passes_the_bound(divisor, delay_frames):
-    left, least = variances_of_sensors([second(RATE / divisor, delay_frames, 3.0)])
-    alone = variances_of_sensors([second(RATE / divisor, delay_frames, 1e4)])[0]
-    assert least < left < alone
-    assert least > 0.3 * left  # it is no empty bound
+    for divisor, delay_frames in ((2, 2), (5, 3.2)):
+        left, least = variances_of_sensors([second(RATE / divisor, delay_frames, 3.0)])
+        alone = variances_of_sensors([second(RATE / divisor, delay_frames, 1e4)])[0]
+        assert 0.3 * left < least < left < alone
 
 
 def test_accelerometers_cannot_do_more_than_know_the_vibrations():
@@ -383,56 +237,18 @@ def test_accelerometers_cannot_do_more_than_know_the_vibrations():
     assert known[0] < 1.6 * known[1]
 
 
-def test_a_sensor_without_noise_gains_nothing():
-    calm = {"turbulence": ar(0.99), "noise_nm": 0.0}
-    suite = lbt.models.SensorSuite(sensors=(second(RATE / 5, 2, 3.0),))
-    assert variance(path(suite=suite), **calm) == variance(path(), **calm)
+CALM = {"turbulence": ar(0.9), "noise_nm": 1.0}
+LATE, MOVING = second(RATE / 5, 2.1, 3.0), path(mirror=shell(100))
 
 
-def test_an_exposure_that_ends_within_a_frame_has_no_bound():
-    with pytest.raises(lbt.errors.ProblemError, match="ends within a frame of the loop"):
-        variances_of_sensors([second(RATE / 5, 2.1, 3.0)])
-
-
-DELAYS = [1, 1.5, 2, 2.01, 2.25, 2.49, 2.75, 3]
-
-
-@pytest.mark.parametrize("delay", DELAYS)
-@pytest.mark.parametrize("kind", ["example", "calm", "quick"])
-def test_the_best_filters_come_close_to_the_limit_in_the_image(delay, kind):
-    """At whole delays they reach it: with a fraction, they draw a line between two means."""
-    plant = {
-        "example": lambda: lbt_axis_plant(delay_frames=delay),
-        "calm": lambda: lbt.tip_tilt_plant(
-            frame_rate_hz=RATE, turbulence=ar(0.99), noise_nm=0.1, delay_frames=delay, modes=1
+def test_refusals():
+    rows = [
+        (
+            lambda: least_model_residual(coupled_plant(delay_frames=2.4)),
+            CoupledModesError,
+            "modes that decouple",
         ),
-        "quick": lambda: lbt.tip_tilt_plant(
-            frame_rate_hz=RATE, turbulence=ar(1.5, -0.6), noise_nm=3.0, delay_frames=delay, modes=1
-        ),
-    }[kind]()
-    limit = least_model_residual(plant).rms_nm
-    for design in (lbt.kalman(plant), lbt.lqg(plant)):
-        loop = lbt.close_loop(plant.hardware, design.controller)
-        left = lbt.residual_budget(loop, plant).rms_nm
-        if delay % 1:  # the limit takes what lies between two samples from 32 of them
-            assert limit * (1 - 1e-5) <= left < limit * (1 + 5e-3)
-        else:
-            assert left == pytest.approx(limit, rel=1e-9)
-
-
-def test_fractions_in_the_image_lie_between_the_whole_delays():
-    model = {"turbulence": ar(1.5, -0.8), "noise_nm": 0.4, "frame_means": False}
-    least = [
-        variance(path(delay), **model) for delay in (2, 2 + 1e-6, 2.25, 2.5, 2.75, 3 - 1e-6, 3)
+        (lambda: variances_of_sensors([LATE]), ProblemError, "ends within a frame of the loop"),
+        (lambda: variance(MOVING, **CALM, frame_means=False), ProblemError, "one with dynamics"),
     ]
-    assert least[1] == pytest.approx(least[0], rel=1e-4)
-    assert least[5] == pytest.approx(least[6], rel=1e-4)
-    assert np.all(np.diff(least) > 0)
-
-
-def test_mirrors_with_dynamics_have_no_limit_in_the_image_yet():
-    shell = lbt.models.PositionLoop.from_bandwidth(
-        natural_frequency_hz=20, damping=0.5, bandwidth_hz=100
-    )
-    with pytest.raises(lbt.errors.ProblemError, match="one with dynamics"):
-        variance(path(mirror=shell), turbulence=ar(0.9), noise_nm=1.0, frame_means=False)
+    require_refusals(rows)

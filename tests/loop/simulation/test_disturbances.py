@@ -14,7 +14,7 @@ from lbt_synth.models.plant.seen_vibration import seen_vibration
 def test_drawn_series_have_their_spectrum(air):
     path = lbt.LoopHardware(frame_rate_hz=400, modes=1)
     truth = lbt.Truth(turbulence=air)
-    series = draw_disturbance(truth, path, frames=8192, cases=200, frame_means=True).phase_nm[
+    series = draw_disturbance(truth, path, frames=4096, cases=100, frame_means=True).phase_nm[
         ..., 0
     ]
     variance = np.mean(series**2, axis=1)
@@ -27,8 +27,7 @@ def test_drawn_series_have_their_spectrum(air):
     assert abs(step.mean() - expected) < 5 * step.std(ddof=1) / np.sqrt(len(step))
 
 
-@pytest.mark.parametrize("frames", [100, 1000])
-def test_power_is_drawn_whole_however_short_the_series(frames):
+def test_power_is_drawn_whole_however_short_the_series():
     """A line between two bins, and a spectrum that rises towards zero, keep their variance."""
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     steep = lbt.Atmosphere(
@@ -39,62 +38,28 @@ def test_power_is_drawn_whole_however_short_the_series(frames):
     )
     for spectrum, rms in ((steep, steep.tilt_rms_nm), (line, 10.0)):
         series = draw_disturbance(
-            lbt.Truth(turbulence=spectrum),
-            path,
-            frames=frames,
-            cases=3000,
-            seed=2,
-            frame_means=True,
+            lbt.Truth(turbulence=spectrum), path, frames=100, cases=3000, seed=2, frame_means=True
         ).phase_nm
         assert np.sqrt(np.mean(series**2)) == pytest.approx(rms, rel=0.05)
 
 
-def test_white_noise_is_drawn_white():
-    flat = lbt.models.TabulatedSpectrum(frequency_hz=[0, 400], density_nm2_hz=[1.0, 1.0])
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    series = draw_disturbance(
-        lbt.Truth(turbulence=flat), path, frames=8, cases=60_000, seed=3, frame_means=True
-    ).phase_nm
-    assert np.mean(series**2) == pytest.approx(400, rel=0.01)
-
-
-def test_drawn_ar_series_are_stationary_from_the_first_frame():
-    line = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=100, direction=(1,))
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    series = draw_disturbance(
-        lbt.Truth(turbulence=None, vibrations=(line,)),
-        path,
-        frames=40,
-        cases=6000,
-        seed=1,
-        frame_means=True,
-    ).phase_nm[..., 0]
-    for frame in (0, 1, 20, 39):
-        assert series[:, frame].std() == pytest.approx(100, rel=0.05)
-    model = line.ar_model(800)
-    correlation = np.mean(series[:, 0] * series[:, 1]) / 100**2
-    a1, a2 = model.coefficients
-    assert correlation == pytest.approx(a1 / (1 - a2), abs=0.05)
-
-
-def test_a_mode_keeps_its_weather_when_the_other_changes():
+def test_every_controller_and_mode_meets_the_weather_of_its_seed():
     both, _ = LOOPS
-    design = lbt.integrator(both, gain=0.4)
-    runs = [
-        lbt.simulate(
-            design.controller,
-            lbt.Truth(turbulence=[SLOW, other]),
-            hardware=both,
-            frames=50,
-            cases=2,
-            seed=1,
-        )
-        for other in (QUICK, TABLE, None)
-    ]
-    for run in runs[1:]:
-        np.testing.assert_array_equal(run.residual_nm[..., 0], runs[0].residual_nm[..., 0])
-        assert not np.array_equal(run.residual_nm[..., 1], runs[0].residual_nm[..., 1])
-    assert not np.any(runs[2].residual_nm[..., 1])
+
+    def run(other, gain=0.4, seed=1):
+        law, truth = lbt.integrator(both, gain=gain), lbt.Truth(turbulence=[SLOW, other])
+        size = {"frames": 50, "cases": 2, "seed": seed, "settle_frames": 100}
+        return lbt.simulate(law, truth, hardware=both, **size)
+
+    first, table, calm = (run(other) for other in (QUICK, TABLE, None))
+    for changed in (table, calm):
+        np.testing.assert_array_equal(changed.residual_nm[..., 0], first.residual_nm[..., 0])
+        assert not np.array_equal(changed.residual_nm[..., 1], first.residual_nm[..., 1])
+    assert not np.any(calm.residual_nm[..., 1])
+    lively, later = run(QUICK, gain=0.6), run(QUICK, seed=2)
+    np.testing.assert_array_equal(lively.total_nm, first.total_nm)
+    assert not np.array_equal(lively.residual_nm, first.residual_nm)
+    assert not np.array_equal(later.total_nm, first.total_nm)
 
 
 PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
@@ -106,11 +71,16 @@ def drawn(line, *, frames, cases=1, zero_frame=0, seed=0):
     return draw_disturbance(truth, PATH, frame_means=True, **options).phase_nm[..., 0]
 
 
-def test_the_drawn_resonance_has_its_rms_and_its_decay():
+def test_drawn_resonances_have_their_rms_and_their_decay_from_the_first_frame():
+    still = lbt.Vibration(frequency_hz=20, damping=0.005, rms_nm=100, direction=(1,))
+    series, (a1, a2) = drawn(still, frames=40, cases=4000, seed=1), still.ar_model(800).coefficients
+    assert series[:, [0, 20, 39]].std(axis=0) == pytest.approx(np.full(3, 100), rel=0.05)
+    correlation = np.mean(series[:, 0] * series[:, 1]) / 100**2
+    assert correlation == pytest.approx(a1 / (1 - a2), abs=0.05)
     line = drifting(duration_s=2, damping=0.02)
-    series = drawn(line, frames=2800, cases=2000, zero_frame=400)
+    series = drawn(line, frames=2800, cases=1000, zero_frame=400)
     for frame in (0, 1, 399, 1200, 2000, 2799):
-        assert series[:, frame].std() == pytest.approx(100, rel=0.07)
+        assert series[:, frame].std() == pytest.approx(100, rel=0.08)
     early, late = series[:, :2], series[:, 2400:2402]  # before the drift, and after it
     for pair, hz in ((early, 17), (late, 23)):
         model = (
@@ -118,7 +88,7 @@ def test_the_drawn_resonance_has_its_rms_and_its_decay():
         )
         a1, a2 = model.coefficients
         correlation = np.mean(pair[:, 0] * pair[:, 1]) / np.mean(pair**2)
-        assert correlation == pytest.approx(a1 / (1 - a2), abs=1.5e-3)
+        assert correlation == pytest.approx(a1 / (1 - a2), abs=2e-3)
 
 
 def path_with(channel):

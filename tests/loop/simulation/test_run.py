@@ -4,20 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import hilbert
-from support.drifting import drifting
 from support.lqg import shell
-from support.plants import lbt_axis_plant
-from support.uneven_axes import LINES, LOOPS, SLOW, TABLE
+from support.refusals import require_refusals
 
 import lbt_synth as lbt
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.loop.simulation.run import Drop, run_segments
 
 
-@pytest.mark.parametrize("delay", [1, 1.4, 2, 2.7, 3])
-def test_fast_loop_is_the_loop_as_written(delay):
+@pytest.mark.parametrize(
+    ("delay", "mirror"), [(1, None), (2.7, None), (2, shell(70, delay_samples=2))]
+)
+def test_fast_loop_is_the_loop_as_written(delay, mirror):
     rng = np.random.default_rng(2)
     turbulence = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=30, frame_rate_hz=800)
     plant = lbt.tip_tilt_plant(
@@ -29,7 +28,10 @@ def test_fast_loop_is_the_loop_as_written(delay):
         sensor_matrix=rng.standard_normal((3, 2)),
         influence_matrix=rng.standard_normal((2, 4)),
     )
-    controller = lbt.kalman(plant).controller
+    path = replace(plant.hardware, mirror=mirror)
+    leaky = lbt.design.IntegratorLaw(leak=0.98)
+    design = lbt.integrator(path, gain=0.1, law=leaky) if mirror else lbt.kalman(plant)
+    controller = design.controller
     truth = lbt.Truth(
         turbulence=turbulence,
         noise_nm=5,
@@ -37,9 +39,7 @@ def test_fast_loop_is_the_loop_as_written(delay):
         vibrations=(lbt.models.SinusoidalVibration(frequency_hz=24, rms_nm=90, direction=(1, 2)),),
     )
     fast, stepped = (
-        lbt.simulate(
-            k, truth, hardware=plant.hardware, frames=300, cases=2, seed=4, settle_frames=50
-        )
+        lbt.simulate(k, truth, hardware=path, frames=300, cases=2, seed=4, settle_frames=50)
         for k in (controller, controller.start())
     )
     for name in ("residual_nm", "commands", "measurements", "total_nm"):
@@ -47,8 +47,7 @@ def test_fast_loop_is_the_loop_as_written(delay):
         assert np.allclose(one, other, atol=1e-9 * np.abs(other).max()), name
 
 
-@pytest.mark.parametrize("frame_means", [False, True])
-@pytest.mark.parametrize(("delay", "mirror"), [(2, None), (2.4, None), (2, 70), (2.4, 70)])
+@pytest.mark.parametrize(("delay", "mirror", "frame_means"), [(2, None, True), (2.4, 70, False)])
 def test_simulation_agrees_with_the_exact_answer(config, delay, mirror, frame_means):
     """Within the statistical error, which the scatter of independent runs gives."""
     moved = None if mirror is None else shell(mirror, delay_samples=2)
@@ -56,45 +55,18 @@ def test_simulation_agrees_with_the_exact_answer(config, delay, mirror, frame_me
     controller = lbt.lqg(replace(config.plant, hardware=path), command_weight=1e-3).controller
     options = {"frame_means": frame_means}
     run = lbt.simulate(
-        controller, config.truth, hardware=path, frames=8000, cases=24, seed=3, **options
+        controller, config.truth, hardware=path, frames=4000, cases=24, seed=3, **options
     )
     loop = lbt.close_loop(path, controller)
     exact = lbt.residual_budget(loop, config.truth, **options)
     variances = run.rms_nm**2
     error = variances.std(ddof=1) / np.sqrt(len(variances))
     assert abs(variances.mean() - exact.rms_nm**2) < 4 * error
-    assert error < 0.03 * exact.rms_nm**2  # the test has teeth
+    assert error < 0.04 * exact.rms_nm**2  # the test has teeth
     strehls = run.strehl(config.imaging)
     scatter = strehls.std(ddof=1) / np.sqrt(len(strehls))
     # the series' own mean is taken out of its image, which only helps
     assert abs(strehls.mean() - lbt.strehl(exact, config.imaging)) < 4 * scatter + 5e-4
-
-
-def test_runs_beyond_the_memory_are_refused(axis_plant):
-    controller = lbt.kalman(axis_plant).controller
-    truth = lbt.Truth(turbulence=None, noise_nm=1)
-    for size in ({"frames": 10**24}, {"frames": 10**6, "cases": 10**6}):
-        with pytest.raises(lbt.errors.ProblemError, match="must fit into 8 GB"):
-            lbt.simulate(controller, truth, hardware=axis_plant.hardware, **size)
-
-
-def test_seeds_give_the_same_weather_to_every_controller(config):
-    hw = config.hardware
-    runs = [
-        lbt.simulate(d.controller, config.truth, hardware=hw, frames=200, seed=9, settle_frames=100)
-        for d in (lbt.integrator(hw, gain=0.3), lbt.integrator(hw, gain=0.6))
-    ]
-    assert np.array_equal(runs[0].total_nm, runs[1].total_nm)
-    assert not np.array_equal(runs[0].residual_nm, runs[1].residual_nm)
-    other = lbt.simulate(
-        lbt.integrator(hw, gain=0.3).controller,
-        config.truth,
-        hardware=hw,
-        frames=200,
-        seed=10,
-        settle_frames=100,
-    )
-    assert not np.array_equal(other.total_nm, runs[0].total_nm)
 
 
 class Broken:
@@ -106,90 +78,29 @@ class Broken:
 
 
 def test_wrong_controllers_and_counts_are_refused(axis_plant):
-    hw, truth = axis_plant.hardware, lbt.Truth(turbulence=None, noise_nm=1)
-    with pytest.raises(lbt.errors.ProblemError, match="must return 1 finite commands"):
-        lbt.simulate(Broken(), truth, hardware=hw, frames=10)
-    with pytest.raises(lbt.errors.ProblemError, match=r"step\(y\) and reset\(\)"):
-        lbt.simulate("controller", truth, hardware=hw, frames=10)
-    controller = lbt.kalman(axis_plant).controller
-    for wrong in (
-        {"frames": 0},
-        {"frames": 1.5},
-        {"cases": 0},
-        {"seed": -1},
-        {"settle_frames": -1},
-    ):
-        with pytest.raises(lbt.errors.ProblemError):
-            lbt.simulate(controller, truth, hardware=hw, **({"frames": 10} | wrong))
-    with pytest.raises(lbt.errors.DimensionError, match="inputs must be"):
-        filter_series(lbt.linear.StateSpace(A=0.5, B=1.0, C=1.0, D=0.0), np.zeros((5, 2)))
-    with pytest.raises(lbt.errors.DimensionError, match="y must have shape"):
-        controller.start().step([1.0, 2.0])
+    hardware, truth = axis_plant.hardware, lbt.Truth(turbulence=None, noise_nm=1)
+    filters = lbt.kalman(axis_plant).controller
     line = lbt.models.SinusoidalVibration(frequency_hz=5, rms_nm=1)
     shaken = lbt.Truth(turbulence=None, vibrations=(line,))
-    with pytest.raises(lbt.errors.DimensionError, match="must have 1 components"):
-        lbt.simulate(controller, shaken, hardware=hw, frames=10)
+    gain = lbt.linear.StateSpace(A=0.5, B=1.0, C=1.0, D=0.0)
 
+    def run(controller=filters, met=truth, **counts):
+        return lbt.simulate(controller, met, hardware=hardware, **({"frames": 10} | counts))
 
-def test_axis_of_the_lbt_in_the_time_domain():
-    """Truth is the model: the simulated means over frames are the Kalman filter's 135.958 nm."""
-    plant = lbt_axis_plant()
-    truth = lbt.Truth(turbulence=plant.turbulence[0], vibrations=plant.vibrations, noise_nm=15.5)
-    run = lbt.simulate(
-        lbt.kalman(plant), truth, hardware=plant.hardware, frames=4000, cases=50, frame_means=True
-    )
-    variances = run.rms_nm**2
-    error = variances.std(ddof=1) / np.sqrt(len(variances))
-    assert abs(variances.mean() - 135.958**2) < 4 * error
-
-
-def test_a_line_above_nyquist_is_refused_as_in_the_exact_answer(axis_plant):
-    line = lbt.models.SinusoidalVibration(frequency_hz=600, rms_nm=1, direction=(1,))
-    truth = lbt.Truth(turbulence=None, vibrations=(line,))
-    with pytest.raises(
-        lbt.errors.ProblemError, match="below the Nyquist frequency 400 Hz; got 600 Hz"
-    ):
-        lbt.simulate(
-            lbt.kalman(axis_plant).controller, truth, hardware=axis_plant.hardware, frames=10
-        )
-
-
-def test_a_simulation_agrees_with_the_exact_answer():
-    both, _ = LOOPS
-    truth = lbt.Truth(turbulence=[SLOW, TABLE], noise_nm=[20.0, 5.0], vibrations=LINES)
-    design = lbt.integrator(both, gain=0.4)
-    run = lbt.simulate(design.controller, truth, hardware=both, frames=20_000, cases=4, seed=3)
-    loop = lbt.close_loop(both, design.controller)
-    exact = lbt.residual_budget(loop, truth)
-    power = np.mean(run.image_nm2, axis=(0, 1))
-    np.testing.assert_allclose(power, np.diag(exact.total_nm2), rtol=0.05)
-
-
-def test_time_0_is_the_first_kept_frame():
-    plant = lbt_axis_plant()
-    truth = lbt.Truth(turbulence=None, vibrations=(drifting(),), noise_nm=1)
-    gentle = lbt.integrator(plant.hardware, gain=0.3).controller
-    series = {
-        settle: lbt.simulate(
-            gentle, truth, hardware=plant.hardware, frames=4000, settle_frames=settle
-        ).total_nm[0, :, 0]
-        for settle in (0, 1000)
-    }
-    # the same phase at random but for the settling: the same frequencies in the same frames
-    phases = [np.unwrap(np.angle(hilbert(s))) for s in series.values()]
-    apart = np.diff(phases, axis=0)[0][300:-300]
-    assert np.ptp(apart) < 0.05
-
-
-def test_simulation_by_taps_is_that_of_the_states():
-    plant = lbt_axis_plant(modes=1)
-    path = lbt.LoopHardware(frame_rate_hz=800, modes=1, mirror=shell(70, delay_samples=2))
-    slow = lbt.integrator(path, gain=0.1)
-    truth = lbt.Truth(turbulence=plant.turbulence[0], noise_nm=15.5)
-    same = {"hardware": path, "frames": 400, "seed": 3, "settle_frames": 100}
-    by_states = lbt.simulate(slow.controller, truth, **same)
-    by_taps = lbt.simulate(slow.controller.start(), truth, **same)
-    np.testing.assert_allclose(by_states.residual_nm, by_taps.residual_nm, atol=1e-9)
+    rows = [
+        (lambda: run(Broken()), ProblemError, "must return 1 finite commands"),
+        (lambda: run("controller"), ProblemError, r"step\(y\) and reset\(\)"),
+        (lambda: run(frames=0), ProblemError, "frames must be"),
+        (lambda: run(cases=0), ProblemError, "cases must be"),
+        (lambda: run(seed=-1), ProblemError, "seed must be"),
+        (lambda: run(settle_frames=-1), ProblemError, "settle_frames must be"),
+        (lambda: run(frames=10**24), ProblemError, "must fit into 8 GB"),
+        (lambda: run(frames=10**6, cases=10**6), ProblemError, "must fit into 8 GB"),
+        (lambda: run(met=shaken), DimensionError, "must have 1 components"),
+        (lambda: filter_series(gain, np.zeros((5, 2))), DimensionError, "inputs must be"),
+        (lambda: filters.start().step([1.0, 2.0]), DimensionError, "y must have shape"),
+    ]
+    require_refusals(rows)
 
 
 PATH = lbt.LoopHardware(frame_rate_hz=500, modes=1)
@@ -211,20 +122,14 @@ def test_a_step_is_answered_frame_by_frame():
     assert found.residual[:20] == pytest.approx(expected)
     assert found.command[:20] == pytest.approx(u)
     assert found.overshoot_percent == pytest.approx(-100 * min(expected))
-
-
-def test_settling_is_the_last_time_outside_five_percent():
-    found = step(0.1)
-    after = round(found.settling_s * 500)
-    assert abs(found.residual[after - 1]) > 0.05
-    assert np.all(np.abs(found.residual[after:]) <= 0.05)
+    slow = step(0.1)
+    after = round(slow.settling_s * 500)
+    assert abs(slow.residual[after - 1]) > 0.05
+    assert np.all(np.abs(slow.residual[after:]) <= 0.05)
     assert np.isnan(step(0.1, frames=5).settling_s)
-
-
-def test_the_step_is_on_the_axis_that_is_named():
     path = lbt.LoopHardware(frame_rate_hz=500, modes=2)
-    assert step(0.3, path, axis=1).residual == pytest.approx(step(0.3).residual)
-    with pytest.raises(lbt.errors.ProblemError, match="axis must be below 2"):
+    assert step(0.1, path, axis=1).residual == pytest.approx(slow.residual)
+    with pytest.raises(ProblemError, match="axis must be below 2"):
         step(0.3, path, axis=2)
 
 
@@ -242,10 +147,7 @@ def exact_nm(design, truth, missing, filtered):
     return lbt.residual_budget(loop, truth).rms_nm
 
 
-@pytest.mark.parametrize(
-    ("missing", "reading"),
-    [((), "missing"), (("m1",), "missing"), (("m2",), "zero"), (("slow", "m2"), "missing")],
-)
+@pytest.mark.parametrize(("missing", "reading"), [(("m2",), "zero"), (("slow", "m2"), "missing")])
 def test_a_run_has_the_exact_residual(sensors_design, sensors_config, missing, reading):
     drops = [Drop(unit=unit, start_s=0, reading=reading) for unit in missing]
     found = np.sqrt(np.mean(failing_run(sensors_design, sensors_config.truth, drops).rms_nm ** 2))
@@ -268,14 +170,6 @@ def test_the_wavefront_sensor_may_go_and_come_back(sensors_design, sensors_confi
     assert np.max(steps[:, 2998:3003]) < 2 * np.max(steps[:, :2990])
 
 
-def test_a_frozen_wavefront_runs_away_where_the_table_says_so(sensors_design, sensors_config):
-    away = Drop(unit="wavefront", start_s=1, reading="frozen")
-    loop = lbt.close_loop(sensors_design.hardware, sensors_design.controller, blind=("wavefront",))
-    found = failing_run(sensors_design, sensors_config.truth, [away], frames=6000, cases=2)
-    grows = np.max(np.abs(found.residual_nm[:, -100:])) > 1e4
-    assert grows == (not loop.is_stable)
-
-
 def test_a_sinusoid_that_channels_see(sensors_design, sensors_config):
     lines = tuple(
         lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=100, direction=d)
@@ -284,8 +178,25 @@ def test_a_sinusoid_that_channels_see(sensors_design, sensors_config):
     truth = replace(sensors_config.truth, vibrations=lines)
     loop = sensors_design.close(sensors_config.hardware)
     exact = lbt.residual_budget(loop, truth)
-    found = failing_run(sensors_design, truth, frames=20_000, cases=4)
+    found = failing_run(sensors_design, truth, frames=10_000, cases=4)
     assert np.sqrt(np.mean(found.rms_nm**2)) == pytest.approx(exact.rms_nm, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"start_s": 2, "end_s": 1}, "must be back after it fails"),
+        ({"start_s": 0, "reading": "odd"}, "missing, zero, frozen"),
+        ({"start_s": -1}, "at least 0"),
+        ({"start_s": 0, "unit": "m3"}, "must be one of wavefront, slow, m1, m2; got 'm3'"),
+    ],
+)
+def test_wrong_drops(sensors_design, sensors_config, fields, words):
+    def drop():
+        return [Drop(**({"unit": "m1"} | fields))]
+
+    with pytest.raises(ProblemError, match=words):
+        failing_run(sensors_design, sensors_config.truth, drop(), frames=10)
 
 
 def test_segments_of_drops_that_overlap():
@@ -297,21 +208,3 @@ def test_segments_of_drops_that_overlap():
         (2, 3, "a, b (zero)"),
         (3, 4, "b (zero)"),
     ]
-
-
-def test_a_sensor_that_is_not_there(sensors_design, sensors_config):
-    with pytest.raises(ProblemError, match="must be one of wavefront, slow, m1, m2; got 'm3'"):
-        failing_run(sensors_design, sensors_config.truth, [Drop(unit="m3", start_s=0)], frames=10)
-
-
-@pytest.mark.parametrize(
-    ("fields", "said"),
-    [
-        ({"start_s": 2, "end_s": 1}, "must be back after it fails"),
-        ({"start_s": 0, "reading": "odd"}, "missing, zero, frozen"),
-        ({"start_s": -1}, "at least 0"),
-    ],
-)
-def test_wrong_drops(fields, said):
-    with pytest.raises(ProblemError, match=said):
-        Drop(unit="m1", **fields)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
@@ -15,31 +15,6 @@ SLOW = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 70, "delay_s
 
 def shell(**changes):
     return lbt.models.PositionLoop.from_bandwidth(**{**QUICK, **changes})
-
-
-@pytest.mark.parametrize("damping", [1.2, 3.0, 8.0])
-def test_two_lags_without_feedback_have_taps_in_closed_form(damping):
-    """A held force on an overdamped mode: steps of ``1 - (p2 e^-p1 t - p1 e^-p2 t)/(p2 - p1)``."""
-    w, T = 2 * np.pi * 200, 1 / 800
-    mirror = lbt.models.PositionLoop(
-        natural_frequency_hz=200,
-        damping=damping,
-        proportional_per_s2=0,
-        derivative_per_s=0,
-        delay_samples=0,
-    )
-    p1, p2 = w * (damping - np.sqrt(damping**2 - 1)), w * (damping + np.sqrt(damping**2 - 1))
-
-    def travelled(t):
-        t = np.maximum(t, 0)
-        slow, fast = (1 - np.exp(-p1 * t)) / p1, (1 - np.exp(-p2 * t)) / p2
-        return t - (p2 * slow - p1 * fast) / (p2 - p1)
-
-    for delay in (2.0, 2.3):
-        taps = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay, mirror=mirror).mirror_taps
-        edges = (np.arange(taps.size + 1) - (delay - 1)) * T
-        exact = np.diff(np.diff(travelled(edges)) / T, prepend=0.0)
-        np.testing.assert_allclose(taps, exact, atol=1e-12)
 
 
 def brute_taps(mirror, frame_rate_hz, delay_frames, frames):
@@ -86,7 +61,6 @@ def brute_taps(mirror, frame_rate_hz, delay_frames, frames):
 @pytest.mark.parametrize(
     ("mirror", "rate", "delay"),
     [
-        (shell(), 3000.0, 2.0),
         (shell(feed_forward=0.3, delay_samples=3), 2400.0, 1.37),
         (shell(ramp_samples=11, natural_frequency_hz=300, damping=0.1), 3000.0, 2.6321),
         (shell(**SLOW), 4000.0, 2.5),
@@ -98,6 +72,7 @@ def test_the_lifted_mirror_is_the_brute_force_one(mirror, rate, delay):
     np.testing.assert_allclose(taps[: brute.size], brute, atol=1e-10)
 
 
+@settings(max_examples=10)
 @given(
     natural=st.floats(5, 300),
     damping=st.floats(0.02, 1.1),
@@ -131,48 +106,11 @@ def test_taps_are_an_impulse_response_of_unit_gain(natural, damping, ratio, dela
     assert later.mirror_taps[1 : taps.size + 1] == pytest.approx(taps, abs=1e-9)
 
 
-def test_a_ramp_is_a_mean_of_steps():
-    rate, n = 800.0, 18
-    steps = [
-        np.resize(lifted_mirror(shell(), rate, 2 + i / 90).taps, 12) * (np.arange(12) < 12)
-        for i in range(n)
-    ]
-    ramp = lifted_mirror(shell(ramp_samples=n), rate, 2.0).taps
-    np.testing.assert_allclose(ramp[:12], np.mean(steps, axis=0), atol=1e-12)
-
-
-def test_a_quicker_mirror_tends_to_the_settled_one():
-    for delay in (2.0, 2.25, 2.75):
-        settled = instant_mirror(delay).taps
-        errors = []
-        for k in (1, 2, 4, 8):
-            mirror = shell(bandwidth_hz=2000 * k, sampling_hz=72_000.0 * k)
-            taps = lifted_mirror(mirror, 800.0, delay).taps
-            padded = np.zeros(max(taps.size, settled.size))
-            padded[: taps.size] += taps
-            padded[: settled.size] -= settled
-            errors.append(np.max(np.abs(padded)))
-        # in proportion to the time the mirror takes
-        assert errors[0] / errors[3] == pytest.approx(8, rel=0.02)
-
-
 def test_a_loop_without_a_mirror_is_what_it_was():
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.25)
     assert path.mirror is None
     assert path.mirror_taps.tolist() == [0.0, 0.75, 0.25]
     assert instant_mirror(1.0).whole.n_states == 0
-
-
-@pytest.mark.parametrize("frames", [0.5, 1.25])
-def test_any_delay_of_a_moving_mirror_is_exact(frames):
-    """A delay error is a delay of the same mirror, not an interpolation of its taps."""
-    from dataclasses import replace
-
-    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.0, mirror=shell())
-    moved = replace(path, delay_frames=2.0 + frames)
-    np.testing.assert_array_equal(
-        moved.mirror_taps, lifted_mirror(shell(), 800.0, 2.0 + frames).taps
-    )
 
 
 def test_mirrors_that_do_not_fit_are_refused():

@@ -1,6 +1,5 @@
 """The local position loop of the mirror, against python-control and closed forms."""
 
-import control
 import numpy as np
 import pytest
 from scipy.optimize import brentq
@@ -29,20 +28,6 @@ def test_the_step_is_that_of_a_second_order_system_when_sampled_fast():
     assert mirror.bandwidth_hz == pytest.approx(500 * np.sqrt(quarter), rel=2e-3)
 
 
-def test_the_lag_converges_with_the_sampling():
-    """Sampled feedback differs from the continuous one by a term of first order in the sample."""
-    t = np.linspace(0, 2e-3, 50)
-    w, z = 2 * np.pi * 500, 0.7
-    wd = w * np.sqrt(1 - z**2)
-    exact = 1 - np.exp(-z * w * t) * (np.cos(wd * t) + z / np.sqrt(1 - z**2) * np.sin(wd * t))
-    errors = []
-    for rate in (2e5, 4e5, 8e5):
-        step = shell(sampling_hz=rate, delay_samples=0).step_response()
-        errors.append(np.max(np.abs(np.interp(t, step.time_s, step.position) - exact)))
-    assert errors[0] / errors[1] == pytest.approx(2, rel=0.05)
-    assert errors[1] / errors[2] == pytest.approx(2, rel=0.05)
-
-
 @pytest.mark.parametrize("changes", [{}, {"ramp_samples": 37, "delay_samples": 0}, SLOW])
 def test_a_step_response_in_blocks_is_that_sample_by_sample(changes):
     mirror = shell(**changes)
@@ -54,33 +39,13 @@ def test_a_step_response_in_blocks_is_that_sample_by_sample(changes):
         state = loop.A @ state + loop.B[:, 0] * r
 
 
-def test_the_motion_within_a_sample_is_that_of_python_control():
-    mirror = lbt.models.PositionLoop(
-        natural_frequency_hz=300,
-        damping=0.2,
-        proportional_per_s2=0,
-        derivative_per_s=0,
-        sampling_hz=9000,
-        delay_samples=0,
-    )
-    w = 2 * np.pi * 300
-    plant = control.tf([w**2], [1, 2 * 0.2 * w, w**2])
-    peer = control.sample_system(plant, 1 / 9000, method="zoh")
-    f = np.array([10.0, 100, 290, 1000, 4000])
-    ours = mirror.closed_loop().frequency_response(f)[:, 0, 0]
-    np.testing.assert_allclose(ours, peer(np.exp(2j * np.pi * f / 9000)), rtol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"bandwidth_hz": 30}, "bandwidth_hz must be at least 50"),
         ({"natural_frequency_hz": 0}, "natural_frequency_hz must be above 0"),
-        ({"damping": -0.1}, "damping must be at least 0"),
         ({"bandwidth_hz": 5000, "delay_samples": 6}, "local loop of the mirror must be stable"),
-        ({"delay_samples": 0.5}, "delay_samples must be an integer"),
         ({"delay_samples": 1000}, "delay_samples must be at most 64"),
-        ({"ramp_samples": 0}, "ramp_samples must be at least 1"),
         ({"sampling_hz": 80.0}, "natural_frequency_hz must lie below half"),
         ({"feed_forward": 11}, "feed_forward must be at most 10"),
         ({"damping": 20.0}, "bandwidth_damping must be at least"),

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.periodic_problems import relative_distance
-from support.sensor_loops import AIR, FAST, LINES, MOTIONS, SLOW, example_plant, held_mean
+from support.sensor_loops import AIR, FAST, MOTIONS, SLOW, example_plant, held_mean
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
-from lbt_synth.models.plant.assembly import Exposure, memory, other_exposures, own_exposure
+from lbt_synth.models import Accelerometer, Motion, SensorSuite
+from lbt_synth.models.plant.assembly import Exposure, memory
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 SEEING = Accelerometer(
@@ -20,19 +20,7 @@ SEEING = Accelerometer(
 
 @pytest.mark.parametrize(
     ("age", "period", "common"),
-    [
-        (1, 1, 1),
-        (3, 1, 1),
-        (2.3, 1, 1),
-        (2, 2, 2),
-        (2, 2, 4),
-        (2.5, 2, 2),
-        (7.6, 3, 6),
-        (20, 20, 20),
-        (39, 20, 20),
-        (40, 20, 60),
-        (59.5, 20, 20),
-    ],
+    [(1, 1, 1), (2.3, 1, 1), (2, 2, 4), (2.5, 2, 2), (7.6, 3, 6), (20, 20, 20), (59.5, 20, 20)],
 )
 def test_a_reading_is_the_mean_of_its_exposure(age, period, common):
     signal = np.random.default_rng(0).standard_normal((200, 2))
@@ -51,23 +39,7 @@ def test_a_reading_is_the_mean_of_its_exposure(age, period, common):
     assert held.n_states <= 2 * (2 + age // period)
 
 
-def test_sensors_side_by_side():
-    slow = WavefrontSensor(name="truth", rate_hz=250, delay_frames=2, noise_nm=4)
-    suite = SensorSuite(sensors=(slow,))
-    path = lbt.LoopHardware(frame_rate_hz=1000, delay_frames=2.5, modes=2, suite=suite)
-    exposures = [own_exposure(path), *other_exposures(path)]
-    assert [(e.age_frames, e.period) for e in exposures] == [(1.0, 1), (6.5, 4)]
-    both = memory(exposures, 2, 4)
-    alone = [memory([each], 2, 4) for each in exposures]
-    assert both.n_states == sum(each.n_states for each in alone)
-    n = alone[0].n_states
-    np.testing.assert_array_equal(both.A[:, n:, n:], alone[1].A)
-    np.testing.assert_array_equal(both.C[:, 2:, n:], alone[1].C)
-    assert not both.A[:, :n, n:].any()
-    assert not both.C[:, :2, n:].any()
-
-
-@pytest.mark.parametrize("delay", [1, 2, 2.4, 3])
+@pytest.mark.parametrize("delay", [1, 2.4])
 def test_channels_that_see_nothing_leave_the_filter_of_the_wavefront(delay):
     fast = Accelerometer(
         name="mirror", rate_hz=500, delay_frames=2, channels=("m1",), noise_m_s2=1.0
@@ -119,7 +91,7 @@ def test_lines_that_move_keep_their_channels():
     np.testing.assert_allclose(one.C, plant.C, rtol=1e-12)
 
 
-@pytest.mark.parametrize("sections", [2, 3, 4])
+@pytest.mark.parametrize("sections", [2, 4])
 def test_a_bump_is_a_chain_of_resonances(sections):
     """The filter leaves what the same bump as one process of order 2 a section leaves."""
     slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=2, frame_rate_hz=1000)
@@ -140,7 +112,7 @@ def test_a_bump_is_a_chain_of_resonances(sections):
         plant.with_sensors(SensorSuite(sensors=(SEEING,)), ({"m1": Motion(size=1)}, {}))
 
 
-@pytest.mark.parametrize("steps", [0, 2, 3])
+@pytest.mark.parametrize("steps", [0, 3])
 def test_a_prediction_further_ahead_has_the_same_readings(steps):
     plant = example_plant((FAST,))
     parts = {name: getattr(plant, name) for name in "ABCDL"}
@@ -153,52 +125,24 @@ def test_a_prediction_further_ahead_has_the_same_readings(steps):
         assert other.age_frames(far) == pytest.approx(one.age_frames(near))
 
 
-def test_lines_that_no_channel_sees_stay_in_place():
-    plant = example_plant((FAST,), motions=({}, MOTIONS[1]))
-    own = plant.own_sensor_alone()
-    kept = [0, 2, *range(4, own.n_states)]  # without the samples of the second line
-    np.testing.assert_array_equal(plant.A[: len(kept), : len(kept)], own.A[np.ix_(kept, kept)])
-    # its mean position has its place in the total phase, and no channel sees the first line
-    position = plant.A[len(kept) - 2 : len(kept), len(kept)]
-    np.testing.assert_allclose(position, LINES[1].direction, rtol=1e-12)
-    assert not plant.C[2:, : len(kept)].any()
-
-
-def test_noise_of_a_reading_is_that_of_nothing_else():
-    assert not example_plant().S.any()
+SUITE = SensorSuite(sensors=(FAST,))
 
 
 @pytest.mark.parametrize(
     ("make", "error", "words"),
     [
-        (lambda: example_plant().with_sensors((SLOW,)), ProblemError, "suite must be a"),
+        (lambda p: p.with_sensors((SLOW,)), ProblemError, "suite must be a"),
+        (lambda p: p.with_sensors(SUITE, MOTIONS[:1]), DimensionError, "one mapping per vibration"),
+        (lambda p: replace(p.parts(), motions=MOTIONS[:1]), DimensionError, "one mapping"),
+        (lambda p: p.controller(np.zeros((1, 2, 3))), DimensionError, "gain_predictor must have"),
         (
-            lambda: example_plant().with_sensors(SensorSuite(sensors=(FAST,)), MOTIONS[:1]),
-            DimensionError,
-            "one mapping per vibration",
-        ),
-        (
-            lambda: replace(example_plant().parts(), motions=MOTIONS[:1]),
-            DimensionError,
-            "one mapping",
-        ),
-        (
-            lambda: example_plant().controller(np.zeros((1, 2, 3))),
-            DimensionError,
-            "gain_predictor must have",
-        ),
-        (
-            lambda: example_plant(delay_frames=4, sensors=(FAST,)),
+            lambda p: example_plant((FAST,), delay_frames=4),
             ProblemError,
-            "sensor mirror must be at least 3 of its frames",
+            "at least 3 of its frames",
         ),
-        (
-            lambda: example_plant().require_own_sensor("this"),
-            ProblemError,
-            "this reads the loop's own sensor alone; got a plant that truth, m1, m2 see, too",
-        ),
+        (lambda p: p.require_own_sensor("this"), ProblemError, "truth, m1, m2 see, too"),
     ],
 )
 def test_refusals(make, error, words):
     with pytest.raises(error, match=words):
-        make()
+        make(example_plant())

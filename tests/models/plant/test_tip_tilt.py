@@ -1,8 +1,9 @@
 """The paper's state, entry by entry, and the equivalence of the two forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from scipy.linalg import solve_discrete_lyapunov
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
@@ -10,17 +11,18 @@ from lbt_synth.models import ARModel
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 RATE = 800
+LINE = lbt.Vibration(frequency_hz=9, damping=0.1, rms_nm=1)
 
 
 def slow(pole=0.98, drive=50.0):
     return ARModel(coefficients=[pole], driving_rms_nm=drive, frame_rate_hz=800)
 
 
-@pytest.mark.parametrize("delay", [1, 2, 3, 4])
-@pytest.mark.parametrize("order", [1, 2])
-def test_predicted_error_is_the_closed_loops_residual(delay, order):
+@pytest.mark.parametrize(
+    ("delay", "coefficients", "commands"), [(1, [0.99], 2), (2, [1.95, -0.955], 5), (4, [0.99], 2)]
+)
+def test_predicted_error_is_the_closed_loops_residual(delay, coefficients, commands):
     """Where truth is the model, the filter's rms is the residual of the loop, exactly."""
-    coefficients = [0.99] if order == 1 else [1.95, -0.955]
     turbulence = ARModel(coefficients=coefficients, driving_rms_nm=20, frame_rate_hz=800)
     line = lbt.Vibration(frequency_hz=23, damping=0.02, rms_nm=120, direction=(0.6, 0.8))
     rng = np.random.default_rng(3)
@@ -31,30 +33,14 @@ def test_predicted_error_is_the_closed_loops_residual(delay, order):
         vibrations=[line],
         noise_nm=9.0,
         sensor_matrix=rng.standard_normal((3, 2)),
-        influence_matrix=rng.standard_normal((2, 2)),
+        influence_matrix=rng.standard_normal((2, commands)),
     )
     design = lbt.kalman(plant)
+    assert len(design.controller.C) == commands
     truth = lbt.Truth(turbulence=turbulence, vibrations=(line,), noise_nm=9.0)
     loop = lbt.close_loop(plant.hardware, design.controller)
     budget = lbt.residual_budget(loop, truth, frame_means=True)
     assert budget.rms_nm == pytest.approx(design.rms, rel=1e-9)
-
-
-def test_more_commands_than_modes_use_the_generalised_inverse():
-    rng = np.random.default_rng(5)
-    influence = rng.standard_normal((2, 5))
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=800, turbulence=slow(), noise_nm=2.0, influence_matrix=influence
-    )
-    design = lbt.kalman(plant)
-    simple = lbt.kalman(lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow(), noise_nm=2.0))
-    truth = lbt.Truth(turbulence=slow(), noise_nm=2.0)
-    one, other = (
-        lbt.residual_budget(lbt.close_loop(d.hardware, d.controller), truth).rms_nm
-        for d in (design, simple)
-    )
-    assert one == pytest.approx(other, rel=1e-9)
-    assert design.controller.C.shape[0] == 5
 
 
 def test_sensor_gain_of_the_design_is_undone():
@@ -64,12 +50,8 @@ def test_sensor_gain_of_the_design_is_undone():
     unit = lbt.kalman(lbt.tip_tilt_plant(**parts, noise_nm=4.0))
     assert halved.rms == pytest.approx(unit.rms, rel=1e-12)
     assert np.allclose(0.5 * halved.gain_predictor, unit.gain_predictor, rtol=1e-10)
-
-
-def test_noise_covariance_may_be_given():
     covariance = np.array([[9.0, 2.0], [2.0, 4.0]])
-    plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow(), noise_nm=covariance)
-    assert np.allclose(plant.R, covariance)
+    assert np.allclose(lbt.tip_tilt_plant(**parts, noise_nm=covariance).R, covariance)
 
 
 def test_retuning_moves_only_the_vibration():
@@ -89,45 +71,20 @@ def test_retuning_moves_only_the_vibration():
         ({"noise_nm": [[1.0, 2.0], [0.0, 1.0]]}, "noise_nm must be symmetric"),
         ({"noise_nm": [[1.0, 2.0], [2.0, 1.0]]}, "noise_nm must be positive definite"),
         ({"noise_nm": np.eye(3)}, "to match the measurements"),
-        ({"delay_frames": 0.5}, "delay_frames must be at least 1; got 0.5"),
         ({"delay_frames": 20.5}, "delay_frames must be at most 20; got 20.5"),
         ({"sensor_gain": 0}, "sensor_gain must be above 0"),
         ({"sensor_matrix": np.eye(3), "influence_matrix": np.eye(2)}, "to match sensor_matrix"),
         ({"sensor_matrix": [[np.nan, 0], [0, 1]]}, "sensor_matrix must be finite"),
         ({"turbulence": [slow()] * 3}, r"one per mode \(2\); got 3"),
-        (
-            {"turbulence": ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)},
-            "must be sampled at the frame rate",
-        ),
-        (
-            {"vibrations": [lbt.Vibration(frequency_hz=9, damping=0.1, rms_nm=1, direction=(1,))]},
-            "must have 2 components",
-        ),
-        (
-            {"vibrations": [lbt.Vibration(frequency_hz=450, damping=0.1, rms_nm=1)]},
-            "below the Nyquist",
-        ),
+        ({"turbulence": replace(slow(), frame_rate_hz=500)}, "must be sampled at the frame rate"),
+        ({"vibrations": [replace(LINE, direction=(1,))]}, "must have 2 components"),
+        ({"vibrations": [replace(LINE, frequency_hz=450)]}, "below the Nyquist"),
     ],
 )
 def test_wrong_parts_are_refused(change, text):
     parts = {"frame_rate_hz": 800, "turbulence": slow(), "noise_nm": 2.0} | change
     with pytest.raises(lbt.errors.ProblemError, match=text):
         lbt.tip_tilt_plant(**parts)
-
-
-def test_sizes_that_clash_are_named():
-    sizes = {"A": (3, 3), "B": (3, 4), "C": (1, 3), "D": (1, 4), "L": (1, 3)}
-    wrong = {"A": (3, 2), "B": (2, 4), "C": (1, 2), "D": (1, 3), "L": (1, 5)}
-    good = {name: np.ones(size) for name, size in sizes.items()} | {"A": np.eye(3) / 2}
-    for name, size in wrong.items():
-        with pytest.raises(lbt.errors.DimensionError, match=f"{name} must"):
-            lbt.EstimationProblem(**(good | {name: np.ones(size)}))
-    with pytest.raises(lbt.errors.DefinitenessError, match="Every measurement needs noise"):
-        lbt.EstimationProblem(A=0.5, B=[[1.0]], C=1.0, D=[[0.0]], L=1.0)
-
-
-def slow_full_state(pole=0.98, drive=50.0):
-    return lbt.models.ARModel(coefficients=[pole], driving_rms_nm=drive, frame_rate_hz=800)
 
 
 def test_full_form_is_the_papers():
@@ -140,7 +97,7 @@ def test_full_form_is_the_papers():
     sensor, influence = rng.standard_normal((3, 2)), rng.standard_normal((2, 2))
     plant = lbt.tip_tilt_plant(
         frame_rate_hz=800,
-        turbulence=slow_full_state(),
+        turbulence=slow(),
         vibrations=lines,
         noise_nm=2.0,
         sensor_matrix=sensor,
@@ -169,9 +126,11 @@ def test_full_form_is_the_papers():
     assert not np.any(full.D_known)
 
 
-@pytest.mark.parametrize("delay", [1, 1.3, 2, 2.5, 3, 4])
-@pytest.mark.parametrize("design", [lbt.kalman, lambda p: lbt.hinf(p, gamma_ratio=1.2)])
-def test_full_and_reduced_form_give_the_same_controller(delay, design):
+@pytest.mark.parametrize(
+    ("design", "delay"),
+    [(lbt.kalman, 1), (lbt.kalman, 2.5), (lambda p: lbt.hinf(p, gamma_ratio=1.2), 3)],
+)
+def test_full_and_reduced_form_give_the_same_controller(design, delay):
     plant = lbt_axis_plant(delay_frames=delay)
     form, n = plant.full(), plant.n_states
     matrices = {name: getattr(form, name) for name in "ABCDL"}
@@ -204,42 +163,6 @@ def test_the_spectrum_is_the_mean_of_the_moved_ones(plant):
     assert lbt.kalman(spread).certificate.passed
 
 
-def test_the_prior_filter_is_the_best_on_average(plant):
-    """Of the filters at hand it has the least mean variance over the frequencies of the prior."""
-    frequencies = [19.2, 19.6, 20.0, 20.4, 20.8]
-    spread = lbt.models.spread_plant(plant, half_width_hz=1.0)
-    assert [line.frequency_hz for line in spread.vibrations] == pytest.approx(frequencies)
-    line = plant.vibrations[0]
-    plants = [
-        lbt.tip_tilt_plant(
-            frame_rate_hz=RATE,
-            turbulence=plant.turbulence,
-            vibrations=[line.at_frequency(f)],
-            noise_nm=15.5,
-            modes=1,
-        )
-        for f in frequencies
-    ]
-
-    def mean(design):
-        return np.mean([error_variance(truth, design) for truth in plants])
-
-    best = lbt.kalman(spread)
-    assert mean(best) == pytest.approx(best.rms**2, rel=1e-8)
-    for other in (lbt.kalman(plant), lbt.hinf(plant, route="riccati"), lbt.kalman(plants[0])):
-        assert mean(other) > 1.005 * best.rms**2
-
-
-def error_variance(truth, design):
-    """Variance of the prediction error of a filter in another plant, from both states at once."""
-    model, gain = design.problem, design.gain_predictor
-    zero = np.zeros((len(truth.A), len(model.A)))
-    A = np.block([[truth.A, zero], [gain @ truth.C, model.A - gain @ model.C]])
-    B = np.vstack([truth.B, gain @ truth.D])
-    C = np.hstack([truth.L, -model.L])
-    return float(np.trace(C @ solve_discrete_lyapunov(A, B @ B.T) @ C.T))
-
-
 def test_one_line_at_the_centre_is_the_plant_itself(plant):
     np.testing.assert_allclose(
         lbt.models.spread_plant(plant, half_width_hz=1.0, lines=1).A, plant.A, rtol=1e-12
@@ -259,9 +182,7 @@ def test_priors_that_cannot_be(plant):
     none, fast = (lbt.tip_tilt_plant(vibrations=v, **common) for v in (None, [line]))
     for wrong, arguments, text in (
         (none, {"half_width_hz": 1.0}, "needs a plant with a vibration"),
-        (plant, {"half_width_hz": 0.0}, "half_width_hz must be above 0"),
         (plant, {"half_width_hz": 20.0}, "half_width_hz must be below 20; got 20. All"),
-        (plant, {"half_width_hz": 1.0, "lines": 0}, "lines must be at least 1"),
         (plant, {"half_width_hz": 1.0, "lines": 65}, "lines must be at most 64"),
         (fast, {"half_width_hz": 9.0}, "below the Nyquist frequency"),
     ):

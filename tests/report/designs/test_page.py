@@ -1,7 +1,6 @@
 """The report of designs as a page: it has all that it should, and says loudly what is wrong."""
 
 import hashlib
-import shutil
 from dataclasses import replace
 
 import pytest
@@ -11,7 +10,7 @@ from support.pages import Reader
 from support.several_sensors import write_config
 
 import lbt_synth as lbt
-from lbt_synth.report.designs.page import design_page, sensors_page
+from lbt_synth.report.designs.page import design_page
 from lbt_synth.report.designs.report import verdict
 from lbt_synth.report.page.html import page_html
 from lbt_synth.storage.tables import Table
@@ -35,13 +34,6 @@ def test_an_unstable_loop_is_named_loudly(report, text):
     assert "UNSTABLE in this loop: wild; certificates that do NOT hold: wild." in verdict(report)
     assert 'class="bad">UNSTABLE' in text
     assert text.count("wild: unstable") > 5
-
-
-def test_the_loop_gain_has_the_margins_of_the_table(report):
-    (found,) = [each for each in design_page(report).charts if each.key == "bode"]
-    for one in report.stable:
-        assert f"{one.name}: {one.margins.phase_deg:.1f}° at" in found.alt
-    assert "phase margin" in {line.get_label() for line in found.figure.axes[1].get_lines()}
 
 
 def test_a_limit_of_nothing_is_no_limit(config, designs):
@@ -99,19 +91,6 @@ def test_a_truth_without_vibrations(config, designs):
     assert "Least residual: slow, " in verdict(report)
 
 
-def test_many_designs_are_a_panel_each(few):
-    many = {f"design {i}": lbt.integrator(few.hardware, gain=0.2 + 0.02 * i) for i in range(8)}
-    report = lbt.report.design_report(few, many)
-    page = design_page(report)
-    charts = {chart.key: chart.figure for chart in page.charts}
-    for key, bars in {"map": 1, "poles": 0, "spectra": 0, "series": 0}.items():
-        assert len(charts[key].axes) == len(many) + bars
-    blocks = page.sections["Summary"]
-    table, truth, *_ = [block for block in blocks if isinstance(block, Table)]
-    assert len(truth.rows) == len(many) + 3
-    assert len(table.headings) == 9
-
-
 def test_nothing_stable_is_needed(config, designs):
     report = lbt.report.design_report(config, {"wild": designs["wild"]})
     text = words_of(report)
@@ -141,74 +120,32 @@ def test_a_certificate_that_cannot_be_computed(few, monkeypatch):
     assert "NOT COMPUTED" in text
 
 
-def test_both_files_or_none(report, tmp_path, monkeypatch):
-    (tmp_path / "a.html").write_text("old")
-    monkeypatch.setattr("lbt_synth.report.page.html.page_html", lambda page: b"new")
-    monkeypatch.setattr("lbt_synth.report.page.html.print_html", lambda html: 1 / 0)
-    monkeypatch.setattr("lbt_synth.report.page.html.require_weasyprint", lambda: None)
-    with pytest.raises(ZeroDivisionError):
-        lbt.report.write_page(design_page(report), tmp_path / "a.html", pdf=tmp_path / "a.pdf")
-    assert (tmp_path / "a.html").read_text() == "old"
-    assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
-
-
-def test_refused_in_the_library(report, config, designs, tmp_path):
-    gone = tmp_path / "gone.yaml"
-    shutil.copy(config.source, gone)
-    loaded = lbt.load_config(gone)
-    gone.unlink()
-    make, errors = lbt.report.design_report, lbt.errors
-    none = {"kalman": tmp_path / "none.fits"}
-    for call, error, words in (
-        (lambda: make(config, {}), errors.ProblemError, "at least one design; got none"),
-        (lambda: make("lbt.yaml", designs), errors.ProblemError, "expected a Config"),
-        (
-            lambda: design_page(replace(report, gain_files=none)),
-            errors.FileError,
-            "cannot read",
-        ),
-        (
-            lambda: design_page(replace(report, config=loaded)),
-            errors.FileError,
-            "cannot read",
-        ),
-        (lambda: design_page(report, title=" "), errors.ProblemError, "title must hold"),
-        (
-            lambda: lbt.report.write_page(design_page(report), tmp_path / "a.txt"),
-            errors.OutputError,
-            "must end in .html",
-        ),
-    ):
-        with pytest.raises(error, match=words):
-            call()
-
-
-def test_a_page_has_the_table_of_failures_and_a_run(sensors_design, sensors_file, sensors_config):
+def test_one_page_has_designs_of_several_sensors_and_of_one(
+    sensors_design, sensors_file, sensors_config
+):
+    designs = {"both": sensors_design, "own": lbt.integrator(sensors_config.hardware, gain=0.3)}
     files = {"both": sensors_file}
-    page, found = sensors_page(sensors_config, {"both": sensors_design}, gain_files=files)
+    report = lbt.report.design_report(sensors_config, designs, gain_files=files)
+    page = design_page(report)
     text = page_html(page).decode()
-    assert "When sensors fail" in text
+    assert "both: When sensors fail" in text
     for source in (sensors_file, sensors_config.source):
         assert hashlib.sha256(source.read_bytes()).hexdigest() in text
     assert "each sensor missing in turn" in text
-    assert found.rows[0].design == "both"
-    limit = found.limit.rms_nm
-    assert found.rows[0].residual_nm < limit  # of the own sensor alone
+    both, own = report.assessments
+    limit = report.limits.limit.rms_nm
+    assert both.limits.residual_nm < limit < own.limits.residual_nm
     assert f"alone leaves less than {limit:.1f}" in text
+    assert f"Least residual: both, {both.limits.residual_nm:.1f}" in verdict(report)
+    assert "Hz, of one sensor: own, " in verdict(report).replace("\u00a0", " ")
+    charts = {chart.key: chart.figure for chart in page.charts}
+    assert [len(charts[f"simulation-{i}"].axes[1].lines) for i in (1, 2)] == [2, 3]
+    assert len(charts["poles"].axes) == 1
 
 
-def test_the_command_takes_them_alone(sensors_file, gains, tmp_path, capsys):
+def test_the_command_takes_them(sensors_file, tmp_path, capsys):
     config, page = write_config(tmp_path), tmp_path / "page.html"
     status, text, _ = run(capsys, "report", config, sensors_file, "-o", page)
     assert (status, page.exists()) == (0, True)
-    assert "above the limit" in text
-    page.unlink()
-    status, _, error = run(capsys, "report", config, sensors_file, gains["kalman"], "-o", page)
-    assert (status, page.exists()) == (2, False)
-    assert "lbt-synth limits takes both" in error
-
-
-@pytest.fixture
-def gains(tmp_path_factory, config):
-    design = lbt.integrator(config.hardware, gain=0.5)
-    return {"kalman": lbt.save_gain(tmp_path_factory.mktemp("own") / "own.fits", design)}
+    assert "Least residual" in text
+    assert 'id="bode"' not in page.read_text()

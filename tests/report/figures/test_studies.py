@@ -5,14 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from support.end_to_end import make_table
 from support.figures import legend
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.report.figures.studies import (
-    end_to_end_figure,
-    end_to_end_table_figure,
     limits_figure,
     tradeoff_figure,
 )
@@ -30,15 +27,6 @@ def test_robustness_figure_draws_the_paper_beside(config):
         [replace(row, strehl=0.99 + row.strehl / 1000) for row in rows]
     ).axes
     assert 97.9 < better.get_ylim()[0] < 99
-
-
-def test_robustness_figure_of_an_unstable_method(config):
-    truth = replace(config.truth, sensor_gain=0.3)
-    rows = list(
-        robustness(config.plant, truth, config.imaging, errors_hz=[-1, 0], gamma_ratio=1.05)
-    )
-    (axis,) = lbt.report.figures.robustness_figure(rows).axes
-    assert legend(axis) == ["Kalman", "H∞: unstable"]
 
 
 @pytest.fixture(scope="module")
@@ -80,45 +68,6 @@ def test_map_figure_has_labels_units_and_the_unstable_region(maps, tmp_path):
     figure.savefig(tmp_path / "map.png")
 
 
-def test_map_figure_of_delay_errors_and_of_few_points(kalman, robust, settings, tmp_path):
-    def mapped(design, gains, delays):
-        return robustness_map(
-            design,
-            settings.truth,
-            settings.imaging,
-            errors_hz=[0],
-            sensor_gains=gains,
-            delay_errors_frames=delays,
-        )
-
-    figure = lbt.report.figures.robustness_map_figure(
-        {"a": mapped(kalman, [1], [0, 0.1]), "b": mapped(robust, [0.9], [0, 0.1])}
-    )
-    assert len(figure.axes) == 5
-    assert figure.axes[2].get_title(loc="left") == "a, delay error +0.1 frames"
-    assert figure.axes[2].get_ylabel() == "sensor gain [-]"
-    figure.savefig(tmp_path / "a.png")
-    nowhere = lbt.report.figures.robustness_map_figure({"a": mapped(robust, [0.1, 0.2], [0])})
-    nowhere.savefig(tmp_path / "b.pdf")
-
-
-def test_map_figures_that_are_refused(maps, kalman, settings):
-    with pytest.raises(lbt.errors.ProblemError, match="at least one map"):
-        lbt.report.figures.robustness_map_figure({})
-    late = robustness_map(
-        kalman,
-        settings.truth,
-        settings.imaging,
-        errors_hz=[0],
-        sensor_gains=[1],
-        delay_errors_frames=[0.1],
-    )
-    with pytest.raises(
-        lbt.errors.ProblemError, match=r"same delay errors \[0.0\]; got \[0.1\] for late"
-    ):
-        lbt.report.figures.robustness_map_figure({**maps, "late": late})
-
-
 def test_modal_figure_has_labels_units_and_all_modes():
     residuals = {"integrators": [9.0, 5.0, 2.0], "Kalman filters": [8.0, 4.0, 1.0]}
     above, below = lbt.report.figures.modal_figure(
@@ -134,41 +83,6 @@ def test_modal_figure_has_labels_units_and_all_modes():
     (gains,) = above.get_lines()
     assert gains.get_color() not in [line.get_color() for line in below.get_lines()]
     assert len(lbt.report.figures.modal_figure({"one": [1.0]}).axes) == 1
-
-
-def test_bad_modal_figures_are_refused():
-    for arguments, error, words in (
-        (({},), lbt.errors.ProblemError, "got none"),
-        (({"a": [1.0, 0.0]},), lbt.errors.ProblemError, "a must be above 0"),
-        (({"a": 1.0},), lbt.errors.DimensionError, "one number per mode"),
-        (({"a": [1.0], "b": [1.0, 2.0]},), lbt.errors.DimensionError, "b must have 1 modes"),
-    ):
-        with pytest.raises(error, match=words):
-            lbt.report.figures.modal_figure(*arguments)
-
-
-def test_the_table_of_the_paper_has_a_panel_a_controller():
-    figure = end_to_end_table_figure(make_table())
-    assert [axis.get_title(loc="left") for axis in figure.axes] == ["Kalman", "H∞", "slow"]
-    assert figure.axes[0].lines[0].get_label() == "Agapito et al. 2008"
-
-
-def test_a_run_has_three_panels_and_a_colour_bar():
-    rng = np.random.default_rng(0)
-    run = lbt.interop.EndToEndRun(
-        system=lbt.load_config(LBT_YAML).end_to_end.system,
-        strehl_series=np.full(40, 0.8),
-        other_modes_series=np.full(40, 0.9),
-        **{
-            name: rng.normal(size=(40, 672)) for name in ("measurements", "commands", "residual_nm")
-        },
-        psf=np.eye(60),
-        psf_pixel_mas=18.4,
-        seed=0,
-        settle_frames=400,
-        seconds=1.0,
-    )
-    assert len(end_to_end_figure(run).axes) == 4
 
 
 def test_a_sensor_gain_of_zero_has_no_line():
@@ -199,7 +113,7 @@ def test_limits_name_designs_and_what_moves(config):
     parts = config.hardware, config.truth, config.imaging
     study = lbt.studies.limits(designs, *parts, errors_hz=[-1, 1])
     (axes,) = limits_figure(study).axes
-    assert legend(axes)[:3] == ["Kalman", "by hand", "slow"]
+    assert legend(axes)[:2] == ["Kalman and by hand", "slow"]
     assert axes.get_xlabel() == "frequency of the true vibration [Hz]"
     several = limits_figure(replace(study, frequency_hz=None)).axes[0].get_xlabel()
     assert several == "shift of the vibration that moves most, the others in proportion [Hz]"

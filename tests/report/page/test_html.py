@@ -4,7 +4,6 @@ import base64
 import hashlib
 import re
 import sys
-import time
 from itertools import pairwise
 
 import numpy as np
@@ -25,7 +24,6 @@ from lbt_synth.report.page.html import (
     unbroken_text,
     write_page,
 )
-from lbt_synth.storage.tables import Cell, Table
 
 
 @pytest.fixture(scope="module")
@@ -241,23 +239,6 @@ def test_it_fits_a_sheet_of_paper(browser, pages, name):
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("screen", [DESK, PHONE], ids=["desk", "phone"])
-def test_drawings_show_and_numbers_open(browser, pages, screen):
-    opened(browser, pages["report"], screen)
-    sizes = browser.execute_script(
-        """return [...document.querySelectorAll(".drawing svg")].map(e => {
-             const box = e.getBoundingClientRect(); return [box.width, box.height]; })"""
-    )
-    assert len(sizes) >= 8
-    assert all(width > 500 and height > 100 for width, height in sizes)
-    summary = browser.find_element("css selector", "#robustness summary")
-    table = browser.find_element("css selector", "#robustness details table")
-    assert not table.is_displayed()
-    summary.send_keys("\ue007")  # enter
-    assert table.is_displayed()
-
-
-@pytest.mark.browser
 def test_the_keyboard_reaches_the_content(browser, pages):
     opened(browser, pages["report"])
     keys = chain(browser)
@@ -276,30 +257,6 @@ def test_the_keyboard_reaches_the_content(browser, pages):
         box = f"return document.getElementById('{target}').getBoundingClientRect()"
         assert browser.execute_script(f"{box}.top") < 900
         assert browser.execute_script(f"{box}.bottom") > 0
-
-
-@pytest.mark.browser
-def test_the_accessibility_tree_names_what_matters(browser, pages):
-    opened(browser, pages["marks"])
-    titles, named = {chart.title for chart in every_mark()}, {}
-    for _ in range(20):  # the tree is made beside the page
-        nodes = browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
-        named = {}
-        for node in nodes:
-            if not node.get("ignored"):
-                role = node["role"]["value"]
-                named.setdefault(role, []).append(node.get("name", {}).get("value", ""))
-        if titles <= set(named.get("figure", ())):
-            break
-        time.sleep(0.5)
-    for role in ("figure", "table", "link", "heading", "main", "navigation"):
-        assert named[role], role
-        assert all(name.strip() for name in named[role] if role != "main"), role
-    assert set(named["figure"]) >= titles
-
-
-def test_the_same_page_is_the_same_file():
-    assert page_html(whole_page()) == page_html(whole_page())
 
 
 def test_without_the_extra_a_pdf_is_refused_before_any_work(tmp_path, monkeypatch):
@@ -323,18 +280,6 @@ def test_a_pdf_has_sheets_of_a4_and_no_date(tmp_path, monkeypatch):
         assert [float(x) for x in box.split()] == pytest.approx([0, 0, 595.28, 841.89], abs=0.1)
     assert print_html(files[0].read_bytes()) == pdf
     assert print_html(page_html(whole_page(HOSTILE))).startswith(b"%PDF")
-
-
-@pytest.mark.parametrize(
-    ("make", "text"),
-    [
-        (lambda: Table(caption="t", headings=("a", "b", "c"), rows=(("1", "2"),)), "1 or 3 cells"),
-        (lambda: Cell(text="a", tone="loud"), "tone must be one of"),
-    ],
-)
-def test_mistakes_are_refused(make, text):
-    with pytest.raises(lbt.errors.ProblemError, match=re.escape(text)):
-        make()
 
 
 def test_a_page_says_what_it_was_made_from_and_leaves_out_what_is_empty(tmp_path):

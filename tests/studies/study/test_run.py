@@ -1,8 +1,5 @@
 """Runs of studies: what they write, resume and refuse."""
 
-import errno
-import os
-
 import numpy as np
 import pytest
 from support.studies import (
@@ -17,7 +14,7 @@ from support.studies import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.errors import OutputError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.studies.study.run import replay_row
 from lbt_synth.studies.study.sample import evaluate_samples
 
@@ -76,127 +73,6 @@ def test_failures_are_listed_and_their_rows_are_there(tmp_path):
     assert [failure[:2] for failure in run.failures] == [(row, "tight") for row in noisy]
     assert np.all(np.isnan(found["tight.strehl"][noisy]))
     assert not np.any(np.isnan(found["a.strehl"]))
-
-
-@pytest.mark.usefixtures("small_parts")
-def test_it_goes_on_where_it_was_whatever_the_batches(tmp_path):
-    study, folder = load_small_study(tmp_path, samples="100"), make_folder(tmp_path)
-    seen = []
-
-    def stops(study, values, start):
-        seen.append((start, start + len(values)))
-        if len(seen) == 4:
-            raise KeyboardInterrupt
-        return evaluate_quickly(study, values, start)
-
-    with pytest.raises(KeyboardInterrupt):
-        lbt.studies.run_study(study, folder, evaluate=stops)
-    parts = part_rows(folder)
-    assert parts == seen[:3]
-    part_path(folder, 1).unlink()  # a hole
-    seen.clear()
-
-    def watches(study, values, start):
-        seen.append((start, start + len(values)))
-        return evaluate_quickly(study, values, start)
-
-    counts = []
-    run = lbt.studies.run_study(study, folder, evaluate=watches, progress=counts.append)
-    kept = parts[0][1] + parts[2][1] - parts[2][0]
-    assert (run.computed, counts[0], sum(counts)) == (100 - kept, kept, 100)
-    assert sum(stop - start for start, stop in seen) == run.computed
-    assert_whole(folder, study)
-
-
-@pytest.mark.usefixtures("small_parts")
-def test_other_studies_and_damage_are_refused(tmp_path):
-    study, folder = load_small_study(tmp_path, samples="60", controllers=TWO), make_folder(tmp_path)
-
-    def stops(study, values, start):
-        if start >= 40:
-            raise KeyboardInterrupt
-        return evaluate_quickly(study, values, start)
-
-    def refused(words, call=lambda: lbt.studies.run_study(study, folder)):
-        with pytest.raises(OutputError, match=words):
-            call()
-
-    with pytest.raises(KeyboardInterrupt):
-        lbt.studies.run_study(study, folder, evaluate=stops)
-    other = load_small_study(tmp_path, samples="60", controllers=TWO, seed="8")
-    refused("is of another study", lambda: lbt.studies.run_study(other, folder))
-    refused("is of another study", lambda: replay_row(other, folder, 0))
-    part = part_path(folder, 0)
-    content = part.read_bytes()
-    for damage in (content[:-30], content[:200] + b"x" + content[201:], b""):
-        part.write_bytes(damage)
-        refused("is damaged. Delete it")
-    part.write_bytes(content)
-    twin = part.with_name("0000000003-0000000005.npz")
-    twin.write_bytes(content)
-    refused("has rows that are in")
-    twin.unlink()
-    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    assert_whole(folder, study)
-
-
-def test_no_directory_and_inputs_in_the_way(tmp_path):
-    study = load_small_study(tmp_path)
-    with pytest.raises(OutputError, match="cannot make the directory"):
-        lbt.studies.run_study(study, tmp_path / "nowhere")
-    made = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.4)
-    lbt.save_gain(tmp_path / "b.fits", made)
-    study = load_small_study(tmp_path, controllers="{a: {file: b.fits}, b: {design: kalman}}")
-    with pytest.raises(OutputError, match="must not replace the input"):
-        lbt.studies.run_study(study, tmp_path)
-
-
-def test_files_of_others_are_not_replaced(tmp_path):
-    study, folder = load_small_study(tmp_path), make_folder(tmp_path)
-    for name in ("slow.fits", "results.csv", "summary.html", "summary.pdf"):
-        (folder / name).write_text("mine")
-        with pytest.raises(OutputError, match=f"{name} is not of a study in this directory"):
-            lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-        assert [path.name for path in folder.iterdir() if path.name != ".lock"] == [name]
-        (folder / name).unlink()
-
-
-def test_what_a_killed_process_had_begun_to_write_is_removed(tmp_path):
-    study, folder = load_small_study(tmp_path), make_folder(tmp_path)
-    (folder / "parts").mkdir()
-    begun = [
-        folder / "parts" / ".lbt_synth.0123456789abcdef.0.tmp",
-        folder / ".lbt_synth.0123456789abcdef.1.tmp",
-    ]
-    for path in begun:
-        path.write_bytes(b"half")
-    (folder / ".mine.csv.tmp").write_bytes(b"whole")
-    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    assert_whole(folder, study)
-    assert not any(path.exists() for path in begun)
-    assert (folder / ".mine.csv.tmp").exists()
-
-
-@pytest.mark.usefixtures("small_parts")
-@pytest.mark.parametrize("calls", [1, 5, 9])
-def test_a_full_disk(tmp_path, monkeypatch, calls):
-    """The manifest and the design, parts, the results: whatever cannot be written."""
-    study, folder = load_small_study(tmp_path, samples="60"), make_folder(tmp_path)
-    left, sync = [calls], os.fsync
-
-    def full(handle):
-        left[0] -= 1
-        if left[0] < 0:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        sync(handle)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(OutputError, match="No space left on device.*its free space"):
-            lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    assert not list(folder.rglob(".*.*"))  # nothing half-written
-    lbt.studies.run_study(study, folder, evaluate=evaluate_quickly)
-    assert_whole(folder, study)
 
 
 def test_tables_are_written_from_the_parts(tmp_path):
@@ -291,17 +167,3 @@ def test_a_row_of_an_unfinished_study(tmp_path):
     assert replay_row(study, folder, 59).stored == {}
     with pytest.raises(ProblemError, match="rows 0 to 59; got row 60"):
         replay_row(study, folder, 60)
-
-
-def test_a_row_without_noise(tmp_path):
-    study, folder = (
-        load_small_study(tmp_path, parameters="{error.noise_factor: 0}"),
-        make_folder(tmp_path),
-    )
-    again = replay_row(study, folder, 1)
-    assert again.fresh["slow.noise_nm"] == 0
-    assert again.fresh["slow.strehl"] > 0.1
-    assert again.files == ()
-    ((row, name, why),) = again.failures
-    assert (row, name) == (1, "configuration")
-    assert "sensor.noise_nm" in why

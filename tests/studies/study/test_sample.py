@@ -99,30 +99,6 @@ def test_a_point_is_what_the_library_says(tmp_path):
     assert np.all(columns["own.residual_nm"] < 1.05 * columns["fixed.residual_nm"])
 
 
-def test_unstable_loops_and_samples_that_fail(tmp_path):
-    study = load_small_study(
-        tmp_path,
-        samples="8",
-        controllers="{wild: {design: integrator, gain: 0.9}, tight: {design: integrator, gain: "
-        "0.7, for: sample}}",
-        parameters="{truth.sensor_gain: {list: [0.3, 1.4]}, loop.delay_frames: {list: [2, 4]}}",
-    )
-    values = study.values()
-    columns, failures = evaluate_samples(study, values, 0)
-    unstable = values[:, 0] == 1.4
-    stable, strehl = columns["wild.stable"], columns["wild.strehl"]
-    assert np.all(stable[unstable] == 0)
-    assert np.all(stable[~unstable] == 1)
-    np.testing.assert_array_equal(np.isnan(strehl), unstable)
-    slow = values[:, 1] == 4
-    assert [row for row, _, _ in failures] == np.flatnonzero(slow).tolist()
-    assert {name for _, name, _ in failures} == {"tight"}
-    assert "failed its certificate" in failures[0][2]
-    np.testing.assert_array_equal(np.isnan(columns["tight.stable"]), slow)
-    lost = slow | (columns["tight.stable"] == 0)
-    np.testing.assert_array_equal(np.isnan(columns["tight.strehl"]), lost)
-
-
 COUNT = 8
 NOISE = "error.noise_factor: {uniform: [0.9, 1.1]}"
 GAIN = "truth.sensor_gain: {uniform: [0.5, 1]}"
@@ -183,20 +159,6 @@ def test_filters_for_their_own_samples(tmp_path, monkeypatch):
     assert len(np.unique(strehl[~np.isnan(strehl)])) >= 3
 
 
-def test_the_sensor_gain_that_designs_assume(tmp_path, monkeypatch):
-    """A fixed controller does not notice; a filter for the sample does, and so does the loop not."""
-    parameters = """{
-      model.sensor_gain: {uniform: [0.6, 1.2]},
-      truth.sensor_gain: {uniform: [0.5, 1.1]}
-    }"""
-    study, *_ = agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=parameters, count=6)
-    rows = counted(monkeypatch)
-    evaluate_samples(study, study.values(0, 6), 0)
-    assert rows == [3, 3]  # all at once, one by itself for each controller
-    one = "{model.sensor_gain: {uniform: [0.6, 1.2]}}"
-    agree(tmp_path, base=LBT_TEXT, controllers=BOTH, parameters=one, count=5)
-
-
 LOOP = "truth.sensor_gain: {uniform: [0.4, 1.1]}"
 DELAY = "error.delay_frames: {list: [0, 0.25]}"
 TIP = "\n    - {kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}"
@@ -249,53 +211,6 @@ def test_changed_configurations(tmp_path, name):
         base = base.replace(old, new)
     parameters = parameters if parameters is WEATHER else f"{{{parameters}}}"
     agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=count)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "path", "values"),
-    [
-        ("axis: both,", "direction_deg: 0,", "model.vibrations[0].direction_deg", "[30, 0]"),
-        (
-            "mirror:\n",
-            "mirror:\n  influence_matrix: [[1.0, 0.0], [0.0, 1.0]]\n",
-            "mirror.influence_matrix[0][1]",
-            "[0.3, 0]",
-        ),
-    ],
-)
-def test_samples_whose_axes_are_no_longer_independent(tmp_path, old, new, path, values):
-    """The configuration has a filter per axis, and some of its samples do not."""
-    assert old in LBT_TEXT
-    parameters = f"{{'{path}': {{list: {values}}}, truth.sensor_gain: {{uniform: [0.5, 1]}}}}"
-    agree(tmp_path, base=LBT_TEXT.replace(old, new), controllers=OWN, parameters=parameters)
-
-
-def test_an_image_that_is_gone(tmp_path):
-    """A jitter of more than the Strehl ratio is integrated for leaves none, either way."""
-    parameters = """{
-      'truth.vibrations[0].rms_mas': {list: [40, 1.0e+5]},
-      truth.sensor_gain: {uniform: [0.5, 1]}
-    }"""
-    _, columns, failures = agree(
-        tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters, count=4
-    )
-    assert not failures
-    strehl = columns["slow.strehl"]
-    assert (strehl == 0).sum() == 2 == (strehl > 0).sum()
-    assert (columns["slow.stable"] == 1).all()
-
-
-def test_groups_of_what_makes_another_configuration(tmp_path, monkeypatch):
-    """Telescopes of two diameters: two groups, each at once; the camera goes with them."""
-    rows = counted(monkeypatch)
-    parameters = """{
-      telescope.diameter_m: {list: [6, 8.22]},
-      imaging.wavelength_um: {list: [1.65]},
-      truth.sensor_gain: {uniform: [0.4, 1]}
-    }"""
-    agree(tmp_path, base=LBT_TEXT, controllers=FIXED, parameters=parameters)
-    # one of each group and controller, then those of the evaluation that it is held against
-    assert len(rows) == 4 + COUNT
 
 
 def test_samples_that_the_configuration_refuses(tmp_path):

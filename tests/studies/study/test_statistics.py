@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import stats
 from scipy.stats import qmc
 
@@ -13,7 +11,6 @@ from lbt_synth.studies import study_statistics
 from lbt_synth.studies.study.statistics import (
     first_order_index,
     percentiles,
-    sensitivity_table,
     share,
     summary_tables,
     worst_table,
@@ -60,50 +57,15 @@ def test_worst_rows_are_the_unstable_then_those_of_least_strehl(small):
     assert (a.worst, b.worst) == ((1, 2, 4, 0), (1, 2, 3, 4, 0))
 
 
-def test_a_stable_loop_without_light_comes_after_unstable_ones_and_ties_by_row():
-    strehl = np.array([0.0, 0.3, 0.3, NAN, 0.3])
-    columns = make_columns(
-        {}, {"a": strehl}, row=np.array([4, 9, 2, 8, 1]), **{"a.stable": [1, 1, 1, 0, 1]}
-    )
-    worst = study_statistics(columns, [], ["a"]).controllers[0].worst
-    assert [columns["row"][place] for place in worst] == [8, 4, 1, 2, 9]
-
-
-@settings(max_examples=5)
-@given(seed=st.integers(0, 10_000))
-def test_the_order_of_samples_is_of_no_matter(seed):
-    rng = np.random.default_rng(seed)
-    columns = make_columns(
-        {"p": rng.random(60), "q": rng.integers(0, 3, 60) * 10.0},
-        {"a": rng.random(60), "b": rng.random(60)},
-        row=np.arange(60),
-    )
-    columns["a.stable"][rng.random(60) < 0.2] = 0
-    columns["b.stable"][rng.random(60) < 0.2] = NAN
-    order = rng.permutation(60)
-    here = study_statistics(columns, ["p", "q"], ["a", "b"])
-    there = study_statistics(
-        {name: values[order] for name, values in columns.items()}, ["p", "q"], ["a", "b"]
-    )
-    assert [t.rows for t in summary_tables(here)] == [t.rows for t in summary_tables(there)]
-    for one, other in zip(here.controllers, there.controllers, strict=True):
-        assert list(one.worst) == order[list(other.worst)].tolist()
-
-
 @pytest.mark.parametrize(
     ("change", "error", "says"),
     [
         ({"a.stable": [1, 2, 1, 1, 1]}, ProblemError, "must be 1, 0 or nan; got 2 at index 1"),
         ({"a.strehl": [NAN] * 5}, NonFiniteError, "within .0, 1.*got nan at index 0"),
-        ({"a.strehl": [1.2, 0, 0, 0, 0]}, ProblemError, "within .0, 1.*got 1.2 at index 0"),
         ({"a.residual_nm": [-1, 0, 0, 0, 0]}, ProblemError, "at least 0 .*got -1"),
-        ({"a.residual_nm": [np.inf, 0, 0, 0, 0]}, NonFiniteError, "got inf at index 0"),
         ({"b.stable": [1, 1]}, DimensionError, "'b.stable' must have 5 rows"),
-        ({"a.strehl": [1, 1]}, DimensionError, "'a.strehl' must have 5 rows"),
         ({"gain": [1, 2, NAN, 4, 5]}, NonFiniteError, "'gain' must be finite; got nan"),
-        ({"gain": [[1, 2]]}, DimensionError, "'gain' must have 5 rows"),
         ({"gain": list("abcde")}, ProblemError, "'gain' must be an array of numbers"),
-        ({"row": [0, 1, NAN, 3, 4]}, NonFiniteError, "'row' must be finite"),
     ],
 )
 def test_columns_that_cannot_be_are_refused(small, change, error, says):
@@ -127,28 +89,31 @@ def test_arguments_that_cannot_be_are_refused(small, parameters, controllers, sa
 
 
 @pytest.mark.parametrize("n", [1, 7, 200])
-def test_percentiles_are_numpys_and_intervals_are_scipys(n):
+def test_intervals_of_percentiles_hold_so_many_order_statistics(n):
     values = np.random.default_rng(n).normal(size=n)
-    for percent, each in percentiles(values, (0, 1, 5, 50, 95, 99, 100)).items():
+    ordered = np.sort(values)
+    for percent, each in percentiles(values, (1, 5, 50, 95, 99)).items():
         assert each.value == pytest.approx(np.percentile(values, percent))
-        if 0 < percent < 100:
-            test = stats.quantile_test(values, q=0, p=percent / 100)
-            expected = test.confidence_interval(0.95)
-            np.testing.assert_allclose([each.low, each.high], [expected.low, expected.high])
+        # at most 2.5 % of samples have so many values below, or above, the true percentile
+        first, last = (np.searchsorted(ordered, end) for end in (each.low, each.high))
+        part = percent / 100
+        assert np.isnan(each.low) or stats.binom.cdf(first, n, part) <= 0.025
+        assert np.isnan(each.high) or stats.binom.sf(last, n, part) <= 0.025
 
 
 def test_percentiles_of_residuals_that_are_infinite():
     values = np.array([1.0, 2.0, 3.0, np.inf, np.inf])
-    found = percentiles(values, (0, 50, 60, 75, 100))
-    assert [each.value for each in found.values()] == [1, 3, np.inf, np.inf, np.inf]
+    found = percentiles(values, (1, 50, 60, 75, 99))
+    assert [each.value for each in found.values()] == [1.04, 3, np.inf, np.inf, np.inf]
 
 
 @pytest.mark.parametrize(("count", "total"), [(0, 50), (50, 50), (3, 50), (40, 4000)])
-def test_intervals_of_parts_are_scipys(count, total):
+def test_intervals_of_parts_are_those_of_clopper_and_pearson(count, total):
     found = share(np.arange(total) < count)
-    expected = stats.binomtest(count, total).proportion_ci(0.95, method="exact")
-    np.testing.assert_allclose([found.low, found.high], [expected.low, expected.high], rtol=1e-9)
     assert found.value == count / total
+    # each tail beyond the ends has 2.5 %
+    assert count == 0 or stats.binom.sf(count - 1, total, found.low) == pytest.approx(0.025)
+    assert count == total or stats.binom.cdf(count, total, found.high) == pytest.approx(0.025)
 
 
 def index(parameter, result):
@@ -186,6 +151,16 @@ def test_ishigami(kind, n, limit):
     assert np.all(np.abs(values - ishigami_indices()) < 4 * errors)
 
 
+# rbd_fast.analyze of SALib 1.6.0, of the same 4000 samples
+SALIB = (0.318278, 0.448807, -0.000789, -0.001446)
+
+
+def test_indices_are_those_of_salib():
+    u = np.random.default_rng(5).random((4000, 4))
+    values = [index(column, ishigami(u))[0] for column in u.T]
+    np.testing.assert_allclose(values, SALIB, atol=0.0025)
+
+
 @pytest.mark.study
 def test_standard_errors_are_those_of_repeated_samples():
     """Mean error, spread over 200 samples, and the mean of the standard errors."""
@@ -216,41 +191,6 @@ def test_the_index_of_a_list_is_epsilon_squared():
     assert index(values, result)[0] == pytest.approx(epsilon, rel=1e-9)
 
 
-@settings(max_examples=10)
-@given(shift=st.floats(-5, 5), scale=st.sampled_from([-3.0, 0.01, 7.0]), seed=st.integers(0, 1000))
-def test_the_index_knows_no_units(shift, scale, seed):
-    u = draw_points("independent", 150, 2, seed)
-    result = u[:, 0] ** 2 + 0.3 * u[:, 1]
-    here = index(u[:, 0], result)
-    there = index(np.exp(3 * u[:, 0]), shift + scale * result)
-    assert there == pytest.approx(here, abs=1e-9)
-
-
-def test_what_only_two_together_do_is_in_no_index():
-    u = draw_points("independent", 5000, 2, seed=4)
-    result = (u[:, 0] - 0.5) * (u[:, 1] - 0.5) + 0.5
-    columns = make_columns({"p": u[:, 0], "q": u[:, 1]}, {"a": result})
-    found = study_statistics(columns, ["p", "q"], ["a"])
-    for row in found.controllers[0].sensitivity.values():
-        assert abs(row["index"]) < 4 * row["index_error"]
-        assert row["index"] < 0.02
-    interactions = summary_tables(found)[-1].rows[-1]
-    assert float(interactions[1].split()[0]) > 97
-
-
-def test_failed_samples_are_left_out_of_indices():
-    u = draw_points("independent", 300, 2, seed=3)
-    columns = make_columns({"q": u[:, 0], "p": u[:, 1]}, {"a": 0.2 * u[:, 0] + 0.5 * u[:, 1]})
-    failed = np.arange(300) % 7 == 0
-    nans = {f"a.{name}": np.where(failed, NAN, columns[f"a.{name}"]) for name in RESULTS}
-    kept = {name: column[~failed] for name, column in columns.items()}
-    spoilt, whole = (study_statistics(each, ["q", "p"], ["a"]) for each in (columns | nans, kept))
-    assert spoilt.ranked == whole.ranked == ("p", "q")
-    for name in ("p", "q"):
-        expected = whole.controllers[0].sensitivity[name]
-        assert spoilt.controllers[0].sensitivity[name] == pytest.approx(expected, rel=1e-12)
-
-
 def test_constants_have_no_index():
     u = draw_points("independent", 200, 1, seed=0)
     columns = make_columns(
@@ -265,20 +205,6 @@ def test_constants_have_no_index():
     assert found.ranked == ("p",)
     table = next(t for t in summary_tables(found) if t.caption.startswith("Variance"))
     assert [row[2] for row in table.rows if len(row) > 1] == ["-", "-"]
-
-
-@pytest.mark.parametrize(("kind", "n"), [("independent", 4096), ("latin", 512), ("sobol", 512)])
-def test_an_edge_is_blurred_within_its_group_alone(kind, n):
-    """A loop that is unstable beyond 0.9 has a Strehl ratio of 0 there."""
-    u = draw_points(kind, n, 2, seed=2)
-    x, y = u.T
-    value, error = index(x, np.where(x > 0.9, 0.0, 0.8 - 0.2 * y))
-    between, within = 0.09 * 0.7**2, 0.9 * 0.2**2 / 12
-    blurred = (
-        0.7**2 / 4 / (16 if n == 4096 else 8)
-    )  # a step in the middle of a group, without a line
-    missing = between / (between + within) - value
-    assert -3 * error < missing < blurred / (between + within) + 3 * error
 
 
 def test_one_odd_sample_makes_no_index():
@@ -340,14 +266,3 @@ def test_tables(small):
     worst = worst_table(found.controllers[0], small, ["gain"])
     assert [cell_text(cell) for cell in worst.rows[0]] == ["11", "unstable", "0.6"]
     assert [cell_text(cell) for cell in worst.rows[1]] == ["12", "40.0", "0.7"]
-
-
-def test_the_table_of_indices_ends_with_what_they_lack():
-    columns = make_columns({"p": np.linspace(0, 1, 50)}, {"a": np.linspace(0, 1, 50)})
-    found = study_statistics(columns, ["p"], ["a"])
-    index = next(t for t in summary_tables(found) if t.caption.startswith("Variance"))
-    assert index.rows == (
-        ("p", "100.0 ± 0.0"),
-        ("only together (interactions)", "0.0 ± 0.0"),
-    )
-    assert sensitivity_table(found, names={"p": "short"}).rows[0][0] == "short"

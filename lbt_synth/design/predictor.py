@@ -1,0 +1,271 @@
+"""A least-squares predictor as a design: a stable filter of readings, made from a record.
+
+The filter reads the pseudo-open-loop measurement and, where the loop has them, accelerometers. The
+loop is a pure delay with a known command, so every stable filter of these makes a stable loop at
+the assumed sensor gain (:func:`youla_controller`). What it leaves is what its record shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from scipy.linalg import block_diag, svd
+
+from lbt_synth.design.certificate import TOLERANCE, Check, Claim, Evidence, stability_check
+from lbt_synth.design.result import UNCERTIFIED, Design, RowTable, SolverReport, with_certificate
+from lbt_synth.errors import ProblemError
+from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.linear.block_filtering import filter_series
+from lbt_synth.linear.lyapunov import output_variances, stationary_root
+from lbt_synth.loop import close_loop, stable_sensor_gains
+from lbt_synth.loop.closed_loop import youla_controller, youla_parameter
+from lbt_synth.models import LoopHardware
+from lbt_synth.storage.rows import Column, column, table_row
+from lbt_synth.validation import FloatArray, frozen_copy
+
+_ORDERS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # of reduced filters, by about a third
+_LOST = 5e-3  # of the variance that the long filter leaves, which a reduced one may add
+_DRIVEN = 20_000  # frames of a record over which states are compared
+_STABLE = 1 - 1e-7  # spectral radius of a filter: one that forgets within a day at 1 kHz
+
+
+def _check_noise(evidence: Evidence, claimed: tuple[float, ...]) -> Iterator[Check]:
+    """Compare the commands that white readings make with those that are claimed."""
+    apart = np.abs(np.array(command_rms(evidence.design.parameters)) / np.array(claimed) - 1)
+    how = "adjoint Lyapunov equation"
+    yield Check("command of white readings, against the one claimed", apart.max(), TOLERANCE, how)
+
+
+@table_row
+class NoiseRow:
+    """What white noise of one reading becomes in the command."""
+
+    reading: str = column("reading")
+    unit: str = column("unit of the noise")
+    command_rms: float = column("command over it, rms", format=".4g")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PredictorDesign(Design):
+    """A controller that predicts the disturbance by a filter of least squares.
+
+    It claims what it leaves on frames of its record that it was not fitted to, as does its
+    fall-back without the other sensors [nm rms], and the command that a reading of unit white noise
+    makes, for each reading of both filters.
+
+    Attributes
+    ----------
+    problem : LoopHardware
+        The loop, with the sensors that are read.
+    parameters : tuple of Controller
+        The filter from the pseudo-open-loop measurement and the readings of all other sensors to
+        the command; where there are others, one without them as a fall-back.
+    """
+
+    CLAIMS: ClassVar[tuple[Claim, ...]] = (
+        Claim(name="residual_nm", heading="residual on unseen frames of its record", unit="nm"),
+        Claim(name="residual_error_nm", heading="standard error of that", unit="nm"),
+        Claim(name="alone_nm", heading="residual of the fall-back on these frames", unit="nm"),
+        Claim(name="command_rms", checks=_check_noise),
+    )
+    DERIVED: ClassVar[tuple[Column, ...]] = (
+        Column(name="sensors", heading="sensors and channels"),
+        Column(name="loop_radius", heading="spectral radius of the loop"),
+        Column(name="gain_low", heading="stable gain factors, from", format=".4g"),
+        Column(name="gain_high", heading="stable gain factors, to", format=".4g"),
+    )
+
+    problem: LoopHardware
+    parameters: tuple[Controller, ...]
+
+    def make_controller(self) -> Controller:
+        """Return the controller of the first filter, with the states of both."""
+        return self._controller(0)
+
+    def _controller(self, chosen: int) -> Controller:
+        """Return the controller of one filter; all of them have the same states."""
+        readings = self.problem.n_readings
+        parts = [(p.A, _padded(p.B, readings), p.C) for p in self.parameters]
+        A, B = block_diag(*(A for A, *_ in parts)), np.vstack([B for _, B, _ in parts])
+        outputs = [C if i == chosen else 0 * C for i, (*_, C) in enumerate(parts)]
+        C, D = np.hstack(outputs), np.zeros((len(outputs[0]), readings))
+        joint = Controller(A=A, B=B, C=C, D=D, dt_s=self.problem.dt_s)
+        return youla_controller(self.problem, joint, stored=len(parts) > 1)
+
+    @property
+    def controllers(self) -> dict[frozenset[str], Controller]:
+        """The controller of all sensors, and that of the loop's own alone."""
+        alone = {frozenset(self.problem.suite.units[1:]): i for i in range(1, len(self.parameters))}
+        return {frozenset(): self.controller} | {
+            missing: self._controller(place) for missing, place in alone.items()
+        }
+
+    @property
+    def expected_residual_nm(self) -> float | None:
+        """Residual on frames of the record that the design was not fitted to [nm rms]."""
+        return self.claims.get("residual_nm")
+
+    def derived(self) -> dict[str, Any]:
+        """Return the sensors, and where the loop is stable."""
+        low, high = stable_sensor_gains(self.problem, self.controller)
+        return {
+            "sensors": ", ".join(self.problem.suite.units),
+            "loop_radius": self.close(self.problem).spectral_radius,
+            "gain_low": low,
+            "gain_high": high,
+        }
+
+    def tables(self) -> tuple[RowTable, ...]:
+        """Return what noise of each reading becomes."""
+        suite, q = self.problem.suite, self.problem.n_measurements
+        names = [*(f"wavefront {i + 1}" for i in range(q)), *suite.channels]
+        units = ["nm"] * q + ["m/s^2"] * len(suite.channels)
+        rows = [
+            NoiseRow(reading=name, unit=unit, command_rms=gain)
+            for name, unit, gain in zip(names, units, self.claims["command_rms"], strict=False)
+        ]
+        return (RowTable(key="noise", title="Command of white noise of a reading", rows=rows),)
+
+    def notes(self) -> list[str]:
+        """Return what the claims rest on."""
+        notes = ["note: a record is no model: the residual is that of its second half."]
+        if self.other_sensors:
+            notes.append(
+                "note: a channel that fails moves no pole of the loop. If it is seen, the loop "
+                "goes on with the fall-back, which reads the wavefront alone."
+            )
+        return notes
+
+    def examine(self) -> Evidence:
+        """Compute whether the filters are stable, and the loops of both."""
+        checks = []
+        names = ("spectral radius of the filter", "spectral radius of the fall-back's filter")
+        for name, parameter in zip(names, self.parameters, strict=False):
+            radius = parameter.to_statespace().spectral_radius
+            checks.append(Check(name, radius, _STABLE, "eigenvalues"))
+        for missing, controller in self.controllers.items():
+            if missing and all(check.passed for check in checks):
+                loop = close_loop(self.problem, controller)
+                checks.append(stability_check("spectral radius of the fall-back's loop", loop))
+        return Evidence(design=self, certificate=replace(UNCERTIFIED, checks=tuple(checks)))
+
+
+def _padded(B: FloatArray, inputs: int) -> FloatArray:
+    """Return an input matrix with zeros for readings that a filter does not take."""
+    return np.hstack([B, np.zeros((len(B), inputs - B.shape[1]))])
+
+
+def command_rms(parameters: Sequence[Controller]) -> tuple[float, ...]:
+    """Return the rms command that each reading makes if it is unit white noise, filter by filter.
+
+    By the adjoint equation: the squared norm of input i is ``B' W B`` of the observability Gramian.
+    """
+    norms = [
+        np.sqrt(output_variances(p.B.T, p.D.T, stationary_root(p.A.T, p.C.T))) for p in parameters
+    ]
+    return tuple(np.concatenate(norms).tolist())
+
+
+def regression_filter(
+    hardware: LoopHardware, base: Controller, coefficients: FloatArray
+) -> Controller:
+    """Return the filter of a base controller and of what a regression adds to it.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        The loop of its own sensor; its influence matrix can be inverted.
+    base : Controller
+        From y(k) to u(k), of a loop that is stable.
+    coefficients : (taps, n, 2 n + c) array_like
+        What is added to the correction of each mode, per value of the base's correction, of the
+        pseudo-open-loop measurement and of the channels; the newest first.
+    """
+    taps, n, signals = coefficients.shape
+    own = youla_parameter(hardware, base)
+    back, out = np.linalg.pinv(hardware.sensor), hardware.projector
+    q, c = hardware.n_measurements, signals - 2 * n
+    into = coefficients.reshape(taps * n, signals)
+    from_base = into[:, :n] @ hardware.influence @ own.C  # by its new state
+    B = np.block(
+        [
+            [own.B, np.zeros((own.n_states, c))],
+            [from_base @ own.B + into[:, n : 2 * n] @ back, into[:, 2 * n :]],
+        ]
+    )
+    A = block_diag(own.A, np.eye(taps * n, k=n))
+    A[own.n_states :, : own.n_states] = from_base @ own.A
+    C = np.hstack([own.C, out, np.zeros((len(out), (taps - 1) * n))])
+    return Controller(A=A, B=B, C=C, D=np.zeros((len(C), q + c)), dt_s=hardware.dt_s)
+
+
+def reduce_filter(
+    parameter: Controller, readings: FloatArray, residual_nm2: float
+) -> tuple[Controller, float]:
+    """Return a filter of few states, and the rms by which its command differs on a record.
+
+    A balanced truncation whose inputs are the readings (frames, q) of the record: the states that
+    are kept move the command most while these are read (D. F. Enns, Proc. 23rd IEEE Conf. Decision
+    and Control, 127 (1984), doi:10.1109/CDC.1984.272286). The fewest states are taken that add less
+    than 0.5 % to a residual variance.
+    """
+    n, last = parameter.n_states, readings[-_DRIVEN:]
+    states = StateSpace(
+        A=parameter.A,
+        B=parameter.B,
+        C=parameter.A,  # in the new-state form
+        D=parameter.B,
+        dt_s=parameter.dt_s,
+    )
+    driven = filter_series(states, last)[len(last) // 10 :]
+    reached = svd(driven / np.sqrt(len(driven)), full_matrices=False)
+    root = reached[2].T * reached[1]  # P = root root'
+    seen = stationary_root(parameter.A.T, parameter.C.T)  # W = seen seen'
+    U, sizes, V = svd(seen.T @ root, full_matrices=False)
+    whole = driven @ parameter.C.T
+    for order in (order for order in _ORDERS if order < min(n, len(sizes))):
+        scale = 1 / np.sqrt(sizes[:order])
+        into, back = (seen @ U[:, :order] * scale).T, root @ V[:order].T * scale
+        few = Controller(
+            A=frozen_copy(into @ parameter.A @ back),
+            B=frozen_copy(into @ parameter.B),
+            C=frozen_copy(parameter.C @ back),
+            D=parameter.D,
+            dt_s=parameter.dt_s,
+        )
+        system = few.to_statespace()
+        if not system.spectral_radius < _STABLE:
+            continue
+        apart = filter_series(system, last)[len(last) // 10 :] - whole
+        lost_nm2 = float(np.sum(np.mean(apart**2, axis=0)))
+        if lost_nm2 < _LOST * residual_nm2:
+            return few, float(np.sqrt(lost_nm2))
+    return parameter, 0.0
+
+
+def predictor_design(
+    hardware: LoopHardware,
+    filters: Sequence[Controller],
+    readings: FloatArray,
+    residual_nm2: float,
+    *,
+    what: str,
+    **claims: float,
+) -> PredictorDesign:
+    """Reduce the filters of a record, and certify the design of them."""
+    if len(filters) != 1 + bool(hardware.suite.sensors):
+        raise ProblemError("a predictor needs one filter, and a fall-back for other sensors.")
+    pairs = [reduce_filter(p, readings[:, : p.B.shape[1]], residual_nm2) for p in filters]
+    short, lost = zip(*pairs, strict=True)
+    status = f"{what}; reduced by {lost[0]:.2g} nm"
+    design = PredictorDesign(
+        method="predictor",
+        problem=hardware,
+        parameters=short,
+        claims={**claims, "command_rms": command_rms(short)},
+        solver=SolverReport(route="least squares", status=status, iterations=1),
+    )
+    return with_certificate(design, "Try a longer record, or the method kalman.")

@@ -1,0 +1,324 @@
+"""The least-squares predictor of a record: what past readings tell beyond a model.
+
+The base is the Kalman filter of the model. Its correction, the pseudo-open-loop measurement and the
+channels of accelerometers, each over the last frames, are regressed on what the base leaves. The
+penalty is chosen by forward chaining: filters of the past are judged on what comes next. With a
+large penalty the predictor is the base. A regression is made of its moments alone, so that parts
+of a record, and signals that are left out, cost no second look at the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from lbt_synth.design.kalman import kalman
+from lbt_synth.design.predictor import PredictorDesign, predictor_design, regression_filter
+from lbt_synth.errors import NumericalError, ProblemError
+from lbt_synth.identification.accelerometers.readings import Channels
+from lbt_synth.identification.fit.identified_model import IdentifiedModel
+from lbt_synth.identification.prediction.residual import gather, replay, settle_frames
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.stretches import Stretches, cut_stretches
+from lbt_synth.linear import Controller
+from lbt_synth.loop import close_loop
+from lbt_synth.models import LoopHardware
+from lbt_synth.models.loop_hardware import past_corrections
+from lbt_synth.storage.rows import column, nm_column, table_row
+from lbt_synth.validation import FloatArray, IntArray
+
+TAPS = 64  # frames of the past: at 1 kHz two periods of a line at 30 Hz, below which the base is
+_PENALTIES = 10.0 ** np.arange(-9, 4)  # of a coefficient whose signal changes by 1 a frame
+_PARTS = 6  # of a record, of which each is predicted by those before, from the third on
+_FIRST = 2
+_OFFSET = 1.0  # by which a channel's readings may stand off zero, in rms changes a frame
+_SEED = 1
+_REMOTE = 16.0  # frames, from which on a penalty grows with age: old readings tell least
+
+
+def noisier(model: IdentifiedModel, factor: float) -> IdentifiedModel:
+    """Return a model with a multiple of its noise."""
+    axes = tuple(replace(axis, noise_nm=factor * axis.noise_nm) for axis in model.axes)
+    return replace(model, axes=axes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Moments:
+    """Sums over frames of products of lagged signals, and of these with targets."""
+
+    squares: FloatArray  # (taps m, taps m), the newest first
+    products: FloatArray  # (taps m, n)
+    targets: FloatArray  # (n,)
+    frames: int
+
+    def __add__(self, other: Moments) -> Moments:
+        """Return the moments of both."""
+        names = ("squares", "products", "targets", "frames")
+        return Moments(**{name: getattr(self, name) + getattr(other, name) for name in names})
+
+    def chosen(self, places: IntArray) -> Moments:
+        """Return the moments of some signals alone."""
+        return replace(
+            self, squares=self.squares[np.ix_(places, places)], products=self.products[places]
+        )
+
+    def left(self, coefficients: FloatArray) -> float:
+        """Return the mean square that coefficients (taps m, n) leave of the targets, summed."""
+        taken = 2 * self.products - self.squares @ coefficients
+        return float(np.sum(self.targets) - np.sum(coefficients * taken)) / self.frames
+
+
+def lagged_moments(signals: FloatArray, targets: FloatArray, runs: Stretches, taps: int) -> Moments:
+    """Return the moments of signals (frames, m) and their past, and of targets (frames, n).
+
+    Beside the lags with the newest value, each product of two lags is that of a frame earlier, less
+    the last frame of the run and with one before it.
+    """
+    (_, m), n = signals.shape, targets.shape[1]
+    squares, products = np.zeros((taps, taps, m, m)), np.zeros((taps, m, n))
+    for start, stop in runs:
+        late = [signals[start - lag : stop - lag] for lag in range(taps)]
+        newest = np.stack([late[0].T @ other for other in late])
+        before = signals[start - 1 - np.arange(taps)]
+        last = signals[stop - 1 - np.arange(taps)]
+        block = np.empty_like(squares)
+        block[0], block[:, 0] = newest, newest.transpose(0, 2, 1)
+        for i in range(1, taps):
+            entered = before[i - 1, None, :, None] * before[i - 1 : taps - 1, None, :]
+            gone = last[i - 1, None, :, None] * last[i - 1 : taps - 1, None, :]
+            block[i, i:] = block[i - 1, i - 1 : taps - 1] + entered - gone
+            block[i:, i] = block[i, i:].transpose(0, 2, 1)
+        squares += block
+        products += np.stack([other.T @ targets[start:stop] for other in late])
+    square = squares.transpose(0, 2, 1, 3).reshape(taps * m, taps * m)
+    kept = [targets[start:stop] for start, stop in runs]
+    return Moments(
+        squares=square,
+        products=products.reshape(taps * m, n),
+        targets=np.sum([np.sum(part**2, axis=0) for part in kept], axis=0),
+        frames=sum(len(part) for part in kept),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Regression:
+    """What a record tells of the future, beside its model.
+
+    Attributes
+    ----------
+    hardware : LoopHardware
+        The loop with the sensors that are read.
+    base : Controller
+        The Kalman filter of the model, of the loop's own sensor.
+    readings : (frames, q + c) ndarray
+        Pseudo-open-loop measurements and channels of the frames that count.
+    parts : tuple of Moments
+        Moments of consecutive parts of the record.
+    scales : (m,) ndarray
+        Changes of each signal from frame to frame, rms.
+    """
+
+    hardware: LoopHardware
+    base: Controller
+    readings: FloatArray
+    parts: tuple[Moments, ...]
+    scales: FloatArray
+
+    @property
+    def own(self) -> int:
+        """Number of signals of the loop's own sensor: the base's corrections and measurements."""
+        return 2 * self.hardware.modes
+
+    def places(self, signals: Sequence[int]) -> IntArray:
+        """Return where some signals stand in the moments, all lags."""
+        rows = np.arange(TAPS)[:, None] * len(self.scales) + np.array(signals)
+        return np.asarray(rows.ravel())
+
+    def _weights(self, signals: Sequence[int]) -> FloatArray:
+        """Return the matrix of the penalty of some signals: of age and offsets of channels, too."""
+        scale, age = self.scales[list(signals)], np.arange(TAPS) / _REMOTE
+        weights = np.diag(np.outer((1 + age**2) ** 2, scale**2).ravel())
+        for place, signal in enumerate(signals):
+            if signal >= self.own:
+                rows = place + len(signals) * np.arange(TAPS)
+                weights[np.ix_(rows, rows)] += (_OFFSET * scale[place]) ** 2
+        return weights
+
+    def solve(self, signals: Sequence[int], penalty: float, moments: Moments) -> FloatArray:
+        """Return the coefficients of some signals, (taps m, n), for moments of these."""
+        weights = penalty * moments.frames * self._weights(signals)
+        try:
+            factor = cho_factor(moments.squares + weights)
+        except np.linalg.LinAlgError:
+            raise NumericalError(
+                "the past readings of a record depend on each other; expected some noise in them.",
+                status="regression",
+            ) from None
+        return np.asarray(cho_solve(factor, moments.products))
+
+    def chained_penalty(self, signals: Sequence[int]) -> float:
+        """Return the penalty whose filters of the past leave least of what comes next."""
+        parts = [part.chosen(self.places(signals)) for part in self.parts]
+        left = np.zeros(len(_PENALTIES))
+        past = sum(parts[1:_FIRST], parts[0])
+        for part in parts[_FIRST:]:
+            left += [part.left(self.solve(signals, p, past)) for p in _PENALTIES]
+            past = past + part
+        return float(_PENALTIES[np.argmin(left)])
+
+    @cached_property
+    def whole(self) -> Moments:
+        """Moments of all frames."""
+        return sum(self.parts[1:], self.parts[0])
+
+    @cached_property
+    def penalty(self) -> float:
+        """The penalty of forward chaining, for all signals."""
+        return self.chained_penalty(range(len(self.scales)))
+
+    def design(self, penalty: float | None = None, **claims: float) -> PredictorDesign:
+        """Return the certified design, by default with the penalty of forward chaining."""
+        everything, own = range(len(self.scales)), range(self.own)
+        penalty = self.penalty if penalty is None else penalty
+        path, filters, left = self.hardware.own_sensor_alone(), list[Controller](), list[float]()
+        for signals in (everything, own)[: 1 + bool(self.hardware.suite.sensors)]:
+            moments = self.whole.chosen(self.places(signals))
+            coefficients = self.solve(signals, penalty, moments)
+            shaped = coefficients.reshape(TAPS, len(signals), -1).transpose(0, 2, 1)
+            filters.append(regression_filter(path, self.base, shaped))
+            left.append(moments.left(coefficients))
+        return predictor_design(
+            self.hardware,
+            filters,
+            self.readings,
+            left[0],
+            what=f"penalty {penalty:.0e}",
+            **claims,
+        )
+
+
+def regress(
+    record: LoopRecord,
+    model: IdentifiedModel,
+    *,
+    stretches: Stretches | None = None,
+    channels: Channels | None = None,
+    noise: float = 1.0,
+) -> Regression:
+    """Collect what a record tells of its future, beside its model.
+
+    More noise than the model's is added as that of a run without any disturbance, of which nothing
+    is to be corrected.
+
+    Parameters
+    ----------
+    record : LoopRecord
+        The record, which the model was identified in.
+    model : IdentifiedModel
+        The model, of which the base is the Kalman filter.
+    stretches : sequence of (start, stop), optional
+        Frames to use; by default all usable ones.
+    channels : Channels, optional
+        Accelerometers beside the record.
+    noise : float, optional
+        Multiple of the model's noise that is assumed, at least 1.
+
+    Raises
+    ------
+    ProblemError
+        If the stretches are too short, or the loop has no command for some mode.
+    """
+    path = model.hardware
+    if len(path.influence) != path.n_commands:
+        raise ProblemError("a predictor needs a command for every mode; got fewer.")
+    runs = record.stretches() if stretches is None else stretches
+    base = kalman(noisier(model, noise).plant()).controller
+    series = record.pseudo_open_loop(model.sensor_gains)
+    loop, lead = close_loop(path, base), len(path.mirror_taps)
+    beside = np.zeros((record.frames, 0)) if channels is None else channels.values
+
+    def lay(series: FloatArray, runs: Stretches, beside: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the signals, what the base leaves, and the measurements, zero outside of runs."""
+        left = replay(loop, series, runs)
+        seen, corrected = (
+            np.where(np.isfinite(left), part, 0.0) for part in (series, series - left)
+        )
+        past = past_corrections(path.mirror_taps, np.hstack([seen, beside]))
+        return np.hstack([corrected, past]), left, seen
+
+    signals, left, seen = lay(series, runs, beside)
+    readings = np.hstack([seen @ path.sensor.T, beside])
+    first = max(TAPS + lead, settle_frames(path))
+    kept = tuple((start + first, stop) for start, stop in runs if stop - start > first)
+    count = sum(stop - start for start, stop in kept)
+    if count < 2 * TAPS * _PARTS:
+        raise ProblemError(
+            f"a predictor needs {2 * TAPS * _PARTS} frames beyond the first {first} of each "
+            f"stretch; got {count}. Record for longer."
+        )
+    edges = [count * part // _PARTS for part in range(_PARTS + 1)]
+    parts = [cut_stretches(kept, a, b) for a, b in pairwise(edges)]
+    changes = np.concatenate([np.diff(signals[start:stop], axis=0) for start, stop in kept])
+    scales = np.sqrt(np.mean(changes**2, axis=0))
+    moments = [lagged_moments(signals, left, part, TAPS) for part in parts]
+    if noise > 1:
+        deviation = np.array([axis.noise_nm for axis in model.axes]) / model.sensor_gains
+        drawn = np.random.default_rng(_SEED).standard_normal((count + first, path.modes))
+        drawn *= deviation * np.sqrt(noise**2 - 1)
+        silence = np.zeros((len(drawn), beside.shape[1]))
+        heard, left, seen = lay(drawn, ((0, len(drawn)),), silence)
+        for place, (a, b) in enumerate(pairwise(edges)):
+            more = lagged_moments(heard, left - seen, ((first + a, first + b),), TAPS)
+            moments[place] += replace(more, frames=0)
+    return Regression(
+        hardware=path if channels is None else channels.hardware(path),
+        base=base,
+        readings=gather(readings, kept),
+        parts=tuple(moments),
+        scales=np.where(scales > 0, scales, 1.0),
+    )
+
+
+@table_row
+class ChannelValue:
+    """What one channel of accelerometers is worth to a predictor, on unseen frames."""
+
+    channel: str = column("channel", help="Name of the channel")
+    without_nm: float = nm_column("without it", unit="nm rms", help="Residual of all other sensors")
+    dead_nm: float = nm_column("zeros, unseen", unit="nm rms", help="Residual if it reads zeros")
+
+
+def channel_values(
+    past: Regression, unseen: Regression, penalty: float, noise_nm2: float
+) -> list[ChannelValue]:
+    """Return what a predictor of the past leaves of unseen frames, without each channel.
+
+    The noise of the measurements is subtracted; nan where it hides the residual.
+    """
+    everything = list(range(len(past.scales)))
+    coefficients = past.solve(everything, penalty, past.whole)
+
+    def left_nm(signals: list[int], coefficients: FloatArray) -> float:
+        moments = unseen.whole.chosen(unseen.places(signals))
+        left_nm2 = moments.left(coefficients) - noise_nm2
+        return float(np.sqrt(left_nm2)) if left_nm2 > 0 else float("nan")
+
+    rows = []
+    for signal, name in zip(everything[past.own :], past.hardware.suite.channels, strict=True):
+        others = [other for other in everything if other != signal]
+        without = past.solve(others, penalty, past.whole.chosen(past.places(others)))
+        silent = coefficients.copy()
+        silent[past.places([signal])] = 0.0
+        rows.append(
+            ChannelValue(
+                channel=name,
+                without_nm=left_nm(others, without),
+                dead_nm=left_nm(everything, silent),
+            )
+        )
+    return rows

@@ -1,0 +1,149 @@
+"""Predictors as designs: filters of readings, reduced, certified and stored."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lbt_synth as lbt
+from lbt_synth.design.predictor import (
+    PredictorDesign,
+    command_rms,
+    predictor_design,
+    reduce_filter,
+    regression_filter,
+)
+from lbt_synth.errors import CertificateError, ProblemError
+from lbt_synth.loop.closed_loop import youla_controller, youla_parameter
+from lbt_synth.models import Accelerometer, SensorSuite
+
+PATH = lbt.LoopHardware(frame_rate_hz=500, delay_frames=2.3, sensor_matrix=[[0.7, 0.1], [0, 0.9]])
+BASE = lbt.integrator(PATH, gain=0.3).controller
+SENSOR = Accelerometer(
+    name="acc", rate_hz=500, delay_frames=2.3, channels=("a", "b", "c"), noise_m_s2=1e-3
+)
+HEARING = replace(PATH, suite=SensorSuite(sensors=(SENSOR,)))
+
+
+def coefficients(signals: int, taps: int = 6) -> np.ndarray:
+    return 0.1 * np.random.default_rng(3).standard_normal((taps, 2, signals))
+
+
+def readings(channels: int = 3, frames: int = 4000) -> np.ndarray:
+    return np.random.default_rng(4).standard_normal((frames, 2 + channels))
+
+
+def made(**claims: float) -> PredictorDesign:
+    filters = [regression_filter(PATH, BASE, coefficients(n)) for n in (7, 4)]
+    return predictor_design(HEARING, filters, readings(), 100.0, what="test", **claims)
+
+
+def test_a_parameter_undoes_its_controller() -> None:
+    back = youla_controller(PATH, youla_parameter(PATH, BASE))
+    y = np.random.default_rng(0).standard_normal((50, 2))
+    runs = [controller.start() for controller in (BASE, back)]
+    first, second = (np.array([run.step(row) for row in y]) for run in runs)
+    np.testing.assert_allclose(second, first, rtol=0, atol=1e-12)
+
+
+def test_the_filter_is_the_sum_that_the_coefficients_say() -> None:
+    """In the time domain: base, its past corrections, past measurements and channels."""
+    b, series = coefficients(7), readings(frames=60)
+    run = regression_filter(PATH, BASE, b).start()
+    own = youla_parameter(PATH, BASE).start()
+    commands = np.array([run.step(row) for row in series])
+    base = np.array([own.step(row[:2]) for row in series])
+    z = series[:, :2] @ np.linalg.inv(PATH.sensor).T
+    signals = np.hstack([base, z, series[:, 2:]])
+    wanted = base.copy()
+    for lag, weights in enumerate(b):
+        wanted[lag:] += signals[: len(series) - lag] @ weights.T
+    np.testing.assert_allclose(commands, wanted, rtol=0, atol=1e-10)
+
+
+def test_any_stable_filter_makes_a_stable_loop_and_channels_move_no_pole() -> None:
+    design = made()
+    loop = design.close(HEARING)
+    assert loop.is_stable
+    assert loop.reads_others
+    alone = loop.feedback()
+    assert not alone.reads_others
+    assert alone.spectral_radius == pytest.approx(loop.spectral_radius, rel=1e-9)
+    low, high = lbt.loop.stable_sensor_gains(HEARING, design.controller)
+    margins = lbt.loop_margins(loop)
+    assert (margins.gain_low, margins.gain_high) == pytest.approx((low, high))
+
+
+def test_a_reduced_filter_loses_little() -> None:
+    long = regression_filter(PATH, BASE, coefficients(7, taps=60) * 0.2)
+    short, lost_nm = reduce_filter(long, readings(), 4.0)
+    assert short.n_states < long.n_states
+    runs = [
+        np.array([k.step(row) for row in readings(frames=2000)])
+        for k in (long.start(), short.start())
+    ]
+    apart = float(np.sum(np.mean((runs[0] - runs[1]) ** 2, axis=0)))
+    assert apart == pytest.approx(lost_nm**2, rel=0.2)
+    assert apart < 5e-3 * 4.0
+    same, nothing = reduce_filter(long, readings(), 1e-12)
+    assert (same is long, nothing) == (True, 0.0)
+
+
+def test_noise_of_readings_is_that_of_a_run() -> None:
+    design = made()
+    rng, drawn = np.random.default_rng(5), []
+    for reading in range(5):
+        run = design.parameters[0].start()
+        white = np.zeros((20_000, 5))
+        white[:, reading] = rng.standard_normal(20_000)
+        drawn.append(np.sqrt(np.sum(np.var([run.step(row) for row in white], axis=0))))
+    assert command_rms(design.parameters)[:5] == pytest.approx(drawn, rel=0.03)
+    (table,) = design.tables()
+    assert [row.reading for row in table.rows] == ["wavefront 1", "wavefront 2", "a", "b", "c"]
+
+
+@pytest.mark.parametrize("name", ["A", "B", "C"])
+@pytest.mark.parametrize("place", [0, 1])
+def test_sabotage_is_seen(name: str, place: int) -> None:
+    """Each array of each filter times 1.001, and the claim itself."""
+    design = made()
+    assert design.recertify().passed
+    parts = list(design.parameters)
+    parts[place] = replace(parts[place], **{name: 1.001 * getattr(parts[place], name)})
+    failed = replace(design, parameters=tuple(parts)).recertify()
+    assert not failed.passed
+    claims = {**design.claims, "command_rms": tuple(1.001 * np.array(design.claims["command_rms"]))}
+    with pytest.raises(CertificateError, match="command of white readings"):
+        replace(design, claims=claims).recertify().require()
+
+
+def test_gain_files_hold_it(tmp_path) -> None:
+    design = made(residual_nm=12.0, residual_error_nm=0.5, alone_nm=20.0)
+    lbt.save_gain(tmp_path / "p.fits", design)
+    again = lbt.load_gain(tmp_path / "p.fits")
+    assert again.claims == design.claims
+    assert again.expected_residual_nm == 12.0
+    assert again.controllers.keys() == {frozenset(), frozenset({"a", "b", "c"})}
+    for one, two in zip(design.controllers.values(), again.controllers.values(), strict=True):
+        np.testing.assert_array_equal(one.A, two.A)
+
+
+def test_a_channel_that_fails_takes_the_fallback_without_a_jump() -> None:
+    """Of the applied commands both filters know the same: the residual stays that of one of them."""
+    design = made()
+    run = design.controller.start(design.controllers)
+    run.miss({"a"})
+    fallback = design.controllers[frozenset({"a", "b", "c"})].start()
+    for row in readings(frames=20):
+        np.testing.assert_array_equal(run.step(row), fallback.step(row))
+    with pytest.raises(ProblemError, match="no filter without wavefront"):
+        run.miss({"wavefront"})
+
+
+def test_a_predictor_needs_a_record() -> None:
+    with pytest.raises(ProblemError, match="the method predictor is made of a record"):
+        lbt.load_config("examples/lbt.yaml").design("predictor")
+    with pytest.raises(ProblemError, match="one filter, and a fall-back"):
+        predictor_design(HEARING, [BASE], readings(), 1.0, what="test")

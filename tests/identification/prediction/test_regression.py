@@ -1,0 +1,168 @@
+"""Predictors of least squares, with and without accelerometers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from support.structures import structure
+
+import lbt_synth as lbt
+from lbt_synth.errors import ProblemError
+from lbt_synth.identification.accelerometers.readings import channels_beside
+from lbt_synth.identification.prediction.comparison import unseen_claims
+from lbt_synth.identification.prediction.regression import (
+    TAPS,
+    channel_values,
+    lagged_moments,
+    noisier,
+    regress,
+)
+from lbt_synth.identification.prediction.residual import replay
+from lbt_synth.identification.stretches import split_halves
+from lbt_synth.loop import close_loop
+
+
+@cache
+def vibrating():
+    """A structure of few modes with three channels, the first half of a run and its model."""
+    seen = structure(41, seconds=40, modes=(5, 5), channels=(3, 3))
+    record = seen.record(0, len(seen.phase) // 2)
+    return seen, record, lbt.identify(record, sensor_gain=1.0)
+
+
+@cache
+def regression(*, channels: bool):
+    seen, record, model = vibrating()
+    beside = channels_beside(record, seen.readings[: record.frames]) if channels else None
+    return regress(record, model, channels=beside)
+
+
+def left_nm2(design, controller=None, *, silent: tuple[int, ...] = ()):
+    """Return what a design leaves of the unseen half of the run, without noise."""
+    seen, record, _ = vibrating()
+    readings = seen.readings.copy()
+    readings[:, list(silent)] = 0.0
+    loop = close_loop(design.hardware, design.controller if controller is None else controller)
+    z = seen.pseudo_open_loop
+    error = seen.phase - (z - replay(loop, z, ((0, len(z)),), readings))
+    return float(np.sum(np.mean(error[record.frames :] ** 2, axis=0)))
+
+
+@pytest.mark.parametrize("runs", [((9, 60),), ((5, 40), (52, 97))])
+def test_moments_are_those_of_the_products(runs) -> None:
+    """Against the regressors written out, row by row."""
+    rng = np.random.default_rng(0)
+    signals, targets = rng.standard_normal((97, 3)), rng.standard_normal((97, 2))
+    moments = lagged_moments(signals, targets, runs, 5)
+    frames = [k for start, stop in runs for k in range(start, stop)]
+    rows = np.array([np.concatenate([signals[k - lag] for lag in range(5)]) for k in frames])
+    wanted = targets[frames]
+    np.testing.assert_allclose(moments.squares, rows.T @ rows, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(moments.products, rows.T @ wanted, rtol=1e-12, atol=1e-12)
+    assert moments.frames == len(frames)
+    b = rng.standard_normal((15, 2))
+    left = np.sum((wanted - rows @ b) ** 2) / len(frames)
+    assert moments.left(b) == pytest.approx(left, rel=1e-12)
+    some = np.array([0, 3, 4])
+    part = moments.chosen(some)
+    np.testing.assert_array_equal(part.squares, moments.squares[np.ix_(some, some)])
+
+
+def test_channels_that_see_a_structure_are_worth_what_is_claimed() -> None:
+    """The claims are of the second half of the record; the judge is a run after it."""
+    seen, record, model = vibrating()
+    kalman = lbt.kalman(model.plant())
+    alone, fused = (regression(channels=channels).design() for channels in (False, True))
+    base = left_nm2(kalman)
+    assert left_nm2(alone) < 1.02 * base
+    assert left_nm2(fused) < 0.6 * base
+    assert fused.other_sensors == ("channel1", "channel2", "channel3")
+    first, _ = split_halves(record.stretches(), record.frames)
+    half = lbt.identify(record, stretches=first, sensor_gain=1.0)
+    beside = channels_beside(record, seen.readings[: record.frames])
+    past = regress(record, half, stretches=first, channels=beside)
+    claims = unseen_claims(record, half, past.design(), beside)
+    assert claims["residual_nm"] ** 2 == pytest.approx(left_nm2(fused), rel=0.2)
+    assert claims["alone_nm"] ** 2 == pytest.approx(left_nm2(alone), rel=0.2)
+    # each channel that fails: the poles stay, the fall-back leaves what the own sensor does
+    (fallback,) = (k for missing, k in fused.controllers.items() if missing)
+    assert left_nm2(fused, fallback, silent=(0, 1, 2)) == pytest.approx(left_nm2(alone), rel=0.05)
+    loops = [close_loop(fused.hardware, k) for k in (fused.controller, fallback)]
+    assert loops[0].spectral_radius == pytest.approx(loops[1].spectral_radius, rel=1e-9)
+    # and what each is worth, by the moments of the unseen half alone
+    _, later = split_halves(record.stretches(), record.frames)
+    unseen = regress(record, half, stretches=later, channels=beside)
+    rows = channel_values(past, unseen, past.penalty, 2 * half.axes[0].noise_nm ** 2)
+    for place, row in enumerate(rows):
+        assert row.channel == f"channel{place + 1}"
+        assert row.without_nm > 0.98 * claims["residual_nm"]
+        dead = np.sqrt(left_nm2(fused, silent=(place,)))
+        assert row.dead_nm == pytest.approx(dead, rel=0.25)
+
+
+def test_the_filter_gives_the_sum_of_squares_of_the_moments() -> None:
+    """The loop, its reduction apart, leaves of the record what the regression says."""
+    seen, record, model = vibrating()
+    fit = regression(channels=True)
+    signals = range(len(fit.scales))
+    coefficients = fit.solve(signals, fit.penalty, fit.whole)
+    design = fit.design()
+    loop = close_loop(design.hardware, design.controller)
+    z = record.pseudo_open_loop(model.sensor_gains)
+    runs = record.stretches()
+    left = replay(loop, z, runs, seen.readings[: record.frames])
+    ((start, stop),) = runs
+    first = start + round(record.frame_rate_hz / 2)
+    measured = float(np.sum(np.mean(left[first:stop] ** 2, axis=0)))
+    assert measured == pytest.approx(fit.whole.left(coefficients), rel=0.01)
+
+
+def test_a_large_penalty_leaves_the_filter_of_the_model() -> None:
+    _, _, model = vibrating()
+    stiff = regression(channels=True).design(1e12)
+    kalman = lbt.kalman(model.plant())
+    assert left_nm2(stiff) == pytest.approx(left_nm2(kalman), rel=0.02)
+
+
+def test_more_noise_is_trusted_less() -> None:
+    """The command of white noise falls, and the residual rises."""
+    _, record, model = vibrating()
+    calm, usual = (regress(record, model, noise=factor).design() for factor in (8.0, 1.0))
+    assert max(calm.claims["command_rms"]) < 0.8 * max(usual.claims["command_rms"])
+    assert left_nm2(calm) > left_nm2(usual)
+    assert noisier(model, 8.0).axes[0].noise_nm == 8 * model.axes[0].noise_nm
+
+
+def test_gains_and_delays_that_are_not_whole() -> None:
+    """A process of second order in a loop of 2.4 frames and a gain of 0.6: no more than its model.
+
+    The truth is the model's, so that no predictor leaves less than its Kalman filter.
+    """
+    line = lbt.Vibration(frequency_hz=40, damping=0.05, rms_nm=100, direction=(1,))
+    fast = lbt.models.ARModel(coefficients=[0.95], driving_rms_nm=20.0, frame_rate_hz=1000)
+    truth = lbt.Truth(turbulence=fast, vibrations=(line,), noise_nm=10.0, sensor_gain=0.6)
+    path = lbt.LoopHardware(frame_rate_hz=1000, modes=1, delay_frames=2.4)
+    ran = lbt.integrator(path, gain=0.3).controller
+    run = lbt.simulate(ran, truth, hardware=path, frames=40_000, frame_means=True)
+    record = lbt.identification.loop_record(
+        run.measurements[0], run.commands[0], frame_rate_hz=1000, delay_frames=2.4, unit="nm"
+    )
+    model = lbt.identify(record, sensor_gain=0.6)
+    design = regress(record, model).design()
+    own, assumed = model.hardware, replace(truth, sensor_gain=1.0)
+    exact = [
+        lbt.residual_budget(close_loop(own, one), assumed, frame_means=True).rms_nm
+        for one in (lbt.kalman(model.plant()), design)
+    ]
+    assert exact[1] == pytest.approx(exact[0], rel=0.01)
+
+
+def test_what_is_too_short_or_dead_is_refused() -> None:
+    _, record, model = vibrating()
+    with pytest.raises(ProblemError, match=f"needs {12 * TAPS} frames beyond the first"):
+        regress(record, model, stretches=((0, 900),))
+    with pytest.raises(ProblemError, match="nothing but zeros or gaps in a, b. Leave them out"):
+        channels_beside(record, np.zeros((500, 2)), ("a", "b"))

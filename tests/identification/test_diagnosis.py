@@ -1,0 +1,212 @@
+"""The autopsy of records, good ones and others, and its three sentences: state, residual, advice."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.control_laws import RATE, SteppedLaw, ordinary_loop, run_law
+from support.diagnoses import GAIN, given_design, line_diagnosis, line_record, short_record
+from support.recorded_loops import LINE
+
+import lbt_synth as lbt
+from lbt_synth.identification import diagnose, loop_record
+from lbt_synth.identification.diagnosis import disturbance_lines, line_name
+from lbt_synth.identification.prediction.comparison import INTEGRATOR, LIMIT, RAN
+
+LOOP = {"frame_rate_hz": RATE, "delay_frames": 2, "unit": "nm"}
+
+
+@pytest.fixture
+def good():
+    return line_diagnosis()
+
+
+def test_a_good_record(good):
+    assert good.doubt == ""
+    assert good.law.kind == "integrator"
+    assert good.law.gain[0, 0] == pytest.approx(GAIN)
+    assert good.loop.delay_frames == 2
+    assert good.loop.spectral_radius < 1
+    (line,) = disturbance_lines(good.model)
+    assert line.frequency_hz == pytest.approx(LINE[0][0], abs=0.2)
+    names = [row.name for row in good.residuals]
+    assert (names[0], names[-1]) == (RAN, LIMIT)
+    assert {INTEGRATOR, good.best, "robust controller", "mine"} < set(names)
+    # the law that was found promises what the record shows
+    assert abs(good.row(RAN).deviations) < 4
+    least = min(good.row(name).replayed_nm for name in names if name not in (RAN, LIMIT, "mine"))
+    assert good.row(good.best).replayed_nm == pytest.approx(least, rel=0.05)
+    assert lbt.close_loop(good.model.hardware, good.best_design.controller).is_stable
+    assert good.row("nothing") is None
+    # a design that was given
+    mine = given_design()
+    assert good.row("mine").replayed_nm > 3 * mine.rms
+    promise, assumption = (note for note in good.notes if note.startswith("mine "))
+    words = f"mine promises {mine.rms:.3g} nm by its own model, and its loop is stable at "
+    assert promise.startswith(words)
+    low, high = (float(end) for end in promise.split(" gains of ")[1].split(" to "))
+    assert low < good.model.sensor_gains[0] < high
+    assert "assumes a sensor gain of 1.000 on axis 0" in assumption
+
+
+@pytest.mark.parametrize(
+    ("change", "doubt", "repair"),
+    [(-1.0, "they have the opposite sign", "--command-sign -1"), (1.0, "", "")],
+)
+def test_a_short_record_has_channels_and_a_law(change, doubt, repair):
+    found = diagnose(short_record(change), given={"mine": given_design()})
+    assert doubt in found.doubt
+    assert repair in (found.commands.advice if found.commands else "")
+    assert abs(found.law.gain[0, 0]) == pytest.approx(GAIN)
+    assert found.model is found.comparison is None
+    assert found.costs == found.residuals == ()
+    assert len(found.channels) == 2
+    (note,) = found.notes
+    expected = "the given design was not tried" if doubt else "no model: the record needs 2000"
+    assert note.startswith(expected)
+    state, residual, advice = found.verdict
+    assert residual == "Nothing can be said of its residual."
+    if not doubt:
+        assert advice == "Record longer before anything is changed."
+        return
+    assert state == f"The commands are not those that the mirror followed: {doubt}."
+    assert advice == "First read the record with --command-sign -1."
+    # a fault of a channel may be what is wrong with them
+    channel = replace(found.channels[0], state="noisy")
+    state, _, advice = replace(found, channels=(channel,)).verdict
+    assert state.startswith("The record has faults: the measurement is noisy. The commands are ")
+    assert advice == "First look at the measurement, which is noisy."
+
+
+@pytest.mark.parametrize(
+    ("make", "doubt", "repair"),
+    [
+        (lambda y, u: (y, u[:, ::-1]), "axes are exchanged", "--swap-axes"),
+        (lambda y, u: (y[:3000], u[-3000:]), "nothing to do with", "find the commands"),
+    ],
+)
+def test_commands_of_another_kind(make, doubt, repair):
+    found = diagnose(loop_record(*make(*ordinary_loop()), **LOOP))
+    assert doubt in found.doubt
+    assert repair in (found.commands.advice if found.commands else "")
+    assert found.model is None
+    assert found.law is not None
+
+
+def test_an_open_loop():
+    found = diagnose(loop_record(line_record().pseudo_open_loop(0.6)[2:], **LOOP))
+    assert found.law is None
+    assert found.loop.stable_gains == ""
+    assert found.row(RAN) is None
+    assert np.isnan(found.costs[-1].running_nm)
+    assert found.costs[-1].best_nm > 0
+
+
+def test_a_design_of_another_loop():
+    air = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
+    two = lbt.kalman(lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=air, noise_nm=5.0))
+    words = "2 measurements and 2 commands, and the rec"
+    with pytest.raises(lbt.errors.ProblemError, match=words):
+        diagnose(line_record(), given={"two": two})
+
+
+def verdict_with(rows, **changes):
+    """Return the sentences of a diagnosis with rows of its comparison in place of others."""
+    found = line_diagnosis()
+    entries = {row.name: row for row in found.comparison.entries}
+    entries |= {name: replace(row, name=name) for name, row in rows.items()}
+    table = replace(found.comparison, entries=tuple(entries.values()))
+    return replace(found, comparison=table, **changes).verdict
+
+
+def scaled(name, factor):
+    """Return a row of the comparison whose residual is larger by a factor."""
+    row = line_diagnosis().row(name)
+    powers = {"measured_nm": 1, "noise_nm2": 2, "covariance_nm2": 2, "error_nm4": 4}
+    residual = row.replayed
+    parts = {key: factor**power * getattr(residual, key) for key, power in powers.items()}
+    return replace(row, replayed=replace(residual, **parts), replayed_nm=factor * row.replayed_nm)
+
+
+def test_sentences_of_a_good_record(good):
+    """All residuals are those on unseen data; of the model there are shares of a variance."""
+    state, residual, advice = good.verdict
+    assert state.startswith("The record is sound: an integrator of gain 0.2 ran, stable at")
+    ran, best, slow = (good.row(name).replayed for name in (RAN, good.best, INTEGRATOR))
+    assert residual.startswith(f"It leaves {ran.text} on unseen data (")
+    start, stop = ran.stretches[0]
+    y = line_record().measurements[start:stop]
+    noise_nm = np.sqrt(ran.noise_nm2[0, 0])
+    measured = f"({np.sqrt(np.mean(y**2)):.3g} nm were measured at this sensor gain, and "
+    assert f"{measured}{noise_nm:.3g} nm are noise)" in residual
+    gain = np.sqrt(np.mean(y**2) / ran.measured_nm2)  # the same as of the first sentence
+    assert gain == pytest.approx(good.model.sensor_gains[0], rel=1e-9)
+    share = (good.costs[0].running_nm / good.costs[-1].running_nm) ** 2
+    assert f": by the model {100 * share:.0f} % of the {good.costs[0].part}" in residual
+    assert "contradict" not in residual
+    words = f"First change the controller: the {good.best} leaves {best.text} on unseen data"
+    assert advice.startswith(words)
+    assert advice.endswith(f". The best integrator leaves {slow.text}.")
+    assert good.costs[-1].running_nm == pytest.approx(good.row(RAN).model_nm, rel=1e-6)
+    assert good.costs[-1].best_nm == pytest.approx(good.row(good.best).model_nm, rel=1e-6)
+
+
+def test_data_that_contradict_the_model_of_what_ran(good):
+    residual = verdict_with({RAN: replace(good.row(RAN), model_nm=500.0)})[1]
+    assert residual.endswith("; the data contradict the model, which expects 500 nm.")
+
+
+def test_sentences_of_a_fault(good):
+    channel = replace(good.channels[0], state="stuck (12 %)", faulty=0.12)
+    state, _, advice = verdict_with({}, channels=(channel,))
+    assert state == "The record has faults: the measurement is stuck (12 %)."
+    assert advice == "First look at the measurement, which is stuck (12 %)."
+
+
+def test_what_is_advised(good):
+    name, best = good.best, good.row(good.best)
+    text = best.replayed.text
+    same = f"Change nothing: of all that was tried the {name} leaves least, {text}."
+    assert verdict_with({RAN: best})[2] == same
+    # the integrator leaves more than what ran, and the best design little less
+    rows = {RAN: scaled(name, 1.01), INTEGRATOR: scaled(name, 1.02)}
+    assert verdict_with(rows)[2].startswith("Change nothing: of all")
+    # much better than what ran, but the integrator is not
+    rows = {RAN: scaled(name, 1.5), INTEGRATOR: scaled(name, 1.6)}
+    advice = verdict_with(rows)[2]
+    assert advice.startswith(f"First change the controller: the {name} leaves ")
+    assert text in advice
+    # the gain is what is wrong
+    advice = verdict_with({INTEGRATOR: scaled(name, 1.02)})[2]
+    assert advice.startswith("First change the gain from 0.2 to ")
+    assert advice.endswith(f" on unseen data, the {name} {text}.")
+
+
+def test_a_loop_of_a_law_that_is_late():
+    y, u = run_law(SteppedLaw(np.diag([0.3, 0.2])), frames=3000)
+    found = diagnose(loop_record(y[1:], u[:-1], **LOOP))
+    found = replace(found, commands=replace(found.commands, explanation="as given"))
+    law = "an integrator of gain 0.3, 0.2 ran, 1 frame late."
+    assert found.verdict[0] == f"The record shows no fault, and {law}"
+
+
+def test_of_a_loop_near_its_limit(good):
+    near, wild = (
+        replace(good, loop=replace(good.loop, values={**good.loop.values, **values}))
+        for values in ({"modulus": 0.12}, {"spectral_radius": 1.02})
+    )
+    assert near.verdict[0].endswith(" but with a modulus margin of 0.12 only.")
+    assert "which is UNSTABLE at the sensor gain of" in wild.verdict[0]
+    tones = [each.findings[0].tone for each in (good, near, wild)]
+    assert tones == ["good", "note", "bad"]
+
+
+def test_along_what_a_line_shakes(good):
+    (line,) = disturbance_lines(good.model)
+    assert line_name(line).startswith("line at ")
+    assert line_name(line).endswith(" Hz")
+    assert line_name(replace(line, kind="broad")).startswith("broad resonance at ")
+    assert line_name(replace(line, direction=(0.866, 0.5))).endswith(" Hz along 30 deg")
+    assert line_name(replace(line, direction=(0.0, 1.0))).endswith(" Hz in tilt")
+    (part,) = (row.part for row in good.costs if row.part.startswith("line"))
+    assert f"% of the {part}" in good.verdict[1]
