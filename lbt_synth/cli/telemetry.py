@@ -38,7 +38,10 @@ def run(arguments: Namespace) -> Report:
     else:
         record = loop_records.require_series(loop_records.load_series(arguments), "telemetry holds")
         telemetry = telemetry_of_record(record)
-        notes = [record.health.summary(), *(f"note: {note}" for note in record.health.notes)]
+        notes = [
+            f"note: {record.health.summary()}",
+            *(f"note: {note}" for note in record.health.notes),
+        ]
     choose_unit(arguments, telemetry.diameter_m)
     report = _describe_telemetry(telemetry)
     report.data["file"] = arguments.file
