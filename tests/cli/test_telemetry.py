@@ -138,7 +138,7 @@ def test_a_record_is_read_once(tmp_path, capsys, recorded_loop):
         models.append(model.read_text().split("\n", 1)[1])
         gain = tmp_path / f"{name}.fits"
         status, text, _ = run(
-            capsys, "auto", *options, "-o", gain, "--no-figure", "--method", "kalman"
+            capsys, "auto", "--verbose", *options, "-o", gain, "--no-figure", "--method", "kalman"
         )
         assert status == 0
         assert "assumes: the commands of the record were read with --command-sign -1" in text
@@ -149,7 +149,7 @@ def test_a_record_is_read_once(tmp_path, capsys, recorded_loop):
     status, text, _ = run(capsys, "diagnose", night)
     assert status == 0
     assert "The record is sound" in text
-    status, text, _ = run(capsys, "telemetry", night)
+    status, text, _ = run(capsys, "telemetry", "--verbose", night)
     assert status == 0
     assert "--command-sign -1 --command-scale 2" in text
 
