@@ -1,16 +1,17 @@
 """Run the commands of the pages again, and hold what they print against the pages.
 
     python benchmarks/console_blocks.py docs/tutorial.md            # prints the lines that differ
-    python benchmarks/console_blocks.py --write docs/tutorial.md    # and corrects their numbers
+    python benchmarks/console_blocks.py --write docs/tutorial.md    # and corrects them
 
 Pages share a folder: those whose files other pages need come first.
-Lines that have the same words are compared; the numbers may be others. Lines with words that no
-command prints are named, and left as they are.
+A block whose lines have words that are printed gets the numbers of today; one with words that no
+command prints gets all that lbt-synth prints.
 """
 
 from __future__ import annotations
 
 import argparse
+import difflib
 import re
 import shlex
 import subprocess
@@ -38,6 +39,8 @@ def distance(one: str, other: str) -> float:
 def printed(command: str, folder: Path) -> list[str]:
     """Run a command of a page, and return the lines that it prints."""
     words = shlex.split(command)
+    if not words:
+        return []
     if words[0] == "lbt-synth":
         words = [sys.executable, "-m", "lbt_synth.cli.main", *words[1:]]
     elif words[0] == "python":
@@ -45,34 +48,50 @@ def printed(command: str, folder: Path) -> list[str]:
     else:
         return []
     done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False)
-    return [line.rstrip() for line in (done.stdout + done.stderr).splitlines() if line.strip()]
+    text = (done.stdout + done.stderr).strip("\n")
+    return [line.rstrip() for line in text.splitlines()]
+
+
+def renewed(command: str, shown: list[str], folder: Path) -> list[str]:
+    """Return what a page shows of a command, with the numbers or all the lines of today.
+
+    A block whose words are all printed keeps its lines, and may leave some out.
+    """
+    found = printed(command, folder)
+    if not found or not shown:
+        return shown
+    out, pool = [], list(found)
+    for line in shown:
+        same = [i for i, new in enumerate(pool) if shape(new) == shape(line)]
+        if not same and re.search(r"\w", line):
+            return found if command.startswith("lbt-synth") else shown
+        new = pool.pop(min(same, key=lambda i: distance(line, pool[i]))) if same else line
+        out.append(new if distance(line, new) > TOLERANCE else line)
+    return out
 
 
 def corrected(page: Path, folder: Path) -> list[str]:
-    """Return the lines of a page with the numbers of today, and print those that differ."""
+    """Return the lines of a page with what is printed today, and print those that differ."""
     lines = page.read_text().splitlines()
-    out, found, inside, command = [], [], False, ""
-    for number, line in enumerate(lines, start=1):
+    out, shown, inside, command = [], [], False, ""
+    for line in [*lines, "```"]:
+        begins = inside and line.startswith("$ ")
+        if inside and (begins or line.startswith("```")) and not command.endswith("\\"):
+            today = renewed(command, shown, folder)
+            if today != shown:
+                changes = difflib.unified_diff(shown, today, page.name, command, lineterm="", n=0)
+                print(*changes, sep="\n")
+            out += today
+            shown, command = [], ""
         if line.startswith("```"):
             inside = line.startswith("```console")
-            found = []
-        elif inside and (command or line.startswith("$ ")):
-            command += line.removeprefix("$ ")
-            if command.endswith("\\"):  # goes on in the next line
-                command = command[:-1]
-            else:
-                found, command = printed(command, folder), ""
-        elif inside and line.strip():
-            same = [i for i, new in enumerate(found) if shape(new) == shape(line)]
-            if same:  # a page may leave lines out
-                new = found.pop(min(same, key=lambda i: distance(line, found[i])))
-                if distance(line, new) > TOLERANCE:
-                    print(f"{page.name}:{number}\n  - {line}\n  + {new}")
-                    line = new
-            elif found and re.search(r"\w", line):
-                print(f"{page.name}:{number} is not printed\n  - {line}")
+        elif begins or command.endswith("\\"):
+            command = command.removesuffix("\\") + line.removeprefix("$ ")
+        elif inside:
+            shown.append(line)
+            continue
         out.append(line)
-    return out
+    return out[:-1]
 
 
 def main() -> None:

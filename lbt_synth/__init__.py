@@ -1,14 +1,30 @@
 """Certified convex synthesis of tip/tilt controllers for adaptive optics.
 
-The names of a design script and the rooms are listed in ``__init__.pyi`` and are imported when
-first used, so that ``import lbt_synth`` costs nothing.
+A design script takes these names; ``help(lbt_synth.kalman)`` explains one:
+
+- plants: LoopHardware, Atmosphere, Vibration, Truth, tip_tilt_plant, EstimationProblem, load_config
+- designs: kalman, hinf, mixed, lqg, robust, integrator, and h2_controller, hinf_controller and
+  mixed_controller for any plant; Design, Controller, solve_dare, hinf_norm
+- loops: close_loop, loop_margins, residual_budget, simulate, strehl, Imaging
+- records: load_record, identify, design_from_record
+- files: save_gain, load_gain
+
+The rooms hold the rest: config, design, errors, files, identification, interop, linear, loop,
+models, report, studies. ``lbt-synth`` does all of it at the terminal, and
+``python -m lbt_synth --help`` lists its commands. Names are imported when first used, so that
+``import lbt_synth`` costs nothing.
+
+    >>> import lbt_synth as lbt
+    >>> loop = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    >>> lbt.integrator(loop, gain=0.5).certificate.passed
+    True
 """
 
 __version__ = "0.3.0"
 
 
 def _read_names():
-    """Return what looks names up, lists them for ``dir``, and lists them for ``import *``."""
+    """Return what looks names up, and what lists them for ``dir``."""
     known = globals()
     if "_names" not in known:
         import lazy_loader
@@ -23,11 +39,8 @@ def __dir__():
 
 def __getattr__(name):
     """Import a name when it is first used, or say in which room it is."""
-    import_lazily, _, names = _read_names()
-    if name == "__all__":
-        return names
     try:
-        return import_lazily(name)
+        return _read_names()[0](name)
     except AttributeError:
         room = None if name.startswith("_") else _find_room(name)
         if room is None:

@@ -5,6 +5,7 @@ import doctest
 import importlib
 import inspect
 import pkgutil
+import pydoc
 import re
 from pathlib import Path
 
@@ -31,6 +32,7 @@ def public_names(path):
     return sorted(n for n in room(path).__all__ if not inspect.ismodule(getattr(room(path), n)))
 
 
+FACE = [name for name in dir(lbt) if not name.startswith("_")]
 NAMES = [f"{path}.{name}" for path in ROOMS for name in public_names(path)]
 
 
@@ -49,18 +51,25 @@ def listed(stub):
 
 
 def test_the_face_has_at_most_forty_four_names():
-    assert len([name for name in dir(lbt) if not name.startswith("_")]) <= 44
-    assert listed(Path(lbt.__file__).with_suffix(".pyi")) == set(lbt.__all__)
-    for name in lbt.__all__:
+    assert len(FACE) <= 44
+    assert listed(Path(lbt.__file__).with_suffix(".pyi")) == set(FACE)
+    for name in FACE:
         thing = getattr(lbt, name)
         if not inspect.ismodule(thing):  # and is one that its room shows
             assert any(thing is public(other) for other in NAMES), name
 
 
+def test_help_is_a_page_with_every_name():
+    text = pydoc.render_doc(lbt, renderer=pydoc.plaintext)
+    assert len(text.splitlines()) < 80
+    words = set(re.findall(r"\w+", lbt.__doc__))
+    assert [name for name in FACE if name not in words and name != "LbtSynthError"] == []
+
+
 @pytest.mark.parametrize("path", ROOMS)
 def test_a_name_that_is_in_a_room_is_pointed_to(path):
     for name in public_names(path):
-        if name not in lbt.__all__:
+        if name not in FACE:
             with pytest.raises(AttributeError, match=rf"try lbt_synth\.{path}\.{name}\."):
                 getattr(lbt, name)
 

@@ -1,14 +1,27 @@
-"""The arguments of each command, declared apart from what runs it so that help stays quick.
+"""All commands with their arguments, in one table, and the parser that is made from it.
 
-The docstring of a function that adds the arguments of a command is the help of the command.
+The table is apart from what runs the commands so that help stays quick. Without an indent stands a
+group of commands, with an indent of two a command, the module that runs it and its help, and with
+an indent of four an argument: its flags, how it is read, and its help, between bars. A deeper line
+goes on with the one before. An argument is read as a type, a default (``=``), ``nargs:``, ``meta:``
+and ``dest:`` as in argparse, ``repeat`` for values of an option that is given again, and ``/`` or
+``@`` for choices. Names without bars are blocks that commands share. A line that begins with ``>``
+opens a group of arguments; those of ``> one of`` exclude each other, and ``>`` alone ends it.
 """
 
 from __future__ import annotations
 
-from argparse import Action, ArgumentParser, Namespace, _ActionsContainer
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+import argparse
+import re
+from argparse import Action, ArgumentParser, Namespace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, cast, get_args, get_origin
 
+import lbt_synth
+from lbt_synth.cli.streams import printable
+from lbt_synth.errors import suggest_word
 from lbt_synth.storage.display_unit import M_S2, UNITS
 
 if TYPE_CHECKING:  # slow to import for --help
@@ -16,77 +29,264 @@ if TYPE_CHECKING:  # slow to import for --help
 
     from lbt_synth.methods.method import Method
 
-_LIMITS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
-GAIN_FILE = "gain file (.fits or .npz)"
-FIGURE = "figure (.png, .pdf or .svg)"
-_SHARED: Mapping[str, dict[str, Any]] = {
-    "config": {"help": "configuration file (YAML)"},
-    "gain": {"help": GAIN_FILE},
-    "--unit": {
-        "choices": UNITS,
-        "help": "what tables, figures and pages show wavefronts in (default nm; JSON and CSV stay "
-        "in nm)",
-    },
-    "--output": {
-        "action": "append",
-        "default": [],
-        "help": "table (.csv) or figure (.png, .pdf, .svg); repeatable",
-    },
-    "--pdf": {"metavar": "FILE", "help": "write the same as a PDF, too (.pdf)"},
-    "--jobs": {"type": int, "default": 1, "help": "processes (default 1)"},
-    "--stroke": {"type": float, "help": "largest command that the mirror applies [nm]"},
-    "--wavelength-um": {"type": float, "help": "of Strehl ratios (default: the file's, or 2.2)"},
+_SHARED = """
+  config | config | | configuration file (YAML)
+  gain | gain | | gain file (.fits or .npz)
+  gains | gains | nargs:* meta:gain | gain files (.fits or .npz)
+  gains+ | gains | nargs:+ meta:gain | gain files (.fits or .npz)
+  unit | --unit | @units | of wavefronts (default: the configuration's, else nm; JSON has nm)
+  outputs | -o --output | repeat | table (.csv) or figure (.png, .pdf, .svg); repeatable
+  pdf | --pdf | meta:FILE | write the same as a PDF, too (.pdf)
+  jobs | --jobs | int =1 | processes
+  stroke | --stroke | float | largest command that the mirror applies [nm]
+  wavelength | --wavelength-um | float | of Strehl ratios (default: the file's, or 2.2)
+  target | --for | @targets nargs:? meta:NAME dest:target required target | the program
+        that loads the file; without NAME, list what each computes
+  reading
+    > reading the record: what its file does not say, and what its commands need, in this order,
+        to be those that the mirror followed; what lbt-synth telemetry -o writes says all of it
+    --kind | closed-loop/open-loop/spectrum
+    --frame-rate-hz | float | frame rate [Hz]
+    --delay-frames | float | total delay [frames]
+    --unit | | of the measurements: nm, um, m, mas, arcsec, urad, rad; results are shown in it, too
+    --show-unit | @units | what results are shown in (JSON and CSV stay in nm)
+    --command-unit | | of the commands (default: --unit)
+    --diameter-m | float | telescope diameter [m], for angles
+    --obstruction | float | as a fraction of the diameter
+    --averages | int | periodograms that a spectrum is the mean of
+    --commands | | another file, with the commands
+    --columns | nargs:+ meta:ROLE=NAME | by name or number, as measurements=tip,tilt times=
+    --axes | int nargs:+ | which of several columns or modes, from 0
+    --sensor-gain | float nargs:+ | sensor gain that is known, of both axes or of each
+    --command-increments | switch | they are increments: add them up
+    --command-shift-frames | int =0 | frames by which they move to later frames
+    --swap-axes | switch | exchange those of the two axes
+    --command-sign | int nargs:+ | 1 or -1, of both axes or of each
+    --command-matrix | float nargs:+ meta:NUMBER | to the axes of the measurements, row after row
+    --command-scale | float nargs:+ | factor, of both axes or of each; 1: as large as applied
+  series
+    file | | telemetry, or FITS, NPY, NPZ or CSV with what a loop measured and commanded, or an
+        open-loop series (identify: or a spectrum)
+    reading
+    > what is known beforehand
+    --noise-nm | float nargs:+ | noise per frame of the sensor [nm], beside a spectrum without
+    --lines-hz | float nargs:+ | frequencies of vibrations [Hz]
+    --lines-error-hz | float =0.1 | standard error of --lines-hz [Hz]
+    --lines-file | | text file with one frequency per row [Hz]
+    --lowest-line-hz | float =3 | what is below counts as turbulence [Hz]
+    --most-lines | int =20 | most vibrations per axis
+    >
+    wavelength
+  record
+    series
+    --accept-record | switch | go on although the commands do not reach the measurements as given
+    --figure | | figure to write (default: the output's name, .png)
+    --no-figure | switch | write no figure
+  accelerometers
+    > accelerometers
+    --accelerometers | | NPY or CSV with one column per channel and one row per frame of the record
+    --accelerometer-rate-hz | float | their rate [Hz] (default: the file's, or the frame rate)
+    --acceleration-unit | @accelerations meta:UNIT | m/s2, mm/s2, um/s2, g, mg (default: of
+        the headings, else m/s2)
+"""
+_TABLE = """
+start: a configuration to begin with
+  init | init | Write a commented configuration to begin with, a schema or a script for the shell.
+    --telescope | @telescopes | published numbers and their sources (default generic: assumed ones)
+    --from | meta:RECORD dest:source | telemetry, for all that it knows of its loop
+    --examples | switch | write the examples of the documentation instead (folder)
+    --schema | switch | print the JSON schema for editors instead (.json)
+    --completion | bash/zsh/fish | print the script with which a shell completes commands instead
+    --force | switch | replace files that are there
+    -o --output | | file to write (default: telescope or record, .yaml)
+design: from a configuration to a gain file
+  design | design | Design a controller and write its gain file.
+    unit config method
+    -o --output | required | gain file (.fits or .npz)
+look: what a design does in the loop, and what could be better
+  compare | comparisons | Compare gain files in the loop of a configuration, one line each.
+    unit config gains+ outputs
+  plot | plot | Plot loops of one or several designs in a classical view, and print their margins.
+    unit
+    kind | sigma/bode/nyquist/nichols/step | the view: sigma has the largest singular values,
+        step the residual and the command after a step
+    gains+
+    --gain-factor | float =1 | factor on the sensor gain that each design assumes
+    outputs
+  simulate | simulate | Close the loop in the time domain, beside the exact answer.
+    unit config gains+
+    --frames | int | frames to keep
+    --cases | int | independent runs
+    --seed | int | seed of the random series
+    --sensor-gain | float | real sensor gain
+    stroke
+    --drop | repeat meta:SENSOR@START[..END][:READING] | a sensor or channel that fails [s], as in
+        m2@10s or wavefront@20s..20.2s; READING missing (seen, default), zero or frozen (believed)
+    --form | plain/estimator | of the controller: plain assumes that commands are applied, estimator
+        is given those that were (default plain)
+    -o --output | | figure (.png, .pdf or .svg)
+    --telemetry | meta:FILE | write the first run (.fits, .npz)
+  report | pages | Write a page about designs in the loop of a configuration.
+    unit config gains+
+    --title | | heading of the page (default: names the configuration)
+    pdf
+    -o --output | required | page to write, one file that opens offline (.html)
+  explore | pages | Open a page of sliders in the browser, beside designs.
+    unit config gains
+    --host | =localhost | to serve at (default localhost: this machine only; others can write files)
+    --port | int =5006 | port to serve at, 0 for any that is free
+    --origin | repeat meta:HOST:PORT | under which a tunnel reaches the page; repeatable
+    -o --output | =. | directory that the page saves into (default: this one)
+  limits | comparisons | Show how far designs are from the least residual of any linear controller.
+    unit config gains outputs
+  robustness | comparisons | Compute the Strehl ratio against an error of all vibration frequencies:
+        that of filters redesigned at each error, or of gain files at many sensor gains.
+    unit config gains
+    > without gain files
+    --gamma-ratio | float | H-infinity bound of each row
+    --sensor-gain | float | real sensor gain
+    > with gain files
+    --errors-hz | float nargs:3 meta:LOW,HIGH,COUNT | true frequency less that of the design, of the
+        line that moves most [Hz]: COUNT values (default: the configuration's)
+    --sensor-gains | float nargs:3 meta:LOW,HIGH,COUNT | real sensor gain: COUNT values (default:
+        the configuration's)
+    --delay-errors | float nargs:+ meta:FRAMES dest:delay_errors_frames | real delay less that of
+        the design [frames] (default: the configuration's, else 0)
+    >
+    outputs
+  tradeoff | comparisons | Design filters from the least norm to the least variance.
+    unit config
+    --points | int =9 | levels of the norm, at least 2, from the least to the Kalman filter's
+    --taps | int =16 | past innovations that the mixed filters weigh, 1 to 64
+    outputs
+  study | study | Try controllers on many samples of what the loop may meet; resumes.
+    unit
+    study | meta:file | study file (YAML)
+    -o --output | required | directory of the study
+    > one of
+    jobs
+    --dask | meta:ADDRESS | Dask scheduler, as tcp://host:8786; it can run code here: trust it
+    >
+    --dask-tls | nargs:3 meta:CA,CERT,KEY | files for a scheduler at tls://host:8786
+    --pdf | switch | write the page as a PDF, too (summary.pdf)
+    > one of
+    --dry-run | switch | say how many samples and how long, and write nothing
+    --row | int | recompute one row, and write it as a configuration
+  mirror | comparisons | Show how the mirror settles, and what ignoring its dynamics costs.
+    unit config
+    --tolerance | float =0.1 | half width of the band in which the mirror counts as settled
+    outputs
+  modal | modal | Compare integrators, optimised gains and Kalman filters for all modes.
+    unit config
+    --modes | int | number of modes, at least 2 (default: mirror.modes)
+    outputs
+prove: what a gain file holds, and whether it is true
+  show | design | Show a gain file: design, loop, margins, certificate.
+    unit gain
+    --matrices | switch | print the gains and the controller, too
+  verify | design | Recompute the certificate of a gain file.
+    gain
+records: from what a loop recorded to a model and a design
+  telemetry | telemetry | Show what telemetry or a record holds, and write it as telemetry.
+    file | | telemetry, or a record of series (FITS, NPY, NPZ or CSV)
+    reading
+    >
+    -o --output | | file to write (.fits, .npz or .aot.fits)
+    --format | fits/npz/aot | of the file to write (default: its ending)
+    --precision | float64/float32 | of the series written (default float64)
+  identify | records | Identify turbulence, vibrations, noise and sensor gain from a record.
+    record accelerometers
+    >
+    -o --output | required | configuration to write (.yaml)
+  auto | records | Go from a record to a gain file: identify, design, certify, test on unseen data.
+    record accelerometers
+    >
+    --method | @record_methods | default: kalman, unless another quick one leaves less
+    --gamma-ratio | float | bound of the norm as a multiple of the least (default 1.2)
+    --model | | configuration to write (default: the output's name, .yaml)
+    -o --output | required | gain file (.fits or .npz)
+  diagnose | records | Say what ran in a record, what is wrong, what it costs, and what to change.
+    series
+    gain | nargs:? | gain file (.fits or .npz) to try on the record
+    -o --output | | page to write, one file that opens offline (.html)
+    pdf
+at the telescope: a gain file in another program
+  export | targets | Write the controller of a gain file for a real-time computer.
+    gain target
+    --form | plain/estimator | c: as of simulate (default plain)
+    --precision | double/single | c: type of all numbers (default double)
+    --name | | c: prefix of the C names (default: the output's name without its ending)
+    --order | int | dao: M of the RTC's configuration (default 20)
+    --modes | int | c, cacao, dao, pyrtc: modes of the RTC (default: those of the design)
+    --other-gain | float | gain of an integrator for each further mode (default: none)
+    --steps | int | cacao: frames of history (default: as many as the loss needs)
+    --loss | float | cacao: loss of residual that chooses them (default 0.01, the most)
+    -o --output | required | file to write: .c (the .h goes beside it), .mat, .fits or .npy, and its
+        certificate; pyrtc: folder
+  rehearse | targets | Run a gain file in the arithmetic of another program, in the loop.
+    file | nargs:? meta:record | what a loop recorded (default: a draw of the file's truth)
+    gain target reading
+    >
+    stroke
+    --frames | int | frames to draw where there is no record (default 8000)
+    --seed | int =1 | seed of what is drawn
+    wavelength
+    -o --output | | figure (.png, .pdf or .svg)
+the paper and the simulator: Agapito et al. 2008, and loops with a pyramid
+  paper | paper | Compute the tables and figures of Agapito et al. 2008, ours beside theirs.
+    unit
+    -o --output | required | directory to write into
+  end-to-end | end_to_end | Close the loop end to end: pyramid, mirror and moving air.
+    unit config
+    gains | nargs:* meta:gain | the gain file to run, or several beside the paper's filters
+    --pixels | int | pixels across the pupil, even
+    --frames | int | frames of an exposure
+    --settle-frames | int | frames to settle before, at least 200
+    --seed | int | seed of the random parts, the first of several
+    --cache | | directory for calibrations and phase screens
+    -o --output | required | directory to write into
+    > for tables of the paper
+    --tables | II/III nargs:+ | run these tables of the paper instead of one gain file
+    jobs
+    --seeds | int =3 | seeds of Table II and of 20 Hz
+    --row-seeds | int =1 | seeds of the other rows
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Command:
+    """A command: its group in the help, the module that runs it, its help, and its arguments."""
+
+    group: str
+    module: str
+    text: str
+    arguments: Sequence[str]
+
+
+def _blocks(table: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield what is indented least or by two, each with the lines that are indented by four."""
+    lines = re.sub(r"\n {8,}", " ", table).strip("\n")  # deeper lines go on
+    for block in re.split(r"\n(?!    )", lines):
+        title, *arguments = block.split("\n")
+        yield title, [argument.strip() for argument in arguments]
+
+
+def _read_commands() -> Iterator[tuple[str, Command]]:
+    """Yield the names of the commands and what the table says of them."""
+    group = ""
+    for title, arguments in _blocks(_TABLE):
+        if title.startswith(" "):
+            name, module, text = title.strip().split(" | ")
+            yield name, Command(group=group, module=module, text=text, arguments=arguments)
+        else:
+            group = title
+
+
+_BLOCKS = {
+    title.split()[0]: [title.partition(" | ")[2]] if "|" in title else arguments
+    for title, arguments in _blocks(_SHARED)
 }
-
-
-def add_shared(parser: _ActionsContainer, *names: str) -> None:
-    """Add arguments that are the same in several commands."""
-    for name in names:
-        flags = ("-o", name) if name == "--output" else (name,)
-        parser.add_argument(*flags, **_SHARED[name])
-
-
-def add_option(
-    parser: _ActionsContainer,
-    name: str,
-    kind: type[Any] | Sequence[str],
-    text: str = "",
-    default: float | None = None,
-    **more: Any,
-) -> None:
-    """Add an option of a type or of some choices; its help ends with its default."""
-    if default is not None:
-        text += f" (default {default:g})"
-    more |= {"type": kind} if isinstance(kind, type) else {"choices": kind}
-    parser.add_argument(name, help=text, default=default, **more)
-
-
-def add_switch(parser: _ActionsContainer, name: str, text: str) -> None:
-    """Add an option without a value."""
-    parser.add_argument(name, action="store_true", help=text)
-
-
-def option_name(argument: str) -> str:
-    """Return an option as people write it, by the name of its argument."""
-    return f"--{argument.replace('_', '-')}"
-
-
-def given_options(arguments: Namespace, *names: str) -> dict[str, Any]:
-    """Return the options of those names that the command line gives."""
-    return {name: value for name in names if (value := getattr(arguments, name)) is not None}
-
-
-def add_gains(parser: ArgumentParser, nargs: str = "*", text: str = GAIN_FILE) -> None:
-    """Add gain files."""
-    # without a default, argparse calls them required
-    parser.add_argument("gains", nargs=nargs, metavar="gain", help=text, default=[])
-
-
-def add_output(
-    parser: ArgumentParser, text: str, *, required: bool = True, default: str | None = None
-) -> None:
-    """Add one output."""
-    parser.add_argument("-o", "--output", required=required, default=default, help=text)
+COMMANDS = dict(_read_commands())
 
 
 class TargetChoice(Action):
@@ -105,52 +305,129 @@ class TargetChoice(Action):
         from lbt_synth.storage.rows import fact_table
 
         targets = {name: target_named(name) for name in target_names()}
-        Report(
-            tables=[
-                fact_table(f"{name}: {target.file}", target.arithmetic)
-                for name, target in targets.items()
-            ]
-        ).print(as_json=False)
+        tables = [
+            fact_table(f"{name}: {target.file}", target.arithmetic)
+            for name, target in targets.items()
+        ]
+        Report(tables=tables).print(verbose=True)
         parser.exit()
 
 
-def init(parser: ArgumentParser) -> None:
-    """Write a commented configuration to begin with."""
+def _targets() -> Sequence[str]:
+    from lbt_synth.interop.pipeline import target_names
+
+    return target_names()
+
+
+def _telescopes() -> Sequence[str]:
     from lbt_synth.config.load import telescope_names
 
-    text = "published numbers and their sources (default generic: assumed ones)"
-    add_option(parser, "--telescope", telescope_names(), text)
-    text = "telemetry, for what it knows: timing, telescope, noise, turbulence and lines"
-    add_option(parser, "--from", str, text, dest="source", metavar="RECORD")
-    add_switch(parser, "--examples", "write the examples of the documentation instead (folder)")
-    add_switch(parser, "--schema", "print the JSON schema for editors instead (.json)")
-    add_switch(parser, "--force", "replace files that are there")
-    add_output(parser, "file to write (default: telescope or record, .yaml)", required=False)
+    return telescope_names()
 
 
-def design(parser: ArgumentParser) -> None:
-    """Design a controller and write its gain file."""
-    add_shared(parser, "--unit", "config")
-    _add_method_options(parser)
-    add_output(parser, GAIN_FILE)
+def _record_methods() -> Sequence[str]:
+    from lbt_synth.methods.registry import record_methods
+
+    return record_methods()
+
+
+_CHOICES: Mapping[str, Callable[[], Sequence[str]]] = {
+    "units": lambda: UNITS,
+    "accelerations": lambda: tuple(M_S2),
+    "targets": _targets,
+    "telescopes": _telescopes,
+    "record_methods": _record_methods,
+}
+_TYPES: Mapping[str, type[Any]] = {"int": int, "float": float}
+
+
+def _add_arguments(parser: ArgumentParser, rows: Sequence[str]) -> None:
+    """Add the arguments of a command or of a block."""
+    place: Any = parser
+    for row in rows:
+        if row.startswith(">"):
+            title, _, text = row[1:].strip().partition(": ")
+            if title == "one of":
+                place = parser.add_mutually_exclusive_group()
+            else:
+                place = parser.add_argument_group(title, text or None) if title else parser
+        elif "|" in row:
+            flags, how, text = (cell.strip() for cell in f"{row} | ".split("|", 2))
+            place.add_argument(*flags.split(), **_keywords(how, text.rstrip(" |")))
+        else:
+            for name in row.split():
+                if name == "method":
+                    _add_method_options(parser)
+                else:
+                    _add_arguments(place, _BLOCKS[name])
+
+
+def _keywords(how: str, text: str) -> dict[str, Any]:
+    """Return what argparse is given for an argument."""
+    keywords: dict[str, Any] = {"help": text}
+    default = None
+    for word in how.split():
+        key, _, value = word.partition(":")
+        if word in _TYPES:
+            keywords["type"] = _TYPES[word]
+        elif word == "switch":
+            keywords["action"] = "store_true"
+        elif word == "repeat":
+            keywords |= {"action": "append", "default": []}
+        elif word == "required":
+            keywords["required"] = True
+        elif word == "target":
+            keywords["action"] = TargetChoice
+        elif word.startswith("="):
+            default = word[1:]
+        elif word.startswith("@"):
+            keywords["choices"] = _CHOICES[word[1:]]()
+        elif key == "nargs":
+            keywords["nargs"] = int(value) if value.isdecimal() else value
+            if value == "*":  # without a default, argparse calls them required
+                keywords["default"] = []
+        elif key == "meta":
+            names = tuple(value.split(","))
+            keywords["metavar"] = names if len(names) > 1 else value
+        elif key == "dest":
+            keywords["dest"] = value
+        else:
+            keywords["choices"] = tuple(word.split("/"))
+    if default is not None:
+        keywords["default"] = keywords.get("type", str)(default)
+        if "type" in keywords:
+            keywords["help"] += f" (default {default})"
+    return keywords
+
+
+def option_name(argument: str) -> str:
+    """Return an option as people write it, by the name of its argument."""
+    return f"--{argument.replace('_', '-')}"
+
+
+def given_options(arguments: Namespace, *names: str) -> dict[str, Any]:
+    """Return the options of those names that the command line gives."""
+    return {name: value for name in names if (value := getattr(arguments, name)) is not None}
+
+
+_LIMITS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 
 
 def _add_method_options(parser: ArgumentParser) -> None:
     """Add ``--method`` and the options of all methods; each method checks its own."""
     from lbt_synth.methods.registry import METHODS, option_names
 
-    methods = METHODS
     parser.add_argument(
         "--method",
-        choices=tuple(methods),
+        choices=tuple(METHODS),
         required=True,
         help="; ".join(
             name if name == method.title else f"{name}: {method.title}"
-            for name, method in methods.items()
+            for name, method in METHODS.items()
         ),
     )
     for name in option_names():
-        owners = [method for method in methods.values() if name in method.options.model_fields]
+        owners = [method for method in METHODS.values() if name in method.options.model_fields]
         helps: dict[str, list[str]] = {}
         for method in owners:
             helps.setdefault(_help_text(method, name), []).append(method.name)
@@ -182,17 +459,17 @@ def _help_text(method: Method, name: str) -> str:
     """Return the description of an option with its choices or its range, and its default."""
     option = method.options.model_fields[name]
     choices = _choices(option)
-    limits = {
-        end: getattr(limit, end)
+    limits = [
+        f"{word} {getattr(limit, end):g}"
         for limit in option.metadata
-        for end in _LIMITS
+        for end, word in _LIMITS.items()
         if getattr(limit, end, None) is not None
-    }
+    ]
     text = option.description or ""
     if choices and not all(choice in text for choice in choices):
         text += f", {' or '.join(choices)}"
     if limits:
-        text += f", {' and '.join(f'{_LIMITS[end]} {limit:g}' for end, limit in limits.items())}"
+        text += f", {' and '.join(limits)}"
     if option.is_required() or option.default is None:
         return text
     if name in method.configurable:
@@ -200,368 +477,82 @@ def _help_text(method: Method, name: str) -> str:
     return f"{text} (default {option.default})"
 
 
-def show(parser: ArgumentParser) -> None:
-    """Show a gain file: design, loop, margins, certificate."""
-    add_shared(parser, "--unit", "gain")
-    add_switch(parser, "--matrices", "print the gains and the controller")
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line: what is wrong, what was meant, and where help is."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print what is wrong with the words, without control characters; exit with status 2."""
+        strange = message.removeprefix("unrecognized arguments: ")
+        if strange != message and (options := _option_strings(self)):
+            message += f"; {suggest_word(strange.split()[0].partition('=')[0], options)}"
+        self.exit(2, f"{self.prog}: error: {printable(message)} (see {self.prog} --help)\n")
+
+    def _check_value(self, action: argparse.Action, value: object) -> None:
+        if action.choices is not None and value not in action.choices:
+            hint = suggest_word(str(value), map(str, action.choices))
+            raise argparse.ArgumentError(action, f"invalid choice {value!r}; {hint}")
 
 
-def verify(parser: ArgumentParser) -> None:
-    """Recompute the certificate of a gain file."""
-    add_shared(parser, "gain")
+def _option_strings(parser: argparse.ArgumentParser) -> list[str]:
+    """Return the options of a parser and of the commands whose arguments it has."""
+    options = [word for word in parser._option_string_actions if word.startswith("--")]
+    commands = parser._subparsers._group_actions[0].choices if parser._subparsers else None
+    parsers = commands.values() if isinstance(commands, dict) else ()
+    return list(dict.fromkeys(options + [w for inner in parsers for w in _option_strings(inner)]))
 
 
-def export(parser: ArgumentParser) -> None:
-    """Write the controller of a gain file for a real-time computer or another program."""
-    add_shared(parser, "gain")
-    _add_target(parser)
-    types = ("double", "single")
-    _add_form(parser, "c")
-    text = "c: type of all numbers (default double)"
-    add_option(parser, "--precision", types, text)
-    text = "c: prefix of the C names (default: the output's name without its ending)"
-    add_option(parser, "--name", str, text)
-    add_option(parser, "--order", int, "dao: M of the RTC's configuration (default 20)")
-    text = "c, cacao, dao, pyrtc: modes of the RTC (default: those of the design)"
-    add_option(parser, "--modes", int, text)
-    text = "the same: gain of an integrator for each further mode (default: no command)"
-    add_option(parser, "--other-gain", float, text)
-    text = "cacao: frames of history (default: as many as the loss needs)"
-    add_option(parser, "--steps", int, text)
-    text = "cacao: relative loss of residual that chooses them (default 0.01, the most)"
-    add_option(parser, "--loss", float, text)
-    text = "file to write: .c (the .h goes beside it), .mat, .fits or .npy, and its certificate; "
-    text += "pyrtc: folder"
-    add_output(parser, text)
-
-
-def _add_form(parser: ArgumentParser, whose: str) -> None:
-    text = "plain assumes that commands are applied, estimator is given those that were"
-    add_option(parser, "--form", ("plain", "estimator"), f"{whose}: {text} (default plain)")
-
-
-def rehearse(parser: ArgumentParser) -> None:
-    """Run a gain file in the arithmetic of another program, in the loop, on a record."""
-    add_shared(parser, "gain")
-    _add_target(parser)
-    text = "what a loop recorded (default: a disturbance drawn from the file's own truth)"
-    add_option(parser, "--record", str, text, metavar="FILE", dest="file")
-    _add_reading(parser)
-    add_shared(parser, "--stroke")
-    add_option(parser, "--frames", int, "frames to draw where there is no record (default 8000)")
-    add_option(parser, "--seed", int, "seed of what is drawn", 1)
-    add_shared(parser, "--wavelength-um")
-    add_output(parser, FIGURE, required=False)
-
-
-def _add_target(parser: ArgumentParser) -> None:
-    from lbt_synth.interop.pipeline import target_names
-
-    text = "the program that loads the file; without NAME, list what each computes, and end"
-    add_option(
-        parser,
-        "--for",
-        target_names(),
-        text,
-        action=TargetChoice,
-        nargs="?",
-        required=True,
-        dest="target",
-        metavar="NAME",
+def build_parser(*named: str) -> argparse.ArgumentParser:
+    """Build the parser of all commands, with the arguments of those that are named."""
+    parser = Parser(
+        prog="lbt-synth",
+        description="Design, certify and analyse tip/tilt controllers that reject vibrations.",
+        epilog=f"{_list_commands()}\n\nExit status: 0 done, 1 a design or verification failed, 2 "
+        "wrong usage or input.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-
-
-def plot(parser: ArgumentParser) -> None:
-    """Plot loops of one or several designs in a classical view, and print their margins."""
-    add_shared(parser, "--unit")
-    text = (
-        "sigma: largest singular values; bode: gain and phase over frequency; nyquist: loops in "
-        "the complex plane; nichols: gain over phase; step: residual and command after a step"
+    parser.add_argument("--version", action="version", version=f"lbt-synth {lbt_synth.__version__}")
+    commands = parser.add_subparsers(
+        dest="command", metavar="COMMAND", required=True, help="one of those below"
     )
-    add_option(parser, "kind", ("sigma", "bode", "nyquist", "nichols", "step"), text)
-    add_gains(parser, "+")
-    text = "factor on the sensor gain that each design assumes, at which the loops are closed"
-    add_option(parser, "--gain-factor", float, text, 1.0)
-    add_shared(parser, "--output")
+    for name, command in COMMANDS.items():
+        # a script for a shell has the commands with a help; the groups list them for the others
+        listed: dict[str, Any] = {"help": command.text} if len(named) > 1 else {}
+        added = commands.add_parser(name, description=command.text, **listed)
+        for flag, text in (
+            ("--json", "print one JSON object instead"),
+            ("--verbose", "print all tables and notes"),
+        ):
+            added.add_argument(flag, action="store_true", help=text)
+        if name in named:
+            _add_arguments(added, command.arguments)
+    return parser
 
 
-def report(parser: ArgumentParser) -> None:
-    """Write a page about designs in the loop of a configuration."""
-    add_shared(parser, "--unit", "config")
-    add_gains(parser, "+")
-    add_option(parser, "--title", str, "heading of the page (default: names the configuration)")
-    add_shared(parser, "--pdf")
-    add_output(parser, "page to write, one file that opens offline (.html)")
+_NAME_WIDTH, _WIDTH = 16, 80  # columns of the names in the list of commands, and of its lines
 
 
-def explore(parser: ArgumentParser) -> None:
-    """Open a page of sliders in the browser, to see designs while the loop and the sky change."""
-    add_shared(parser, "--unit", "config")
-    add_gains(parser, text="gain files to show beside the design of the sliders")
-    text = "name or address to serve at (default localhost: this machine only; others can write "
-    add_option(parser, "--host", str, text + "files with the page)")
-    parser.set_defaults(host="localhost")
-    add_option(parser, "--port", int, "port to serve at, 0 for any that is free", 5006)
-    text = "host:port under which a browser reaches the page through a tunnel; repeatable"
-    parser.add_argument("--origin", action="append", default=[], metavar="HOST:PORT", help=text)
-    text = "directory that the page saves into (default: this one)"
-    add_output(parser, text, required=False, default=".")
+def _list_commands() -> str:
+    """Return the commands in their groups, each with its help."""
+    lines, group = list[str](), ""
+    for name, command in COMMANDS.items():
+        if command.group != group:
+            group = command.group
+            lines += ["", group]
+        lines += wrap(
+            command.text.rstrip("."),
+            _WIDTH,
+            initial_indent=f"  {name:{_NAME_WIDTH - 2}}",
+            subsequent_indent=" " * _NAME_WIDTH,
+        )
+    return "\n".join(lines[1:])
 
 
-def simulate(parser: ArgumentParser) -> None:
-    """Close the loop in the time domain, beside the exact answer."""
-    add_shared(parser, "--unit", "config", "gain")
-    add_option(parser, "--frames", int, "frames to keep")
-    add_option(parser, "--cases", int, "independent runs")
-    add_option(parser, "--seed", int, "seed of the random series")
-    add_option(parser, "--sensor-gain", float, "real sensor gain")
-    add_shared(parser, "--stroke")
-    parser.add_argument(
-        "--drop",
-        action="append",
-        metavar="SENSOR@START[..END][:READING]",
-        help="a sensor or channel that fails [s], as in m2@10s or wavefront@20s..20.2s; READING "
-        "missing (seen, default), zero or frozen (believed)",
-    )
-    _add_form(parser, "of the controller")
-    add_output(parser, FIGURE, required=False)
-    add_option(parser, "--telemetry", str, "write the first run (.fits, .npz)", metavar="FILE")
-
-
-def telemetry(parser: ArgumentParser) -> None:
-    """Show what a telemetry file or a record holds, and write it as telemetry."""
-    parser.add_argument("file", help="telemetry, or a record of series (FITS, NPY, NPZ or CSV)")
-    _add_reading(parser)
-    add_output(parser, "file to write (.fits, .npz or .aot.fits)", required=False)
-    endings = ("fits", "npz", "aot")
-    add_option(parser, "--format", endings, "of the file to write (default: its ending)")
-    types = ("float64", "float32")
-    add_option(parser, "--precision", types, "of the series written (default float64)")
-
-
-def end_to_end(parser: ArgumentParser) -> None:
-    """Close the loop end to end: pyramid, mirror and moving air."""
-    _add_simulator(parser)
-    add_shared(parser, "gain")
-
-
-def end_to_end_table(parser: ArgumentParser) -> None:
-    """Run Tables II and III of Agapito et al. 2008 end to end."""
-    _add_simulator(parser)
-    add_gains(parser, text="gain files to run beside the paper's filters")
-    add_shared(parser, "--jobs")
-    add_option(parser, "--seeds", int, "seeds of Table II and of 20 Hz", 3)
-    add_option(parser, "--row-seeds", int, "seeds of the other rows", 1)
-    parser.add_argument(
-        "--tables", nargs="+", choices=("II", "III"), default=["II", "III"], help="default both"
-    )
-
-
-def _add_simulator(parser: ArgumentParser) -> None:
-    add_shared(parser, "--unit", "config")
-    add_option(parser, "--pixels", int, "pixels across the pupil, even")
-    add_option(parser, "--frames", int, "frames of an exposure")
-    add_option(parser, "--settle-frames", int, "frames to settle before, at least 200")
-    add_option(parser, "--seed", int, "seed of the random parts, the first of several")
-    add_option(parser, "--cache", str, "directory for calibrations and phase screens")
-    add_output(parser, "directory to write into")
-
-
-def _add_reading(parser: ArgumentParser) -> None:
-    """Add what a record's file may not say, and what its commands need."""
-    facts = parser.add_argument_group(
-        "reading the record",
-        "What its file does not say, and what its commands need, in this order, to be those that "
-        "the mirror followed. The telemetry that lbt-synth telemetry -o writes says all of it.",
-    )
-    add_option(facts, "--kind", ("closed-loop", "open-loop", "spectrum"))
-    add_option(facts, "--frame-rate-hz", float, "frame rate [Hz]")
-    add_option(facts, "--delay-frames", float, "total delay [frames]")
-    text = "of the measurements: nm, um, m, mas, arcsec, urad, rad; results are shown in it, too"
-    add_option(facts, "--unit", str, text)
-    add_option(facts, "--show-unit", UNITS, "what results are shown in (JSON and CSV stay in nm)")
-    add_option(facts, "--command-unit", str, "of the commands (default: --unit)")
-    add_option(facts, "--diameter-m", float, "telescope diameter [m], for angles")
-    add_option(facts, "--obstruction", float, "as a fraction of the diameter")
-    add_option(facts, "--averages", int, "periodograms that a spectrum is the mean of")
-    add_option(facts, "--commands", str, "another file, with the commands")
-    text = "columns by name or number from 0, as in measurements=tip,tilt commands=3,4 times="
-    add_option(facts, "--columns", str, text, nargs="+", metavar="ROLE=NAME")
-    add_option(facts, "--axes", int, "which of several columns or modes, from 0", nargs="+")
-    text = "sensor gain that is known, of both axes or of each"
-    add_option(facts, "--sensor-gain", float, text, nargs="+")
-    add_switch(facts, "--command-increments", "the commands are increments: add them up")
-    text = "frames by which the commands move to later frames, or to earlier ones below 0"
-    add_option(facts, "--command-shift-frames", int, text, 0)
-    add_switch(facts, "--swap-axes", "exchange the commands of the two axes")
-    text = "1 or -1 on the commands, of both axes or of each"
-    add_option(facts, "--command-sign", int, text, nargs="+")
-    text = "matrix from the commands to the axes of the measurements, row after row"
-    add_option(facts, "--command-matrix", float, text, nargs="+", metavar="NUMBER")
-    text = "factor on the commands, of both axes or of each; 1 says that they were recorded as "
-    add_option(facts, "--command-scale", float, text + "large as applied", nargs="+")
-
-
-def _add_prior_knowledge(parser: ArgumentParser) -> None:
-    """Add what is known before an identification."""
-    known = parser.add_argument_group("what is known beforehand")
-    text = "noise per frame of the loop's sensor [nm], beside a spectrum that has none"
-    add_option(known, "--noise-nm", float, text, nargs="+")
-    add_option(known, "--lines-hz", float, "frequencies of vibrations [Hz]", nargs="+")
-    add_option(known, "--lines-error-hz", float, "standard error of --lines-hz [Hz]", 0.1)
-    add_option(known, "--lines-file", str, "text file with one frequency per row [Hz]")
-    add_option(known, "--lowest-line-hz", float, "what is below counts as turbulence [Hz]", 3.0)
-    add_option(known, "--most-lines", int, "most vibrations per axis", 20)
-
-
-def _add_series(parser: ArgumentParser) -> None:
-    """Add a record, or a series, and all that it may not say."""
-    parser.add_argument(
-        "file",
-        help="what the loop recorded: telemetry, or FITS, NPY, NPZ or CSV with measurements "
-        "and commands, or an open-loop series (identify: or a spectrum)",
-    )
-    _add_reading(parser)
-    _add_prior_knowledge(parser)
-    add_shared(parser, "--wavelength-um")
-
-
-def _add_record(parser: ArgumentParser) -> None:
-    """Add a record that is fitted, and its figure."""
-    _add_series(parser)
-    text = "go on although the commands do not reach the measurements as given"
-    add_switch(parser, "--accept-record", text)
-    add_option(parser, "--figure", str, "figure to write (default: the output's name, .png)")
-    add_switch(parser, "--no-figure", "write no figure")
-
-
-def identify(parser: ArgumentParser) -> None:
-    """Identify turbulence, vibrations, noise and sensor gain from a record."""
-    _add_record(parser)
-    _add_accelerometers(parser)
-    add_output(parser, "configuration to write (.yaml)")
-
-
-def _add_accelerometers(parser: ArgumentParser) -> None:
-    """Add accelerometers beside a record."""
-    moving = parser.add_argument_group("accelerometers")
-    text = "NPY or CSV with one column per channel and one row per frame of the record"
-    add_option(moving, "--accelerometers", str, text)
-    text = "their rate (default: that of the file's times or header, else the frame rate) [Hz]"
-    add_option(moving, "--accelerometer-rate-hz", float, text)
-    text = f"their unit: {', '.join(M_S2)} (default: that of the headings, else m/s2)"
-    add_option(moving, "--acceleration-unit", tuple(M_S2), text, metavar="UNIT")
-
-
-def auto(parser: ArgumentParser) -> None:
-    """Go from a record to a gain file: identify, design, certify, test on unseen data."""
-    from lbt_synth.methods.registry import default_method, record_methods
-
-    _add_record(parser)
-    _add_accelerometers(parser)
-    text = (
-        f"default: {default_method()}, unless another of the quick ones leaves clearly less of the "
-        "frames after its training"
-    )
-    add_option(parser, "--method", record_methods(), text)
-    text = "norm as a multiple of the least norm, for methods with a bound (default 1.2)"
-    add_option(parser, "--gamma-ratio", float, text)
-    add_option(parser, "--model", str, "configuration to write (default: the output's name, .yaml)")
-    add_output(parser, GAIN_FILE)
-
-
-def diagnose(parser: ArgumentParser) -> None:
-    """Say what ran in a record, what is wrong, what it costs, and what to change first."""
-    _add_series(parser)
-    parser.add_argument("gain", nargs="?", help=f"{GAIN_FILE} to try on the record")
-    add_output(parser, "page to write, one file that opens offline (.html)", required=False)
-    add_shared(parser, "--pdf")
-
-
-def robustness(parser: ArgumentParser) -> None:
-    """Compute the Strehl ratio against an error of all vibration frequencies.
-
-    It is that of filters redesigned at each error, or of the designs of gain files at many sensor
-    gains.
-    """
-    add_shared(parser, "--unit", "config")
-    add_gains(parser)
-    redesigned = parser.add_argument_group("without gain files")
-    add_option(redesigned, "--gamma-ratio", float, "H-infinity bound of each row")
-    add_option(redesigned, "--sensor-gain", float, "real sensor gain")
-    fixed = parser.add_argument_group("with gain files")
-    for name, text in (
-        ("--errors-hz", "true frequency less that of the design, of the line that moves most [Hz]"),
-        ("--sensor-gains", "real sensor gain"),
-    ):
-        text += ": COUNT values (default: the configuration's)"
-        add_option(fixed, name, float, text, nargs=3, metavar=("LOW", "HIGH", "COUNT"))
-    text = "real delay less that of the design [frames] (default: the configuration's, else 0)"
-    name, dest = "--delay-errors", "delay_errors_frames"
-    add_option(fixed, name, float, text, nargs="+", dest=dest, metavar="FRAMES")
-    add_shared(parser, "--output")
-
-
-def tradeoff(parser: ArgumentParser) -> None:
-    """Design filters from the least norm to the least variance, and compare their sensor gains."""
-    add_shared(parser, "--unit", "config")
-    text = "levels of the norm, at least 2, from the least of any filter to the Kalman filter's"
-    add_option(parser, "--points", int, text, 9)
-    text = "past innovations that the mixed filters (least variance at each norm) weigh, 1 to 64"
-    add_option(parser, "--taps", int, text, 16)
-    add_shared(parser, "--output")
-
-
-def limits(parser: ArgumentParser) -> None:
-    """Show how far designs are from the least residual of any linear controller."""
-    add_shared(parser, "--unit", "config")
-    add_gains(
-        parser,
-        text="gain files to add to the integrator, the Kalman and the H-infinity filter of the "
-        "configuration",
-    )
-    add_shared(parser, "--output")
-
-
-def mirror(parser: ArgumentParser) -> None:
-    """Show the step of the mirror's local loop, and what ignoring its dynamics costs."""
-    add_shared(parser, "--unit", "config")
-    text = "half width of the band in which the mirror counts as settled"
-    add_option(parser, "--tolerance", float, text, 0.1)
-    add_shared(parser, "--output")
-
-
-def modal(parser: ArgumentParser) -> None:
-    """Compare integrators, optimised gains and Kalman filters for all modes of the mirror."""
-    add_shared(parser, "--unit", "config")
-    add_option(parser, "--modes", int, "number of modes, at least 2 (default: mirror.modes)")
-    add_shared(parser, "--output")
-
-
-def study(parser: ArgumentParser) -> None:
-    """Try controllers on many samples of what the loop may meet; resumes if started again."""
-    add_shared(parser, "--unit")
-    parser.add_argument("study", metavar="file", help="study file (YAML)")
-    add_output(parser, "directory of the study")
-    engine = parser.add_mutually_exclusive_group()
-    add_shared(engine, "--jobs")
-    text = "Dask scheduler that runs it instead, as tcp://host:8786; it can run code here: trust it"
-    add_option(engine, "--dask", str, text, metavar="ADDRESS")
-    text = "files of the authority, certificate and key for a scheduler at tls://host:8786"
-    metavar = ("CA", "CERT", "KEY")
-    add_option(parser, "--dask-tls", str, text, nargs=3, metavar=metavar)
-    add_switch(parser, "--pdf", "write the page as a PDF, too (summary.pdf)")
-    instead = parser.add_mutually_exclusive_group()
-    add_switch(instead, "--dry-run", "say how many samples and how long, and write nothing")
-    add_option(instead, "--row", int, "recompute one row, and write it as a configuration")
-
-
-def paper(parser: ArgumentParser) -> None:
-    """Compute the tables and figures of Agapito et al. 2008, ours beside theirs."""
-    add_shared(parser, "--unit")
-    add_output(parser, "directory to write into")
-
-
-def completion(parser: ArgumentParser) -> None:
-    """Print the script with which a shell completes commands, options and files."""
-    parser.add_argument("shell", choices=("bash", "zsh", "fish"))
+def command_options(name: str) -> dict[str, tuple[str, Any]]:
+    """Return the longest spelling and the default of each option of a command, by its argument."""
+    commands = build_parser(name)._subparsers._group_actions[0].choices  # type: ignore[union-attr]
+    actions = cast(dict[str, argparse.ArgumentParser], commands)[name]._actions
+    return {
+        action.dest: (max(action.option_strings, key=len), action.default)
+        for action in actions
+        if action.option_strings and action.dest != "help"
+    }

@@ -1,44 +1,99 @@
-"""The commands limits, tradeoff, mirror and robustness: designs in the loop of a configuration."""
+"""The commands compare, limits, tradeoff, mirror and robustness: designs in a configured loop."""
 
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
 
 from lbt_synth import studies
-from lbt_synth.cli.arguments import given_options
+from lbt_synth.cli.arguments import command_options, given_options
 from lbt_synth.cli.loop_inputs import (
     load_designs,
     load_shown,
+    margin_columns,
     named_difference_notes,
     own_sensor_notes,
     say_limit,
+    say_residual,
     truth_at_sensor_gain,
 )
-from lbt_synth.cli.output import Report
-from lbt_synth.cli.parser import command_options
+from lbt_synth.cli.output import BRIEF_ROWS, PERCENT, RMS, Report, spread_indices
 from lbt_synth.cli.streams import track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ConfigError, ProblemError
-from lbt_synth.loop import least_residual
+from lbt_synth.interop import frame_cost
+from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
-from lbt_synth.models import PositionLoop
 from lbt_synth.report.designs.report import refine_values, require_compatible, stable_interval
 from lbt_synth.report.figures import robustness_figure, robustness_map_figure
 from lbt_synth.report.figures.studies import limits_figure, mirror_figure, tradeoff_figure
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
+from lbt_synth.storage.words import listing_text
+from lbt_synth.studies import LimitRow
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, default_methods, mirror_rows
-from lbt_synth.validation import FloatArray, agree, frozen_copy, integer, number
+from lbt_synth.validation import FloatArray, IntArray, agree, frozen_copy, integer, number
 
-_SHOWN = 8  # sensor gains of a map, and taps of a mirror, that are printed of more
+
+def run_compare(arguments: Namespace) -> Report:
+    """Compare gain files in the loop of a configuration, one line each."""
+    config = load_shown(arguments)
+    designs = load_designs(arguments.gains, any_sensors=True)
+    study = _study_limits(config, designs)
+    rows = [_compared(designs[row.design], row, config) for row in study.rows]
+    report = Report(verdict=_say_designs(study.rows, study))
+    if tough := [row for row in rows if row.modulus is not None]:
+        row = max(tough, key=lambda row: float(row.modulus))
+        frames = min(row.delay_frames, row.early_frames)
+        decibels = min(row.gain_less_db, row.gain_more_db)
+        report.verdict.append(
+            f"{row.design} has the largest margin, and survives {frames:.2g} frames of delay or "
+            f"{decibels:.2g} dB of sensor gain, either way."
+        )
+    caption = f"In the truth of {config.source.name}; {config.imaging.label}"
+    report.add_rows("designs", caption, rows, figure=lambda: limits_figure(study))
+    report.data["limit_nm"] = None if study.limit is None else study.limit.rms_nm
+    report.notes += named_difference_notes(config, designs)
+    return report
+
+
+def _compared(design: Design, row: LimitRow, config: Config) -> Facts:
+    """Return the line of a design: what it leaves, what its loop survives, and what it costs."""
+    loop = design.close(config.hardware, sensor_gain=config.truth.sensor_gain)
+    margins = loop_margins(loop) if row.stable and not loop.reads_others else None
+    cost = None if design.other_sensors else frame_cost(design).multiplications
+    return facts(
+        design=fact(row.design, "design"),
+        residual_nm=fact(row.residual_nm, "residual", missing="unstable", **RMS),
+        strehl=fact(row.strehl, "Strehl", **PERCENT),
+        **margin_columns(margins),
+        n_states=fact(design.controller.n_states, "states"),
+        multiplications=fact(cost, "products per frame"),
+    )
+
+
+def _study_limits(config: Config, designs: Mapping[str, Design]) -> LimitStudy:
+    return studies.limits(
+        designs, config.hardware, config.truth, config.imaging, errors_hz=config.errors_hz
+    )
+
+
+def _say_designs(rows: Sequence[LimitRow], study: LimitStudy) -> list[str]:
+    """Return which designs are unstable in the truth, and what the best of the others leaves."""
+    unstable = [row.design for row in rows if not row.stable]
+    verbs = "is" if len(unstable) == 1 else "are"
+    verdict = [f"{listing_text(unstable)} {verbs} unstable in the truth."] if unstable else []
+    if stable := [row for row in rows if row.stable]:
+        best = min(stable, key=lambda row: row.residual_nm)
+        verdict.append(say_residual(best.design, best, study.limit))
+    return verdict
 
 
 def run_limits(arguments: Namespace) -> Report:
@@ -50,11 +105,9 @@ def run_limits(arguments: Namespace) -> Report:
         for method in reference_methods()
     }
     designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}
-    study = studies.limits(
-        designs, config.hardware, config.truth, config.imaging, errors_hz=config.errors_hz
-    )
+    study = _study_limits(config, designs)
     no_band = () if study.band is not None else ("above_band_limit_percent",)
-    report = Report()
+    report = Report(verdict=_say_designs(study.rows, study))
     report.add_rows(
         "rows",
         f"Distance to the limits of any linear controller; {config.imaging.label}",
@@ -64,43 +117,32 @@ def run_limits(arguments: Namespace) -> Report:
         figure=lambda: limits_figure(study),
     )
     report.data["limit_nm"] = None if study.limit is None else study.limit.rms_nm
-    if study.band is not None:
+    if study.band is not None and study.band_hz is not None:
         report.data |= {
             "band_hz": study.band_hz,
             "band_limit_nm": study.band.rms_nm,
             "band_achieved_nm": study.band.achieved_nm,
         }
-    report.notes += [*_limit_notes(study, config), *_design_notes(config, designs, study)]
+        low, high = study.band_hz
+        report.verdict.append(
+            f"With the vibration anywhere from {low:g} to {high:g} Hz, the least worst residual is "
+            f"{nm_text(study.band.rms_nm, '.6g', unit='nm rms')} (a filter of infinite order "
+            f"achieves {nm_text(study.band.achieved_nm, '.6g')})."
+        )
+    report.notes += [*_limit_notes(study, config), *named_difference_notes(config, designs)]
     return report
 
 
 def _limit_notes(study: LimitStudy, config: Config) -> list[str]:
+    """Return what the limit is of, and which rows compare something else than they seem to."""
     if study.limit is None:
-        return [
+        notes = [
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
             "vibrations along principal axes of the sensor's noise."
         ]
-    notes = [
-        say_limit(study.limit, config)
-        + (
-            " (of sinusoids of known frequency, what moves within frames)"
-            if study.band is not None
-            else ""
-        )
-    ]
-    if study.band is not None and study.band_hz is not None:
-        low, high = study.band_hz
-        notes.append(
-            f"least worst residual with the vibration anywhere from {low:g} to {high:g} Hz: "
-            f"{nm_text(study.band.rms_nm, '.6g', unit='nm rms')} (a filter of infinite order "
-            f"achieves {nm_text(study.band.achieved_nm, '.6g')})"
-        )
-    return notes
-
-
-def _design_notes(config: Config, designs: dict[str, Design], study: LimitStudy) -> list[str]:
-    """Warn of rows that compare something else than they seem to."""
-    notes = []
+    else:
+        within = " (of sinusoids of known frequency, what moves within frames)"
+        notes = [say_limit(study.limit, config) + within * (study.band is not None)]
     if config.truth.vibrations and not config.plant.vibrations:
         notes.append(
             "note: kalman and hinf are designed without a vibration, as model.vibrations is "
@@ -108,7 +150,7 @@ def _design_notes(config: Config, designs: dict[str, Design], study: LimitStudy)
         )
     if study.band is None and len(config.truth.vibrations) > 1:
         notes.append("note: the limit over a range of frequencies is that of a single sinusoid.")
-    return notes + named_difference_notes(config, designs)
+    return notes
 
 
 def run_tradeoff(arguments: Namespace) -> Report:
@@ -123,20 +165,21 @@ def run_tradeoff(arguments: Namespace) -> Report:
             what="filters",
         )
     )
-    least = points[0].design
-    report = Report()
+    mixed = [point for point in points if point.family == FAMILIES[0]]
+    first, last, least = mixed[0], mixed[-1], points[0].design
+    caption = "Trade-off of variance, norm and sensor gain"
+    report = Report(tables=[row_table(f"{caption}, by the mixed filter", mixed)])
     report.add_rows(
-        "points",
-        "Trade-off of variance, norm and sensor gain",
-        points,
-        without=("design",),
-        figure=lambda: tradeoff_figure(points),
+        "points", caption, points, without=("design",), figure=lambda: tradeoff_figure(points)
     )
     report.data |= {"gamma_least": least.gamma_least, "gamma_infeasible": least.gamma_infeasible}
-    report.notes.append(
-        f"the least norm of any filter lies between {nm_text(least.gamma_infeasible, '.9g')} and "
-        f"{nm_text(least.gamma_least, '.9g')}"
-    )
+    report.verdict = [
+        f"Lowering the norm of the error from {nm_text(last.gamma, '.1f')} to "
+        f"{nm_text(first.gamma, '.1f')} raises its rms from {nm_text(last.rms, '.1f')} to "
+        f"{nm_text(first.rms, '.1f')}.",
+        f"The least norm of any filter lies between {nm_text(least.gamma_infeasible, '.9g')} and "
+        f"{nm_text(least.gamma_least, '.9g')}.",
+    ]
     report.notes += own_sensor_notes(config)
     return report
 
@@ -144,50 +187,52 @@ def run_tradeoff(arguments: Namespace) -> Report:
 def run_mirror(arguments: Namespace) -> Report:
     """Show how the mirror of a configuration settles, and compare designs on it."""
     config = load_shown(arguments)
-    plant, shell = config.plant.own_sensor_alone(), _require_local_loop(config)
-    hardware = plant.hardware
-    step = shell.step_response(arguments.tolerance)
+    plant, shell = config.plant.own_sensor_alone(), config.hardware.mirror
+    if shell is None:
+        raise ConfigError(
+            f"{config.source}: the key mirror.local_loop is missing: without it the mirror settles "
+            "at once. lbt_slow_mirror.yaml of lbt-synth init --examples has it.",
+            path="mirror.local_loop",
+        )
+    hardware, step = plant.hardware, shell.step_response(arguments.tolerance)
     rows = mirror_rows(
         plant, config.truth, config.imaging, command_weight=config.settings.design.command_weight
     )
-    taps = hardware.mirror_taps
-    shown = [f"{tap:.4f}" for tap in taps[:_SHOWN]] + ["..."] * (taps.size > _SHOWN)
-    report = Report(data={"taps": taps})
     limit_nm = limit_or_nan(lambda: least_residual(hardware, config.truth))
     least = "least residual of any linear controller in the truth"
-    per_cent, ms = {"unit": "%", "scale": 100}, {"unit": "ms", "scale": 1e3}
-    report.add_facts(
-        "The mirror after a step of its command",
-        facts(
-            rise_s=fact(step.rise_s, "rise, 10 % to 90 %", **ms),
-            overshoot=fact(step.overshoot, "overshoot", **per_cent),
-            tolerance=fact(step.tolerance, "tolerance of the settling time", **per_cent),
-            settling_s=fact(step.settling_s, "settling time", **ms),
-            settling_frames=fact(step.settling_s / hardware.dt_s, "  in frames", unit="frames"),
-            bandwidth_hz=fact(shell.bandwidth_hz, "bandwidth, -3 dB", unit="Hz"),
-            frame_s=fact(hardware.dt_s, "one frame", **ms),
-            limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
-        ),
-    )
+    ms = {"unit": "ms", "scale": 1e3}
+    frames = step.settling_s / hardware.dt_s
+    best = min((row for row in rows if row.stable), key=lambda row: float(row.residual_nm))
+    report = Report(data={"taps": hardware.mirror_taps})
+    report.verdict = [f"{row.design}: unstable on this mirror." for row in rows if not row.stable]
+    report.verdict += [
+        f"{best.design} leaves least, {nm_text(best.residual_nm, '.1f')} rms (Strehl ratio "
+        f"{100 * best.strehl:.1f} %).",
+        f"The mirror settles within {1e3 * step.settling_s:.3g} ms, {frames:.2g} frames.",
+    ]
     report.add_rows(
         "rows",
         f"Designs on this mirror; {config.imaging.label}",
         rows,
         figure=lambda: mirror_figure(hardware, tolerance=arguments.tolerance),
     )
-    report.notes.append(f"weights of u(k), u(k-1), ... in exposure k: {', '.join(shown)}")
+    report.add_facts(
+        "The mirror after a step of its command",
+        facts(
+            rise_s=fact(step.rise_s, "rise, 10 % to 90 %", **ms),
+            overshoot=fact(step.overshoot, "overshoot", unit="%", scale=100),
+            tolerance=fact(step.tolerance, "tolerance of the settling time", unit="%", scale=100),
+            settling_s=fact(step.settling_s, "settling time", **ms),
+            settling_frames=fact(frames, "  in frames", unit="frames"),
+            bandwidth_hz=fact(shell.bandwidth_hz, "bandwidth, -3 dB", unit="Hz"),
+            frame_s=fact(hardware.dt_s, "one frame", **ms),
+            limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
+        ),
+    )
+    taps = [f"{tap:.4f}" for tap in hardware.mirror_taps[:BRIEF_ROWS]]
+    more = ", ..." * (hardware.mirror_taps.size > BRIEF_ROWS)
+    report.notes.append(f"weights of u(k), u(k-1), ... in exposure k: {', '.join(taps)}{more}")
     return report
-
-
-def _require_local_loop(config: Config) -> PositionLoop:
-    key, shell = "mirror.local_loop", config.hardware.mirror
-    if shell is None:
-        raise ConfigError(
-            f"{config.source}: the key {key} is missing: without it the mirror settles at once. "
-            "lbt_slow_mirror.yaml of lbt-synth init --examples has it.",
-            path=key,
-        )
-    return shell
 
 
 def run_robustness(arguments: Namespace) -> Report:
@@ -206,14 +251,14 @@ def _refuse_unused_options(arguments: Namespace) -> None:
         why = "goes with gain files, whose designs stay as they are; name some"
         if arguments.gains:
             why = "is for redesigning, without gain files; the options of these are "
-            why += ", ".join(names[each] for each in maps)
+            why += ", ".join(names[option] for option in maps)
         raise ProblemError(f"{names[name]} {why}.")
 
 
 def _redesign(config: Config, arguments: Namespace) -> Report:
-    settings = config.settings
-    ratio = arguments.gamma_ratio
-    errors = config.errors_hz
+    """Design filters for the true frequency at each error."""
+    settings, errors, ratio = config.settings, config.errors_hz, arguments.gamma_ratio
+    methods = default_methods()
     rows = list(
         track_progress(
             studies.robustness(
@@ -224,15 +269,35 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
                 gamma_ratio=settings.design.gamma_ratio if ratio is None else ratio,
                 hold=settings.robustness.hold,
             ),
-            total=len(errors) * len(default_methods()),
+            total=len(errors) * len(methods),
             what="designs",
         )
     )
-    report = Report()
+    by_method = {name: [row for row in rows if row.method == name] for name in methods}
     caption = f"Robustness to the vibration frequency; {config.imaging.label}"
+    centre = int(np.argmin(np.abs(errors)))
+    places = spread_indices(len(errors), centre)
+    columns = [
+        facts(
+            error_hz=fact(errors[place], "error", unit="Hz", format="+.2f"),
+            **{f"{n}_strehl": fact(r[place].strehl, n, **PERCENT) for n, r in by_method.items()},
+            **{f"{n}_nm": fact(r[place].residual_nm, n, **RMS) for n, r in by_method.items()},
+        )
+        for place in places
+    ]
+    report = Report(tables=[row_table(f"{caption}, and residual", columns)])
+    report.verdict = [
+        f"{name} has a Strehl ratio of {100 * r[centre].strehl:.1f} % at an error of "
+        f"{errors[centre]:+g} Hz, and of {_worst_text([row.strehl for row in r])} at worst."
+        for name, r in by_method.items()
+    ]
     report.add_rows("rows", caption, rows, figure=lambda: robustness_figure(rows))
     report.notes += own_sensor_notes(config)
     return report
+
+
+def _worst_text(strehls: Sequence[float]) -> str:
+    return "none (unstable)" if np.isnan(strehls).any() else f"{100 * min(strehls):.1f} %"
 
 
 def _map_designs(config: Config, arguments: Namespace) -> Report:
@@ -245,7 +310,7 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
         number(gain, "--sensor-gains", above=0)
     designs = load_designs(arguments.gains)
     assumed = {name: _assumed_gain(name, d, config) for name, d in designs.items()}
-    maps = {}
+    maps, intervals = {}, {}
     for name, design in designs.items():
         grid = studies.robustness_map(
             design,
@@ -256,16 +321,45 @@ def _map_designs(config: Config, arguments: Namespace) -> Report:
             delay_errors_frames=delays,
         )
         maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
-    report = Report(data={"maps": {}}, figure=lambda: robustness_map_figure(maps))
+        intervals[name] = _stable_gains(design, maps[name], assumed[name])
+    real = int(np.argmin(np.abs(gains - config.sensor_gain * config.truth.sensor_gain)))
+    where = f"frequency errors of {np.min(errors):+g} to {np.max(errors):+g} Hz"
+    report = Report(figure=lambda: robustness_map_figure(maps))
+    report.data["maps"] = {
+        name: asdict(grid) | {"stable_sensor_gains": intervals[name]} for name, grid in maps.items()
+    }
     report.rows = [point for name, grid in maps.items() for point in _map_points(name, grid)]
+    lines = [
+        line for name in maps for line in _map_lines(name, maps[name], [real], intervals[name])
+    ]
+    title = f"{config.imaging.label}, over {where}"
+    report.tables.append(row_table(f"At a sensor gain of {gains[real]:.3g}: {title}", lines))
+    report.verdict = _say_maps(maps, lines, where)
+    shown = spread_indices(gains.size, real)
     for name, grid in maps.items():
-        intervals = _stable_gains(designs[name], grid, assumed[name])
-        report.data["maps"][name] = asdict(grid) | {"stable_sensor_gains": intervals}
-        low, high = np.min(grid.errors_hz), np.max(grid.errors_hz)
-        title = f"{name}: {config.imaging.label}, over frequency errors of {low:+g} to {high:+g} Hz"
-        report.tables.append(row_table(title, list(_map_lines(grid))))
-        report.notes += _map_notes(name, designs[name], config, grid, intervals)
+        rows = list(_map_lines(name, grid, shown, intervals[name]))
+        report.tables.append(row_table(f"{name}: {title}", rows))
+        report.notes += _map_notes(name, designs[name], config)
     return report
+
+
+def _say_maps(maps: Mapping[str, RobustnessMap], lines: Sequence[Facts], where: str) -> list[str]:
+    """Return where designs are unstable, and which keeps the highest Strehl ratio at worst."""
+    verdict = [
+        f"{name} is unstable at {count} of {grid.stable.size} pairs of a sensor gain and a delay "
+        "error of its map."
+        for name, grid in maps.items()
+        if (count := np.count_nonzero(~grid.stable))
+    ]
+    worst = {line.file: [x.worst for x in lines if x.file == line.file] for line in lines}
+    lowest = {name: float(np.min(values)) for name, values in worst.items()}  # nan if unstable
+    if stable := {name: value for name, value in lowest.items() if not np.isnan(value)}:
+        best = max(stable, key=lambda name: stable[name])
+        verdict.append(
+            f"{best} keeps the highest Strehl ratio at worst over {where}, "
+            f"{100 * stable[best]:.1f} %."
+        )
+    return verdict
 
 
 def _parse_range(
@@ -325,54 +419,42 @@ def _map_points(name: str, grid: RobustnessMap) -> list[Facts]:
     ]
 
 
-def _map_lines(grid: RobustnessMap) -> Iterator[Facts]:
+def _map_lines(
+    name: str,
+    grid: RobustnessMap,
+    shown: Sequence[int] | IntArray,
+    intervals: Sequence[tuple[float, float]],
+) -> Iterator[Facts]:
     """Yield a row for some sensor gains at each delay error, with its worst frequency error."""
-    gains, shown = grid.sensor_gains, np.arange(grid.sensor_gains.size)
-    if gains.size > _SHOWN:  # some from end to end, and the one that is nearest to 1
-        some = np.linspace(0, gains.size - 1, _SHOWN - 1).round().astype(int)
-        shown = np.unique([*some, int(np.argmin(np.abs(gains - 1)))])
-    percent = {"unit": "%", "scale": 100, "format": ".2f"}
-    for i, delay in enumerate(grid.delay_errors_frames):
+    for i, (delay, (low, high)) in enumerate(zip(grid.delay_errors_frames, intervals, strict=True)):
         for j in shown:
             stable, strehls = bool(grid.stable[i, j]), grid.strehl[i, j]
             worst = int(np.argmin(strehls)) if stable else 0
             centre = strehls[grid.errors_hz == 0]
+            at_hz = grid.errors_hz[worst] if stable else np.nan
             yield facts(
-                sensor_gain=fact(gains[j], "sensor gain", format=".3f"),
+                file=fact(name, "file"),
+                sensor_gain=fact(grid.sensor_gains[j], "sensor gain", format=".3f"),
                 delay_error=fact(delay, "delay error", unit="frames", format="+g"),
                 stable=fact(stable, "stable"),
-                centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **percent),
-                worst=fact(strehls[worst], "worst Strehl", **percent),
-                worst_hz=fact(
-                    grid.errors_hz[worst] if stable else np.nan, "at", unit="Hz", format="+.2f"
-                ),
+                centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **PERCENT),
+                worst=fact(strehls[worst], "worst Strehl", **PERCENT),
+                worst_hz=fact(at_hz, "at", unit="Hz", format="+.2f"),
+                low=fact(low, "stable gains, from", format=".4g"),
+                high=fact(high, "to", format=".4g"),
             )
 
 
-def _map_notes(
-    name: str,
-    design: Design,
-    config: Config,
-    grid: RobustnessMap,
-    intervals: list[tuple[float, float]],
-) -> list[str]:
-    notes = []
-    for delay, (low, high) in zip(grid.delay_errors_frames, intervals, strict=True):
-        late = f" with a delay error of {delay:+g} frames" if delay != 0 else ""
-        ends = "none found" if np.isnan(low) else f"{low:.4g} to {high:.4g}"
-        notes.append(f"{name}: stable sensor gains{late}: {ends}")
-    if unstable := np.count_nonzero(~grid.stable):
+def _map_notes(name: str, design: Design, config: Config) -> list[str]:
+    """Return in what a design was made for another loop, whose map this is."""
+    hardware, notes = require_hardware(design, "a map"), []
+    if hardware.delay_frames != config.hardware.delay_frames:
         notes.append(
-            f"warning: {name} is unstable at {unstable} of {grid.stable.size} pairs of a sensor "
-            "gain and a delay error of its map."
+            f"note: {name} was designed for a delay of {hardware.delay_frames:g} frames, from "
+            f"which its delay errors count; the configuration has "
+            f"{config.hardware.delay_frames:g}."
         )
-    own = require_hardware(design, "a map")
-    if own.delay_frames != config.hardware.delay_frames:
-        notes.append(
-            f"note: {name} was designed for a delay of {own.delay_frames:g} frames, from which "
-            f"its delay errors count; the configuration has {config.hardware.delay_frames:g}."
-        )
-    if own.mirror != config.hardware.mirror:
+    if hardware.mirror != config.hardware.mirror:
         notes.append(
             f"note: {name} was designed for another mirror than the configuration's, and its map "
             "is that of its own."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -11,24 +12,23 @@ import numpy as np
 
 from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import add_truth, choose_design_unit, load_shown
-from lbt_synth.cli.output import Report
+from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.design.result import without_units
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest, read_design, require_gain_name
-from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.methods.registry import design_title, option_names
 from lbt_synth.methods.request import Wording, design_request
-from lbt_synth.models import LoopHardware
-from lbt_synth.models.loop_hardware import LoopFacts
 from lbt_synth.storage.atomic_files import require_writable
-from lbt_synth.storage.rows import fact_table, json_record
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import fact_table, json_record, row_table
 
 _WORDING = Wording(method="--method {}", option="--{}")
 
 
-def run(arguments: Namespace) -> Report:
+def run_design(arguments: Namespace) -> Report:
     """Design a controller and write its gain file."""
     given = given_options(arguments, *option_names())
     request = design_request(arguments.method, given, _WORDING)
@@ -36,9 +36,9 @@ def run(arguments: Namespace) -> Report:
     config = load_shown(arguments)
     design = config.design(request)
     path = save_gain(arguments.output, design)
-    report = describe_design(design)
-    alike = () if given else (request.method.name,)
-    add_truth(report, design, config, without=alike)
+    report = Report()
+    add_truth(report, design, config, without=() if given else (request.method.name,))
+    describe_design(report, design)
     if design.method != request.method.name:
         title = design_title(design.method)
         report.notes.append(
@@ -48,46 +48,64 @@ def run(arguments: Namespace) -> Report:
     return report
 
 
-_SMALL_MODULUS = 0.3
+_SMALL_MODULUS = 0.3  # below what a loop is usually asked for
 
 
-def describe_design(design: Design, *, matrices: bool = False) -> Report:
-    """Describe a design: what it is, its loop, its certificate, and its matrices if asked for."""
-    report = Report(
-        data={
-            "solver": asdict(design.solver),
-            "poles": [complex(p) for p in design.poles],
-            "controller_spectral_radius": design.controller.to_statespace().spectral_radius,
-        }
-    )
+def describe_design(report: Report, design: Design) -> None:
+    """Add what a design is, what its loop survives, and its certificate."""
+    alone = design.controller.to_statespace().spectral_radius
+    report.data |= {
+        "solver": asdict(design.solver),
+        "poles": [complex(p) for p in design.poles],
+        "controller_spectral_radius": alone,
+        "assumptions": design.assumptions,
+    }
     facts: list[Any] = [design.facts()]
     margins = []
     if design.hardware is not None:
-        facts.append(_loop_facts(report, design.hardware))
+        facts.append(design.hardware.facts())
+        if design.hardware.mirror is not None:
+            settling_s = design.hardware.mirror.step_response().settling_s
+            report.data["mirror"] = asdict(design.hardware.mirror) | {"settling_s": settling_s}
         if not design.other_sensors:
             margins = [loop_margins(close_loop(design.hardware, design))]
             report.data["margins"] = json_record(*margins)
-            report.opening += [each.survival for each in margins]
-        report.notes += _loop_notes(design, design.hardware, report.data)
-        report.notes += [f"warning: {text}" for each in margins for text in each.fragilities]
+    report.verdict = [*_say_fragility(margins), *(report.verdict or [_say_model(design)])]
+    report.verdict += [f"It {one.survival}" for one in margins if not one.fragilities]
+    report.verdict.append(say_checks(design.certificate.checks))
     report.add_records(*facts)
     printed = fact_table("Design", *facts, *margins)
     report.tables.append(without_units(printed) if design.hardware is None else printed)
+    report.notes += _loop_notes(design, margins, alone)
     tables = design.tables()
     report.notes += [*design.notes(), *(note for table in tables for note in table.notes)]
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
-    report.data["assumptions"] = design.assumptions
     for table in tables:
         report.add_rows(table.key, table.title, table.rows)
     report.add_rows("checks", "Certificate", design.certificate.checks)
-    if matrices:
-        named = {name: getattr(design.controller, name) for name in "ABCD"}
-        named |= design.arrays()
-        report.data["matrices"] = named
-        with np.printoptions(precision=8, linewidth=160, suppress=False):
-            for name, value in named.items():
-                report.notes += [f"{name} =", *str(value).splitlines()]
-    return report
+
+
+def _say_fragility(margins: Sequence[LoopMargins]) -> list[str]:
+    return [f"{text[0].upper()}{text[1:]}" for one in margins for text in one.fragilities]
+
+
+def _say_model(design: Design) -> str:
+    """Return what a design promises in its own model, for one without a truth."""
+    title = f"The {design_title(design.method)}"
+    if (residual_nm := design.expected_residual_nm) is not None:
+        return f"{title} leaves {nm_text(residual_nm, '.1f')} rms in its model."
+    if design.is_estimator:
+        return f"{title} leaves an estimation error of {design.rms:.6g} rms in its model."
+    return f"{title} has {design.controller.n_states} states."
+
+
+def _add_matrices(report: Report, design: Design) -> None:
+    """Add the gains and the controller, as they are printed."""
+    arrays = {name: getattr(design.controller, name) for name in "ABCD"} | design.arrays()
+    report.data["matrices"] = arrays
+    with np.printoptions(precision=8, linewidth=160, suppress=False):
+        for name, value in arrays.items():
+            report.notes += [f"{name} =", *str(value).splitlines()]
 
 
 def add_moving_gain(report: Report, design: Design) -> None:
@@ -101,27 +119,19 @@ def add_moving_gain(report: Report, design: Design) -> None:
         report.add_facts("Sensor gain that moves", moving_gain(loop), key="moving_gain")
 
 
-def _loop_facts(report: Report, hardware: LoopHardware) -> LoopFacts:
-    """Return the facts of a loop; the data get its mirror, if that has dynamics."""
-    facts = hardware.facts()
-    if hardware.mirror is not None:
-        settling_s = hardware.mirror.step_response().settling_s
-        report.data["mirror"] = asdict(hardware.mirror) | {"settling_s": settling_s}
-    return facts
-
-
-def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) -> list[str]:
-    notes = []
-    alone = data["controller_spectral_radius"]
-    if hardware.mirror is not None and not design.knows_mirror:
+def _loop_notes(design: Design, margins: Sequence[LoopMargins], alone: float) -> list[str]:
+    if design.hardware is None:
+        return []
+    notes = [
+        f"note: the modulus margin {one.modulus:.3g} is small; a loop is usually asked for "
+        f"{_SMALL_MODULUS:g} or more. Lower the gain, or design with more noise."
+        for one in margins
+        if one.modulus < _SMALL_MODULUS
+    ]
+    if design.hardware.mirror is not None and not design.knows_mirror:
         notes.append(
             "note: this filter commands its estimate as if the mirror settled at once, so that its "
             "estimation error is not the residual; --method lqg commands for the mirror's dynamics."
-        )
-    if "margins" in data and (modulus := data["margins"]["modulus"]) < _SMALL_MODULUS:
-        notes.append(
-            f"note: the modulus margin {modulus:.3g} is small; a loop is usually asked for "
-            f"{_SMALL_MODULUS:g} or more. Lower the gain, or design with more noise."
         )
     if alone > 1:
         notes.append(
@@ -134,15 +144,17 @@ def _loop_notes(design: Design, hardware: LoopHardware, data: dict[str, Any]) ->
 def run_show(arguments: Namespace) -> Report:
     """Describe the design in a gain file, what a frame costs, and its matrices if asked for."""
     design, digest = load_with_digest(arguments.gain)
-    choose_design_unit(arguments, design)
-    report = describe_design(design, matrices=arguments.matrices)
+    choose_design_unit(arguments, {arguments.gain: design})
+    report = Report()
+    if design.configuration:
+        add_truth(report, design, config_from_text(design.configuration, Path(arguments.gain)))
+    describe_design(report, design)
     add_moving_gain(report, design)
-    report.data |= {"file": arguments.gain, "digest": digest}
     unproved = ["route and status of the solver"]
     unproved += ["what its record shows"] * (design.method == "predictor")
     unproved += ["assumptions"] * bool(design.assumptions)
     unproved += ["configuration, and so the truth"] * bool(design.configuration)
-    report.data["not_proved"] = unproved
+    report.data |= {"file": arguments.gain, "digest": digest, "not_proved": unproved}
     report.notes += [
         f"proved: the certificate, computed again from this file of digest {digest}.",
         f"not proved, the file's word: {'; '.join(unproved)}.",
@@ -150,31 +162,26 @@ def run_show(arguments: Namespace) -> Report:
     if not design.other_sensors:
         from lbt_synth.interop import frame_cost  # which a design does not need
 
-        cost = frame_cost(design)
-        report.data["frame_cost"] = json_record(cost)
-        report.tables.append(fact_table("Cost per frame, as exported to C", cost))
-    if design.configuration:
-        add_truth(report, design, config_from_text(design.configuration, Path(arguments.gain)))
+        report.add_facts("Cost per frame, as exported to C", frame_cost(design), key="frame_cost")
+    if arguments.matrices:
+        _add_matrices(report, design)
     return report
 
 
 def run_verify(arguments: Namespace) -> Report:
     """Recompute the certificate of a gain file."""
     design, digest = read_design(arguments.gain)
-    certificate = design.certificate
+    passed = design.certificate.passed
+    checks = sorted(design.certificate.checks, key=lambda check: check.passed)
     report = Report(
-        data={
-            "file": arguments.gain,
-            "digest": digest,
-            "method": design.method,
-            "passed": certificate.passed,
-        },
-        notes=[
-            f"{arguments.gain}: {'verified' if certificate.passed else 'NOT VERIFIED'}",
-            f"digest {digest}",
+        data={"file": arguments.gain, "digest": digest, "method": design.method, "passed": passed},
+        verdict=[
+            f"{arguments.gain}: {'verified' if passed else 'NOT VERIFIED'}. {say_checks(checks)}"
         ],
-        passed=certificate.passed,
+        notes=[f"note: digest {digest}"],
+        passed=passed,
     )
-    report.add_rows("checks", "Certificate", certificate.checks)
+    report.add_rows("checks", "Certificate", checks, hidden=("computed_by",))
+    report.tables.append(row_table("Certificate, and how it was computed", checks))
     add_moving_gain(report, design)
     return report

@@ -1,21 +1,21 @@
-"""The commands end-to-end and end-to-end-table: loops with a pyramid and moving air."""
+"""The command end-to-end: loops with a pyramid and moving air, and tables of the paper in them."""
 
 from __future__ import annotations
 
 import json
 from argparse import Namespace
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.engine import run_in_parts
-from lbt_synth.cli.loop_inputs import choose_wavefront_unit, load_design, load_designs
-from lbt_synth.cli.output import Report, json_value
+from lbt_synth.cli.loop_inputs import load_design, load_designs, load_shown
+from lbt_synth.cli.output import PERCENT, Report, json_value
 from lbt_synth.cli.streams import count_progress
-from lbt_synth.config import load_config
 from lbt_synth.design import Design
-from lbt_synth.errors import GainFileError, UnstableLoopError
+from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, save_telemetry
 from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
 from lbt_synth.interop.specula.optics import Calibration, specula_version
@@ -23,6 +23,7 @@ from lbt_synth.interop.specula.simulation import unread_sensors
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.studies import end_to_end_figure, end_to_end_table_figure
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
+from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import (
     Facts,
@@ -43,27 +44,38 @@ _FILES = ("run.png", "telemetry.fits", "summary.json")
 
 
 def run(arguments: Namespace) -> Report:
-    """Close the loop of a gain file end to end, and write a figure, telemetry and a summary."""
+    """Close the loop of a gain file end to end, or run tables of the paper."""
+    if arguments.tables is not None:
+        return _run_tables(arguments)
+    if len(arguments.gains) != 1:
+        raise ProblemError(
+            "an end-to-end run takes one gain file; got "
+            f"{', '.join(arguments.gains) or 'none'}. --tables takes any number."
+        )
+    (gain,) = arguments.gains
     outputs = [Path(arguments.output) / name for name in _FILES]
-    refuse_replacing(outputs, [arguments.config, arguments.gain])
-    choose_wavefront_unit(arguments)
-    setup = load_setup(arguments)
-    design = load_design(arguments.gain, any_sensors=True)
+    refuse_replacing(outputs, [arguments.config, gain])
+    setup = _load_setup(arguments)
+    design = load_design(gain, any_sensors=True)
     setup.controller(design)  # refuses a filter of another loop before any work
     specula_version()  # refuses where it is missing
     make_directory(arguments.output)
     figure_file, telemetry_file, summary_file = outputs
-    calibration = calibrate_setup(setup, arguments)
+    calibration = _calibrate(setup, arguments)
     total = setup.frames + setup.settle_frames
     with count_progress(total=total, what="frames") as count:
         loop_run = setup.run(design, calibration=calibration, cache=arguments.cache, progress=count)
     _require_seen(loop_run)
-    system = loop_run.system
+    system, (tip_nm, tilt_nm, *_) = loop_run.system, loop_run.rms_nm
     report = Report()
+    report.verdict.append(
+        f"The Strehl ratio is {100 * loop_run.strehl:.1f} %, with "
+        f"{nm_text(tip_nm, '.1f')} rms of tip and {nm_text(tilt_nm, '.1f')} of tilt left."
+    )
     report.add_facts(
         f"End to end, Strehl ratio at {system.imaging_wavelength_um:g} um: {system.modes} modes, "
         f"{loop_run.frames} frames after {loop_run.settle_frames}, seed {loop_run.seed}",
-        _run_facts(loop_run, design, calibration, arguments),
+        _run_facts(loop_run, design, calibration, gain),
     )
     if unread := unread_sensors(design):
         report.notes.append(
@@ -71,7 +83,7 @@ def run(arguments: Namespace) -> Report:
             f"filter of the gain file runs, without {listing_text(unread)}."
         )
     summary = json.dumps(json_value(report.data), indent=1).encode() + b"\n"
-    recorded = _telemetry(loop_run, design, calibration, arguments)
+    recorded = _telemetry(loop_run, design, calibration, gain)
     report.note_files(
         [
             save_figure(end_to_end_figure(loop_run), figure_file),
@@ -82,16 +94,13 @@ def run(arguments: Namespace) -> Report:
     return report
 
 
-def _run_facts(
-    loop_run: EndToEndRun, design: Design, calibration: Calibration, arguments: Namespace
-) -> Facts:
+def _run_facts(loop_run: EndToEndRun, design: Design, calibration: Calibration, gain: str) -> Facts:
     """Return the main numbers of a run, and what it ran."""
     numbers, rms = loop_run.summary(), {"unit": "nm rms", "format": ".1f"}
-    percent = {"unit": "%", "scale": 100, "format": ".2f"}
-    headings: dict[str, tuple[str, dict[str, Any]]] = {
-        "strehl": ("Strehl ratio", percent),
-        "strehl_error": ("  standard error", percent | {"unit": "points"}),
-        "other_modes_strehl": ("  without tip and tilt", percent),
+    headings: dict[str, tuple[str, Mapping[str, Any]]] = {
+        "strehl": ("Strehl ratio", PERCENT),
+        "strehl_error": ("  standard error", {**PERCENT, "unit": "points"}),
+        "other_modes_strehl": ("  without tip and tilt", PERCENT),
         "tip_rms_nm": ("tip", rms),
         "tilt_rms_nm": ("tilt", rms),
         "other_modes_rms_nm": ("all other modes", rms),
@@ -102,7 +111,7 @@ def _run_facts(
     milliseconds = 1e3 * loop_run.seconds / (loop_run.frames + loop_run.settle_frames)
     condition = calibration.reconstructor.condition_number
     return facts(
-        gain=fact(str(arguments.gain)),
+        gain=fact(gain),
         method=fact(design.method),
         specula=fact(specula_version()),
         **{name: fact(getattr(loop_run, name)) for name in ("frames", "settle_frames", "seed")},
@@ -126,36 +135,36 @@ def _require_seen(loop_run: EndToEndRun) -> None:
         )
 
 
-def load_setup(arguments: Namespace) -> EndToEndSetup:
+def _load_setup(arguments: Namespace) -> EndToEndSetup:
     """Load the end-to-end setup of a configuration, with the changes of the command line."""
-    setup = load_config(arguments.config).end_to_end
+    setup = load_shown(arguments, all_modes=True).end_to_end
     if arguments.pixels is not None:
         setup = replace(setup, system=replace(setup.system, pixels=arguments.pixels))
     return replace(setup, **given_options(arguments, "frames", "settle_frames", "seed"))
 
 
-def calibrate_setup(setup: EndToEndSetup, arguments: Namespace) -> Calibration:
+def _calibrate(setup: EndToEndSetup, arguments: Namespace) -> Calibration:
     """Calibrate a system, or take its calibration from the cache, behind a progress bar."""
     with count_progress(total=setup.system.modes, what="calibration") as count:
         return calibrate(setup.system, cache=arguments.cache, progress=count)
 
 
 def _telemetry(
-    loop_run: EndToEndRun, design: Design, calibration: Calibration, arguments: Namespace
+    loop_run: EndToEndRun, design: Design, calibration: Calibration, gain: str
 ) -> Telemetry:
-    system, gain = loop_run.system, loop_run.tip_tilt_gain
+    system, optical = loop_run.system, loop_run.tip_tilt_gain
     return fill_row(
         Telemetry,
         *(loop_run, system, system.hardware),
         name=f"end to end, {system.modes} modes",
         influence_matrix=None,
         strehl=min(loop_run.strehl, 1.0),
-        sensor_gain=gain if gain > 0 else None,
+        sensor_gain=optical if optical > 0 else None,
         controller_name=f"mixed: tip and tilt by {design.method}, integrators for the rest",
-        controller_digest=file_sha256(arguments.gain, GainFileError),
+        controller_digest=file_sha256(gain, GainFileError),
         metadata={
             "simulator": f"SPECULA {specula_version()}",
-            "gain_file": Path(arguments.gain).name,
+            "gain_file": Path(gain).name,
             "pixels": system.pixels,
             "settle_frames": loop_run.settle_frames,
             "calibration": calibration.key,
@@ -167,13 +176,12 @@ def _telemetry(
 _TABLE_FILES = {"II": ("table_ii.csv",), "III": ("table_iii.csv", "table_iii.png", "table_iii.pdf")}
 
 
-def run_end_to_end_table(arguments: Namespace) -> Report:
+def _run_tables(arguments: Namespace) -> Report:
     """Run Tables II and III of the paper end to end, resuming what was interrupted."""
     folder = Path(arguments.output)
     written = [folder / name for number in arguments.tables for name in _TABLE_FILES[number]]
     refuse_replacing(written, [arguments.config, *arguments.gains])
-    choose_wavefront_unit(arguments)
-    setup = load_setup(arguments)
+    setup = _load_setup(arguments)
     designs = load_designs(arguments.gains)
     for count in ("seeds", "row_seeds", "jobs"):
         integer(getattr(arguments, count), option_name(count), at_least=1)
@@ -185,7 +193,7 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
     }
     total = len(all_cases(plan_cases(setup, designs, **plan)))
     make_directory(folder)
-    calibrate_setup(setup, arguments)
+    _calibrate(setup, arguments)
     case_folder = folder / "cases"
     with run_in_parts(arguments, case_folder, total=total, what="runs") as engine:
         table = end_to_end_tables(
@@ -209,8 +217,8 @@ def run_end_to_end_table(arguments: Namespace) -> Report:
             row_table(f"Table {n} end to end: Strehl ratio [%] at 2.2 um", entries)
             for n, entries in printed.items()
         ],
-        notes=[
-            f"Table III, {method}: end to end less modal {points:.1f} points rms"
+        verdict=[
+            f"Table III, {method}: end to end less modal {points:.1f} points rms."
             for method, points in differences.items()
         ],
     )

@@ -1,13 +1,14 @@
-"""The command init: a configuration to begin with, and its schema for editors."""
+"""The command init: a configuration to begin with, its schema, and completion in shells."""
 
 from __future__ import annotations
 
 import json
 import re
-from argparse import Namespace
-from collections.abc import Mapping
+from argparse import Action, ArgumentParser, Namespace
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from lbt_synth.cli.arguments import COMMANDS, build_parser
 from lbt_synth.cli.output import Report
 from lbt_synth.config import config_schema, identified_config, telescope_template
 from lbt_synth.config.load import example_files
@@ -29,10 +30,10 @@ _USUAL = "generic"  # the telescope of which nothing is known
 
 
 def run(arguments: Namespace) -> Report:
-    """Write a configuration of a telescope or a record, all examples, or the schema."""
+    """Write a configuration of a telescope or a record, all examples, a schema or a script."""
     report = Report()
-    if arguments.schema:
-        return _schema(arguments)
+    if arguments.schema or arguments.completion:
+        return _script(arguments)
     if arguments.examples:
         folder = Path(arguments.output or "examples")
         contents = {folder / name: text for name, text in sorted(example_files().items())}
@@ -57,9 +58,9 @@ def run(arguments: Namespace) -> Report:
     _refuse_taken(contents, force=arguments.force)
     report.note_files(write_together({at: text.encode() for at, text in contents.items()}))
     method = default_method()
-    report.notes.append(
-        f"next: put in your own numbers, then lbt-synth design {file} --method {method} "
-        f"-o {file.with_name(f'{file.stem}_{method}.fits')}"
+    report.verdict.append(
+        f"Next, put in your own numbers; then lbt-synth design {file} --method {method} "
+        f"-o {file.with_name(f'{file.stem}_{method}.fits')} makes a controller."
     )
     return report
 
@@ -117,17 +118,44 @@ def _section(name: str, template: str) -> re.Match[str] | None:
     return re.search(rf"^{name}:.*\n(?:  .*\n)+", template, re.MULTILINE)
 
 
-def _schema(arguments: Namespace) -> Report:
-    """Print the schema of a configuration, or write it."""
+def _script(arguments: Namespace) -> Report:
+    """Print the schema of a configuration or the completion of a shell, or write it."""
+    asked = "--schema" if arguments.schema else "--completion"
     others = {"--telescope": arguments.telescope, "--from": arguments.source}
     others |= {"--examples": arguments.examples, "--force": arguments.force}
+    others |= {"--completion": arguments.schema and arguments.completion}
     if given := [option for option, value in others.items() if value]:
-        raise ProblemError(f"--schema goes with -o alone; got {', '.join(given)}. Leave it out.")
-    schema = config_schema()
-    text = json.dumps(schema, indent=1)
+        raise ProblemError(f"{asked} goes with -o alone; got {', '.join(given)}. Leave it out.")
+    data, text = config_schema(), json.dumps(config_schema(), indent=1)
+    if not arguments.schema:
+        text = _completion(arguments.completion)
+        data = {"shell": arguments.completion, "script": text}
     if arguments.output is None:
-        return Report(data=schema, opening=text.splitlines())
-    report, output = Report(), require_ending(arguments.output, "a schema", (".json",))
+        return Report(data=data, text=text)
+    output = Path(arguments.output)
+    if arguments.schema:
+        require_ending(output, "a schema", (".json",))
     require_writable(output)
+    report = Report()
     report.note_written(write_atomically(output, f"{text}\n".encode()))
     return report
+
+
+def _completion(shell: str) -> str:
+    """Return the script of a shell, made from the arguments of all commands."""
+    import shtab  # which no other command needs
+
+    parser = build_parser(*COMMANDS)
+    for action in _takes_files(parser):
+        action.complete = shtab.FILE  # type: ignore[attr-defined]
+    return str(shtab.complete(parser, shell=shell))
+
+
+def _takes_files(parser: ArgumentParser) -> Iterator[Action]:
+    """Yield the arguments of all commands that may be the name of a file."""
+    for action in parser._actions:
+        if isinstance(action.choices, dict):
+            for command in action.choices.values():
+                yield from _takes_files(command)
+        elif action.choices is None and action.nargs != 0 and action.type in (None, str):
+            yield action

@@ -6,6 +6,7 @@ from argparse import Namespace
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,24 +17,40 @@ from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
-from lbt_synth.loop import least_residual
+from lbt_synth.loop import LoopMargins, least_residual
 from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit, limit_or_none
+from lbt_synth.methods.registry import design_title
 from lbt_synth.models import Truth, nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.display_unit import LENGTHS, UNITS, nm_text, show_in
-from lbt_synth.studies.limits import compare_in_truth
+from lbt_synth.storage.rows import Column, fact
+from lbt_synth.studies.limits import LimitRow, compare_in_truth
 
 _MAS_PER_URAD = np.degrees(1e-6) * 3.6e6
 _WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns
-_NAME = "this design"
+_NAME, _BASELINE = "this design", "integrator"
 
 
 def choose_unit(
-    arguments: Namespace, diameter_m: float | None = None, configured: str | None = None
+    arguments: Namespace,
+    diameter_m: float | None = None,
+    configured: str | None = None,
+    *,
+    all_modes: bool = False,
 ) -> None:
-    """Show wavefronts in the unit that was asked for; an angle needs the telescope's diameter."""
+    """Show wavefronts in the unit that is asked for, else in that of the configuration, else in nm.
+
+    An angle needs the telescope's diameter, and is none of modes beside tip and tilt.
+    """
     asked = getattr(arguments, "show_unit", None) or arguments.unit
-    name = (asked if asked in UNITS else None) or configured or "nm"
+    asked = asked if asked in UNITS else None  # a record may be in others
+    if asked not in (None, *LENGTHS) and all_modes:
+        raise ProblemError(
+            f"--unit {asked} is an angle of tip and tilt, and this command shows other modes, "
+            f"too. Try {' or '.join(LENGTHS)}."
+        )
+    usual = "nm" if all_modes and configured not in LENGTHS else configured
+    name = asked or usual or "nm"
     if name in LENGTHS:
         show_in(name, LENGTHS[name])
         return
@@ -47,30 +64,22 @@ def choose_unit(
     show_in(name, mas if name == "mas" else mas * _MAS_PER_URAD)
 
 
-def load_shown(arguments: Namespace, config: Config | None = None) -> Config:
+def load_shown(
+    arguments: Namespace, config: Config | None = None, *, all_modes: bool = False
+) -> Config:
     """Load the configuration of a command, if it has none, and show wavefronts in its unit."""
     config = load_config(arguments.config) if config is None else config
-    choose_unit(arguments, config.imaging.diameter_m, config.settings.units)
+    choose_unit(arguments, config.imaging.diameter_m, config.settings.units, all_modes=all_modes)
     return config
 
 
-def choose_wavefront_unit(arguments: Namespace) -> None:
-    """Show wavefronts of all modes in the unit that was asked for, which cannot be an angle."""
-    if arguments.unit not in (None, *LENGTHS):
-        raise ProblemError(
-            f"--unit {arguments.unit} is an angle of tip and tilt, and this command shows other "
-            f"modes, too. Try {' or '.join(LENGTHS)}."
-        )
-    choose_unit(arguments)
-
-
-def choose_design_unit(arguments: Namespace, *designs: Design) -> None:
-    """Show wavefronts in the unit that was asked for, by the configurations in gain files."""
-    if arguments.unit is None:
-        return
-    texts = {each.configuration for each in designs if each.configuration}
-    diameters = {config_from_text(text, Path("gain file")).imaging.diameter_m for text in texts}
-    choose_unit(arguments, diameters.pop() if len(diameters) == 1 else None)
+def choose_design_unit(arguments: Namespace, designs: Mapping[str, Design]) -> None:
+    """Show wavefronts in the unit that the configurations in gain files agree on."""
+    texts = {design.configuration: path for path, design in designs.items()}
+    configs = [config_from_text(text, Path(path)) for text, path in texts.items() if text]
+    telescopes = {(config.imaging.diameter_m, config.settings.units) for config in configs}
+    alone = telescopes.pop() if len(telescopes) == 1 else (None, None)
+    choose_unit(arguments, *alone)
 
 
 def load_design(path: str, *, any_sensors: bool = False) -> Design:
@@ -171,6 +180,7 @@ def add_truth(
         )
         return
     comparison = compare_in_truth({_NAME: design}, config, without=without)
+    row, *others = comparison.rows
     caption = f"In the truth of {config.source.name}; {config.imaging.label}"
     report.add_rows("truth", caption, comparison.rows, without=_WITHOUT)
     report.data |= {
@@ -178,7 +188,44 @@ def add_truth(
         "wavelength_um": config.imaging.wavelength_um,
         "truth_warnings": comparison.warnings[_NAME],
     }
+    warnings = comparison.warnings[_NAME]
+    if row.stable:
+        report.verdict.append(
+            say_residual(f"The {design_title(design.method)}", row, comparison.limit)
+        )
+        if slow := [other for other in others if other.design == _BASELINE and other.stable]:
+            residual = nm_text(slow[0].residual_nm, ".1f")
+            report.verdict[-1] += f" The best {_BASELINE} leaves {residual}."
+    else:
+        report.verdict.append(f"{warnings[0][0].upper()}{warnings[0][1:]} of {config.source.name}.")
+        warnings = warnings[1:]
     if comparison.limit is not None:
         report.notes.append(say_limit(comparison.limit, config))
-    report.notes += [f"warning: {text}." for text in comparison.warnings[_NAME]]
+    report.notes += [f"warning: {text}." for text in warnings]
     report.notes += [f"note: {text}" for text in comparison.notes]
+
+
+def say_residual(name: str, row: LimitRow, limit: ResidualLimit | None) -> str:
+    """Return the sentence on what a stable design leaves in the truth."""
+    said = f"{name} leaves {nm_text(row.residual_nm, '.1f')} rms in the truth (Strehl ratio "
+    said += f"{100 * row.strehl:.1f} %)"
+    if limit is None or np.isnan(row.above_limit_percent):
+        return f"{said}."
+    least = nm_text(limit.rms_nm, ".1f")
+    return f"{said}, {row.above_limit_percent:.0f} % above the {least} of the best linear one."
+
+
+def margin_columns(margins: LoopMargins | None) -> dict[str, tuple[Any, Column]]:
+    """Return the facts of what a loop survives, alone; None where it is unstable."""
+    names = ("delay_frames", "early_frames", "modulus")
+    late, early, modulus = (getattr(margins, name, None) for name in names)
+    less, more = (None, None) if margins is None else margins.gain_errors_db
+    frames = {"unit": "frames", "format": ".2f"}
+    decibels = {"unit": "dB", "format": ".1f"}
+    return {
+        "delay_frames": fact(late, "late by", **frames),
+        "early_frames": fact(early, "early by", **frames),
+        "gain_less_db": fact(less, "gain down", **decibels),
+        "gain_more_db": fact(more, "gain up", **decibels),
+        "modulus": fact(modulus, "modulus margin", format=".3f"),
+    }

@@ -22,7 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from lbt_synth.cli.parser import build_parser, command_module, command_options
+from lbt_synth.cli.arguments import COMMANDS, build_parser, command_options
 from lbt_synth.cli.streams import discard, print_error, show_progress
 from lbt_synth.errors import ConfigError, LbtSynthError, SynthesisError
 from lbt_synth.storage.display_unit import own_display_unit
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print_error("interrupted")
         return INTERRUPTED
-    report.print(as_json=arguments.json)
+    report.print(as_json=arguments.json, verbose=arguments.verbose)
     return DONE if report.passed else FAILED
 
 
@@ -80,7 +80,7 @@ def _run_command(arguments: Namespace) -> Report:
 
 def _find_command(command: str) -> Callable[[Namespace], Report]:
     """Return what runs a command, from its module."""
-    module = importlib.import_module(f"lbt_synth.cli.{command_module(command)}")
+    module = importlib.import_module(f"lbt_synth.cli.{COMMANDS[command].module}")
     named = f"run_{command.replace('-', '_')}"
     run: Callable[[Namespace], Report] = getattr(module, named, None) or module.run
     return run

@@ -10,18 +10,17 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from lbt_synth import models
-from lbt_synth.cli.loop_inputs import choose_wavefront_unit
-from lbt_synth.cli.output import Report
-from lbt_synth.config import Config, load_config
+from lbt_synth.cli.loop_inputs import load_shown
+from lbt_synth.cli.output import RMS, Report
+from lbt_synth.config import Config
 from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_residuals
 from lbt_synth.errors import ConfigError
 from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.figures import modal_figure
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import Facts, fact, facts, row_table
+from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.validation import FloatArray, integer
 
-_RMS: dict[str, Any] = {"unit": "nm", "format": ".1f"}
 _MIRROR_NOTE = (
     "mirror: its local loop on every mode; the Kalman filters know its real positions, but command "
     "their estimates as if it were there at once (lbt-synth mirror, design lqg: tip and tilt "
@@ -31,8 +30,7 @@ _MIRROR_NOTE = (
 
 def run(arguments: Namespace) -> Report:
     """Compare integrators, optimised gains and Kalman filters, mode by mode."""
-    choose_wavefront_unit(arguments)
-    config = load_config(arguments.config)
+    config = load_shown(arguments, all_modes=True)
     count = _mode_count(arguments.modes, config)
     atmosphere = config.require_atmosphere(
         "the turbulence of hundreds of modes is computed from it"
@@ -44,21 +42,19 @@ def run(arguments: Namespace) -> Report:
     uniform, gains, residuals = _design_controllers(config, air, noise)
     rows = _order_rows(air.rms_nm, noise, gains, *residuals.values())
     totals_nm = {name: _total_rms(rms) for name, rms in residuals.items()}
-    alone = _total_rms(air.rms_nm)
     report = Report(
         data={
             "modes": count,
             "uniform_gain": uniform,
             "residual_nm": totals_nm,
-            "turbulence_nm": alone,
+            "turbulence_nm": _total_rms(air.rms_nm),
         }
     )
-    all_nm = {"none, turbulence alone": alone, **totals_nm}
-    totals = [
-        facts(controller=fact(name, "controller"), residual_nm=fact(rms, "residual", **_RMS))
-        for name, rms in all_nm.items()
-    ]
-    report.tables.append(row_table("All modes", totals))
+    leaves = [f"{name} {nm_text(rms, '.1f')} rms" for name, rms in totals_nm.items()]
+    turbulence = nm_text(_total_rms(air.rms_nm), ".1f")
+    report.verdict.append(
+        f"Of {turbulence} rms of turbulence in {count} modes, what is left is: {'; '.join(leaves)}."
+    )
     report.add_rows(
         "rows",
         "By radial order, residuals over its modes",
@@ -169,12 +165,12 @@ def _order_rows(
             facts(
                 radial_order=fact(int(order), "radial order"),
                 modes=fact(int(which.sum()), "modes"),
-                turbulence_nm=fact(_total_rms(turbulence[which]), "turbulence", **_RMS),
+                turbulence_nm=fact(_total_rms(turbulence[which]), "turbulence", **RMS),
                 noise_nm=fact(float(noise[which][0]), "noise per mode", unit="nm", format=".2f"),
                 gain=fact(float(gains[which].mean()), "mean gain", format=".3f"),
-                uniform_nm=fact(uniform, "one gain", **_RMS),
-                optimised_nm=fact(optimised, "optimised gains", **_RMS),
-                kalman_nm=fact(filtered, "Kalman", **_RMS),
+                uniform_nm=fact(uniform, "one gain", **RMS),
+                optimised_nm=fact(optimised, "optimised gains", **RMS),
+                kalman_nm=fact(filtered, "Kalman", **RMS),
             )
         )
     return rows

@@ -1,4 +1,4 @@
-"""What a command prints and writes: tables for people, JSON for programs, figures, telemetry."""
+"""What a command prints and writes: the point first, one table, JSON, figures, telemetry."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import os
 import shutil
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,12 +28,19 @@ from lbt_synth.storage.rows import (
     row_table,
 )
 from lbt_synth.storage.tables import Table, text_lines
+from lbt_synth.validation import IntArray
 
 if TYPE_CHECKING:  # which few commands need
     from lbt_synth.files import Telemetry
 
-_WIDTH = 200  # where the output is no terminal
+_WIDTH = 200  # columns of --verbose where the output is no terminal
+_BRIEF_WIDTH, _BRIEF_LINES, BRIEF_ROWS = 100, 25, 12  # without --verbose: a screen
+_WRITTEN = "written: "
+_URGENT = ("warning", "note")  # the notes that are printed without --verbose, in this order
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
+# how the facts of commands print a Strehl ratio, and a residual
+PERCENT: Mapping[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}
+RMS: Mapping[str, Any] = {"unit": "nm", "format": ".1f"}
 
 
 @dataclass(kw_only=True)
@@ -40,9 +48,10 @@ class Report:
     """What a command reports, for programs and for people."""
 
     data: dict[str, Any] = field(default_factory=dict)  # for ``--json``; nan and inf become null
-    opening: list[str] = field(default_factory=list)  # lines above the tables
-    tables: list[Table] = field(default_factory=list)  # what people see
+    verdict: list[str] = field(default_factory=list)  # sentences, what matters most first
+    tables: list[Table] = field(default_factory=list)  # the first is printed without --verbose
     notes: list[str] = field(default_factory=list)  # lines below the tables
+    text: str = ""  # a script or a schema, printed as it is instead
     passed: bool = True  # False makes the exit status 1
     # what -o writes: rows of a .csv, but for some of their fields, and a figure
     rows: Sequence[Any] = ()
@@ -97,24 +106,96 @@ class Report:
     def note_written(self, path: str | os.PathLike[str], key: str = "file") -> None:
         """Add a file that was written to the data, and a line about it to the notes."""
         self.data[key] = str(path)
-        self.notes.append(f"written: {path}")
+        self.notes.append(f"{_WRITTEN}{path}")
 
     def note_files(self, paths: Iterable[str | os.PathLike[str]]) -> None:
         """Add files that were written to the data, and a line about each to the notes."""
         self.data["files"] = [str(path) for path in paths]
-        self.notes += [f"written: {path}" for path in self.data["files"]]
+        self.notes += [f"{_WRITTEN}{path}" for path in self.data["files"]]
 
-    def print(self, *, as_json: bool) -> None:
+    def print(self, *, as_json: bool = False, verbose: bool = False) -> None:
         """Print to standard output."""
         if as_json:
-            print(json.dumps(json_value(self.data), allow_nan=False))
+            said = {"verdict": self.verdict} if self.verdict else {}
+            print(json.dumps(json_value(said | self.data), allow_nan=False))
+            return
+        if self.text:
+            print(self.text)
             return
         room = shutil.get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
         lacks_line = "─".encode(sys.stdout.encoding or "utf-8", "replace") == b"?"
         rule = "-" if lacks_line else "─"
-        lines = [line for table in self.tables for line in text_lines(table, room, rule=rule)]
-        for line in (*self.opening, *lines, *self.notes):
+        for line in self._all(room, rule) if verbose else self._brief(room, rule):
             print(printable(line))
+
+    def _all(self, room: int, rule: str) -> Iterator[str]:
+        """Yield all that there is to say."""
+        for sentence in self.verdict:
+            yield from _wrapped(sentence, room)
+        for table in self.tables:
+            yield from text_lines(table, room, rule=rule)
+        yield from self.notes
+
+    def _brief(self, room: int, rule: str) -> list[str]:
+        """Return the verdict, the first table and what is urgent, at most a screen."""
+        room = min(room, _BRIEF_WIDTH)
+        files = [note.removeprefix(_WRITTEN) for note in self.notes if note.startswith(_WRITTEN)]
+        written = [f"{_WRITTEN}{', '.join(files)}"] if files else []
+        if files and len(written[0]) > room and len(files) > 1:
+            written = [f"{_WRITTEN}{len(files)} files, {files[0]} to {files[-1]}"]
+        lines = _wrapped(" ".join(self.verdict), room)
+        if self.tables:
+            table = text_lines(_thinned(self.tables[0]), room, rule=rule)
+            lines += [""] * bool(lines) + table
+        urgent = [
+            line
+            for mark in _URGENT
+            for note in self.notes
+            if note.startswith(mark)
+            for line in _wrapped(note, room)
+        ]
+        lines += urgent
+        space = _BRIEF_LINES - len(written)
+        if len(lines) > space:
+            lines = [*lines[: space - 1], "... more with --verbose"]
+        return lines + written
+
+
+def _wrapped(text: str, room: int) -> list[str]:
+    """Return a text in lines, with no name of a file broken, and no % apart from its number."""
+    joined = text.replace(" %", "\u00a0%")
+    lines = wrap(joined, room, break_long_words=False, break_on_hyphens=False)
+    return [line.replace("\u00a0", " ") for line in lines]
+
+
+def spread_indices(count: int, *kept: int) -> IntArray:
+    """Return the places of the rows that are printed of a list: from end to end, and some more."""
+    if count <= BRIEF_ROWS:
+        return np.arange(count)
+    places = np.linspace(0, count - 1, BRIEF_ROWS - len(kept)).round().astype(np.int64)
+    return np.unique([*places, *kept])
+
+
+def _thinned(table: Table) -> Table:
+    """Return a table with as many rows as are printed without --verbose.
+
+    They are from end to end, and of facts, which are in the order of their weight, the first.
+    """
+    count = len(table.rows)
+    if count <= BRIEF_ROWS:
+        return table
+    facts = table.headings[0] == "quantity"
+    places = np.arange(BRIEF_ROWS) if facts else spread_indices(count)
+    rows = tuple(table.rows[place] for place in places)
+    caption = f"{table.caption} ({len(rows)} of {count} rows; the others with --verbose)"
+    return replace(table, caption=caption, rows=rows)
+
+
+def say_checks(checks: Sequence[Any]) -> str:
+    """Return how many checks of a certificate passed, in a sentence."""
+    passed = sum(check.passed for check in checks)
+    failed = "" if passed == len(checks) else f"; {len(checks) - passed} FAILED"
+    return f"{passed} of {len(checks)} checks passed{failed}."
 
 
 def json_value(value: Any) -> Any:
@@ -171,7 +252,6 @@ def write_telemetry(
     telemetry: Telemetry,
     *,
     key: str,
-    what: str = "telemetry",
     kind: str | None = None,
     precision: str = "float64",
 ) -> None:
@@ -183,7 +263,7 @@ def write_telemetry(
     kind = require_telemetry_name(output, kind)
     path = save_telemetry(output, telemetry, format=kind, precision=precision)
     lost = lost_fields(telemetry) if kind == "aot" else ()
-    report.data |= {key: str(path), "lost": list(lost)}
-    report.notes.append(f"written: {path} ({what})")
+    report.note_written(path, key)
+    report.data["lost"] = list(lost)
     if lost:
         report.notes.append(f"note: the AOT standard has no place for {', '.join(lost)}.")

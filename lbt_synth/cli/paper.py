@@ -15,7 +15,7 @@ from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import loop_figure, robustness_figure
 from lbt_synth.storage.atomic_files import make_directory, write_atomically
 from lbt_synth.storage.display_unit import own_display_unit
-from lbt_synth.storage.rows import Facts, csv_rows, json_record
+from lbt_synth.storage.rows import csv_rows, json_record
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.studies import RobustnessRow
 from lbt_synth.studies.paper import (
@@ -45,12 +45,14 @@ def run(arguments: Namespace) -> Report:
         [table_entry(*pair) for pair in rows if pair[0].table == table] for table in ("II", "III")
     )
     filters = paper_filters()
-    files = write_paper(folder, rows, filters)
+    files = _write_paper(folder, rows, filters)
     ratio = filters[1].gamma_requested / filters[1].gamma_least
-    columns = {
-        method: rms_difference([e for e in third if e.method == method])
-        for method in dict.fromkeys(entry.method for entry in third)
-    }
+    by_method = [
+        (number, method, [entry for entry in entries if entry.method == method])
+        for number, entries in (("II", second), ("III", third))
+        for method in dict.fromkeys(entry.method for entry in entries)
+    ]
+    columns = {method: rms_difference(entries) for n, method, entries in by_method if n == "III"}
     with own_display_unit():  # JSON stays in nm
         parameters = parameter_rows()
     report = Report(
@@ -63,35 +65,47 @@ def run(arguments: Namespace) -> Report:
                 dict(zip(("name", "value", "origin"), row, strict=True)) for row in parameters
             ],
         },
-        notes=[
-            "Table III, rms difference: "
-            + ", ".join(f"{design_title(m)} {d:.2f} points" for m, d in columns.items()),
-            f"H-infinity: bound at {ratio:.3f} times the least at 20 Hz",
+        verdict=[
+            f"Table III, {design_title(method)}: {points:.2f} points rms from the paper."
+            for method, points in columns.items()
+        ],
+        notes=[f"H-infinity: bound at {ratio:.3f} times the least at 20 Hz"],
+    )
+    headings = ("table", "method", "rows", "rms difference", "largest difference")
+    report.add_table(
+        "Strehl ratios [%] at 2.2 um, ours less the paper's",
+        headings,
+        [
+            (
+                number,
+                design_title(method),
+                len(entries),
+                f"{rms_difference(entries):.2f}",
+                f"{max((e.difference for e in entries), key=abs):+.1f}",
+            )
+            for number, method, entries in by_method
         ],
     )
     report.add_table("Parameters", ("parameter", "value", "origin"), parameter_rows())
     for number, entries in (("II", second), ("III", third)):
-        _add_comparison(report, f"Table {number}: Strehl ratio [%] at 2.2 um", entries)
+        report.add_table(
+            f"Table {number}: Strehl ratio [%] at 2.2 um",
+            ("row", "method", "ours", "paper", "difference"),
+            [
+                (
+                    e.label,
+                    design_title(e.method),
+                    *map("{:.1f}".format, (e.ours, e.paper)),
+                    f"{e.difference:+.1f}",
+                )
+                for e in entries
+            ],
+        )
     report.note_files(files)
     return report
 
 
-def _add_comparison(report: Report, title: str, entries: list[Facts]) -> None:
-    """Add a table with the methods side by side."""
-    methods = dict.fromkeys(entry.method for entry in entries)
-    headings, lines = ["row"], {entry.label: [entry.label] for entry in entries}
-    for method in methods:
-        headings += [f"{design_title(method)}, ours", "paper", "difference"]
-    for entry in entries:  # in the order of the methods within each row
-        lines[entry.label] += [
-            f"{entry.ours:.1f}",
-            f"{entry.paper:.1f}",
-            f"{entry.difference:+.1f}",
-        ]
-    report.add_table(title, headings, lines.values())
-
-
-def write_paper(
+def _write_paper(
     folder: Path,
     rows: list[tuple[PaperRow, RobustnessRow]],
     filters: tuple[FilterDesign, FilterDesign],

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from lbt_synth.cli.loop_inputs import choose_design_unit, load_designs
+from lbt_synth.cli.loop_inputs import choose_design_unit, load_designs, margin_columns
 from lbt_synth.cli.output import Report
 from lbt_synth.design import Design
 from lbt_synth.errors import UnstableLoopError
@@ -23,8 +23,7 @@ from lbt_synth.report.figures.loops import (
     open_loops,
     sigma_curves,
 )
-from lbt_synth.storage.display_unit import shown_unit
-from lbt_synth.storage.rows import Column, Facts, columns, fact, facts, json_record, json_units
+from lbt_synth.storage.rows import Column, Facts, fact, facts, json_record, json_units, row_table
 from lbt_synth.validation import FloatArray
 
 _SETTLING_FRAMES = 8000  # within which loops settle, beyond what is drawn
@@ -38,10 +37,12 @@ _Curves: TypeAlias = dict[str, dict[str, FloatArray]]
 
 def run(arguments: Namespace) -> Report:
     """Print the margins of designs, and write their figure and their points."""
-    view = arguments.kind
-    designs, gain = load_designs(arguments.gains), arguments.gain_factor
-    choose_design_unit(arguments, *designs.values())
+    view, gain = arguments.kind, arguments.gain_factor
+    designs = load_designs(arguments.gains)
+    choose_design_unit(arguments, dict(zip(arguments.gains, designs.values(), strict=True)))
     report = Report(figure=lambda: loop_figure(designs, view, sensor_gain=gain))
+    if view == "step":
+        _add_step_facts(report, designs, gain)
     _add_margins(report, designs, gain)
     curves = _draw(view, designs, gain)
     if not curves:
@@ -55,8 +56,6 @@ def run(arguments: Namespace) -> Report:
         for name, series in curves.items()
     }
     report.data["units"] |= {name: _UNITS[name] for name in report.rows[0].values if name in _UNITS}
-    if view == "step":
-        _add_step_facts(report, designs, gain)
     return report
 
 
@@ -93,37 +92,38 @@ def _points(curves: _Curves) -> Iterator[Facts]:
 
 
 def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: float) -> None:
-    """Add the margins of designs, side by side."""
-    margins = {name: _margins(design, gain_factor) for name, design in designs.items()}
+    """Add the margins of designs, a line for each."""
+    records: dict[str, dict[str, Any]] = {}
+    lines = []
+    for name, design in designs.items():
+        records[name], margins = {"method": design.method}, None
+        if design.is_estimator:
+            records[name] |= {"gamma": design.gamma, "rms": design.rms}
+        if design.hardware is not None:
+            loop = close_loop(design.hardware, design.controller, sensor_gain=gain_factor)
+            records[name]["stable"] = loop.is_stable
+            if loop.is_stable:
+                margins = loop_margins(loop)
+                records[name] |= json_record(margins)
+                report.verdict.append(f"{name} {margins.survival}")
+            else:
+                report.verdict.insert(0, f"{name} is unstable at this sensor gain.")
+        crossover = getattr(margins, "crossover_hz", None)
+        lines.append(
+            facts(
+                design=fact(name, "design"),
+                stable=fact(records[name].get("stable"), "stable"),
+                **margin_columns(margins),
+                phase=fact(getattr(margins, "phase_deg", None), "phase", unit="deg", format=".1f"),
+                crossover=fact(crossover, "crossover", unit="Hz", format=".1f"),
+            )
+        )
     physical = all(design.hardware is not None for design in designs.values())
     units = json_units(LoopMargins) | ({"gamma": "nm", "rms": "nm"} if physical else {})
-    report.data |= {"designs": margins, "units": units, "gain_factor": gain_factor}
-    unit, factor = shown_unit(units.get("gamma", ""))
-    norms = [factor * record["gamma"] if "gamma" in record else None for record in margins.values()]
-    quantities = [("stable", "stable", "")]
-    quantities += [(c.heading, c.key, c.shown_unit) for c in columns(LoopMargins) if c.heading]
-    report.add_table(
-        f"Margins at {gain_factor:g} times the sensor gain that each design assumes",
-        ("quantity", *margins, "unit"),
-        [("norm", *norms, unit)]
-        + [
-            (heading, *(record.get(key) for record in margins.values()), unit)
-            for heading, key, unit in quantities
-        ],
-    )
-
-
-def _margins(design: Design, gain_factor: float) -> dict[str, Any]:
-    """Return the method of a design, its norm in its model, and the margins of its loop."""
-    record: dict[str, Any] = {"method": design.method}
-    if design.is_estimator:
-        record |= {"gamma": design.gamma, "rms": design.rms}
-    if design.hardware is not None:
-        loop = close_loop(design.hardware, design.controller, sensor_gain=gain_factor)
-        record["stable"] = loop.is_stable
-        if loop.is_stable:
-            record |= json_record(loop_margins(loop))
-    return record
+    report.data |= {"designs": records, "gain_factor": gain_factor}
+    report.data["units"] = report.data.get("units", {}) | units
+    caption = f"Margins at {gain_factor:g} times the sensor gain that each design assumes"
+    report.tables.append(row_table(caption, lines))
 
 
 def _named_steps(

@@ -38,7 +38,10 @@ def run(arguments: Namespace) -> Report:
     else:
         record = loop_records.require_series(loop_records.load_series(arguments), "telemetry holds")
         telemetry = telemetry_of_record(record)
-        notes = [record.health.summary(), *(f"note: {note}" for note in record.health.notes)]
+        notes = [
+            f"note: {record.health.summary()}",
+            *(f"note: {note}" for note in record.health.notes),
+        ]
     choose_unit(arguments, telemetry.diameter_m)
     report = _describe_telemetry(telemetry)
     report.data["file"] = arguments.file
@@ -83,8 +86,12 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
         }
     )
     seconds = telemetry.frames / telemetry.frame_rate_hz
+    report.verdict.append(
+        f"A loop of {count_text(telemetry.modes, 'mode')} at {telemetry.frame_rate_hz:g} Hz, for "
+        f"{seconds:.6g} s ({telemetry.frames} frames)."
+    )
     report.add_table(
-        f"{telemetry.frames} frames, {seconds:.6g} s, {count_text(telemetry.modes, 'mode')}",
+        "What the file holds",
         ("array", "shape", "axes", "unit", "rms"),
         [
             (

@@ -21,7 +21,7 @@ def here(tmp_path, monkeypatch):
 def test_a_telescope_is_written_with_its_schema(here, capsys, telescope):
     status, out, error = run(capsys, "init", "--telescope", telescope)
     assert (status, error) == (0, "")
-    assert f"next: put in your own numbers, then lbt-synth design {telescope}.yaml" in out
+    assert f"Next, put in your own numbers; then lbt-synth design {telescope}.yaml" in out
     text = (here / f"{telescope}.yaml").read_text()
     assert text.startswith("# yaml-language-server: $schema=lbt-synth.schema.json\n")
     assert json.loads((here / "lbt-synth.schema.json").read_text()) == lbt.config.config_schema()
@@ -37,7 +37,7 @@ def test_nothing_is_replaced_without_force(here, capsys):
     assert "generic.yaml would be replaced. Give another name by -o, or --force." in error
     assert (here / "generic.yaml").read_text() == "mine"
     status, out, _ = run(capsys, "init", "--force", "--json")
-    assert json.loads(out) == {"files": ["generic.yaml", "lbt-synth.schema.json"]}
+    assert json.loads(out)["files"] == ["generic.yaml", "lbt-synth.schema.json"]
     lbt.load_config("generic.yaml")
 
 

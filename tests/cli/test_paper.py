@@ -8,15 +8,11 @@ from support.commands import run
 
 import lbt_synth as lbt
 from lbt_synth.cli import paper
-from lbt_synth.studies.paper import (
-    modal_row,
-    paper_filters,
-    plan_rows,
-)
+from lbt_synth.studies.paper import modal_row, paper_filters, plan_rows
 
 
 def test_paper(tmp_path, capsys):
-    status, text, _ = run(capsys, "paper", "-o", tmp_path / "a" / "b")
+    status, text, _ = run(capsys, "paper", "-o", tmp_path / "a" / "b", "--verbose")
     assert status == 0
     assert "Table III" in text
     assert "fitted" in text
@@ -24,7 +20,7 @@ def test_paper(tmp_path, capsys):
 
 
 def test_paper_in_the_unit_of_the_user(tmp_path, capsys):
-    status, text, _ = run(capsys, "paper", "-o", tmp_path / "mas", "--unit", "mas")
+    status, text, _ = run(capsys, "paper", "-o", tmp_path / "mas", "--unit", "mas", "--verbose")
     assert status == 0
     assert re.search(r"turbulence pole, rms +0\.98860, 59\.38 mas ", text)
     assert re.search(r"80 mas as the rms of a sinusoid +80\.00 mas ", text)
@@ -49,7 +45,7 @@ def written(folder):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(paper, "robustness_figure", draw)
         rows = [(row, modal_row(row)) for row in plan_rows()]
-        return paper.write_paper(folder, rows, paper_filters()), drawn
+        return paper._write_paper(folder, rows, paper_filters()), drawn
 
 
 def test_written_files(folder, written):

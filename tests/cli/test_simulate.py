@@ -113,7 +113,7 @@ def test_the_run_reaches_beyond_the_last_event(capsys, config_file, sensors_file
     data = json.loads(run(capsys, *arguments)[1])
     assert data["frames"] == 5500
     assert [row["sensors"] for row in data["segments"]] == ["none", "m2"]
-    assert " in the loop: 1 run of 5500 frames; " in run(capsys, *arguments[:-1])[1]
+    assert "Simulated between failures and returns" in run(capsys, *arguments[:-1])[1]
 
 
 @pytest.mark.parametrize(
@@ -143,13 +143,7 @@ def test_a_design_of_one_sensor_has_nothing_to_drop(capsys, config_file, gains):
 
 
 @pytest.mark.parametrize(
-    "command",
-    [
-        ("plot sigma",),
-        ("plot bode",),
-        ("plot step",),
-        ("rehearse", "--for", "c"),
-    ],
+    "command", [("plot sigma",), ("plot bode",), ("plot step",), ("rehearse", "--for", "c")]
 )
 def test_commands_for_one_sensor_say_so(capsys, sensors_file, command):
     status, out, error = run(capsys, *command[0].split(), sensors_file, *command[1:])
@@ -159,14 +153,16 @@ def test_commands_for_one_sensor_say_so(capsys, sensors_file, command):
 
 def test_the_table_of_the_paper_has_no_channels(capsys, sensors_file, tmp_path):
     out = tmp_path / "table"
-    status, _, error = run(capsys, "end-to-end-table", LBT_YAML, sensors_file, "-o", out)
+    status, _, error = run(
+        capsys, "end-to-end", LBT_YAML, sensors_file, "--tables", "II", "-o", out
+    )
     assert status == 2
     assert "is a design of several sensors" in error
     assert not out.exists()
 
 
 def test_show_prints_what_failures_do(capsys, sensors_file):
-    status, text, _ = run(capsys, "show", sensors_file)
+    status, text, _ = run(capsys, "show", sensors_file, "--verbose")
     assert status == 0
     assert "When sensors fail" in text
     assert "wavefront + slow + m1 + m2" in text
@@ -201,20 +197,8 @@ def test_commands_that_read_the_own_sensor_alone_say_so(capsys, config_file):
         assert "note: the loop's own sensor is read alone, without slow, m1, m2." in text
 
 
-@pytest.mark.parametrize(
-    ("method", "options"),
-    [("kalman", ("--route", "sdp")), ("hinf", ("--route", "lmi")), ("mixed", ("--taps", 8))],
-)
-def test_options_that_need_one_rate(tmp_path, capsys, config_file, method, options):
-    gain = tmp_path / "q.fits"
-    status, _, error = run(capsys, "design", config_file, "--method", method, *options, "-o", gain)
-    assert status == 2
-    assert "needs a period of 1; got one of 2 samples. Try" in error
-    assert not gain.exists()
-
-
 def test_a_design_has_units(tmp_path, capsys, sensors_file):
-    text = run(capsys, "show", sensors_file)[1]
+    text = run(capsys, "show", sensors_file, "--verbose")[1]
     line = next(row for row in text.splitlines() if row.strip().startswith("estimation error, rms"))
     assert line.split()[-1] == "nm"
 
@@ -227,7 +211,7 @@ def test_what_a_drop_says():
 
 def test_it_is_exported_to_c(tmp_path, capsys, sensors_file):
     out = tmp_path / "k.c"
-    status, text, error = run(capsys, "export", sensors_file, "--for", "c", "-o", out)
+    status, text, error = run(capsys, "export", sensors_file, "--for", "c", "-o", out, "--verbose")
     assert (status, error) == (0, "")
     assert "spectral radius with any sensors missing" in text
     data = json.loads(run(capsys, "export", sensors_file, "--for", "c", "-o", out, "--json")[1])
@@ -246,3 +230,17 @@ def test_exports_that_cannot_hold_it(tmp_path, capsys, sensors_file, options, sa
     assert (status, out) == (2, "")
     assert said in error
     assert not list(tmp_path.iterdir())
+
+
+def test_several_gain_files_are_a_line_each(tmp_path, capsys, gains):
+    """Each line is what the command prints of the file alone: one seed is one weather."""
+    few = ("--frames", 500, "--cases", 2)
+    data = json.loads(run(capsys, "simulate", CONFIG, *gains.values(), *few, "--json")[1])
+    assert [row["design"] for row in data["designs"]] == list(gains)
+    for row, gain in zip(data["designs"], gains.values(), strict=True):
+        (alone,) = json.loads(run(capsys, "simulate", CONFIG, gain, *few, "--json")[1])["designs"]
+        assert row == alone
+    for option, name in (("-o", "a.png"), ("--telemetry", "a.fits")):
+        words = (*gains.values(), option, tmp_path / name)
+        status, _, error = run(capsys, "simulate", CONFIG, *words)
+        assert (status, "goes with one gain file; got 3." in error) == (2, True)

@@ -18,10 +18,7 @@ from lbt_synth.cli.streams import discard, printable
 
 COMMAND = f"{sys.executable} -c 'from lbt_synth.cli.main import entry_point; entry_point()'"
 # what is run, its status, and how many lines it writes to standard error
-CASES = {
-    "none 2>/dev/full": (2, 0),
-    "none >/dev/full 2>/dev/full": (2, 0),
-}
+CASES = {"none 2>/dev/full": (2, 0), "none >/dev/full 2>/dev/full": (2, 0)}
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the device is Linux's own")  # noqa: PTH110
@@ -39,7 +36,7 @@ def test_a_broken_pipe_is_not_left_to_rich(monkeypatch, as_json):
     """Rich would end the process with status 1; the entry point makes 141 of the error."""
     reader, writer = os.pipe()
     os.close(reader)
-    report = Report(opening=["a line"])
+    report = Report(verdict=["a line"])
     with os.fdopen(writer, "w") as stream:
         monkeypatch.setattr("sys.stdout", stream)
         report.print(as_json=as_json)

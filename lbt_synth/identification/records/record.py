@@ -128,6 +128,16 @@ class LoopRecord:
     read_with: str = ""
     usable: BoolArray = field(init=False)
 
+    def __repr__(self) -> str:
+        """Return three lines: what was recorded, how the loop ran, and what is usable."""
+        series = "measurements" if self.commands is None else "measurements and commands"
+        delay = "unknown" if self.delay_frames is None else f"{self.delay_frames:g} frames"
+        return (
+            f"<LoopRecord of {self.source or 'series'}: {self.frames} frames of {series},\n"
+            f" {self.axes} axes at {self.frame_rate_hz:g} Hz, delay {delay},\n"
+            f" {self.health.summary()}>"
+        )
+
     def __post_init__(self) -> None:
         y = matrix(self.measurements, "measurements")
         check_fields(self, measurements=y)

@@ -164,3 +164,10 @@ def test_commands_before_a_record_do_not_make_it_shorter():
     assert (late.first_known, late.lost) == (3, pytest.approx(1 / 4997))
     with pytest.raises(ProblemError, match="needs 5000 usable frames"):
         require_length(late, seconds=5)
+
+
+def test_its_text_is_three_lines():
+    lines = repr(loop_record(np.ones((100, 2)), frame_rate_hz=RATE, unit="nm")).splitlines()
+    assert len(lines) == 3
+    assert "100 frames of measurements" in lines[0]
+    assert "2 axes at 1000 Hz" in lines[1]

@@ -25,7 +25,7 @@ def test_a_mistyped_option_is_named(capsys, words, message) -> None:
 
 
 def test_a_mistyped_command_is_suggested(capsys):
-    views = "known are init, completion, "  # of plot, and no word is near
+    views = "known are init, design, "  # of plot, and no word is near
     near = "did you mean design?"
     for words, hint in ((("desgn",), near), (("bode",), views)):
         status, out, error = run(capsys, *words)
@@ -41,7 +41,7 @@ def test_what_can_be_left_out_is_not_called_required(capsys):
 @pytest.mark.e2e
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_a_shell_takes_its_script(tmp_path, capsys, shell):
-    status, out, error = run(capsys, "completion", shell)
+    status, out, error = run(capsys, "init", "--completion", shell)
     assert (status, error) == (0, "")
     assert all(word in out for word in ("tradeoff", "gamma-ratio"))
     script = tmp_path / "script"
@@ -63,7 +63,7 @@ def test_a_shell_takes_its_script(tmp_path, capsys, shell):
 )
 def test_bash_completes(tmp_path, capsys, words, expected):
     (tmp_path / "gain.fits").write_text("")
-    (tmp_path / "script").write_text(run(capsys, "completion", "bash")[1])
+    (tmp_path / "script").write_text(run(capsys, "init", "--completion", "bash")[1])
     line = " ".join(words)
     code = (
         f"source ./script; COMP_WORDS=(lbt-synth {line}); COMP_CWORD={len(words)}; "

@@ -1,4 +1,4 @@
-"""The command rehearse: a gain file in the arithmetic of a target, in the loop, on data."""
+"""The commands export and rehearse: a gain file in another program, and its loop there."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ from typing import TypeAlias
 
 import numpy as np
 
+from lbt_synth.cli.arguments import command_options, given_options, option_name
 from lbt_synth.cli.loop_inputs import choose_unit, load_design, load_shown
 from lbt_synth.cli.loop_records import load_series, record_imaging, require_series
-from lbt_synth.cli.output import Report, require_figure
-from lbt_synth.cli.parser import command_options
+from lbt_synth.cli.output import PERCENT, Report, require_figure, say_checks
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import GainFileError, ProblemError
+from lbt_synth.files import load_gain
 from lbt_synth.identification.records.record import require_length
-from lbt_synth.interop import Rehearsal, rehearse
+from lbt_synth.interop import Rehearsal, export, frame_cost, rehearse, target_named
+from lbt_synth.interop.pipeline import target_names
 from lbt_synth.loop import Imaging
 from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
 from lbt_synth.loop.strehl import series_strehl
@@ -26,62 +28,98 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.records import simulation_figure
+from lbt_synth.storage.atomic_files import require_writable
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import Facts, fact, facts
+from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import FloatArray, integer
 
+_OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps", "loss")
 _FRAMES = 8000  # of a drawn disturbance
 _DRAWN = ("frames", "seed")  # options that only a drawn disturbance has
-_ALWAYS = ("target", "file", "stroke", "wavelength_um", "output", "json", "unit", "show_unit")
-_FEWEST = 256  # frames of a record
+_ALWAYS = ("target", "stroke", "wavelength_um", "output", "json", "verbose", "unit", "show_unit")
+_FEWEST = 256  # frames of a record: a loop needs some to settle, and some to compare
 
-
-# the source in words, what the loops run_rehearse on, and residual and commands of a record
+# the source in words, what the loops run on, and residual and commands of a record
 _Series: TypeAlias = tuple[
     str, Disturbance, LoopHardware, Imaging, tuple[FloatArray, FloatArray] | None
 ]
 
 
-def run(arguments: Namespace) -> Report:
+def run_export(arguments: Namespace) -> Report:
+    """Write the controller of a gain file for another program."""
+    target = target_named(arguments.target)
+    options = given_options(arguments, *_OPTIONS)
+    for option in options:
+        if option not in target.options:
+            *some, last = (n for n in target_names() if option in target_named(n).options)
+            fitting = f"{', '.join(some)} or {last}" if some else last
+            raise ProblemError(
+                f"{option_name(option)} goes with --for {fitting}; got --for {arguments.target}."
+            )
+    output = Path(arguments.output)
+    require_writable(*target.places(output), inputs=[arguments.gain])
+    design = load_gain(arguments.gain)
+    digest = file_sha256(arguments.gain, GainFileError)
+    written = export(output, design, arguments.target, gain_digest=digest, **options)
+    report = Report(
+        data={"gain": arguments.gain, "gain_digest": digest, "target": arguments.target}
+    )
+    report.verdict.append(
+        f"What {arguments.target} computes differs from the controller by {written.error:.2g} of "
+        "the largest command."
+    )
+    if written.checks:
+        report.verdict.append(say_checks(written.checks))
+    commands, measurements = design.controller.D.shape[-2:]
+    what = facts(
+        method=fact(design.method, "method"),
+        n_states=fact(design.controller.n_states, "states of the controller"),
+        measurements=fact(measurements, "measurements"),
+        commands=fact(commands, "commands"),
+        error=fact(written.error, "difference from the controller", unit="of the largest command"),
+    )
+    report.add_facts("Export", what)
+    if arguments.target == "c" and not design.other_sensors:
+        report.add_facts("Cost per frame", frame_cost(design), key="frame_cost")
+    if written.checks:
+        report.add_rows("checks", "Checks in the arithmetic of the target", written.checks)
+    report.notes += [f"note: {note}." for note in written.notes]
+    report.note_files(written.files)
+    return report
+
+
+def run_rehearse(arguments: Namespace) -> Report:
     """Run the loop in the arithmetic of a target, beside the design and what ran."""
-    inputs = [path for path in (arguments.gain, arguments.file) if path is not None]
+    target, recorded = arguments.target, arguments.file is not None
     if arguments.output is not None:
-        require_figure(arguments.output, inputs=inputs)
+        paths = given_options(arguments, "gain", "file")
+        require_figure(arguments.output, inputs=tuple(paths.values()))
     _refuse_idle_options(arguments)
     design = load_design(arguments.gain)
-    recorded = arguments.file is not None
     series = (_recorded if recorded else _drawn)(arguments, design)
     source, disturbance, hardware, imaging, ran = series
-    rehearsal = rehearse(
-        design, arguments.target, disturbance, hardware=hardware, stroke=arguments.stroke
-    )
-    loops = {
-        f"in {arguments.target}": rehearsal.target,
-        "design, double precision": rehearsal.design,
-    }
-    rows = [
-        _describe(
-            name,
-            one.image_nm2[0],
-            one.commands[0],
-            one.strehl,
-            imaging,
-            rehearsal.clipped_frames(one),
-        )
-        for name, one in loops.items()
-    ]
+    rehearsal = rehearse(design, target, disturbance, hardware=hardware, stroke=arguments.stroke)
+    rows = []
+    for name, run in ((f"in {target}", rehearsal.target), ("design", rehearsal.design)):
+        clipped = rehearsal.clipped_frames(run)
+        squares, commands = run.image_nm2[0], run.commands[0]
+        rows.append(_describe(name, squares, commands, run.strehl, imaging, clipped))
     if ran is not None:
-        residual, commands = (part[rehearsal.settle_frames :] for part in ran)
+        residual, commands = (signal[rehearsal.settle_frames :] for signal in ran)
 
         def ratio(camera: Imaging) -> FloatArray:
             return np.array([series_strehl(residual, camera)])
 
         rows.append(_describe("what ran", residual**2, commands, ratio, imaging, None))
-    report = Report(data={"gain": arguments.gain, "target": arguments.target})
-    what = f"Rehearsal for {arguments.target} on {source}; {imaging.label}"
-    report.add_rows("loops", what, rows)
+    leaves = [f"{nm_text(row.residual_nm, '.1f')} rms ({row.name})" for row in rows]
+    report = Report(data={"gain": arguments.gain, "target": target})
+    report.verdict = [f"On {source}: {listing_text(leaves)}.", say_checks(rehearsal.checks)]
+    report.add_rows("loops", f"Rehearsal for {target}; {imaging.label}", rows)
     report.add_facts("The target beside the design", _difference_facts(rehearsal))
-    report.add_rows("checks", f"Checks in the arithmetic of {arguments.target}", rehearsal.checks)
-    if arguments.file is not None:
+    report.add_rows("checks", f"Checks in the arithmetic of {target}", rehearsal.checks)
+    if recorded:
         report.notes += [
             "note: residuals are of means over frames, and hold the noise of the measurements.",
             "note: Strehl ratios are of tip and tilt alone; the record knows no other modes.",
@@ -89,7 +127,7 @@ def run(arguments: Namespace) -> Report:
     if design.hardware is not None:
         report.notes += [f"note: {text}" for text in loop_differences(design.hardware, hardware)]
     if arguments.output is not None:
-        figure = simulation_figure(rehearsal.target, title=f"{design.method} in {arguments.target}")
+        figure = simulation_figure(rehearsal.target, title=f"{design.method} in {target}")
         report.note_written(save_figure(figure, arguments.output))
     return report
 
@@ -113,7 +151,7 @@ def _describe(
         first_nm=fact(axes[0], "first axis", **rms),
         second_nm=fact(second, "second axis", **rms),
         residual_nm=fact(float(np.linalg.norm(axes)), "residual", **rms),
-        strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
+        strehl=fact(ratio, "Strehl", **PERCENT),
         largest_command_nm=fact(largest_nm, "largest command", unit="nm", format=".1f"),
         clipped_frames=fact(clipped, "clipped frames"),
     )
@@ -138,7 +176,7 @@ def _refuse_idle_options(arguments: Namespace) -> None:
     for name, (option, usual) in command_options("rehearse").items():
         idle = name not in (*_DRAWN, *_ALWAYS) if drawn else name in _DRAWN
         if idle and getattr(arguments, name) != usual:
-            raise ProblemError(f"{option} goes {'with' if drawn else 'without'} --record.")
+            raise ProblemError(f"{option} goes {'with' if drawn else 'without'} a record.")
 
 
 def _recorded(arguments: Namespace, design: Design) -> _Series:
@@ -183,7 +221,7 @@ def _drawn(arguments: Namespace, design: Design) -> _Series:
     """Return a disturbance drawn from the truth that the gain file was made with."""
     if not design.configuration:
         raise ProblemError(
-            "the gain file holds no configuration to draw a disturbance from. Give --record."
+            "the gain file holds no configuration to draw a disturbance from. Give a record, too."
         )
     config = config_from_text(design.configuration, Path(arguments.gain))
     load_shown(arguments, config)

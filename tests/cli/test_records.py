@@ -1,0 +1,459 @@
+"""The commands identify, auto and diagnose: good records, and bad ones."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.commands import run
+from support.diagnoses import given_design, line_record
+from support.night import GAIN, LINE_HZ, NOISE
+from support.recorded_loops import RATE, open_record, spliced_record
+
+import lbt_synth as lbt
+from lbt_synth.identification.fit import whittle
+
+FACTS = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm")
+
+
+@pytest.fixture(scope="module")
+def tip_night(recorded_loop, tmp_path_factory):
+    """The axis of the recorded night that vibrates, alone."""
+    file = tmp_path_factory.mktemp("tip") / "tip.npz"
+    run_, _, _ = recorded_loop
+    y, u = (series[0, :, :1] for series in (run_.measurements, run_.commands))
+    np.savez(file, measurements=y, commands=u)
+    return file
+
+
+@pytest.fixture(scope="module")
+def brief_night(recorded_loop, tmp_path_factory):
+    """The telemetry of the first five seconds."""
+    run_, path, ran = recorded_loop
+    seen = lbt.files.telemetry_from_simulation(run_, path, sensor_gain=GAIN, design=ran)
+    names = ("commands", "measurements", "residual_nm", "total_nm")
+    brief = replace(seen, **{name: getattr(seen, name)[:5000] for name in names})
+    return lbt.files.save_telemetry(tmp_path_factory.mktemp("brief") / "brief.fits", brief)
+
+
+def test_identify_writes_a_configuration_that_designs(tmp_path, capsys, recorded_night):
+    out = tmp_path / "model.yaml"
+    status, text, error = run(
+        capsys, "identify", recorded_night, "-o", out, "--wavelength-um", 1.65
+    )
+    assert (status, error) == (0, "")
+    assert text.startswith("1 vibration, the strongest of ")
+    assert "Vibrations, the strongest first" in text
+    assert out.with_suffix(".png").stat().st_size > 10_000
+    config = lbt.load_config(out)
+    (line,) = config.plant.vibrations
+    assert line.frequency_hz == pytest.approx(LINE_HZ, abs=0.2)
+    assert line.direction == (1.0, 0.0)
+    assert config.imaging.wavelength_um == 1.65
+    assert config.settings.model.sensor_gain == pytest.approx([GAIN, GAIN], rel=0.15)
+    gain = tmp_path / "k.fits"
+    assert run(capsys, "design", out, "--method", "kalman", "-o", gain)[0] == 0
+    assert run(capsys, "verify", gain)[0] == 0
+
+
+def test_a_line_along_a_diagonal_is_one_row(tmp_path, capsys):
+    line = lbt.Vibration(frequency_hz=31, damping=0.006, rms_nm=60, direction=(0.8, -0.6))
+    file = tmp_path / "night.npy"
+    np.save(file, open_record(((line, 0),), frames=8192).measurements)
+    options = ("--columns", "measurements=0,1", "--frame-rate-hz", 1000, "--unit", "nm")
+    options += ("--kind", "open-loop", "--no-figure", "-o", tmp_path / "m.yaml")
+    status, text, _ = run(capsys, "identify", file, *options)
+    assert status == 0
+    assert re.match(
+        r"1 vibration, the strongest of \d\d\.\d nm rms at (30\.[789]|31\.[0123])", text
+    )
+    status, text, _ = run(capsys, "identify", file, *options, "--json")
+    (found,) = json.loads(text)["vibrations"]
+    assert found["direction"] == pytest.approx([0.8, -0.6], abs=0.01)
+
+
+def test_a_spectrum(tmp_path, capsys):
+    f = np.arange(1, 1600) * 0.25
+    line = lbt.Vibration(frequency_hz=52, damping=0.02, rms_nm=30).ar_model(RATE)
+    chance = np.random.default_rng(0).gamma(20.0, 1 / 20.0, f.size)
+    file = tmp_path / "psd.csv"
+    np.savetxt(
+        file,
+        np.column_stack([f, (line.psd(f) + 0.5) * chance]),
+        delimiter=",",
+        comments="",
+        header="frequency_hz,psd_nm2/Hz",
+    )
+    options = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm^2/Hz")
+    status, _, error = run(
+        capsys, "identify", file, "-o", tmp_path / "m.yaml", *options, "--kind", "spectrum"
+    )
+    assert (status, error) == (0, "")
+    config = lbt.load_config(tmp_path / "m.yaml")
+    assert config.hardware.frame_rate_hz == 1000
+    assert config.plant.vibrations[0].frequency_hz == pytest.approx(52, abs=0.3)
+    stated = ("--kind", "spectrum", "--noise-nm", 7, "-o", tmp_path / "n.yaml", "--no-figure")
+    status, _, error = run(capsys, "identify", file, *options, *stated)
+    assert (status, error) == (0, "")
+    assert np.diag(lbt.load_config(tmp_path / "n.yaml").plant.R) == pytest.approx(49)
+    status, _, error = run(
+        capsys, "auto", file, "-o", tmp_path / "t.fits", *options, "--kind", "spectrum"
+    )
+    assert status == 2
+    assert "got a spectrum" in error
+
+
+def test_lists_announce_lines(tmp_path, capsys, recorded_night):
+    (tmp_path / "named.csv").write_text("error_hz,frequency_hz\n0.1,31.0\n,77\n")
+    words = (recorded_night, "-o", tmp_path / "m.yaml", "--no-figure", "--json")
+    for options in (("--lines-file", tmp_path / "named.csv"), ("--lines-hz", 31, 77)):
+        status, text, error = run(capsys, "identify", *words, *options)
+        assert (status, error) == (0, "")
+        (line,) = json.loads(text)["axes"][0]["vibrations"]
+        assert line["announced"]
+        assert line["frequency_hz"] == pytest.approx(LINE_HZ, abs=0.2)
+
+
+@pytest.mark.parametrize("text", ["frequency_hz,error_hz\n20,0.1\n,0.2\n", "1,2,3\n"])
+def test_lists_of_lines_that_are_refused(tmp_path, capsys, recorded_night, text):
+    (tmp_path / "lines.csv").write_text(text)
+    options = ("-o", tmp_path / "m.yaml", "--lines-file", tmp_path / "lines.csv")
+    status, _, error = run(capsys, "identify", recorded_night, *options)
+    assert status == 2
+    assert "must have a frequency_hz in each row" in error
+
+
+def test_accelerometers_are_compared_with_the_lines_of_the_model(
+    tmp_path, capsys, recorded_loop, tip_night
+):
+    """Two readings a frame in mm/s^2: a channel that follows the line twofold, and a dead one."""
+    run_, _, _ = recorded_loop
+    shake = np.diff(run_.total_nm[0][:, 0], n=2, prepend=[0, 0])  # mm/s^2 at 1 kHz
+    readings = 2 * shake + 0.05 * np.std(shake) * np.random.default_rng(4).standard_normal(
+        shake.size
+    )
+    table = np.column_stack([readings, np.zeros(shake.size)]).repeat(2, axis=0)
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="m1,m2", comments="")
+    base = ("identify", tip_night, *FACTS, "-o", tmp_path / "m.yaml", "--no-figure")
+    own = ("--accelerometers", tmp_path / "a.csv", "--acceleration-unit", "mm/s2")
+    status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 2000, "--json")
+    assert (status, error) == (0, "")
+    found = json.loads(text)
+    (line,) = [row for row in found["accelerometer_lines"] if row["useful"]]
+    assert (line["channel"], found["vibrations"][line["line"]]["kind"]) == ("m1", "line")
+    assert line["motion_nm_per_nm"] == pytest.approx(2, rel=0.05)
+    assert [row["verdict"] for row in found["accelerometers"]] == ["used", "dead"]
+    settings = lbt.load_config(tmp_path / "m.yaml").settings
+    assert settings.sensors["accelerometer"].channels == ["m1"]
+    (moving,) = [each.accelerometers for each in settings.model.vibrations if each.accelerometers]
+    assert moving["m1"].motion_nm_per_nm == line["motion_nm_per_nm"]
+    status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 1500, "--verbose")
+    assert status == 0  # a rate that is wrong shows no line
+    assert "check the rate of the readings" in text
+    status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 500)
+    assert status == 2
+    assert "at least once a frame, 1000 Hz, and last a frame; got 24000 readings at 500 Hz" in error
+
+
+def test_a_model_is_written_whatever_becomes_of_its_accelerometers(
+    tmp_path, capsys, monkeypatch, recorded_loop, tip_night
+):
+    run_, _, _ = recorded_loop
+    np.save(tmp_path / "a.npy", 1e-3 * np.diff(run_.total_nm[0][:, 0], n=2, prepend=[0, 0]))
+    real = lbt.identification.accelerometer_transfers
+
+    def fails(*_, **__):
+        raise lbt.errors.NumericalError("gone.")
+
+    def is_noiseless(*given, **options):
+        found = real(*given, **options)
+        rows = tuple(replace(row, noise_m_s2=0.0) for row in found.channels)
+        return replace(found, channels=rows)
+
+    for wrong, words in (
+        (fails, "warning: the accelerometers were not compared: gone."),
+        (is_noiseless, "warning: the model is written without accelerometers: "),
+    ):
+        monkeypatch.setattr(lbt.identification, "accelerometer_transfers", wrong)
+        out = tmp_path / f"{wrong.__name__}.yaml"
+        base = ("identify", tip_night, *FACTS, "-o", out, "--no-figure")
+        status, text, _ = run(capsys, *base, "--accelerometers", tmp_path / "a.npy")
+        assert status == 0
+        assert words in text
+        settings = lbt.load_config(out).settings
+        assert settings.sensors is None
+        assert settings.model.vibrations
+
+
+def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
+    run_, _, _ = recorded_loop
+    y, u = run_.measurements[0].copy(), run_.commands[0]
+    y[5000:5400] = np.nan
+    y[8000] = np.nan
+    np.savez(tmp_path / "n.npz", measurements=y, commands=u)
+    options = (*FACTS, "--no-figure")
+    status, text, _ = run(
+        capsys, "identify", tmp_path / "n.npz", "-o", tmp_path / "m.yaml", *options
+    )
+    assert status == 0
+    assert re.search(r"note: \d+ of \d+ frames are usable", text)
+    assert "not finite" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("-o", "m.txt"), "must end in .yaml"),
+        (("-o", "m.yaml", "--columns", "a"), "takes ROLE=NAME"),
+        (("-o", "m.yaml", "--acceleration-unit", "g"), "goes with --accelerometers"),
+        (("-o", "m.yaml", "--wavelength-um", "0"), "--wavelength-um must be above 0"),
+    ],
+)
+def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, brief_night, options, words):
+    monkeypatch.chdir(tmp_path)
+    status, text, error = run(capsys, "identify", brief_night, *options)
+    assert (status, text) == (2, "")
+    assert words in error
+    assert "Traceback" not in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sinusoid_without_noise_is_no_crash(tmp_path, capsys, monkeypatch) -> None:
+    evaluations = []
+    plain = whittle.derivatives
+    monkeypatch.setattr(
+        whittle, "derivatives", lambda *given: evaluations.append(0) or plain(*given)
+    )
+    np.save(tmp_path / "s.npy", 100 * np.sin(2 * np.pi * 0.05 * np.arange(8192)))
+    words = ("--kind", "open-loop", "--no-figure", "-o", tmp_path / "s.yaml", *FACTS)
+    status, _, error = run(capsys, "identify", tmp_path / "s.npy", *words)
+    assert status in (0, 2)
+    assert "Traceback" not in error
+    assert 0 < len(evaluations) < 10_000  # the search ends
+
+
+@pytest.fixture(scope="module")
+def made(recorded_night, tmp_path_factory):
+    """Everything that auto writes, and what it says."""
+    import contextlib
+    import io
+
+    from lbt_synth.cli.main import main
+
+    out = tmp_path_factory.mktemp("auto") / "tt.fits"
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text):
+        assert main(["auto", str(recorded_night), "-o", str(out), "--json"]) == 0
+    return out, json.loads(text.getvalue())
+
+
+def test_auto_tests_its_design_on_unseen_data(made, recorded_loop):
+    out, data = made
+    rows = {row["name"]: row for row in data["held_out"]}
+    assert list(rows) == [
+        "what ran",
+        "best integrator",
+        "Kalman filter",
+        "H-infinity filter",
+        "LQG controller",
+        "least-squares predictor",
+        "limit of performance",
+    ]
+    kalman = rows["Kalman filter"]
+    assert kalman["data_nm"] < 0.5 * rows["what ran"]["data_nm"]
+    assert kalman["data_nm"] < 1.02 * rows["least-squares predictor"]["data_nm"]
+    assert kalman["data_nm"] == pytest.approx(kalman["model_nm"], rel=0.1)
+    # what ran is what the simulation left in its second half
+    run_, _, _ = recorded_loop
+    half = run_.residual_nm[0, len(run_.residual_nm[0]) // 2 :]
+    true = np.sqrt(np.sum(np.mean(half**2, axis=0)))
+    gain = data["axes"][0]["sensor_gain"]
+    assert rows["what ran"]["data_nm"] == pytest.approx(true * GAIN / gain, rel=0.05)
+    assert data["gain_over_what_ran"]["residual_nm"][1] == kalman["data_nm"]
+    assert data["certificate"] is True
+    assert data["method"] == "kalman"
+    assert data["units"]["data_error_nm"] == "nm"
+    assert lbt.load_gain(out).certificate.passed
+    assert lbt.load_config(data["model"]).plant.vibrations
+    assert out.with_suffix(".png").is_file()
+
+
+def test_auto_says_what_it_found(capsys, recorded_night, tmp_path):
+    options = ("--method", "hinf", "--gamma-ratio", 1.3, "--sensor-gain", GAIN, "--no-figure")
+    files = ("-o", tmp_path / "h.npz", "--model", tmp_path / "m.yml")
+    status, text, error = run(capsys, "auto", recorded_night, *options, *files)
+    assert (status, error) == (0, "")
+    said = " ".join(text.split())
+    assert re.match(
+        r"The H-infinity filter leaves [\d.]+ nm rms on unseen data, where what ran left [\d.]+ nm",
+        said,
+    )
+    assert "Kalman filter" not in text
+    assert not (tmp_path / "h.png").exists()
+    assert (tmp_path / "m.yml").is_file()
+
+
+def test_an_open_loop_series_and_one_axis(tmp_path, capsys, recorded_loop):
+    run_, _, _ = recorded_loop
+    noise = np.random.default_rng(0).standard_normal(len(run_.total_nm[0]))
+    np.save(tmp_path / "open.npy", run_.total_nm[0][:, 0] + NOISE * noise)
+    words = ("--kind", "open-loop", "--no-figure", "-o", tmp_path / "t.fits", *FACTS)
+    status, text, error = run(capsys, "auto", tmp_path / "open.npy", *words)
+    assert (status, error) == (0, "")
+    assert "what ran" not in text
+    assert "note: the Kalman filter stays: " in text
+    assert lbt.load_config(tmp_path / "t.yaml").plant.hardware.modes == 1
+
+
+def test_auto_refuses_what_it_cannot_do(tmp_path, capsys, recorded_night):
+    for options, words in (
+        (("--method", "kalman", "--gamma-ratio", 1.1), "--gamma-ratio goes with method hinf or"),
+        (("--lines-hz", 12, "-5"), "--lines-hz must be above 0; got -5"),
+        (("--model", tmp_path / "t.fits"), "must end in .yaml"),
+    ):
+        status, _, error = run(capsys, "auto", recorded_night, "-o", tmp_path / "t.fits", *options)
+        assert (status, words in error) == (2, True)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_short_record_is_refused_in_the_words_of_the_command_line(tmp_path, capsys) -> None:
+    record, file = spliced_record(frames=3000), tmp_path / "brief.npz"
+    np.savez(file, measurements=record.measurements, commands=record.commands)
+    known = ("--frame-rate-hz", 1000, "--unit", "nm", "--no-figure", "-o", tmp_path / "q.fits")
+    for options, message in (
+        (
+            ("--delay-frames", 2),
+            "the record needs 4000 usable frames (4 s at 1000 Hz) in stretches of at least 256; "
+            "got 2996 (3 s), the longest stretch 2996.",
+        ),
+        (("--delay-frames", 0.2), "--delay-frames must be"),
+        ((), "not known; give --delay-frames, from the middle"),
+    ):
+        status, text, error = run(capsys, "auto", file, *known, *options)
+        assert (status, text) == (2, "")
+        assert message in error
+        assert not any(name in error for name in ("_frames", "record.", "bridged", "settle"))
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_names_that_no_text_can_hold(tmp_path, capsys) -> None:
+    record = spliced_record(frames=9000)
+    file = tmp_path / "a\x01.npz"
+    np.savez(file, measurements=record.measurements, commands=record.commands)
+    words = ("auto", file, "-o", tmp_path / "q.fits", *FACTS, "--no-figure")
+    status, text, error = run(capsys, *words)
+    assert (status, error) == (0, "")
+    assert "a\\x01.npz" in (tmp_path / "q.yaml").read_text()
+    said = " ".join(text.split())
+    assert "note: the record is short (9 s): it does not tell lines less than 0.11 Hz apart" in said
+
+
+def write(path, change=1.0, frames=None, **more):
+    record = line_record()
+    y, u = record.measurements[:frames], record.commands[:frames]
+    np.savez(path, measurements=y, commands=change * u, **more)
+    return path
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("records") / "night.npz")
+
+
+def test_a_page_of_text(capsys, night):
+    status, text, error = run(capsys, "diagnose", night, *FACTS, "--verbose")
+    assert (status, error) == (0, "")
+    said = " ".join(text.split())
+    assert said.startswith("The record is sound: an integrator of gain 0.2 ran")
+    for caption in (
+        "First change the controller: the ",
+        "Record: 8.188 s at 1000 Hz. 8186 of 8188 frames are usable",
+        "Control law in use, from y to u",
+        "Vibrations",
+        "What each part leaves by the model of the first half (best design: ",
+        "Residual on the second half of the record",
+    ):
+        assert caption in said
+
+
+def test_a_gain_file_the_page_and_json(capsys, night, tmp_path):
+    gain = lbt.save_gain(tmp_path / "mine.npz", given_design())
+    page = tmp_path / "page.html"
+    status, text, error = run(capsys, "diagnose", night, gain, *FACTS, "-o", page, "--json")
+    assert (status, error) == (0, "")
+    data = json.loads(text)
+    assert data["doubt"] is None
+    assert data["control_law"]["kind"] == "integrator"
+    assert any(note.startswith("mine promises") for note in data["notes"])
+    assert {row["name"] for row in data["residuals"]} > {"mine", data["best"], "what ran"}
+    assert data["costs"][-1]["part"] == "all"
+    assert data["lines"][0]["frequency_hz"] == pytest.approx(31, abs=0.2)
+    assert data["verdict"][0].startswith("The record is sound")
+    assert data["files"] == [str(page)]
+    assert "Diagnosis of night.npz" in page.read_text(encoding="utf-8")
+
+
+def test_a_record_that_lies_is_still_diagnosed(capsys, tmp_path):
+    status, text, _ = run(capsys, "diagnose", write(tmp_path / "n.npz", -1.0, 3000), *FACTS)
+    assert status == 0
+    assert " ".join(text.split()).startswith(
+        "The commands are not those that the mirror followed: they have the opposite sign. "
+        "Nothing can be said of its residual. First read the record with --command-sign -1. "
+    )
+    assert "Vibrations" not in text
+
+
+def test_a_dead_axis_leaves_the_other(capsys, tmp_path):
+    record = line_record()
+    y = np.hstack([record.measurements, np.zeros((record.frames, 1))])
+    path = tmp_path / "dead.npz"
+    np.savez(path, measurements=y, commands=np.hstack([record.commands] * 2))
+    status, text, _ = run(capsys, "diagnose", path, *FACTS)
+    assert status == 0
+    assert text.startswith("The record has faults: the tilt measurement is dead. It leaves ")
+    assert "note: the rest is of the axis that lives: the other one is dead" in text
+
+
+def test_the_clock(capsys, tmp_path):
+    record = line_record()
+    jitter = 5e-5 * np.random.default_rng(0).standard_normal(record.frames)
+    kept = np.ones(record.frames, dtype=bool)
+    kept[100::800] = False
+    write_times = np.arange(record.frames) / RATE + jitter
+    path = tmp_path / "clock.npz"
+    np.savez(
+        path,
+        times_s=write_times[kept],
+        measurements=record.measurements[kept],
+        commands=record.commands[kept],
+    )
+    status, text, _ = run(
+        capsys, "diagnose", path, "--delay-frames", 2, "--unit", "nm", "--verbose"
+    )
+    assert status == 0
+    assert "11 missing (frames)" in " ".join(text.split())
+
+
+def test_bad_input(capsys, night, tmp_path):
+    def error_of(*arguments):
+        status, _, error = run(capsys, "diagnose", *arguments)
+        assert status == 2
+        (line,) = error.splitlines()
+        return line.removeprefix("lbt-synth: error: ")
+
+    assert error_of(night, *FACTS[:2], *FACTS[4:]).startswith("the total delay of this loop is not")
+    assert "cannot read" in error_of(night, tmp_path / "no.fits", *FACTS)
+    assert ".html" in error_of(night, *FACTS, "-o", tmp_path / "page.txt")
+    assert error_of(night, *FACTS, "--pdf", "a.pdf").startswith("--pdf is the page of -o on paper")
+    assert "npz" in error_of(tmp_path / "nowhere.npz", *FACTS)
+    spectrum = tmp_path / "psd.csv"
+    f = np.arange(1.0, 200)
+    np.savetxt(
+        spectrum, np.column_stack([f, 1 / f]), delimiter=",", header="frequency_hz,psd", comments=""
+    )
+    assert error_of(spectrum, "--kind", "spectrum", "--unit", "nm^2/Hz").startswith(
+        "diagnose examines recorded series; got a spectrum."
+    )
