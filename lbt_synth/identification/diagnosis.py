@@ -532,7 +532,7 @@ def _missed_by_the_model(diagnosis: Diagnosis) -> Iterator[Finding]:
     less_nm = float(np.sqrt(model.total_nm2 - data.total_nm2))
     yield Finding(
         tone="note",
-        sentence=f"The model misses {nm_text(less_nm)} that past readings tell, most of it "
+        sentence=f"The model misses {nm_text(less_nm)} that past readings tell, above all "
         f"between {low_hz:.0f} and {high_hz:.0f} Hz.",
     )
 
