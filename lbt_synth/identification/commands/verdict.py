@@ -467,7 +467,7 @@ def _scale(
         within |= could_have_run(choice.repair, usual, record, law)
     if high < seeming < _ANOTHER_UNIT * high:
         held = [_fit_cost(coarse, choice.repair, gain) for gain in (*_TRIED, seeming)]
-        within |= min(held[:-1]) < held[-1] + _SURPRISING
+        within |= min(held[:-1]) < held[-1] + CLEAR
     return likely_factors(choice.gain, within)
 
 
