@@ -53,7 +53,6 @@ _ODD = CLEAR / 2  # nats that what no law asks for must add, by the model of the
 _SURPRISING = 3 * CLEAR  # nats that overrule a law with errors
 _WRONG_GAIN = 2.0  # factor by which a coarse gain may err; another unit is off by its square
 _ANOTHER_UNIT = 25.0  # factor beyond the limits that no wide resonances explain
-_TRIED = 0.3, 0.6, 1.2  # plausible gains of quick fits
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
 _LITTLE = 0.01  # of the gain of a law, which has no inverse; or of the changes of commands, which
 # moves a gain by 10 % if the law leaves them
@@ -466,7 +465,8 @@ def _scale(
         usual = np.geomspace(*PLAUSIBLE_GAINS, 8)
         within |= could_have_run(choice.repair, usual, record, law)
     if high < seeming < _ANOTHER_UNIT * high:
-        held = [_fit_cost(coarse, choice.repair, gain) for gain in (*_TRIED, seeming)]
+        tried = np.geomspace(low * _WRONG_GAIN**2, high / _WRONG_GAIN**2, 3).tolist()
+        held = [_fit_cost(coarse, choice.repair, gain) for gain in (*tried, seeming)]
         within |= min(held[:-1]) < held[-1] + CLEAR
     return likely_factors(choice.gain, within)
 
