@@ -46,6 +46,11 @@ def test_prose_is_plain_and_no_line_is_longer_than_100(page):
     assert NOT_ENGLISH.findall(" ".join(lines)) == []
 
 
+@pytest.mark.parametrize("page", sorted(ROOT.glob("docs/decisions/*.md")), ids=lambda page: page.stem)
+def test_a_page_of_decisions_says_what_holds_today_in_120_lines(page):
+    assert len(page.read_text(encoding="utf-8").splitlines()) <= 120
+
+
 @pytest.fixture(scope="module")
 def house():
     spec = importlib.util.spec_from_file_location("house", ROOT / "docs" / "house.py")
