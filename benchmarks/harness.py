@@ -1,19 +1,26 @@
-"""Timing by pairs, growth with size, and the machine."""
+"""What benchmarks share: timing by pairs, loops over records, a rival of least squares."""
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
 import platform
 import re
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
+from lbt_synth.models.loop_hardware import past_corrections
+
+FIGURES = Path(__file__).with_name("identification_figures.json")
 Row = dict[str, Any]
 PEERS = ("numpy", "scipy", "cvxpy", "clarabel", "control", "slycot")
 
@@ -85,3 +92,57 @@ def machine() -> Row:
             for name in ("numpy", "scipy", "cvxpy", "clarabel", "control", "slycot")
         },
     }
+
+
+def record_options(
+    description: str | None, *, records: int, first: int = 0, **more: Any
+) -> argparse.Namespace:
+    """Parse which records to draw, and options of a benchmark with their defaults."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", action="store_true", help=f"into {FIGURES.name}")
+    for name, default in {"first": first, "records": records, "jobs": 1, **more}.items():
+        if isinstance(default, bool):
+            parser.add_argument(f"--{name}", action="store_true")
+        else:
+            parser.add_argument(f"--{name}", type=type(default), default=default)
+    return parser.parse_args()
+
+
+def run_all(measure: Callable[[int], Row], asked: argparse.Namespace) -> list[Row]:
+    """Measure each record by its seed, in line or in processes."""
+    seeds = range(asked.first, asked.first + asked.records)
+    if asked.jobs == 1:
+        return [measure(seed) for seed in seeds]
+    with ProcessPoolExecutor(asked.jobs) as pool:
+        return list(pool.map(measure, seeds))
+
+
+def write_figures(name: str, figures: Row) -> None:
+    """Put the figures of a benchmark into the file that keeps them."""
+    book = json.loads(FIGURES.read_text())
+    FIGURES.write_text(json.dumps({**book, name: figures}, indent=1) + "\n")
+
+
+def lagged(series: np.ndarray, count: int) -> np.ndarray:
+    """Return a series (frames, n) and its past, (frames, count n), zeros before the first."""
+    before = np.vstack([np.zeros((count - 1, series.shape[1])), series])
+    return sliding_window_view(before, count, axis=0)[..., ::-1].reshape(len(series), -1)
+
+
+def least_squares(
+    open_loop: np.ndarray,
+    mirror_taps: Sequence[float] | np.ndarray,
+    count: int,
+    training: Sequence[tuple[int, int]],
+) -> np.ndarray:
+    """Return what a predictor of past values, fitted to some frames, leaves of a series.
+
+    A command of past pseudo-open-loop values reaches the mirror by its taps, so the series is
+    regressed on its own past as the mirror would have followed it.
+    """
+    rows = lagged(past_corrections(np.asarray(mirror_taps), open_loop), count)
+    frames = np.concatenate([np.arange(start + count + 2, stop) for start, stop in training])
+    fit = np.linalg.lstsq(rows[frames], open_loop[frames], rcond=None)[0]
+    return open_loop - rows @ fit

@@ -19,12 +19,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import control
 import numpy as np
-from harness import Row, machine, paired, seconds
-from speed_ensemble import ENSEMBLE
+from harness import Row, machine, paired
 from speed_export import REALTIME
-from speed_identification import IDENTIFICATION
 from speed_linear import SIZED
-from speed_modal import MODAL
 
 import lbt_synth as lbt
 from lbt_synth.linear.block_filtering import filter_series
@@ -44,18 +41,9 @@ def imports() -> dict[str, Row]:
     for name, arguments in (
         ("import lbt_synth", ["-c", "import lbt_synth"]),
         ("lbt-synth --help", ["-m", "lbt_synth.cli.main", "--help"]),
-        (
-            "first Kalman design",
-            [
-                "-c",
-                "import lbt_synth as l; l.kalman(l.EstimationProblem("
-                "A=1., B=[[1., 0.]], C=1., D=[[0., 1.]], L=1.))",
-            ],
-        ),
     ):
         figures = paired(interpreter(arguments), base, 7)
         out[name] = figures | {"ratio": 1 / figures["ratio"], "bar": 1.5}
-    del out["first Kalman design"]["bar"]
     return out
 
 
@@ -90,19 +78,6 @@ def time_domain() -> dict[str, Row]:
     error = np.max(np.abs(filter_series(system, one) - expected.T)) / np.max(np.abs(expected))
     assert error < 1e-10, error
     return out
-
-
-def synthesis() -> dict[str, Row]:
-    plant = lbt.load_config(ROOT / "examples" / "lbt.yaml").plant
-    return {
-        name: {"ours_s": seconds(call, 5)}
-        for name, call in (
-            ("Kalman, Riccati", lambda: lbt.kalman(plant)),
-            ("Kalman, SDP", lambda: lbt.kalman(plant, route="sdp")),
-            ("H-infinity 1.2, Riccati", lambda: lbt.hinf(plant, gamma_ratio=1.2, route="riccati")),
-            ("H-infinity 1.2, LMI", lambda: lbt.hinf(plant, gamma_ratio=1.2)),
-        )
-    }
 
 
 def maps() -> dict[str, Row]:
@@ -188,9 +163,9 @@ def main() -> None:
     here = machine()
     results: dict[str, object] = {}
     pages = []
-    everyday = {**imports(), **time_domain(), **synthesis(), **maps()}
+    everyday = {**imports(), **time_domain(), **maps()}
     tables = [("everyday operations", "operation", everyday)]
-    for title, first, case in (*SIZED, *MODAL, *ENSEMBLE, *IDENTIFICATION, *REALTIME):
+    for title, first, case in (*SIZED, *REALTIME):
         print(f"... {title}", file=sys.stderr)
         tables.append((title, first, {str(size): row for size, row in case().items()}))
     for title, first, rows in tables:

@@ -6,11 +6,10 @@ import control
 import cvxpy as cp
 import numpy as np
 import scipy.linalg
-import slycot
 from harness import Row, once, paired, seconds, with_growth
 
 import lbt_synth as lbt
-from lbt_synth.linear.riccati.filtering import kalman_riccati, least_gamma
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 
 RATE_HZ = 800.0
 POINTS = 10_000
@@ -64,19 +63,6 @@ def modal_equations() -> dict[int, Row]:
     return with_growth(rows)
 
 
-def single_equations() -> dict[int, Row]:
-    rows = {}
-    for lines in (1, 4, 12, 24, 49):
-        p = plant(lines)
-        parts = (p.A.T, p.C.T, p.Q, p.R)
-        rows[p.n_states] = paired(
-            lambda q=parts: lbt.solve_dare(*q),
-            lambda q=parts: scipy.linalg.solve_discrete_are(*q),
-            5,
-        )
-    return with_growth(rows)
-
-
 def least_gamma_riccati() -> dict[int, Row]:
     """Whole designs: Kalman start, search, refinement, proof from below, certificate."""
     rows = {}
@@ -84,22 +70,6 @@ def least_gamma_riccati() -> dict[int, Row]:
         p = plant(lines)
         rows[p.n_states] = {"ours_s": seconds(lambda q=p: lbt.hinf(q, route="riccati"), 7)}
     rows[26]["bar_s"] = 0.05
-    return with_growth(rows)
-
-
-def least_gamma_search() -> dict[int, Row]:
-    """The search alone, from a Kalman solution that is at hand."""
-    rows = {}
-    for lines in (1, 4, 12, 20):
-        p = plant(lines)
-        start = kalman_riccati(p)
-        upper = lbt.hinf_norm(p.error_system(start.gain_predictor)).upper
-        lower = float(np.sqrt(np.linalg.eigvalsh(p.L @ start.P @ p.L.T)[-1]))
-        rows[p.n_states] = {
-            "ours_s": seconds(
-                lambda q=p, s=start, a=lower, b=upper: least_gamma(q, lower=a, upper=b, start=s), 7
-            )
-        }
     return with_growth(rows)
 
 
@@ -150,21 +120,6 @@ def error_system(lines: int) -> lbt.linear.StateSpace:
     return p.error_system(kalman_riccati(p).gain_predictor)
 
 
-def norms() -> dict[int, Row]:
-    rows = {}
-    for lines in (1, 4, 12, 20):
-        G = error_system(lines)
-        n, m, p = G.n_states, G.B.shape[1], G.C.shape[0]
-        rows[n] = paired(
-            lambda g=G: lbt.hinf_norm(g),
-            lambda g=G, n=n, m=m, p=p: slycot.ab13dd(
-                "D", "I", "N", "D", n, m, p, g.A, np.eye(n), g.B, g.C, g.D, 1e-10
-            ),
-            9,
-        )
-    return with_growth(rows)
-
-
 def responses() -> dict[int, Row]:
     """Largest singular value at 10,000 frequencies."""
     rows = {}
@@ -179,14 +134,6 @@ def responses() -> dict[int, Row]:
             calls=3,
         )
     rows[26]["bar"] = 10
-    return with_growth(rows)
-
-
-def mixed_filters() -> dict[int, Row]:
-    rows = {}
-    for lines in (1, 4, 12):
-        p = plant(lines)
-        rows[p.n_states] = {"ours_s": seconds(lambda q=p: lbt.mixed(q, gamma_ratio=1.1), 1)}
     return with_growth(rows)
 
 
@@ -224,19 +171,10 @@ def shaping_by_functions() -> dict[int, Row]:
     return with_growth(rows)
 
 
-def shaping_by_bands() -> dict[int, Row]:
-    return with_growth({n: shaped(60, n) for n in (1, 3, 6)})
-
-
 SIZED = (
     ("modal filter equations in one call (scipy in a loop)", "equations", modal_equations),
-    ("one filter equation (scipy)", "states", single_equations),
     ("least gamma, Riccati, whole design", "states", least_gamma_riccati),
-    ("least gamma, Riccati, the search alone", "states", least_gamma_search),
     ("least gamma, LMI, whole design (textbook LMI)", "states", least_gamma_lmi),
-    ("H-infinity norm (SLICOT's AB13DD)", "states", norms),
     (f"singular values at {POINTS} points (python-control)", "states", responses),
-    ("mixed filter, 16 taps, whole design", "states", mixed_filters),
     ("shaping with 3 bands, whole design, by functions", "functions", shaping_by_functions),
-    ("shaping with 60 functions, whole design, by bands", "bands", shaping_by_bands),
 )
