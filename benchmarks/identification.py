@@ -21,10 +21,18 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from harness import least_squares, record_options, run_all
+from harness import (
+    frozen_flow,
+    least_squares,
+    log_uniform,
+    random_line,
+    record_options,
+    run_all,
+    run_integrator,
+    second_order,
+)
 
 import lbt_synth as lbt
-from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
 NEAR_HZ = 0.1
@@ -58,33 +66,17 @@ def case(
     """
     rng = np.random.default_rng([seed, 1])
     path = lbt.LoopHardware(frame_rate_hz=rate, delay_frames=2, modes=1)
-    noise = float(np.exp(rng.uniform(np.log(2), np.log(30))))
+    noise = log_uniform(rng, 2, 30)
     sensor_gain = float(rng.uniform(0.4, 1.0))
     frozen = bool(seed % 2)
     turbulence: lbt.models.Spectrum
     if frozen:
-        turbulence = lbt.Atmosphere(
-            seeing_arcsec=float(rng.uniform(0.5, 1.5)),
-            outer_scale_m=float(rng.uniform(15, 40)),
-            wind_speed_m_s=float(rng.uniform(5, 25)),
-            diameter_m=8.22,
-        )
+        turbulence = frozen_flow(rng)
     else:
-        corner = float(np.exp(rng.uniform(np.log(0.2), np.log(3))))
+        corner = log_uniform(rng, 0.2, 3)
         damping, rms = float(rng.uniform(0.1, 1.0)), float(rng.uniform(200, 800))
-        a1, a2, drive = coefficients(2 * np.pi * corner / rate, damping)
-        turbulence = lbt.models.ARModel(
-            coefficients=[a1, a2], driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=rate
-        )
-    lines = tuple(
-        lbt.Vibration(
-            frequency_hz=float(rng.uniform(5, 150)),
-            damping=float(np.exp(rng.uniform(np.log(0.002), np.log(0.01)))),
-            rms_nm=float(rng.uniform(5, 100)),
-            direction=(1.0,),
-        )
-        for _ in range(int(rng.integers(0, 6)))
-    )
+        turbulence = second_order(corner, damping, rms, rate)
+    lines = tuple(random_line(rng, (1.0,)) for _ in range(int(rng.integers(0, 6))))
     if close:
         lines += tuple(
             replace(
@@ -96,7 +88,7 @@ def case(
         )
     total = turbulence if drift is None else lbt.models.SumSpectrum(parts=[turbulence, drift])
     truth = lbt.Truth(turbulence=total, vibrations=lines, noise_nm=noise, sensor_gain=sensor_gain)
-    ran = lbt.integrator(path, gain=float(rng.uniform(0.2, 0.6)))
+    gain = float(rng.uniform(0.2, 0.6))
     seen = truth
     if colour:  # to the loop, noise is a part of the phase that it cannot remove
         own = lbt.models.ARModel(
@@ -106,17 +98,14 @@ def case(
         )
         whole = lbt.models.SumSpectrum(parts=[total, own])
         seen = replace(truth, turbulence=whole, noise_nm=1e-3 * noise)
-    run = lbt.simulate(
-        ran.controller,
+    record, run = run_integrator(
+        path,
         seen,
-        hardware=path,
-        frames=frames,
+        gain,
+        frames,
         seed=seed,
         settle_frames=2000,
         frame_means=bool(colour),  # noise is a process of means over frames
-    )
-    record = lbt.identification.loop_record(
-        run.measurements[0], run.commands[0], frame_rate_hz=rate, delay_frames=2, unit="nm"
     )
     return Case(frozen, drift, path, truth, record, run.total_nm[0])
 
