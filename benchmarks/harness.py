@@ -89,10 +89,7 @@ def machine() -> Row:
         "python": platform.python_version(),
         "blas": f"{blas['name']} {blas['version']}",
         "blas_threads": os.environ["OPENBLAS_NUM_THREADS"],
-        **{
-            name: version(name)
-            for name in ("numpy", "scipy", "cvxpy", "clarabel", "control", "slycot")
-        },
+        **{name: version(name) for name in PEERS},
     }
 
 

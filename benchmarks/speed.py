@@ -19,6 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import control
 import numpy as np
+from commands import COMMANDS
 from harness import Row, machine, paired
 from speed_export import REALTIME
 from speed_linear import SIZED
@@ -126,31 +127,18 @@ def cells(name: str, row: Row, per_second: float) -> list[str]:
         return f"{factor * row[key]:{digits}}" if key in row else ""
 
     form = ".3f" if per_second == 1e3 else ".1f"
-    bar = shown("bar", 1, "g")
-    if "bar_s" in row:
-        bar = f"{1e3 * row['bar_s']:g} ms"
     return [
         name,
-        shown("ours_s", per_second, form) + (f" ({row['status']})" if "status" in row else ""),
-        shown("peer_s", per_second, form)
-        + (f" ({row['peer_status']})" if "peer_status" in row else ""),
+        *(shown(key, per_second, form) for key in ("ours_s", "peer_s")),
         shown("ratio", 1, ".2f"),
-        bar,
-        shown("growth", 1, ".2f"),
-        shown("peer_growth", 1, ".2f"),
+        shown("bar", 1, "g") or (f"{1e3 * row['bar_s']:g} ms" if "bar_s" in row else ""),
+        *(shown(key, 1, ".2f") for key in ("growth", "peer_growth")),
     ]
 
 
 def headings(time_unit: str) -> list[str]:
-    return [
-        "",
-        f"ours [{time_unit}]",
-        f"peer [{time_unit}]",
-        "ratio",
-        "bar",
-        "growth",
-        "peer's growth",
-    ]
+    times = (f"ours [{time_unit}]", f"peer [{time_unit}]")
+    return ["", *times, "ratio", "bar", "growth", "peer's growth"]
 
 
 def page(title: str, head: list[str], lines: list[list[str]]) -> str:
@@ -165,19 +153,16 @@ def main() -> None:
     pages = []
     everyday = {**imports(), **time_domain(), **maps()}
     tables = [("everyday operations", "operation", everyday)]
-    for title, first, case in (*SIZED, *REALTIME):
+    for title, first, case in (*COMMANDS, *SIZED, *REALTIME):
         print(f"... {title}", file=sys.stderr)
         tables.append((title, first, {str(size): row for size, row in case().items()}))
     for title, first, rows in tables:
         time_unit, per_second = unit(rows)
         head = headings(time_unit)
         lines = [cells(name, row, per_second) for name, row in rows.items()]
-        widths = [max(len(line[i]) for line in [*lines, head]) for i in range(len(head))]
-        print(f"\n{title}\n" + "  ".join(h.rjust(w) for h, w in zip(head, widths, strict=True)))
-        for line in lines:
-            print("  ".join(c.rjust(w) for c, w in zip(line, widths, strict=True)))
         results[title] = rows
         pages.append(page(title[0].upper() + title[1:], [first, *head[1:]], lines))
+        print(pages[-1])
     target = Path(__file__).with_name("results.json")
     target.write_text(json.dumps({"machine": here, "results": results}, indent=1) + "\n")
     listing = "\n".join(f"- {key.replace('_', ' ')}: {value}" for key, value in here.items())
