@@ -111,8 +111,12 @@ def prove_written(design: Design, written: Written) -> tuple[Check, ...]:
     """Check the loop around a controller as it is written; without a loop there is none."""
     if design.hardware is None:
         return written.checks
-    prove = _prove_sensors if len(written.controllers) > 1 else _prove_loop
-    return (*prove(design, design.hardware, written), *written.checks)
+    checks, several = [], len(written.controllers) > 1
+    if written.entry is not None or not several:
+        checks += _prove_loop(design, design.hardware, written)
+    if several:
+        checks += _prove_sensors(design, design.hardware, written)
+    return (*checks, *written.checks)
 
 
 def _prove_sensors(design: Design, hardware: LoopHardware, written: Written) -> list[Check]:
@@ -132,7 +136,7 @@ def _prove_sensors(design: Design, hardware: LoopHardware, written: Written) -> 
             if not loops[0].is_stable:
                 losses.append(np.inf)
                 break
-            after, before = (residual_budget(loop, design.problem).rms_nm for loop in loops)
+            after, before = (_residual_nm(design, loop) for loop in loops)
             losses.append(after / before - 1)
         name_of_loss = f"residual with {name}, loss"
         checks += [
@@ -142,9 +146,16 @@ def _prove_sensors(design: Design, hardware: LoopHardware, written: Written) -> 
     return checks
 
 
+def _residual_nm(design: Design, loop: ClosedLoop) -> float:
+    """Return the rms residual of a loop under the plant of its design, or the reference."""
+    if design.plant is not None:
+        return float(residual_budget(loop, design.problem).rms_nm)
+    return float(np.sqrt(np.sum(mode_variances(design, loop, slice(loop.hardware.modes)))))
+
+
 def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> list[Check]:
     """Check stability, residual, modulus margin and demands of a loop over its sensor gains."""
-    (controller,) = written.controllers.values()
+    controller = written.controllers[frozenset()]
     low, high = proved_gains(design, hardware)
     count = 2 + int(np.log(high / low) / np.log(_STEP))
     gains = np.append(np.geomspace(low, high, count), 1.0)
@@ -186,7 +197,7 @@ def scenario_gains(design: Design) -> tuple[float, ...]:
 
 def _residual_check(design: Design, hardware: LoopHardware, written: Written, gain: float) -> Check:
     """Compare the residual, with what the rounding of the arithmetic and what is left out add."""
-    (controller,) = written.controllers.values()
+    controller = written.controllers[frozenset()]
     n, m = hardware.modes, hardware.n_commands
     pair = design.controller, controller
     loops = [close_loop(hardware, c, sensor_gain=gain) for c in pair]
@@ -350,20 +361,23 @@ def rehearsal_error(design: Design, other: Any) -> float:
 
 def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
     """Return the commands of the controller itself, and the readings of several sensors."""
-    if not design.other_sensors or design.plant is None:
+    if not design.other_sensors or design.hardware is None:
         return _rehearse(design, design.controller.start()), None
-    plant, (starts, length) = design.problem, _absences(design)
-    rate = plant.hardware.frame_rate_hz
-    run = simulate(
-        design,
-        Truth(
+    (starts, length), rate = _absences(design), design.hardware.frame_rate_hz
+    frames = (2 * len(starts) + 1) * length
+    disturbance: Disturbance | Truth = _reference(design.hardware, frames)
+    if (plant := design.plant) is not None:
+        disturbance = Truth(
             turbulence=plant.turbulence,
             vibrations=plant.vibrations,
             motions=plant.motions,
             noise_nm=np.linalg.norm(plant.own_noise_factor, axis=1),
-        ),
-        hardware=plant.hardware,
-        frames=(2 * len(starts) + 1) * length,
+        )
+    run = simulate(
+        design,
+        disturbance,
+        hardware=design.hardware,
+        frames=frames,
         settle_frames=0,
         drops=[
             Drop(unit=unit, start_s=start / rate, end_s=(start + length) / rate)
@@ -375,25 +389,30 @@ def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
 
 def _absences(design: Design) -> tuple[dict[str, int], int]:
     """Return the first frame in which each sensor is missing, and for how many frames it is."""
-    hardware, period = design.problem.hardware, design.problem.period
-    units = tuple(hardware.suite.rows(hardware))
+    units, period = sorted(frozenset().union(*design.controllers)), design.controller.period
     turns = 2 * len(units) + 1
     length = period * int(np.ceil(FRAMES / turns / period))  # all are due at its begin
     return {unit: (2 * i + 1) * length for i, unit in enumerate(units)}, length
 
 
+def _reference(hardware: LoopHardware, frames: int) -> Disturbance:
+    """Return white noise of the readings, and a slow phase."""
+    rng = np.random.default_rng(0)
+    total = rng.standard_normal((1, frames, hardware.modes))
+    for k in range(1, frames):
+        total[0, k] = POLE * total[0, k - 1] + np.sqrt(1 - POLE**2) * total[0, k]
+    noise = NOISE * rng.standard_normal((1, frames, hardware.n_readings))
+    return Disturbance(phase_nm=total, noise=noise, frame_means=True)
+
+
 def _rehearse(design: Design, controller: SteppedController | RunningController) -> FloatArray:
     """Return the commands (frames, m) of a controller that takes the place of a design's own."""
-    rng = np.random.default_rng(0)
     hardware, q = design.hardware, design.controller.D.shape[1]
     if hardware is None:
         controller.reset()
-        return np.array([controller.step(y) for y in rng.standard_normal((FRAMES, q))])
-    total = rng.standard_normal((1, FRAMES, hardware.modes))
-    for k in range(1, FRAMES):
-        total[0, k] = POLE * total[0, k - 1] + np.sqrt(1 - POLE**2) * total[0, k]
-    noise = NOISE * rng.standard_normal((1, FRAMES, q))
-    disturbance = Disturbance(phase_nm=total, noise=noise, frame_means=True)
+        noise = np.random.default_rng(0).standard_normal((FRAMES, q))
+        return np.array([controller.step(y) for y in noise])
+    disturbance = _reference(hardware, FRAMES)
     return np.asarray(simulate(controller, disturbance, hardware=hardware).commands[0])
 
 

@@ -83,7 +83,7 @@ def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
     terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
     (s, _, m), out = terms.sizes, _written_out(terms, "")
     sums = "".join([*out["errors"], *out["states"], *out["commands"]])
-    table = terms.gains[NONE][0].size if terms.masked else 0  # of a frame in which all is read
+    table = terms.gains[NONE][0].size if terms.tabled else 0  # of a frame in which all is read
     varying = len(terms.read) * len(out["varying"])
     return FrameCost(
         multiplications=sums.count(" * ") + table,
@@ -107,7 +107,7 @@ def _round(designs: Sequence[Design], *, form: str, precision: str, **_: Any) ->
                 "the applied commands; got form=plain. Leave it out."
             )
         terms = source_terms(design, form=kind)
-        count = int(np.count_nonzero(terms.whole)) if not several else 0
+        count = int(np.count_nonzero(terms.whole)) if not terms.tabled else 0
         if count > MOST_TERMS:
             raise ProblemError(
                 f"the terms of a controller must be at most {MOST_TERMS:,} in C, for each is "
@@ -202,7 +202,7 @@ def _described(terms: SourceTerms) -> dict[str, Any]:
     (n, q, m), form = terms.sizes, "plain: x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k)"
     if terms.applied:
         form = "estimator: x(k+1) = A x(k) + L u_applied(k-1) + B y(k), u(k) = C x(k+1)"
-    if terms.masked:
+    if terms.tabled:
         form = "estimator: x = A x + L u_applied + K (y + G x + J u_applied), u = C x"
     return {
         "n": n,
@@ -210,6 +210,7 @@ def _described(terms: SourceTerms) -> dict[str, Any]:
         "m": m,
         "form": form,
         "masked": terms.masked,
+        "tabled": terms.tabled,
         "applied": terms.applied,
         "estimates": terms.gains[NONE].shape[1],
         "period": len(terms.read),
@@ -283,14 +284,14 @@ def _written_out(terms: SourceTerms, prefix: str) -> dict[str, Any]:
     out: dict[str, Any] = {"errors": []}
     start = f"    const {prefix}_real u{{}} ="
     transition, predicting = terms.transition, [*states, *applied]
-    if terms.masked:
+    if terms.tabled:
         names, line = columns(G=s, J=m), "        error[count++] ="
         out["errors"] = sums(names, terms.innovation, predicting, line, begin="y[{}]")
     else:
         transition = np.concatenate([transition, terms.gains[NONE]], axis=2)
     names = columns(A=s, L=m, B=q)
     out["states"] = sums(names, transition, [*predicting, *readings], start)
-    new = [f"state->x[{j}]" if terms.masked else f"n{j}" for j in range(s)]
+    new = [f"state->x[{j}]" if terms.tabled else f"n{j}" for j in range(s)]
     out["commands"] = sums(columns(C=s, D=q), terms.command[None], [*new, *readings], start)
     named = {kind: sorted(numbers) for kind, numbers in used.items()}
     return {**out, "constants": constants, "varying": varying, "used": named}
@@ -309,7 +310,7 @@ def _wrap_sum(terms: Sequence[tuple[str, str]], column: int) -> str:
 
 def _tables(terms: SourceTerms) -> dict[str, Any]:
     """Return the gains of each phase and of each set that is missing, and where they begin."""
-    if not terms.masked:
+    if not terms.tabled:
         return {"gains": [], "count": 0, "due": [], "first": [], "sets": 0}
     units, gains = tuple(terms.rows), []
     sets = [
@@ -339,8 +340,10 @@ def _read(files: Mapping[Path, bytes], like: SourceTerms) -> SourceTerms:
 def _facts(terms: SourceTerms, **_: Any) -> dict[str, Any]:
     """Return what the certificate says of the source."""
     form: dict[str, Any] = {"form": "estimator" if terms.applied else "plain"}
+    if terms.tabled:
+        form["period"] = len(terms.read)
     if terms.masked:
-        form |= {"period": len(terms.read), "sensors": list(terms.rows)}
+        form["sensors"] = list(terms.rows)
     return form
 
 

@@ -16,6 +16,7 @@ from support.exports import bare_design, lbt_config, lbt_designs, relative
 from support.sensor_loops import SLOW, example_plant
 
 import lbt_synth as lbt
+from lbt_synth.design.predictor import predictor_design, regression_filter
 from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.interop import pipeline
 from lbt_synth.interop.c import export as c_export
@@ -322,6 +323,7 @@ DROPS = (
 )
 UNITS = ("wavefront", "slow", "m1", "m2")
 MISSING, NOT_FINITE, NOT_DUE, NOT_APPLIED = 1, 2, 4, 8
+HELD = 2  # of a predictor
 
 
 @pytest.fixture(scope="module")
@@ -590,6 +592,56 @@ def test_a_source_that_is_stepped_without_more_is_that_of_all_sensors(sensors_de
     for k, y in enumerate(np.random.default_rng(5).standard_normal((30, 6))):
         x = own.A[k % 2] @ x + own.B[k % 2] @ y
         assert source.step(y) == pytest.approx(own.C[0] @ x, rel=1e-9)
+
+
+@pytest.fixture(scope="module")
+def predictor():
+    """A predictor that reads three channels, and has one fall-back for all of them."""
+    path = lbt.LoopHardware(frame_rate_hz=500, delay_frames=2.3)
+    acc = lbt.models.Accelerometer(
+        name="acc", rate_hz=500, delay_frames=2.3, channels=("a", "b", "c"), noise_m_s2=1e-3
+    )
+    suite = lbt.models.SensorSuite(sensors=(acc,))
+    base = lbt.integrator(path, gain=0.3).controller
+    rng = np.random.default_rng(3)
+    filters = [regression_filter(path, base, 0.1 * rng.standard_normal((6, 2, n))) for n in (7, 4)]
+    readings = rng.standard_normal((4000, 5))
+    return predictor_design(replace(path, suite=suite), filters, readings, 100.0, what="test")
+
+
+@pytest.mark.parametrize("precision", LIMITS)
+def test_a_predictor_without_a_channel_is_its_fall_back(tmp_path, predictor, precision):
+    """In the loop of its own commands, beside the controllers of the design."""
+    written = lbt.interop.export(tmp_path / "p.c", predictor, "c", precision=precision)
+    theirs = Compiled(written.files[0], single=precision == "single")
+    twin, ours = written.start(np.inf), predictor.controller.start(predictor.controllers)
+    rng, commands = np.random.default_rng(0), np.zeros((2, 2, 2))  # of both loops
+    expected, found = [], []
+    for k in range(300):
+        y = rng.standard_normal(5)
+        fresh = np.array([True, not 50 <= k < 90, not 80 <= k < 120, k != 200])
+        ours.miss([unit for unit, read in zip("abc", fresh[1:], strict=True) if not read])
+        seen = [np.append(y[:2] - past[1], y[2:]) for past in commands]
+        expected.append(ours.step(seen[0]))
+        last = theirs.u.astype(float)
+        blind = np.where(np.repeat(fresh, [2, 1, 1, 1]), seen[1], np.nan)
+        found.append(theirs.step(blind, fresh, last))
+        new = dict(zip(("wavefront", *"abc"), fresh.tolist(), strict=True))
+        assert np.array_equal(found[-1], twin.step(blind, new, last))
+        assert theirs.status == (MISSING if not fresh.all() else 0)
+        commands = np.stack([np.stack([expected[-1], found[-1]]), commands[:, 0]], axis=1)
+    assert relative(found, expected) < LIMITS[precision]
+    names = [check.name for check in written.checks]
+    assert "residual with any sensors missing, loss" in names
+    before, state = theirs.u.copy(), theirs.state.copy()
+    for y, fresh, applied in (
+        (np.ones(5), [0, 1, 1, 1], np.zeros(2)),
+        ([np.nan, *np.ones(4)], [1, 1, 1, 1], np.zeros(2)),
+        (np.ones(5), [1, 1, 1, 1], [0.0, np.inf]),
+    ):
+        assert np.array_equal(theirs.step(y, fresh, applied), before)
+        assert theirs.status == HELD
+        assert np.array_equal(theirs.state, state)
 
 
 CPP = """
