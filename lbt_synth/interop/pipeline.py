@@ -201,7 +201,6 @@ def export(
     *,
     modes: int | None = None,
     other_gain: float | None = None,
-    hardware: LoopHardware | None = None,
     gain_digest: str | None = None,
     **options: Any,
 ) -> Exported:
@@ -233,8 +232,6 @@ def export(
         the command 0, without ``other_gain``. Not for ``matlab``.
     other_gain : float, optional
         Gain of an integrator for each further mode.
-    hardware : LoopHardware, optional
-        Loop of the integrators, where no filter says which.
     gain_digest : str, optional
         SHA-256 of the gain file, for the certificate (64 hexadecimal digits).
     **options
@@ -291,7 +288,6 @@ def export(
         target,
         modes=modes,
         other_gain=other_gain,
-        hardware=hardware,
         modal=modes is not None if program.modal is None else program.modal,
         mixed=program.mixed,
         reads_others=program.reads_others,

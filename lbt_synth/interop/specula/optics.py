@@ -9,7 +9,7 @@ import json
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,11 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lbt_synth.design.modal import Reconstructor, reconstructor
-from lbt_synth.errors import FileError, MissingExtraError, OutputError, ProblemError
+from lbt_synth.errors import MissingExtraError, OutputError, ProblemError
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.array_file import digest, npz_bytes, open_fits, read_npz
+from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
 from lbt_synth.storage.atomic_files import make_directory, write_atomically
-from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import (
     Finite,
     FloatArray,
@@ -251,16 +250,6 @@ def _make_pupil(system: EndToEndSystem, parameters: Any) -> Any:
     return _make(name, parameters, mask_diam=1.0, obs_diam=system.obstruction)
 
 
-def _discard_damaged(files: Iterable[Path]) -> None:
-    """Delete truncated phase screens, so that they are computed again."""
-    for file in files:
-        try:
-            with open_fits(read_bytes(file, FileError)) as units:
-                _ = units[0].data.shape
-        except Exception:  # astropy has no common class for what damage makes it raise
-            file.unlink()
-
-
 class Optics:
     """One optical train, exposed frame after frame.
 
@@ -284,11 +273,19 @@ class Optics:
         self._parameters = _make_parameters(system)
         self._pupil = _make_pupil(system, self._parameters)
         self._commands = self._make_input(np.zeros(len(modes.shapes)))
-        self._tilts = self._make_input(np.zeros(2))
-        mirror = self._make_mirror(modes.shapes, self._commands, -1)
-        shaker = self._make_mirror(modes.shapes[:2], self._tilts, 1)
-        layers = [self._pupil, mirror.outputs["out_layer"], shaker.outputs["out_layer"]]
-        inputs = {"common_layer_list": layers}
+        mirror = _make(
+            "processing_objects.dm:DM",
+            self._parameters,
+            0,
+            ifunc=_make(
+                "data_objects.ifunc:IFunc",
+                ifunc=modes.shapes,
+                mask=modes.mask.astype(np.float32),
+            ),
+            sign=1,
+            inputs={"in_command": self._commands},
+        )
+        inputs = {"common_layer_list": [self._pupil, mirror.outputs["out_layer"]]}
         air = [] if screens is None else [self._make_air(screens, frames, seed)]
         if air:
             inputs["atmo_layer_list"] = air[0].outputs["layer_list"]
@@ -316,7 +313,7 @@ class Optics:
             nd=_PSF_SAMPLING,
             inputs={"in_ef": self._field},
         )
-        self._train = [*air, mirror, shaker, beam, pyramid, detector, self._slopes]
+        self._train = [*air, mirror, beam, pyramid, detector, self._slopes]
         for part in (*self._train, self._camera):
             part.setup()
         # photons per subaperture, over the whole detector
@@ -328,11 +325,12 @@ class Optics:
     ) -> FloatArray:
         """Expose one frame with commands (modes,) and tilts (2,), and return its slopes (q,)."""
         self._time_ns += self._step_ns
-        self._commands.value[:] = commands_nm
-        self._tilts.value[:] = tilts_nm
+        phase_nm = -np.asarray(commands_nm)  # a correction is subtracted from the phase
+        phase_nm[:2] += tilts_nm
+        self._commands.value[:] = phase_nm
         if self._weather:
             self._weather[0].value[:] = seeing * self.system.reference_seeing_arcsec
-        for signal in (self._commands, self._tilts, self._pupil, *self._weather):
+        for signal in (self._commands, self._pupil, *self._weather):
             signal.generation_time = self._time_ns
         self._trigger(self._train)
         return np.array(self._slopes.outputs["out_slopes"].slopes, dtype=np.float64)
@@ -361,12 +359,6 @@ class Optics:
                 part.trigger()
                 part.post_trigger()
 
-    def _make_mirror(self, shapes: Any, commands: Any, sign: int) -> Any:
-        mask = self.modes.mask.astype(np.float32)
-        functions = _make("data_objects.ifunc:IFunc", ifunc=shapes, mask=mask)
-        name, inputs = "processing_objects.dm:DM", {"in_command": commands}
-        return _make(name, self._parameters, 0, ifunc=functions, sign=sign, inputs=inputs)
-
     def _make_air(self, screens: Path, frames: int, seed: int | None) -> Any:
         system = self.system
         side = system.screen_pixels(frames)
@@ -389,7 +381,6 @@ class Optics:
         seed = (seed or 0) + 1
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            _discard_damaged(folder.glob(f"ps_seed{seed}_*.fits"))
             return _make(
                 "processing_objects.atmo_evolution:AtmoEvolution",
                 self._parameters,
@@ -401,10 +392,14 @@ class Optics:
                 seed=seed,
                 inputs=inputs,
             )
-        except OSError as error:
+        except (
+            OSError,
+            TypeError,
+            ValueError,
+        ) as error:  # of a cut file
             raise OutputError(
-                f"cannot make or read a phase screen in {folder}: {error}. Name another "
-                "directory with --cache.",
+                f"cannot make or read a phase screen in {folder}: {error}. Delete that directory, "
+                "or name another one with --cache.",
                 path=folder,
             ) from error
 

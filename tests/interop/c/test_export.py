@@ -342,24 +342,6 @@ def theirs(sensor_files):
     return Compiled(sensor_files["double"].files[0])
 
 
-def test_sums_and_tables_fill_lines_of_96_characters():
-    """The second line of a sum is indented by eight, the first begins where its statement ends."""
-    terms = [("+", f"c[{i}] * x{i}") for i in range(12)]
-    wrapped = c_export._wrap_sum(terms, 27)
-    first, second = wrapped.split("\n")
-    assert first == " " + " + ".join(text for _, text in terms[:5])
-    assert second == " " * 8 + " ".join(f"+ {text}" for _, text in terms[5:])
-    assert 27 + len(first) <= 95 < 27 + len(first) + len(" + c[5] * x5")
-    assert len(second) == 95
-    assert c_export._wrap_sum([("-", "x0"), ("-", "x1")], 9) == " -x0 - x1"
-    table = c_export._fill_lines(["0x1.0p+0"] * 19).split("\n")
-    assert [len(line) for line in table] == [93, 93, 12]
-    full = c_export._fill_lines(["0x1.00p+0"] * 7 + ["0x1p+0"] * 3)
-    assert len(full.split("\n")[0]) == 96
-    fuller = c_export._fill_lines(["0x1.00p+0"] * 7 + ["0x1p+0", "0x1.0p0", "0x1p+0"])
-    assert len(fuller.split("\n")[0]) == 88  # the next would end at 97
-
-
 def test_the_header_says_where_each_sensor_reads(tmp_path):
     design = lbt.kalman(example_plant((SLOW,)))
     header = lbt.interop.export(tmp_path / "k.c", design, "c").files[1].read_text()

@@ -114,8 +114,8 @@ def test_a_sensor_gain_is_in_what_is_made_again(shaped):
     exact = direct_form_rows(design.controller, 20)
     plain = make_again(shaped, direct_form_rows(shaped.controller, 20))
     made = make_again(design, exact)
-    # to what the two programmes of different scales leave open of their coefficients
-    assert made[:21] == pytest.approx(2 * plain[:21], rel=2e-3, abs=1e-6)
+    # to what the programmes leave open, and what makes up for the rounding of other coefficients
+    assert made[:21] == pytest.approx(2 * plain[:21], rel=2e-3, abs=2e-6)
     assert all(check.passed for check in prove_written(design, _as_computed(design, made)))
 
 
