@@ -1,7 +1,6 @@
 """Matrices of all modes: a design with integrators, filters for each mode."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -135,21 +134,6 @@ def test_the_source_of_many_modes_proves_equal_ones_once(tmp_path, designs):
     assert len(names) == 2
     theirs = Compiled(written.files[0], single=False)
     assert np.allclose(theirs.step(np.ones(120), np.ones(120))[2:], 1.4)
-
-
-def test_a_damaged_copy_of_a_mode_is_found(tmp_path, designs, monkeypatch):
-    """Each copy is read from the text of the source."""
-    own = lbt.interop.target_named("c")
-
-    def damaged(files, like):
-        terms = own.read(files, like)
-        terms.gains[frozenset()][0, -1, -1] = 2.5  # of the last integrator
-        return terms
-
-    monkeypatch.setattr("lbt_synth.interop.c.export.TARGET", replace(own, read=damaged))
-    with pytest.raises(lbt.errors.NumericalError, match="must hold the numbers that are proved"):
-        lbt.interop.export(tmp_path / "k.c", designs["kalman"], "c", modes=5, other_gain=0.4)
-    assert not list(tmp_path.iterdir())
 
 
 def test_pyrtc_gets_the_gain_of_all_others_and_its_proof(tmp_path, designs):

@@ -9,7 +9,7 @@ import json
 import logging
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,10 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from lbt_synth.design.modal import Reconstructor, reconstructor
-from lbt_synth.errors import MissingExtraError, OutputError, ProblemError
+from lbt_synth.errors import FileError, MissingExtraError, OutputError, ProblemError
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.array_file import digest, npz_bytes, read_npz
+from lbt_synth.storage.array_file import digest, npz_bytes, open_fits, read_npz
 from lbt_synth.storage.atomic_files import make_directory, write_atomically
+from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.validation import (
     Finite,
     FloatArray,
@@ -250,6 +251,16 @@ def _make_pupil(system: EndToEndSystem, parameters: Any) -> Any:
     return _make(name, parameters, mask_diam=1.0, obs_diam=system.obstruction)
 
 
+def _discard_damaged(files: Iterable[Path]) -> None:
+    """Delete truncated phase screens, so that they are computed again."""
+    for file in files:
+        try:
+            with open_fits(read_bytes(file, FileError)) as units:
+                _ = units[0].data.shape
+        except Exception:  # astropy has no common class for what damage makes it raise
+            file.unlink()
+
+
 class Optics:
     """One optical train, exposed frame after frame.
 
@@ -381,6 +392,7 @@ class Optics:
         seed = (seed or 0) + 1
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            _discard_damaged(folder.glob(f"ps_seed{seed}_*.fits"))
             return _make(
                 "processing_objects.atmo_evolution:AtmoEvolution",
                 self._parameters,
@@ -398,8 +410,8 @@ class Optics:
             ValueError,
         ) as error:  # of a cut file
             raise OutputError(
-                f"cannot make or read a phase screen in {folder}: {error}. Delete that directory, "
-                "or name another one with --cache.",
+                f"cannot make or read a phase screen in {folder}: {error}. Name another "
+                "directory with --cache.",
                 path=folder,
             ) from error
 

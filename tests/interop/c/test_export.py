@@ -1,7 +1,6 @@
 """The exported C source, compiled and run beside the controller."""
 
 import json
-import os
 import re
 import subprocess
 from dataclasses import replace
@@ -12,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.compiled import STRICT, Compiled, compiler, header_numbers
-from support.exports import bare_design, lbt_config, lbt_designs, relative
+from support.exports import bare_design, lbt_designs, relative
 from support.sensor_loops import SLOW, example_plant
 
 import lbt_synth as lbt
@@ -23,10 +22,8 @@ from lbt_synth.interop.c import export as c_export
 from lbt_synth.interop.c.terms import RunningSource, source_terms
 from lbt_synth.interop.pipeline import target_named, target_names
 from lbt_synth.interop.proof import rehearsal_error
-from lbt_synth.linear.controller import RunningController
 from lbt_synth.loop.simulation.run import Drop
 
-FRAMES = 3000
 LIMITS = {"double": 1e-12, "single": 1e-5}
 
 
@@ -40,34 +37,6 @@ def exported(tmp_path_factory):
         return lbt.interop.export(target, lbt_designs()[name], "c", precision=precision)
 
     return write
-
-
-@cache
-def own_commands(name):
-    """Commands of a design in the loop of the configuration, which no export changes."""
-    return loop_commands(lbt_designs()[name].controller.start())
-
-
-def loop_commands(stepped):
-    """Commands of a controller in the loop of the configuration."""
-    run = lbt.simulate(
-        stepped, lbt_config().truth, hardware=lbt_config().hardware, frames=FRAMES, settle_frames=0
-    )
-    return run.commands
-
-
-@pytest.mark.parametrize("precision", LIMITS)
-@pytest.mark.parametrize("name", ["kalman", "hinf", "integrator", "prior", "turned"])
-def test_the_compiled_controller_closes_the_loop(exported, name, precision):
-    """Same disturbance and noise for thousands of frames, in a loop: some are unstable alone."""
-    single = precision == "single"
-    written = exported(name, precision)
-    expected = own_commands(name)
-    assert np.max(np.abs(expected)) > 100  # nm
-    error = relative(loop_commands(Compiled(written.files[0], single=single)), expected)
-    assert error < LIMITS[precision]
-    if single:  # what the file says of itself, met in another loop
-        assert written.error / 10 < error < 10 * written.error
 
 
 @pytest.mark.parametrize("precision", LIMITS)
@@ -134,15 +103,6 @@ def test_reset_forgets(exported, sensor_files, name):
         assert np.array_equal(theirs.step([np.nan, 1.0]), [0.0, 0.0])
 
 
-def test_measurements_and_commands_in_one_array(exported, designs):
-    for name in ("kalman", "turned"):
-        theirs, ours = Compiled(exported(name).files[0]), designs[name].controller.start()
-        for y in np.random.default_rng(5).standard_normal((5, 2)):
-            both = y.copy()
-            theirs._call("step", theirs.state, both, both)
-            assert np.allclose(both, ours.step(y), rtol=1e-12, atol=1e-12)
-
-
 @st.composite
 def controllers(draw):
     """Stable controllers of all shapes: sparse and dense, zero rows, signs, no feedthrough."""
@@ -178,18 +138,6 @@ def test_any_stable_controller(tmp_path, controller, precision):
     states = max(1.0, float(np.max(np.abs(ours.state))))
     size = max(float(np.max(np.abs(expected))), states)
     assert np.max(np.abs(found - expected)) < LIMITS[precision] * size
-
-
-@pytest.mark.parametrize("name", ["kalman", "turned"])
-def test_two_loops_at_once_do_not_meet(exported, designs, name):
-    source = exported(name).files[0]
-    one = Compiled(source)
-    two = Compiled(source, library=one.library)
-    alone = [designs[name].controller.start() for _ in range(2)]
-    series = np.random.default_rng(3).standard_normal((60, 2, 2))
-    for pair in series:
-        for instance, own, y in zip((one, two), alone, pair, strict=True):
-            assert np.allclose(instance.step(y), own.step(y), rtol=1e-11, atol=1e-11)
 
 
 def test_coefficients_are_exact_and_explained(exported, designs):
@@ -258,16 +206,6 @@ def test_files_that_are_no_source(tmp_path, designs, file):
         lbt.interop.export(tmp_path / file, designs["integrator"], "c", name="k")
 
 
-def test_single_precision_has_a_largest_number(tmp_path):
-    huge = lbt.Controller(A=[[0.5]], B=[[1e39]], C=[[1e-39]], D=[[0.0]])
-    lbt.interop.export(tmp_path / "k.c", bare_design(huge), "c")
-    with pytest.raises(
-        lbt.errors.ProblemError, match=r"below 3.4e\+38 in single precision; got 1e\+39"
-    ):
-        lbt.interop.export(tmp_path / "single.c", bare_design(huge), "c", precision="single")
-    assert not list(tmp_path.glob("single*"))
-
-
 def test_arithmetic_that_overflows_is_refused(tmp_path):
     """Coefficients that fit, products that do not."""
     steep = lbt.Controller(A=[[0.5]], B=[[1e30]], C=[[1e30]], D=[[0.0]])
@@ -285,33 +223,6 @@ def test_a_loop_that_rounding_would_break_is_refused(tmp_path, loaded):
     ):
         lbt.interop.export(tmp_path / "single.c", brink, "c", precision="single")
     assert not list(tmp_path.glob("single*"))
-
-
-@pytest.mark.usefixtures("short_rehearsal")
-def test_source_and_header_are_both_written_or_none(tmp_path, designs, monkeypatch):
-    before = {
-        file: file.read_bytes()
-        for file in lbt.interop.export(tmp_path / "k.c", designs["kalman"], "c").files
-    }
-    real, calls = os.fsync, []
-
-    def full(number):
-        calls.append(number)
-        if len(calls) % 2 == 0:  # the disk takes the first of the files only
-            raise OSError(28, "No space left on device")
-        real(number)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(os, "fsync", full)
-        for name in ("k.c", "new.c"):
-            with pytest.raises(lbt.errors.OutputError, match=r"cannot write .*: No space left"):
-                lbt.interop.export(tmp_path / name, designs["hinf"], "c")
-    assert len(calls) == 4
-    assert {file: file.read_bytes() for file in tmp_path.iterdir()} == before
-    (tmp_path / "taken.h").mkdir()
-    with pytest.raises(lbt.errors.OutputError, match=r"taken\.h is a directory"):
-        lbt.interop.export(tmp_path / "taken.c", designs["hinf"], "c")
-    assert not (tmp_path / "taken.c").exists()
 
 
 SENSOR_FRAMES = 1200
@@ -383,31 +294,6 @@ def test_the_commands_are_those_of_the_simulation(simulated, theirs):
         assert theirs.status == MISSING * any(d.covers(k * 1e-3 + 1e-9) for d in DROPS)
         last = u
     assert relative(found, simulated.commands[0]) < 1e-9
-
-
-@pytest.mark.parametrize(("precision", "limit"), [("double", 1e-9), ("single", 1e-3)])
-def test_the_compiled_filter_closes_the_loop(
-    sensors_design, sensors_config, simulated, sensor_files, precision, limit
-):
-    """The simulation with the compiled source as its filters, for each set that is missing."""
-    theirs = Compiled(sensor_files[precision].files[0], single=precision == "single")
-    frame = iter(range(SENSOR_FRAMES))
-
-    class Source(RunningController):
-        """It says what is new, and takes the commands that were applied."""
-
-        def reset(self):
-            self.missing = ()
-
-        def miss(self, missing):
-            self.missing = missing
-
-        def step(self, y, applied):
-            return theirs.step(y[:, 0], fresh_in(next(frame), self.missing), applied[:, 0])[:, None]
-
-    found = run_sensors(Source(sensors_design.controller), sensors_config, sensors_design.hardware)
-    assert relative(found.commands, simulated.commands) < limit
-    assert relative(found.residual_nm, simulated.residual_nm) < limit
 
 
 @pytest.mark.parametrize("precision", ["double", "single"])
@@ -565,15 +451,6 @@ def test_the_cost_is_that_of_the_source(sensor_files, sensors_design):
     estimates = int(re.search(r"add\(state->x, (\d+), gains", text)[1])
     assert cost.multiplications == products + 6 * estimates
     assert cost.states == sizes["STATES"] + sizes["COMMANDS"]
-
-
-def test_a_source_that_is_stepped_without_more_is_that_of_all_sensors(sensors_design):
-    """What is due is new, and its own commands are applied: the controller of the design."""
-    source, own = RunningSource(source_terms(sensors_design)), sensors_design.controller
-    x = np.zeros(own.n_states)
-    for k, y in enumerate(np.random.default_rng(5).standard_normal((30, 6))):
-        x = own.A[k % 2] @ x + own.B[k % 2] @ y
-        assert source.step(y) == pytest.approx(own.C[0] @ x, rel=1e-9)
 
 
 @pytest.fixture(scope="module")

@@ -376,19 +376,6 @@ def test_slopes_are_those_of_finite_differences(case):
     assert np.all(np.isfinite(before))
 
 
-def test_a_loop_that_coarse_arithmetic_breaks_is_mended(case):
-    loop, c = case
-    allowed_nm = loop.residuals_nm(c)
-    before = loop.residuals_nm(c, rounding=True) / allowed_nm
-    found = dao.refit(loop, c)
-    after = loop.residuals_nm(found, rounding=True) / allowed_nm
-    assert np.min(before) > 5
-    assert np.max(after) < 1.01
-    assert loop.radius(found) < 1
-    rounded = round_together(loop, found).astype(np.float64)
-    assert loop.residuals_nm(rounded, rounding=True) == pytest.approx(after * allowed_nm, rel=5e-3)
-
-
 def test_errors_of_rounding_cancel_where_they_count(case):
     """Against rounding one by one, by what each changes of the loop's polynomial."""
     loop, own = case

@@ -4,16 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support.end_to_end import CONFIG, make_run
 from support.sensor_loops import sinusoid_reading
 from support.small_telescope import BRIGHT, PATH, PLANT, SETUP, SHAKE, needs_specula
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.interop.specula.simulation import AccompaniedFilter, accompany_filter
-from lbt_synth.linear import Controller
+from lbt_synth.interop.specula.simulation import accompany_filter
 from lbt_synth.loop.simulation.disturbances import draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
 
@@ -70,20 +67,6 @@ def test_the_same_seed_is_the_same_run_and_the_same_air(cache):
     taps = PATH.mirror_taps
     corrected = taps[1] * b.commands[:-1] + taps[0] * b.commands[1:]
     assert np.allclose(b.residual_nm[1:] + corrected, a.residual_nm[1:], atol=0.02)
-
-
-@needs_specula
-def test_a_slow_mirror_of_the_hardware_is_that_of_the_optics(cache):
-    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.4)
-    run = replace(SETUP, system=replace(BRIGHT, hardware=path), frames=50, vibrations=(SHAKE,)).run(
-        None, cache=cache
-    )
-    still = replace(
-        SETUP, system=replace(BRIGHT, hardware=path), frames=50, vibrations=(SHAKE,), gain=0.0
-    ).run(None, tip_tilt_gain=0.0, cache=cache)
-    u = run.commands
-    corrected = 0.6 * u[1:-1] + 0.4 * u[:-2]  # u(k-1) and u(k-2)
-    assert np.allclose(run.residual_nm[2:] + corrected, still.residual_nm[2:], atol=0.02)
 
 
 @needs_specula
@@ -179,15 +162,6 @@ def test_the_strehl_ratio_and_its_error(setup):
     assert np.isnan(short.strehl_error)
 
 
-@settings(max_examples=25, deadline=None)
-@given(gain=st.floats(0.1, 1.2), noise=st.floats(0.0, 60.0))
-def test_the_gain_of_tip_and_tilt_lies_between_theirs(gain, noise):
-    system = replace(lbt.load_config(CONFIG).end_to_end.system, modes=3)
-    run = make_run(system, gain=gain, noise_nm=noise, frames=300)
-    low, high = sorted(run.optical_gain()[0][:2])
-    assert low - 1e-12 <= run.tip_tilt_gain <= high + 1e-12
-
-
 LENGTH = {"frames": 1600, "settle_frames": 400, "seed": 2}
 # faint enough that the noise of the pyramid decides, as it does of a dim star
 DIM = replace(BRIGHT, photons=30.0, read_noise_electrons=4.0)
@@ -258,25 +232,6 @@ def test_channels_follow_the_motions_that_shake_the_telescope():
             if channel in MOTIONS[line]
         )
         np.testing.assert_allclose(own.others[5:-1, column], expected[5:-1], atol=1e-6)
-
-
-def test_steps_are_those_of_the_filter_of_all_readings():
-    rng = np.random.default_rng(0)
-    parts = {"A": (2, 3, 3), "B": (2, 3, 3), "C": (2, 2, 3), "D": (2, 2, 3)}
-    controller = Controller(**{n: rng.standard_normal(s) for n, s in parts.items()})
-    others = rng.standard_normal((4, 1))
-    own = AccompaniedFilter(controller=controller, others=others, hardware=PATH)
-    y = rng.standard_normal((4, 2))
-    x, expected = np.zeros(3), []
-    for k in range(4):
-        measured = np.append(y[k], others[k])
-        x = controller.A[k % 2] @ x + controller.B[k % 2] @ measured
-        expected.append(controller.C[k % 2] @ x + controller.D[k % 2] @ measured)
-    for _ in range(2):
-        np.testing.assert_allclose([own.step(each) for each in y], expected, rtol=1e-12)
-        with pytest.raises(ProblemError, match="readings for 4 frames"):
-            own.step(y[0])
-        own.reset()
 
 
 def test_a_further_wavefront_sensor_is_not_read(shaking):
