@@ -30,7 +30,7 @@ from lbt_synth.linear.controller import RunningController
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import residual_budget
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, youla_controller
 from lbt_synth.loop.simulation.disturbances import Disturbance
 from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
 from lbt_synth.loop.stable_range import radii_by_gain
@@ -107,6 +107,18 @@ def command_as_state(textbook: StateSpace) -> Controller:
     )
 
 
+def filter_of_history(hardware: LoopHardware, system: StateSpace) -> tuple[Controller, Controller]:
+    """Return the controller of a filter of pseudo-open-loop values, its command a further state.
+
+    Beside it is what noise in the command and noise in these values become.
+    """
+    m, n = system.D.shape[0], system.n_states
+    controller = youla_controller(hardware, command_as_state(system))
+    command = np.eye(controller.n_states, m, k=-n)  # a part of the command that is sent
+    B = np.hstack([command, controller.B])
+    return controller, replace(controller, B=B, D=np.zeros((m, 2 * m)))
+
+
 def prove_written(design: Design, written: Written) -> tuple[Check, ...]:
     """Check the loop around a controller as it is written; without a loop there is none."""
     if design.hardware is None:
@@ -157,8 +169,7 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
     """Check stability, residual, modulus margin and demands of a loop over its sensor gains."""
     controller = written.controllers[frozenset()]
     low, high = proved_gains(design, hardware)
-    count = 2 + int(np.log(high / low) / np.log(_STEP))
-    gains = np.append(np.geomspace(low, high, count), 1.0)
+    gains = gains_between(low, high)
     radius = float(np.max(radii_by_gain(hardware, controller)(gains)))
     name = f"spectral radius at sensor gains {low:.4g} to {high:.4g}"
     checks = [Check(name, radius, 1 - STABILITY_MARGIN, f"eigenvalues at {gains.size} gains")]
@@ -172,6 +183,12 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
     after += change(1.0) if change else 0.0
     checks.append(Check("modulus margin, loss", float(after / before) - 1, LOSS, "level sets"))
     return checks + _demand_checks(design, other, change)
+
+
+def gains_between(low: float, high: float) -> FloatArray:
+    """Return sensor gains in steps of 1 %, and a gain of 1."""
+    count = 2 + int(np.log(high / low) / np.log(_STEP))
+    return np.append(np.geomspace(low, high, count), 1.0)
 
 
 def proved_gains(design: Design, hardware: LoopHardware) -> tuple[float, float]:

@@ -3,8 +3,7 @@
 At sensor gain 1 the command is a stable filter Q of the pseudo-open-loop measurement. At the gains
 G, a diagonal matrix, the commands are ``Q w / D`` with ``D = 1 - (1 - G) L Q`` and the path L of
 norm 1. Without a part E of Q they change by ``E w / D D'``, where ``D' = D + (1 - G) L E``: a small
-gain ``|1 - G| |E / D| < 1`` keeps the loop stable. D changes by at most ``|G' - G| |Q|`` between
-two gains, which bounds ``1 / |1 / D|`` there.
+gain ``|1 - G| |E / D| < 1`` keeps the loop stable.
 """
 
 from __future__ import annotations
@@ -28,21 +27,20 @@ from lbt_synth.interop.proof import (
     LOSS,
     ROUNDOFF,
     Written,
-    command_as_state,
+    filter_of_history,
+    gains_between,
     mode_variances,
     proved_gains,
     scenario_gains,
 )
 from lbt_synth.linear import StateSpace, hinf_norm
 from lbt_synth.loop import ClosedLoop, close_loop
-from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import open_fits
 from lbt_synth.validation import FloatArray, integer, number
 
 LONGEST_DELAY = 8  # frames; modalfilter keeps the commands of ten frames
 _LONGEST = 1 << 17  # steps that are looked for
-_CLOSE = 0.5  # of the least distance that is computed: a bound on all others
 _ROOM = 0.98  # of the loss, for what is rounded
 _MOST_NUMBERS = 100_000_000  # of the matrix: 400 MB
 _SIGN = "mirror = + PFmat history; the matrix holds the controller with its sign changed"
@@ -124,28 +122,13 @@ class PredictiveFilter:
         """Sensor gains for which the small gain is proved."""
         return proved_gains(self.design, self.hardware)
 
-    def least_distance(self, enough: float) -> float:
-        """Bound ``1 / |1 - G| |1 / D|`` over the interval, or return one not above enough."""
-        steepness = float(np.max(self.hardware.sensor)) * float(hinf_norm(self.system))
-        low, high = self.interval
-        intervals, least = [(low, high)], float("inf")
-        while intervals:
-            a, b = intervals.pop()
-            off = max(self.off(a), self.off(b))  # convex: largest at an end
-            if off == 0:
-                continue
-            least = min(least, *(self._distance(gain) for gain in (a, b)))
-            if least <= enough:
-                return least
-            inverses = 1 / self.at(a)[2] + 1 / self.at(b)[2]
-            if (inverses - steepness * (b - a)) / 2 < _CLOSE * least * off:
-                middle = (a + b) / 2
-                intervals += [(a, middle), (middle, b)]
-        return _CLOSE * least
-
-    def _distance(self, gain: float) -> float:
-        off = self.off(gain)
-        return 1 / (off * self.at(gain)[2]) if off > 0 else float("inf")
+    @cached_property
+    def distance(self) -> float:
+        """Least norm of a part E that may make the loop unstable at a sensor gain."""
+        steered = [(self.off(gain), gain) for gain in gains_between(*self.interval)]
+        return min(
+            (1 / (off * self.at(gain)[2]) for off, gain in steered if off > 0), default=np.inf
+        )
 
     @cached_property
     def sizes_nm(self) -> dict[float, tuple[float, float]]:
@@ -197,7 +180,7 @@ class PredictiveFilter:
 
     def small_gain(self, norm: float) -> float:
         """Bound the gain around the loop of what is left out; below 1 it keeps that stable."""
-        return norm / self.least_distance(norm)
+        return norm / self.distance
 
     def _peak(self, gain: float, norm: float) -> float:
         """Bound 1 / D' at a sensor gain."""
@@ -215,12 +198,8 @@ class PredictiveFilter:
 
     def as_computed(self, taps: FloatArray) -> Written:
         """Return the filter as a controller, and the rounding of sums of its taps in any order."""
-        m, n = self.hardware.modes, self.system.n_states
-        parameter = command_as_state(self.system)
-        controller = youla_controller(replace(self.hardware, sensor_matrix=None), parameter)
-        # noise in the product is part of the command; noise in the history comes as a measurement
-        command = np.eye(controller.n_states, m, k=-n)
-        entry = replace(controller, B=np.hstack([command, controller.B]), D=np.zeros((m, 2 * m)))
+        hardware = replace(self.hardware, sensor_matrix=None)
+        controller, entry = filter_of_history(hardware, self.system)
         sizes, norm = np.abs(np.hstack([*taps])), self.cut_norm(len(taps), taps)
 
         def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
@@ -232,7 +211,7 @@ class PredictiveFilter:
 
         low, high = self.interval
         name = f"small gain of what is left out, sensor gains {low:.4g} to {high:.4g}"
-        how = "level sets, bound between gains"
+        how = f"level sets at {gains_between(low, high).size} gains"
         return Written(
             controllers={frozenset(): controller},
             entry=entry,

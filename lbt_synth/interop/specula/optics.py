@@ -404,11 +404,7 @@ class Optics:
                 seed=seed,
                 inputs=inputs,
             )
-        except (
-            OSError,
-            TypeError,
-            ValueError,
-        ) as error:  # of a cut file
+        except OSError as error:
             raise OutputError(
                 f"cannot make or read a phase screen in {folder}: {error}. Name another "
                 "directory with --cache.",
