@@ -3,7 +3,8 @@
 At sensor gain 1 the command is a stable filter Q of the pseudo-open-loop measurement. At the gains
 G, a diagonal matrix, the commands are ``Q w / D`` with ``D = 1 - (1 - G) L Q`` and the path L of
 norm 1. Without a part E of Q they change by ``E w / D D'``, where ``D' = D + (1 - G) L E``: a small
-gain ``|1 - G| |E / D| < 1`` keeps the loop stable.
+gain ``|1 - G| |E / D| < 1`` keeps the loop stable. D changes by at most ``|G' - G| |Q|`` between
+two gains, which bounds ``1 / |1 / D|`` there.
 """
 
 from __future__ import annotations
@@ -124,11 +125,13 @@ class PredictiveFilter:
 
     @cached_property
     def distance(self) -> float:
-        """Least norm of a part E that may make the loop unstable at a sensor gain."""
-        steered = [(self.off(gain), gain) for gain in gains_between(*self.interval)]
-        return min(
-            (1 / (off * self.at(gain)[2]) for off, gain in steered if off > 0), default=np.inf
-        )
+        """Bound the least norm of a part E that may make the loop unstable at a sensor gain."""
+        gains = np.sort(gains_between(*self.interval))
+        inverse = np.array([1 / self.at(gain)[2] for gain in gains])
+        off = np.array([self.off(gain) for gain in gains])  # convex: largest at an end
+        steepness = float(np.max(self.hardware.sensor)) * float(hinf_norm(self.system))
+        between = (inverse[1:] + inverse[:-1] - steepness * np.diff(gains)) / 2
+        return max(float(np.min(between / np.maximum(off[1:], off[:-1]))), 0.0)
 
     @cached_property
     def sizes_nm(self) -> dict[float, tuple[float, float]]:
@@ -180,7 +183,7 @@ class PredictiveFilter:
 
     def small_gain(self, norm: float) -> float:
         """Bound the gain around the loop of what is left out; below 1 it keeps that stable."""
-        return norm / self.distance
+        return norm / self.distance if self.distance > 0 else float("inf")
 
     def _peak(self, gain: float, norm: float) -> float:
         """Bound 1 / D' at a sensor gain."""
@@ -211,7 +214,7 @@ class PredictiveFilter:
 
         low, high = self.interval
         name = f"small gain of what is left out, sensor gains {low:.4g} to {high:.4g}"
-        how = f"level sets at {gains_between(low, high).size} gains"
+        how = "level sets, bound between gains"
         return Written(
             controllers={frozenset(): controller},
             entry=entry,

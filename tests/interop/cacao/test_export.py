@@ -9,7 +9,7 @@ from astropy.io import fits
 from support.recorded_runs import recorded_run
 
 import lbt_synth as lbt
-from lbt_synth.interop.cacao.export import AppliedFilter, predictive_filter
+from lbt_synth.interop.cacao.export import AppliedFilter, PredictiveFilter, predictive_filter
 from lbt_synth.interop.proof import mode_variances, prove_written
 from lbt_synth.loop.closed_loop import youla_controller
 
@@ -135,7 +135,24 @@ def test_the_small_gain_is_that_of_the_closed_form(path):
     for gain in np.geomspace(max(1.01 * low, 0.1), min(high / 1.01, 10.0), 60):
         s = 1 / (1 + gain * 0.3 / (z * (z - 1)))
         expected = max(expected, abs(1 - gain) * np.max(np.abs(s + (1 - s) / gain)) * left_out)
-    assert found.small_gain(found.cut_norm(2)) == pytest.approx(expected, rel=1e-3)
+    norm = found.cut_norm(2)
+    gains = np.geomspace(*found.interval, 60)
+    steered = norm * max(found.off(gain) * found.at(gain)[2] for gain in gains)
+    assert steered == pytest.approx(expected, rel=1e-3)
+    assert found.small_gain(norm) >= steered
+
+
+def test_the_small_gain_holds_between_the_gains_that_are_computed(path, monkeypatch):
+    """A loop that is nearly unstable at one sensor gain between two alone."""
+    found = predictive_filter(lbt.integrator(path, gain=0.3))
+    steepness, least = float(lbt.linear.hinf_norm(found.system)), 1e-3 / (1 - 0.128)
+
+    def at(_, gain):
+        return None, None, 1 / (1e-3 + min(steepness * abs(gain - 0.128), 0.3))
+
+    monkeypatch.setattr(PredictiveFilter, "at", at)
+    assert found.distance <= least
+    assert found.small_gain(2 * least) > 1
 
 
 def test_rounding_is_bounded_by_a_loop_in_that_arithmetic(path):
