@@ -131,7 +131,9 @@ class PredictiveFilter:
         off = np.array([self.off(gain) for gain in gains])  # convex: largest at an end
         steepness = float(np.max(self.hardware.sensor)) * float(hinf_norm(self.system))
         between = (inverse[1:] + inverse[:-1] - steepness * np.diff(gains)) / 2
-        return max(float(np.min(between / np.maximum(off[1:], off[:-1]))), 0.0)
+        widest = np.maximum(off[1:], off[:-1])
+        least = between[widest > 0] / widest[widest > 0]
+        return max(float(np.min(least, initial=np.inf)), 0.0)
 
     @cached_property
     def sizes_nm(self) -> dict[float, tuple[float, float]]:
