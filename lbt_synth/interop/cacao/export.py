@@ -29,7 +29,6 @@ from lbt_synth.interop.proof import (
     ROUNDOFF,
     Written,
     filter_of_history,
-    gains_between,
     mode_variances,
     proved_gains,
     scenario_gains,
@@ -42,6 +41,7 @@ from lbt_synth.validation import FloatArray, integer, number
 
 LONGEST_DELAY = 8  # frames; modalfilter keeps the commands of ten frames
 _LONGEST = 1 << 17  # steps that are looked for
+_CLOSE = 0.5  # of the least distance that is computed: a bound on all others
 _ROOM = 0.98  # of the loss, for what is rounded
 _MOST_NUMBERS = 100_000_000  # of the matrix: 400 MB
 _SIGN = "mirror = + PFmat history; the matrix holds the controller with its sign changed"
@@ -123,17 +123,28 @@ class PredictiveFilter:
         """Sensor gains for which the small gain is proved."""
         return proved_gains(self.design, self.hardware)
 
-    @cached_property
-    def distance(self) -> float:
-        """Bound the least norm of a part E that may make the loop unstable at a sensor gain."""
-        gains = np.sort(gains_between(*self.interval))
-        inverse = np.array([1 / self.at(gain)[2] for gain in gains])
-        off = np.array([self.off(gain) for gain in gains])  # convex: largest at an end
+    def least_distance(self, enough: float) -> float:
+        """Bound ``1 / |1 - G| |1 / D|`` over the interval, or return one not above enough."""
         steepness = float(np.max(self.hardware.sensor)) * float(hinf_norm(self.system))
-        between = (inverse[1:] + inverse[:-1] - steepness * np.diff(gains)) / 2
-        widest = np.maximum(off[1:], off[:-1])
-        least = between[widest > 0] / widest[widest > 0]
-        return max(float(np.min(least, initial=np.inf)), 0.0)
+        low, high = self.interval
+        intervals, least = [(low, high)], float("inf")
+        while intervals:
+            a, b = intervals.pop()
+            off = max(self.off(a), self.off(b))  # convex: largest at an end
+            if off == 0:
+                continue
+            least = min(least, *(self._distance(gain) for gain in (a, b)))
+            if least <= enough:
+                return least
+            inverses = 1 / self.at(a)[2] + 1 / self.at(b)[2]
+            if (inverses - steepness * (b - a)) / 2 < _CLOSE * least * off:
+                middle = (a + b) / 2
+                intervals += [(a, middle), (middle, b)]
+        return _CLOSE * least
+
+    def _distance(self, gain: float) -> float:
+        off = self.off(gain)
+        return 1 / (off * self.at(gain)[2]) if off > 0 else float("inf")
 
     @cached_property
     def sizes_nm(self) -> dict[float, tuple[float, float]]:
@@ -185,7 +196,7 @@ class PredictiveFilter:
 
     def small_gain(self, norm: float) -> float:
         """Bound the gain around the loop of what is left out; below 1 it keeps that stable."""
-        return norm / self.distance if self.distance > 0 else float("inf")
+        return norm / self.least_distance(norm)
 
     def _peak(self, gain: float, norm: float) -> float:
         """Bound 1 / D' at a sensor gain."""

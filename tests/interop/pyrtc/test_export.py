@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
-from support.exports import bare_design, lbt_designs, with_controller
+from support.exports import bare_design, lbt_designs
 from support.gain_files import odd_plant
 from support.recorded_runs import recorded_run
 
@@ -48,20 +48,6 @@ def test_a_loop_of_more_modes_and_other_matrices(tmp_path):
     expected = np.eye(4)
     expected[:2, :2] = plant.hardware.sensor @ plant.hardware.influence
     assert np.array_equal(np.load(tmp_path / "interaction_matrix.npz")["data"], expected)
-
-
-def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch):
-    design = lbt_designs()["integrator"]
-    with pytest.raises(lbt.errors.ProblemError, match="modes must be at least 2"):
-        lbt.interop.export(tmp_path / "k", design, "pyrtc", modes=1)
-    wild = with_controller(design, lbt.integrator(design.hardware, gain=0.95).controller)
-    held = pol_filter(wild)  # pyRTC computes another controller than that of the design
-    own = replace(lbt.interop.target_named("pyrtc"), round=lambda *_, **__: [held])
-    own = replace(own, read=lambda *_: held)
-    monkeypatch.setattr("lbt_synth.interop.pyrtc.export.TARGET", own)
-    with pytest.raises(lbt.errors.NumericalError, match=r"in the arithmetic of pyrtc .+ is"):
-        lbt.interop.export(tmp_path / "k", design, "pyrtc")
-    assert list(tmp_path.iterdir()) == []
 
 
 PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)

@@ -55,14 +55,9 @@ def test_too_many_modes_for_the_mirror():
     ("change", "match"),
     [
         ({"diameter_m": 0}, "diameter_m"),
-        ({"seeing_arcsec": float("nan")}, "seeing_arcsec"),
-        ({"obstruction": 1.0}, "obstruction"),
-        ({"read_noise_electrons": -1}, "read_noise_electrons"),
-        ({"modes": 2}, "modes"),
         ({"pixels": 61}, "pixels must be even"),
         ({"pixels": 20}, "pixels must be even"),
         ({"pixels": 2000}, "pixels must be even"),
-        ({"wind_direction_deg": float("inf")}, "wind_direction_deg"),
         ({"hardware": lbt.LoopHardware(frame_rate_hz=800, modes=3)}, "two modes"),
         (
             {"hardware": lbt.LoopHardware(frame_rate_hz=800, sensor_matrix=2 * np.eye(2))},
