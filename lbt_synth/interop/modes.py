@@ -88,8 +88,8 @@ def mode_designs(
                 "modes and other_gain go with a design of one sensor; got one of several. Leave "
                 "them out."
             )
-        modal = modal or other_gain is not None
-        controlled = require_modal(design) if modal else len(design.controller.C)
+        several = other_gain is not None or (mixed and modal)
+        controlled = require_modal(design) if several else len(design.controller.C)
         parts = [ModeDesign(design, tuple(range(controlled)))]
     count = controlled if modes is None else integer(modes, "modes", at_least=1)
     if count < controlled:

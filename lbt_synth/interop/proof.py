@@ -107,6 +107,12 @@ def command_as_state(textbook: StateSpace) -> Controller:
     )
 
 
+def history_filter(loop: ClosedLoop) -> StateSpace:
+    """Return the filter from pseudo-open-loop values to the commands of a loop of unit sensor."""
+    s, n = loop.commanding(), loop.hardware.modes
+    return replace(s, B=s.B[:, n:], D=s.D[:, n:])
+
+
 def filter_of_history(hardware: LoopHardware, system: StateSpace) -> tuple[Controller, Controller]:
     """Return the controller of a filter of pseudo-open-loop values, its command a further state.
 

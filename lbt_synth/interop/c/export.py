@@ -367,6 +367,6 @@ TARGET = Target(
     hint="Try double precision.",
     endings=(".c",),
     beside=(".h",),
-    modal=None,
+    modal=False,
     reads_others=True,
 )

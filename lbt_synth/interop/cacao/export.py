@@ -29,6 +29,7 @@ from lbt_synth.interop.proof import (
     ROUNDOFF,
     Written,
     filter_of_history,
+    history_filter,
     mode_variances,
     proved_gains,
     scenario_gains,
@@ -253,8 +254,7 @@ def predictive_filter(design: Design) -> PredictiveFilter:
             "cacao counts with a sensor gain of 1, at which the loop of this design is unstable. "
             "Divide the reconstructor by the sensor gain, and design for a gain of 1."
         )
-    s, n = loop.commanding(), hardware.modes
-    system = replace(s, B=s.B[:, n:], D=s.D[:, n:]).balanced()
+    system = history_filter(loop).balanced()
     return PredictiveFilter(design=design, hardware=hardware, system=system)
 
 

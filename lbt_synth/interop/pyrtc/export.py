@@ -25,7 +25,7 @@ from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.interop.pipeline import CERTIFICATE, Arithmetic, Target
-from lbt_synth.interop.proof import ROUNDOFF, Written, filter_of_history
+from lbt_synth.interop.proof import ROUNDOFF, Written, filter_of_history, history_filter
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
@@ -157,11 +157,9 @@ def pol_filter(design: Design) -> PolFilter:
 
 def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> PolFilter:
     """Return the filter of a controller, for a response (m, m) from commands to measurements."""
-    m = len(response)
     A, B, C, D = (np.ascontiguousarray(matrix) for matrix in (own.A, own.B, own.C, own.D))
     own = replace(own, A=A, B=B @ response, C=C, D=D @ response)
-    modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=m)
-    commanding = close_loop(modal, own).commanding()
+    modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=len(response))
     delay = max(1, int(hardware.delay_frames + 0.5))
     taps = np.zeros(max(delay, len(hardware.mirror_taps)))
     taps[: len(hardware.mirror_taps)] = hardware.mirror_taps
@@ -170,7 +168,7 @@ def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> 
         delay_frames=delay,
         response=response,
         taps=taps,
-        system=replace(commanding, B=commanding.B[:, m:], D=commanding.D[:, m:]),
+        system=history_filter(close_loop(modal, own)),
     )
 
 
@@ -235,6 +233,4 @@ TARGET = Target(
     facts=lambda whole, **_: {"delay_frames": whole.delay_frames},
     hint="Design with less accurate models, or for lower sensor gains.",
     contents=(_CONFIG, _GAIN, _RESPONSE, _CONFIG + CERTIFICATE),
-    modal=False,
-    mixed=False,
 )
