@@ -151,7 +151,7 @@ def run_show(arguments: Namespace) -> Report:
     describe_design(report, design)
     add_moving_gain(report, design)
     unproved = ["route and status of the solver"]
-    unproved += ["what its record shows"] * (design.method == "predictor")
+    unproved += ["what its record shows"] * ("residual_nm" in design.claims)
     unproved += ["assumptions"] * bool(design.assumptions)
     unproved += ["configuration, and so the truth"] * bool(design.configuration)
     report.data |= {"file": arguments.gain, "digest": digest, "not_proved": unproved}
