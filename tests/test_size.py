@@ -35,7 +35,7 @@ COUNTS = {
     "tuned constants": 660,
     "lines of tests": 35146,
     "words of docs": 72200,
-    "lines of benchmarks": 4130,
+    "lines of benchmarks": 4120,
 }
 
 
