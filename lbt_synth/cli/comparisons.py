@@ -45,7 +45,7 @@ from lbt_synth.validation import FloatArray, IntArray, agree, frozen_copy, integ
 def run_compare(arguments: Namespace) -> Report:
     """Compare gain files in the loop of a configuration, one line each."""
     config = load_shown(arguments)
-    designs = load_designs(arguments.gains, any_sensors=True)
+    designs = load_designs(arguments.gains, config)
     study = _study_limits(config, designs)
     rows = [_compared(designs[row.design], row, config) for row in study.rows]
     report = Report(verdict=_say_designs(study.rows, study))
@@ -99,7 +99,7 @@ def _say_designs(rows: Sequence[LimitRow], study: LimitStudy) -> list[str]:
 def run_limits(arguments: Namespace) -> Report:
     """Compare designs with the least residual of any linear controller."""
     config = load_shown(arguments)
-    files = load_designs(arguments.gains, any_sensors=True)
+    files = load_designs(arguments.gains, config)
     designs = {
         method.name: config.design(method.name, **method.in_comparison)
         for method in reference_methods()

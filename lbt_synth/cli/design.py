@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.cli.arguments import given_options
-from lbt_synth.cli.loop_inputs import add_truth, choose_design_unit, load_shown
+from lbt_synth.cli.loop_inputs import add_truth, choose_design_unit, load_shown, say_accelerometers
 from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
@@ -92,6 +92,8 @@ def _say_fragility(margins: Sequence[LoopMargins]) -> list[str]:
 def _say_model(design: Design) -> str:
     """Return what a design promises in its own model, for one without a truth."""
     title = f"The {design_title(design.method)}"
+    if design.plant is None and (bought := say_accelerometers(design)):
+        return f"{title} leaves {bought}, on unseen frames of its record."
     if (residual_nm := design.expected_residual_nm) is not None:
         return f"{title} leaves {nm_text(residual_nm, '.1f')} rms in its model."
     if design.is_estimator:

@@ -11,12 +11,12 @@ from typing import Any
 
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.engine import run_in_parts
-from lbt_synth.cli.loop_inputs import load_design, load_designs, load_shown
+from lbt_synth.cli.loop_inputs import load_designs, load_shown
 from lbt_synth.cli.output import PERCENT, Report, json_value
 from lbt_synth.cli.streams import count_progress
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
-from lbt_synth.files import Telemetry, save_telemetry
+from lbt_synth.files import Telemetry, load_gain, save_telemetry
 from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
 from lbt_synth.interop.specula.optics import Calibration, specula_version
 from lbt_synth.interop.specula.simulation import unread_sensors
@@ -56,7 +56,7 @@ def run(arguments: Namespace) -> Report:
     outputs = [Path(arguments.output) / name for name in _FILES]
     refuse_replacing(outputs, [arguments.config, gain])
     setup = _load_setup(arguments)
-    design = load_design(gain, any_sensors=True)
+    design = load_gain(gain)
     setup.controller(design)  # refuses a filter of another loop before any work
     specula_version()  # refuses where it is missing
     make_directory(arguments.output)

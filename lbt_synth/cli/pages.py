@@ -30,7 +30,7 @@ def run_report(arguments: Namespace) -> Report:
     if arguments.title is not None and not arguments.title.strip():
         raise ProblemError("--title must hold at least one letter; got an empty text.")
     config = load_shown(arguments)
-    designs = load_designs(arguments.gains, any_sensors=True)
+    designs = load_designs(arguments.gains, config)
     files = dict(zip(designs, arguments.gains, strict=True))
     assessed = design_report(config, designs, gain_files=files)
     page = design_page(assessed, title=arguments.title)

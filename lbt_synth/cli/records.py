@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from lbt_synth import identification
 from lbt_synth.cli import loop_records
 from lbt_synth.cli.arguments import given_options
-from lbt_synth.cli.loop_inputs import choose_unit, load_designs
+from lbt_synth.cli.loop_inputs import choose_unit, load_designs, say_accelerometers
 from lbt_synth.cli.output import BRIEF_ROWS, Report, say_checks
 from lbt_synth.cli.streams import count_progress
 from lbt_synth.errors import LbtSynthError, ProblemError
@@ -161,6 +161,8 @@ def _say_held_out(
             "strehl": [ran.strehl, best.strehl],
         }
     report.verdict.append(f"{said}.")
+    if bought := say_accelerometers(made.design):
+        report.verdict.append(f"That is {bought}.")
     if best.contradicts_model:
         more = "more" if best.deviations > 0 else "less"
         report.notes.append(

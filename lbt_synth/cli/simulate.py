@@ -99,7 +99,7 @@ def run(arguments: Namespace) -> Report:
         raise ProblemError(f"--{option} goes with one gain file; got {len(arguments.gains)}.")
     config = load_shown(arguments)
     truth = truth_at_sensor_gain(config, arguments.sensor_gain)
-    designs = load_designs(arguments.gains, any_sensors=True)
+    designs = load_designs(arguments.gains, config)
     runs = [_run(arguments, name, design, truth, config) for name, design in designs.items()]
     report = _describe_runs(runs, truth, config)
     only = runs[0]

@@ -8,6 +8,7 @@ import pytest
 from support.commands import run
 from support.configs import with_errors
 from support.plants import LBT_YAML
+from support.predictors import made
 from support.robust_config import robust_writer
 
 import lbt_synth as lbt
@@ -118,7 +119,7 @@ def test_telemetry_is_shown_in_an_angle(capsys, files):
     assert main(["telemetry", path, "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["units"]["residual_nm"] == "nm"
-    assert main(["telemetry", path, "--unit", "mas"]) == 0
+    assert main(["telemetry", path, "--show-unit", "mas"]) == 0
     (row,) = re.findall(r"residual_nm .*", capsys.readouterr().out)
     scale = lbt.models.nm_per_mas(data["diameter_m"])
     assert float(row.split()[-1]) == pytest.approx(data["rms"]["residual_nm"] / scale, rel=1e-5)
@@ -259,3 +260,31 @@ def test_one_configuration_is_one_unit(capsys, files, tmp_path, command):
     assert status == 0
     assert f" {unit}" in out or f"[{unit}" in out
     assert re.findall(r".*\bnm\b.*", out) == []
+
+
+@pytest.mark.parametrize("command", ["simulate", "compare", "report"])
+def test_a_truth_that_moves_no_accelerometer_says_nothing_of_a_predictor(tmp_path, capsys, command):
+    gain = lbt.save_gain(tmp_path / "p.fits", made(residual_nm=106.2, alone_nm=167.4))
+    output = ("-o", tmp_path / "r.html") if command == "report" else ()
+    status, text, error = run(capsys, command, CONFIG, gain, *output)
+    assert (status, text) == (2, "")
+    assert f"{gain} reads a, ..., which nothing in the truth of lbt.yaml moves; its" in error
+    assert f"record shows 106 nm: lbt-synth show {gain}." in error
+
+
+def test_show_says_what_accelerometers_buy(tmp_path, capsys):
+    gain = lbt.save_gain(tmp_path / "p.fits", made(residual_nm=106.2, alone_nm=167.4))
+    status, text, _ = run(capsys, "show", gain)
+    assert status == 0
+    assert " ".join(text.split()).startswith(
+        "The least-squares predictor leaves 106 nm with the accelerometers, 167 nm without them, "
+        "on unseen frames of its record."
+    )
+    status, _, error = run(
+        capsys, "design", CONFIG, "--method", "predictor", "-o", tmp_path / "q.fits"
+    )
+    assert (status, error) == (
+        2,
+        "lbt-synth: error: the method predictor is made of a record; got a plant or a "
+        "configuration alone. Try lbt-synth auto RECORD --method predictor.\n",
+    )

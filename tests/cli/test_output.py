@@ -298,7 +298,14 @@ def test_what_is_printed_is_cut_to_a_screen(capsys):
     report.print(verbose=True)
     text = capsys.readouterr().out
     assert all(word in text for word in ("remark", "r17", "note: 29"))
-    report.tables.clear()
+    long = f"assumes: the sensor gain lies {'between two limits ' * 40}."
+    report.notes += [long, "assumes: the commands are as recorded.", "warning: unstable."]
+    report.print()
+    lines = capsys.readouterr().out.splitlines()
+    kept = [line for line in lines if line.endswith(("(--verbose)", "recorded.", "unstable."))]
+    assert (len(lines), len(kept)) == (25, 3)  # what an assumption says is never left out
+    assert sum("between two limits" in line for line in lines) == 5
+    report = Report()
     report.add_table("Facts", ("quantity", "value"), [(f"q{i}", i) for i in range(40)])
     report.print()
     assert re.findall(r"  (q\d+)", capsys.readouterr().out) == [f"q{i}" for i in range(12)]
