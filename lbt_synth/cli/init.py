@@ -8,7 +8,7 @@ from argparse import Action, ArgumentParser, Namespace
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from lbt_synth.cli.arguments import COMMANDS, build_parser
+from lbt_synth.cli.arguments import COMMANDS, build_parser, refuse_options
 from lbt_synth.cli.output import Report
 from lbt_synth.config import config_schema, identified_config, telescope_template
 from lbt_synth.config.load import example_files
@@ -121,11 +121,8 @@ def _section(name: str, template: str) -> re.Match[str] | None:
 def _script(arguments: Namespace) -> Report:
     """Print the schema of a configuration or the completion of a shell, or write it."""
     asked = "--schema" if arguments.schema else "--completion"
-    others = {"--telescope": arguments.telescope, "--from": arguments.source}
-    others |= {"--examples": arguments.examples, "--force": arguments.force}
-    others |= {"--completion": arguments.schema and arguments.completion}
-    if given := [option for option, value in others.items() if value]:
-        raise ProblemError(f"{asked} goes with -o alone; got {', '.join(given)}. Leave it out.")
+    others = ["telescope", "source", "examples", "force", *["completion"] * arguments.schema]
+    refuse_options(arguments, others, f"does not go with {asked}; leave it out")
     data, text = config_schema(), json.dumps(config_schema(), indent=1)
     if not arguments.schema:
         text = _completion(arguments.completion)

@@ -17,7 +17,7 @@ import numpy as np
 
 from lbt_synth.cli.streams import printable
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.draw import FIGURE_ENDINGS, require_figure_name, save_figure
+from lbt_synth.report.draw import FIGURE_ENDINGS, save_figure
 from lbt_synth.storage.atomic_files import require_writable, write_atomically
 from lbt_synth.storage.rows import (
     cell_text,
@@ -225,11 +225,6 @@ def json_value(value: Any) -> Any:
     return value
 
 
-def require_figure(output: str, *, inputs: Sequence[str]) -> None:
-    """Refuse an output that cannot become a figure, or would replace an input."""
-    require_writable(require_figure_name(output), inputs=inputs)
-
-
 def run_with_outputs(run: Callable[[Namespace], Report], arguments: Namespace) -> Report:
     """Run a command, and write its rows to outputs in .csv and its figure to all others.
 
@@ -243,7 +238,8 @@ def run_with_outputs(run: Callable[[Namespace], Report], arguments: Namespace) -
             raise ProblemError(
                 f"an output must end in .csv, {', '.join(FIGURE_ENDINGS)}; got {output!r}."
             )
-    inputs = [getattr(arguments, "config", None), *getattr(arguments, "gains", ())]
+    one = [getattr(arguments, name, None) for name in ("config", "gain", "file")]
+    inputs = [*one, *getattr(arguments, "gains", ())]
     require_writable(*outputs, inputs=[path for path in inputs if path])
     report = run(arguments)
     if (figure := report.figure) is not None:
