@@ -228,7 +228,7 @@ at the telescope: a gain file in another program
     gain target reading
     >
     stroke
-    --frames | int | frames to draw where there is no record (default 8000)
+    --frames | int =8000 | frames to draw where there is no record
     --seed | int =1 | seed of what is drawn
     wavelength
     outputs

@@ -48,9 +48,6 @@ def run_design(arguments: Namespace) -> Report:
     return report
 
 
-_SMALL_MODULUS = 0.3  # below what a loop is usually asked for
-
-
 def describe_design(report: Report, design: Design) -> None:
     """Add what a design is, what its loop survives, and its certificate."""
     alone = design.controller.to_statespace().spectral_radius
@@ -76,7 +73,7 @@ def describe_design(report: Report, design: Design) -> None:
     report.add_records(*facts)
     printed = fact_table("Design", *facts, *margins)
     report.tables.append(without_units(printed) if design.hardware is None else printed)
-    report.notes += _loop_notes(design, margins, alone)
+    report.notes += _loop_notes(design, alone)
     tables = design.tables()
     report.notes += [*design.notes(), *(note for table in tables for note in table.notes)]
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
@@ -121,15 +118,10 @@ def add_moving_gain(report: Report, design: Design) -> None:
         report.add_facts("Sensor gain that moves", moving_gain(loop), key="moving_gain")
 
 
-def _loop_notes(design: Design, margins: Sequence[LoopMargins], alone: float) -> list[str]:
+def _loop_notes(design: Design, alone: float) -> list[str]:
     if design.hardware is None:
         return []
-    notes = [
-        f"note: the modulus margin {one.modulus:.3g} is small; a loop is usually asked for "
-        f"{_SMALL_MODULUS:g} or more. Lower the gain, or design with more noise."
-        for one in margins
-        if one.modulus < _SMALL_MODULUS
-    ]
+    notes = list[str]()
     if design.hardware.mirror is not None and not design.knows_mirror:
         notes.append(
             "note: this filter commands its estimate as if the mirror settled at once, so that its "

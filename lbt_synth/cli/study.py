@@ -39,9 +39,8 @@ from lbt_synth.validation import integer
 
 _TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
 _FAILURE = ("row", "controller", "error")
-_NUMBER_BYTES = 21  # of a number of a study, in a part and in the table of results
-_LOW = 5.0  # percentile of the Strehl ratio that a bad night has
 _WORST = 3  # rows of each controller that are printed; the page has more
+_LOW = 5.0  # percentile of the Strehl ratio that a bad night has
 
 
 def run(arguments: Namespace) -> Report:
@@ -77,9 +76,9 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
             computing_s=run.computing_s,
         )
         write_page(page, pages[0], pdf=pages[1] if arguments.pdf else None)
-    files = dict.fromkeys((run.results, run.failed), run.new) | dict.fromkeys(pages, draws)
     varying = [name for name, p in loaded.settings.parameters.items() if p.varies]
     worst = [worst_table(each, columns, varying) for each in statistics.controllers]
+    files = dict.fromkeys((run.results, run.failed), run.new) | dict.fromkeys(pages, draws)
     done = f"{folder} is finished: {loaded.samples} samples in {run.results.name}; none computed."
     if run.computed:
         done = (
@@ -187,13 +186,10 @@ def _estimate(loaded: studies.Study, at_once: int) -> Facts:
     evaluate_samples(loaded, loaded.values(0, 1), 0)  # warms up
     rows = min(part_rows(loaded), loaded.samples)
     _, seconds = timed(evaluate_samples, loaded, loaded.values(0, rows), 0)
-    space = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
-    disk_bytes = _NUMBER_BYTES * len(loaded.columns) * loaded.samples
     return facts(
         measured_rows=fact(rows, "samples measured in one process"),
         measured_s=fact(seconds, "  their time", unit="s", format=".3g"),
         seconds=fact(seconds / rows * loaded.samples / at_once),  # said in a note, in words
-        disk_bytes=fact(disk_bytes, "space on the disk, about", **space),
     )
 
 

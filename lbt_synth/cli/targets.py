@@ -35,7 +35,6 @@ from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import FloatArray, integer
 
 _OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps", "loss")
-_FRAMES = 8000  # of a drawn disturbance
 _DRAWN = ("frames", "seed")  # options that only a drawn disturbance has
 _ALWAYS = ("target", "stroke", "wavelength_um", "output", "json", "verbose", "unit", "show_unit")
 _FEWEST = 256  # frames of a record: a loop needs some to settle, and some to compare
@@ -220,9 +219,8 @@ def _drawn(arguments: Namespace, design: Design) -> _Series:
     imaging = config.imaging
     if arguments.wavelength_um is not None:
         imaging = replace(imaging, wavelength_um=arguments.wavelength_um)
-    frames, alone = _FRAMES, config.hardware.own_sensor_alone()
+    alone = config.hardware.own_sensor_alone()
     seed = integer(arguments.seed, "--seed", at_least=0)
-    if arguments.frames is not None:
-        frames = integer(arguments.frames, "--frames", at_least=1)
+    frames = integer(arguments.frames, "--frames", at_least=1)
     drawn = draw_disturbance(config.truth, alone, frames=frames, seed=seed)
     return f"{frames} frames of its own truth", drawn, config.hardware, imaging, None

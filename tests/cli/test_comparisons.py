@@ -72,28 +72,9 @@ SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
 
 def test_command_with_gain_files(tmp_path, capsys, gains, config):
     table, figure = tmp_path / "m.csv", tmp_path / "m.png"
-    status, text, error = run(
-        capsys,
-        "robustness",
-        CONFIG,
-        gains["kalman"],
-        gains["hinf"],
-        "--errors-hz",
-        -2,
-        2,
-        5,
-        "--sensor-gains",
-        0.5,
-        1,
-        3,
-        "--delay-errors",
-        0,
-        0.1,
-        "-o",
-        table,
-        "-o",
-        figure,
-    )
+    points = ("--errors-hz", -2, 2, 5, "--sensor-gains", 0.5, 1, 3, "--delay-errors", 0, 0.1)
+    words = ("robustness", CONFIG, gains["kalman"], gains["hinf"], *points)
+    status, text, error = run(capsys, *words, "-o", table, "-o", figure)
     assert (status, error) == (0, "")
     assert (
         "At a sensor gain of 1: Strehl ratio at 2.2 um, over frequency errors of -2 to +2" in text
@@ -102,15 +83,8 @@ def test_command_with_gain_files(tmp_path, capsys, gains, config):
     assert text.startswith("hinf is unstable at ")
     assert figure.read_bytes().startswith(b"\x89PNG")
     rows = list(csv.DictReader(table.read_text().splitlines()))
-    assert list(rows[0]) == [
-        "file",
-        "delay_error_frames",
-        "sensor_gain",
-        "error_hz",
-        "strehl",
-        "residual_nm",
-        "stable",
-    ]
+    columns = "file delay_error_frames sensor_gain error_hz strehl residual_nm stable"
+    assert list(rows[0]) == columns.split()
     assert len(rows) == 2 * 2 * 3 * 5
     row = rows[1 * 5 + 3]
     assert (row["file"], row["sensor_gain"], row["error_hz"]) == ("kalman", "0.75", "1.0")

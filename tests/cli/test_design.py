@@ -37,11 +37,6 @@ def test_design(tmp_path, capsys, options, method):
     assert re.search(r"(\d+) of \1 checks passed\.", " ".join(text.split()))
 
 
-def test_a_small_margin_gets_a_note(tmp_path, capsys):
-    _, out, _ = run(capsys, "design", CONFIG, "--method", "integrator", "-o", tmp_path / "i.fits")
-    assert "note: the modulus margin 0.0751 is small" in out
-
-
 @pytest.fixture
 def small(tmp_path):
     return robust_writer(tmp_path)

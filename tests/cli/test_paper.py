@@ -25,17 +25,10 @@ from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.studies.paper import modal_row, paper_filters, plan_rows
 
 
-def test_paper(tmp_path, capsys):
-    status, text, _ = run(capsys, "paper", "-o", tmp_path / "a" / "b", "--verbose")
-    assert status == 0
-    assert "Table III" in text
-    assert "fitted" in text
-    assert (tmp_path / "a" / "b" / "table_iii.csv").exists()
-
-
 def test_paper_in_the_unit_of_the_user(tmp_path, capsys):
     status, text, _ = run(capsys, "paper", "-o", tmp_path / "mas", "--unit", "mas", "--verbose")
     assert status == 0
+    assert "Table III: Strehl ratio" in text
     assert re.search(r"turbulence pole, rms +0\.98860, 59\.38 mas ", text)
     assert re.search(r"80 mas as the rms of a sinusoid +80\.00 mas ", text)
     assert " nm" not in text
@@ -64,17 +57,9 @@ def written(folder):
 
 def test_written_files(folder, written):
     files, _ = written
-    assert {p.name for p in files} == {
-        "table_ii.csv",
-        "table_iii.csv",
-        "parameters.csv",
-        "robustness.png",
-        "robustness.pdf",
-        "sigma.png",
-        "sigma.pdf",
-        "paper_kalman.fits",
-        "paper_hinf.fits",
-    }
+    tables = "table_ii.csv table_iii.csv parameters.csv paper_kalman.fits paper_hinf.fits"
+    figures = "robustness.png robustness.pdf sigma.png sigma.pdf"
+    assert {path.name for path in files} == {*tables.split(), *figures.split()}
     with (folder / "table_iii.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 30
@@ -175,16 +160,8 @@ def test_the_command_writes_telemetry_that_is_the_run(tmp_path, cache, capsys):
     config, gain = small_config(tmp_path), tmp_path / "k.fits"
     lbt.save_gain(gain, lbt.kalman(lbt.load_config(config).plant))
     out = tmp_path / "run"
-    arguments = [
-        "end-to-end",
-        str(config),
-        str(gain),
-        "-o",
-        str(out),
-        "--cache",
-        str(cache),
-        "--json",
-    ]
+    arguments = ["end-to-end", str(config), str(gain), "-o", str(out), "--cache", str(cache)]
+    arguments += ["--json"]
     assert main(arguments) == 0
     data = json.loads(capsys.readouterr().out)
     assert sorted(p.name for p in out.iterdir()) == ["run.png", "summary.json", "telemetry.fits"]
@@ -234,24 +211,8 @@ def test_a_design_of_several_sensors_runs_without_those_that_are_not_simulated(
 @needs_specula
 def test_a_table_that_was_killed_goes_on(tmp_path, cache):
     config, out = small_config(tmp_path), tmp_path / "table"
-    arguments = [
-        sys.executable,
-        "-m",
-        "lbt_synth.cli.main",
-        "end-to-end",
-        str(config),
-        "-o",
-        str(out),
-        "--cache",
-        str(cache),
-        "--seeds",
-        "1",
-        "--tables",
-        "II",
-        "--jobs",
-        "2",
-        "--json",
-    ]
+    arguments = [sys.executable, "-m", "lbt_synth.cli.main", "end-to-end", str(config)]
+    arguments += f"-o {out} --cache {cache} --seeds 1 --tables II --jobs 2 --json".split()
     first = subprocess.Popen(arguments, stdout=subprocess.DEVNULL)
     end = time.monotonic() + 120
     while len(list(out.glob("cases/*.npz"))) < 2:

@@ -337,3 +337,19 @@ def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, recorded_night,
     assert (status, text, error.count("\n")) == (2, "", 1)
     assert message in error
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_auto_says_what_accelerometers_buy(tmp_path, capsys, recorded_loop, tip_night):
+    shake = 1e-3 * np.diff(recorded_loop[0].total_nm[0][:, 0], n=2, prepend=[0, 0])
+    np.save(tmp_path / "a.npy", shake)
+    words = ("auto", tip_night, *FACTS, "--accelerometers", tmp_path / "a.npy", "--no-figure")
+    words += ("--method", "predictor", "-o", tmp_path / "p.fits")
+    status, text, error = run(capsys, *words)
+    assert (status, error) == (0, "")
+    claims = lbt.load_gain(tmp_path / "p.fits").claims
+    bought = f"That is {claims['residual_nm']:.3g} nm with the accelerometers, "
+    bought += f"{claims['alone_nm']:.3g} nm without them."
+    assert bought in " ".join(text.split())
+    assert "\nassumes: the sensor gain lies within" in text
+    (channel,) = json.loads(run(capsys, *words, "--json")[1])["accelerometers"]
+    assert channel["without_nm"] > claims["residual_nm"]

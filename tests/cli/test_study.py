@@ -89,7 +89,7 @@ def test_the_command(tmp_path, capsys):
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--verbose")
     assert status == 0
     assert "is finished: 200 samples in results.csv; none computed" in out
-    for text in ("50th percentile", "Worst samples of b", "sensor_gain", "unchanged: "):
+    for text in ("50th percentile", "sensor_gain", "unchanged: "):
         assert text in out
     page = tmp_path / "out" / "summary.html"
     page.write_text("changed")
@@ -121,7 +121,6 @@ def test_an_estimate(tmp_path, monkeypatch):
     cost = estimate(loaded, 1)
     assert 4 < cost.seconds < 9
     assert cost.measured_rows == 5000
-    assert cost.disk_bytes == 5000 * 21 * 9
     assert estimate(loaded, 100).seconds < 0.09
 
 
