@@ -334,12 +334,12 @@ def _say_maps(maps: Mapping[str, RobustnessMap], lines: Sequence[Facts], where: 
 
 
 def _parse_range(
-    given: Sequence[float] | None, option: str, default: Sequence[float] | FloatArray
+    ends: Sequence[float] | None, option: str, default: Sequence[float] | FloatArray
 ) -> FloatArray:
     """Return the values of LOW HIGH COUNT, or those of the configuration where none are given."""
-    if given is None:
+    if ends is None:
         return np.array(default)
-    low, high, count = (number(value, option) for value in given)
+    low, high, count = (number(value, option) for value in ends)
     if not (low < high and count.is_integer() and count >= 2):
         raise ProblemError(
             f"{option} must be LOW HIGH COUNT with LOW below HIGH and a COUNT of at least 2; got "

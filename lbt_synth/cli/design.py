@@ -30,14 +30,14 @@ _WORDING = Wording(method="--method {}", option="--{}")
 
 def run_design(arguments: Namespace) -> Report:
     """Design a controller and write its gain file."""
-    given = given_options(arguments, *option_names())
-    request = design_request(arguments.method, given, _WORDING)
+    options = given_options(arguments, *option_names())
+    request = design_request(arguments.method, options, _WORDING)
     require_writable(require_gain_name(arguments.output), inputs=[arguments.config])
     config = load_shown(arguments)
     design = config.design(request)
     path = save_gain(arguments.output, design)
     report = Report()
-    add_truth(report, design, config, without=() if given else (request.method.name,))
+    add_truth(report, design, config, without=() if options else (request.method.name,))
     describe_design(report, design)
     if design.method != request.method.name:
         title = design_title(design.method)

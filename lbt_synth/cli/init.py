@@ -73,7 +73,7 @@ def _refuse_taken(contents: Mapping[Path, str | None], *, force: bool) -> None:
         if path.is_file() and (text is None or path.read_bytes() != text.encode())
     ]
     if taken and not force:
-        renamed = any(Path(each).name != _SCHEMA for each in taken)  # by -o
+        renamed = any(Path(path).name != _SCHEMA for path in taken)  # by -o
         advice = "another name by -o, or --force" if renamed else "--force"
         raise OutputError(f"{', '.join(taken)} would be replaced. Give {advice}.")
 
@@ -107,7 +107,7 @@ def _unknown_sections(record: LoopRecord, source: str, telescope: str) -> str:
     """Return the sections of a telescope that a record does not know, as comments."""
     names = ["atmosphere"] if record.diameter_m is not None else ["telescope", "atmosphere"]
     template = telescope_template(telescope)
-    sections = [found[0] for name in names if (found := _section(name, template))]
+    sections = [match[0] for name in names if (match := _section(name, template))]
     marks = re.findall(r"^# (\[\d\] .+\n(?:#     .+\n)*)", template, re.MULTILINE)
     used = [mark for mark in marks if any(mark[:3] in section for section in sections)]
     text = "".join([f"Not in {source}; this is of the template {telescope}:\n", *sections, *used])

@@ -119,9 +119,9 @@ def load_designs(paths: list[str], config: Config | None = None) -> dict[str, De
 
 def _distinct_tails(paths: list[str]) -> list[str]:
     """Return the last parts of different paths, as few as distinguish all of them."""
-    whole = [Path(path).resolve().parts for path in paths]
-    for count in range(1, max(map(len, whole))):
-        names = [printable("/".join(parts[-count:])) for parts in whole]
+    tails = [Path(path).resolve().parts for path in paths]
+    for count in range(1, max(map(len, tails))):
+        names = [printable("/".join(parts[-count:])) for parts in tails]
         if len(set(names)) == len(names):
             return names
     return paths

@@ -339,15 +339,15 @@ def read_accelerations(
     )
 
 
-def add_accelerometers(report: Report, found: AccelerometerTransfers) -> None:
+def add_accelerometers(report: Report, transfers: AccelerometerTransfers) -> None:
     """Add how the channels of accelerometers move with the lines, and what is used."""
-    if found.transfers:
-        report.add_rows("accelerometer_lines", "Accelerometers and lines", found.transfers)
-    report.add_rows("accelerometers", "Accelerometers", found.channels)
+    if transfers.transfers:
+        report.add_rows("accelerometer_lines", "Accelerometers and lines", transfers.transfers)
+    report.add_rows("accelerometers", "Accelerometers", transfers.channels)
     report.data["accelerometer_shift"] = {
-        name: getattr(found, f"shift_{name}") for name in ("frames", "error_frames")
+        name: getattr(transfers, f"shift_{name}") for name in ("frames", "error_frames")
     }
-    report.notes.append(f"note: {found.shift_text}")
+    report.notes.append(f"note: {transfers.shift_text}")
 
 
 def find_places(arguments: Namespace, model: str | Path | None, **others: Path) -> dict[str, Path]:
@@ -364,8 +364,8 @@ def find_places(arguments: Namespace, model: str | Path | None, **others: Path) 
     elif arguments.figure is not None:
         raise ProblemError("give one of --figure and --no-figure, not both.")
     read = ("file", "commands", "lines_file", "accelerometers")
-    given = given_options(arguments, *(name for name in read if name in arguments))
-    require_writable(*places.values(), inputs=given.values())
+    inputs = given_options(arguments, *(name for name in read if name in arguments))
+    require_writable(*places.values(), inputs=inputs.values())
     return places
 
 
@@ -460,12 +460,12 @@ def _axis_record(axis: IdentifiedAxis) -> dict[str, Any]:
     turbulence, whiteness = axis.turbulence, axis.whiteness
     tests = ("deviation", "p_value", "white")
     noise = ("noise_nm", "noise_error_nm", "noise_correlation", "noise_correlation_error")
-    own = (*noise, "sensor_gain", "sensor_gain_error", "sensor_gain_note")
+    shown = (*noise, "sensor_gain", "sensor_gain_error", "sensor_gain_note")
     return {
         "turbulence": asdict(axis.turbulence_fit)
         | {"coefficients": turbulence.coefficients, "driving_rms_nm": turbulence.driving_rms_nm},
         "vibrations": [asdict(line) for line in axis.parts],
-        **{name: getattr(axis, name) for name in own},
+        **{name: getattr(axis, name) for name in shown},
         "whiteness": {name: getattr(whiteness, name) for name in tests},
     }
 

@@ -77,7 +77,7 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
         )
         write_page(page, pages[0], pdf=pages[1] if arguments.pdf else None)
     varying = [name for name, p in loaded.settings.parameters.items() if p.varies]
-    worst = [worst_table(each, columns, varying) for each in statistics.controllers]
+    worst = [worst_table(one, columns, varying) for one in statistics.controllers]
     files = dict.fromkeys((run.results, run.failed), run.new) | dict.fromkeys(pages, draws)
     done = f"{folder} is finished: {loaded.samples} samples in {run.results.name}; none computed."
     if run.computed:

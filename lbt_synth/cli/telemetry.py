@@ -110,12 +110,12 @@ def record_telescope(arguments: Namespace, record: LoopRecord | SpectrumRecord) 
     }
 
 
-def _parse_columns(given: Sequence[str] | None) -> dict[str, list[str | int]] | None:
+def _parse_columns(pairs: Sequence[str] | None) -> dict[str, list[str | int]] | None:
     """Parse ROLE=NAME[,NAME] pairs; a role without a name has no column."""
-    if given is None:
+    if pairs is None:
         return None
     out: dict[str, list[str | int]] = {}
-    for pair in given:
+    for pair in pairs:
         role, equals, names = pair.partition("=")
         if not equals or not role:
             raise ProblemError(

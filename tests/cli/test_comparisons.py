@@ -186,20 +186,6 @@ def test_the_mirror_settles(tmp_path, capsys):
     assert (status, "mirror.local_loop is missing" in error) == (2, True)
 
 
-def test_modal(tmp_path, capsys):
-    table, figure = tmp_path / "m.csv", tmp_path / "m.png"
-    status, text, error = run(
-        capsys, "modal", LBT_YAML, "--modes", 60, "-o", table, "-o", figure, "--verbose"
-    )
-    assert (status, error) == (0, "")
-    for words in ("By radial order", "optimised gains", "Kalman filters", "written"):
-        assert words in text
-    assert figure.read_bytes().startswith(b"\x89PNG")
-    rows = list(csv.DictReader(table.read_text().splitlines()))
-    assert [int(row["modes"]) for row in rows] == [2, 3, 4, 5, 6, 7, 8, 9, 10, 6]
-    assert sum(int(row["modes"]) for row in rows) == 60
-
-
 def test_modal_knows_the_local_loop(capsys):
     """Gains and filters of a slow mirror are those of loops with that mirror."""
     slow = SLOW_YAML

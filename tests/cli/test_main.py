@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -199,55 +200,31 @@ def test_output_that_cannot_be_written(gains):
     assert "cannot write the output" in done.stderr
 
 
-KNOWN = ("--unit", "nm", "--frame-rate-hz", "1000", "--delay-frames", "2")
-SAID = [
-    (
-        ("design", "CONFIG", "--method", "hinf", "--gamma", "1", "-o", "OUT.fits"),
-        ("--gamma must be at least 155", "Try --gamma-ratio 1.2."),
-    ),
-    (
-        ("design", "CONFIG", "--method", "kalman", "--horizon", "200", "-o", "OUT.fits"),
-        ("--horizon must leave the loop", "which makes 201.\n"),
-    ),
-    (("simulate", "CONFIG", "GAIN", "--sensor-gain", "0"), ("--sensor-gain must be above 0",)),
-    (
-        ("end-to-end", "CONFIG", "GAIN", "-o", "OUT", "--pixels", "11"),
-        ("--pixels must be even, at least subapertures_across (30)",),
-    ),
-    (
-        ("identify", "BARE.csv", "-o", "OUT.yaml"),
-        ("Choose by --columns measurements=... commands=..., names",),
-    ),
-    (
-        ("identify", "NAMED.csv", "-o", "OUT.yaml"),
-        (
-            "nothing tells the unit of tip, tilt, command_tip, command_tilt: give --unit (nm,",
-            "; the frame rate: give --frame-rate-hz, or the times; the total delay: give "
-            "--delay-frames.\n",
-        ),
-    ),
-    (
-        ("identify", "NIGHT", "--unit", "mas", "-o", "OUT.yaml"),
-        (
-            "--unit must be that of the data, 'nm'; got 'mas'. Leave it out; --show-unit is the unit",
-        ),
-    ),
-]
+SAID = {
+    "design CONFIG --method hinf --gamma 1 -o OUT.fits": "at least 155.* Try --gamma-ratio 1.2.",
+    "design CONFIG --method kalman --horizon 200 -o OUT.fits": "--horizon must .* makes 201.",
+    "simulate CONFIG GAIN --sensor-gain 0": "--sensor-gain must be above 0",
+    "end-to-end CONFIG GAIN -o OUT --pixels 11": "--pixels must be even, at least subapertures_",
+    "identify BARE.csv -o OUT.yaml": "Choose by --columns measurements=... commands=..., names",
+    "identify NAMED.csv -o OUT.yaml": "unit of tip, tilt, command_tip, command_tilt: give --unit "
+    ".*; the frame rate: give --frame-rate-hz, or the times; the total delay: give --delay-frames.",
+    "identify NIGHT --unit mas -o OUT.yaml": "--unit must be that of the data, 'nm'; got 'mas'. "
+    "Leave it out; --show-unit is the unit",
+}
 
 
-@pytest.mark.parametrize(("words", "texts"), SAID, ids=lambda words: " ".join(words)[:40])
+@pytest.mark.parametrize("words", SAID)
 def test_an_error_names_options_and_files(
-    tmp_path, capsys, monkeypatch, gains, recorded_night, words, texts
+    tmp_path, capsys, monkeypatch, gains, recorded_night, words
 ):
     monkeypatch.chdir(tmp_path)
     rows = "1.0,2.0,0.5,0.25\n2.0,1.0,0.25,0.5\n" * 100
     (tmp_path / "BARE.csv").write_text(rows)
     (tmp_path / "NAMED.csv").write_text("tip,tilt,command_tip,command_tilt\n" + rows)
     places = {"CONFIG": LBT_YAML, "GAIN": gains["kalman"], "NIGHT": recorded_night}
-    status, out, error = run(capsys, *(places.get(word, word) for word in words))
-    assert (status, out, error.count("\n")) == (1 if {"--gamma", "--rms"} & {*words} else 2, "", 1)
-    for text in texts:
-        assert text in error
+    status, out, error = run(capsys, *(places.get(word, word) for word in words.split()))
+    assert (status, out, error.count("\n")) == (1 if "--gamma" in words else 2, "", 1)
+    assert re.search(SAID[words], error)
 
 
 def test_in_python_arguments_keep_their_names():
