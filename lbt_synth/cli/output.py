@@ -149,15 +149,17 @@ class Report:
         verdict = _wrapped(" ".join(self.verdict), room)
         *urgent, notes = ([n for n in self.notes if n.startswith(mark)] for mark in _URGENT)
         kept = _cut([note for marked in urgent for note in marked], room)
+        space = _BRIEF_LINES - len(written)
+        most = max(space - 1 - len([*verdict, *kept]), 0)
         table: list[str] = []
         for count in range(BRIEF_ROWS, 1, -1) if self.tables else ():
             thinned = text_lines(_thinned(self.tables[0], count), room, rule=rule)
             table = [""] * bool(verdict) + thinned
-            if len([*verdict, *table, *kept, *written]) < _BRIEF_LINES:
+            if len(table) <= most:
                 break
-        lines = verdict + table + kept + [line for note in notes for line in _wrapped(note, room)]
-        space = _BRIEF_LINES - len(written)
-        if len(lines) > space:
+        more = [line for note in notes for line in _wrapped(note, room)]
+        lines = verdict + table[:most] + kept + more
+        if len(lines) > space or len(table) > most:
             lines = [*lines[: space - 1], "... more with --verbose"]
         return lines + written
 

@@ -282,6 +282,13 @@ def test_what_is_printed_is_cut_to_a_screen(capsys):
     kept = [line for line in lines if line.endswith(("(--verbose)", "recorded.", "unstable."))]
     assert (len(lines), len(kept)) == (25, 3)  # what an assumption says is never left out
     assert sum("between two limits" in line for line in lines) == 5
+    report.tables.clear()
+    wide = [f"a heading of column {i}" for i in range(12)]
+    report.add_table("Wide", wide, [["1234.5678901"] * 12] * 9)
+    report.print()
+    cut = capsys.readouterr().out.splitlines()
+    assert (len(cut), cut[-2]) == (25, "... more with --verbose")
+    assert [line for line in cut if line in kept] == kept
     report = Report()
     report.add_table("Facts", ("quantity", "value"), [(f"q{i}", i) for i in range(40)])
     report.print()
