@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 4480,
+    "cli": 4320,
     "config": 1876,
     "design": 7570,
     "files": 1608,
@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 265,
     "public names": 230,
     "tuned constants": 660,
-    "lines of tests": 35146,
+    "lines of tests": 34080,
     "words of docs": 63000,
 }
 

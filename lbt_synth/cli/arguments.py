@@ -12,16 +12,16 @@ opens a group of arguments; those of ``> one of`` exclude each other, and ``>`` 
 from __future__ import annotations
 
 import argparse
+import importlib
 import re
 from argparse import Action, ArgumentParser, Namespace
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, Literal, NoReturn, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn, cast, get_args, get_origin
 
 import lbt_synth
 from lbt_synth.cli.streams import printable
-from lbt_synth.errors import suggest_word
+from lbt_synth.errors import ProblemError, suggest_word
 from lbt_synth.storage.display_unit import M_S2, UNITS
 
 if TYPE_CHECKING:  # slow to import for --help
@@ -106,7 +106,7 @@ design: from a configuration to a gain file
 look: what a design does in the loop, and what could be better
   compare | comparisons | Compare gain files in the loop of a configuration, one line each.
     unit config gains+ outputs
-  plot | plot | Plot loops of one or several designs in a classical view, and print their margins.
+  plot | pages | Plot loops of one or several designs in a classical view, and print their margins.
     unit
     kind | sigma/bode/nyquist/nichols/step | the view: sigma has the largest singular values,
         step the residual and the command after a step
@@ -124,7 +124,7 @@ look: what a design does in the loop, and what could be better
         m2@10s or wavefront@20s..20.2s; READING missing (seen, default), zero or frozen (believed)
     --form | plain/estimator | of the controller: plain assumes that commands are applied, estimator
         is given those that were (default plain)
-    -o --output | | figure (.png, .pdf or .svg)
+    outputs
     --telemetry | meta:FILE | write the first run (.fits, .npz)
   report | pages | Write a page about designs in the loop of a configuration.
     unit config gains+
@@ -151,7 +151,7 @@ look: what a design does in the loop, and what could be better
     --sensor-gains | float nargs:3 meta:LOW,HIGH,COUNT | real sensor gain: COUNT values (default:
         the configuration's)
     --delay-errors | float nargs:+ meta:FRAMES dest:delay_errors_frames | real delay less that of
-        the design [frames] (default: the configuration's, else 0)
+        the configuration [frames] (default: the configuration's, else 0)
     >
     outputs
   tradeoff | comparisons | Design filters from the least norm to the least variance.
@@ -176,7 +176,7 @@ look: what a design does in the loop, and what could be better
     unit config
     --tolerance | float =0.1 | half width of the band in which the mirror counts as settled
     outputs
-  modal | modal | Compare integrators, optimised gains and Kalman filters for all modes.
+  modal | comparisons | Compare integrators, optimised gains and Kalman filters for all modes.
     unit config
     --modes | int | number of modes, at least 2 (default: mirror.modes)
     outputs
@@ -228,15 +228,15 @@ at the telescope: a gain file in another program
     gain target reading
     >
     stroke
-    --frames | int | frames to draw where there is no record (default 8000)
+    --frames | int =8000 | frames to draw where there is no record
     --seed | int =1 | seed of what is drawn
     wavelength
-    -o --output | | figure (.png, .pdf or .svg)
+    outputs
 the paper and the simulator: Agapito et al. 2008, and loops with a pyramid
   paper | paper | Compute the tables and figures of Agapito et al. 2008, ours beside theirs.
     unit
     -o --output | required | directory to write into
-  end-to-end | end_to_end | Close the loop end to end: pyramid, mirror and moving air.
+  end-to-end | paper | Close the loop end to end: pyramid, mirror and moving air.
     unit config
     gains | nargs:* meta:gain | the gain file to run, or several beside the paper's filters
     --pixels | int | pixels across the pupil, even
@@ -253,8 +253,7 @@ the paper and the simulator: Agapito et al. 2008, and loops with a pyramid
 """
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Command:
+class Command(NamedTuple):
     """A command: its group in the help, the module that runs it, its help, and its arguments."""
 
     group: str
@@ -277,7 +276,7 @@ def _read_commands() -> Iterator[tuple[str, Command]]:
     for title, arguments in _blocks(_TABLE):
         if title.startswith(" "):
             name, module, text = title.strip().split(" | ")
-            yield name, Command(group=group, module=module, text=text, arguments=arguments)
+            yield name, Command(group, module, text, arguments)
         else:
             group = title
 
@@ -313,30 +312,12 @@ class TargetChoice(Action):
         parser.exit()
 
 
-def _targets() -> Sequence[str]:
-    from lbt_synth.interop.pipeline import target_names
-
-    return target_names()
-
-
-def _telescopes() -> Sequence[str]:
-    from lbt_synth.config.load import telescope_names
-
-    return telescope_names()
-
-
-def _record_methods() -> Sequence[str]:
-    from lbt_synth.methods.registry import record_methods
-
-    return record_methods()
-
-
-_CHOICES: Mapping[str, Callable[[], Sequence[str]]] = {
-    "units": lambda: UNITS,
-    "accelerations": lambda: tuple(M_S2),
-    "targets": _targets,
-    "telescopes": _telescopes,
-    "record_methods": _record_methods,
+_CHOICES = {  # what an argument may be: a tuple, or the function that returns it, slow to import
+    "units": UNITS,
+    "accelerations": tuple(M_S2),
+    "targets": "lbt_synth.interop.pipeline:target_names",
+    "telescopes": "lbt_synth.config.load:telescope_names",
+    "record_methods": "lbt_synth.methods.registry:record_methods",
 }
 _TYPES: Mapping[str, type[Any]] = {"int": int, "float": float}
 
@@ -381,7 +362,11 @@ def _keywords(how: str, text: str) -> dict[str, Any]:
         elif word.startswith("="):
             default = word[1:]
         elif word.startswith("@"):
-            keywords["choices"] = _CHOICES[word[1:]]()
+            choices = _CHOICES[word[1:]]
+            if isinstance(choices, str):
+                module, function = choices.split(":")
+                choices = getattr(importlib.import_module(module), function)()
+            keywords["choices"] = choices
         elif key == "nargs":
             keywords["nargs"] = int(value) if value.isdecimal() else value
             if value == "*":  # without a default, argparse calls them required
@@ -545,6 +530,15 @@ def _list_commands() -> str:
             subsequent_indent=" " * _NAME_WIDTH,
         )
     return "\n".join(lines[1:])
+
+
+def refuse_options(arguments: Namespace, names: Iterable[str], why: str) -> None:
+    """Refuse options that the command line gives, although they do not go with the rest of it."""
+    options = command_options(arguments.command)
+    for name in names:
+        option, usual = options[name]
+        if getattr(arguments, name) != usual:
+            raise ProblemError(f"{option} {why}.")
 
 
 def command_options(name: str) -> dict[str, tuple[str, Any]]:

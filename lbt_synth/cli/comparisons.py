@@ -1,15 +1,17 @@
-"""The commands compare, limits, tradeoff, mirror and robustness: designs in a configured loop."""
+"""The commands compare, limits, tradeoff, mirror, robustness and modal: a configured loop."""
 
 from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
+from typing import Any, NoReturn
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
-from lbt_synth import studies
-from lbt_synth.cli.arguments import command_options, given_options
+from lbt_synth import models, studies
+from lbt_synth.cli.arguments import refuse_options
 from lbt_synth.cli.loop_inputs import (
     load_designs,
     load_shown,
@@ -20,18 +22,19 @@ from lbt_synth.cli.loop_inputs import (
     say_residual,
     truth_at_sensor_gain,
 )
-from lbt_synth.cli.output import BRIEF_ROWS, PERCENT, RMS, Report, spread_indices
+from lbt_synth.cli.output import PERCENT, RMS, Report, spread_indices
 from lbt_synth.cli.streams import track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.design.result import require_hardware
+from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_residuals
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.interop import frame_cost
 from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
+from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.designs.report import refine_values, require_compatible, stable_interval
-from lbt_synth.report.figures import robustness_figure, robustness_map_figure
+from lbt_synth.report.figures import modal_figure, robustness_figure, robustness_map_figure
 from lbt_synth.report.figures.studies import limits_figure, mirror_figure, tradeoff_figure
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
@@ -39,16 +42,15 @@ from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import LimitRow
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, default_methods, mirror_rows
-from lbt_synth.validation import FloatArray, IntArray, agree, frozen_copy, integer, number
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 
 def run_compare(arguments: Namespace) -> Report:
     """Compare gain files in the loop of a configuration, one line each."""
     config = load_shown(arguments)
-    designs = load_designs(arguments.gains, any_sensors=True)
-    study = _study_limits(config, designs)
+    designs = load_designs(arguments.gains, config)
+    report, study = _begin(designs, config)
     rows = [_compared(designs[row.design], row, config) for row in study.rows]
-    report = Report(verdict=_say_designs(study.rows, study))
     if tough := [row for row in rows if row.modulus is not None]:
         row = max(tough, key=lambda row: float(row.modulus))
         frames = min(row.delay_frames, row.early_frames)
@@ -59,7 +61,6 @@ def run_compare(arguments: Namespace) -> Report:
         )
     caption = f"In the truth of {config.source.name}; {config.imaging.label}"
     report.add_rows("designs", caption, rows, figure=lambda: limits_figure(study))
-    report.data["limit_nm"] = None if study.limit is None else study.limit.rms_nm
     report.notes += named_difference_notes(config, designs)
     return report
 
@@ -79,35 +80,32 @@ def _compared(design: Design, row: LimitRow, config: Config) -> Facts:
     )
 
 
-def _study_limits(config: Config, designs: Mapping[str, Design]) -> LimitStudy:
-    return studies.limits(
+def _begin(designs: Mapping[str, Design], config: Config) -> tuple[Report, LimitStudy]:
+    """Return a study of designs beside the limits, and what it says first of them."""
+    study = studies.limits(
         designs, config.hardware, config.truth, config.imaging, errors_hz=config.errors_hz
     )
-
-
-def _say_designs(rows: Sequence[LimitRow], study: LimitStudy) -> list[str]:
-    """Return which designs are unstable in the truth, and what the best of the others leaves."""
-    unstable = [row.design for row in rows if not row.stable]
-    verbs = "is" if len(unstable) == 1 else "are"
-    verdict = [f"{listing_text(unstable)} {verbs} unstable in the truth."] if unstable else []
-    if stable := [row for row in rows if row.stable]:
+    report = Report(data={"limit_nm": None if study.limit is None else study.limit.rms_nm})
+    if unstable := [row.design for row in study.rows if not row.stable]:
+        verb = "is" if len(unstable) == 1 else "are"
+        report.verdict.append(f"{listing_text(unstable)} {verb} unstable in the truth.")
+    if stable := [row for row in study.rows if row.stable]:
         best = min(stable, key=lambda row: row.residual_nm)
-        verdict.append(say_residual(best.design, best, study.limit))
-    return verdict
+        report.verdict.append(say_residual(best.design, best, study.limit))
+    return report, study
 
 
 def run_limits(arguments: Namespace) -> Report:
     """Compare designs with the least residual of any linear controller."""
     config = load_shown(arguments)
-    files = load_designs(arguments.gains, any_sensors=True)
+    files = load_designs(arguments.gains, config)
     designs = {
         method.name: config.design(method.name, **method.in_comparison)
         for method in reference_methods()
     }
     designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}
-    study = _study_limits(config, designs)
+    report, study = _begin(designs, config)
     no_band = () if study.band is not None else ("above_band_limit_percent",)
-    report = Report(verdict=_say_designs(study.rows, study))
     report.add_rows(
         "rows",
         f"Distance to the limits of any linear controller; {config.imaging.label}",
@@ -116,7 +114,6 @@ def run_limits(arguments: Namespace) -> Report:
         hidden=() if study.shift_hz.size else ("worst_nm",),
         figure=lambda: limits_figure(study),
     )
-    report.data["limit_nm"] = None if study.limit is None else study.limit.rms_nm
     if study.band is not None and study.band_hz is not None:
         report.data |= {
             "band_hz": study.band_hz,
@@ -129,28 +126,20 @@ def run_limits(arguments: Namespace) -> Report:
             f"{nm_text(study.band.rms_nm, '.6g', unit='nm rms')} (a filter of infinite order "
             f"achieves {nm_text(study.band.achieved_nm, '.6g')})."
         )
-    report.notes += [*_limit_notes(study, config), *named_difference_notes(config, designs)]
-    return report
-
-
-def _limit_notes(study: LimitStudy, config: Config) -> list[str]:
-    """Return what the limit is of, and which rows compare something else than they seem to."""
-    if study.limit is None:
-        notes = [
+    if study.limit is not None:
+        report.notes.append(say_limit(study.limit, config))
+    else:
+        report.notes.append(
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
             "vibrations along principal axes of the sensor's noise."
-        ]
-    else:
-        within = " (of sinusoids of known frequency, what moves within frames)"
-        notes = [say_limit(study.limit, config) + within * (study.band is not None)]
+        )
     if config.truth.vibrations and not config.plant.vibrations:
-        notes.append(
+        report.notes.append(
             "note: kalman and hinf are designed without a vibration, as model.vibrations is "
             "missing; the truth has one."
         )
-    if study.band is None and len(config.truth.vibrations) > 1:
-        notes.append("note: the limit over a range of frequencies is that of a single sinusoid.")
-    return notes
+    report.notes += named_difference_notes(config, designs)
+    return report
 
 
 def run_tradeoff(arguments: Namespace) -> Report:
@@ -189,11 +178,8 @@ def run_mirror(arguments: Namespace) -> Report:
     config = load_shown(arguments)
     plant, shell = config.plant.own_sensor_alone(), config.hardware.mirror
     if shell is None:
-        raise ConfigError(
-            f"{config.source}: the key mirror.local_loop is missing: without it the mirror settles "
-            "at once. lbt_slow_mirror.yaml of lbt-synth init --examples has it.",
-            path="mirror.local_loop",
-        )
+        why = "is missing: without it the mirror settles at once. lbt_slow_mirror.yaml of"
+        _refuse_key(config, "mirror.local_loop", f"{why} lbt-synth init --examples has it")
     hardware, step = plant.hardware, shell.step_response(arguments.tolerance)
     rows = mirror_rows(
         plant, config.truth, config.imaging, command_weight=config.settings.design.command_weight
@@ -229,30 +215,19 @@ def run_mirror(arguments: Namespace) -> Report:
             limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
         ),
     )
-    taps = [f"{tap:.4f}" for tap in hardware.mirror_taps[:BRIEF_ROWS]]
-    more = ", ..." * (hardware.mirror_taps.size > BRIEF_ROWS)
-    report.notes.append(f"weights of u(k), u(k-1), ... in exposure k: {', '.join(taps)}{more}")
     return report
 
 
 def run_robustness(arguments: Namespace) -> Report:
     """Compute the Strehl ratio over an error of the vibration frequency."""
-    _refuse_unused_options(arguments)
+    if arguments.gains:
+        why = "is for redesigning, without gain files"
+        refuse_options(arguments, ("sensor_gain", "gamma_ratio"), why)
+    else:
+        maps = ("errors_hz", "sensor_gains", "delay_errors_frames")
+        refuse_options(arguments, maps, "goes with gain files; name some")
     config = load_shown(arguments)
     return (_map_designs if arguments.gains else _redesign)(config, arguments)
-
-
-def _refuse_unused_options(arguments: Namespace) -> None:
-    """Refuse the options of redesigning beside gain files, and those of maps without them."""
-    names = {name: words for name, (words, _) in command_options(arguments.command).items()}
-    maps = ("errors_hz", "sensor_gains", "delay_errors_frames")
-    unused = ("sensor_gain", "gamma_ratio") if arguments.gains else maps
-    for name in given_options(arguments, *unused):
-        why = "goes with gain files, whose designs stay as they are; name some"
-        if arguments.gains:
-            why = "is for redesigning, without gain files; the options of these are "
-            why += ", ".join(names[option] for option in maps)
-        raise ProblemError(f"{names[name]} {why}.")
 
 
 def _redesign(config: Config, arguments: Namespace) -> Report:
@@ -276,14 +251,13 @@ def _redesign(config: Config, arguments: Namespace) -> Report:
     by_method = {name: [row for row in rows if row.method == name] for name in methods}
     caption = f"Robustness to the vibration frequency; {config.imaging.label}"
     centre = int(np.argmin(np.abs(errors)))
-    places = spread_indices(len(errors), centre)
     columns = [
         facts(
             error_hz=fact(errors[place], "error", unit="Hz", format="+.2f"),
             **{f"{n}_strehl": fact(r[place].strehl, n, **PERCENT) for n, r in by_method.items()},
             **{f"{n}_nm": fact(r[place].residual_nm, n, **RMS) for n, r in by_method.items()},
         )
-        for place in places
+        for place in spread_indices(len(errors), centre)
     ]
     report = Report(tables=[row_table(f"{caption}, and residual", columns)])
     report.verdict = [
@@ -302,44 +276,41 @@ def _worst_text(strehls: Sequence[float]) -> str:
 
 def _map_designs(config: Config, arguments: Namespace) -> Report:
     """Map the Strehl ratio of gain files over frequency error, sensor gain and delay error."""
-    settings = config.settings.robustness
+    settings, hardware = config.settings.robustness, config.hardware
     errors = _parse_range(arguments.errors_hz, "--errors-hz", refine_values(config.errors_hz))
     gains = _parse_range(arguments.sensor_gains, "--sensor-gains", settings.sensor_gains)
     delays = arguments.delay_errors_frames or settings.delay_errors_frames
     for gain in gains:
         number(gain, "--sensor-gains", above=0)
     designs = load_designs(arguments.gains)
-    assumed = {name: _assumed_gain(name, d, config) for name, d in designs.items()}
     maps, intervals = {}, {}
     for name, design in designs.items():
+        require_compatible(name, design, hardware)
         grid = studies.robustness_map(
             design,
             config.truth,
             config.imaging,
             errors_hz=errors,
-            sensor_gains=gains / assumed[name],
+            sensor_gains=gains / config.sensor_gain,
             delay_errors_frames=delays,
+            hardware=hardware,
         )
+        intervals[name] = _stable_gains(design, grid, config)
         maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
-        intervals[name] = _stable_gains(design, maps[name], assumed[name])
     real = int(np.argmin(np.abs(gains - config.sensor_gain * config.truth.sensor_gain)))
+    lines = [line for name in maps for line in _map_lines(name, maps[name], real, intervals[name])]
     where = f"frequency errors of {np.min(errors):+g} to {np.max(errors):+g} Hz"
-    report = Report(figure=lambda: robustness_map_figure(maps))
+    caption = f"At a sensor gain of {gains[real]:.3g}: {config.imaging.label}, over {where}"
+    report = Report(
+        verdict=_say_maps(maps, lines, where),
+        tables=[row_table(caption, lines)],
+        notes=named_difference_notes(config, designs),
+        rows=[point for name, grid in maps.items() for point in _map_points(name, grid)],
+        figure=lambda: robustness_map_figure(maps),
+    )
     report.data["maps"] = {
         name: asdict(grid) | {"stable_sensor_gains": intervals[name]} for name, grid in maps.items()
     }
-    report.rows = [point for name, grid in maps.items() for point in _map_points(name, grid)]
-    lines = [
-        line for name in maps for line in _map_lines(name, maps[name], [real], intervals[name])
-    ]
-    title = f"{config.imaging.label}, over {where}"
-    report.tables.append(row_table(f"At a sensor gain of {gains[real]:.3g}: {title}", lines))
-    report.verdict = _say_maps(maps, lines, where)
-    shown = spread_indices(gains.size, real)
-    for name, grid in maps.items():
-        rows = list(_map_lines(name, grid, shown, intervals[name]))
-        report.tables.append(row_table(f"{name}: {title}", rows))
-        report.notes += _map_notes(name, designs[name], config)
     return report
 
 
@@ -363,12 +334,12 @@ def _say_maps(maps: Mapping[str, RobustnessMap], lines: Sequence[Facts], where: 
 
 
 def _parse_range(
-    given: Sequence[float] | None, option: str, default: Sequence[float] | FloatArray
+    ends: Sequence[float] | None, option: str, default: Sequence[float] | FloatArray
 ) -> FloatArray:
     """Return the values of LOW HIGH COUNT, or those of the configuration where none are given."""
-    if given is None:
+    if ends is None:
         return np.array(default)
-    low, high, count = (number(value, option) for value in given)
+    low, high, count = (number(value, option) for value in ends)
     if not (low < high and count.is_integer() and count >= 2):
         raise ProblemError(
             f"{option} must be LOW HIGH COUNT with LOW below HIGH and a COUNT of at least 2; got "
@@ -377,29 +348,13 @@ def _parse_range(
     return np.linspace(low, high, int(count))
 
 
-def _assumed_gain(name: str, design: Design, config: Config) -> float:
-    """Return the sensor gain that a design assumes, relative to ``sensor.matrix``."""
-    require_compatible(name, design, config.hardware)
-    own, here = require_hardware(design, "a map"), config.hardware
-    unit = here.sensor / config.sensor_gain
-    gain = float(np.sum(own.sensor * unit) / np.sum(unit**2))
-    if not (gain > 0 and agree(own.sensor, gain * unit) and agree(own.influence, here.influence)):
-        raise ProblemError(
-            f"{name} must have the configuration's sensor and influence matrices, up to a sensor "
-            "gain; it has others. Design it for this configuration."
-        )
-    return gain
-
-
-def _stable_gains(design: Design, grid: RobustnessMap, assumed: float) -> list[tuple[float, float]]:
+def _stable_gains(design: Design, grid: RobustnessMap, config: Config) -> list[FloatArray]:
     """Return the interval of stable real sensor gains at each delay error, or nan for none."""
-    hardware, intervals = require_hardware(design, "a map"), []
+    hardware, intervals = config.hardware, []
     for delay, stable in zip(grid.delay_errors_frames, grid.stable, strict=True):
         real = replace(hardware, delay_frames=hardware.delay_frames + delay)
-        # around the gain that the design assumes, if the loop is stable there
-        starts = [1.0, *grid.sensor_gains[stable] / assumed]
-        low, high = stable_interval(real, design.controller, starts)
-        intervals.append((low * assumed, high * assumed))
+        ends = stable_interval(real, design.controller, [1.0, *grid.sensor_gains[stable]])
+        intervals.append(config.sensor_gain * np.array(ends))
     return intervals
 
 
@@ -420,43 +375,130 @@ def _map_points(name: str, grid: RobustnessMap) -> list[Facts]:
 
 
 def _map_lines(
-    name: str,
-    grid: RobustnessMap,
-    shown: Sequence[int] | IntArray,
-    intervals: Sequence[tuple[float, float]],
+    name: str, grid: RobustnessMap, real: int, intervals: Sequence[FloatArray]
 ) -> Iterator[Facts]:
-    """Yield a row for some sensor gains at each delay error, with its worst frequency error."""
+    """Yield a row for each delay error at the real sensor gain, with its worst frequency error."""
     for i, (delay, (low, high)) in enumerate(zip(grid.delay_errors_frames, intervals, strict=True)):
-        for j in shown:
-            stable, strehls = bool(grid.stable[i, j]), grid.strehl[i, j]
-            worst = int(np.argmin(strehls)) if stable else 0
-            centre = strehls[grid.errors_hz == 0]
-            at_hz = grid.errors_hz[worst] if stable else np.nan
-            yield facts(
-                file=fact(name, "file"),
-                sensor_gain=fact(grid.sensor_gains[j], "sensor gain", format=".3f"),
-                delay_error=fact(delay, "delay error", unit="frames", format="+g"),
-                stable=fact(stable, "stable"),
-                centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **PERCENT),
-                worst=fact(strehls[worst], "worst Strehl", **PERCENT),
-                worst_hz=fact(at_hz, "at", unit="Hz", format="+.2f"),
-                low=fact(low, "stable gains, from", format=".4g"),
-                high=fact(high, "to", format=".4g"),
+        stable, strehls = bool(grid.stable[i, real]), grid.strehl[i, real]
+        worst = int(np.argmin(strehls)) if stable else 0
+        centre = strehls[grid.errors_hz == 0]
+        at_hz = grid.errors_hz[worst] if stable else np.nan
+        yield facts(
+            file=fact(name, "file"),
+            delay_error=fact(delay, "delay error", unit="frames", format="+g"),
+            stable=fact(stable, "stable"),
+            centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **PERCENT),
+            worst=fact(strehls[worst], "worst Strehl", **PERCENT),
+            worst_hz=fact(at_hz, "at", unit="Hz", format="+.2f"),
+            low=fact(low, "stable gains, from", format=".4g"),
+            high=fact(high, "to", format=".4g"),
+        )
+
+
+def run_modal(arguments: Namespace) -> Report:
+    """Compare integrators, optimised gains and Kalman filters, mode by mode."""
+    config = load_shown(arguments, all_modes=True)
+    settings, hardware = config.settings, config.hardware
+    modes = settings.mirror.modes if arguments.modes is None else arguments.modes
+    if modes is None:
+        _refuse_key(config, "mirror.modes", "is missing; give it, or --modes")
+    modes = integer(modes, "modes", at_least=2)
+    reason = "the turbulence of hundreds of modes is computed from it"
+    air = models.modal_turbulence(
+        config.require_atmosphere(reason), modes=modes, frame_rate_hz=hardware.frame_rate_hz
+    )
+    for key, value in (
+        ("sensor.noise_nm", config.noise_nm),
+        ("model.sensor_gain", settings.model.sensor_gain),
+    ):
+        if np.ndim(value):
+            _refuse_key(config, key, "must be one number for hundreds of modes; got one per axis")
+    pyramid, noise_nm = settings.sensor.pyramid, np.full(modes, float(config.noise_nm))
+    if pyramid is not None:
+        modulation = pyramid.modulation_lambda_over_d
+        noise_nm = models.pyramid_modal_noise_nm(
+            float(config.noise_nm), modes=modes, modulation_lambda_over_d=modulation
+        )
+    uniform, gains, residuals = _modal_residuals(config, air, noise_nm)
+    totals_nm = {name: float(np.linalg.norm(rms_nm)) for name, rms_nm in residuals.items()}
+    air_nm = float(np.linalg.norm(air.rms_nm))
+    leaves = [f"{name} {nm_text(rms, '.1f')} rms" for name, rms in totals_nm.items()]
+    report = Report(data={"modes": modes, "uniform_gain": uniform, "residual_nm": totals_nm})
+    report.data["turbulence_nm"] = air_nm
+    report.verdict.append(
+        f"Of {nm_text(air_nm, '.1f')} rms of turbulence in {modes} modes, what is left is: "
+        f"{'; '.join(leaves)}."
+    )
+    report.add_rows(
+        "rows",
+        "By radial order, residuals over its modes",
+        _order_rows(air.rms_nm, noise_nm, gains, *residuals.values()),
+        figure=lambda: modal_figure(residuals, gains=gains, turbulence_nm=air.rms_nm),
+    )
+    return report
+
+
+def _refuse_key(config: Config, key: str, why: str) -> NoReturn:
+    raise ConfigError(f"{config.source}: the key {key} {why}.", path=key)
+
+
+def _modal_residuals(
+    config: Config, air: models.ModalTurbulence, noise_nm: FloatArray
+) -> tuple[float, FloatArray, dict[str, FloatArray]]:
+    """Return the best single gain, the best of each mode, and the residuals by controller [nm]."""
+    hardware, lines = config.hardware, dict[int, list[models.Vibration]]()
+    for line in config.plant.vibrations:  # each axis by itself
+        for axis, share in enumerate(line.direction):
+            if axis < noise_nm.size and abs(share) > 1e-9:
+                tilted = replace(line, rms_nm=abs(share) * line.rms_nm, direction=(1.0,))
+                lines.setdefault(axis, []).append(tilted)
+    seen: dict[str, Any] = {"noise_nm": noise_nm, "vibrations": lines}
+    seen["sensor_gain"] = config.sensor_gain
+    path: dict[str, Any] = {name: getattr(hardware, name) for name in ("delay_frames", "mirror")}
+    gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **path, **seen)
+
+    def integrator_rms(gain: float) -> FloatArray:
+        control = MixedController(gains=np.full(noise_nm.size, gain))
+        return modal_residuals(control, air, hardware=hardware, **seen)
+
+    most = gains.limit.min()
+    uniform = minimize_scalar(
+        lambda gain: np.linalg.norm(integrator_rms(gain)),
+        bounds=(1e-3 * most, most),
+        method="bounded",
+    ).x
+    return (
+        float(uniform),
+        gains.gains,
+        {
+            f"integrators, gain {uniform:.2f}": integrator_rms(uniform),
+            "integrators, optimised gains": gains.rms_nm,
+            "Kalman filters": modal_filters(air, **path, **seen).rms_nm,
+        },
+    )
+
+
+def _order_rows(
+    air_nm: FloatArray, noise_nm: FloatArray, gains: FloatArray, *residuals: FloatArray
+) -> list[Facts]:
+    """Return a row for each radial order: root sums of squares over its modes."""
+    radial, _ = noll_orders(noise_nm.size)
+    rows = []
+    for order in np.unique(radial):
+        which = radial == order
+        turbulence_nm, *left_nm = (
+            float(np.linalg.norm(rms_nm[which])) for rms_nm in (air_nm, *residuals)
+        )
+        rows.append(
+            facts(
+                radial_order=fact(int(order), "radial order"),
+                modes=fact(int(which.sum()), "modes"),
+                turbulence_nm=fact(turbulence_nm, "turbulence", **RMS),
+                noise_nm=fact(float(noise_nm[which][0]), "noise per mode", unit="nm", format=".2f"),
+                gain=fact(float(gains[which].mean()), "mean gain", format=".3f"),
+                uniform_nm=fact(left_nm[0], "one gain", **RMS),
+                optimised_nm=fact(left_nm[1], "optimised gains", **RMS),
+                kalman_nm=fact(left_nm[2], "Kalman", **RMS),
             )
-
-
-def _map_notes(name: str, design: Design, config: Config) -> list[str]:
-    """Return in what a design was made for another loop, whose map this is."""
-    hardware, notes = require_hardware(design, "a map"), []
-    if hardware.delay_frames != config.hardware.delay_frames:
-        notes.append(
-            f"note: {name} was designed for a delay of {hardware.delay_frames:g} frames, from "
-            f"which its delay errors count; the configuration has "
-            f"{config.hardware.delay_frames:g}."
         )
-    if hardware.mirror != config.hardware.mirror:
-        notes.append(
-            f"note: {name} was designed for another mirror than the configuration's, and its map "
-            "is that of its own."
-        )
-    return notes
+    return rows

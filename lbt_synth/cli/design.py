@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.cli.arguments import given_options
-from lbt_synth.cli.loop_inputs import add_truth, choose_design_unit, load_shown
+from lbt_synth.cli.loop_inputs import add_truth, choose_design_unit, load_shown, say_accelerometers
 from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
@@ -30,14 +30,14 @@ _WORDING = Wording(method="--method {}", option="--{}")
 
 def run_design(arguments: Namespace) -> Report:
     """Design a controller and write its gain file."""
-    given = given_options(arguments, *option_names())
-    request = design_request(arguments.method, given, _WORDING)
+    options = given_options(arguments, *option_names())
+    request = design_request(arguments.method, options, _WORDING)
     require_writable(require_gain_name(arguments.output), inputs=[arguments.config])
     config = load_shown(arguments)
     design = config.design(request)
     path = save_gain(arguments.output, design)
     report = Report()
-    add_truth(report, design, config, without=() if given else (request.method.name,))
+    add_truth(report, design, config, without=() if options else (request.method.name,))
     describe_design(report, design)
     if design.method != request.method.name:
         title = design_title(design.method)
@@ -46,9 +46,6 @@ def run_design(arguments: Namespace) -> Report:
         )
     report.note_written(path)
     return report
-
-
-_SMALL_MODULUS = 0.3  # below what a loop is usually asked for
 
 
 def describe_design(report: Report, design: Design) -> None:
@@ -76,7 +73,7 @@ def describe_design(report: Report, design: Design) -> None:
     report.add_records(*facts)
     printed = fact_table("Design", *facts, *margins)
     report.tables.append(without_units(printed) if design.hardware is None else printed)
-    report.notes += _loop_notes(design, margins, alone)
+    report.notes += _loop_notes(design, alone)
     tables = design.tables()
     report.notes += [*design.notes(), *(note for table in tables for note in table.notes)]
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
@@ -92,6 +89,8 @@ def _say_fragility(margins: Sequence[LoopMargins]) -> list[str]:
 def _say_model(design: Design) -> str:
     """Return what a design promises in its own model, for one without a truth."""
     title = f"The {design_title(design.method)}"
+    if design.plant is None and (bought := say_accelerometers(design)):
+        return f"{title} leaves {bought}, on unseen frames of its record."
     if (residual_nm := design.expected_residual_nm) is not None:
         return f"{title} leaves {nm_text(residual_nm, '.1f')} rms in its model."
     if design.is_estimator:
@@ -119,15 +118,10 @@ def add_moving_gain(report: Report, design: Design) -> None:
         report.add_facts("Sensor gain that moves", moving_gain(loop), key="moving_gain")
 
 
-def _loop_notes(design: Design, margins: Sequence[LoopMargins], alone: float) -> list[str]:
+def _loop_notes(design: Design, alone: float) -> list[str]:
     if design.hardware is None:
         return []
-    notes = [
-        f"note: the modulus margin {one.modulus:.3g} is small; a loop is usually asked for "
-        f"{_SMALL_MODULUS:g} or more. Lower the gain, or design with more noise."
-        for one in margins
-        if one.modulus < _SMALL_MODULUS
-    ]
+    notes = list[str]()
     if design.hardware.mirror is not None and not design.knows_mirror:
         notes.append(
             "note: this filter commands its estimate as if the mirror settled at once, so that its "
@@ -183,5 +177,4 @@ def run_verify(arguments: Namespace) -> Report:
     )
     report.add_rows("checks", "Certificate", checks, hidden=("computed_by",))
     report.tables.append(row_table("Certificate, and how it was computed", checks))
-    add_moving_gain(report, design)
     return report

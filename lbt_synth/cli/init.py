@@ -8,7 +8,7 @@ from argparse import Action, ArgumentParser, Namespace
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from lbt_synth.cli.arguments import COMMANDS, build_parser
+from lbt_synth.cli.arguments import COMMANDS, build_parser, refuse_options
 from lbt_synth.cli.output import Report
 from lbt_synth.config import config_schema, identified_config, telescope_template
 from lbt_synth.config.load import example_files
@@ -73,7 +73,7 @@ def _refuse_taken(contents: Mapping[Path, str | None], *, force: bool) -> None:
         if path.is_file() and (text is None or path.read_bytes() != text.encode())
     ]
     if taken and not force:
-        renamed = any(Path(each).name != _SCHEMA for each in taken)  # by -o
+        renamed = any(Path(path).name != _SCHEMA for path in taken)  # by -o
         advice = "another name by -o, or --force" if renamed else "--force"
         raise OutputError(f"{', '.join(taken)} would be replaced. Give {advice}.")
 
@@ -107,7 +107,7 @@ def _unknown_sections(record: LoopRecord, source: str, telescope: str) -> str:
     """Return the sections of a telescope that a record does not know, as comments."""
     names = ["atmosphere"] if record.diameter_m is not None else ["telescope", "atmosphere"]
     template = telescope_template(telescope)
-    sections = [found[0] for name in names if (found := _section(name, template))]
+    sections = [match[0] for name in names if (match := _section(name, template))]
     marks = re.findall(r"^# (\[\d\] .+\n(?:#     .+\n)*)", template, re.MULTILINE)
     used = [mark for mark in marks if any(mark[:3] in section for section in sections)]
     text = "".join([f"Not in {source}; this is of the template {telescope}:\n", *sections, *used])
@@ -121,11 +121,8 @@ def _section(name: str, template: str) -> re.Match[str] | None:
 def _script(arguments: Namespace) -> Report:
     """Print the schema of a configuration or the completion of a shell, or write it."""
     asked = "--schema" if arguments.schema else "--completion"
-    others = {"--telescope": arguments.telescope, "--from": arguments.source}
-    others |= {"--examples": arguments.examples, "--force": arguments.force}
-    others |= {"--completion": arguments.schema and arguments.completion}
-    if given := [option for option, value in others.items() if value]:
-        raise ProblemError(f"{asked} goes with -o alone; got {', '.join(given)}. Leave it out.")
+    others = ["telescope", "source", "examples", "force", *["completion"] * arguments.schema]
+    refuse_options(arguments, others, f"does not go with {asked}; leave it out")
     data, text = config_schema(), json.dumps(config_schema(), indent=1)
     if not arguments.schema:
         text = _completion(arguments.completion)

@@ -15,6 +15,7 @@ from lbt_synth.cli.streams import printable
 from lbt_synth.config import Config, load_config
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.loop import LoopMargins, least_residual
@@ -82,37 +83,56 @@ def choose_design_unit(arguments: Namespace, designs: Mapping[str, Design]) -> N
     choose_unit(arguments, *alone)
 
 
-def load_design(path: str, *, any_sensors: bool = False) -> Design:
-    """Load a design; refuse one that reads other sensors unless the command takes it."""
+def load_design(path: str, config: Config | None = None) -> Design:
+    """Load a design; refuse one that reads other sensors, which the truth of no file moves."""
     design = load_gain(path)
-    if any_sensors or not design.other_sensors:
+    if not design.other_sensors:
         return design
-    raise ProblemError(
-        f"{path} is a design of several sensors; this command takes designs of the loop's own "
-        "sensor alone. Try show, verify, limits, simulate, or export --for c."
-    )
+    if config is None:
+        raise ProblemError(
+            f"{path} is a design of several sensors; this command takes designs of the loop's own "
+            "sensor alone. Try show, verify, limits, simulate, or export --for c."
+        )
+    channels = require_hardware(design, "a loop").suite.channels
+    moved = {name for motion in config.truth.motions for name in motion}
+    if design.plant is None and channels and moved.isdisjoint(channels):
+        first = ", ".join([channels[0], *["..."][: len(channels) - 1]])
+        shows = nm_text(design.expected_residual_nm or np.nan)
+        raise ProblemError(
+            f"{path} reads {first}, which nothing in the truth of {config.source.name} moves; its "
+            f"record shows {shows}: lbt-synth show {path}."
+        )
+    return design
 
 
-def load_designs(paths: list[str], *, any_sensors: bool = False) -> dict[str, Design]:
-    """Load designs, named by the stems of their files or, where these repeat, by longer tails."""
+def load_designs(paths: list[str], config: Config | None = None) -> dict[str, Design]:
+    """Load designs, named by the stems of their files or, where these repeat, by longer tails.
+
+    With a configuration, they may read other sensors, too.
+    """
     if len({Path(path).resolve() for path in paths}) != len(paths):
         raise ProblemError(f"each gain file must be given once; got {', '.join(paths)}.")
     stems = [printable(Path(path).stem) for path in paths]
     names = stems if len(set(stems)) == len(stems) else _distinct_tails(paths)
-    return {
-        name: load_design(path, any_sensors=any_sensors)
-        for name, path in zip(names, paths, strict=True)
-    }
+    return {name: load_design(path, config) for name, path in zip(names, paths, strict=True)}
 
 
 def _distinct_tails(paths: list[str]) -> list[str]:
     """Return the last parts of different paths, as few as distinguish all of them."""
-    whole = [Path(path).resolve().parts for path in paths]
-    for count in range(1, max(map(len, whole))):
-        names = [printable("/".join(parts[-count:])) for parts in whole]
+    tails = [Path(path).resolve().parts for path in paths]
+    for count in range(1, max(map(len, tails))):
+        names = [printable("/".join(parts[-count:])) for parts in tails]
         if len(set(names)) == len(names):
             return names
     return paths
+
+
+def say_accelerometers(design: Design) -> str:
+    """Return what accelerometers buy on the record of a predictor; empty for other designs."""
+    with_nm, without_nm = (design.claims.get(name) for name in ("residual_nm", "alone_nm"))
+    if with_nm is None or without_nm is None:
+        return ""
+    return f"{nm_text(with_nm)} with the accelerometers, {nm_text(without_nm)} without them"
 
 
 def loop_difference_notes(config: Config, design: Design) -> list[str]:

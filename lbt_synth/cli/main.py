@@ -111,13 +111,13 @@ def _say_names(message: str, arguments: Namespace) -> str:
     """Name options where a message names arguments of functions."""
     options = {name: said for name, (said, _) in command_options(arguments.command).items()}
 
-    def name(found: re.Match[str]) -> str:
-        return options.get(found[0], found[0])
+    def name(match: re.Match[str]) -> str:
+        return options.get(match[0], match[0])
 
-    def setting(found: re.Match[str]) -> str:
-        word, value = found.groups()
+    def setting(match: re.Match[str]) -> str:
+        word, value = match.groups()
         if word not in options:
-            return found[0]
+            return match[0]
         pairs = re.findall(r"'(\w+)': ([^,}]+)", value)
         words = [f"{key}={entry}" for key, entry in pairs] or [value.strip("'\"")]
         return " ".join([options[word], *words])

@@ -17,7 +17,7 @@ import numpy as np
 
 from lbt_synth.cli.streams import printable
 from lbt_synth.errors import ProblemError
-from lbt_synth.report.draw import FIGURE_ENDINGS, require_figure_name, save_figure
+from lbt_synth.report.draw import FIGURE_ENDINGS, save_figure
 from lbt_synth.storage.atomic_files import require_writable, write_atomically
 from lbt_synth.storage.rows import (
     cell_text,
@@ -36,7 +36,10 @@ if TYPE_CHECKING:  # which few commands need
 _WIDTH = 200  # columns of --verbose where the output is no terminal
 _BRIEF_WIDTH, _BRIEF_LINES, BRIEF_ROWS = 100, 25, 12  # without --verbose: a screen
 _WRITTEN = "written: "
-_URGENT = ("warning", "note")  # the notes that are printed without --verbose, in this order
+# what of the notes is printed without --verbose, in this order: the first two whole, if they fit
+# into some lines, else without the ends of the longest
+_URGENT = ("assumes", "warning", "note")
+_URGENT_LINES = 8
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
 # how the facts of commands print a Strehl ratio, and a residual
 PERCENT: Mapping[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}
@@ -143,49 +146,58 @@ class Report:
         written = [f"{_WRITTEN}{', '.join(files)}"] if files else []
         if files and len(written[0]) > room and len(files) > 1:
             written = [f"{_WRITTEN}{len(files)} files, {files[0]} to {files[-1]}"]
-        lines = _wrapped(" ".join(self.verdict), room)
-        if self.tables:
-            table = text_lines(_thinned(self.tables[0]), room, rule=rule)
-            lines += [""] * bool(lines) + table
-        urgent = [
-            line
-            for mark in _URGENT
-            for note in self.notes
-            if note.startswith(mark)
-            for line in _wrapped(note, room)
-        ]
-        lines += urgent
+        verdict = _wrapped(" ".join(self.verdict), room)
+        *urgent, notes = ([n for n in self.notes if n.startswith(mark)] for mark in _URGENT)
+        kept = _cut([note for marked in urgent for note in marked], room)
         space = _BRIEF_LINES - len(written)
-        if len(lines) > space:
+        most = max(space - 1 - len([*verdict, *kept]), 0)
+        table: list[str] = []
+        for count in range(BRIEF_ROWS, 1, -1) if self.tables else ():
+            thinned = text_lines(_thinned(self.tables[0], count), room, rule=rule)
+            table = [""] * bool(verdict) + thinned
+            if len(table) <= most:
+                break
+        more = [line for note in notes for line in _wrapped(note, room)]
+        lines = verdict + table[:most] + kept + more
+        if len(lines) > space or len(table) > most:
             lines = [*lines[: space - 1], "... more with --verbose"]
         return lines + written
 
 
-def _wrapped(text: str, room: int) -> list[str]:
+def _cut(notes: Sequence[str], room: int) -> list[str]:
+    """Return notes in lines, the longest of them without their ends where they are too many."""
+    counts = [len(_wrapped(note, room)) for note in notes]
+    while sum(counts) > _URGENT_LINES and max(counts) > 1:
+        counts[counts.index(max(counts))] -= 1
+    return [
+        line
+        for note, count in zip(notes, counts, strict=True)
+        for line in _wrapped(note, room, max_lines=count, placeholder=" ... (--verbose)")
+    ]
+
+
+def _wrapped(text: str, room: int, **cut: Any) -> list[str]:
     """Return a text in lines, with no name of a file broken, and no % apart from its number."""
     joined = text.replace(" %", "\u00a0%")
-    lines = wrap(joined, room, break_long_words=False, break_on_hyphens=False)
+    lines = wrap(joined, room, break_long_words=False, break_on_hyphens=False, **cut)
     return [line.replace("\u00a0", " ") for line in lines]
 
 
-def spread_indices(count: int, *kept: int) -> IntArray:
+def spread_indices(count: int, *kept: int, most: int = BRIEF_ROWS) -> IntArray:
     """Return the places of the rows that are printed of a list: from end to end, and some more."""
-    if count <= BRIEF_ROWS:
+    if count <= most:
         return np.arange(count)
-    places = np.linspace(0, count - 1, BRIEF_ROWS - len(kept)).round().astype(np.int64)
+    places = np.linspace(0, count - 1, most - len(kept)).round().astype(np.int64)
     return np.unique([*places, *kept])
 
 
-def _thinned(table: Table) -> Table:
-    """Return a table with as many rows as are printed without --verbose.
-
-    They are from end to end, and of facts, which are in the order of their weight, the first.
-    """
+def _thinned(table: Table, most: int) -> Table:
+    """Return a table with so many rows: from end to end, and of facts the first and weightiest."""
     count = len(table.rows)
-    if count <= BRIEF_ROWS:
+    if count <= most:
         return table
     facts = table.headings[0] == "quantity"
-    places = np.arange(BRIEF_ROWS) if facts else spread_indices(count)
+    places = np.arange(most) if facts else spread_indices(count, most=most)
     rows = tuple(table.rows[place] for place in places)
     caption = f"{table.caption} ({len(rows)} of {count} rows; the others with --verbose)"
     return replace(table, caption=caption, rows=rows)
@@ -215,11 +227,6 @@ def json_value(value: Any) -> Any:
     return value
 
 
-def require_figure(output: str, *, inputs: Sequence[str]) -> None:
-    """Refuse an output that cannot become a figure, or would replace an input."""
-    require_writable(require_figure_name(output), inputs=inputs)
-
-
 def run_with_outputs(run: Callable[[Namespace], Report], arguments: Namespace) -> Report:
     """Run a command, and write its rows to outputs in .csv and its figure to all others.
 
@@ -233,7 +240,8 @@ def run_with_outputs(run: Callable[[Namespace], Report], arguments: Namespace) -
             raise ProblemError(
                 f"an output must end in .csv, {', '.join(FIGURE_ENDINGS)}; got {output!r}."
             )
-    inputs = [getattr(arguments, "config", None), *getattr(arguments, "gains", ())]
+    one = [getattr(arguments, name, None) for name in ("config", "gain", "file")]
+    inputs = [*one, *getattr(arguments, "gains", ())]
     require_writable(*outputs, inputs=[path for path in inputs if path])
     report = run(arguments)
     if (figure := report.figure) is not None:

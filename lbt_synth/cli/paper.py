@@ -1,107 +1,118 @@
-"""The command paper: the tables and figures of Agapito et al. (2008), ours beside theirs."""
+"""The commands paper and end-to-end: Agapito et al. (2008), and loops with a pyramid."""
 
 from __future__ import annotations
 
+import json
 from argparse import Namespace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-from lbt_synth.cli.loop_inputs import choose_unit
-from lbt_synth.cli.output import Report
-from lbt_synth.cli.streams import track_progress
-from lbt_synth.design import FilterDesign
-from lbt_synth.files import save_gain
+from lbt_synth.cli.arguments import given_options, option_name
+from lbt_synth.cli.loop_inputs import choose_unit, load_designs, load_shown
+from lbt_synth.cli.output import PERCENT, Report, json_value
+from lbt_synth.cli.streams import count_progress, track_progress
+from lbt_synth.cli.study import run_in_parts
+from lbt_synth.design import Design, FilterDesign
+from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
+from lbt_synth.files import Telemetry, load_gain, save_gain, save_telemetry
+from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
+from lbt_synth.interop.specula.optics import Calibration, specula_version
+from lbt_synth.interop.specula.simulation import unread_sensors
 from lbt_synth.methods.registry import design_label, design_title
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import loop_figure, robustness_figure
-from lbt_synth.storage.atomic_files import make_directory, write_atomically
-from lbt_synth.storage.display_unit import own_display_unit
-from lbt_synth.storage.rows import csv_rows, json_record
+from lbt_synth.report.figures.studies import end_to_end_figure, end_to_end_table_figure
+from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
+from lbt_synth.storage.display_unit import nm_text, own_display_unit
+from lbt_synth.storage.input_files import file_sha256
+from lbt_synth.storage.rows import (
+    Facts,
+    csv_rows,
+    fact,
+    facts,
+    fill_row,
+    json_record,
+    json_units,
+    row_table,
+)
 from lbt_synth.storage.tables import csv_bytes
+from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import RobustnessRow
 from lbt_synth.studies.paper import (
     DIAMETER_M,
     TABLE_II,
     TABLE_III,
     PaperRow,
+    all_cases,
+    end_to_end_tables,
     modal_row,
     paper_filters,
     parameter_rows,
+    plan_cases,
     plan_rows,
     rms_difference,
+    rms_modal_difference,
     table_entry,
 )
+from lbt_synth.validation import integer
 
 _ROWS = 3 * len(TABLE_II) + 2 * len(TABLE_III)  # of both tables and their controllers
 
 
-def run(arguments: Namespace) -> Report:
+def run_paper(arguments: Namespace) -> Report:
     """Compute and write the tables and figures of the paper."""
     choose_unit(arguments, DIAMETER_M)
     folder = make_directory(arguments.output)
     rows = [
         (row, modal_row(row)) for row in track_progress(plan_rows(), total=_ROWS, what="tables")
     ]
-    second, third = (
-        [table_entry(*pair) for pair in rows if pair[0].table == table] for table in ("II", "III")
-    )
-    filters = paper_filters()
-    files = _write_paper(folder, rows, filters)
-    ratio = filters[1].gamma_requested / filters[1].gamma_least
-    by_method = [
-        (number, method, [entry for entry in entries if entry.method == method])
-        for number, entries in (("II", second), ("III", third))
+    tables = {
+        number: [table_entry(*pair) for pair in rows if pair[0].table == number]
+        for number in ("II", "III")
+    }
+    by_method = {
+        (number, method): [entry for entry in entries if entry.method == method]
+        for number, entries in tables.items()
         for method in dict.fromkeys(entry.method for entry in entries)
-    ]
-    columns = {method: rms_difference(entries) for n, method, entries in by_method if n == "III"}
+    }
+    columns = {m: rms_difference(entries) for (n, m), entries in by_method.items() if n == "III"}
+    filters = paper_filters()
     with own_display_unit():  # JSON stays in nm
         parameters = parameter_rows()
+    names = ("name", "value", "origin")
     report = Report(
         data={
-            "table_ii": [json_record(entry) for entry in second],
-            "table_iii": [json_record(entry) for entry in third],
+            **{f"table_{n.lower()}": [json_record(e) for e in tables[n]] for n in tables},
             "table_iii_rms_points": columns,
-            "hinf_gamma_ratio": ratio,
-            "parameters": [
-                dict(zip(("name", "value", "origin"), row, strict=True)) for row in parameters
-            ],
+            "hinf_gamma_ratio": filters[1].gamma_requested / filters[1].gamma_least,
+            "parameters": [dict(zip(names, row, strict=True)) for row in parameters],
         },
         verdict=[
             f"Table III, {design_title(method)}: {points:.2f} points rms from the paper."
             for method, points in columns.items()
         ],
-        notes=[f"H-infinity: bound at {ratio:.3f} times the least at 20 Hz"],
     )
-    headings = ("table", "method", "rows", "rms difference", "largest difference")
     report.add_table(
         "Strehl ratios [%] at 2.2 um, ours less the paper's",
-        headings,
+        ("table", "method", "rows", "rms difference", "largest difference"),
         [
             (
                 number,
                 design_title(method),
                 len(entries),
                 f"{rms_difference(entries):.2f}",
-                f"{max((e.difference for e in entries), key=abs):+.1f}",
+                f"{max((entry.difference for entry in entries), key=abs):+.1f}",
             )
-            for number, method, entries in by_method
+            for (number, method), entries in by_method.items()
         ],
     )
     report.add_table("Parameters", ("parameter", "value", "origin"), parameter_rows())
-    for number, entries in (("II", second), ("III", third)):
-        report.add_table(
-            f"Table {number}: Strehl ratio [%] at 2.2 um",
-            ("row", "method", "ours", "paper", "difference"),
-            [
-                (
-                    e.label,
-                    design_title(e.method),
-                    *map("{:.1f}".format, (e.ours, e.paper)),
-                    f"{e.difference:+.1f}",
-                )
-                for e in entries
-            ],
-        )
-    report.note_files(files)
+    for number, entries in tables.items():
+        caption = f"Table {number}: Strehl ratio [%] at 2.2 um"
+        report.tables.append(row_table(caption, entries))
+    report.note_files(_write_paper(folder, rows, filters))
     return report
 
 
@@ -130,3 +141,190 @@ def _write_paper(
         files += [save_figure(figure, folder / f"{name}{ending}") for ending in (".png", ".pdf")]
     names = ("paper_kalman.fits", "paper_hinf.fits")
     return files + [save_gain(folder / n, one) for n, one in zip(names, filters, strict=True)]
+
+
+_LEAST_GAIN = 0.01  # optical gain of tip and tilt; less is what a saturated pyramid shows
+_FILES = ("run.png", "telemetry.fits", "summary.json")
+
+
+def run_end_to_end(arguments: Namespace) -> Report:
+    """Close the loop of a gain file end to end, or run tables of the paper."""
+    if arguments.tables is not None:
+        return _run_tables(arguments)
+    if len(arguments.gains) != 1:
+        raise ProblemError(
+            "an end-to-end run takes one gain file; got "
+            f"{', '.join(arguments.gains) or 'none'}. --tables takes any number."
+        )
+    (gain,) = arguments.gains
+    outputs = [Path(arguments.output) / name for name in _FILES]
+    refuse_replacing(outputs, [arguments.config, gain])
+    setup = _load_setup(arguments)
+    design = load_gain(gain)
+    setup.controller(design)  # refuses a filter of another loop before any work
+    specula_version()  # refuses where it is missing
+    make_directory(arguments.output)
+    figure_file, telemetry_file, summary_file = outputs
+    calibration = _calibrate(setup, arguments)
+    total = setup.frames + setup.settle_frames
+    with count_progress(total=total, what="frames") as count:
+        loop_run = setup.run(design, calibration=calibration, cache=arguments.cache, progress=count)
+    _require_seen(loop_run)
+    system, (tip_nm, tilt_nm, *_) = loop_run.system, loop_run.rms_nm
+    report = Report()
+    report.verdict.append(
+        f"The Strehl ratio is {100 * loop_run.strehl:.1f} %, with "
+        f"{nm_text(tip_nm, '.1f')} rms of tip and {nm_text(tilt_nm, '.1f')} of tilt left."
+    )
+    report.add_facts(
+        f"End to end, Strehl ratio at {system.imaging_wavelength_um:g} um: {system.modes} modes, "
+        f"{loop_run.frames} frames after {loop_run.settle_frames}, seed {loop_run.seed}",
+        _run_facts(loop_run, design, calibration, gain),
+    )
+    if unread := unread_sensors(design):
+        report.notes.append(
+            "note: the pyramid is the only wavefront sensor of the simulation: the fall-back "
+            f"filter of the gain file runs, without {listing_text(unread)}."
+        )
+    summary = json.dumps(json_value(report.data), indent=1).encode() + b"\n"
+    recorded = _telemetry(loop_run, design, calibration, gain)
+    report.note_files(
+        [
+            save_figure(end_to_end_figure(loop_run), figure_file),
+            save_telemetry(telemetry_file, recorded, precision="float32"),
+            write_atomically(summary_file, summary),
+        ]
+    )
+    return report
+
+
+def _run_facts(loop_run: EndToEndRun, design: Design, calibration: Calibration, gain: str) -> Facts:
+    """Return the main numbers of a run, and what it ran."""
+    numbers, rms = loop_run.summary(), {"unit": "nm rms", "format": ".1f"}
+    headings: dict[str, tuple[str, Mapping[str, Any]]] = {
+        "strehl": ("Strehl ratio", PERCENT),
+        "strehl_error": ("  standard error", {**PERCENT, "unit": "points"}),
+        "other_modes_strehl": ("  without tip and tilt", PERCENT),
+        "tip_rms_nm": ("tip", rms),
+        "tilt_rms_nm": ("tilt", rms),
+        "other_modes_rms_nm": ("all other modes", rms),
+        "tip_tilt_gain": ("optical gain of tip and tilt", {"format": ".3f"}),
+        "tip_tilt_gain_error": ("  standard error", {"format": ".3f"}),
+        "tip_tilt_noise_nm": ("what it leaves of their measurements", rms),
+    }
+    milliseconds = 1e3 * loop_run.seconds / (loop_run.frames + loop_run.settle_frames)
+    condition = calibration.reconstructor.condition_number
+    return facts(
+        gain=fact(gain),
+        method=fact(design.method),
+        specula=fact(specula_version()),
+        **{name: fact(getattr(loop_run, name)) for name in ("frames", "settle_frames", "seed")},
+        pixels=fact(loop_run.system.pixels),
+        **{name: fact(numbers[name], text, **how) for name, (text, how) in headings.items()},
+        condition_number=fact(condition, "condition of the reconstructor", format=".1f"),
+        milliseconds_a_frame=fact(milliseconds, "time per frame", unit="ms", format=".1f"),
+    )
+
+
+def _require_seen(loop_run: EndToEndRun) -> None:
+    """Refuse a run in which the pyramid no longer sees tip and tilt."""
+    if not loop_run.tip_tilt_gain > _LEAST_GAIN:
+        tip, tilt, *_ = loop_run.rms_nm
+        pixels = loop_run.system.pixels
+        raise UnstableLoopError(
+            "the pyramid must see tip and tilt; got an optical gain of "
+            f"{loop_run.tip_tilt_gain:.2g} at residuals of {tip:.3g} and {tilt:.3g} nm rms: the "
+            f"loop ran away. Try more than {pixels} pixels (--pixels), brighter light, or lower "
+            "gains."
+        )
+
+
+def _load_setup(arguments: Namespace) -> EndToEndSetup:
+    """Load the end-to-end setup of a configuration, with the changes of the command line."""
+    setup = load_shown(arguments, all_modes=True).end_to_end
+    if arguments.pixels is not None:
+        setup = replace(setup, system=replace(setup.system, pixels=arguments.pixels))
+    return replace(setup, **given_options(arguments, "frames", "settle_frames", "seed"))
+
+
+def _calibrate(setup: EndToEndSetup, arguments: Namespace) -> Calibration:
+    """Calibrate a system, or take its calibration from the cache, behind a progress bar."""
+    with count_progress(total=setup.system.modes, what="calibration") as count:
+        return calibrate(setup.system, cache=arguments.cache, progress=count)
+
+
+def _telemetry(
+    loop_run: EndToEndRun, design: Design, calibration: Calibration, gain: str
+) -> Telemetry:
+    system, optical = loop_run.system, loop_run.tip_tilt_gain
+    return fill_row(
+        Telemetry,
+        *(loop_run, system, system.hardware),
+        name=f"end to end, {system.modes} modes",
+        influence_matrix=None,
+        strehl=min(loop_run.strehl, 1.0),
+        sensor_gain=optical if optical > 0 else None,
+        controller_name=f"mixed: tip and tilt by {design.method}, integrators for the rest",
+        controller_digest=file_sha256(gain, GainFileError),
+        metadata={
+            "simulator": f"SPECULA {specula_version()}",
+            "gain_file": Path(gain).name,
+            "pixels": system.pixels,
+            "settle_frames": loop_run.settle_frames,
+            "calibration": calibration.key,
+            "sensor_gain_is": "optical gain of tip and tilt, measured in the loop",
+        },
+    )
+
+
+_TABLE_FILES = {"II": ("table_ii.csv",), "III": ("table_iii.csv", "table_iii.png", "table_iii.pdf")}
+
+
+def _run_tables(arguments: Namespace) -> Report:
+    """Run Tables II and III of the paper end to end, resuming what was interrupted."""
+    folder = Path(arguments.output)
+    written = [folder / name for number in arguments.tables for name in _TABLE_FILES[number]]
+    refuse_replacing(written, [arguments.config, *arguments.gains])
+    setup = _load_setup(arguments)
+    designs = load_designs(arguments.gains)
+    for count in ("seeds", "row_seeds", "jobs"):
+        integer(getattr(arguments, count), option_name(count), at_least=1)
+    specula_version()
+    plan: dict[str, Any] = {
+        "seeds": range(setup.seed, setup.seed + arguments.seeds),
+        "row_seeds": range(setup.seed, setup.seed + arguments.row_seeds),
+        "tables": arguments.tables,
+    }
+    total = len(all_cases(plan_cases(setup, designs, **plan)))
+    make_directory(folder)
+    _calibrate(setup, arguments)
+    case_folder = folder / "cases"
+    with run_in_parts(arguments, case_folder, total=total, what="runs") as engine:
+        table = end_to_end_tables(
+            setup, case_folder, designs, **plan, **engine, cache=arguments.cache
+        )
+    printed = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
+    files = [write_atomically(folder / _TABLE_FILES[n][0], csv_rows(printed[n])) for n in printed]
+    if "III" in printed:
+        figure = end_to_end_table_figure(table)
+        files += [save_figure(figure, folder / name) for name in _TABLE_FILES["III"][1:]]
+    methods = dict.fromkeys(entry.method for entry in printed.get("III", ()))
+    differences = {method: rms_modal_difference(table, method) for method in methods}
+    report = Report(
+        data={
+            "entries": [json_record(entry) for entry in table],
+            "units": json_units(table[0]),
+            "modal_distance_points": differences,
+            "runs": total,
+        },
+        tables=[
+            row_table(f"Table {n} end to end: Strehl ratio [%] at 2.2 um", entries)
+            for n, entries in printed.items()
+        ],
+        verdict=[
+            f"Table III, {method}: end to end less modal {points:.1f} points rms."
+            for method, points in differences.items()
+        ],
+    )
+    report.note_files(files)
+    return report

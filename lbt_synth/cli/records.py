@@ -4,24 +4,43 @@ from __future__ import annotations
 
 from argparse import Namespace
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from lbt_synth import identification
-from lbt_synth.cli import loop_records
-from lbt_synth.cli.arguments import given_options
-from lbt_synth.cli.loop_inputs import choose_unit, load_designs
+from lbt_synth.cli.arguments import given_options, refuse_options
+from lbt_synth.cli.loop_inputs import choose_unit, load_designs, say_accelerometers
 from lbt_synth.cli.output import BRIEF_ROWS, Report, say_checks
 from lbt_synth.cli.streams import count_progress
-from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.cli.telemetry import (
+    load_series,
+    record_imaging,
+    record_telescope,
+    require_series,
+)
+from lbt_synth.config import identified_config
+from lbt_synth.config.write import RAISED, config_text, require_writable_facts
+from lbt_synth.errors import LbtSynthError, ProblemError, TelemetryError
+from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
-from lbt_synth.identification import IdentifiedModel, LoopRecord, SpectrumRecord
+from lbt_synth.identification import IdentifiedAxis, IdentifiedModel, LoopRecord, SpectrumRecord
+from lbt_synth.identification.accelerometers.readings import Readings, load_readings
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
+from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.fit.identified_model import model_tables
+from lbt_synth.identification.records.contents import TEXTS, join_names, read_contents
+from lbt_synth.identification.records.record import LEAST_SECONDS, require_length
 from lbt_synth.loop import Imaging, loop_margins
+from lbt_synth.report.draw import require_figure_name, save_figure
+from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.page.html import require_page_names, write_page
+from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import json_record
+from lbt_synth.storage.rows import json_record, row_table
 from lbt_synth.storage.words import count_text
+from lbt_synth.validation import FloatArray, number
 
 if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not need
     from lbt_synth.identification import Diagnosis
@@ -33,24 +52,24 @@ _STEPS = 3  # that diagnose and auto count
 
 def run_identify(arguments: Namespace) -> Report:
     """Identify a loop from its record; write a configuration and, by default, a figure."""
-    places = loop_records.find_places(arguments, arguments.output)
-    record = loop_records.read_record(arguments)
+    places = find_places(arguments, arguments.output)
+    record = read_record(arguments)
     choose_unit(arguments, record.diameter_m)
-    loop_records.require_comparable(arguments, record)
-    options = loop_records.identification_options(arguments, record)
+    readings = read_accelerations(arguments, record)
+    options = identification_options(arguments, record)
     doubts: tuple[str, ...] = ()
     if isinstance(record, SpectrumRecord):  # it does not hold the timing of the loop
         options |= {name: getattr(arguments, name) for name in ("frame_rate_hz", "delay_frames")}
     else:
-        doubts = loop_records.judge_record(arguments, record)
+        doubts = judge_record(arguments, record)
     model = identification.identify(record, **options)
     report = Report(data={"source": str(arguments.file)})
-    loop_records.add_record(report, record)
-    loop_records.add_model(report, model)
+    add_record(report, record)
+    add_model(report, model)
     _say_model(report, model, record)
     transfers: AccelerometerTransfers | None = None
-    if arguments.accelerometers is not None and isinstance(record, LoopRecord):
-        channels, values, notes = loop_records.read_accelerations(arguments, record)
+    if readings is not None and isinstance(record, LoopRecord):
+        channels, values, notes = readings
         report.notes += [f"note: {note}." for note in notes]
         try:
             transfers = identification.accelerometer_transfers(
@@ -59,9 +78,9 @@ def run_identify(arguments: Namespace) -> Report:
         except LbtSynthError as error:  # the model is not lost
             report.notes.append(f"warning: the accelerometers were not compared: {error}")
         else:
-            loop_records.add_accelerometers(report, transfers)
-    report.notes += [loop_records.marked_note(doubt) for doubt in doubts]
-    loop_records.write_files(report, places, arguments, record, model, accelerometers=transfers)
+            add_accelerometers(report, transfers)
+    report.notes += [marked_note(doubt) for doubt in doubts]
+    write_files(report, places, arguments, record, model, accelerometers=transfers)
     return report
 
 
@@ -91,16 +110,11 @@ def run_auto(arguments: Namespace) -> Report:
     from lbt_synth.identification.auto import LEAST_SECONDS  # with it come the methods
 
     gain = require_gain_name(arguments.output)
-    places = loop_records.find_places(arguments, arguments.model, gain=gain)
-    record = loop_records.require_series(
-        loop_records.read_record(arguments, LEAST_SECONDS), "auto tests its design on"
-    )
+    places = find_places(arguments, arguments.model, gain=gain)
+    record = require_series(read_record(arguments, LEAST_SECONDS), "auto tests its design on")
     choose_unit(arguments, record.diameter_m)
-    loop_records.require_comparable(arguments, record)
-    channels, values, notes = None, None, tuple[str, ...]()
-    if arguments.accelerometers is not None:
-        channels, values, notes = loop_records.read_accelerations(arguments, record)
-    imaging = loop_records.record_imaging(arguments, record)
+    channels, values, notes = read_accelerations(arguments, record) or (None, None, ())
+    imaging = record_imaging(arguments, record)
     with count_progress(total=_STEPS, what="identifying and designing") as count:
         made = identification.design_from_record(
             record,
@@ -108,13 +122,13 @@ def run_auto(arguments: Namespace) -> Report:
             gamma_ratio=arguments.gamma_ratio,
             imaging=imaging,
             accept_record=arguments.accept_record,
-            command_scale_known=loop_records.is_scale_known(record),
+            command_scale_known=is_scale_known(record),
             accelerations=values,
             channels=channels,
             progress=count,
-            **loop_records.identification_options(arguments, record),
+            **identification_options(arguments, record),
         )
-    made = loop_records.with_repair(record, made)
+    made = with_repair(record, made)
     design, table = made.design, made.held_out
     report = Report(data={"source": str(arguments.file), "method": design.method})
     report.add_rows(
@@ -124,8 +138,8 @@ def run_auto(arguments: Namespace) -> Report:
     )
     report.notes += [f"note: {note}" for note in table.notes]
     _say_held_out(report, made, record, imaging)
-    loop_records.add_record(report, record)
-    loop_records.add_model(report, made.model)
+    add_record(report, record)
+    add_model(report, made.model)
     report.notes += [f"note: {note}." for note in notes]
     if made.channels:
         title = "Accelerometers: residual on the second half of the record"
@@ -137,7 +151,7 @@ def run_auto(arguments: Namespace) -> Report:
     ]
     report.data |= {"certificate": design.certificate.passed, "assumptions": design.assumptions}
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
-    loop_records.write_files(report, places, arguments, record, made.model, made)
+    write_files(report, places, arguments, record, made.model, made)
     return report
 
 
@@ -161,6 +175,8 @@ def _say_held_out(
             "strehl": [ran.strehl, best.strehl],
         }
     report.verdict.append(f"{said}.")
+    if bought := say_accelerometers(made.design):
+        report.verdict.append(f"That is {bought}.")
     if best.contradicts_model:
         more = "more" if best.deviations > 0 else "less"
         report.notes.append(
@@ -168,7 +184,7 @@ def _say_held_out(
             f"{abs(best.deviations):.1f} standard errors: the disturbance changed, or the model "
             "leaves something out."
         )
-    report.notes += [loop_records.marked_note(note) for note in made.notes]
+    report.notes += [marked_note(note) for note in made.notes]
 
 
 def run_diagnose(arguments: Namespace) -> Report:
@@ -182,25 +198,25 @@ def run_diagnose(arguments: Namespace) -> Report:
     elif arguments.pdf is not None:
         raise ProblemError("--pdf is the page of -o on paper; give -o, too.")
     designs = {} if arguments.gain is None else load_designs([arguments.gain])
-    both = _load_series(arguments)
+    both = _series(arguments)
     choose_unit(arguments, both.diameter_m)
     live = live_axes(both)
-    record = both if len(live) in (0, both.axes) else _load_series(arguments, live)
+    record = both if len(live) in (0, both.axes) else _series(arguments, live)
     with count_progress(total=_STEPS, what="diagnosing") as count:
         diagnosis = identification.diagnose(
             record.bridged(),
             given=designs,
             whole=both,
-            imaging=loop_records.record_imaging(arguments, record),
+            imaging=record_imaging(arguments, record),
             progress=count,
-            **loop_records.identification_options(arguments, record),
+            **identification_options(arguments, record),
         )
     sections = diagnosis_tables(diagnosis)
     report = Report(
         data={"source": str(arguments.file), **_diagnosis_data(diagnosis)},
         verdict=list(diagnosis.verdict),
         tables=[*sections.pop("verdict")[::-1], *(t for one in sections.values() for t in one)],
-        notes=[loop_records.marked_note(note) for note in diagnosis.notes],
+        notes=[marked_note(note) for note in diagnosis.notes],
     )
     if arguments.output is not None:
         files = (arguments.file, *([arguments.gain] if arguments.gain else []))
@@ -209,10 +225,10 @@ def run_diagnose(arguments: Namespace) -> Report:
     return report
 
 
-def _load_series(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
+def _series(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
     """Load the record, or some of its axes."""
-    series = loop_records.load_series(arguments, axes)
-    return loop_records.require_series(series, "diagnose examines")
+    series = load_series(arguments, axes)
+    return require_series(series, "diagnose examines")
 
 
 def _diagnosis_data(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -224,7 +240,7 @@ def _diagnosis_data(diagnosis: Diagnosis) -> dict[str, Any]:
     poles = {} if law is None else {"poles": [[abs(pole) for pole in row] for row in law.poles]}
     return {
         "doubt": diagnosis.doubt or None,
-        "record": loop_records.record_data(diagnosis.record),
+        "record": record_data(diagnosis.record),
         "channels": [json_record(row) for row in diagnosis.channels],
         "commands": None if commands is None else json_record(commands.facts()),
         "control_law": None if law is None else asdict(law) | poles,
@@ -235,3 +251,234 @@ def _diagnosis_data(diagnosis: Diagnosis) -> dict[str, Any]:
         "best": diagnosis.best or None,
         "notes": diagnosis.notes,
     }
+
+
+def read_record(
+    arguments: Namespace, least_seconds: float = LEAST_SECONDS
+) -> LoopRecord | SpectrumRecord:
+    """Load the record of the command line, with its short gaps bridged; refuse a short one."""
+    record = load_series(arguments)
+    if isinstance(record, LoopRecord):
+        record = record.bridged()
+        require_length(record, seconds=least_seconds)
+    return record
+
+
+def judge_record(arguments: Namespace, record: LoopRecord) -> tuple[str, ...]:
+    """Refuse a record whose commands do not reach its measurements; return notes on others."""
+    if record.commands is None:
+        return ()
+    verdict = explain_commands(record, sensor_gain=record.stated_gain or None)
+    if not arguments.accept_record:
+        verdict.require_accepted()
+    return (*verdict.notes, *(f"warning: it is assumed that {word}" for word in verdict.overruled))
+
+
+def identification_options(
+    arguments: Namespace, record: LoopRecord | SpectrumRecord
+) -> dict[str, Any]:
+    """Return the options of an identification that the command line gives.
+
+    Refuse facts of which no model can be written before it is identified.
+    """
+    telescope = record_telescope(arguments, record)
+    if telescope["obstruction"] is not None and record.diameter_m is None:
+        raise ProblemError("--obstruction is a fraction of the diameter; give --diameter-m.")
+    loop = record if isinstance(record, LoopRecord) else arguments
+    require_writable_facts(record.axes, loop.frame_rate_hz, loop.delay_frames, **telescope)
+    options: dict[str, Any] = {
+        "announced": _expected_lines(arguments),
+        "lowest_line_hz": arguments.lowest_line_hz,
+        "most_lines": arguments.most_lines,
+    }
+    if isinstance(record, SpectrumRecord):
+        if arguments.sensor_gain is not None:
+            raise ProblemError("a spectrum is of the phase: it has no sensor gain to be given.")
+        return options | {"noise_nm": arguments.noise_nm}
+    if arguments.noise_nm is not None:
+        raise ProblemError("--noise-nm is for spectra; the noise of a series is found in it.")
+    return options | {"sensor_gain": record.stated_gain or None}
+
+
+def _expected_lines(arguments: Namespace) -> FloatArray:
+    """Return lines known beforehand and their errors, (lines, 2) [Hz], by arguments and a file."""
+    lines = []
+    if arguments.lines_hz is not None:
+        error = number(arguments.lines_error_hz, "lines_error_hz", at_least=0)
+        lines = [(number(line, "lines_hz", above=0), error) for line in arguments.lines_hz]
+    if arguments.lines_file is not None:
+        path = require_ending(arguments.lines_file, "a list of lines", TEXTS, TelemetryError)
+        columns = read_contents(path).columns
+        # headings, if there are any, must say which column has the frequencies
+        columns.sort(key=lambda column: bool(column.name) and column.role != "frequency")
+        roles = [column.role == "frequency" for column in columns if column.name]
+        table = np.column_stack([column.values for column in columns])
+        if table.shape[1] > 2 or sum(roles) != bool(roles) or np.isnan(table[:, 0]).any():
+            raise ProblemError(
+                f"{path} must have a frequency_hz in each row, and no more than an error_hz beside "
+                f"it; got {join_names(columns)}."
+            )
+        lines += [(row[0], np.nansum(row[1:])) for row in table]
+    return np.reshape(lines, (-1, 2))
+
+
+def read_accelerations(
+    arguments: Namespace, record: LoopRecord | SpectrumRecord
+) -> Readings | None:
+    """Read the accelerometers of the command line, if there are any."""
+    if arguments.accelerometers is None:
+        of_others = ("accelerometer_rate_hz", "acceleration_unit")
+        refuse_options(arguments, of_others, "goes with --accelerometers")
+        return None
+    record = require_series(record, "accelerometers are compared with")
+    return load_readings(
+        arguments.accelerometers,
+        record.frame_rate_hz,
+        rate_hz=arguments.accelerometer_rate_hz,
+        unit=arguments.acceleration_unit,
+    )
+
+
+def add_accelerometers(report: Report, transfers: AccelerometerTransfers) -> None:
+    """Add how the channels of accelerometers move with the lines, and what is used."""
+    if transfers.transfers:
+        report.add_rows("accelerometer_lines", "Accelerometers and lines", transfers.transfers)
+    report.add_rows("accelerometers", "Accelerometers", transfers.channels)
+    report.data["accelerometer_shift"] = {
+        name: getattr(transfers, f"shift_{name}") for name in ("frames", "error_frames")
+    }
+    report.notes.append(f"note: {transfers.shift_text}")
+
+
+def find_places(arguments: Namespace, model: str | Path | None, **others: Path) -> dict[str, Path]:
+    """Return where model, figure and others go, by default beside each other.
+
+    Refuse bad places.
+    """
+    output = Path(arguments.output)
+    model = require_ending(model or output.with_suffix(".yaml"), "a model", (".yaml", ".yml"))
+    places = {**others, "model": model}
+    if not arguments.no_figure:
+        figure = arguments.figure or output.with_suffix(".png")
+        places["figure"] = require_figure_name(figure)
+    elif arguments.figure is not None:
+        raise ProblemError("give one of --figure and --no-figure, not both.")
+    read = ("file", "commands", "lines_file", "accelerometers")
+    inputs = given_options(arguments, *(name for name in read if name in arguments))
+    require_writable(*places.values(), inputs=inputs.values())
+    return places
+
+
+def write_files(
+    report: Report,
+    places: dict[str, Path],
+    arguments: Namespace,
+    record: LoopRecord | SpectrumRecord,
+    model: IdentifiedModel,
+    made: RecordedDesign | None = None,
+    accelerometers: AccelerometerTransfers | None = None,
+) -> None:
+    """Write gain file, model and figure, one after the other: what is ready is not lost."""
+    designs = None
+    if made is not None:
+        designs = {made.name: made.design}
+        report.note_written(save_gain(places["gain"], made.design))
+    try:
+        text, comments = _model_text(model, arguments, record, accelerometers)
+    except ProblemError as error:
+        if accelerometers is None:
+            raise
+        report.notes.append(f"warning: the model is written without accelerometers: {error}")
+        text, comments = _model_text(model, arguments, record, None)
+    report.note_written(write_atomically(places["model"], text), "model")
+    report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
+    if "figure" in places:
+        figure = identification_figure(model, designs=designs)
+        report.note_written(save_figure(figure, places["figure"]), "figure")
+
+
+def _model_text(
+    model: IdentifiedModel,
+    arguments: Namespace,
+    record: LoopRecord | SpectrumRecord,
+    accelerometers: AccelerometerTransfers | None,
+) -> tuple[bytes, dict[str, str]]:
+    """Return the text of a configuration for an identified model, and its comments."""
+    source = ascii(Path(arguments.file).name)[1:-1]
+    settings, comments = identified_config(
+        model,
+        **record_telescope(arguments, record),
+        title=f"Identified from {source} by lbt-synth {arguments.command}.",
+        accelerometers=accelerometers,
+    )
+    return config_text(settings, comments).encode(), comments
+
+
+def add_record(report: Report, record: LoopRecord | SpectrumRecord) -> None:
+    """Add what a record holds, and what was found wrong with it."""
+    report.data["record"] = record_data(record)
+    if isinstance(record, SpectrumRecord):
+        report.notes += [f"note: {note}" for note in record.notes]
+        return
+    if record.health.findings:
+        caption = f"Record of {record.duration_s:.4g} s: {record.health.summary()}"
+        report.tables.append(row_table(caption, record.health.findings))
+    report.notes += [f"note: {note}" for note in record.health.notes]
+
+
+def record_data(record: LoopRecord | SpectrumRecord) -> dict[str, Any]:
+    """Return what JSON says of a record."""
+    if isinstance(record, SpectrumRecord):
+        frequencies = record.frequency_hz.size
+        return {"kind": "spectrum", "frequencies": frequencies, "notes": record.notes}
+    return {
+        "kind": "open loop" if record.commands is None else "closed loop",
+        "frames": record.frames,
+        "usable": record.health.usable,
+        "frame_rate_hz": record.frame_rate_hz,
+        "delay_frames": record.delay_frames,
+        "findings": [asdict(finding) for finding in record.health.findings],
+        "notes": record.health.notes,
+    }
+
+
+def add_model(report: Report, model: IdentifiedModel) -> None:
+    """Add the tables of an identified model, its notes, and its numbers."""
+    report.tables += model_tables(model)
+    report.notes += [marked_note(note) for note in model.notes]
+    report.data["axes"] = [_axis_record(axis) for axis in model.axes]
+    report.data["vibrations"] = [asdict(line) for line in model.parts]
+    report.data["model_notes"] = model.notes
+
+
+def marked_note(note: str) -> str:
+    """Mark a note as such, unless it is a warning."""
+    return note if note.startswith("warning") else f"note: {note}"
+
+
+def _axis_record(axis: IdentifiedAxis) -> dict[str, Any]:
+    turbulence, whiteness = axis.turbulence, axis.whiteness
+    tests = ("deviation", "p_value", "white")
+    noise = ("noise_nm", "noise_error_nm", "noise_correlation", "noise_correlation_error")
+    shown = (*noise, "sensor_gain", "sensor_gain_error", "sensor_gain_note")
+    return {
+        "turbulence": asdict(axis.turbulence_fit)
+        | {"coefficients": turbulence.coefficients, "driving_rms_nm": turbulence.driving_rms_nm},
+        "vibrations": [asdict(line) for line in axis.parts],
+        **{name: getattr(axis, name) for name in shown},
+        "whiteness": {name: getattr(whiteness, name) for name in tests},
+    }
+
+
+def with_repair(record: LoopRecord, made: RecordedDesign) -> RecordedDesign:
+    """Return what was made of a record, with the repair of its commands as an assumption."""
+    if not record.read_with:
+        return made
+    words = f"the commands of the record were read with {record.read_with}"
+    design = replace(made.design, assumptions=(words, *made.design.assumptions))
+    return replace(made, design=design)
+
+
+def is_scale_known(record: LoopRecord) -> bool:
+    """Return whether somebody said at which size commands were recorded."""
+    return "--command-scale" in record.read_with or "--command-matrix" in record.read_with

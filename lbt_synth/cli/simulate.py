@@ -5,23 +5,22 @@ from __future__ import annotations
 import re
 from argparse import Namespace
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from lbt_synth.cli.arguments import given_options
+from lbt_synth.cli.arguments import given_options, refuse_options
 from lbt_synth.cli.loop_inputs import (
     load_designs,
     load_shown,
     loop_difference_notes,
     truth_at_sensor_gain,
 )
-from lbt_synth.cli.output import PERCENT, RMS, Report, require_figure, write_telemetry
+from lbt_synth.cli.output import PERCENT, RMS, Report, write_telemetry
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
-from lbt_synth.files import Telemetry, telemetry_from_simulation
+from lbt_synth.files import telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.linear import estimator_form
 from lbt_synth.loop import (
@@ -34,9 +33,8 @@ from lbt_synth.loop import (
     strehl,
 )
 from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_or_nan
-from lbt_synth.loop.simulation.run import READINGS, Drop, settling_frames
+from lbt_synth.loop.simulation.run import READINGS, Drop, Segment, settling_frames
 from lbt_synth.models import Truth
-from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import nm_text
@@ -44,11 +42,14 @@ from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import count_text
 from lbt_synth.studies.robustness import run_failures
-from lbt_synth.validation import FloatArray
 
 _TIME = r"(\d+\.?\d*)s?"
 _DROP = re.compile(rf"([^@]+)@{_TIME}(?:\.\.{_TIME})?(?::({'|'.join(READINGS)}))?")
 _AFTER_S = 5.0  # that a run lasts beyond the last event, if --frames is not given
+_PARTS = {"turbulence": "turbulence", "vibration": "vibration", "noise": "noise"}  # of a residual
+_PARTS |= {"within": "within frames"}
+# a line of the table, the runs, the parts between failures of sensors, and what to say
+_Run: TypeAlias = tuple[Facts, Simulation, list[tuple[Segment, Facts]], list[str]]
 
 
 def parse_drop(text: str) -> Drop:
@@ -65,48 +66,33 @@ def parse_drop(text: str) -> Drop:
     return Drop(unit=unit, **ends, reading=reading or READINGS[0])
 
 
-_PARTS = {"turbulence": "turbulence", "vibration": "vibration", "noise": "noise"}
-_PARTS |= {"within": "within frames"}  # of a residual
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Run:
-    """A gain file in the loop: its name, the runs in time, and the answer without chance."""
-
-    name: str
-    design: Design
-    simulation: Simulation
-    strehls: FloatArray
-    exact: ResidualBudget | None  # None of a truth that drifts
-    limit_nm: float  # nan where other sensors can leave less
-    settle_frames: int
-    clipped: float | None  # share of the frames in which a command reached the stroke
-    segments: list[tuple[Any, Any]]  # between failures and returns of sensors
-
-
 def run(arguments: Namespace) -> Report:
     """Close the loop in the time domain, beside the exact answer; sensors may fail on the way."""
-    inputs = [arguments.config, *arguments.gains]
-    if arguments.output is not None:
-        require_figure(arguments.output, inputs=inputs)
     if arguments.telemetry is not None:
         require_telemetry_name(arguments.telemetry)
-        require_writable(arguments.telemetry, inputs=inputs)
-    several = len(arguments.gains) > 1
-    for option in ("output", "telemetry", "drop") if several else ():
-        if not getattr(arguments, option):
-            continue
-        raise ProblemError(f"--{option} goes with one gain file; got {len(arguments.gains)}.")
+        require_writable(arguments.telemetry, inputs=[arguments.config, *arguments.gains])
+    if (count := len(arguments.gains)) > 1:
+        single = ("output", "telemetry", "drop")
+        refuse_options(arguments, single, f"goes with one gain file; got {count}")
     config = load_shown(arguments)
     truth = truth_at_sensor_gain(config, arguments.sensor_gain)
-    designs = load_designs(arguments.gains, any_sensors=True)
+    designs = load_designs(arguments.gains, config)
     runs = [_run(arguments, name, design, truth, config) for name, design in designs.items()]
     report = _describe_runs(runs, truth, config)
-    only = runs[0]
-    if arguments.output is not None:
-        report.note_written(save_figure(_draw(only), arguments.output))
+    design, (_, simulation, segments, _) = next(iter(designs.values())), runs[0]
+    report.figure = lambda: _draw(design, simulation, segments)
     if arguments.telemetry is not None:
-        recorded = _first_case(only, truth, config, arguments.gains[0])
+        noise_nm = truth.noise_per_measurement(config.hardware.n_measurements).tolist()
+        noise = {f"noise_nm_{i}": value for i, value in enumerate(noise_nm, start=1)}
+        recorded = telemetry_from_simulation(
+            simulation,
+            config.hardware,
+            sensor_gain=truth.sensor_gain,
+            design=design,
+            controller_digest=file_sha256(arguments.gains[0], GainFileError),
+            imaging=config.imaging,
+            metadata={"case": 0, "cases": len(simulation.commands), **noise},
+        )
         write_telemetry(report, arguments.telemetry, recorded, key="telemetry")
     return report
 
@@ -115,85 +101,108 @@ def _run(arguments: Namespace, name: str, design: Design, truth: Truth, config: 
     """Run the loop of a gain file."""
     drops = _parse_drops(arguments, name, design)
     loop = design.close(config.hardware, sensor_gain=truth.sensor_gain)
+    differences = loop_difference_notes(config, design)
     try:
         loop.require_stable()
     except UnstableLoopError as error:
-        why = " ".join([str(error), *loop_difference_notes(config, design)])
+        why = " ".join([str(error), *differences])
         raise UnstableLoopError(why, spectral_radius=loop.radius_per_frame) from error
     sizes: dict[str, Any] = _choose_sizes(arguments, config, drops)
-    settle, segments = config.settings.simulation.settle_frames, list[tuple[Any, Any]]()
+    usual, notes = config.settings.simulation.settle_frames, list[str]()
+    segments: list[tuple[Segment, Facts]] = []
     if design.other_sensors:
         simulation, segments = run_failures(design, config, truth, drops, **sizes)
+        notes.append("note: the exact answer is with all sensors.")
     else:  # the same settling for all controllers, so that one seed is one weather
-        settle = max(settle, settling_frames(loop.radius_per_frame))
+        settle = max(usual, settling_frames(loop.radius_per_frame))
         form = estimator_form(design) if arguments.form == "estimator" else design.controller
         sizes |= {"settle_frames": settle, "stroke": arguments.stroke}
         simulation = simulate(form, truth, hardware=config.hardware, **sizes)
-    limit_nm = np.nan
+        if settle > usual:
+            notes.append(
+                f"note: this loop settles for {settle} frames, not {usual}; its random series are "
+                "not those of a faster loop with the same seed. Raise simulation.settle_frames."
+            )
+    limit_nm, clipped = np.nan, None
     if not loop.reads_others and not truth.drifts:
         limit_nm = limit_or_nan(lambda: least_residual(config.hardware.own_sensor_alone(), truth))
-    clipped = None
     if arguments.stroke is not None:
         reached = np.any(np.abs(simulation.commands) >= arguments.stroke, axis=2)
         clipped = float(np.mean(reached))
-    return _Run(
-        name=name,
-        design=design,
-        simulation=simulation,
-        strehls=simulation.strehl(config.imaging),
-        exact=None if truth.drifts else residual_budget(loop, truth),
-        limit_nm=limit_nm,
-        settle_frames=settle,
-        clipped=clipped,
-        segments=segments,
-    )
-
-
-def _draw(one: _Run) -> Any:
-    """Return the figure of a run."""
-    title = one.design.method
-    if one.design.other_sensors:
-        places, exact_nm = [s for s, _ in one.segments], [row.exact_nm for _, row in one.segments]
-        return sensor_failure_figure(
-            one.simulation, title=title, segments=places, exact_nm=exact_nm
+        notes.append(
+            f"note: the mirror clipped the commands of {clipped:.2%} of the frames; the exact "
+            "answer has no limit of the stroke."
         )
-    title += ": the first second, and spectra of all runs"
-    return simulation_figure(one.simulation, title=title)
+    exact = None if truth.drifts else residual_budget(loop, truth)
+    row = _describe(name, simulation, exact, limit_nm, clipped, config.imaging)
+    return row, simulation, segments, notes + differences
+
+
+def _describe(
+    name: str,
+    simulation: Simulation,
+    exact: ResidualBudget | None,
+    limit_nm: float,
+    clipped: float | None,
+    imaging: Imaging,
+) -> Facts:
+    """Return the line of a gain file, with the exact answer unless a vibration drifts."""
+    simulated_nm = float(np.sqrt(np.mean(simulation.rms_nm**2)))
+    ratio = float(np.mean(simulation.strehl(imaging)))
+    residual_nm = above = exact_ratio = None
+    if exact is not None:
+        residual_nm, exact_ratio = exact.rms_nm, strehl(exact, imaging)
+        above = round(above_percent(residual_nm, limit_nm), 6) + 0.0
+    command_rms = float(np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1)))))
+    return facts(
+        design=fact(name, "design"),
+        residual_simulated_nm=fact(simulated_nm, "residual", **RMS),
+        residual_exact_nm=fact(residual_nm, "exact", **RMS),
+        strehl_simulated=fact(ratio, "Strehl", **PERCENT),
+        strehl_exact=fact(exact_ratio, "exact", **PERCENT),
+        **{
+            f"{part}_nm": fact(getattr(exact, f"{part}_nm", None), word, **RMS)
+            for part, word in _PARTS.items()
+        },
+        limit_nm=fact(limit_nm, unit="nm"),
+        above_limit_percent=fact(above, unit="%"),
+        command_rms=fact(command_rms, unit="nm"),
+        clipped=fact(clipped),
+    )
 
 
 def _describe_runs(runs: Sequence[_Run], truth: Truth, config: Config) -> Report:
     """Return a line for each gain file, and all that is known of a single one."""
-    imaging, first = config.imaging, runs[0].simulation
+    rows, (_, first, segments, _) = [row for row, *_ in runs], runs[0]
     cases, frames = first.residual_nm.shape[:2]
-    rows = [_describe(one, imaging) for one in runs]
     report = Report(data={"frames": frames, "cases": cases, "seed": first.seed})
-    report.data["wavelength_um"] = imaging.wavelength_um
+    report.data["wavelength_um"] = config.imaging.wavelength_um
     report.data["sensor_gain"] = config.sensor_gain * truth.sensor_gain
-    if len(runs) == 1:
-        report.data |= {"strehl": runs[0].strehls, "residual_nm": first.rms_nm}
-        report.add_records(rows[0])
-        report.data["units"]["residual_nm"] = "nm"
-    for one, row in zip(runs, rows, strict=True):
+    for row in rows:
         residual = nm_text(row.residual_simulated_nm, ".1f")
-        said = f"{one.name} leaves {residual} rms (Strehl ratio {100 * row.strehl_simulated:.1f} %)"
-        if one.exact is not None:
-            said += f", and {nm_text(one.exact.rms_nm, '.1f')} without chance"
+        said = f"{row.design} leaves {residual} rms (Strehl ratio {100 * row.strehl_simulated:.1f}"
+        said += " %)"
+        if row.residual_exact_nm is not None:
+            said += f", and {nm_text(row.residual_exact_nm, '.1f')} without chance"
         report.verdict.append(f"{said}.")
-    limits_nm = [one.limit_nm for one in runs if not np.isnan(one.limit_nm)]
+    limits_nm = [row.limit_nm for row in rows if not np.isnan(row.limit_nm)]
     if limits_nm:
         least = nm_text(limits_nm[0], ".1f")
         report.verdict.append(
             f"No linear controller of the loop's own sensor leaves less than {least}."
         )
-    caption = f"{count_text(cases, 'run')} of {frames} frames; {imaging.label}"
+    caption = f"{count_text(cases, 'run')} of {frames} frames; {config.imaging.label}"
     report.add_rows("designs", caption, rows)
-    for one in runs:
-        if one.segments:
+    report.rows = rows
+    if len(rows) == 1:
+        report.add_records(*rows)
+        report.data |= {"strehl": first.strehl(config.imaging), "residual_nm": first.rms_nm}
+        report.data["units"]["residual_nm"] = "nm"
+        if segments:
             caption = "Simulated between failures and returns of sensors"
-            report.add_rows("segments", caption, [row for _, row in one.segments])
+            report.add_rows("segments", caption, [row for _, row in segments])
             report.tables.reverse()
-            report.notes.append("note: the exact answer is with all sensors.")
-        report.notes += _simulation_notes(one, config)
+    report.notes += dict.fromkeys(note for *_, notes in runs for note in notes)
     if truth.drifts:
         report.notes.append(
             "note: a vibration drifts, so there is no exact answer beside the simulation."
@@ -201,30 +210,14 @@ def _describe_runs(runs: Sequence[_Run], truth: Truth, config: Config) -> Report
     return report
 
 
-def _describe(one: _Run, imaging: Imaging) -> Facts:
-    """Return the line of a run."""
-    simulation, exact = one.simulation, one.exact
-    command_rms = float(np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1)))))
-    residual_nm = None if exact is None else exact.rms_nm
-    above = None
-    if residual_nm is not None:
-        above = round(above_percent(residual_nm, one.limit_nm), 6) + 0.0
-    return facts(
-        design=fact(one.name, "design"),
-        residual_simulated_nm=fact(
-            float(np.sqrt(np.mean(simulation.rms_nm**2))), "residual", **RMS
-        ),
-        residual_exact_nm=fact(residual_nm, "exact", **RMS),
-        strehl_simulated=fact(float(np.mean(one.strehls)), "Strehl", **PERCENT),
-        strehl_exact=fact(None if exact is None else strehl(exact, imaging), "exact", **PERCENT),
-        **{
-            f"{part}_nm": fact(getattr(exact, f"{part}_nm", None), word, **RMS)
-            for part, word in _PARTS.items()
-        },
-        limit_nm=fact(one.limit_nm, unit="nm"),
-        above_limit_percent=fact(above, unit="%"),
-        command_rms=fact(command_rms, unit="nm"),
-        clipped=fact(one.clipped),
+def _draw(design: Design, simulation: Simulation, segments: Sequence[tuple[Segment, Facts]]) -> Any:
+    """Return the figure of a run."""
+    if not design.other_sensors:
+        title = f"{design.method}: the first second, and spectra of all runs"
+        return simulation_figure(simulation, title=title)
+    places, exact_nm = [place for place, _ in segments], [row.exact_nm for _, row in segments]
+    return sensor_failure_figure(
+        simulation, title=design.method, segments=places, exact_nm=exact_nm
     )
 
 
@@ -235,9 +228,9 @@ def _parse_drops(arguments: Namespace, name: str, design: Design) -> list[Drop]:
             "--drop goes with a design of several sensors: give sensors in the configuration and "
             f"design again. {name} has the loop's own sensor alone."
         )
-    own_alone = ("stroke", "form", "telemetry") if design.other_sensors else ()
-    for option in given_options(arguments, *own_alone):
-        raise ProblemError(f"--{option} goes with a design of the loop's own sensor alone.")
+    if design.other_sensors:
+        own_alone = ("stroke", "form", "telemetry")
+        refuse_options(arguments, own_alone, "goes with a design of the loop's own sensor alone")
     return [parse_drop(text) for text in arguments.drop or ()]
 
 
@@ -254,37 +247,3 @@ def _choose_sizes(arguments: Namespace, config: Config, drops: Sequence[Drop]) -
             f"frames; got {sizes['frames']}."
         )
     return sizes
-
-
-def _simulation_notes(one: _Run, config: Config) -> list[str]:
-    notes = []
-    if one.clipped is not None:
-        notes.append(
-            f"note: the mirror clipped the commands of {one.clipped:.2%} of the frames; the exact "
-            "answer has no limit of the stroke."
-        )
-    if one.strehls.size > 1:
-        scatter = 100 * np.std(one.strehls, ddof=1)
-        notes.append(f"scatter of the Strehl ratio between runs: {scatter:.2f} points")
-    usual = config.settings.simulation.settle_frames
-    if one.settle_frames > usual:
-        notes.append(
-            f"note: this loop settles for {one.settle_frames} frames, not {usual}; its random "
-            "series are not those of a faster loop with the same seed. Raise "
-            "simulation.settle_frames."
-        )
-    return notes + loop_difference_notes(config, one.design)
-
-
-def _first_case(one: _Run, truth: Truth, config: Config, gain_file: str) -> Telemetry:
-    noise_nm = truth.noise_per_measurement(config.hardware.n_measurements).tolist()
-    noise = {f"noise_nm_{i}": value for i, value in enumerate(noise_nm, start=1)}
-    return telemetry_from_simulation(
-        one.simulation,
-        config.hardware,
-        sensor_gain=truth.sensor_gain,
-        design=one.design,
-        controller_digest=file_sha256(gain_file, GainFileError),
-        imaging=config.imaging,
-        metadata={"case": 0, "cases": len(one.simulation.commands), **noise},
-    )

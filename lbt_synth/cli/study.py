@@ -1,23 +1,35 @@
-"""The command study: run a study, say what it would cost, or replay one of its rows."""
+"""The command study: run a study, say what it would cost, or replay one of its rows.
+
+Its work, and that of end-to-end, is done by processes of this machine or by a Dask cluster. Nothing
+else imports Dask.
+"""
 
 from __future__ import annotations
 
 import os
 from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+import lbt_synth
 from lbt_synth import studies
-from lbt_synth.cli.engine import choose_engine, run_in_parts
+from lbt_synth.cli.arguments import refuse_options
 from lbt_synth.cli.loop_inputs import load_shown
 from lbt_synth.cli.output import PERCENT, Report
+from lbt_synth.cli.streams import count_progress, print_error
+from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.storage.tables import Table
+from lbt_synth.storage.thread_limits import WorkerPool, limit_threads
 from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.grid import timed
 from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, part_rows, replay_row
@@ -25,10 +37,10 @@ from lbt_synth.studies.study.sample import evaluate_samples
 from lbt_synth.studies.study.statistics import StudyStatistics, summary_tables, worst_table
 from lbt_synth.validation import integer
 
+_TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
 _FAILURE = ("row", "controller", "error")
-_NUMBER_BYTES = 21  # of a number of a study, in a part and in the table of results
-_LOW = 5.0  # percentile of the Strehl ratio that a bad night has
 _WORST = 3  # rows of each controller that are printed; the page has more
+_LOW = 5.0  # percentile of the Strehl ratio that a bad night has
 
 
 def run(arguments: Namespace) -> Report:
@@ -64,9 +76,9 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
             computing_s=run.computing_s,
         )
         write_page(page, pages[0], pdf=pages[1] if arguments.pdf else None)
-    files = dict.fromkeys((run.results, run.failed), run.new) | dict.fromkeys(pages, draws)
     varying = [name for name, p in loaded.settings.parameters.items() if p.varies]
-    worst = [worst_table(each, columns, varying) for each in statistics.controllers]
+    worst = [worst_table(one, columns, varying) for one in statistics.controllers]
+    files = dict.fromkeys((run.results, run.failed), run.new) | dict.fromkeys(pages, draws)
     done = f"{folder} is finished: {loaded.samples} samples in {run.results.name}; none computed."
     if run.computed:
         done = (
@@ -159,19 +171,11 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     parameters = {name: section.text for name, section in loaded.settings.parameters.items()}
     controllers = {name: section.text for name, section in loaded.settings.controllers.items()}
     report = Report(data={"parameters": parameters, "controllers": controllers})
-    report.add_facts(
-        f"Study {loaded.source}",
-        facts(
-            samples=fact(loaded.samples, "samples"),
-            sampling=fact(loaded.settings.sampling, "sampling"),
-            seed=fact(loaded.settings.seed, "seed"),
-            evaluation=fact(loaded.settings.evaluation, "evaluation"),
-            workers=fact(count),
-        ),
-        cost,
-    )
-    report.add_table("Parameters", ("parameter", "distribution"), parameters.items())
-    report.add_table("Controllers", ("controller", "what"), controllers.items())
+    settings = loaded.settings
+    names = ("sampling", "seed", "evaluation")
+    what = {"samples": fact(loaded.samples, "samples"), "workers": fact(count)}
+    what |= {name: fact(getattr(settings, name), name) for name in names}
+    report.add_facts(f"Study {loaded.source}", facts(**what), cost)
     report.verdict.append(f"The study takes about {duration_text(cost.seconds)} on {where}.")
     report.notes += [*_sampling_notes(loaded), "note: nothing was written."]
     return report
@@ -182,13 +186,10 @@ def _estimate(loaded: studies.Study, at_once: int) -> Facts:
     evaluate_samples(loaded, loaded.values(0, 1), 0)  # warms up
     rows = min(part_rows(loaded), loaded.samples)
     _, seconds = timed(evaluate_samples, loaded, loaded.values(0, rows), 0)
-    space = {"unit": "MB", "scale": 1e-6, "format": ".3g"}
-    disk_bytes = _NUMBER_BYTES * len(loaded.columns) * loaded.samples
     return facts(
         measured_rows=fact(rows, "samples measured in one process"),
         measured_s=fact(seconds, "  their time", unit="s", format=".3g"),
         seconds=fact(seconds / rows * loaded.samples / at_once),  # said in a note, in words
-        disk_bytes=fact(disk_bytes, "space on the disk, about", **space),
     )
 
 
@@ -200,7 +201,7 @@ def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report
     values = loaded.parameters_by_name(loaded.values(row, row + 1)[0])
     report = Report(
         data={"row": row, "parameters": values, "stored": stored, "fresh": fresh}
-        | {"failures": [dict(zip(_FAILURE, each, strict=True)) for each in replay.failures]},
+        | {"failures": [dict(zip(_FAILURE, failure, strict=True)) for failure in replay.failures]},
         notes=[
             *([] if stored else ["note: the study has no result of this row yet."]),
             *(f"warning: failed: {name}: {error}" for _, name, error in replay.failures),
@@ -208,6 +209,94 @@ def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report
     )
     results = [(name, stored.get(name), fresh.get(name)) for name in loaded.result_columns]
     report.add_table(f"Results of row {row}", ("result", "stored", "now"), results)
-    report.add_table("Parameters", ("parameter", "value"), values.items())
     report.note_files(replay.files)
     return report
+
+
+def choose_engine(
+    arguments: Namespace,
+) -> AbstractContextManager[tuple[Executor | None, int | None]]:
+    """Provide the executor of ``--dask`` or of ``--jobs`` with its workers; None for one job."""
+    dask, tls = (getattr(arguments, name, None) for name in ("dask", "dask_tls"))
+    if dask is not None:
+        return connect_cluster(dask, tls=tls)
+    if tls is not None:
+        refuse_options(arguments, ("dask_tls",), "goes with --dask")
+    return nullcontext((None, None)) if arguments.jobs == 1 else _start_processes(arguments.jobs)
+
+
+@contextmanager
+def _start_processes(jobs: int) -> Iterator[tuple[Executor, int]]:
+    """Provide processes with one thread each, which end at once if the block fails."""
+    integer(jobs, "--jobs", at_least=1, at_most=8 * (os.cpu_count() or 1))
+    with limit_threads(), WorkerPool(jobs) as pool:
+        yield pool, jobs
+
+
+@contextmanager
+def run_in_parts(
+    arguments: Namespace, folder: Path, *, total: int, what: str
+) -> Iterator[dict[str, Any]]:
+    """Provide the executor, its workers and a progress bar for work that resumes from a folder.
+
+    An interruption says where what is finished stays.
+    """
+    with (
+        choose_engine(arguments) as (executor, workers),
+        count_progress(total=total, what=what) as count,
+    ):
+        make_directory(folder)
+        try:
+            yield {"executor": executor, "workers": workers, "progress": count}
+        except KeyboardInterrupt:
+            print_error(f"what is finished is kept in {folder}; start it again to continue")
+            raise
+
+
+@contextmanager
+def connect_cluster(
+    address: str, *, tls: Sequence[str] | None = None
+) -> Iterator[tuple[Executor, int]]:
+    """Provide the executor of a Dask scheduler with this package, and how many threads it has.
+
+    A scheduler can run code on its clients: name only one that you trust. ``tls`` names the
+    files of the authority, of the certificate and of the key of an encrypted connection.
+    """
+    try:
+        from distributed import Client
+        from distributed.security import Security
+    except ImportError as error:
+        raise MissingExtraError(
+            '--dask needs dask.distributed; try: pip install "lbt-synth[dask]".', extra="dask"
+        ) from error
+    names = ("tls_ca_file", "tls_client_cert", "tls_client_key")
+    try:
+        files = dict(zip(names, tls, strict=True)) if tls else {}
+        security = Security(**files, require_encryption=True if tls else None)
+        client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False, security=security)
+    except (OSError, ValueError, TypeError) as error:
+        text = " ".join(str(error).split()) or "no answer"
+        raise ProblemError(
+            f"no Dask scheduler answers at {address!r} ({text.rstrip('.')}). Expected an address "
+            "such as tcp://host:8786; start one with dask scheduler, and dask worker."
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_TIMEOUT_S)
+        except TimeoutError as error:
+            raise ProblemError(
+                f"the scheduler at {address} has no workers; start some with dask worker {address}."
+            ) from error
+        _require_versions(address, client)
+        yield client.get_executor(pure=False), sum(client.ncores().values())
+
+
+def _require_versions(address: str, client: Any) -> None:
+    """Refuse workers without this version, whose results would be others."""
+    hosts = client.get_versions(packages=["lbt_synth"])["workers"]
+    versions = {host["packages"].get("lbt_synth") or "none" for host in hosts.values()}
+    if versions != {lbt_synth.__version__}:
+        raise ProblemError(
+            f"all workers must have lbt_synth {lbt_synth.__version__}, as here; those of {address} "
+            f"have {', '.join(sorted(versions))}. Start them from the same environment."
+        )

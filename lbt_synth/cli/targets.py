@@ -10,10 +10,10 @@ from typing import TypeAlias
 
 import numpy as np
 
-from lbt_synth.cli.arguments import command_options, given_options, option_name
+from lbt_synth.cli.arguments import command_options, given_options, option_name, refuse_options
 from lbt_synth.cli.loop_inputs import choose_unit, load_design, load_shown
-from lbt_synth.cli.loop_records import load_series, record_imaging, require_series
-from lbt_synth.cli.output import PERCENT, Report, require_figure, say_checks
+from lbt_synth.cli.output import PERCENT, Report, say_checks
+from lbt_synth.cli.telemetry import load_series, record_imaging, require_series
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError
@@ -26,7 +26,6 @@ from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
 from lbt_synth.loop.strehl import series_strehl
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.records import simulation_figure
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import nm_text
@@ -36,7 +35,6 @@ from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import FloatArray, integer
 
 _OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps", "loss")
-_FRAMES = 8000  # of a drawn disturbance
 _DRAWN = ("frames", "seed")  # options that only a drawn disturbance has
 _ALWAYS = ("target", "stroke", "wavelength_um", "output", "json", "verbose", "unit", "show_unit")
 _FEWEST = 256  # frames of a record: a loop needs some to settle, and some to compare
@@ -93,10 +91,9 @@ def run_export(arguments: Namespace) -> Report:
 def run_rehearse(arguments: Namespace) -> Report:
     """Run the loop in the arithmetic of a target, beside the design and what ran."""
     target, recorded = arguments.target, arguments.file is not None
-    if arguments.output is not None:
-        paths = given_options(arguments, "gain", "file")
-        require_figure(arguments.output, inputs=tuple(paths.values()))
-    _refuse_idle_options(arguments)
+    idle = set(command_options("rehearse")) - {*_DRAWN, *_ALWAYS}
+    why = "goes without a record" if recorded else "goes with a record"
+    refuse_options(arguments, _DRAWN if recorded else sorted(idle), why)
     design = load_design(arguments.gain)
     series = (_recorded if recorded else _drawn)(arguments, design)
     source, disturbance, hardware, imaging, ran = series
@@ -116,7 +113,13 @@ def run_rehearse(arguments: Namespace) -> Report:
     leaves = [f"{nm_text(row.residual_nm, '.1f')} rms ({row.name})" for row in rows]
     report = Report(data={"gain": arguments.gain, "target": target})
     report.verdict = [f"On {source}: {listing_text(leaves)}.", say_checks(rehearsal.checks)]
-    report.add_rows("loops", f"Rehearsal for {target}; {imaging.label}", rows)
+    title = f"{design.method} in {target}"
+    report.add_rows(
+        "loops",
+        f"Rehearsal for {target}; {imaging.label}",
+        rows,
+        figure=lambda: simulation_figure(rehearsal.target, title=title),
+    )
     report.add_facts("The target beside the design", _difference_facts(rehearsal))
     report.add_rows("checks", f"Checks in the arithmetic of {target}", rehearsal.checks)
     if recorded:
@@ -126,9 +129,6 @@ def run_rehearse(arguments: Namespace) -> Report:
         ]
     if design.hardware is not None:
         report.notes += [f"note: {text}" for text in loop_differences(design.hardware, hardware)]
-    if arguments.output is not None:
-        figure = simulation_figure(rehearsal.target, title=f"{design.method} in {target}")
-        report.note_written(save_figure(figure, arguments.output))
     return report
 
 
@@ -168,15 +168,6 @@ def _difference_facts(rehearsal: Rehearsal) -> Facts:
         frames=fact(len(apart_nm), "frames compared"),
         settle_frames=fact(rehearsal.settle_frames, settled),
     )
-
-
-def _refuse_idle_options(arguments: Namespace) -> None:
-    """Refuse options of a record where none is given, and of a drawn disturbance where one is."""
-    drawn = arguments.file is None
-    for name, (option, usual) in command_options("rehearse").items():
-        idle = name not in (*_DRAWN, *_ALWAYS) if drawn else name in _DRAWN
-        if idle and getattr(arguments, name) != usual:
-            raise ProblemError(f"{option} goes {'with' if drawn else 'without'} a record.")
 
 
 def _recorded(arguments: Namespace, design: Design) -> _Series:
@@ -228,9 +219,8 @@ def _drawn(arguments: Namespace, design: Design) -> _Series:
     imaging = config.imaging
     if arguments.wavelength_um is not None:
         imaging = replace(imaging, wavelength_um=arguments.wavelength_um)
-    frames, alone = _FRAMES, config.hardware.own_sensor_alone()
+    alone = config.hardware.own_sensor_alone()
     seed = integer(arguments.seed, "--seed", at_least=0)
-    if arguments.frames is not None:
-        frames = integer(arguments.frames, "--frames", at_least=1)
+    frames = integer(arguments.frames, "--frames", at_least=1)
     drawn = draw_disturbance(config.truth, alone, frames=frames, seed=seed)
     return f"{frames} frames of its own truth", drawn, config.hardware, imaging, None

@@ -1,42 +1,162 @@
-"""The command telemetry: what telemetry or a record holds, and telemetry written of it."""
+"""The command telemetry, and how commands read a record: what its file does not say."""
 
 from __future__ import annotations
 
 from argparse import Namespace
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli import loop_records
-from lbt_synth.cli.arguments import given_options
+from lbt_synth.cli.arguments import given_options, refuse_options
 from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report, write_telemetry
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry, load_telemetry
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.files.telemetry.telemetry import LAYERS
+from lbt_synth.identification import LoopRecord, SpectrumRecord, load_record
+from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
 from lbt_synth.identification.records.from_file import is_telemetry, telemetry_of_record
+from lbt_synth.loop import Imaging
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
-from lbt_synth.storage.rows import Facts, fact, fact_table, facts, json_record, json_units
+from lbt_synth.storage.rows import fact, fact_table, facts, json_record, json_units
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
+
+_FACTS = (  # that a file may not hold
+    *("delay_frames", "unit", "command_unit", "diameter_m", "obstruction"),
+    *("axes", "averages", "commands"),
+)
+_READING = (  # options that say how a record is read
+    *_FACTS,
+    *("kind", "frame_rate_hz", "columns", "sensor_gain", "command_increments", "swap_axes"),
+    *("command_shift_frames", "command_sign", "command_matrix", "command_scale"),
+)
+
+
+def require_series(record: LoopRecord | SpectrumRecord, what: str) -> LoopRecord:
+    """Return a record of series; refuse a spectrum, as ``what`` needs the series."""
+    if isinstance(record, SpectrumRecord):
+        raise ProblemError(
+            f"{what} recorded series; got a spectrum. Try lbt-synth identify and lbt-synth design."
+        )
+    return record
+
+
+def is_read_anew(arguments: Namespace) -> bool:
+    """Return whether the command line says anything about how a record is read."""
+    return any(getattr(arguments, name) not in (None, False, 0) for name in _READING)
+
+
+def load_series(
+    arguments: Namespace, axes: Sequence[int] | None = None
+) -> LoopRecord | SpectrumRecord:
+    """Load the record of the command line, or some of its axes, whatever its length."""
+    kind, facts = arguments.kind, {name: getattr(arguments, name) for name in _FACTS}
+    if axes is not None:
+        chosen = facts["axes"]
+        facts["axes"] = list(axes) if chosen is None else [chosen[axis] for axis in axes]
+    record = load_record(
+        arguments.file,
+        kind=None if kind is None else kind.replace("-", "_"),
+        frame_rate_hz=None if kind == "spectrum" else arguments.frame_rate_hz,
+        columns=_parse_columns(arguments.columns),
+        **facts,
+    )
+    repair = CommandRepair(
+        increments=arguments.command_increments,
+        shift_frames=arguments.command_shift_frames,
+        swap_axes=arguments.swap_axes,
+        sign=tuple(arguments.command_sign or ()),
+        matrix=tuple(arguments.command_matrix or ()),
+        scale=arguments.command_scale or 1.0,
+    )
+    if isinstance(record, SpectrumRecord):
+        if repair.options:
+            raise ProblemError(f"a spectrum has no commands; leave {repair.options} out.")
+        return record
+    options = repair.options
+    if arguments.command_scale is not None and not repair.scales:
+        options = f"{options} --command-scale 1".strip()
+    return replace(
+        repair_commands(record, repair) if repair.options else record,
+        read_with=" ".join(filter(None, (record.read_with, options))),
+        stated_gain=tuple(arguments.sensor_gain or record.stated_gain),
+    )
+
+
+def record_imaging(arguments: Namespace, record: LoopRecord) -> Imaging:
+    """Return the camera of the command line or the record, and the telescope of the record."""
+    facts_of_record = record_telescope(arguments, record)
+    return Imaging(**facts_of_record | {"obstruction": facts_of_record["obstruction"] or 0.0})
+
+
+def record_telescope(arguments: Namespace, record: LoopRecord | SpectrumRecord) -> dict[str, Any]:
+    """Return diameter, obstruction and wavelength: of the command line, else of the record."""
+    if isinstance(record, LoopRecord):
+        obstruction, wavelength_um = record.obstruction, record.imaging_wavelength_um
+    else:
+        obstruction, wavelength_um = arguments.obstruction, None
+    if arguments.wavelength_um is not None:
+        wavelength_um = arguments.wavelength_um
+    camera = Imaging() if wavelength_um is None else Imaging(wavelength_um=wavelength_um)
+    return {
+        "diameter_m": record.diameter_m,
+        "obstruction": obstruction,
+        "wavelength_um": camera.wavelength_um,
+    }
+
+
+def _parse_columns(pairs: Sequence[str] | None) -> dict[str, list[str | int]] | None:
+    """Parse ROLE=NAME[,NAME] pairs; a role without a name has no column."""
+    if pairs is None:
+        return None
+    out: dict[str, list[str | int]] = {}
+    for pair in pairs:
+        role, equals, names = pair.partition("=")
+        if not equals or not role:
+            raise ProblemError(
+                "--columns takes ROLE=NAME or ROLE=NAME,NAME, as in measurements=tip,tilt or "
+                f"density=3,4, and ROLE= for a role that no column has; got {pair!r}."
+            )
+        chosen = names.split(",") if names else []
+        out[role] = [int(name) if name.isdecimal() else name for name in chosen]
+    return out
+
+
+_LOOP = {  # what telemetry says of the loop that it is from: headings and units
+    "name": ("system", ""),
+    "frame_rate_hz": ("frame rate", "Hz"),
+    "delay_frames": ("total delay", "frames"),
+    "sensor_gain": ("sensor gain", ""),
+    "controller_name": ("controller", ""),
+    "controller_digest": ("gain file, SHA-256", ""),
+    "strehl": ("Strehl ratio", ""),
+    "imaging_wavelength_um": ("imaging wavelength", "um"),
+    "psf_pixel_mas": ("pixel of the image", "mas"),
+    "diameter_m": ("telescope diameter", "m"),
+    "obstruction": ("central obstruction", ""),
+    "seed": ("seed", ""),
+}
 
 
 def run(arguments: Namespace) -> Report:
     """Show telemetry, or a record as telemetry, and write it."""
     output = arguments.output
-    if output is None and (arguments.format or arguments.precision):
-        raise ProblemError("--format and --precision are of what -o writes; give -o FILE.")
-    if output is not None:
+    if output is None:
+        refuse_options(arguments, ("format", "precision"), "is of what -o writes; give -o FILE")
+    else:
         require_telemetry_name(output, arguments.format)
         named = given_options(arguments, "file", "commands")
         require_writable(output, inputs=list(named.values()))
     notes: list[str] = []
-    if is_telemetry(arguments.file) and not loop_records.is_read_anew(arguments):
+    if is_telemetry(arguments.file) and not is_read_anew(arguments):
         telemetry = load_telemetry(arguments.file)
     else:
-        record = loop_records.require_series(loop_records.load_series(arguments), "telemetry holds")
+        record = require_series(load_series(arguments), "telemetry holds")
         telemetry = telemetry_of_record(record)
         notes = [
             f"note: {record.health.summary()}",
@@ -68,7 +188,11 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
     }
     units = {name: layer.unit_in(telemetry) for name, _, layer in arrays}
     mirror = telemetry.mirror
-    what = _loop_facts(telemetry)
+    states = telemetry.controller and telemetry.controller.n_states
+    what = facts(
+        **{n: fact(getattr(telemetry, n), text, unit=unit) for n, (text, unit) in _LOOP.items()},
+        controller_states=fact(states, "states of the controller"),
+    )
     mirror_record = None if mirror is None else asdict(mirror)
     report = Report(
         data={
@@ -110,28 +234,6 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
     if more:
         report.add_table("What else the file says", ("name", "value"), more.items())
     return report
-
-
-def _loop_facts(telemetry: Telemetry) -> Facts:
-    """Return what telemetry says of the loop that it is from."""
-    controller = telemetry.controller
-    return facts(
-        name=fact(telemetry.name, "system"),
-        frame_rate_hz=fact(telemetry.frame_rate_hz, "frame rate", unit="Hz"),
-        delay_frames=fact(telemetry.delay_frames, "total delay", unit="frames"),
-        sensor_gain=fact(telemetry.sensor_gain, "sensor gain"),
-        controller_name=fact(telemetry.controller_name, "controller"),
-        controller_digest=fact(telemetry.controller_digest, "gain file, SHA-256"),
-        strehl=fact(telemetry.strehl, "Strehl ratio"),
-        imaging_wavelength_um=fact(
-            telemetry.imaging_wavelength_um, "imaging wavelength", unit="um"
-        ),
-        psf_pixel_mas=fact(telemetry.psf_pixel_mas, "pixel of the image", unit="mas"),
-        diameter_m=fact(telemetry.diameter_m, "telescope diameter", unit="m"),
-        obstruction=fact(telemetry.obstruction, "central obstruction"),
-        seed=fact(telemetry.seed, "seed"),
-        controller_states=fact(controller and controller.n_states, "states of the controller"),
-    )
 
 
 def _rms(series: FloatArray) -> float:

@@ -24,7 +24,7 @@ from lbt_synth.config.build import (
 from lbt_synth.config.schema import FileSection, describe_error
 from lbt_synth.errors import ConfigError, FileError, ProblemError, name_file
 from lbt_synth.loop import Imaging
-from lbt_synth.methods.request import RECORD_NEEDED, DesignRequest, design_request
+from lbt_synth.methods.request import DesignRequest, design_request, refuse_without_record
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.input_files import read_bytes
@@ -114,7 +114,7 @@ class Config(Summarised):
 
     def record_design(self) -> Design:
         """Raise ProblemError: a configuration is no record."""
-        raise ProblemError(RECORD_NEEDED)
+        refuse_without_record()
 
     def size_nm(self, entry: Any, key: str) -> float:
         """Return the size of an entry with ``rms_nm`` or ``rms_mas`` [nm rms wavefront]."""

@@ -276,8 +276,8 @@ class FilterDesign(Design):
         rows = failure_rows(self.problem, self.gain_predictor, self.fallbacks)
         unseen = [row.missing for row in rows if row.must_switch]
         warning = (
-            f"note: unstable if these fail unseen: {'; '.join(unseen)}. The computer of the loop "
-            "has to see such a failure, and take the fall-back filter."
+            f"warning: unstable if these fail unseen: {'; '.join(unseen)}. The loop's "
+            "computer has to see such a failure, and take the fall-back filter."
         )
         notes = [
             "unseen: the readings are zero, or frozen, and the filter believes them: a reading "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from pydantic import ValidationError
 
@@ -16,11 +16,6 @@ if TYPE_CHECKING:
     from lbt_synth.design.result import Design
     from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 
-
-RECORD_NEEDED = (
-    "the method predictor is made of a record; got a plant or a configuration alone. Try lbt-synth "
-    "auto RECORD --method predictor, or design_from_record(record, method='predictor')."
-)
 _SHORT_WORDS = {
     "greater than or equal to": "at least",
     "less than or equal to": "at most",
@@ -95,6 +90,15 @@ def design_request(
     return DesignRequest(method=method, given=dict(given), options=options)
 
 
+def refuse_without_record() -> NoReturn:
+    """Raise ProblemError: the method predictor is made of a record."""
+    raise ProblemError(
+        "the method predictor is made of a record; got a plant or a configuration alone.",
+        in_python="Try design_from_record(record, method='predictor').",
+        at_terminal="Try lbt-synth auto RECORD --method predictor.",
+    )
+
+
 def option_owners(option: str) -> list[str]:
     """Return the names of the methods that take an option."""
     return [m.name for m in METHODS.values() if option in m.options.model_fields]
@@ -164,7 +168,7 @@ class PlantInputs:
     def record_design(self) -> Design:
         """Return the design of the record that the plant was identified from."""
         if self.predict is None:
-            raise ProblemError(RECORD_NEEDED)
+            refuse_without_record()
         return self.predict()
 
     def size_nm(self, entry: Any, key: str) -> float:

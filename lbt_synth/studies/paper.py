@@ -291,11 +291,11 @@ def table_entry(row: PaperRow, modal: RobustnessRow) -> Facts:
     """Put the Strehl ratio of the modal analysis of a row beside the paper's [%]."""
     ours = 100 * modal.strehl
     return facts(
-        label=fact(row.label, key="row"),
-        method=fact(row.method),
-        ours=fact(ours, key="strehl_percent"),
-        paper=fact(row.paper, key="paper_strehl_percent"),
-        difference=fact(ours - row.paper, key="difference_points"),
+        label=fact(row.label, "row", key="row"),
+        method=fact(row.method, "method"),
+        ours=fact(ours, "ours", format=".1f", key="strehl_percent"),
+        paper=fact(row.paper, "paper", format=".1f", key="paper_strehl_percent"),
+        difference=fact(ours - row.paper, "difference", format="+.1f", key="difference_points"),
     )
 
 

@@ -14,7 +14,7 @@ def gains(tmp_path_factory):
     config = lbt.load_config(LBT_YAML)
     designs = {
         "kalman": lbt.kalman(config.plant),
-        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2),
+        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati"),
         "integrator": lbt.integrator(config.hardware, gain=0.5),
     }
     return {name: lbt.save_gain(folder / f"{name}.fits", d) for name, d in designs.items()}

@@ -8,11 +8,11 @@ import pytest
 from support.commands import run
 from support.configs import with_errors
 from support.plants import LBT_YAML
+from support.predictors import made
 from support.robust_config import robust_writer
 
 import lbt_synth as lbt
 from lbt_synth.cli.main import main
-from lbt_synth.storage.display_unit import own_display_unit, show_in
 
 CONFIG = str(LBT_YAML)
 
@@ -42,27 +42,9 @@ COMMANDS = {
 
 def run_on(capsys, files, command, *options):
     words = [word.format(files) for word in COMMANDS[command]]
-    assert main([*command.split(), *words, *options]) == 0
-    return capsys.readouterr().out
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_no_nanometre_is_left(capsys, files, command):
-    unit = "urad"  # the other one is in configurations below
-    option = "--show-unit" if command == "identify" else "--unit"
-    out = run_on(capsys, files, command, option, unit)
-    assert unit in out
-    assert re.findall(r".*\bnm\b.*", out) == []
-
-
-def test_no_nanometre_is_left_on_a_page(capsys, files):
-    page = files / "r.html"
-    words = ["report", f"{files}/c.yaml", f"{files}/k.fits", "--unit", "mas", "-o", str(page)]
-    assert main(words) == 0
-    text = re.sub(r"(?s)<(script|style|pre)\b.*?</\1>|<[^>]+>", " ", page.read_text())
-    assert re.findall(r".*\bnm\b.*", text) == []
-    assert re.search(r"noise per frame [\d.]+ mas ", " ".join(text.split()))
-    capsys.readouterr()
+    status, text, _ = run(capsys, command, *words, *options)
+    assert status == 0
+    return text
 
 
 def test_the_numbers_are_those_of_the_diameter(capsys, files):
@@ -86,30 +68,11 @@ def test_json_stays_in_nanometres(capsys, files):
     assert one == other
 
 
-def test_a_configuration_may_choose(capsys, files, tmp_path):
-    own = tmp_path / "own.yaml"
-    own.write_text((files / "c.yaml").read_text() + "\nunits: mas\n")
-    assert main(["robustness", str(own)]) == 0
-    assert "kalman [mas]" in capsys.readouterr().out
-    assert main(["robustness", str(own), "--unit", "nm"]) == 0
-    assert "kalman [nm]" in capsys.readouterr().out
-
-
 def test_an_angle_needs_a_diameter(capsys, tmp_path):
     plant = lbt.load_config(CONFIG).plant
     lbt.save_gain(tmp_path / "bare.fits", lbt.kalman(plant))
     assert main(["show", str(tmp_path / "bare.fits"), "--unit", "mas"]) == 2
     assert "telescope's diameter, which is not known here" in capsys.readouterr().err
-
-
-def test_modes_beside_tilt_have_lengths_only(capsys, tmp_path):
-    words = ["modal", CONFIG, "--modes", "6", "-o", str(tmp_path / "m.svg")]
-    assert main([*words, "--unit", "um"]) == 0
-    out = capsys.readouterr().out
-    assert " um rms of turbulence" in out
-    assert re.findall(r".*\bnm\b.*", out) == []
-    assert main([*words, "--unit", "mas"]) == 2
-    assert "--unit mas is an angle of tip and tilt" in capsys.readouterr().err
 
 
 def test_telemetry_is_shown_in_an_angle(capsys, files):
@@ -118,30 +81,14 @@ def test_telemetry_is_shown_in_an_angle(capsys, files):
     assert main(["telemetry", path, "--json"]) == 0
     data = json.loads(capsys.readouterr().out)
     assert data["units"]["residual_nm"] == "nm"
-    assert main(["telemetry", path, "--unit", "mas"]) == 0
+    assert main(["telemetry", path, "--show-unit", "mas"]) == 0
     (row,) = re.findall(r"residual_nm .*", capsys.readouterr().out)
     scale = lbt.models.nm_per_mas(data["diameter_m"])
     assert float(row.split()[-1]) == pytest.approx(data["rms"]["residual_nm"] / scale, rel=1e-5)
     assert row.split()[-2] == "mas"
 
 
-def test_a_demand_has_its_limit_in_the_unit():
-    step = lbt.design.shaping.CommandRms(at_most_nm=30.0, turbulence=None, noise_nm=5.0)
-    with own_display_unit():
-        show_in("mas", 10.0)
-        assert step.label == "command stroke of at most 3 mas rms"
-    assert step.label == "command stroke of at most 30 nm rms"
-
-
 LINE = "{kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}"
-SHAKEN = """
-  robust:
-    bands:
-      - {low_hz: 19.0, high_hz: 21.0, rms_mas: 80.0, axis: tip}
-    modulus_margin: 0.8
-    functions: 12
-    states: null
-"""
 
 
 def truth_of(capsys, *arguments):
@@ -174,15 +121,6 @@ def test_design_and_show_give_the_residual_in_the_truth(tmp_path, capsys, config
     assert "35 % above the 37.8 nm of the best linear one" in " ".join(text.split())
 
 
-def test_the_wavelength_is_that_of_the_file(tmp_path, capsys):
-    path = tmp_path / "k_band.yaml"
-    path.write_text(LBT_YAML.read_text().replace("wavelength_um: 2.2", "wavelength_um: 1.65"))
-    gain = tmp_path / "g.npz"
-    status, text, _ = run(capsys, "design", path, "--method", "integrator", "-o", gain)
-    assert (status, "In the truth of k_band.yaml; Strehl ratio at 1.65 um" in text) == (0, True)
-    assert "at 1.65 um" in run(capsys, "show", gain)[1]
-
-
 def test_a_residual_that_the_design_does_not_expect_is_a_warning(tmp_path, capsys):
     gain = tmp_path / "g.fits"
     still = LBT_YAML.with_name("lbt_robust.yaml")  # its model has no vibration
@@ -201,22 +139,6 @@ def test_a_residual_that_the_design_does_not_expect_is_a_warning(tmp_path, capsy
     assert status == 0
     assert "a vibration of the truth drifts" in text
     assert "In the truth" not in text
-
-
-def test_a_demand_that_costs_residual_is_named(tmp_path, capsys):
-    model = (
-        "    kind: ar2",
-        (
-            "    kind: ar2\n  vibrations:\n"
-            "    - {axis: tip, frequency_hz: 20.0, damping: 0.005, rms_mas: 80.0}"
-        ),
-    )
-    path, gain = robust_writer(tmp_path)(SHAKEN, model=model), tmp_path / "r.fits"
-    status, text, _ = run(capsys, "design", path, "--method", "robust", "-o", gain)
-    assert status == 0
-    better = [line for line in text.splitlines() if "leaves less in the truth" in line]
-    assert better
-    assert all("it violates: modulus margin of at least 0.8" in line for line in better)
 
 
 def test_an_unstable_loop_in_the_truth_is_told(tmp_path, capsys):
@@ -259,3 +181,57 @@ def test_one_configuration_is_one_unit(capsys, files, tmp_path, command):
     assert status == 0
     assert f" {unit}" in out or f"[{unit}" in out
     assert re.findall(r".*\bnm\b.*", out) == []
+
+
+@pytest.mark.parametrize("command", ["simulate", "compare", "report"])
+def test_a_truth_that_moves_no_accelerometer_says_nothing_of_a_predictor(tmp_path, capsys, command):
+    gain = lbt.save_gain(tmp_path / "p.fits", made(residual_nm=106.2, alone_nm=167.4))
+    output = ("-o", tmp_path / "r.html") if command == "report" else ()
+    status, text, error = run(capsys, command, CONFIG, gain, *output)
+    assert (status, text) == (2, "")
+    assert f"{gain} reads a, ..., which nothing in the truth of lbt.yaml moves; its" in error
+    assert f"record shows 106 nm: lbt-synth show {gain}." in error
+
+
+def test_show_says_what_accelerometers_buy(tmp_path, capsys):
+    gain = lbt.save_gain(tmp_path / "p.fits", made(residual_nm=106.2, alone_nm=167.4))
+    status, text, _ = run(capsys, "show", gain)
+    assert status == 0
+    assert " ".join(text.split()).startswith(
+        "The least-squares predictor leaves 106 nm with the accelerometers, 167 nm without them, "
+        "on unseen frames of its record."
+    )
+    status, _, error = run(
+        capsys, "design", CONFIG, "--method", "predictor", "-o", tmp_path / "q.fits"
+    )
+    assert (status, error) == (
+        2,
+        "lbt-synth: error: the method predictor is made of a record; got a plant or a "
+        "configuration alone. Try lbt-synth auto RECORD --method predictor.\n",
+    )
+
+
+SHAKEN = """
+  robust:
+    bands:
+      - {low_hz: 19.0, high_hz: 21.0, rms_mas: 80.0, axis: tip}
+    modulus_margin: 0.8
+    functions: 12
+    states: null
+"""
+
+
+def test_a_demand_that_costs_residual_is_named(tmp_path, capsys):
+    model = (
+        "    kind: ar2",
+        (
+            "    kind: ar2\n  vibrations:\n"
+            "    - {axis: tip, frequency_hz: 20.0, damping: 0.005, rms_mas: 80.0}"
+        ),
+    )
+    path, gain = robust_writer(tmp_path)(SHAKEN, model=model), tmp_path / "r.fits"
+    status, text, _ = run(capsys, "design", path, "--method", "robust", "-o", gain)
+    assert status == 0
+    better = [line for line in text.splitlines() if "leaves less in the truth" in line]
+    assert better
+    assert all("it violates: modulus margin of at least 0.8" in line for line in better)

@@ -146,45 +146,25 @@ WITHOUT_INPUTS = {"paper", "init", "explore"}
 # name of the input that it would replace.
 CASES = {
     "design": ("config.yaml", "config.yaml --method integrator -o OUT.fits"),
-    "export mat": ("gain.fits", "gain.fits --for matlab -o OUT.mat"),
-    "export dao": ("gain.fits", "gain.fits --for dao -o OUT.fits"),
-    "export c": ("gain.fits", "gain.fits --for c -o OUT.c"),
-    "export pyrtc": ("gain.fits", "gain.fits --for pyrtc -o .", "config.yaml.certificate.json"),
-    "export c header": ("gain.fits", "gain.fits --for c -o other.c", "other.h"),
-    "rehearse": ("gain.fits", "gain.fits --for dao -o OUT.png"),
-    "rehearse record": ("series.fits", "series.fits gain.fits --for dao -o OUT.pdf"),
-    "plot sigma": ("gain.fits", "sigma gain.fits -o OUT.png"),
-    "plot bode": ("gain.fits", "bode gain.fits -o OUT.png"),
-    "plot nyquist": ("gain.fits", "nyquist gain.fits -o a.csv -o OUT.png"),
-    "plot nichols": ("gain.fits", "nichols gain.fits -o OUT.pdf"),
-    "plot step": ("gain.fits", "step gain.fits -o OUT.csv"),
+    "export": ("gain.fits", "gain.fits --for c -o other.c", "other.h"),
+    "rehearse": ("series.fits", "series.fits gain.fits --for dao -o OUT.pdf"),
+    "plot": ("gain.fits", "nyquist gain.fits -o a.csv -o OUT.png"),
     "simulate": ("gain.fits", "config.yaml gain.fits -o OUT.png"),
-    "simulate config": ("config.yaml", "config.yaml gain.fits -o OUT.png"),
     "simulate telemetry": ("gain.fits", "config.yaml gain.fits --frames 50 --telemetry OUT.fits"),
     "telemetry": ("series.fits", "series.fits -o OUT.fits"),
     "auto": ("series.fits", "series.fits -o OUT.fits"),
-    "diagnose": ("series.fits", "series.fits -o OUT.html"),
-    "diagnose pdf": ("series.fits", "series.fits -o a.html --pdf OUT.pdf"),
-    "diagnose gain": ("gain.fits", "series.fits gain.fits -o OUT.html"),
-    "identify": ("series.fits", "series.fits -o a.yaml --figure OUT.png"),
-    "identify commands": ("config.yaml", "series.fits --commands config.yaml -o OUT.yaml"),
+    "diagnose": ("gain.fits", "series.fits gain.fits -o a.html --pdf OUT.pdf"),
+    "identify": ("config.yaml", "series.fits --commands config.yaml -o OUT.yaml"),
     "compare": ("gain.fits", "config.yaml gain.fits -o OUT.csv"),
     "robustness": ("config.yaml", "config.yaml -o OUT.csv"),
-    "robustness gain": ("gain.fits", "config.yaml gain.fits -o a.csv -o OUT.png"),
-    "report": ("gain.fits", "config.yaml gain.fits -o OUT.html"),
-    "report config": ("config.yaml", "config.yaml gain.fits -o OUT.html"),
-    "report pdf": ("gain.fits", "config.yaml gain.fits -o a.html --pdf OUT.pdf"),
+    "report": ("gain.fits", "config.yaml gain.fits -o a.html --pdf OUT.pdf"),
     "tradeoff": ("config.yaml", "config.yaml -o OUT.csv"),
-    "limits": ("config.yaml", "config.yaml -o OUT.csv"),
-    "limits gain": ("gain.fits", "config.yaml gain.fits -o OUT.pdf"),
+    "limits": ("gain.fits", "config.yaml gain.fits -o OUT.pdf"),
     "mirror": ("config.yaml", "config.yaml -o OUT.png"),
     "modal": ("config.yaml", "config.yaml -o OUT.csv"),
     "end-to-end": ("gain.fits", "config.yaml gain.fits -o .", "telemetry.fits"),
-    "end-to-end config": ("config.yaml", "config.yaml gain.fits -o .", "summary.json"),
     "end-to-end tables": ("gain.fits", "config.yaml gain.fits -o . --tables II", "table_ii.csv"),
-    "study": ("config.yaml", "study.yaml -o .", "a.fits"),
-    "study configuration": ("config.yaml", "study.yaml -o .", "results.csv"),
-    "study file": ("study.yaml", "study.yaml -o .", "summary.html"),
+    "study": ("study.yaml", "study.yaml -o .", "summary.html"),
     "study row": ("config.yaml", "study.yaml -o . --row 3", "row_3.yaml"),
 }
 
@@ -210,17 +190,14 @@ def test_every_command_that_writes_is_here():
     assert {case.split()[0] for case in CASES} | READ_ONLY | WITHOUT_INPUTS == set(COMMANDS)
 
 
-@pytest.mark.parametrize("link", [os.symlink, os.link], ids=["symbolic link", "hard link"])
 @pytest.mark.parametrize("case", CASES)
-def test_an_output_that_is_an_input_is_refused(
-    tmp_path, capsys, monkeypatch, originals, case, link
-):
+def test_an_output_that_is_an_input_is_refused(tmp_path, capsys, monkeypatch, originals, case):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(originals, tmp_path, dirs_exist_ok=True)
     source, words, *target = CASES[case]
     arguments = words.split()
     taken = target[0] if target else next(a for a in arguments if a.startswith("OUT"))
-    link(tmp_path / source, tmp_path / taken)
+    os.link(tmp_path / source, tmp_path / taken)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     status, out, error = run(capsys, case.split()[0], *arguments)
     assert (status, out) == (2, "")
@@ -298,7 +275,21 @@ def test_what_is_printed_is_cut_to_a_screen(capsys):
     report.print(verbose=True)
     text = capsys.readouterr().out
     assert all(word in text for word in ("remark", "r17", "note: 29"))
+    long = f"assumes: the sensor gain lies {'between two limits ' * 40}."
+    report.notes += [long, "assumes: the commands are as recorded.", "warning: unstable."]
+    report.print()
+    lines = capsys.readouterr().out.splitlines()
+    kept = [line for line in lines if line.endswith(("(--verbose)", "recorded.", "unstable."))]
+    assert (len(lines), len(kept)) == (25, 3)  # what an assumption says is never left out
+    assert sum("between two limits" in line for line in lines) == 5
     report.tables.clear()
+    wide = [f"a heading of column {i}" for i in range(12)]
+    report.add_table("Wide", wide, [["1234.5678901"] * 12] * 9)
+    report.print()
+    cut = capsys.readouterr().out.splitlines()
+    assert (len(cut), cut[-2]) == (25, "... more with --verbose")
+    assert [line for line in cut if line in kept] == kept
+    report = Report()
     report.add_table("Facts", ("quantity", "value"), [(f"q{i}", i) for i in range(40)])
     report.print()
     assert re.findall(r"  (q\d+)", capsys.readouterr().out) == [f"q{i}" for i in range(12)]

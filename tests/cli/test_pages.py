@@ -1,22 +1,24 @@
-"""The commands report and explore: their files, their output, and their errors."""
+"""The commands plot, report and explore: their files, their output, and their errors."""
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
+import shutil
 import signal
 import socket
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from urllib.request import urlopen
 
+import numpy as np
 import pytest
 from support.commands import hear_interruptions, run
 from support.design_reports import SMALL, three_designs
 from support.pages import Reader
-from support.plants import LBT_YAML, lbt_axis_plant
+from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 
@@ -36,11 +38,6 @@ def config(folder):
 @pytest.fixture(scope="module")
 def designs(config):
     return three_designs(config)
-
-
-@pytest.fixture(scope="module")
-def report(config, designs):
-    return lbt.report.design_report(config, designs)
 
 
 def test_command(folder, designs, capsys, monkeypatch):
@@ -113,85 +110,6 @@ def test_pages_name_no_directories(folder, designs, tmp_path, capsys):
     assert str(tmp_path) not in text
 
 
-@pytest.mark.parametrize("name", ["red\x1b[31m", "two\nlines", "bad\udcff", "turned\u202e"])
-def test_names_that_no_page_can_show_are_escaped(folder, designs, tmp_path, capsys, name):
-    lbt.save_gain(tmp_path / "k.fits", designs["slow"])
-    odd = (tmp_path / "k.fits").rename(tmp_path / f"{name}.fits")
-    page = tmp_path / "r.html"
-    status, out, error = run(capsys, "report", str(folder / "small.yaml"), str(odd), "-o", page)
-    assert (status, error) == (0, "")
-    escaped = name.encode("unicode_escape").decode()
-    assert f"Least residual: {escaped}, " in out
-    assert "<h1>Controllers for small.yaml</h1>" in page.read_text()
-
-
-@pytest.fixture(scope="module")
-def gains(folder, designs, config):
-    lbt.save_gain(folder / "ok.fits", designs["slow"])
-    lbt.save_gain(folder / "one_axis.fits", lbt.kalman(lbt_axis_plant(modes=1)))
-    other = replace(config.hardware, frame_rate_hz=1000.0)
-    lbt.save_gain(folder / "fast.fits", lbt.integrator(other, gain=0.4))
-    walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    lbt.save_gain(folder / "bare.fits", lbt.kalman(walk))
-    drift = SMALL.replace(
-        "{kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}",
-        "{kind: drift, axis: tip, frequency_hz: 20.0, end_hz: 21.0, duration_s: 5.0, rms_mas: 80.0}",
-    )
-    (folder / "drift.yaml").write_text(drift)
-    return folder
-
-
-@pytest.mark.parametrize(
-    ("arguments", "text"),
-    [
-        (
-            ("small.yaml", "one_axis.fits", "-o", "x.html"),
-            "one_axis must be for the configuration's 2",
-        ),
-        (("small.yaml", "fast.fits", "-o", "x.html"), "800 Hz; got a design for 1000 Hz"),
-        (("small.yaml", "bare.fits", "-o", "x.html"), "bare estimation problem"),
-        (("small.yaml", "ok.fits", "-o", "x.pdf"), "a page must end in .html; got 'x.pdf'"),
-        (("small.yaml", "ok.fits", "-o", "x.html", "--pdf", "x.ps"), "a page must end in .pdf"),
-        (("small.yaml", "ok.fits", "-o", "x.html", "--title", " "), "--title must hold"),
-        (("drift.yaml", "ok.fits", "-o", "x.html"), "a truth that is stationary"),
-    ],
-)
-def test_bad_input_ends_in_one_line(gains, capsys, monkeypatch, arguments, text):
-    monkeypatch.chdir(gains)
-    status, out, error = run(capsys, "report", *arguments)
-    assert (status, out) == (2, "")
-    assert text in error
-    assert error.count("\n") == 1
-    assert not Path("x.html").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--port", "70000"), "--port must be at most 65535"),
-        (("--origin", "http://a:8"), "--origin must be HOST:PORT, as localhost:8080; got"),
-        (("--origin", "a\x07b:8"), "--origin must be HOST:PORT, as localhost:8080; got"),
-        (("--origin", "a:123456"), "--origin must be HOST:PORT, as localhost:8080; got"),
-        (("-o", "nowhere"), "no directory nowhere"),
-        (("nothing.fits",), "nothing.fits"),
-    ],
-)
-def test_wrong_words_are_refused(capsys, tmp_path, monkeypatch, words, message):
-    monkeypatch.chdir(tmp_path)
-    status, out, error = run(capsys, "explore", LBT_YAML, *words)
-    assert (status, out) == (2, "")
-    assert message in error
-    assert error.count("\n") == 1
-
-
-def test_a_design_for_another_loop_is_refused(capsys, tmp_path):
-    design = lbt.integrator(lbt.LoopHardware(frame_rate_hz=500), gain=0.3)
-    lbt.save_gain(tmp_path / "slow.fits", design)
-    status, _, error = run(capsys, "explore", LBT_YAML, tmp_path / "slow.fits")
-    assert status == 2
-    assert "slow must run at the configuration's 800 Hz" in error
-
-
 @pytest.mark.parametrize(
     ("host", "message"),
     [
@@ -229,3 +147,80 @@ def test_it_serves_until_it_is_interrupted(tmp_path):
     assert "<title>Explore lbt.yaml</title>" in text
     assert (process.returncode, error) == (0, "")
     assert json.loads(out) == {"url": url, "files": []}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("report lbt.yaml k.fits -o x.pdf", "a page must end in .html; got 'x.pdf'"),
+        ("report lbt.yaml k.fits -o x.html --title ", "--title must hold at least one letter"),
+        ("report lbt.yaml FAST.fits -o x.html", "must run at the configuration's 800 Hz; got"),
+        ("explore lbt.yaml --port 70000", "--port must be at most 65535"),
+        (
+            "explore lbt.yaml --origin a\x07b:8",
+            "--origin must be HOST:PORT, as localhost:8080; got",
+        ),
+        ("explore lbt.yaml -o nowhere", "no directory nowhere"),
+        ("explore lbt.yaml FAST.fits", "must run at the configuration's 800 Hz; got a design for"),
+    ],
+)
+def test_wrong_words_are_refused(capsys, tmp_path, monkeypatch, designs, words, message):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(LBT_YAML, "lbt.yaml")
+    lbt.save_gain("k.fits", designs["slow"])
+    lbt.save_gain("FAST.fits", lbt.integrator(lbt.LoopHardware(frame_rate_hz=500), gain=0.3))
+    status, out, error = run(capsys, *words.split(" "))
+    assert (status, out, error.count("\n")) == (2, "", 1)
+    assert message in error
+    assert not (tmp_path / "x.html").exists()
+
+
+VIEWS = ("bode", "nyquist", "nichols", "step", "sigma")
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_a_view_writes_its_figure_and_its_points(view, tmp_path, capsys, gains):
+    figure, table = tmp_path / f"{view}.png", tmp_path / f"{view}.csv"
+    status, text, _ = run(
+        capsys, "plot", view, gains["kalman"], gains["integrator"], "-o", figure, "-o", table
+    )
+    assert status == 0
+    assert text.startswith("kalman survives 0.47 frames more delay")
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    data = json.loads(run(capsys, "plot", view, gains["kalman"], gains["integrator"], "--json")[1])
+    with table.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["design"] for row in rows} == set(data["curves"]) == {"kalman", "integrator"}
+    for name, curves in data["curves"].items():
+        for quantity, values in curves.items():
+            written = [float(row[quantity]) for row in rows if row["design"] == name]
+            assert written == values
+    assert "error" in data["curves"]["kalman"] or view != "sigma"
+    assert "error" not in data["curves"]["integrator"]
+
+
+def test_points_of_a_loop_are_those_of_an_integrator(capsys, gains):
+    data = json.loads(run(capsys, "plot", "nyquist", gains["integrator"], "--json")[1])
+    found = {name: np.array(values) for name, values in data["curves"]["integrator"].items()}
+    z = np.exp(2j * np.pi * found["frequency_hz"] / 800)
+    expected = 0.5 * z**-2 / (1 - 1 / z)
+    assert found["real"] + 1j * found["imaginary"] == pytest.approx(expected, rel=1e-6)
+    assert found["gain_db"] == pytest.approx(20 * np.log10(np.abs(expected)), abs=1e-6)
+    assert (data["units"]["gain_db"], data["units"]["phase_deg"]) == ("dB", "deg")
+
+
+def test_overshoot_and_settling_time(capsys, gains):
+    status, text, _ = run(capsys, "plot", "step", gains["integrator"])
+    assert status == 0
+    assert "settling time, to 5 % [ms]" in text
+    (row,) = json.loads(run(capsys, "plot", "step", gains["integrator"], "--json")[1])["steps"]
+    assert row["overshoot_percent"] == pytest.approx(25.0)  # 1, 1, 0.5, 0, -0.25, -0.25, ...
+
+
+def test_without_a_stable_loop_there_is_nothing_to_draw(tmp_path, capsys, gains):
+    out = tmp_path / "bode.csv"
+    status, _, error = run(
+        capsys, "plot", "bode", gains["integrator"], "--gain-factor", 3, "-o", out
+    )
+    assert (status, out.exists()) == (1, False)
+    assert "no loop is stable at 3 times the sensor gain" in error

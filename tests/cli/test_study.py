@@ -8,15 +8,25 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.commands import run
-from support.studies import TWO, assert_whole, part_rows, read_table, study_file
+from support.studies import (
+    TWO,
+    assert_whole,
+    evaluate_quickly,
+    part_rows,
+    read_table,
+    study_file,
+)
 
 import lbt_synth as lbt
 from lbt_synth.cli.study import _estimate as estimate
+from lbt_synth.cli.study import connect_cluster
+from lbt_synth.errors import NumericalError
 from lbt_synth.studies.study.sample import evaluate_samples
 
 
@@ -65,7 +75,6 @@ def test_the_command(tmp_path, capsys):
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--dry-run", "--verbose")
     assert status == 0
     assert "200" in out
-    assert "uniform from 100 to 900" in out
     assert "nothing was written" in out
     assert not (tmp_path / "out").exists()
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--verbose")
@@ -80,7 +89,7 @@ def test_the_command(tmp_path, capsys):
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--verbose")
     assert status == 0
     assert "is finished: 200 samples in results.csv; none computed" in out
-    for text in ("50th percentile", "Worst samples of b", "sensor_gain", "unchanged: "):
+    for text in ("50th percentile", "sensor_gain", "unchanged: "):
         assert text in out
     page = tmp_path / "out" / "summary.html"
     page.write_text("changed")
@@ -112,7 +121,6 @@ def test_an_estimate(tmp_path, monkeypatch):
     cost = estimate(loaded, 1)
     assert 4 < cost.seconds < 9
     assert cost.measured_rows == 5000
-    assert cost.disk_bytes == 5000 * 21 * 9
     assert estimate(loaded, 100).seconds < 0.09
 
 
@@ -122,6 +130,7 @@ def test_json(tmp_path, capsys):
     cost = json.loads(out)
     assert (status, cost["samples"], cost["workers"]) == (0, 20, 1)
     assert cost["seconds"] > 0
+    assert "uniform from 100 to 900" in cost["parameters"].values()
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--json")
     data = json.loads(out)
     assert (status, data["computed"], data["failures"]) == (0, 20, 0)
@@ -131,25 +140,6 @@ def test_json(tmp_path, capsys):
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--row", "3", "--json")
     again = json.loads(out)
     assert again["fresh"]["slow.strehl"] == pytest.approx(again["stored"]["slow.strehl"], rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--jobs", "0"), "--jobs must be at least 1; got 0"),
-        (("--jobs", "100000"), "jobs must be at most"),
-        (("--row", "-1"), "row must be at least 0"),
-        (("--row", "4"), "rows 0 to 3; got row 4"),
-    ],
-)
-def test_wrong_arguments(tmp_path, capsys, arguments, message):
-    path = study_file(tmp_path, samples="4")
-    status, out, error = run(capsys, "study", path, "-o", tmp_path / "out", *arguments)
-    assert (status, out) == (2, "")
-    assert message in error
-    assert error.count("\n") == 1
-    if "--row" in arguments:
-        assert not (tmp_path / "out").exists()
 
 
 def test_dask_without_its_package(tmp_path, capsys, monkeypatch):
@@ -257,7 +247,7 @@ def test_an_encrypted_scheduler(tmp_path, capsys, certificate, monkeypatch):
     from distributed import LocalCluster
     from distributed.security import Security
 
-    monkeypatch.setattr("lbt_synth.cli.engine._TIMEOUT_S", 5)
+    monkeypatch.setattr("lbt_synth.cli.study._TIMEOUT_S", 5)
     # distributed keeps the standard error of the test that loaded it, which has ended
     monkeypatch.setattr(logging, "raiseExceptions", False)
     own, key = map(str, certificate)
@@ -286,7 +276,7 @@ def test_an_encrypted_scheduler(tmp_path, capsys, certificate, monkeypatch):
 @pytest.mark.e2e
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport", ""])
 def test_no_scheduler(tmp_path, capsys, address, monkeypatch):
-    monkeypatch.setattr("lbt_synth.cli.engine._TIMEOUT_S", 1)
+    monkeypatch.setattr("lbt_synth.cli.study._TIMEOUT_S", 1)
     path = study_file(tmp_path, samples="4", parameters=PARAMETERS)
     before = time.monotonic()
     status, _, error = run(capsys, "study", path, "-o", tmp_path / "out", "--dask", address)
@@ -300,7 +290,7 @@ def test_no_scheduler(tmp_path, capsys, address, monkeypatch):
 def test_a_scheduler_without_workers(tmp_path, capsys, monkeypatch):
     from distributed import LocalCluster
 
-    monkeypatch.setattr("lbt_synth.cli.engine._TIMEOUT_S", 1)
+    monkeypatch.setattr("lbt_synth.cli.study._TIMEOUT_S", 1)
     path = study_file(tmp_path, samples="4", parameters=PARAMETERS)
     with LocalCluster(n_workers=0, dashboard_address=":0") as empty:
         status, _, error = run(
@@ -308,3 +298,39 @@ def test_a_scheduler_without_workers(tmp_path, capsys, monkeypatch):
         )
     assert status == 2
     assert "has no workers; start some with" in error
+
+
+def kills_its_worker(study, values, start):
+    """The first process that gets rows from 30 on ends; the file that it makes stops the others."""
+    if start >= 30:
+        with contextlib.suppress(FileExistsError):
+            Path(os.environ["STUDY_DIED"]).touch(exist_ok=False)
+            time.sleep(0.5)  # so that the first rows are written
+            os.kill(os.getpid(), signal.SIGKILL)
+    return evaluate_quickly(study, values, start)
+
+
+@pytest.mark.e2e
+def test_a_worker_killed_on_dask(tmp_path, monkeypatch):
+    """Two workers, of which one is killed: the study is started again, and nothing is lost."""
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setenv("STUDY_DIED", str(tmp_path / "died"))
+    study = lbt.studies.load_study(study_file(tmp_path, samples="60", parameters=PARAMETERS))
+    folder = tmp_path / "out"
+    folder.mkdir()
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
+    with distributed.LocalCluster(**options) as cluster:
+        cluster.scheduler.allowed_failures = 0  # one death is enough
+        with connect_cluster(cluster.scheduler_address) as (executor, workers):
+            assert workers == 2
+            run = partial(
+                lbt.studies.run_study, study, folder, executor=executor, workers=workers,
+                evaluate=kills_its_worker,
+            )  # fmt: skip
+            with pytest.raises(NumericalError, match="start the study again"):
+                run()
+            kept = sum(stop - start for start, stop in part_rows(folder))
+            assert 0 < kept < 60
+            again = run()
+    assert (again.computed, again.failures) == (60 - kept, ())
+    assert_whole(folder, study)

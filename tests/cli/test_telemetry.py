@@ -60,19 +60,9 @@ def test_what_is_in_a_file(capsys, night):
     status, text, error = run(capsys, "telemetry", night, "--verbose")
     assert (status, error) == (0, "")
     seen = full(name="LBT")
-    for words in (
-        "6 frames",
-        "2 modes",
-        "slopes",
-        "6 x 8",
-        "pixel",
-        "frame rate",
-        "2.25",
-        "mirror_taps",
-        "mirror, natural_frequency_hz",
-        seen.convention,
-    ):
-        assert words in text
+    words = "6 frames/2 modes/slopes/6 x 8/pixel/frame rate/2.25/mirror_taps"
+    for part in (*words.split("/"), "mirror, natural_frequency_hz", seen.convention):
+        assert part in text
     status, text, _ = run(capsys, "telemetry", night, "--json")
     data = json.loads(text)
     assert status == 0
@@ -173,19 +163,11 @@ def test_an_open_loop_is_read_once_and_a_spectrum_is_not(tmp_path, capsys):
 
 
 def test_bad_input_is_one_line(tmp_path, capsys, night, gain):
-    damaged = tmp_path / "damaged.fits"
-    damaged.write_bytes(night.read_bytes()[:-2880])
     for arguments, words in (
-        (("telemetry", tmp_path / "none.fits"), "No such file or directory"),
-        (("telemetry", damaged), "is no telemetry file, or it is damaged"),
         (("telemetry", gain), "names do not tell what the columns are"),
-        (("telemetry", night, "--format", "npz"), "--format and --precision are of what -o writes"),
-        (("telemetry", night, "--precision", "float32"), "--format and --precision"),
+        (("telemetry", night, "--format", "npz"), "--format is of what -o writes; give -o FILE."),
         (("telemetry", night, "-o", tmp_path / "t.txt"), "must end in .fits, .npz or .aot.fits"),
-        (("telemetry", night, "-o", tmp_path / "t.fits", "--format", "npz"), "does not fit"),
-        (("telemetry", night, "-o", tmp_path / "no" / "t.fits"), "no directory"),
         (("simulate", LBT_YAML, gain, "--telemetry", "t.txt"), "telemetry must end in"),
-        (("simulate", LBT_YAML, gain, "--telemetry", tmp_path / "no" / "t.fits"), "no directory"),
     ):
         status, text, error = run(capsys, *arguments)
         assert (status, text) == (2, "")

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.predictors import BASE, HEARING, PATH, coefficients, made, readings
 
 import lbt_synth as lbt
 from lbt_synth.design.predictor import (
-    PredictorDesign,
     command_rms,
     predictor_design,
     reduce_filter,
@@ -17,27 +17,6 @@ from lbt_synth.design.predictor import (
 )
 from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.loop.closed_loop import youla_controller, youla_parameter
-from lbt_synth.models import Accelerometer, SensorSuite
-
-PATH = lbt.LoopHardware(frame_rate_hz=500, delay_frames=2.3, sensor_matrix=[[0.7, 0.1], [0, 0.9]])
-BASE = lbt.integrator(PATH, gain=0.3).controller
-SENSOR = Accelerometer(
-    name="acc", rate_hz=500, delay_frames=2.3, channels=("a", "b", "c"), noise_m_s2=1e-3
-)
-HEARING = replace(PATH, suite=SensorSuite(sensors=(SENSOR,)))
-
-
-def coefficients(signals: int, taps: int = 6) -> np.ndarray:
-    return 0.1 * np.random.default_rng(3).standard_normal((taps, 2, signals))
-
-
-def readings(channels: int = 3, frames: int = 4000) -> np.ndarray:
-    return np.random.default_rng(4).standard_normal((frames, 2 + channels))
-
-
-def made(**claims: float) -> PredictorDesign:
-    filters = [regression_filter(PATH, BASE, coefficients(n)) for n in (7, 4)]
-    return predictor_design(HEARING, filters, readings(), 100.0, what="test", **claims)
 
 
 def test_a_parameter_undoes_its_controller() -> None:

@@ -8,6 +8,7 @@ import lbt_synth as lbt
 from lbt_synth.design import shaping
 from lbt_synth.design.shaping import Attenuation, CommandRms, LoopErrors, MovingSensorGain
 from lbt_synth.design.shaping.channel import mode_loop
+from lbt_synth.storage.display_unit import own_display_unit, show_in
 
 DEMANDS = [
     shaping.ModulusMargin(at_least=0.4),
@@ -104,3 +105,11 @@ def test_a_moving_gain_that_clashes_is_named():
     with pytest.raises(lbt.errors.InfeasibleError) as caught:
         shaped(*demands, objective=LINE, functions=16)
     assert any("while the sensor gain moves" in text for text in caught.value.conflict)
+
+
+def test_a_demand_has_its_limit_in_the_unit():
+    step = lbt.design.shaping.CommandRms(at_most_nm=30.0, turbulence=None, noise_nm=5.0)
+    with own_display_unit():
+        show_in("mas", 10.0)
+        assert step.label == "command stroke of at most 3 mas rms"
+    assert step.label == "command stroke of at most 30 nm rms"
