@@ -34,7 +34,7 @@ COUNTS = {
     "public names": 230,
     "tuned constants": 660,
     "lines of tests": 34080,
-    "words of docs": 63000,
+    "words of docs": 62300,
 }
 
 
