@@ -79,8 +79,7 @@ browser: $(VENV)/.ready-browser ## pages in headless Chromium (Debian: chromium,
 study: $(VENV)/.ready    ## the long numerical studies
 	$(BIN)/pytest -m study tests
 
-bench: $(VENV)/.ready    ## whole commands beside an earlier version, and speed against peers
-	$(BIN)/python benchmarks/commands.py
+bench: $(VENV)/.ready    ## whole commands and their parts, beside peers and bars
 	$(BIN)/python benchmarks/speed.py
 
 docs: $(VENV)/.ready     ## the documentation, warnings are errors

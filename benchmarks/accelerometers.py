@@ -13,20 +13,18 @@ frames late.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from harness import log_uniform, record_options, run_all, second_order
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
 from lbt_synth.loop.simulation.disturbances import run_oscillator
 from lbt_synth.models.plant.seen_vibration import seen_vibration
-from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
 MARGIN = 100  # frames before and after the record
@@ -55,7 +53,7 @@ def random_lines(rng: np.random.Generator) -> list[lbt.Vibration]:
         out.append(
             lbt.Vibration(
                 frequency_hz=float(frequency),
-                damping=float(np.exp(rng.uniform(np.log(0.002), np.log(0.02)))),
+                damping=log_uniform(rng, 0.002, 0.02),
                 rms_nm=float(rng.uniform(10, 100)),
                 direction=(float(np.cos(angle)), float(np.sin(angle))),
             )
@@ -81,18 +79,15 @@ def case(seed: int, frames: int) -> Case:
     """Draw a loop with accelerometers, and run it."""
     rng = np.random.default_rng([seed, 22])
     lines = random_lines(rng)
-    corner, damping = float(np.exp(rng.uniform(np.log(0.3), np.log(2)))), float(rng.uniform(0.3, 1))
+    corner, damping = log_uniform(rng, 0.3, 2), float(rng.uniform(0.3, 1))
     rms, noise = float(rng.uniform(200, 600)), float(rng.uniform(5, 30))
-    a1, a2, drive = coefficients(2 * np.pi * corner / RATE, damping)
-    turbulence = lbt.models.ARModel(
-        coefficients=[a1, a2], driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=RATE
-    )
+    turbulence = second_order(corner, damping, rms, RATE)
     drawn = [series(line, frames + 2 * MARGIN, rng) for line in lines]
     positions, accelerations = np.array(drawn).transpose(1, 0, 2)
     total = np.array([line.direction for line in lines]).T @ positions[:, MARGIN:-MARGIN]
     slow = lfilter(
         [1],
-        [1, -a1, -a2],
+        np.append(1, -turbulence.coefficients),
         turbulence.driving_rms_nm * rng.standard_normal((2, frames + 20_000)),
     )[:, -frames:]
     late = int(rng.integers(0, 21))
@@ -224,27 +219,17 @@ def true_plant(it: Case, *channels: str) -> lbt.models.TipTiltPlant:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--records", type=int, default=100)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=60)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--designs", action="store_true", help="designs instead of channels")
-    given = parser.parse_args()
+    given = record_options(__doc__, records=100, jobs=2, seconds=60.0, designs=False)
+    frames = int(given.seconds * RATE)
     if given.designs:
-        work = partial(loss, frames=int(given.seconds * RATE))
-        with ProcessPoolExecutor(given.jobs) as pool:
-            lost = np.array(list(pool.map(work, range(given.first, given.first + given.records))))
+        lost = np.array(run_all(partial(loss, frames=frames), given))
         print(f"| variance above that of the filter from the truth, {len(lost)} records | |")
         print("|---|---:|")
         for name, value in (("median", np.median(lost)), ("largest", lost.max())):
             print(f"| {name} | {100 * value:.2f} % |")
         print(f"| within 5 % | {np.sum(lost < 0.05)} |")
         return
-    work = partial(examine, frames=int(given.seconds * RATE))
-    seeds = range(given.first, given.first + given.records)
-    with ProcessPoolExecutor(given.jobs) as pool:
-        results = list(pool.map(work, seeds))
+    results = run_all(partial(examine, frames=frames), given)
     every = {name: [x for each in results for x in each[name]] for name in results[0]}
 
     def share(name: str) -> str:

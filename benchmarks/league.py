@@ -1,19 +1,12 @@
 """Designs of the package and their rivals on records: trained on the past, scored on the future.
 
     python benchmarks/league.py [RECORD ...] [--records 7] [--seconds 30] [--splits 3]
-    python benchmarks/league.py --errors [--records 300] [--seconds 15]
 
 Without files, record k is simulated with the change number k modulo 7; 0 is none. Two axes, an
 integrator runs. What competes on a split has learned from the frames before it only; the best
 integrator in hindsight alone knows the test. The table has the measured residual above the best of
 each record (with noise, geometric mean, %), its standard error, and the share of records within
 1 %; then the same per record.
-
-``--errors`` tells how well the standard errors of paired differences cover the truth. Random loops
-of one axis have turbulence, up to four lines and noise. A Kalman filter with the exact model is
-compared with one whose lines are 0.5 Hz off, and with the best integrator, on one series each. The
-table has the share of records on which the measured difference is within one and within two
-standard errors of that of the exact residuals.
 """
 
 from __future__ import annotations
@@ -24,34 +17,29 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.linalg import block_diag, solve_toeplitz
+from harness import least_squares
+from scipy.linalg import solve_toeplitz
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.design.shaping.channel import Basis, Channel, laguerre_basis
-from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.prediction.residual import (
-    check_series,
     estimate_residual,
-    inverse_sensor,
-    invert,
+    gather,
+    mode_noise,
+    settled_test,
 )
-from lbt_synth.identification.stretches import Stretches, StretchesLike, cut_stretches
-from lbt_synth.linear import Controller
+from lbt_synth.identification.stretches import Stretches, cut_stretches
 from lbt_synth.linear.controller import as_controller
-from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import ComplexArray, FloatArray, integer, number, require_instance
+from lbt_synth.validation import FloatArray
 
+Entry = lbt.Controller | lbt.Design | FloatArray
 CHANGES = ("none", "wind", "seeing", "drifting", "dying", "flux", "gain")
 DELAY, GAIN = 2, 0.35
 AR_ORDER = 20  # of the predictor, as pyRTC's default
 GAIN_TOLERANCE = 1e-3  # of the search for the best integrator
 NEAR = 0.01  # of the best residual: as good as the best
-RATE_HZ = 800.0  # of the loops for --errors
-SHIFT_HZ = 0.5  # of the lines of the wrong model
 
 
 def sampled_resonance(frequency_hz, damping, rate):
@@ -144,76 +132,6 @@ def integrators(hardware: lbt.models.LoopHardware, gains: Sequence[float]) -> lb
     return lbt.Controller(A=eye, B=B, C=eye, D=np.zeros_like(eye), dt_s=hardware.dt_s)
 
 
-_MOST_ORDER = 40
-_MOST_FREQUENCIES = 2048
-_LONG, _LONG_POLE = 80, 0.7  # Laguerre functions of the filter that is then truncated
-
-
-def spectral_design(
-    open_loop: ArrayLike,
-    hardware: LoopHardware,
-    *,
-    order: int = 10,
-    sensor_gain: float = 1.0,
-    stretches: StretchesLike | None = None,
-) -> Controller:
-    """Return the controller whose filter of a given order leaves least of a measured spectrum.
-
-    With a stable filter Q from the pseudo-open-loop series to the command, a loop leaves
-    ``e = (1 - z^-1 M Q) z`` of the series, M the mirror's delay. The mean square of e over the
-    periodogram of z is a sum of squares that is linear in Q: for given poles a least-squares
-    problem, and the poles follow by variable projection (G. H. Golub, V. Pereyra, SIAM J. Numer.
-    Anal. 10, 413 (1973), doi:10.1137/0710036). That such a loop is convex in the measured spectrum
-    is the idea of I. Dinis et al. (arXiv:2410.05123), who bound its norms as well.
-    """
-    require_instance(hardware, LoopHardware)
-    count = integer(order, "order", at_least=2, at_most=_MOST_ORDER)
-    gain = number(sensor_gain, "sensor_gain", above=0)
-    back = inverse_sensor(hardware) / gain
-    need = "a predictor needs a command for every mode, and an influence matrix"
-    to_command = invert(hardware.influence, need)
-    series, parts = check_series(open_loop, hardware.modes, stretches)
-    filters = [_filter_for_axis(column, parts, hardware, count) for column in series.T]
-    A, B, C = (block_diag(*(getattr(each, name) for each in filters)) for name in "ABC")
-    parameter = Controller(
-        A=A, B=B @ back, C=to_command @ C, D=np.zeros(back.shape), dt_s=hardware.dt_s
-    )
-    believed = replace(hardware, sensor_matrix=gain * hardware.sensor)
-    return youla_controller(believed, parameter)
-
-
-def _filter_for_axis(
-    series: FloatArray, stretches: Stretches, hardware: LoopHardware, order: int
-) -> Controller:
-    """Return the filter from one series (frames,) to its command."""
-    rate, single = hardware.frame_rate_hz, hardware.single_mode()
-    found = loop_periodogram(series, None, frame_rate_hz=rate, stretches=stretches)
-    together = -(-len(found.frequency_hz) // _MOST_FREQUENCIES)
-    smooth = found.merge(np.arange(0, len(found.frequency_hz), together))
-    mean = float(np.mean(np.concatenate([series[start:stop] for start, stop in stretches])))
-    f = np.append(0.0, smooth.frequency_hz)
-    power = np.append(mean**2, smooth.measured * smooth.step_hz)
-    size = np.sqrt(power / np.sum(power))
-    path: ComplexArray = Channel(
-        hardware=single, basis=laguerre_basis(1, 0.0, dt_s=hardware.dt_s)
-    ).complementary_rows(f)[:, 0]
-    weight = size * np.abs(path)
-    # |size (1 - path Q)| = |weight / path - weight Q|: Q is fitted to the inverse of the path
-    target = size * np.exp(-1j * np.angle(path))
-    long = laguerre_basis(_LONG, _LONG_POLE, dt_s=hardware.dt_s)
-    few, _ = long.truncated(_fitted(long, f, weight, target), order, f, weight)
-    return few.parameter(_fitted(few, f, weight, target))
-
-
-def _fitted(
-    basis: Basis, frequency_hz: FloatArray, weight: FloatArray, target: ComplexArray
-) -> FloatArray:
-    """Return the coefficients of a weighted response that is closest to a target."""
-    rows = weight[:, None] * basis.response(frequency_hz)
-    columns, goal = (np.concatenate([x.real, x.imag]) for x in (rows, target))
-    return np.asarray(np.linalg.lstsq(columns, goal, rcond=None)[0])
-
-
 @dataclass(frozen=True, eq=False)
 class Split:
     """Frames to learn from, later ones that count, and the model that the first give."""
@@ -231,13 +149,18 @@ class Split:
     def open_loop(self) -> FloatArray:
         return self.record.pseudo_open_loop(self.model.sensor_gains)
 
-    def residual(self, controller: Controller) -> lbt.identification.ResidualEstimate:
-        """Return what a controller would have left of the test."""
+    def residual(self, entry: Entry) -> lbt.identification.ResidualEstimate:
+        """Return what a controller would have left of the test, or a series leaves (frames, n)."""
+        noise = [axis.noise_nm for axis in self.model.axes]
+        if isinstance(entry, np.ndarray):
+            kept = settled_test(self.record.stretches(), self.test, self.hardware)
+            noise_nm2, error = mode_noise(self.hardware, np.diag(np.square(noise)), 0.0)
+            return estimate_residual(gather(entry, kept), kept, noise_nm2, error)
         return lbt.identification.replayed_residual(
             self.open_loop,
-            controller,
+            as_controller(entry),
             self.hardware,
-            noise_nm=[axis.noise_nm for axis in self.model.axes],
+            noise_nm=noise,
             stretches=self.record.stretches(),
             test=self.test,
         )
@@ -281,21 +204,16 @@ def ar_filter(split: Split) -> lbt.Design:
     return lbt.kalman(plant)
 
 
-def fir_predictor(split: Split, taps: int) -> lbt.Controller:
-    """Return the best FIR predictor of the training."""
-    return lbt.identification.least_squares_predictor(
-        split.open_loop, split.hardware, taps=taps, stretches=split.training
-    )[0]
+def fir_predictor(split: Split, taps: int) -> FloatArray:
+    """Return what the best FIR predictor of the training leaves, (frames, n)."""
+    return least_squares(split.open_loop, split.hardware.mirror_taps, taps, split.training)
 
 
-ENTRIES: dict[str, Callable[[Split], lbt.Controller | lbt.Design]] = {
+ENTRIES: dict[str, Callable[[Split], Entry]] = {
     "best integrator": best_integrator,
     f"AR({AR_ORDER}) filter": ar_filter,
     "least squares, 32 taps": lambda split: fir_predictor(split, 32),
     "least squares, 64 taps": lambda split: fir_predictor(split, 64),
-    "data-driven H2, order 10": lambda split: spectral_design(
-        split.open_loop, split.hardware, order=10, stretches=split.training
-    ),
     "Kalman": lambda split: lbt.kalman(split.model.plant()),
     "H-infinity, 1.2 of least": lambda split: lbt.hinf(split.model.plant(), gamma_ratio=1.2),
     "automatic": lambda split: lbt.design_from_record(past(split)).design,
@@ -324,7 +242,7 @@ def residuals_of(
         split = Split(record, training, test, model)
         for name in [name for name in ENTRIES if name not in failed]:
             try:
-                residuals[name].append(split.residual(as_controller(ENTRIES[name](split))))
+                residuals[name].append(split.residual(ENTRIES[name](split)))
             except lbt.LbtSynthError as error:
                 print(f"{name} is not in the table: {error}")
                 failed.add(name)
@@ -368,88 +286,18 @@ def play(records: dict[str, lbt.identification.LoopRecord], splits: int) -> None
         print(f"{entry:26s} {100 * mean:6.2f} {100 * error:6.2f} {100 * near:8.0f} %", *cells)
 
 
-def draw_plant(rng, shift_hz: float = 0.0) -> lbt.models.TipTiltPlant:
-    corner, rms = np.exp(rng.uniform(np.log(0.3), np.log(3))), rng.uniform(200, 600)
-    a1, a2, drive = sampled_resonance(corner, 0.7, RATE_HZ)
-    lines = [
-        lbt.Vibration(
-            frequency_hz=rng.uniform(8, 90) + shift_hz,
-            damping=float(np.exp(rng.uniform(np.log(0.002), np.log(0.03)))),
-            rms_nm=rng.uniform(10, 100),
-            direction=(1.0,),
-        )
-        for _ in range(int(rng.integers(1, 5)))
-    ]
-    return lbt.tip_tilt_plant(
-        frame_rate_hz=RATE_HZ,
-        turbulence=lbt.models.ARModel(
-            coefficients=[a1, a2], driving_rms_nm=rms * drive, frame_rate_hz=RATE_HZ
-        ),
-        vibrations=lines,
-        noise_nm=float(np.exp(rng.uniform(np.log(3), np.log(25)))),
-        modes=1,
-    )
-
-
-def deviations(seed: int, frames: int) -> dict[str, float]:
-    """Return how many standard errors two measured differences are from the truth."""
-    plant = draw_plant(np.random.default_rng([3, seed]))
-    wrong = draw_plant(np.random.default_rng([3, seed]), shift_hz=SHIFT_HZ)
-    truth = lbt.Truth(
-        turbulence=plant.turbulence[0],
-        vibrations=plant.vibrations,
-        noise_nm=float(np.sqrt(plant.R[0, 0])),
-    )
-    designs = {
-        "exact": lbt.kalman(plant),
-        "lines 0.5 Hz off": lbt.kalman(wrong),
-        "integrator": lbt.design.model_integrator(plant),
-    }
-    left, exact = {}, {}
-    for name, design in designs.items():
-        run = lbt.simulate(
-            design.controller, truth, hardware=plant.hardware, frames=frames, seed=seed,
-            settle_frames=8000,
-        )  # fmt: skip
-        left[name] = estimate_residual(
-            run.measurements[0], ((0, frames),), plant.R, np.zeros((1, 1))
-        )
-        loop = lbt.close_loop(plant.hardware, design.controller)
-        exact[name] = lbt.residual_budget(loop, truth, frame_means=True).rms_nm ** 2
-    found = {}
-    for name in ("lines 0.5 Hz off", "integrator"):
-        difference, error = left[name].above(left["exact"])
-        found[name] = (difference - exact[name] + exact["exact"]) / error
-    return found
-
-
-def print_errors(records: int, seconds: float) -> None:
-    """Print how often measured differences are within their standard errors of the truth."""
-    every = [deviations(seed, round(seconds * RATE_HZ)) for seed in range(records)]
-    for name in every[0]:
-        size = np.abs([errors[name] for errors in every])
-        print(
-            f"exact against {name:18s} within 1 error {100 * np.mean(size < 1):.0f} %, "
-            f"within 2 {100 * np.mean(size < 2):.0f} %; rms {np.sqrt(np.mean(size**2)):.2f}"
-        )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("files", nargs="*", metavar="RECORD", help="what loops recorded")
-    parser.add_argument("--records", type=int, help="simulated records (default 7; errors 300)")
-    parser.add_argument("--seconds", type=float, help="of each (default 30; errors 15)")
+    parser.add_argument("--records", type=int, default=7, help="simulated records")
+    parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--splits", type=int, default=3)
-    parser.add_argument("--errors", action="store_true")
-    arguments = parser.parse_args()
-    if arguments.errors:
-        print_errors(arguments.records or 300, arguments.seconds or 15)
-        return
-    records = {Path(path).stem: lbt.load_record(path) for path in arguments.files} or {
-        f"{seed:02d}-{CHANGES[seed % len(CHANGES)]}": simulate_record(seed, arguments.seconds or 30)
-        for seed in range(arguments.records or len(CHANGES))
+    asked = parser.parse_args()
+    records = {Path(path).stem: lbt.load_record(path) for path in asked.files} or {
+        f"{seed:02d}-{CHANGES[seed % len(CHANGES)]}": simulate_record(seed, asked.seconds)
+        for seed in range(asked.records)
     }
-    play(records, arguments.splits)
+    play(records, asked.splits)
 
 
 if __name__ == "__main__":

@@ -6,10 +6,9 @@ modulation of 4 lambda/D. Delay 2 frames, 800 Hz.
 """
 
 import argparse
-import statistics
-import time
 
 import numpy as np
+from harness import seconds
 from scipy.optimize import minimize_scalar
 
 import lbt_synth as lbt
@@ -17,17 +16,6 @@ from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.draw import save_figure
 
 MODES, RATE_HZ = 672, 800.0
-
-
-def timed(call, repeats=9):
-    """Median time [ms] of a call."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return 1e3 * statistics.median(times)
 
 
 def total(rms):
@@ -90,13 +78,12 @@ def main() -> None:
     for name, rms in rows_shaken.items():
         print(f"{name:36s} {total(rms):7.1f} {total(rms[:2]):7.1f}")
 
-    design = timed(lambda: lbt.design.modal.modal_filters(modes, noise_nm=noise))
-    search = timed(
-        lambda: lbt.design.modal.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ)
+    design = seconds(lambda: lbt.design.modal.modal_filters(modes, noise_nm=noise), 9)
+    search = seconds(
+        lambda: lbt.design.modal.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ), 9
     )
-    print(f"design of {MODES} certified filters: {design:.0f} ms; optimised gains: {search:.0f} ms")
-    left = timed(lambda: lbt.design.modal.modal_residuals(filters, modes, noise_nm=noise))
-    print(f"residuals of {MODES} filters in the image: {left:.0f} ms")
+    times = f"filters {1e3 * design:.0f} ms, optimised gains {1e3 * search:.0f} ms"
+    print(f"design of {MODES} modes: {times}")
     if output:
         figure = lbt.report.figures.modal_figure(
             rows, gains=optimised.gains, turbulence_nm=modes.rms_nm

@@ -1,12 +1,16 @@
-"""Fit Table III's H-infinity column with other fixed parameters.
+"""Fit Table III's H-infinity column with other fixed parameters, or compare turbulence models.
 
-Run with ``python benchmarks/paper.py`` from the repository (some minutes).
+Run with ``python benchmarks/paper.py`` (some minutes) or ``python benchmarks/paper.py turbulence``
+from the repository.
 """
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize
+
+import lbt_synth as lbt
 
 sys.path.insert(0, "examples")
 import fit_table_iii as fit
@@ -34,7 +38,30 @@ def show(name: str, parameters: np.ndarray, rms: float) -> None:
     )
 
 
-if __name__ == "__main__":
+def turbulence_models() -> None:
+    """Print what filters of two models leave of frozen flow without any vibration."""
+    config = lbt.load_config("examples/lbt.yaml")
+    air, noise_nm, path = config.atmosphere, config.noise_nm, config.hardware
+    calm = replace(config.truth, vibrations=())
+    models = {
+        "Kalman, AR1": lbt.models.ar1_turbulence(air, frame_rate_hz=800),
+        "Kalman, AR2": lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=noise_nm),
+    }
+    designs = {"integrator": lbt.design.optimal_integrator(path, calm)} | {
+        name: lbt.kalman(lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=model, noise_nm=noise_nm))
+        for name, model in models.items()
+    }
+    for name, design in designs.items():
+        loop = lbt.close_loop(path, design.controller)
+        budget = lbt.residual_budget(loop, calm, frame_means=True)
+        print(
+            f"{name:12s} residual {budget.rms_nm:5.1f} nm (turbulence {budget.turbulence_nm:.1f}, "
+            f"noise {budget.noise_nm:.1f}), Strehl {100 * lbt.strehl(budget, config.imaging):.1f} %"
+        )
+
+
+def refits() -> None:
+    """Print the weights that other fixed parameters ask for."""
     show("as in the library", START, fit.loss(START))
     fit.KALMAN_DAMPING = 0.003
     show("damping 0.003", *refit(START))
@@ -54,3 +81,7 @@ if __name__ == "__main__":
     fit.loss = lambda p: free(np.array([p[0], p[1], held]))
     found, rms = refit(np.array([START[0], START[1], held]))
     show("no bound (Kalman)", np.array([found[0], found[1], held]), rms)
+
+
+if __name__ == "__main__":
+    turbulence_models() if sys.argv[1:] == ["turbulence"] else refits()

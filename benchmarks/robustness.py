@@ -8,9 +8,6 @@ from dataclasses import replace
 
 import matplotlib.pyplot as plt
 import numpy as np
-from rich.console import Console
-from rich.progress import track
-from rich.table import Table
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
@@ -48,7 +45,6 @@ def worst_strehl(design: lbt.Design, errors=ERRORS) -> np.ndarray:
 
 def tuned(make, start: list[float], what: str) -> lbt.Design:
     """Design whose mean over the gains of the worst Strehl ratio is largest."""
-    console = Console(stderr=True)
 
     def cost(x: np.ndarray) -> float:
         try:
@@ -56,11 +52,8 @@ def tuned(make, start: list[float], what: str) -> lbt.Design:
         except (lbt.errors.SynthesisError, lbt.errors.ProblemError):
             return 0.0
 
-    with console.status(f"tuning {what}"):
-        found = minimize(
-            cost, np.log(start), method="Nelder-Mead", options={"maxfev": 90, "xatol": 1e-2}
-        )
-    parameters = np.exp(found.x)
+    options = {"maxfev": 90, "xatol": 1e-2}
+    parameters = np.exp(minimize(cost, np.log(start), method="Nelder-Mead", options=options).x)
     print(f"{what}: damping {parameters[0]:.4f}, rms {parameters[1]:.1f} nm")
     return make(*parameters)
 
@@ -106,39 +99,21 @@ def main() -> None:
         ).rms_nm
         for gain in GAINS
     }
-    table = Table(title="Worst Strehl ratio over 15 rows [%], by sensor gain")
-    for heading in (
-        "controller",
-        *map(str, GAINS),
-        "stable gains",
-        "modulus",
-        "states",
-        "residual [nm]",
-        "above limit [%]",
-    ):
-        table.add_column(heading, justify="left" if heading == "controller" else "right")
+    print(
+        "| controller | worst Strehl ratio [%] at 1 | 0.7 | 0.5 | 0.358 | stable sensor gains ",
+        end="",
+    )
+    print("| modulus margin | states | worst residual [nm] | above the limit [%] |")
     study = lbt.studies.limits(every, every["shaped"].hardware, TRUTH, CAMERA, errors_hz=ERRORS)
     for (name, design), row in zip(every.items(), study.rows, strict=True):
         margins = lbt.loop_margins(lbt.close_loop(design.hardware, design.controller))
-        table.add_row(
-            name,
-            *(f"{s:.2f}" for s in worst_strehl(design)),
-            f"{margins.gain_low:.2f}-{margins.gain_high:.2f}",
-            f"{margins.modulus:.2f}",
-            str(design.controller.n_states // 2),
-            f"{row.worst_nm:.1f}",
-            f"{row.above_band_limit_percent:.0f}",
+        strehls = " | ".join(f"{s:.2f}" for s in worst_strehl(design))
+        print(
+            f"| {name} | {strehls} | {margins.gain_low:.2f}-{margins.gain_high:.2f} "
+            f"| {margins.modulus:.2f} | {design.controller.n_states // 2} "
+            f"| {row.worst_nm:.1f} | {row.above_band_limit_percent:.0f} |"
         )
-    table.add_row(
-        "limit",
-        *(f"{limit_strehl(bands[g]):.2f}" for g in GAINS),
-        "",
-        "",
-        "",
-        f"{bands[1.0]:.1f}",
-        "0",
-    )
-    Console(width=150).print(table)
+    print("| limit |", *(f"{limit_strehl(bands[g]):.2f} |" for g in GAINS), f"{bands[1.0]:.1f} nm")
     draw(every, bands)
 
 
@@ -150,9 +125,7 @@ def draw(every: dict[str, lbt.Design], bands: dict[float, float]) -> None:
     with house_style():
         figure, axes = plt.subplots(1, 2, figsize=(9, 4), sharey=True, layout="constrained")
         for axis, gain in zip(axes, (1.0, 0.358), strict=True):
-            for (name, design), style, colour in track(
-                list(zip(every.items(), styles, colours, strict=True)), transient=True
-            ):
+            for (name, design), style, colour in zip(every.items(), styles, colours, strict=True):
                 found = lbt.studies.robustness_map(
                     design, TRUTH, CAMERA, errors_hz=shifts, sensor_gains=[gain]
                 )

@@ -16,19 +16,25 @@ in benchmarks/identification.py (odd records: frozen flow). Four sets:
 
 from __future__ import annotations
 
-import argparse
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from unittest import mock
 
 import numpy as np
+from harness import (
+    frozen_flow,
+    log_uniform,
+    random_line,
+    record_options,
+    run_all,
+    run_integrator,
+    second_order,
+)
 from identification import coverage
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit import identify
-from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE = 1000.0
 SETS = ("diagonal", "independent", "twins", "air")
@@ -38,16 +44,6 @@ TIP, TILT = (1.0, 0.0), (0.0, 1.0)
 def along(degrees: float) -> tuple[float, float]:
     """Return a direction over the axes."""
     return float(np.cos(np.radians(degrees))), float(np.sin(np.radians(degrees)))
-
-
-def random_line(rng: np.random.Generator, direction: tuple[float, float]) -> lbt.Vibration:
-    """Draw a line, as in benchmarks/identification.py."""
-    return lbt.Vibration(
-        frequency_hz=float(rng.uniform(5, 150)),
-        damping=float(np.exp(rng.uniform(np.log(0.002), np.log(0.01)))),
-        rms_nm=float(rng.uniform(5, 100)),
-        direction=direction,
-    )
 
 
 def vibrations(kind: str, rng: np.random.Generator, air: lbt.Vibration) -> list[lbt.Vibration]:
@@ -65,20 +61,12 @@ def vibrations(kind: str, rng: np.random.Generator, air: lbt.Vibration) -> list[
     return [air, random_line(rng, TIP), random_line(rng, TILT)]
 
 
-def slow_process(frequency_hz: float, damping: float, rms_nm: float) -> lbt.models.ARModel:
-    """Return turbulence of second order."""
-    a1, a2, drive = coefficients(2 * np.pi * frequency_hz / RATE, damping)
-    return lbt.models.ARModel(
-        coefficients=[a1, a2], driving_rms_nm=rms_nm * np.sqrt(drive), frame_rate_hz=RATE
-    )
-
-
 def draw_truth(kind: str, seed: int) -> tuple[lbt.Truth, float]:
     """Draw a truth, and the gain of the integrator."""
     rng = np.random.default_rng([seed, 7, SETS.index(kind)])
-    noise = float(np.exp(rng.uniform(np.log(2), np.log(30))))
+    noise = log_uniform(rng, 2, 30)
     sensor_gain, gain = float(rng.uniform(0.4, 1.0)), float(rng.uniform(0.2, 0.6))
-    corner = float(np.exp(rng.uniform(np.log(0.2), np.log(3))))
+    corner = log_uniform(rng, 0.2, 3)
     damping, rms = float(rng.uniform(0.1, 0.95)), float(rng.uniform(200, 800))
     part = float(rng.uniform(0.5, 0.95)) if kind == "air" else 0.0
     common = lbt.Vibration(
@@ -87,14 +75,9 @@ def draw_truth(kind: str, seed: int) -> tuple[lbt.Truth, float]:
         rms_nm=rms * np.sqrt(max(part, 0.01)),
         direction=along(rng.uniform(20, 70) * rng.choice([-1, 1])),
     )
-    turbulence: lbt.models.Spectrum = slow_process(corner, damping, rms * np.sqrt(1 - part))
+    turbulence: lbt.models.Spectrum = second_order(corner, damping, rms * np.sqrt(1 - part), RATE)
     if seed % 2 and kind != "air":
-        turbulence = lbt.Atmosphere(
-            seeing_arcsec=float(rng.uniform(0.5, 1.5)),
-            outer_scale_m=float(rng.uniform(15, 40)),
-            wind_speed_m_s=float(rng.uniform(5, 25)),
-            diameter_m=8.22,
-        )
+        turbulence = frozen_flow(rng)
     truth = lbt.Truth(
         turbulence=turbulence,
         vibrations=tuple(vibrations(kind, rng, common)),
@@ -179,17 +162,7 @@ def run_loop(kind: str, seed: int, frames: int) -> tuple[lbt.Truth, lbt.identifi
     """Return a truth, and the record of a loop that it shook."""
     truth, gain = draw_truth(kind, seed)
     path = lbt.LoopHardware(frame_rate_hz=RATE)
-    run = lbt.simulate(
-        lbt.integrator(path, gain=gain).controller,
-        truth,
-        hardware=path,
-        frames=frames,
-        seed=seed,
-        settle_frames=2000,
-    )
-    record = lbt.identification.loop_record(
-        run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
-    )
+    record, _ = run_integrator(path, truth, gain, frames, seed=seed, settle_frames=2000)
     return truth, record
 
 
@@ -333,26 +306,17 @@ def table(kind: str, results: list[dict]) -> None:
 
 def main() -> None:
     """Run the study."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--records", type=int, default=100)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--sets", nargs="+", choices=SETS, default=SETS)
-    parser.add_argument("--errors", action="store_true", help="only the standard errors")
-    asked = parser.parse_args()
-    seeds, frames = range(asked.first, asked.first + asked.records), int(asked.seconds * RATE)
-    with ProcessPoolExecutor(asked.jobs) as pool:
-        for kind in asked.sets:
-            study = partial(only_errors if asked.errors else studied, kind, frames=frames)
-            results = list(pool.map(study, seeds))
-            if not asked.errors:
-                table(kind, results)
-                continue
-            for frozen in (False, True):
-                some = [r for r in results if r["frozen"] == frozen]
-                print(f"{kind}, {'frozen flow' if frozen else 'second order'}: {len(some)} records")
-                coverage(some)
+    asked = record_options(__doc__, records=100, jobs=2, seconds=60.0, sets=SETS, errors=False)
+    for kind in asked.sets:
+        study = only_errors if asked.errors else studied
+        results = run_all(partial(study, kind, frames=int(asked.seconds * RATE)), asked)
+        if not asked.errors:
+            table(kind, results)
+            continue
+        for frozen in (False, True):
+            some = [r for r in results if r["frozen"] == frozen]
+            print(f"{kind}, {'frozen flow' if frozen else 'second order'}: {len(some)} records")
+            coverage(some)
 
 
 if __name__ == "__main__":

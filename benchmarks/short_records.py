@@ -10,13 +10,13 @@ the truth, and replayed on the minute after its record.
 
 from __future__ import annotations
 
-import argparse
 import time
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 
 import identification as loops
 import numpy as np
+from harness import log_uniform, record_options, run_all
 
 import lbt_synth as lbt
 
@@ -29,9 +29,9 @@ LENGTHS_S = (30.0, 17.0, 10.0)
 def drifting_case(seed: int, seconds: float) -> loops.Case:
     """Draw a loop with a drift, and run it for so long and for a minute more."""
     rng = np.random.default_rng([seed, 2])
-    rate = float(np.round(np.exp(rng.uniform(np.log(500), np.log(2000)))))
-    pole = 1 - float(np.exp(rng.uniform(*np.log(1 - np.array(POLES)))))
-    rms = float(np.exp(rng.uniform(*np.log(DRIFT_NM))))
+    rate = float(np.round(log_uniform(rng, 500, 2000)))
+    pole = 1 - log_uniform(rng, *(1 - np.array(POLES)))
+    rms = log_uniform(rng, *DRIFT_NM)
     drift = lbt.models.ARModel(
         coefficients=[pole], driving_rms_nm=rms * np.sqrt(1 - pole**2), frame_rate_hz=rate
     )
@@ -56,9 +56,8 @@ def replayed(
     return found.total_nm2, found.total_error_nm2
 
 
-def studied(task: tuple[int, float]) -> dict:
+def studied(seed: int, seconds: float) -> dict:
     """Everything that is measured of one record."""
-    seed, seconds = task
     it = drifting_case(seed, seconds)
     whole, frames = it.record, round(seconds * it.path.frame_rate_hz)
     record = lbt.identification.loop_record(
@@ -133,17 +132,9 @@ def show(seconds: float, results: list[dict]) -> None:
 
 def main() -> None:
     """Run the study."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--records", type=int, default=40)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--seconds", type=float, nargs="+", default=list(LENGTHS_S))
-    asked = parser.parse_args()
-    seeds = range(asked.first, asked.first + asked.records)
-    with ProcessPoolExecutor(asked.jobs) as pool:
-        for seconds in asked.seconds:
-            tasks = [(seed, seconds) for seed in seeds]
-            show(seconds, list(pool.map(studied, tasks)))
+    asked = record_options(__doc__, records=40, jobs=2, seconds=LENGTHS_S)
+    for seconds in asked.seconds:
+        show(seconds, run_all(partial(studied, seconds=seconds), asked))
 
 
 if __name__ == "__main__":

@@ -19,12 +19,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import control
 import numpy as np
-from harness import Row, machine, paired, seconds
-from speed_ensemble import ENSEMBLE
+from commands import COMMANDS
+from harness import Row, machine, paired
 from speed_export import REALTIME
-from speed_identification import IDENTIFICATION
 from speed_linear import SIZED
-from speed_modal import MODAL
 
 import lbt_synth as lbt
 from lbt_synth.linear.block_filtering import filter_series
@@ -44,18 +42,9 @@ def imports() -> dict[str, Row]:
     for name, arguments in (
         ("import lbt_synth", ["-c", "import lbt_synth"]),
         ("lbt-synth --help", ["-m", "lbt_synth.cli.main", "--help"]),
-        (
-            "first Kalman design",
-            [
-                "-c",
-                "import lbt_synth as l; l.kalman(l.EstimationProblem("
-                "A=1., B=[[1., 0.]], C=1., D=[[0., 1.]], L=1.))",
-            ],
-        ),
     ):
         figures = paired(interpreter(arguments), base, 7)
         out[name] = figures | {"ratio": 1 / figures["ratio"], "bar": 1.5}
-    del out["first Kalman design"]["bar"]
     return out
 
 
@@ -90,19 +79,6 @@ def time_domain() -> dict[str, Row]:
     error = np.max(np.abs(filter_series(system, one) - expected.T)) / np.max(np.abs(expected))
     assert error < 1e-10, error
     return out
-
-
-def synthesis() -> dict[str, Row]:
-    plant = lbt.load_config(ROOT / "examples" / "lbt.yaml").plant
-    return {
-        name: {"ours_s": seconds(call, 5)}
-        for name, call in (
-            ("Kalman, Riccati", lambda: lbt.kalman(plant)),
-            ("Kalman, SDP", lambda: lbt.kalman(plant, route="sdp")),
-            ("H-infinity 1.2, Riccati", lambda: lbt.hinf(plant, gamma_ratio=1.2, route="riccati")),
-            ("H-infinity 1.2, LMI", lambda: lbt.hinf(plant, gamma_ratio=1.2)),
-        )
-    }
 
 
 def maps() -> dict[str, Row]:
@@ -151,31 +127,18 @@ def cells(name: str, row: Row, per_second: float) -> list[str]:
         return f"{factor * row[key]:{digits}}" if key in row else ""
 
     form = ".3f" if per_second == 1e3 else ".1f"
-    bar = shown("bar", 1, "g")
-    if "bar_s" in row:
-        bar = f"{1e3 * row['bar_s']:g} ms"
     return [
         name,
-        shown("ours_s", per_second, form) + (f" ({row['status']})" if "status" in row else ""),
-        shown("peer_s", per_second, form)
-        + (f" ({row['peer_status']})" if "peer_status" in row else ""),
+        *(shown(key, per_second, form) for key in ("ours_s", "peer_s")),
         shown("ratio", 1, ".2f"),
-        bar,
-        shown("growth", 1, ".2f"),
-        shown("peer_growth", 1, ".2f"),
+        shown("bar", 1, "g") or (f"{1e3 * row['bar_s']:g} ms" if "bar_s" in row else ""),
+        *(shown(key, 1, ".2f") for key in ("growth", "peer_growth")),
     ]
 
 
 def headings(time_unit: str) -> list[str]:
-    return [
-        "",
-        f"ours [{time_unit}]",
-        f"peer [{time_unit}]",
-        "ratio",
-        "bar",
-        "growth",
-        "peer's growth",
-    ]
+    times = (f"ours [{time_unit}]", f"peer [{time_unit}]")
+    return ["", *times, "ratio", "bar", "growth", "peer's growth"]
 
 
 def page(title: str, head: list[str], lines: list[list[str]]) -> str:
@@ -188,21 +151,18 @@ def main() -> None:
     here = machine()
     results: dict[str, object] = {}
     pages = []
-    everyday = {**imports(), **time_domain(), **synthesis(), **maps()}
+    everyday = {**imports(), **time_domain(), **maps()}
     tables = [("everyday operations", "operation", everyday)]
-    for title, first, case in (*SIZED, *MODAL, *ENSEMBLE, *IDENTIFICATION, *REALTIME):
+    for title, first, case in (*COMMANDS, *SIZED, *REALTIME):
         print(f"... {title}", file=sys.stderr)
         tables.append((title, first, {str(size): row for size, row in case().items()}))
     for title, first, rows in tables:
         time_unit, per_second = unit(rows)
         head = headings(time_unit)
         lines = [cells(name, row, per_second) for name, row in rows.items()]
-        widths = [max(len(line[i]) for line in [*lines, head]) for i in range(len(head))]
-        print(f"\n{title}\n" + "  ".join(h.rjust(w) for h, w in zip(head, widths, strict=True)))
-        for line in lines:
-            print("  ".join(c.rjust(w) for c, w in zip(line, widths, strict=True)))
         results[title] = rows
         pages.append(page(title[0].upper() + title[1:], [first, *head[1:]], lines))
+        print(pages[-1])
     target = Path(__file__).with_name("results.json")
     target.write_text(json.dumps({"machine": here, "results": results}, indent=1) + "\n")
     listing = "\n".join(f"- {key.replace('_', ' ')}: {value}" for key, value in here.items())

@@ -19,7 +19,7 @@ from dataclasses import replace
 from unittest import mock
 
 import numpy as np
-from harness import Row, with_growth
+from harness import Row, log_uniform, random_line, run_integrator, with_growth
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit import whittle
@@ -38,16 +38,11 @@ def record(
     found = []
     for direction in ((1.0, 0.0), (0.0, 1.0)):
         for place, damping, rms, count in (
-            ((5, 150), np.log([0.002, 0.01]), (5, 100), lines),
-            ((15, 200), np.log([0.1, 0.4]), (20, 80), wide),
+            ((5, 150), (0.002, 0.01), (5, 100), lines),
+            ((15, 200), (0.1, 0.4), (20, 80), wide),
         ):
             found += [
-                lbt.Vibration(
-                    frequency_hz=float(rng.uniform(*place)),
-                    damping=float(np.exp(rng.uniform(*damping))),
-                    rms_nm=float(rng.uniform(*rms)),
-                    direction=direction,
-                )
+                random_line(rng, direction, hz=place, damping=damping, rms_nm=rms)
                 for _ in range(count)
             ]
     air = lbt.Atmosphere(
@@ -59,27 +54,19 @@ def record(
     truth = lbt.Truth(
         turbulence=air,
         vibrations=tuple(found),
-        noise_nm=float(np.exp(rng.uniform(np.log(2), np.log(30)))),
+        noise_nm=log_uniform(rng, 2, 30),
         sensor_gain=float(rng.uniform(0.4, 1)),
     )
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=2)
-    law = lbt.integrator(path, gain=float(rng.uniform(0.2, 0.5))).controller
-    run = lbt.simulate(law, truth, hardware=path, frames=seconds * int(RATE), seed=seed)
-    return lbt.identification.loop_record(
-        run.measurements[0], run.commands[0], frame_rate_hz=RATE, delay_frames=2, unit="nm"
-    )
+    gain = float(rng.uniform(0.2, 0.5))
+    return run_integrator(path, truth, gain, seconds * int(RATE), seed=seed)[0]
 
 
 def hard_record(seed: int) -> tuple[lbt.identification.LoopRecord, lbt.Truth]:
     """Return a record that leaves its sensor gain nearly open, and its truth."""
     rng = np.random.default_rng([seed, 991])
     lines = [
-        lbt.Vibration(
-            frequency_hz=float(rng.uniform(*place)),
-            damping=float(np.exp(rng.uniform(*np.log(damping)))),
-            rms_nm=float(rng.uniform(*rms)),
-            direction=direction,
-        )
+        random_line(rng, direction, hz=place, damping=damping, rms_nm=rms)
         for direction, count, place, damping, rms in (
             ((1.0, 0.0), 6, (8, 160), (0.002, 0.01), (5, 60)),
             ((0.0, 1.0), 6, (8, 160), (0.002, 0.01), (5, 60)),
@@ -99,11 +86,7 @@ def hard_record(seed: int) -> tuple[lbt.identification.LoopRecord, lbt.Truth]:
         sensor_gain=0.7,
     )
     path = lbt.LoopHardware(frame_rate_hz=rate, delay_frames=2)
-    law = lbt.integrator(path, gain=0.08).controller
-    run = lbt.simulate(law, truth, hardware=path, frames=int(20 * rate), seed=seed)
-    record = lbt.identification.loop_record(
-        run.measurements[0], run.commands[0], frame_rate_hz=rate, delay_frames=2, unit="nm"
-    )
+    record, _ = run_integrator(path, truth, 0.08, int(20 * rate), seed=seed)
     return record, truth
 
 

@@ -10,11 +10,11 @@ the true loop, over that of an integrator of gain 0.4 in the same loop.
 
 from __future__ import annotations
 
-import argparse
 import time
 
 import numpy as np
-from wrong_commands import draw_lines, frozen_flow
+from harness import frozen_flow, log_uniform, record_options, run_integrator
+from wrong_commands import draw_lines
 
 import lbt_synth as lbt
 from lbt_synth.identification.auto import RecordedDesign
@@ -24,7 +24,7 @@ def draw(seed: int, seconds: float) -> tuple[lbt.identification.LoopRecord, lbt.
     """Draw a loop, and record it."""
     rng = np.random.default_rng([seed, 771])
     rate = float(rng.choice([500.0, 1000.0]))
-    noise = float(np.exp(rng.uniform(np.log(2), np.log(25))))
+    noise = log_uniform(rng, 2, 25)
     sensor, gain = float(rng.uniform(0.4, 1.0)), float(rng.uniform(0.2, 0.6))
     lines = list(draw_lines(rng, int(rng.integers(1, 6)), (0.002, 0.01)))
     lines += draw_lines(rng, 2, (0.05, 0.2))
@@ -32,11 +32,8 @@ def draw(seed: int, seconds: float) -> tuple[lbt.identification.LoopRecord, lbt.
     truth = lbt.Truth(
         turbulence=frozen_flow(rng), vibrations=tuple(lines), noise_nm=noise, sensor_gain=sensor
     )
-    law, frames = lbt.integrator(path, gain=gain).controller, int(seconds * rate)
-    run = lbt.simulate(law, truth, hardware=path, frames=frames, seed=seed, settle_frames=500)
-    record = lbt.identification.loop_record(
-        run.measurements[0], run.commands[0], frame_rate_hz=rate, delay_frames=2, unit="nm"
-    )
+    frames = int(seconds * rate)
+    record, _ = run_integrator(path, truth, gain, frames, seed=seed, settle_frames=500)
     return record, truth
 
 
@@ -49,12 +46,7 @@ def residual_nm(design: lbt.Design, record: lbt.identification.LoopRecord, truth
 
 def main() -> None:
     """Print a line per record, and the summary."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--records", type=int, default=24)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--auto", action="store_true")
-    given = parser.parse_args()
+    given = record_options(__doc__, records=24, seconds=30.0, auto=False)
     deviations = []
     for seed in range(given.first, given.first + given.records):
         record, truth = draw(seed, given.seconds)

@@ -14,19 +14,17 @@ much more variance does it leave than the best linear controller?
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from harness import frozen_flow, log_uniform, random_line, record_options, run_all, second_order
 
 import lbt_synth as lbt
 from lbt_synth.identification.commands.verdict import explain_commands
-from lbt_synth.models.resonance_spectrum import coefficients
 
 RATE, DELAY, SETTLE = 1000.0, 2, 1000
 FAULTS = {  # and the beginning of what repairs it
@@ -68,37 +66,19 @@ def draw_lines(rng: np.random.Generator, count: int, damping: tuple[float, float
     """Draw resonances in any direction."""
     for _ in range(count):
         angle = rng.uniform(0, np.pi)
-        yield lbt.Vibration(
-            frequency_hz=float(rng.uniform(5, 150)),
-            damping=float(np.exp(rng.uniform(*np.log(damping)))),
-            rms_nm=float(rng.uniform(5, 100)),
-            direction=(np.cos(angle), np.sin(angle)),
-        )
-
-
-def frozen_flow(rng: np.random.Generator) -> lbt.Atmosphere:
-    """Draw an atmosphere."""
-    return lbt.Atmosphere(
-        seeing_arcsec=float(rng.uniform(0.5, 1.5)),
-        outer_scale_m=float(rng.uniform(15, 40)),
-        wind_speed_m_s=float(rng.uniform(5, 25)),
-        diameter_m=8.22,
-    )
+        yield random_line(rng, (np.cos(angle), np.sin(angle)), damping=damping)
 
 
 def draw_loop(seed: int, frames: int) -> Loop:
     """Draw a loop; odd ones have frozen flow."""
     rng = np.random.default_rng([seed, 17])
-    noise = float(np.exp(rng.uniform(np.log(2), np.log(30))))
+    noise = log_uniform(rng, 2, 30)
     sensor_gain, gain = float(rng.uniform(0.4, 1.0)), float(rng.uniform(0.2, 0.6))
     turbulence: lbt.models.Spectrum = frozen_flow(rng)
     if seed % 2 == 0:
-        corner = float(np.exp(rng.uniform(np.log(0.2), np.log(3))))
+        corner = log_uniform(rng, 0.2, 3)
         damping, rms = float(rng.uniform(0.1, 1)), float(rng.uniform(200, 800))
-        a1, a2, drive = coefficients(2 * np.pi * corner / RATE, damping)
-        turbulence = lbt.models.ARModel(
-            coefficients=[a1, a2], driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=RATE
-        )
+        turbulence = second_order(corner, damping, rms, RATE)
     lines = tuple(draw_lines(rng, int(rng.integers(0, 6)), (0.002, 0.01)))
     truth = lbt.Truth(
         turbulence=turbulence, vibrations=lines, noise_nm=noise, sensor_gain=sensor_gain
@@ -193,7 +173,7 @@ def draw_good(kind: str, seed: int, seconds: float) -> lbt.identification.LoopRe
     """Draw a record without a fault."""
     rng = np.random.default_rng([seed, 77])
     rate, delay = float(rng.choice([500.0, 800.0, 1000.0, 2000.0])), 2.0
-    noise = float(np.exp(rng.uniform(np.log(2), np.log(25))))
+    noise = log_uniform(rng, 2, 25)
     sensor, gain = float(rng.uniform(0.35, 1.1)), float(rng.uniform(0.15, 0.6))
     lines = list(draw_lines(rng, int(rng.integers(0, 6)), (0.001, 0.02)))
     turbulence: lbt.models.Spectrum = frozen_flow(rng)
@@ -286,20 +266,11 @@ def show_designs(designs: list[tuple[str, float]]) -> None:
 
 def main() -> None:
     """Print the table."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("--records", type=int, default=200)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=30.0)
-    parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--good", action="store_true")
-    parser.add_argument("--auto", action="store_true")
-    given = parser.parse_args()
-    seeds = range(given.first, given.first + given.records)
+    given = record_options(__doc__, records=200, jobs=2, seconds=30.0, good=False, auto=False)
     one = partial(judge, frames=int(given.seconds * RATE), design=given.auto)
     if given.good:
         one = partial(judge_good, seconds=given.seconds)
-    with ProcessPoolExecutor(given.jobs) as pool:
-        rows = [row for rows in pool.map(one, seeds) for row in rows]
+    rows = [row for rows in run_all(one, given) for row in rows]
     for fault in KINDS if given.good else FAULTS:
         own = [row for row in rows if row[0] == fault]
         named, passed = (np.mean([row[i] for row in own]) for i in (1, 2))

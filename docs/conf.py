@@ -28,7 +28,6 @@ root_doc = "index"
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 exclude_patterns = [
     "_build",
-    "benchmarks_commands.md",
     "benchmarks_table.md",
     "api/generated/modules.md",
     "gallery/sg_execution_times.rst",

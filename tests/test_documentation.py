@@ -6,8 +6,10 @@ import importlib.util
 import inspect
 import re
 import shutil
+import tomllib
 
 import pytest
+from ruamel.yaml import YAML
 from support.plants import ROOT
 
 import lbt_synth as lbt
@@ -44,6 +46,20 @@ def test_prose_is_plain_and_no_line_is_longer_than_100(page):
     lines = prose(page.read_text(encoding="utf-8"))
     assert [line for line in lines if len(line) > 100] == []
     assert NOT_ENGLISH.findall(" ".join(lines)) == []
+
+
+@pytest.mark.parametrize(
+    "page", sorted(ROOT.glob("docs/decisions/*.md")), ids=lambda page: page.stem
+)
+def test_a_page_of_decisions_says_what_holds_today_in_120_lines(page):
+    assert len(page.read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def test_the_citation_is_of_this_version_and_goes_into_the_source_archive():
+    citation = YAML(typ="safe").load(ROOT / "CITATION.cff")
+    assert (citation["version"], citation["references"][0]["year"]) == (lbt.__version__, 2008)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert "CITATION.cff" in project["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
 
 
 @pytest.fixture(scope="module")

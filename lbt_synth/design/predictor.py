@@ -87,8 +87,8 @@ class PredictorDesign(Design):
 
     def _controller(self, chosen: int) -> Controller:
         """Return the controller of one filter; all of them have the same states."""
-        readings = self.problem.n_readings
-        parts = [(p.A, _padded(p.B, readings), p.C) for p in self.parameters]
+        readings, read = self.problem.n_readings, self.parameters[chosen].B.shape[1]
+        parts = [(p.A, _padded(p.B[:, :read], readings), p.C) for p in self.parameters]
         A, B = block_diag(*(A for A, *_ in parts)), np.vstack([B for _, B, _ in parts])
         outputs = [C if i == chosen else 0 * C for i, (*_, C) in enumerate(parts)]
         C, D = np.hstack(outputs), np.zeros((len(outputs[0]), readings))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+from scipy.signal import welch
 
 from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import LbtSynthError, ProblemError
@@ -37,7 +38,12 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, loop_margins, residual_budget
 from lbt_synth.loop.budget import line_covariance
 from lbt_synth.loop.stable_range import stable_sensor_gains
-from lbt_synth.methods.registry import METHODS, reference_methods
+from lbt_synth.methods.registry import (
+    METHODS,
+    default_method,
+    method_named,
+    reference_methods,
+)
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.display_unit import nm_text
@@ -51,6 +57,7 @@ _NOISIER = 3.0  # times the other axis, from frame to frame: turbulence and line
 _WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel
 _WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers", "held": "held"}
 _ALL = "all"  # parts together
+_SEGMENT = 256  # frames of a spectrum: 4 Hz at 1 kHz, as finely as a miss is told
 _NARROW = 0.3  # modulus margin: less is a gain margin below 1.4
 _LEAST_SHARE = 0.05  # of the residual variance, of a part that is named
 
@@ -352,6 +359,7 @@ class Diagnosis:
     def findings(self) -> tuple[Finding, ...]:
         """What the record tells, the most urgent first; the last one is about its residual."""
         faults = list(_find_faults(self)) or [_judge_loop(self)]
+        faults += _missed_by_the_model(self)
         return (*faults, Finding(sentence=_residual_text(self), advice=_advice_text(self)))
 
     @property
@@ -476,8 +484,8 @@ def _compare(
     first, _ = split_halves(record.stretches(), record.frames)
     fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
     half = identify(record, **{**options, **fixed})
-    robust = [m for m in METHODS.values() if m.plant_section is not None]
-    names = [m.name for m in (*reference_methods(estimators_only=True), *robust)]
+    more = [m for m in METHODS.values() if m.plant_section is not None or m.of_record]
+    names = [m.name for m in (*reference_methods(estimators_only=True), *more)]
     table, designs = compare_designs(
         record, half, {name: {} for name in names}, others=given, running=running, imaging=imaging
     )
@@ -503,6 +511,30 @@ def _find_faults(diagnosis: Diagnosis) -> Iterator[Finding]:
             sentence=f"The commands are not those that the mirror followed: {diagnosis.doubt}.",
             advice=f"First {diagnosis.commands.advice}.",
         )
+
+
+def _missed_by_the_model(diagnosis: Diagnosis) -> Iterator[Finding]:
+    """Say where the model misses what past readings tell: a predictor leaves clearly less."""
+    rows = {row.name: row.replayed for row in diagnosis.residuals}
+    model, data = (
+        rows.get(method_named(name).title)
+        for name in (default_method(), *(m.name for m in METHODS.values() if m.of_record))
+    )
+    if model is None or data is None or not model.is_clearly_above(data):
+        return
+    series = (one.measured_nm for one in (model, data))
+    first, second = (np.sum(welch(e, nperseg=_SEGMENT, axis=0)[1], axis=1) for e in series)
+    more, peak = first - second, int(np.argmax(first - second))
+    below = np.flatnonzero(more < more[peak] / 2)
+    low = max(below[below < peak], default=-1) + 0.5
+    high = min(below[below > peak], default=len(more)) - 0.5
+    low_hz, high_hz = (diagnosis.record.frame_rate_hz / _SEGMENT * end for end in (low, high))
+    less_nm = float(np.sqrt(model.total_nm2 - data.total_nm2))
+    yield Finding(
+        tone="note",
+        sentence=f"The model misses {nm_text(less_nm)} that past readings tell, above all "
+        f"between {low_hz:.0f} and {high_hz:.0f} Hz.",
+    )
 
 
 def _judge_loop(diagnosis: Diagnosis) -> Finding:

@@ -10,7 +10,6 @@ from lbt_synth.design import Design, IntegratorLaw, integrator
 from lbt_synth.design.modal import MixedController, ModalFilters
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import CertificateError, ProblemError
-from lbt_synth.models import LoopHardware
 from lbt_synth.validation import integer, number, require_instance
 
 ModalDesign: TypeAlias = Design | MixedController | ModalFilters
@@ -64,7 +63,6 @@ def mode_designs(
     *,
     modes: int | None,
     other_gain: float | None,
-    hardware: LoopHardware | None,
     modal: bool,
     mixed: bool,
     reads_others: bool,
@@ -72,8 +70,6 @@ def mode_designs(
     """Return the designs of a file, each certified, and the number of its modes."""
     start = getattr(design, "start", None)  # of a stack of designs
     design = cast("Design | MixedController", design if start is None else start())
-    if hardware is not None and getattr(design, "hardware", None) is not None:
-        raise ProblemError("hardware must be left out where a design has a loop; got both.")
     if isinstance(design, MixedController):
         if not mixed:
             raise ProblemError(
@@ -82,9 +78,7 @@ def mode_designs(
             )
         if other_gain is not None:
             raise ProblemError("other_gain goes with a design; here each mode has its own gain.")
-        parts, controlled = _mode_designs(design, hardware), design.n_modes
-        if not parts:
-            raise ProblemError("at least one mode must have a gain above 0; all are 0.")
+        parts, controlled = _mode_designs(design), design.n_modes
         for part in parts:
             require_exportable(part.design)
     else:
@@ -94,8 +88,8 @@ def mode_designs(
                 "modes and other_gain go with a design of one sensor; got one of several. Leave "
                 "them out."
             )
-        modal = modal or other_gain is not None
-        controlled = require_modal(design) if modal else len(design.controller.C)
+        several = other_gain is not None or (mixed and modal)
+        controlled = require_modal(design) if several else len(design.controller.C)
         parts = [ModeDesign(design, tuple(range(controlled)))]
     count = controlled if modes is None else integer(modes, "modes", at_least=1)
     if count < controlled:
@@ -114,13 +108,13 @@ def mode_designs(
     return parts, count
 
 
-def _mode_designs(control: MixedController, hardware: LoopHardware | None) -> list[ModeDesign]:
+def _mode_designs(control: MixedController) -> list[ModeDesign]:
     """Return the design of each mode; modes that get no command have none."""
     if control.reconstructor is not None:
         raise ProblemError("the RTC reconstructs modes itself; got a reconstructor.")
-    loop = control.hardware or hardware
+    loop, kind = control.hardware, type(control.filter).__name__
     if loop is None:
-        raise ProblemError("hardware must be given where no filter has a loop; got None.")
+        raise ProblemError(f"the filter must be a certified design or ModalFilters; got {kind}.")
     designs: list[ModeDesign] = []
     if hasattr(control.filter, "designs"):
         filtered, which = np.array(control.filtered), control.filter.which
@@ -128,12 +122,9 @@ def _mode_designs(control: MixedController, hardware: LoopHardware | None) -> li
             ModeDesign(design, tuple(filtered[which == i].tolist()))
             for i, design in enumerate(control.filter.designs)
         ]
-    elif hasattr(control.filter, "certificate"):
+    else:
         require_modal(control.filter)
         designs.append(ModeDesign(control.filter, tuple(control.filtered)))
-    elif control.filter is not None:
-        kind = type(control.filter).__name__
-        raise ProblemError(f"the filter must be a certified design or ModalFilters; got {kind}.")
     laws: dict[tuple[float, float], list[int]] = {}
     for mode in np.setdiff1d(np.arange(control.n_modes), control.filtered).tolist():
         laws.setdefault((float(control.gains[mode]), float(control.leak[mode])), []).append(mode)

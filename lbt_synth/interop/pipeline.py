@@ -82,17 +82,17 @@ class Target:
         ``computed(design, numbers)`` returns the :class:`Written` that is proved.
     start : callable
         ``start(numbers, limit)`` returns a twin, which clips where the program knows the limit.
-    join : callable
-        ``join(numbers, parts, count)`` returns the numbers of a file of so many modes.
+    join : callable or None
+        ``join(numbers, parts, count)`` returns the numbers of a file of so many modes. Without it a
+        file holds one design, of any matrices.
     facts, remark : callable
         ``facts(whole, **options)`` returns what else the certificate names, and
         ``remark(design, numbers)`` what a user is told, or nothing.
     endings, beside, contents : tuple of str
         Endings of a file, those of what goes beside it; names in a folder.
-    modal : bool or None
-        Whether measurements and commands must be the modes; None where it does for several designs.
-    mixed, reads_others : bool
-        Whether a file may hold several designs, and a design read further sensors.
+    modal, reads_others : bool
+        Whether measurements and commands of one design must be the modes, too, as those of several
+        must; whether a design may read further sensors.
     """
 
     arithmetic: Arithmetic
@@ -103,15 +103,14 @@ class Target:
     computed: Callable[[Design, Any], Written]
     start: Callable[[Any, float], SteppedController]
     options: Mapping[str, Any] = field(default_factory=dict)
-    join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] = lambda numbers, *_: numbers[0]
+    join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] | None = None
     facts: Callable[..., Mapping[str, Any]] = lambda _, **options: {}
     remark: Callable[[Design, Any], str] = lambda *_: ""
     hint: str
     endings: tuple[str, ...] = ()
     beside: tuple[str, ...] = ()
     contents: tuple[str, ...] = ()
-    modal: bool | None = True
-    mixed: bool = True
+    modal: bool = True
     reads_others: bool = False
 
     def path_in(self, folder: Path) -> Path:
@@ -201,7 +200,6 @@ def export(
     *,
     modes: int | None = None,
     other_gain: float | None = None,
-    hardware: LoopHardware | None = None,
     gain_digest: str | None = None,
     **options: Any,
 ) -> Exported:
@@ -233,8 +231,6 @@ def export(
         the command 0, without ``other_gain``. Not for ``matlab``.
     other_gain : float, optional
         Gain of an integrator for each further mode.
-    hardware : LoopHardware, optional
-        Loop of the integrators, where no filter says which.
     gain_digest : str, optional
         SHA-256 of the gain file, for the certificate (64 hexadecimal digits).
     **options
@@ -291,15 +287,14 @@ def export(
         target,
         modes=modes,
         other_gain=other_gain,
-        hardware=hardware,
-        modal=modes is not None if program.modal is None else program.modal,
-        mixed=program.mixed,
+        modal=program.modal or modes is not None,
+        mixed=program.join is not None,
         reads_others=program.reads_others,
     )
     first = parts[0].design
     origin = _provenance_lines(first, gain_digest)
     numbers = program.round([part.design for part in parts], **settings)
-    file_numbers = program.join(numbers, parts, count)
+    file_numbers = program.join(numbers, parts, count) if program.join else numbers[0]
     pairs = list(zip(parts, numbers, strict=True))
     error = max(rehearsal_error(part.design, program.start(held, np.inf)) for part, held in pairs)
     precision = settings.get("precision", program.arithmetic.precision)

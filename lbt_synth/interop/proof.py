@@ -30,7 +30,7 @@ from lbt_synth.linear.controller import RunningController
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import residual_budget
-from lbt_synth.loop.closed_loop import STABILITY_MARGIN
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, youla_controller
 from lbt_synth.loop.simulation.disturbances import Disturbance
 from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
 from lbt_synth.loop.stable_range import radii_by_gain
@@ -107,12 +107,34 @@ def command_as_state(textbook: StateSpace) -> Controller:
     )
 
 
+def history_filter(loop: ClosedLoop) -> StateSpace:
+    """Return the filter from pseudo-open-loop values to the commands of a loop of unit sensor."""
+    s, n = loop.commanding(), loop.hardware.modes
+    return replace(s, B=s.B[:, n:], D=s.D[:, n:])
+
+
+def filter_of_history(hardware: LoopHardware, system: StateSpace) -> tuple[Controller, Controller]:
+    """Return the controller of a filter of pseudo-open-loop values, its command a further state.
+
+    Beside it is what noise in the command and noise in these values become.
+    """
+    m, n = system.D.shape[0], system.n_states
+    controller = youla_controller(hardware, command_as_state(system))
+    command = np.eye(controller.n_states, m, k=-n)  # a part of the command that is sent
+    B = np.hstack([command, controller.B])
+    return controller, replace(controller, B=B, D=np.zeros((m, 2 * m)))
+
+
 def prove_written(design: Design, written: Written) -> tuple[Check, ...]:
     """Check the loop around a controller as it is written; without a loop there is none."""
     if design.hardware is None:
         return written.checks
-    prove = _prove_sensors if len(written.controllers) > 1 else _prove_loop
-    return (*prove(design, design.hardware, written), *written.checks)
+    checks, several = [], len(written.controllers) > 1
+    if written.entry is not None or not several:
+        checks += _prove_loop(design, design.hardware, written)
+    if several:
+        checks += _prove_sensors(design, design.hardware, written)
+    return (*checks, *written.checks)
 
 
 def _prove_sensors(design: Design, hardware: LoopHardware, written: Written) -> list[Check]:
@@ -132,7 +154,7 @@ def _prove_sensors(design: Design, hardware: LoopHardware, written: Written) -> 
             if not loops[0].is_stable:
                 losses.append(np.inf)
                 break
-            after, before = (residual_budget(loop, design.problem).rms_nm for loop in loops)
+            after, before = (_residual_nm(design, loop) for loop in loops)
             losses.append(after / before - 1)
         name_of_loss = f"residual with {name}, loss"
         checks += [
@@ -142,12 +164,18 @@ def _prove_sensors(design: Design, hardware: LoopHardware, written: Written) -> 
     return checks
 
 
+def _residual_nm(design: Design, loop: ClosedLoop) -> float:
+    """Return the rms residual of a loop under the plant of its design, or the reference."""
+    if design.plant is not None:
+        return float(residual_budget(loop, design.problem).rms_nm)
+    return float(np.sqrt(np.sum(mode_variances(design, loop, slice(loop.hardware.modes)))))
+
+
 def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> list[Check]:
     """Check stability, residual, modulus margin and demands of a loop over its sensor gains."""
-    (controller,) = written.controllers.values()
+    controller = written.controllers[frozenset()]
     low, high = proved_gains(design, hardware)
-    count = 2 + int(np.log(high / low) / np.log(_STEP))
-    gains = np.append(np.geomspace(low, high, count), 1.0)
+    gains = gains_between(low, high)
     radius = float(np.max(radii_by_gain(hardware, controller)(gains)))
     name = f"spectral radius at sensor gains {low:.4g} to {high:.4g}"
     checks = [Check(name, radius, 1 - STABILITY_MARGIN, f"eigenvalues at {gains.size} gains")]
@@ -161,6 +189,12 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
     after += change(1.0) if change else 0.0
     checks.append(Check("modulus margin, loss", float(after / before) - 1, LOSS, "level sets"))
     return checks + _demand_checks(design, other, change)
+
+
+def gains_between(low: float, high: float) -> FloatArray:
+    """Return sensor gains in steps of 1 %, and a gain of 1."""
+    count = 2 + int(np.log(high / low) / np.log(_STEP))
+    return np.append(np.geomspace(low, high, count), 1.0)
 
 
 def proved_gains(design: Design, hardware: LoopHardware) -> tuple[float, float]:
@@ -186,7 +220,7 @@ def scenario_gains(design: Design) -> tuple[float, ...]:
 
 def _residual_check(design: Design, hardware: LoopHardware, written: Written, gain: float) -> Check:
     """Compare the residual, with what the rounding of the arithmetic and what is left out add."""
-    (controller,) = written.controllers.values()
+    controller = written.controllers[frozenset()]
     n, m = hardware.modes, hardware.n_commands
     pair = design.controller, controller
     loops = [close_loop(hardware, c, sensor_gain=gain) for c in pair]
@@ -350,20 +384,23 @@ def rehearsal_error(design: Design, other: Any) -> float:
 
 def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
     """Return the commands of the controller itself, and the readings of several sensors."""
-    if not design.other_sensors or design.plant is None:
+    if not design.other_sensors or design.hardware is None:
         return _rehearse(design, design.controller.start()), None
-    plant, (starts, length) = design.problem, _absences(design)
-    rate = plant.hardware.frame_rate_hz
-    run = simulate(
-        design,
-        Truth(
+    (starts, length), rate = _absences(design), design.hardware.frame_rate_hz
+    frames = (2 * len(starts) + 1) * length
+    disturbance: Disturbance | Truth = _reference(design.hardware, frames)
+    if (plant := design.plant) is not None:
+        disturbance = Truth(
             turbulence=plant.turbulence,
             vibrations=plant.vibrations,
             motions=plant.motions,
             noise_nm=np.linalg.norm(plant.own_noise_factor, axis=1),
-        ),
-        hardware=plant.hardware,
-        frames=(2 * len(starts) + 1) * length,
+        )
+    run = simulate(
+        design,
+        disturbance,
+        hardware=design.hardware,
+        frames=frames,
         settle_frames=0,
         drops=[
             Drop(unit=unit, start_s=start / rate, end_s=(start + length) / rate)
@@ -375,25 +412,30 @@ def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
 
 def _absences(design: Design) -> tuple[dict[str, int], int]:
     """Return the first frame in which each sensor is missing, and for how many frames it is."""
-    hardware, period = design.problem.hardware, design.problem.period
-    units = tuple(hardware.suite.rows(hardware))
+    units, period = sorted(frozenset().union(*design.controllers)), design.controller.period
     turns = 2 * len(units) + 1
     length = period * int(np.ceil(FRAMES / turns / period))  # all are due at its begin
     return {unit: (2 * i + 1) * length for i, unit in enumerate(units)}, length
 
 
+def _reference(hardware: LoopHardware, frames: int) -> Disturbance:
+    """Return white noise of the readings, and a slow phase."""
+    rng = np.random.default_rng(0)
+    total = rng.standard_normal((1, frames, hardware.modes))
+    for k in range(1, frames):
+        total[0, k] = POLE * total[0, k - 1] + np.sqrt(1 - POLE**2) * total[0, k]
+    noise = NOISE * rng.standard_normal((1, frames, hardware.n_readings))
+    return Disturbance(phase_nm=total, noise=noise, frame_means=True)
+
+
 def _rehearse(design: Design, controller: SteppedController | RunningController) -> FloatArray:
     """Return the commands (frames, m) of a controller that takes the place of a design's own."""
-    rng = np.random.default_rng(0)
     hardware, q = design.hardware, design.controller.D.shape[1]
     if hardware is None:
         controller.reset()
-        return np.array([controller.step(y) for y in rng.standard_normal((FRAMES, q))])
-    total = rng.standard_normal((1, FRAMES, hardware.modes))
-    for k in range(1, FRAMES):
-        total[0, k] = POLE * total[0, k - 1] + np.sqrt(1 - POLE**2) * total[0, k]
-    noise = NOISE * rng.standard_normal((1, FRAMES, q))
-    disturbance = Disturbance(phase_nm=total, noise=noise, frame_means=True)
+        noise = np.random.default_rng(0).standard_normal((FRAMES, q))
+        return np.array([controller.step(y) for y in noise])
+    disturbance = _reference(hardware, FRAMES)
     return np.asarray(simulate(controller, disturbance, hardware=hardware).commands[0])
 
 

@@ -16,7 +16,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.methods.registry import METHODS, design_label, method_named, reference_methods
 
 CONFIG = str(LBT_YAML)
-BUILT_IN = ("hinf", "integrator", "kalman", "lqg", "mixed", "robust")
+BUILT_IN = ("hinf", "integrator", "kalman", "lqg", "mixed", "predictor", "robust")
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_every_command_takes_a_method_of_the_table(leaky, tmp_path, capsys, monk
     assert "try --leak-per-s 5" in error
     status, _, error = run(capsys, *design, "--leak-per-s", "-1")
     assert (status, error) == (2, "lbt-synth: error: --leak-per-s must be above 0; got -1.\n")
-    status, out, error = run(capsys, *design, "--leak-per-s", "5")
+    status, out, error = run(capsys, *design, "--leak-per-s", "5", "--verbose")
     assert (status, error) == (0, "")
     assert "leak, against the one claimed" in out
 
@@ -110,7 +110,7 @@ def test_no_other_file_names_a_method():
         elsewhere = path.relative_to(ROOT).parts[1] not in ("design", "methods")
         if elsewhere and any(name in text for name in BUILT_IN):
             strings = {n.value for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Constant)}
-            assert not strings & set(BUILT_IN), path
+            assert not strings & (set(BUILT_IN) - {"integrator"}), path  # a control law, too
 
 
 def test_an_option_that_no_method_has(tmp_path, capsys):

@@ -203,7 +203,8 @@ def accelerometer_transfers(
     alarm = number(false_alarm, "false_alarm", above=0, below=1)
     largest_s = number(largest_shift_s, "largest_shift_s", at_least=0)
     live = np.std(readings[good], axis=0) > LEAST_M_S2
-    places = [i for i, part in enumerate(model.parts) if part.kind == "line"]
+    resonant = [part.kind != "turbulence" and part.sections == 1 for part in model.parts]
+    places = np.flatnonzero(resonant).tolist()
     places.sort(key=lambda i: model.parts[i].frequency_hz)
     lines = [model.parts[i] for i in places]
     lag, shift, error, transfers = 0, 0.0, float("inf"), tuple[TransferRow, ...]()
@@ -326,7 +327,8 @@ def _make_bands(
     swing = -1e-9 * (2 * np.pi * f) ** 2  # in m/s^2 a nm
     shapes = np.stack([_density(line, f, bin_hz) for line in lines], axis=1)
     background = [np.interp(f, a.frequency_hz, a.background_nm2_hz) for a in model.axes]
-    total = np.einsum("fj,ja,jb->fab", shapes, along, along)
+    narrow = np.array([line.kind == "line" for line in lines])  # the others are background
+    total = np.einsum("fj,ja,jb->fab", shapes[:, narrow], along[narrow], along[narrow])
     total += np.stack(background, axis=1)[:, :, None] * np.eye(axes)
     root = np.linalg.cholesky(total)
     cross = np.transpose(shapes[:, :, None] * along, (0, 2, 1))  # (f, axes, lines)

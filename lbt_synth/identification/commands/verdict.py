@@ -52,6 +52,7 @@ _GIVEN = CommandRepair()
 _ODD = CLEAR / 2  # nats that what no law asks for must add, by the model of the fit as well
 _SURPRISING = 3 * CLEAR  # nats that overrule a law with errors
 _WRONG_GAIN = 2.0  # factor by which a coarse gain may err; another unit is off by its square
+_ANOTHER_UNIT = 25.0  # factor beyond the limits that no wide resonances explain
 _FACTORS = (*(10.0**n for n in range(-12, 13) if n), 0.5, 2.0)  # between units, or of reflection
 _LITTLE = 0.01  # of the gain of a law, which has no inverse; or of the changes of commands, which
 # moves a gain by 10 % if the law leaves them
@@ -175,7 +176,7 @@ def explain_commands(
     choice = _choose(coarse, law, lag)
     scale = np.ones(record.axes)
     if not choice.unrelated.any():
-        scale = _scale(record, law, choice, limits)
+        scale = _scale(coarse, law, choice, limits)
     is_low = choice.gain < usual[0] / _WRONG_GAIN
     is_hidden = bool(np.any(scale < 1) or (sure is None and np.any(is_low)))
     if doubt := _doubt_choice(record, law, choice, is_hidden):
@@ -429,8 +430,8 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     return float(np.max(abs(poles[moves]))) if moves.any() else np.inf
 
 
-def _fit_cost(coarse: CoarseRecord, repair: CommandRepair) -> float:
-    """Return the criterion of a quick fit over all axes; infinite where one fails."""
+def _fit_cost(coarse: CoarseRecord, repair: CommandRepair, gain: float | None = None) -> float:
+    """Return the criterion of a quick fit over all axes, at a gain; infinite where one fails."""
     record, total = coarse.record, 0.0
     length = int(SEGMENT_S * record.frame_rate_hz)
     pieces = [
@@ -440,7 +441,7 @@ def _fit_cost(coarse: CoarseRecord, repair: CommandRepair) -> float:
     ]
     for y, c in zip(record.measurements.T, coarse.corrections(repair).T, strict=True):
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
-        search = Search(data=data, gain=None, most_lines=_LINES, gain_error=float("inf"))
+        search = Search(data=data, gain=gain, most_lines=_LINES, gain_error=float("inf"))
         try:
             total += cost(search, find_components(search, rounds=FEW_ROUNDS))
         except NumericalError:
@@ -449,19 +450,24 @@ def _fit_cost(coarse: CoarseRecord, repair: CommandRepair) -> float:
 
 
 def _scale(
-    record: LoopRecord, law: ControlLaw | None, choice: _Choice, limits: tuple[float, float]
+    coarse: CoarseRecord, law: ControlLaw | None, choice: _Choice, limits: tuple[float, float]
 ) -> FloatArray:
     """Return the factors (axes,) of commands whose gains lie beyond the limits of another unit.
 
     A sure law that runs at a plausible gain refutes commands that are too large: a gain that seems
-    too small is one that lines hide.
+    too small is one that lines hide. One that seems too large by less than a hundred may be that of
+    wide resonances, unless quick fits of plausible gains are clearly less likely.
     """
     low, high = limits
+    record, seeming = coarse.record, float(np.exp(np.mean(np.log(choice.gain))))
     within = (choice.gain >= low) & (choice.gain <= high)
-    is_small = float(np.mean(np.log(choice.gain))) < np.log(low)
-    if is_small and law is not None and law.is_sure:
+    if seeming < low and law is not None and law.is_sure:
         usual = np.geomspace(*PLAUSIBLE_GAINS, 8)
         within |= could_have_run(choice.repair, usual, record, law)
+    if high < seeming < _ANOTHER_UNIT * high:
+        tried = np.geomspace(low * _WRONG_GAIN**2, high / _WRONG_GAIN**2, 3).tolist()
+        held = [_fit_cost(coarse, choice.repair, gain) for gain in (*tried, seeming)]
+        within |= min(held[:-1]) < held[-1] + CLEAR
     return likely_factors(choice.gain, within)
 
 

@@ -81,9 +81,9 @@ def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
     (1, 1)
     """
     terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
-    (s, _, m), out = terms.sizes, _written_out(terms, "")
+    (s, _, m), out = terms.sizes, _written_out(terms)
     sums = "".join([*out["errors"], *out["states"], *out["commands"]])
-    table = terms.gains[NONE][0].size if terms.masked else 0  # of a frame in which all is read
+    table = terms.gains[NONE][0].size if terms.tabled else 0  # of a frame in which all is read
     varying = len(terms.read) * len(out["varying"])
     return FrameCost(
         multiplications=sums.count(" * ") + table,
@@ -107,7 +107,7 @@ def _round(designs: Sequence[Design], *, form: str, precision: str, **_: Any) ->
                 "the applied commands; got form=plain. Leave it out."
             )
         terms = source_terms(design, form=kind)
-        count = int(np.count_nonzero(terms.whole)) if not several else 0
+        count = int(np.count_nonzero(terms.whole)) if not terms.tabled else 0
         if count > MOST_TERMS:
             raise ProblemError(
                 f"the terms of a controller must be at most {MOST_TERMS:,} in C, for each is "
@@ -167,7 +167,7 @@ def _write(
         + "const unsigned char *fresh, " * terms.masked
         + f"const {prefix}_real *applied, " * terms.applied,
         **_described(terms),
-        **_written_out(terms, prefix),
+        **_written_out(terms),
         **_tables(terms),
     }
     source, declarations = (
@@ -202,7 +202,7 @@ def _described(terms: SourceTerms) -> dict[str, Any]:
     (n, q, m), form = terms.sizes, "plain: x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k)"
     if terms.applied:
         form = "estimator: x(k+1) = A x(k) + L u_applied(k-1) + B y(k), u(k) = C x(k+1)"
-    if terms.masked:
+    if terms.tabled:
         form = "estimator: x = A x + L u_applied + K (y + G x + J u_applied), u = C x"
     return {
         "n": n,
@@ -210,6 +210,7 @@ def _described(terms: SourceTerms) -> dict[str, Any]:
         "m": m,
         "form": form,
         "masked": terms.masked,
+        "tabled": terms.tabled,
         "applied": terms.applied,
         "estimates": terms.gains[NONE].shape[1],
         "period": len(terms.read),
@@ -238,19 +239,16 @@ def _describe_units(terms: SourceTerms) -> list[dict[str, Any]]:
     ]
 
 
-def _written_out(terms: SourceTerms, prefix: str) -> dict[str, Any]:
+def _written_out(terms: SourceTerms) -> dict[str, Any]:
     """Return the sums of a frame with each non-zero term; factors of 1 and -1 are signs."""
     s, q, m = terms.sizes
     constants: list[tuple[str, float]] = []
     varying: list[tuple[str, list[float]]] = []  # what changes from phase to phase
-    used: dict[str, set[int]] = {"x": set(), "y": set(), "a": set()}
     states, applied, readings = (
         [f"{kind}{j}" for j in range(size)] for kind, size in zip("xay", (s, m, q), strict=True)
     )
 
     def term(place: str, values: FloatArray, signal: str) -> tuple[str, str]:
-        if signal[0] in used:
-            used[signal[0]].add(int(signal[1:]))
         value = float(values[0])
         if np.any(values != value):
             varying.append((place, values.tolist()))
@@ -261,11 +259,7 @@ def _written_out(terms: SourceTerms, prefix: str) -> dict[str, Any]:
         return "+", f"c[{len(constants) - 1}] * {signal}"
 
     def sums(
-        names: Sequence[str],
-        matrix: FloatArray,
-        signals: Sequence[str],
-        start: str,
-        begin: str = "",
+        names: Sequence[str], matrix: FloatArray, signals: Sequence[str], begin: str = ""
     ) -> list[str]:
         """Return a sum for each row of (N, rows, columns); columns have the names of matrices."""
         out = []
@@ -274,42 +268,42 @@ def _written_out(terms: SourceTerms, prefix: str) -> dict[str, Any]:
             used_columns = np.flatnonzero(matrix[:, i].any(axis=0)).tolist()
             some += [term(names[j].format(i), matrix[:, i, j], signals[j]) for j in used_columns]
             zero = _exact_constant(0.0, single=terms.single)
-            out.append(_wrap_sum(some or [("+", zero)], len(start.format(i))))
+            out.append(_wrap_sum(some or [("+", zero)]))
         return out
 
     def columns(**sizes: int) -> list[str]:
         return [f"{name}[{{}}][{j}]" for name, size in sizes.items() for j in range(size)]
 
     out: dict[str, Any] = {"errors": []}
-    start = f"    const {prefix}_real u{{}} ="
     transition, predicting = terms.transition, [*states, *applied]
-    if terms.masked:
-        names, line = columns(G=s, J=m), "        error[count++] ="
-        out["errors"] = sums(names, terms.innovation, predicting, line, begin="y[{}]")
+    if terms.tabled:
+        out["errors"] = sums(columns(G=s, J=m), terms.innovation, predicting, begin="y[{}]")
     else:
         transition = np.concatenate([transition, terms.gains[NONE]], axis=2)
     names = columns(A=s, L=m, B=q)
-    out["states"] = sums(names, transition, [*predicting, *readings], start)
-    new = [f"state->x[{j}]" if terms.masked else f"n{j}" for j in range(s)]
-    out["commands"] = sums(columns(C=s, D=q), terms.command[None], [*new, *readings], start)
-    named = {kind: sorted(numbers) for kind, numbers in used.items()}
+    out["states"] = sums(names, transition, [*predicting, *readings])
+    new = [f"state->x[{j}]" if terms.tabled else f"n{j}" for j in range(s)]
+    out["commands"] = sums(columns(C=s, D=q), terms.command[None], [*new, *readings])
+    text = "".join([*out["errors"], *out["states"], *out["commands"]])
+    named = {
+        kind: sorted({int(number) for number in re.findall(rf"\b{kind}(\d+)", text)})
+        for kind in "xya"
+    }
     return {**out, "constants": constants, "varying": varying, "used": named}
 
 
-def _wrap_sum(terms: Sequence[tuple[str, str]], column: int) -> str:
-    """Return a sum of (sign, term) that begins at a column, its terms wrapped over lines."""
+def _wrap_sum(terms: Sequence[tuple[str, str]]) -> str:
+    """Return a sum of (sign, term) on lines of its own, none of which breaks a term."""
     text = " ".join(f"{sign} {term}".replace(" ", "\0") for sign, term in terms)
     text = text.removeprefix("+\0").replace("-\0", "-", text.startswith("-"))
-    begin, more = " " * (column + 1), " " * 8
-    wrapped = textwrap.fill(
-        text, _WIDTH - 1, initial_indent=begin, subsequent_indent=more, break_long_words=False
-    )
-    return wrapped[column:].replace("\0", " ")
+    indent = " " * 8
+    lines = textwrap.fill(text, _WIDTH - 1, initial_indent=indent, subsequent_indent=indent)
+    return "\n" + lines.replace("\0", " ")
 
 
 def _tables(terms: SourceTerms) -> dict[str, Any]:
     """Return the gains of each phase and of each set that is missing, and where they begin."""
-    if not terms.masked:
+    if not terms.tabled:
         return {"gains": [], "count": 0, "due": [], "first": [], "sets": 0}
     units, gains = tuple(terms.rows), []
     sets = [
@@ -339,8 +333,10 @@ def _read(files: Mapping[Path, bytes], like: SourceTerms) -> SourceTerms:
 def _facts(terms: SourceTerms, **_: Any) -> dict[str, Any]:
     """Return what the certificate says of the source."""
     form: dict[str, Any] = {"form": "estimator" if terms.applied else "plain"}
+    if terms.tabled:
+        form["period"] = len(terms.read)
     if terms.masked:
-        form |= {"period": len(terms.read), "sensors": list(terms.rows)}
+        form["sensors"] = list(terms.rows)
     return form
 
 
@@ -371,6 +367,6 @@ TARGET = Target(
     hint="Try double precision.",
     endings=(".c",),
     beside=(".h",),
-    modal=None,
+    modal=False,
     reads_others=True,
 )

@@ -44,6 +44,7 @@ class SourceTerms:
     rows: Mapping[str, slice]  # of each sensor or channel in y
     dt_s: float
     applied: bool  # whether the source is given the commands that were applied
+    switched: bool = False  # of two "phases": all is read, or the loop's own sensor alone
     single: bool = False  # whether its numbers are of single precision
 
     @property
@@ -59,6 +60,11 @@ class SourceTerms:
         return len(self.rows) > 1
 
     @property
+    def tabled(self) -> bool:
+        """Whether the gains of each set that is missing stand in a table."""
+        return self.masked and not self.switched
+
+    @property
     def whole(self) -> FloatArray:
         """All matrices of one sensor: columns of states, applied commands and measurements."""
         (s, _, m), gains = self.sizes, self.gains[NONE][0]
@@ -70,6 +76,16 @@ class SourceTerms:
         matrices: dict[str, Any] = {name: _to_single(getattr(self, name)) for name in _CONSTANT}
         gains = {some: _to_single(K) for some, K in self.gains.items()}
         return replace(self, **matrices, gains=gains, single=True)
+
+    def phase(self, k: int) -> SourceTerms:
+        """Return the terms of one phase alone, as those of one sensor."""
+        one = slice(k, k + 1)
+        matrices: dict[str, Any] = {
+            name: getattr(self, name)[one] for name in ("transition", "innovation", "read")
+        }
+        rows = {"measurements": slice(0, self.read.shape[1])}
+        gains = {NONE: self.gains[NONE][one]}
+        return replace(self, **matrices, gains=gains, rows=rows, switched=False)
 
     def controller(self, missing: frozenset[str] = NONE) -> Controller:
         """Return the controller that the terms make where its own commands are applied."""
@@ -102,8 +118,26 @@ def source_terms(design: Design, *, form: str = "plain") -> SourceTerms:
         return _filter_terms(design)
     if form == "plain" and not design.other_sensors:
         return controller_terms(design.controller)
-    require_hardware(design, "the estimator form")  # a bare filter has no commands to be applied
-    estimator = estimator_form(design)
+    hardware = require_hardware(design, "the estimator form")  # a bare filter moves no mirror
+    phases = [_estimator_terms(controller) for controller in design.controllers.values()]
+    if len(phases) == 1:
+        return phases[0]
+    stacks: dict[str, Any] = {
+        name: np.concatenate([getattr(terms, name) for terms in phases])
+        for name in ("transition", "innovation", "read")
+    }
+    return replace(
+        phases[0],
+        **stacks,
+        gains={NONE: np.concatenate([terms.gains[NONE] for terms in phases])},
+        rows=hardware.suite.rows(hardware),
+        switched=True,
+    )
+
+
+def _estimator_terms(controller: Controller) -> SourceTerms:
+    """Return the coefficients of the estimator form of a controller."""
+    estimator = estimator_form(controller)
     inputs = np.hstack([estimator.B, estimator.applied])
     D = np.zeros((len(estimator.C), inputs.shape[1]))
     joint = Controller(A=estimator.A, B=inputs, C=estimator.C, D=D, dt_s=estimator.dt_s)
@@ -181,20 +215,23 @@ class RunningSource:
         new = frozenset(
             unit
             for unit in due
-            if (fresh is None or fresh[unit]) and np.all(np.isfinite(y[rows[unit]]))
+            if (fresh is None or fresh.get(unit, True)) and np.all(np.isfinite(y[rows[unit]]))
         )
-        if not self._terms.masked and not new:
+        if not self._terms.tabled and next(iter(rows)) not in new:
             return np.asarray(self._last, dtype=np.float64)
+        phase = self._phase
+        if self._terms.switched:
+            phase, due = int(new < due), new
         self._missing = (self._missing - due) | (due - new)
         used = np.concatenate([np.r_[rows[unit]] for unit in rows if unit in new] or [[]])
         used = used.astype(np.intp)
-        transition, innovation = (matrix[self._phase] for matrix in self._matrices[:2])
+        transition, innovation = (matrix[phase] for matrix in self._matrices[:2])
         last = self._last if applied is None else np.asarray(applied, dtype=self._dtype)
         signals = np.concatenate([self._state, last])
         measured: NDArray[Any] = np.zeros(len(read), dtype=self._dtype)
         measured[used] = y[used]
         errors = _added(np.hstack([measured[:, None], innovation * signals]))
-        gains = self._gains[self._missing][self._phase]
+        gains = self._gains[self._missing][phase]
         state = _added(transition * signals)
         n = len(gains)
         state[:n] = _added(np.hstack([state[:n, None], (gains * errors)[:, used]]))
@@ -236,7 +273,15 @@ def join(numbers: Sequence[SourceTerms], parts: Sequence[ModeDesign], count: int
 
 
 def as_computed(design: Design, terms: SourceTerms) -> Written:
-    """Return the controllers that a source makes, and the rounding of one of one sensor."""
+    """Return the controllers that a source makes, and the rounding of sums that it writes out."""
+    if terms.switched:
+        phases = [as_computed(design, terms.phase(k)) for k in (0, 1)]
+        pairs = zip(design.controllers, phases, strict=True)
+        return replace(
+            phases[0],
+            controllers={missing: written.controllers[NONE] for missing, written in pairs},
+            checks=max((written.checks for written in phases), key=lambda c: c[0].value),
+        )
     (s, _, m), K = terms.sizes, terms.gains[NONE]
     still = terms.transition[:, :, :s].copy()
     still[:, : K.shape[1]] += K @ terms.innovation[:, :, :s]
@@ -245,7 +290,7 @@ def as_computed(design: Design, terms: SourceTerms) -> Written:
         alone = StateSpace(A=still, B=np.zeros((s, 0)), C=np.zeros((0, s)), D=np.zeros((0, 0)))
         radius, name = alone.radius_per_frame, "spectral radius of the estimator alone"
         checks = (Check(name, radius, 1 - STABILITY_MARGIN, EIGENVALUES),)
-    if terms.masked:
+    if terms.tabled:
         controllers = {missing: terms.controller(missing) for missing in terms.gains}
         return Written(controllers=controllers, checks=checks)
     # the command is rounded, applied, and known to the next frame: it is a further state
@@ -348,7 +393,7 @@ def used_readings(terms: SourceTerms, missing: frozenset[str]) -> BoolArray:
 
 def count_gains(terms: SourceTerms) -> int:
     """Return how many gains stand in the table of a source, 0 where they are written out."""
-    if not terms.masked:
+    if not terms.tabled:
         return 0
     readings = sum(int(np.count_nonzero(used_readings(terms, some))) for some in terms.gains)
     return readings * int(terms.gains[NONE].shape[1])

@@ -28,14 +28,14 @@ from lbt_synth.interop.proof import (
     LOSS,
     ROUNDOFF,
     Written,
-    command_as_state,
+    filter_of_history,
+    history_filter,
     mode_variances,
     proved_gains,
     scenario_gains,
 )
 from lbt_synth.linear import StateSpace, hinf_norm
 from lbt_synth.loop import ClosedLoop, close_loop
-from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import open_fits
 from lbt_synth.validation import FloatArray, integer, number
@@ -215,12 +215,8 @@ class PredictiveFilter:
 
     def as_computed(self, taps: FloatArray) -> Written:
         """Return the filter as a controller, and the rounding of sums of its taps in any order."""
-        m, n = self.hardware.modes, self.system.n_states
-        parameter = command_as_state(self.system)
-        controller = youla_controller(replace(self.hardware, sensor_matrix=None), parameter)
-        # noise in the product is part of the command; noise in the history comes as a measurement
-        command = np.eye(controller.n_states, m, k=-n)
-        entry = replace(controller, B=np.hstack([command, controller.B]), D=np.zeros((m, 2 * m)))
+        hardware = replace(self.hardware, sensor_matrix=None)
+        controller, entry = filter_of_history(hardware, self.system)
         sizes, norm = np.abs(np.hstack([*taps])), self.cut_norm(len(taps), taps)
 
         def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
@@ -258,8 +254,7 @@ def predictive_filter(design: Design) -> PredictiveFilter:
             "cacao counts with a sensor gain of 1, at which the loop of this design is unstable. "
             "Divide the reconstructor by the sensor gain, and design for a gain of 1."
         )
-    s, n = loop.commanding(), hardware.modes
-    system = replace(s, B=s.B[:, n:], D=s.D[:, n:]).balanced()
+    system = history_filter(loop).balanced()
     return PredictiveFilter(design=design, hardware=hardware, system=system)
 
 

@@ -56,9 +56,6 @@ _HASTE = 12  # power of its residual with which a scenario gains weight
 _STEEP = 5.0  # weight of what exceeds a limit
 _LINE = 0.3  # weight of a vibration's mean power; its largest is a limit
 _GAINS = 25  # sensor gains at which a step must be stable
-_ORDERS = 100  # in which the coefficients are rounded; the best one counts
-
-
 _NEGLIGIBLE = 1e-13  # of the largest coefficient; single precision has no use for less
 _SIGN = "actuators = -M2V u; y and u in the units of the mode, with the mirror's sign"
 
@@ -223,27 +220,22 @@ def refit(loop: DirectFormLoop, exact: FloatArray) -> FloatArray:
 
 
 def round_together(loop: DirectFormLoop, exact: FloatArray) -> NDArray[np.float32]:
-    """Round coefficients in the best of many orders; the rest makes up for each in p."""
+    """Round coefficients one by one, the most sensitive first; the rest makes up for each in p."""
     of_a, of_b = loop.slopes()
     seen = np.concatenate(
         [(of_a + g * of_b) / loop.polynomials(exact, g)[2][:, None] for g in loop.bounded_gains]
     )
     used = np.flatnonzero(exact)
     step = np.spacing(np.abs(exact[used]).astype(np.float32)).astype(np.float64)
-    triangle = np.linalg.qr(np.concatenate([seen.real, seen.imag])[:, used] * step)[1]
-    steps, rng = exact[used] / step, np.random.default_rng(0)
-    least, best = np.inf, steps
-    for _ in range(_ORDERS):
-        order = rng.permutation(used.size)
-        R, wanted, nearest = np.linalg.qr(triangle[:, order])[1], steps[order], np.zeros(used.size)
-        for k in range(used.size - 1, -1, -1):
-            made_up = R[k, k + 1 :] @ (wanted[k + 1 :] - nearest[k + 1 :]) / R[k, k]
-            nearest[k] = np.round(wanted[k] + made_up)
-        miss = float(np.linalg.norm(R @ (nearest - wanted)))
-        if miss < least:
-            least, best = miss, nearest[np.argsort(order)]
+    moved = np.concatenate([seen.real, seen.imag])[:, used] * step
+    order = np.argsort(np.linalg.norm(moved, axis=0))
+    R, used, step = np.linalg.qr(moved[:, order])[1], used[order], step[order]
+    wanted, nearest = exact[used] / step, np.zeros(used.size)
+    for k in range(used.size - 1, -1, -1):
+        made_up = R[k, k + 1 :] @ (wanted[k + 1 :] - nearest[k + 1 :]) / R[k, k]
+        nearest[k] = np.round(wanted[k] + made_up)
     rounded = np.zeros(exact.size, dtype=np.float32)
-    rounded[used] = best * step
+    rounded[used] = nearest * step
     return rounded
 
 

@@ -82,6 +82,4 @@ TARGET = Target(
     start=lambda terms, _: RunningSource(terms),
     hint="Design with fewer states.",
     endings=(".mat",),
-    modal=False,
-    mixed=False,
 )

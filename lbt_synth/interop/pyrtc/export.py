@@ -25,7 +25,7 @@ from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.interop.pipeline import CERTIFICATE, Arithmetic, Target
-from lbt_synth.interop.proof import ROUNDOFF, Written
+from lbt_synth.interop.proof import ROUNDOFF, Written, filter_of_history, history_filter
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
@@ -92,33 +92,20 @@ class PolFilter:
 
     def as_computed(self) -> Written:
         """Return the controller that pyRTC's loop computes, and what its arithmetic adds."""
-        s, R, m, d = self.system, self.reconstructor, len(self.response), len(self.taps)
-        n = s.n_states
-        A = np.zeros((n + d * m, n + d * m))
-        A[: n + m, :n] = np.vstack([s.A, s.C])
-        A[n + m :, n:-m] = np.eye((d - 1) * m)
-        entry = np.zeros((len(A), 2 * m))
-        entry[: n + m, :m] = np.vstack([s.B, s.D])
-        entry[n : n + m, m:] = np.eye(m)
-        A[:, n:] += np.kron(self.taps, entry[:, :m])
-        C = np.zeros((m, len(A)))
-        C[:, n : n + m] = np.eye(m)  # the command sent, in the new state
-        controller = Controller(A=A, B=entry[:, :m] @ R, C=C, D=np.zeros((m, m)), dt_s=s.dt_s)
+        R, m = self.reconstructor, len(self.response)
+        modal = replace(self.hardware, sensor_matrix=None, influence_matrix=None, modes=m)
+        controller, entry = filter_of_history(modal, self.system)
+        controller = replace(controller, B=controller.B @ R)
 
         def variance(_gain: float, measured: FloatArray, commands: FloatArray) -> FloatArray:
             """Bound the rounding of the signal, of its product, of the sum and of the command."""
             terms = np.abs(R) * measured
             residual = np.sum(terms, axis=1)
-            squares = [
-                2 * np.sum(terms**2, axis=1)
-                + np.sum(np.cumsum(terms, axis=1) ** 2, axis=1)
-                + (residual + commands) ** 2,
-                commands**2,
-            ]
+            sums = 2 * np.sum(terms**2, axis=1) + np.sum(np.cumsum(terms, axis=1) ** 2, axis=1)
+            squares = [commands**2, sums + (residual + commands) ** 2]
             return np.asarray(ROUNDOFF["single"] ** 2 / 3 * np.concatenate(squares))
 
-        entered = replace(controller, B=entry, D=np.zeros((m, 2 * m)))
-        return Written(controllers={frozenset(): controller}, entry=entered, variance=variance)
+        return Written(controllers={frozenset(): controller}, entry=entry, variance=variance)
 
 
 class InnerLoop:
@@ -170,11 +157,9 @@ def pol_filter(design: Design) -> PolFilter:
 
 def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> PolFilter:
     """Return the filter of a controller, for a response (m, m) from commands to measurements."""
-    m = len(response)
     A, B, C, D = (np.ascontiguousarray(matrix) for matrix in (own.A, own.B, own.C, own.D))
     own = replace(own, A=A, B=B @ response, C=C, D=D @ response)
-    modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=m)
-    commanding = close_loop(modal, own).commanding()
+    modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=len(response))
     delay = max(1, int(hardware.delay_frames + 0.5))
     taps = np.zeros(max(delay, len(hardware.mirror_taps)))
     taps[: len(hardware.mirror_taps)] = hardware.mirror_taps
@@ -183,7 +168,7 @@ def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> 
         delay_frames=delay,
         response=response,
         taps=taps,
-        system=replace(commanding, B=commanding.B[:, m:], D=commanding.D[:, m:]),
+        system=history_filter(close_loop(modal, own)),
     )
 
 
@@ -248,6 +233,4 @@ TARGET = Target(
     facts=lambda whole, **_: {"delay_frames": whole.delay_frames},
     hint="Design with less accurate models, or for lower sensor gains.",
     contents=(_CONFIG, _GAIN, _RESPONSE, _CONFIG + CERTIFICATE),
-    modal=False,
-    mixed=False,
 )

@@ -284,11 +284,19 @@ class Optics:
         self._parameters = _make_parameters(system)
         self._pupil = _make_pupil(system, self._parameters)
         self._commands = self._make_input(np.zeros(len(modes.shapes)))
-        self._tilts = self._make_input(np.zeros(2))
-        mirror = self._make_mirror(modes.shapes, self._commands, -1)
-        shaker = self._make_mirror(modes.shapes[:2], self._tilts, 1)
-        layers = [self._pupil, mirror.outputs["out_layer"], shaker.outputs["out_layer"]]
-        inputs = {"common_layer_list": layers}
+        mirror = _make(
+            "processing_objects.dm:DM",
+            self._parameters,
+            0,
+            ifunc=_make(
+                "data_objects.ifunc:IFunc",
+                ifunc=modes.shapes,
+                mask=modes.mask.astype(np.float32),
+            ),
+            sign=1,
+            inputs={"in_command": self._commands},
+        )
+        inputs = {"common_layer_list": [self._pupil, mirror.outputs["out_layer"]]}
         air = [] if screens is None else [self._make_air(screens, frames, seed)]
         if air:
             inputs["atmo_layer_list"] = air[0].outputs["layer_list"]
@@ -316,7 +324,7 @@ class Optics:
             nd=_PSF_SAMPLING,
             inputs={"in_ef": self._field},
         )
-        self._train = [*air, mirror, shaker, beam, pyramid, detector, self._slopes]
+        self._train = [*air, mirror, beam, pyramid, detector, self._slopes]
         for part in (*self._train, self._camera):
             part.setup()
         # photons per subaperture, over the whole detector
@@ -328,11 +336,12 @@ class Optics:
     ) -> FloatArray:
         """Expose one frame with commands (modes,) and tilts (2,), and return its slopes (q,)."""
         self._time_ns += self._step_ns
-        self._commands.value[:] = commands_nm
-        self._tilts.value[:] = tilts_nm
+        phase_nm = -np.asarray(commands_nm)  # a correction is subtracted from the phase
+        phase_nm[:2] += tilts_nm
+        self._commands.value[:] = phase_nm
         if self._weather:
             self._weather[0].value[:] = seeing * self.system.reference_seeing_arcsec
-        for signal in (self._commands, self._tilts, self._pupil, *self._weather):
+        for signal in (self._commands, self._pupil, *self._weather):
             signal.generation_time = self._time_ns
         self._trigger(self._train)
         return np.array(self._slopes.outputs["out_slopes"].slopes, dtype=np.float64)
@@ -360,12 +369,6 @@ class Optics:
             if part.check_ready(self._time_ns):
                 part.trigger()
                 part.post_trigger()
-
-    def _make_mirror(self, shapes: Any, commands: Any, sign: int) -> Any:
-        mask = self.modes.mask.astype(np.float32)
-        functions = _make("data_objects.ifunc:IFunc", ifunc=shapes, mask=mask)
-        name, inputs = "processing_objects.dm:DM", {"in_command": commands}
-        return _make(name, self._parameters, 0, ifunc=functions, sign=sign, inputs=inputs)
 
     def _make_air(self, screens: Path, frames: int, seed: int | None) -> Any:
         system = self.system

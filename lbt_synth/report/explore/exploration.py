@@ -322,7 +322,7 @@ def new_view(
 
 
 # Frequencies of a curve, in all and on each side of a line, and shifts of the true lines: as many
-# as a page draws in a tenth of a second (benchmarks/explore.py)
+# as a page draws in a tenth of a second
 _POINTS, _NEAR_A_LINE, _SHIFTS = 240, 28, 15
 
 

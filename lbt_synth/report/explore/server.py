@@ -233,7 +233,7 @@ class Session:
         self._kept: dict[str, Shown] = {}
         self._threads = ThreadPoolExecutor(_THREADS)
         self._sliders = {knob: knob_slider(knob) for knob in exploration.knobs}
-        methods = [(method.name, method.title) for method in METHODS.values()]
+        methods = [(m.name, m.title) for m in METHODS.values() if not m.of_record]
         name = first.request.method.name
         self._method = Select(name="method", title="Method", value=name, options=methods)
         self._verdict, self._facts, self._files = (

@@ -49,8 +49,8 @@ PARTS, RESULTS, FAILED = "parts", "results.csv", "failed.csv"
 PAGE, PRINT = "summary.html", "summary.pdf"
 _PARAMETER, _RESULT = "%.12g", "%.9g"  # formats in CSV; a replayed row has all digits
 # Rows of a part whose samples are evaluated together: some tenths of a second, of which the check
-# of one sample by itself is a fifth (benchmarks/study_rates.py would be slower with fewer). Where
-# each sample takes milliseconds or seconds, a killed study shall lose few of them.
+# of one sample by itself is a fifth. Where each sample takes milliseconds or seconds, a killed
+# study shall lose few of them.
 _ROWS_TOGETHER, _ROWS_ONE_BY_ONE = 8192, 16
 
 Evaluate = Callable[[Study, FloatArray, int], Result]

@@ -21,7 +21,7 @@ _MOST_WORST = 10  # samples that are listed
 _FEWEST = 20  # samples for an index
 _CONSTANT = 1e-12  # scatter of a Strehl ratio that is rounding
 # With more groups than 8 and fewer samples, one parameter of a Sobol sequence inherits up to 9 % of
-# another (benchmarks/study_statistics.py)
+# another
 _FEW_GROUPS, _MANY_SAMPLES = 8, 4096
 _MOST_VALUES = 32  # a parameter with more distinct values is continuous
 

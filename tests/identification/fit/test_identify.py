@@ -243,7 +243,7 @@ def test_random_closed_loops_reach_what_the_page_says() -> None:
     found, missed, false = (sum(len(r[k]) for r in results) for k in ("found", "missed", "false"))
     assert found / (found + missed) > 0.95
     assert false / len(results) < 0.2
-    ratio, half = (np.array([r[key] for r in results]) for key in ("ratio", "half_ratio"))
+    ratio, half = (np.array([r[key] for r in results]) for key in ("ratio", "replay_ratio"))
     assert np.median(ratio) < 1.03
     assert np.percentile(ratio, 95) < 1.10
     assert np.median(half) < 1.01

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import runpy
 from dataclasses import replace
 from functools import cache
 
+import league
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.plants import ROOT
 from support.predictions import (
     CAMERA,
     FLAT,
@@ -326,12 +325,11 @@ def test_what_cannot_be_replayed_is_refused(call, message):
 
 def test_the_league_of_designs_and_rivals(monkeypatch, capsys):
     """The script of the benchmarks ranks a filter of the model above the best integrator."""
-    league = runpy.run_path(str(ROOT / "benchmarks/league.py"))
     names = ("best integrator", "least squares, 32 taps", "Kalman")
-    entries = {name: league["ENTRIES"][name] for name in names}
-    monkeypatch.setitem(league["play"].__globals__, "ENTRIES", entries)
+    entries = {name: league.ENTRIES[name] for name in names}
+    monkeypatch.setattr(league, "ENTRIES", entries)
     short = replace(short_record(), measured=np.arange(9000) < 600)
-    league["play"]({"night": short_record(), "brief": short}, 2)
+    league.play({"night": short_record(), "brief": short}, 2)
     failure, _, heading, *rows = capsys.readouterr().out.splitlines()
     assert failure.startswith("brief is not in the table: ")
     assert heading.split()[-1] == "night"

@@ -160,15 +160,6 @@ def test_the_small_gain_holds_between_the_gains_that_are_computed(path, monkeypa
     assert len(set(tried)) < 60
 
 
-def test_the_distance_of_a_loop_is_bounded_at_all_its_gains(path):
-    for sensor in ([[1.0]], [[0.7]]):
-        own = replace(path, sensor_matrix=np.array(sensor))
-        found = predictive_filter(lbt.integrator(own, gain=0.3))
-        each = [g for g in np.geomspace(*found.interval, 60) if g * sensor[0][0] != 1]
-        least = min(1 / (abs(1 - g * sensor[0][0]) * found.at(g)[2]) for g in each)
-        assert found.least_distance(0.0) <= least <= 2.001 * found.least_distance(0.0)
-
-
 def test_rounding_is_bounded_by_a_loop_in_that_arithmetic(path):
     """The same taps in single and in double precision; the proof has what this noise leaves."""
     design = lbt.integrator(path, gain=0.3)
@@ -289,18 +280,3 @@ def test_every_bit_is_that_of_the_program(delay):
         found = np.array([run.step(y) for y in series])
         assert np.array_equal(found, reference(matrix, delay + 1, series))
         run.reset()
-
-
-def test_its_history_is_the_pseudo_open_loop_measurement():
-    """In a loop with the same delay, the history is the phase, whatever is applied."""
-    hardware = lbt.LoopHardware(frame_rate_hz=500, delay_frames=2.25, modes=1)
-    taps = hardware.mirror_taps
-    run = AppliedFilter([[-0.25, -0.5]], 2.25)
-    phase = np.sin(np.arange(30) / 3)
-    commands = np.zeros(len(taps) + 1)
-    history = []
-    for value in phase:
-        y = value - taps @ commands[:-1]
-        commands = np.append(run.step([y]), commands[:-1])
-        history.append(run._history[0, 0])
-    assert np.allclose(history, phase, atol=1e-6)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
-from support.exports import bare_design, lbt_designs, relative, with_controller
+from support.exports import bare_design, lbt_designs
 from support.gain_files import odd_plant
 from support.recorded_runs import recorded_run
 
@@ -48,27 +48,6 @@ def test_a_loop_of_more_modes_and_other_matrices(tmp_path):
     expected = np.eye(4)
     expected[:2, :2] = plant.hardware.sensor @ plant.hardware.influence
     assert np.array_equal(np.load(tmp_path / "interaction_matrix.npz")["data"], expected)
-
-
-def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch):
-    design = lbt_designs()["integrator"]
-    with pytest.raises(lbt.errors.ProblemError, match="modes must be at least 2"):
-        lbt.interop.export(tmp_path / "k", design, "pyrtc", modes=1)
-    wild = with_controller(design, lbt.integrator(design.hardware, gain=0.95).controller)
-    held = pol_filter(wild)  # pyRTC computes another controller than that of the design
-    own = replace(lbt.interop.target_named("pyrtc"), round=lambda *_, **__: [held])
-    own = replace(own, read=lambda *_: held)
-    monkeypatch.setattr("lbt_synth.interop.pyrtc.export.TARGET", own)
-    with pytest.raises(lbt.errors.NumericalError, match=r"in the arithmetic of pyrtc .+ is"):
-        lbt.interop.export(tmp_path / "k", design, "pyrtc")
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(("name", "text"), [("file", "cannot make"), ("no/k", "cannot make")])
-def test_a_folder_that_cannot_be_made_is_an_error(tmp_path, name, text):
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(lbt.errors.OutputError, match=text):
-        lbt.interop.export(tmp_path / name, lbt_designs()["integrator"], "pyrtc")
 
 
 PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
@@ -139,10 +118,10 @@ def test_the_noise_of_the_arithmetic_in_closed_form():
     own = 0.4 / (1 - 1 / z)
     assert whole.to_statespace().frequency_response([30.0])[0, 0, 0] == pytest.approx(own)
     # a command that is off by e is known to be: u = own (y + z^-2 e) + e
-    assert entry == pytest.approx([own, 1 + own / z**2])
+    assert entry == pytest.approx([1 + own / z**2, own])
     ulp = 2.0**-24 / np.sqrt(3)
     assert np.sqrt(rounding.variance(1.0, np.array([3.0]), np.array([4.0]))) == pytest.approx(
-        [ulp * np.sqrt(3 * 9 + 49), ulp * 4]
+        [ulp * 4, ulp * np.sqrt(3 * 9 + 49)]
     )
 
 
@@ -164,18 +143,6 @@ def series(design, frames, seed=0):
     return total, 10 * rng.standard_normal((1, frames, design.hardware.modes))
 
 
-@pytest.mark.parametrize("name", ["kalman", "hinf", "integrator", "odd"])
-def test_its_commands_are_those_of_the_controller(name):
-    design = lbt.kalman(odd_plant()) if name == "odd" else lbt_designs()[name]
-    given = series(design, 1000)
-    own, twin = (
-        recorded_run(one, design.hardware, *given)[0, :, 2:4]
-        for one in (design.controller.start(), InnerLoop(pol_filter(design)))
-    )
-    assert 0 < relative(twin, own) < 1e-6
-    assert np.array_equal(twin, twin.astype(np.float32))
-
-
 def test_a_clipped_command_winds_nothing_up():
     design = lbt_designs()["kalman"]
     total, noise = series(design, 3000)
@@ -190,22 +157,6 @@ def test_a_clipped_command_winds_nothing_up():
     for y in held[500:1000]:
         alone.step(y)
     assert np.max(np.abs(alone.state)) > 1e8
-
-
-def test_a_loop_that_was_open_closes_as_if_it_had_not_been():
-    """The mirror is flattened while the loop does not run."""
-    design, frames = lbt_designs()["kalman"], 2500
-    total, noise = series(design, frames)
-    whole = recorded_run(InnerLoop(pol_filter(design)), design.hardware, total, noise)[0, :, :2]
-    loop, commands, residual = InnerLoop(pol_filter(design)), np.zeros((2, 2)), np.zeros(2)
-    for k in range(frames):
-        closed = not 500 <= k < 800
-        commands = np.vstack(
-            [loop.step(residual + noise[0, k]) if closed else np.zeros(2), commands[:1]]
-        )
-        residual = total[0, k] - commands[1]
-        if k > 1500:
-            assert np.max(np.abs(residual - whole[k])) < 0.5
 
 
 def test_reset_forgets():

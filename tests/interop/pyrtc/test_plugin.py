@@ -204,34 +204,6 @@ def test_what_does_not_fit_is_refused(gains):
         GainFilePredictor(3, other_gain=1.5, **slow)
 
 
-def test_further_modes_run_the_integrator_of_other_targets(gains):
-    """In a loop of the same delay: the commands of a design of all modes."""
-    path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
-    whole = lbt.integrator(path, gain=0.4).controller.start()
-    predictor = GainFilePredictor(2, gain_file=gains / "lazy.fits", other_gain=0.4)
-    phase = np.cumsum(np.random.default_rng(0).standard_normal(300))
-    phase[:2] = 0.0
-    ours, theirs = [0.0, 0.0], [0.0, 0.0]  # u(k-1) corrects what frame k + 1 measures
-    for value in phase:
-        ours.append(float(whole.step([value - ours[-2]])[0]))
-        pol = value - theirs[-2] + theirs[-2]
-        predictor.update([0.0, pol])
-        theirs.append(float(np.float32(predictor.predict()[1])))
-    assert np.allclose(theirs, ours, rtol=1e-5, atol=1e-5)
-    assert np.max(np.abs(ours)) > 5
-
-
-def test_a_damaged_gain_file_is_one_sentence(gains, tmp_path):
-    content = bytearray((gains / "kalman.fits").read_bytes())
-    content[content.index(lbt_designs()["kalman"].gain_predictor.astype(">f8").tobytes())] ^= 1
-    (tmp_path / "bad.fits").write_bytes(content)
-    with pytest.raises(
-        lbt.errors.GainFileError, match=r"bad.fits is no gain file, or it is damaged"
-    ) as caught:
-        GainFilePredictor(2, gain_file=tmp_path / "bad.fits")
-    assert "\n" not in str(caught.value)
-
-
 def test_fit_identifies_the_series_and_designs_for_it(gains):
     """In any unit, and with frames that are not finite."""
     rng = np.random.default_rng(0)
