@@ -425,25 +425,26 @@ def _gains_between(start: float, end: float) -> FloatArray:
 
 
 def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:
-    """Return sensor gains within intervals (axes, 2) at which the loop of a design is unstable.
+    """Return sensor gains within intervals (axes, 2) at which a loop of a design is unstable.
 
     Each corner of the box is tried, and all common factors on the gains of the design that its
     sides allow: exact for axes that decouple; both with the delay of the design, and at a tenth of
-    a frame from it. None if the loop is stable at all of them.
+    a frame from it, of the design and its fall-backs. None if all are stable at all of them.
     """
-    loop = design.close(require_hardware(design, "an interval of gains")).feedback()
-    delay, assumed = loop.hardware.delay_frames, np.diag(loop.hardware.sensor)
-    factors = gains / assumed[:, None]
-    for late in (0.0, DELAY_ERROR, -min(DELAY_ERROR, delay - 1)):
-        path = replace(loop.hardware, delay_frames=delay + late)
-        for corner in product(*gains):
-            turned = replace(path, sensor_matrix=np.diag(corner))
-            if not close_loop(turned, loop.controller).is_stable:
-                return np.array(corner)
-        low, high = stable_sensor_gains(path, loop.controller)
-        for factor in (np.min(factors), np.max(factors)):
-            if not low < factor < high:
-                return np.asarray(factor * assumed)
+    hardware = require_hardware(design, "an interval of gains")
+    delay, factors = hardware.delay_frames, gains / np.diag(hardware.sensor)[:, None]
+    for controller in design.controllers.values():
+        loop = close_loop(hardware, controller).feedback()
+        for late in (0.0, DELAY_ERROR, -min(DELAY_ERROR, delay - 1)):
+            path = replace(loop.hardware, delay_frames=delay + late)
+            for corner in product(*gains):
+                turned = replace(path, sensor_matrix=np.diag(corner))
+                if not close_loop(turned, loop.controller).is_stable:
+                    return np.array(corner)
+            low, high = stable_sensor_gains(path, loop.controller)
+            for factor in (np.min(factors), np.max(factors)):
+                if not low < factor < high:
+                    return np.asarray(factor * np.diag(hardware.sensor))
     return None
 
 
