@@ -173,7 +173,7 @@ def explain_commands(
         return refuse(explanation=shifted or AS_GIVEN, repair=repair, notes=(note,))
     usual = PLAUSIBLE_GAINS if known is None else (float(np.min(known)), float(np.max(known)))
     limits = usual[0] / _WRONG_GAIN**2, usual[1] * _WRONG_GAIN**2
-    choice = _choose(coarse, law, lag)
+    choice = _choose(coarse, law, lag, None if known is None else limits)
     scale = np.ones(record.axes)
     if not choice.unrelated.any():
         scale = _scale(coarse, law, choice, limits)
@@ -325,14 +325,23 @@ class _Choice(NamedTuple):
     unrelated: BoolArray  # (axes,), of commands that follow no law and do not reach the axis
 
 
-def _choose(coarse: CoarseRecord, law: ControlLaw | None, lag: int) -> _Choice:
-    """Return the repair that law and likelihood ask for."""
+def _choose(
+    coarse: CoarseRecord, law: ControlLaw | None, lag: int, known: tuple[float, float] | None
+) -> _Choice:
+    """Return the repair that law and likelihood ask for.
+
+    Where limits of a known gain hold as given, they have to hold after a repair.
+    """
     record = coarse.record
     repairs = list_repairs(record.axes, record.hardware.delay_frames, law, lag)
     contrasts, gain = coarse.compare(repairs)
     contrasts, unrelated = contrasts[:, :-1], contrasts[:, -1]
     contrast = contrasts.sum(axis=0)
     penalty, asked = _penalties(repairs, gain, record, law, lag)
+    if known is not None:
+        held = gain[:, : penalty.size]
+        holds = np.all((held > known[0]) & (held < known[1]), axis=0)
+        penalty = np.where(holds | (not holds[0]), penalty, np.inf)
     best = int(np.argmin(contrast + penalty))
     nats = contrast[0] - contrast
     if asked[best]:

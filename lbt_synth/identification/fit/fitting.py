@@ -56,6 +56,9 @@ _COLOURED = 9.0  # the same of a colour of the noise, which a wrong gain can exp
 _MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _WORTH = 1e-3  # of the innovations' variance, by which a line upon a bump must lower it
 _FAR = 2.0  # half widths of a section from the middle of a bump: what lies beyond is not upon it
+# half width times frequency, angles per frame, below which the process of a bump of so many
+# sections has an error of 1e-4 in double precision
+_STEEPEST = {3: 2e-4, 4: 1e-3}
 _SEED = 0.01  # of the lowest density: noise from which a fit begins at least
 _HIGHEST = float(np.log(0.999 * np.pi))  # angle per frame of a line
 _FASTEST_HZ = 10.0  # natural frequency of turbulence: above, it would be a resonance
@@ -157,6 +160,10 @@ class Search:
             if c.kind == "line":
                 low[spectrum.place(i)] = self.log_angle(_LOWEST * self.data.step_hz)
                 high[spectrum.place(i)] = _HIGHEST
+                if least := _STEEPEST.get(c.sections):
+                    narrowest = min(2 * least / c.frequency**2, 0.9)
+                    low[spectrum.place(i) + 1] = damping_parameter("line", narrowest)
+                    low[spectrum.place(i)] = c.log_frequency - np.log(2) / 2
             elif c.kind != "drift":
                 high[spectrum.place(i)] = self.log_angle(_FASTEST_HZ)
         return replace(priors, bounds=(low, high))

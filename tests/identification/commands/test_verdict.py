@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.control_laws import TRUTH, SteppedLaw, ordinary_loop, run_law
 from support.recorded_loops import LINE, RATE, resonant_record, spliced_record
+from support.structures import structure
 from support.wrong_commands import FAULTS, record, wrong_record
 
 import lbt_synth as lbt
@@ -342,3 +343,9 @@ def test_wide_resonances_hide_no_other_unit(factor: float, options: str) -> None
     assert record.commands is not None
     record = replace(record, commands=factor * record.commands)
     assert explain_commands(record).options == options
+
+
+def test_a_known_gain_holds_after_a_repair() -> None:
+    """By its spectrum another delay was likelier, at which one axis had a seventh of the gain."""
+    seen = structure(138).record(0, 10_000)
+    assert explain_commands(seen, sensor_gain=[1.0]).doubt == ""

@@ -12,6 +12,7 @@ from lbt_synth.identification.fit.fitting import Search, cost, fit, prune, requi
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import Background, Component, SpectrumModel
 from lbt_synth.identification.fit.whittle import contrast
+from lbt_synth.models.vibration import coefficient_rows, sampled_lines
 
 RATE = 1000.0
 
@@ -95,3 +96,19 @@ def test_what_a_part_of_the_turbulence_explains_the_rest_takes_over() -> None:
     kept, dropped = (prune(search, several, thorough=thorough) for thorough in (False, True))
     assert [len(model.spectrum.components) for model in (kept, dropped)] == [2, 1]
     assert cost(search, dropped) < cost(search, kept) - 5
+
+
+def test_a_bump_stays_one_that_double_precision_holds() -> None:
+    """The process of four sections at 3 Hz had a variance below zero."""
+    search = empty_search()
+    bump = replace(search.component("line", 20.0, 0.05, 100.0), sections=4)
+    spectrum = white_noise().add(search.component("turbulence", 1.0, 0.5, 10.0), bump)
+    low = search.priors(spectrum).bounds[0][spectrum.place(1) : spectrum.place(1) + 2]
+    narrowest = replace(bump, log_frequency=low[0], damping=low[1])
+    hertz = narrowest.frequency / search.data.angle_s
+    ratio, rate = np.array([narrowest.damping_ratio]), search.data.frame_rate_hz
+    _, drive = sampled_lines(np.array([hertz]), ratio, 1.0, rate, 4)
+    z = np.exp(-1j * np.linspace(0, np.pi, 400_001)[1:])
+    a1, a2 = coefficient_rows(np.array([narrowest.frequency]), ratio)[0]
+    exact = np.mean(np.abs(1 / (1 - a1 * z - a2 * z**2)) ** 8)
+    assert drive[0] * np.sqrt(exact) == pytest.approx(1, abs=1e-3)
