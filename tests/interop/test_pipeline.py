@@ -3,7 +3,7 @@
 import hashlib
 import json
 import math
-from dataclasses import astuple, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,6 @@ from astropy.io import fits
 from ruamel.yaml import YAML
 from scipy.io import loadmat
 from support.compiled import Compiled
-from support.plants import ROOT
 from support.recorded_runs import recorded_run
 from support.sensor_loops import SLOW, example_plant
 
@@ -220,13 +219,6 @@ CHUNK = 100
 FILES = {"k.c": "c", "k.mat": "matlab", "k.npy": "dao"}
 PATH = lbt.LoopHardware(frame_rate_hz=800)
 PHASE = 100 * np.cumsum(np.random.default_rng(0).standard_normal((1500, 2)), axis=0) / 30
-
-
-def test_the_page_has_the_table_of_the_targets():
-    page = (ROOT / "docs" / "real_time_computer.md").read_text()
-    for name in target_names():
-        words = astuple(lbt.interop.target_named(name).arithmetic)
-        assert f"* - `{name}`\n" + "".join(f"  - {text}\n" for text in words) in page
 
 
 @pytest.mark.usefixtures("short_rehearsal")

@@ -10,7 +10,6 @@ from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
 from lbt_synth.loop.simulation.run import Drop
-from lbt_synth.methods.registry import gain_robust_method
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import ARModel, SinusoidalVibration, TabulatedSpectrum
 from lbt_synth.models.plant.tip_tilt import retuned_plant
@@ -170,7 +169,7 @@ def test_each_line_moves_by_its_share(kalman, settings):
 
 def test_a_map_knows_the_band_of_its_design(kalman, settings):
     inputs = PlantInputs(plant=settings.plant)
-    robust = design_request(gain_robust_method(), {}).build(inputs)
+    robust = design_request("robust", {}).build(inputs)
 
     def band(design, truth):
         return robustness_map(
