@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+from dataclasses import astuple
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from support.exports import lbt_config, lbt_designs
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
+from lbt_synth.interop.pipeline import target_named, target_names
 
 
 @pytest.fixture
@@ -166,3 +168,13 @@ def test_what_is_missing_is_said(capsys, monkeypatch, files, words, message):
     status, _, error = run(capsys, "rehearse", *words)
     assert status == 2
     assert message in error
+
+
+def test_targets_say_how_they_compute(capsys):
+    """Without a name, `--for` prints each target's arithmetic, word for word."""
+    status, text, error = run(capsys, "export", "--for")
+    assert (status, error) == (0, "")
+    printed = " ".join(text.split())
+    for name in target_names():
+        for words in astuple(target_named(name).arithmetic):
+            assert words in printed, name
