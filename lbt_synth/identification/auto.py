@@ -257,7 +257,7 @@ class _Predictor:
     def design(self, noise: float = 1.0) -> Design:
         """Return the design that assumes a multiple of the model's noise."""
         half = self._fit(self._half, stretches=self._first, noise=noise)
-        claims = self._claims(half.design(self._penalty))
+        claims = self._claims(half.design())
         return self._fit(self._model, noise=noise).design(self._penalty, **claims)
 
     def channel_values(self) -> tuple[ChannelValue, ...]:
@@ -266,7 +266,7 @@ class _Predictor:
         past, unseen = (
             self._fit(self._half, stretches=part) for part in (self._first, self._later)
         )
-        return tuple(channel_values(past, unseen, self._penalty, noise_nm2))
+        return tuple(channel_values(past, unseen, past.penalty, noise_nm2))
 
 
 def _design(
