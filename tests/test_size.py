@@ -14,27 +14,28 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 4320,
+    "cli": 4246,
     "config": 1876,
-    "design": 7570,
+    "design": 7690,
     "files": 1608,
-    "identification": 9800,
-    "interop": 4360,
-    "linear": 5874,
+    "identification": 9965,
+    "interop": 4400,
+    "linear": 5763,
     "loop": 4905,
     "methods": 920,
     "models": 4400,
-    "report": 4398,
+    "report": 4312,
     "storage": 1049,
-    "studies": 3050,
+    "studies": 3135,
     "errors, validation": 642,
 }
 COUNTS = {
-    "files of the package": 265,
-    "public names": 230,
-    "tuned constants": 660,
-    "lines of tests": 34080,
-    "words of docs": 62300,
+    "files of the package": 216,
+    "public names": 219,
+    "tuned constants": 540,
+    "lines of tests": 33020,
+    "lines of benchmarks": 4042,
+    "words of docs": 61300,
 }
 
 

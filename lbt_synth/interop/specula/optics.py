@@ -284,18 +284,7 @@ class Optics:
         self._parameters = _make_parameters(system)
         self._pupil = _make_pupil(system, self._parameters)
         self._commands = self._make_input(np.zeros(len(modes.shapes)))
-        mirror = _make(
-            "processing_objects.dm:DM",
-            self._parameters,
-            0,
-            ifunc=_make(
-                "data_objects.ifunc:IFunc",
-                ifunc=modes.shapes,
-                mask=modes.mask.astype(np.float32),
-            ),
-            sign=1,
-            inputs={"in_command": self._commands},
-        )
+        mirror = self._make_mirror()
         inputs = {"common_layer_list": [self._pupil, mirror.outputs["out_layer"]]}
         air = [] if screens is None else [self._make_air(screens, frames, seed)]
         if air:
@@ -330,6 +319,21 @@ class Optics:
         # photons per subaperture, over the whole detector
         flux = system.photons * len(indices.ind_pup) * system.frame_rate_hz
         self._field.S0 = flux / float(self._field.masked_area())
+
+    def _make_mirror(self) -> Any:
+        """Return the mirror that the commands move, in the modes."""
+        return _make(
+            "processing_objects.dm:DM",
+            self._parameters,
+            0,
+            ifunc=_make(
+                "data_objects.ifunc:IFunc",
+                ifunc=self.modes.shapes,
+                mask=self.modes.mask.astype(np.float32),
+            ),
+            sign=1,
+            inputs={"in_command": self._commands},
+        )
 
     def expose(
         self, commands_nm: FloatArray, tilts_nm: Sequence[float] | FloatArray, *, seeing: float = 1
