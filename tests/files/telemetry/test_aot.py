@@ -288,10 +288,6 @@ def no_clock(system):
     loop.time = loop.commands.time = sensor.measurements.time = None
 
 
-def with_nan(system):
-    system.loops[0].commands.data[1, 2] = np.nan
-
-
 def short(system):
     system.loops[0].commands.data = system.loops[0].commands.data[:2]
 
@@ -305,7 +301,6 @@ def still(system):
     [
         (drop("commands"), "has no control loop with commands and measurements"),
         (no_clock, "the frame rate is missing"),
-        (with_nan, "commands must be finite"),
         (short, "measurements must have 2 frames to match commands"),
         (still, "the frame rate is missing"),
         (lambda s: s.metadata.append(aotpy.Metadatum("LBTSYNTH", "{")), "inconsistent"),
