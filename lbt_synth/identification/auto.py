@@ -219,6 +219,7 @@ def design_from_record(
         predictor.design if predictor else partial(_design, method, model, defaults),
         allowed_gains(record, model) if finds_gain else None,
         command_scale_known=command_scale_known,
+        claimed=predictor.claimed if predictor else _as_it_is,
     )
     step(1)
     return RecordedDesign(
@@ -252,21 +253,25 @@ class _Predictor:
         self._claims = partial(unseen_claims, record, half, channels=channels)
         self._fit = partial(regress, record, channels=channels)
         self._first, self._later = split_halves(record.stretches(), record.frames)
-        self._penalty = self._fit(model).penalty
+        self._whole, self._past = self._fit(model), self._fit(half, stretches=self._first)
 
-    def design(self, noise: float = 1.0) -> Design:
-        """Return the design that assumes a multiple of the model's noise."""
-        half = self._fit(self._half, stretches=self._first, noise=noise)
-        claims = self._claims(half.design())
-        return self._fit(self._model, noise=noise).design(self._penalty, **claims)
+    def design(self, noise: float) -> Design:
+        """Return the design that assumes a multiple of the model's noise, without claims."""
+        whole = self._whole if noise == 1 else self._fit(self._model, noise=noise)
+        return whole.design(self._whole.penalty)
+
+    def claimed(self, design: Design, noise: float) -> Design:
+        """Return the design with what that of the first half leaves of the second."""
+        past = self._past
+        if noise != 1:
+            past = self._fit(self._half, stretches=self._first, noise=noise)
+        return replace(design, claims={**design.claims, **self._claims(past.design())})
 
     def channel_values(self) -> tuple[ChannelValue, ...]:
         """Return what each channel is worth on the second half of the record."""
         noise_nm2 = float(np.sum(np.array([axis.noise_nm for axis in self._half.axes]) ** 2))
-        past, unseen = (
-            self._fit(self._half, stretches=part) for part in (self._first, self._later)
-        )
-        return tuple(channel_values(past, unseen, past.penalty, noise_nm2))
+        unseen = self._fit(self._half, stretches=self._later)
+        return tuple(channel_values(self._past, unseen, noise_nm2))
 
 
 def _design(
@@ -448,21 +453,28 @@ def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:
     return None
 
 
+def _as_it_is(design: Design, noise: float) -> Design:
+    """Return a design that claims all that it will."""
+    return design
+
+
 def design_for_gains(
     model: IdentifiedModel,
     design: Callable[[float], Design],
     allowed: FloatArray | None,
     *,
     command_scale_known: bool,
+    claimed: Callable[[Design, float], Design] = _as_it_is,
 ) -> tuple[Design, tuple[str, ...]]:
     """Return a design that is stable at all sensor gains that a record allows, and notes.
 
-    ``design`` makes one that assumes a multiple of the model's noise. Its first assumption says
-    which gains are possible. Commands that were recorded at half their size look like twice the
-    sensor gain, and no record can tell; so unless the scale of the commands is known, half of the
-    gains are possible, and each axis may have those of both. Where the design is unstable at one of
-    them, or with a delay a tenth of a frame off, the one that assumes the least more noise and is
-    stable takes its place: the more noise, the less a filter trusts its sensor.
+    ``design`` makes one that assumes a multiple of the model's noise, and ``claimed`` adds what
+    only the one that is taken claims. Its first assumption says which gains are possible. Commands
+    that were recorded at half their size look like twice the sensor gain, and no record can tell;
+    so unless the scale of the commands is known, half of the gains are possible, and each axis may
+    have those of both. Where the design is unstable at one of them, or with a delay a tenth of a
+    frame off, the one that assumes the least more noise and is stable takes its place: the more
+    noise, the less a filter trusts its sensor.
     """
     usual, assumed = design(1.0), list[str]()
     intervals = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1)
@@ -480,18 +492,19 @@ def design_for_gains(
             if np.ptp(allowed, axis=0).any():
                 text += ", and each axis at those of both, because they differ"
         assumed.append(text)
-    bad = unstable_gains(usual, intervals)
+    bad, usual = unstable_gains(usual, intervals), claimed(usual, 1.0)
     if bad is None:
         return replace(usual, assumptions=(*assumed, *usual.assumptions)), ()
-    safe = _assume_noise(design, intervals)
+    stable = _assume_noise(design, intervals)
     advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
-    if safe is None:
+    if stable is None:
         gain = ", ".join(f"{value:.3g}" for value in bad)
         raise CertificateError(
             f"the loop of the design is unstable at the sensor gain {gain}, or there with a delay "
             f"{DELAY_ERROR:g} frames off, and the record allows {_in_words(intervals)}. Record "
             f"with a higher loop gain, look for jumps in it, give the sensor gain{advice}."
         )
+    safe = claimed(*stable)
     note = (
         f"to be stable at sensor gains of {_in_words(intervals)}, and with a delay up to "
         f"{DELAY_ERROR:g} frames off, the design leaves {nm_text(_residual_nm(safe, model))}; "
@@ -507,8 +520,10 @@ def design_for_gains(
     return replace(safe, assumptions=(*assumed, *safe.assumptions)), (note,)
 
 
-def _assume_noise(design: Callable[[float], Design], intervals: FloatArray) -> Design | None:
-    """Return the design of least more noise that is stable at all gains; None if there is none."""
+def _assume_noise(
+    design: Callable[[float], Design], intervals: FloatArray
+) -> tuple[Design, float] | None:
+    """Return the design of least more noise that is stable at all gains, and the factor."""
     stable, low, high = None, 0.0, 1.0  # binary logarithms of factors
     while stable is None and high <= _MOST_NOISE:
         stable = _if_stable(design, 2.0**high, intervals)
@@ -518,7 +533,7 @@ def _assume_noise(design: Callable[[float], Design], intervals: FloatArray) -> D
         nearer = _if_stable(design, 2.0**middle, intervals)
         low, high = (low, middle) if nearer else (middle, high)
         stable = nearer or stable
-    return stable
+    return None if stable is None else (stable, 2.0**high)
 
 
 def _if_stable(

@@ -45,7 +45,6 @@ from lbt_synth.validation import FloatArray, frozen_copy, matrix, require_instan
 
 RAN = "what ran"
 INTEGRATOR = "best integrator"
-ALONE = "predictor without channels"
 LIMIT = "limit of performance"
 
 

@@ -166,16 +166,6 @@ class Regression:
             ) from None
         return np.asarray(cho_solve(factor, moments.products))
 
-    def chained_penalty(self, signals: Sequence[int]) -> float:
-        """Return the penalty whose filters of the past leave least of what comes next."""
-        parts = [part.chosen(self.places(signals)) for part in self.parts]
-        left = np.zeros(len(_PENALTIES))
-        past = sum(parts[1:_FIRST], parts[0])
-        for part in parts[_FIRST:]:
-            left += [part.left(self.solve(signals, p, past)) for p in _PENALTIES]
-            past = past + part
-        return float(_PENALTIES[np.argmin(left)])
-
     @cached_property
     def whole(self) -> Moments:
         """Moments of all frames."""
@@ -183,8 +173,13 @@ class Regression:
 
     @cached_property
     def penalty(self) -> float:
-        """The penalty of forward chaining, for all signals."""
-        return self.chained_penalty(range(len(self.scales)))
+        """The penalty whose filters of the past leave least of what comes next."""
+        signals, left = range(len(self.scales)), np.zeros(len(_PENALTIES))
+        past = sum(self.parts[1:_FIRST], self.parts[0])
+        for part in self.parts[_FIRST:]:
+            left += [part.left(self.solve(signals, p, past)) for p in _PENALTIES]
+            past = past + part
+        return float(_PENALTIES[np.argmin(left)])
 
     def design(self, penalty: float | None = None, **claims: float) -> PredictorDesign:
         """Return the certified design, by default with the penalty of forward chaining."""
@@ -304,15 +299,13 @@ class ChannelValue:
     dead_nm: float = nm_column("zeros, unseen", unit="nm rms", help="Residual if it reads zeros")
 
 
-def channel_values(
-    past: Regression, unseen: Regression, penalty: float, noise_nm2: float
-) -> list[ChannelValue]:
+def channel_values(past: Regression, unseen: Regression, noise_nm2: float) -> list[ChannelValue]:
     """Return what a predictor of the past leaves of unseen frames, without each channel.
 
     The noise of the measurements is subtracted; nan where it hides the residual.
     """
     everything = list(range(len(past.scales)))
-    coefficients = past.solve(everything, penalty, past.whole)
+    coefficients = past.solve(everything, past.penalty, past.whole)
 
     def left_nm(signals: list[int], coefficients: FloatArray) -> float:
         moments = unseen.whole.chosen(unseen.places(signals))
@@ -322,7 +315,7 @@ def channel_values(
     rows = []
     for signal, name in zip(everything[past.own :], past.hardware.suite.channels, strict=True):
         others = [other for other in everything if other != signal]
-        without = past.solve(others, penalty, past.whole.chosen(past.places(others)))
+        without = past.solve(others, past.penalty, past.whole.chosen(past.places(others)))
         silent = coefficients.copy()
         silent[past.places([signal])] = 0.0
         rows.append(

@@ -289,16 +289,14 @@ def check_series(
 
 
 def inverse_sensor(hardware: LoopHardware) -> FloatArray:
-    """Return the inverse of the sensor matrix, (n, n)."""
-    need = "a replay needs a measurement for every mode, and a sensor matrix"
-    return invert(hardware.sensor, need)
-
-
-def invert(square: FloatArray, need: str) -> FloatArray:
-    """Return the inverse of a matrix of the loop; refuse one that has none."""
+    """Return the inverse of the sensor matrix, (n, n); refuse one that has none."""
+    square = hardware.sensor
     rank = np.linalg.matrix_rank(square)
     if square.shape[0] != square.shape[1] or rank < len(square):
-        raise ProblemError(f"{need} that can be inverted; got {square.shape} of rank {rank}.")
+        raise ProblemError(
+            "a replay needs a measurement for every mode, and a sensor matrix that can be "
+            f"inverted; got {square.shape} of rank {rank}."
+        )
     return np.asarray(np.linalg.inv(square))
 
 

@@ -95,7 +95,7 @@ def test_channels_that_see_a_structure_are_worth_what_is_claimed() -> None:
     # and what each is worth, by the moments of the unseen half alone
     _, later = split_halves(record.stretches(), record.frames)
     unseen = regress(record, half, stretches=later, channels=beside)
-    rows = channel_values(past, unseen, past.penalty, 2 * half.axes[0].noise_nm ** 2)
+    rows = channel_values(past, unseen, 2 * half.axes[0].noise_nm ** 2)
     for place, row in enumerate(rows):
         assert row.channel == f"channel{place + 1}"
         assert row.without_nm > 0.98 * claims["residual_nm"]
