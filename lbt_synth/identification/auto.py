@@ -442,12 +442,15 @@ def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:
         loop = close_loop(hardware, controller).feedback()
         for late in (0.0, DELAY_ERROR, -min(DELAY_ERROR, delay - 1)):
             path = replace(loop.hardware, delay_frames=delay + late)
-            for corner in product(*gains):
+            for corner in product(*map(np.unique, gains)):
                 turned = replace(path, sensor_matrix=np.diag(corner))
                 if not close_loop(turned, loop.controller).is_stable:
                     return np.array(corner)
+            ends = (np.min(factors), np.max(factors))
+            if ends == (1.0, 1.0):  # the only corner
+                continue
             low, high = stable_sensor_gains(path, loop.controller)
-            for factor in (np.min(factors), np.max(factors)):
+            for factor in ends:
                 if not low < factor < high:
                     return np.asarray(factor * np.diag(hardware.sensor))
     return None
