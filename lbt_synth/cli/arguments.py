@@ -243,7 +243,6 @@ the paper and the simulator: Agapito et al. 2008, and loops with a pyramid
     --frames | int | frames of an exposure
     --settle-frames | int | frames to settle before, at least 200
     --seed | int | seed of the random parts, the first of several
-    --cache | | directory for calibrations and phase screens
     -o --output | required | directory to write into
     > for tables of the paper
     --tables | II/III nargs:+ | run these tables of the paper instead of one gain file

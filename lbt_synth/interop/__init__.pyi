@@ -6,8 +6,4 @@ from .pipeline import Target as Target
 from .pipeline import export as export
 from .pipeline import rehearse as rehearse
 from .pipeline import target_named as target_named
-from .specula.optics import EndToEndSystem as EndToEndSystem
-from .specula.optics import calibrate as calibrate
-from .specula.simulation import EndToEndRun as EndToEndRun
-from .specula.simulation import EndToEndSetup as EndToEndSetup
 from .specula.simulation import run_end_to_end as run_end_to_end
