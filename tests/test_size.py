@@ -31,7 +31,7 @@ LINES = {
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 219,
+    "public names": 209,
     "tuned constants": 540,
     "lines of tests": 33020,
     "lines of benchmarks": 4042,

@@ -298,8 +298,7 @@ class TargetChoice(Action):
             setattr(namespace, self.dest, values)
             return
         from lbt_synth.cli.output import Report  # needs what makes help slow
-        from lbt_synth.interop import target_named
-        from lbt_synth.interop.pipeline import target_names
+        from lbt_synth.interop.pipeline import target_named, target_names
         from lbt_synth.storage.rows import fact_table
 
         targets = {name: target_named(name) for name in target_names()}

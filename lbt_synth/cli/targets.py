@@ -19,8 +19,9 @@ from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.identification.records.record import require_length
-from lbt_synth.interop import Rehearsal, export, frame_cost, rehearse, target_named
-from lbt_synth.interop.pipeline import target_names
+from lbt_synth.interop import export, rehearse
+from lbt_synth.interop.c.export import frame_cost
+from lbt_synth.interop.pipeline import Rehearsal, target_named, target_names
 from lbt_synth.loop import Imaging
 from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
 from lbt_synth.loop.strehl import series_strehl

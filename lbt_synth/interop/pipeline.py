@@ -65,53 +65,30 @@ class Arithmetic:
 class Target:
     """A program that runs our controllers: how it rounds, writes and reads the numbers of a design.
 
-    Attributes
-    ----------
-    arithmetic : Arithmetic
-        How it computes.
-    file, hint : str
-        What is written, in words; what to try where the proof fails.
-    options : mapping
-        Options of :func:`export` that the target takes, each with its default.
-    round : callable
-        ``round(designs, **options)`` returns the numbers of each design, in a type of the target.
-    write, read : callable
-        ``write(place, whole, design, origin, gain_digest=..., **options)`` returns the content of
-        each file, and ``read(files, whole)`` the numbers in it; ``whole`` has their sizes.
-    computed : callable
-        ``computed(design, numbers)`` returns the :class:`Written` that is proved.
-    start : callable
-        ``start(numbers, limit)`` returns a twin, which clips where the program knows the limit.
-    join : callable or None
-        ``join(numbers, parts, count)`` returns the numbers of a file of so many modes. Without it a
-        file holds one design, of any matrices.
-    facts, remark : callable
-        ``facts(whole, **options)`` returns what else the certificate names, and
-        ``remark(design, numbers)`` what a user is told, or nothing.
-    endings, beside, contents : tuple of str
-        Endings of a file, those of what goes beside it; names in a folder.
-    modal, reads_others : bool
-        Whether measurements and commands of one design must be the modes, too, as those of several
-        must; whether a design may read further sensors.
+    ``whole`` are the numbers of a file, of all its modes.
     """
 
     arithmetic: Arithmetic
-    file: str
+    file: str  # what is written, in words
+    # round(designs, **options) returns the numbers of each design, in a type of the target
     round: Callable[..., list[Any]]
+    # write(place, whole, design, origin, gain_digest=..., **options) returns the content of files
     write: Callable[..., dict[Path, bytes]]
-    read: Callable[[Mapping[Path, bytes], Any], Any]
-    computed: Callable[[Design, Any], Written]
+    read: Callable[[Mapping[Path, bytes], Any], Any]  # read(files, whole), which has the sizes
+    computed: Callable[[Design, Any], Written]  # what is proved of the numbers of a design
+    # start(numbers, limit) returns a twin, which clips where the program knows the limit
     start: Callable[[Any, float], SteppedController]
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)  # of export, with their defaults
+    # join(numbers, parts, count) returns the numbers of a file; without it it holds one design
     join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] | None = None
-    facts: Callable[..., Mapping[str, Any]] = lambda _, **options: {}
-    remark: Callable[[Design, Any], str] = lambda *_: ""
-    hint: str
-    endings: tuple[str, ...] = ()
-    beside: tuple[str, ...] = ()
-    contents: tuple[str, ...] = ()
-    modal: bool = True
-    reads_others: bool = False
+    facts: Callable[..., Mapping[str, Any]] = lambda _, **options: {}  # facts(whole, **options)
+    remark: Callable[[Design, Any], str] = lambda *_: ""  # what a user is told, or nothing
+    hint: str  # what to try where the proof fails
+    endings: tuple[str, ...] = ()  # of a file
+    beside: tuple[str, ...] = ()  # endings of what goes beside it
+    contents: tuple[str, ...] = ()  # names in a folder
+    modal: bool = True  # whether measurements and commands of one design must be the modes, too
+    reads_others: bool = False  # whether a design may read further sensors
 
     def path_in(self, folder: Path) -> Path:
         """Return a path in a folder that can be written."""
@@ -126,40 +103,13 @@ class Target:
 
 
 def target_names() -> tuple[str, ...]:
-    """Return the names of the targets, sorted, without loading them.
-
-    >>> from lbt_synth.interop.pipeline import target_names
-    >>> target_names()
-    ('c', 'cacao', 'dao', 'matlab', 'pyrtc')
-    """
+    """Return the names of the targets, sorted, without loading them."""
     exports = Path(__file__).parent.glob("*/export.py")
     return tuple(sorted(path.parent.name for path in exports))
 
 
 def target_named(name: str) -> Target:
-    """Return one target.
-
-    Parameters
-    ----------
-    name : str
-        One of :func:`target_names`.
-
-    Returns
-    -------
-    Target
-        The target.
-
-    Raises
-    ------
-    ProblemError
-        If there is none of that name.
-
-    Examples
-    --------
-    >>> from lbt_synth.interop.pipeline import target_named
-    >>> target_named("dao").arithmetic.precision
-    'single'
-    """
+    """Return one target."""
     module: Any = import_module(
         f"lbt_synth.interop.{choice(name, 'target', target_names())}.export"
     )
@@ -169,28 +119,15 @@ def target_named(name: str) -> Target:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Exported:
-    """Files that were written, and how far they are from the controller.
+    """Files that were written, and how far they are from the controller."""
 
-    Attributes
-    ----------
-    files : tuple of Path
-        The files; the certificate is the last one.
-    error : float
-        Largest difference of commands from the controller's in the arithmetic of the file, over the
-        largest command: in the closed loop where the design is of one, on white noise elsewhere.
-    start : callable
-        ``start(limit)`` returns what was written, stepped in the arithmetic of the target.
-    checks : tuple of Check
-        The proof in the loop, with the numbers of the file.
-    notes : tuple of str
-        What a user should know of the export.
-    """
-
-    files: tuple[Path, ...]
+    files: tuple[Path, ...]  # the certificate is the last one
+    # largest difference of commands from the controller's in the arithmetic of the file, over the
+    # largest command: in the closed loop where the design is of one, on white noise elsewhere
     error: float
-    start: Callable[[float], SteppedController]
-    checks: tuple[Check, ...]
-    notes: tuple[str, ...]
+    start: Callable[[float], SteppedController]  # what was written, from the limit of the stroke
+    checks: tuple[Check, ...]  # the proof in the loop, with the numbers of the file
+    notes: tuple[str, ...]  # what a user should know of the export
 
 
 def export(
@@ -245,7 +182,9 @@ def export(
     Returns
     -------
     Exported
-        Files, errors, the checks in the arithmetic of the target, and notes.
+        The ``files``, of which the certificate is the last; ``error``, the largest difference of
+        commands from the controller's over the largest command; ``checks``, the proof in the
+        arithmetic of the target; ``start(limit)``, what was written, stepped; and ``notes``.
 
     Raises
     ------
@@ -436,23 +375,13 @@ def _certificate(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rehearsal:
-    """A target and the design itself on the same series, after both loops have settled.
+    """A target and the design itself on the same series, after both loops have settled."""
 
-    Attributes
-    ----------
-    target, design : Simulation
-        In the arithmetic of the target, and in double precision; commands are as they were applied.
-    settle_frames, stroke : int, float
-        Frames at the beginning that are left out; largest modulus of a command, or infinity.
-    checks : tuple of Check
-        The proof of what the target runs, as in its certificate.
-    """
-
-    target: Simulation
-    design: Simulation
-    settle_frames: int
-    stroke: float
-    checks: tuple[Check, ...]
+    target: Simulation  # in its arithmetic; commands are as they were applied
+    design: Simulation  # in double precision
+    settle_frames: int  # at the beginning, left out
+    stroke: float  # largest modulus of a command, or infinity
+    checks: tuple[Check, ...]  # the proof of what the target runs, as in its certificate
 
     @property
     def differences(self) -> FloatArray:
@@ -494,7 +423,8 @@ def rehearse(
     Returns
     -------
     Rehearsal
-        Both loops, on the frames after they have settled.
+        The simulations ``target`` and ``design`` of the frames after both loops have settled, the
+        ``differences`` of their commands (frames, m), and ``checks``.
 
     Raises
     ------

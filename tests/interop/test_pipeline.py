@@ -202,7 +202,7 @@ def judge(folder, seed):
     verdicts = {}
     for name, oracle in ORACLES.items():
         options = random_options(name, rng)
-        target = lbt.interop.target_named(name)
+        target = target_named(name)
         try:
             written = lbt.interop.export(target.path_in(folder), design, name, **options)
         except (lbt.errors.NumericalError, lbt.errors.ProblemError):
@@ -230,7 +230,7 @@ def test_the_oracles_see_a_loop_that_is_unstable(tmp_path):
     )
     design = lbt.integrator(quick, gain=0.9)
     for name, oracle in ORACLES.items():
-        target = lbt.interop.target_named(name)
+        target = target_named(name)
         files = lbt.interop.export(target.path_in(tmp_path), design, name).files
         assert decays(quick, oracle(files, quick, {}))
         if name != "cacao":  # its configuration has the delay, so that this loop has none to miss
@@ -295,7 +295,7 @@ def test_what_no_format_takes(tmp_path, designs, file):
 @pytest.mark.usefixtures("short_rehearsal")
 @pytest.mark.parametrize("name", target_names())
 def test_the_same_design_gives_the_same_files_and_a_certificate_of_them(tmp_path, designs, name):
-    own, seen = lbt.interop.target_named(name), []
+    own, seen = target_named(name), []
     for folder in (tmp_path / "a", tmp_path / "b"):
         folder.mkdir()
         written = lbt.interop.export(
@@ -329,7 +329,7 @@ def test_a_sensor_gain_of_each_axis_is_in_the_numbers(tmp_path, designs, name):
     )
     phase = 100 * np.cumsum(np.random.default_rng(0).standard_normal((600, 2)), axis=0) / 30
     for design in (lbt.kalman(plant), lbt.integrator(hardware, gain=0.5)):
-        target = lbt.interop.target_named(name)
+        target = target_named(name)
         written = lbt.interop.export(target.path_in(tmp_path), design, name)
         assert all(check.passed for check in written.checks)
         runs = [
@@ -353,7 +353,7 @@ def test_an_option_goes_with_its_target(tmp_path, designs):
 @pytest.mark.parametrize("name", target_names())
 def test_what_is_proved_is_what_was_read_from_the_file(tmp_path, designs, monkeypatch, name):
     """Each file holds numbers; where one is another when it is read, it is not written."""
-    own = lbt.interop.target_named(name)
+    own = target_named(name)
 
     def damaged(files, like):
         return louder(own.read(files, like))

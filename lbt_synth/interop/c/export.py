@@ -55,31 +55,7 @@ class FrameCost:
 
 
 def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
-    """Count the arithmetic and the memory of one frame.
-
-    Parameters
-    ----------
-    design : Design or Controller
-        The controller, or a design with one.
-
-    Returns
-    -------
-    FrameCost
-        Counts for the C source that :func:`export` writes.
-
-    Raises
-    ------
-    ProblemError
-        If it is neither.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lag = lbt.Controller(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
-    >>> cost = lbt.interop.frame_cost(lag)
-    >>> cost.multiplications, cost.additions
-    (1, 1)
-    """
+    """Count the arithmetic and the memory of one frame of the C source."""
     terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
     (s, _, m), out = terms.sizes, _written_out(terms)
     sums = "".join([*out["errors"], *out["states"], *out["commands"]])
