@@ -443,7 +443,7 @@ def _refuse_key(config: Config, key: str, why: str) -> NoReturn:
 
 
 def _modal_residuals(
-    config: Config, air: models.ModalTurbulence, noise_nm: FloatArray
+    config: Config, air: models.ARModel, noise_nm: FloatArray
 ) -> tuple[float, FloatArray, dict[str, FloatArray]]:
     """Return the best single gain, the best of each mode, and the residuals by controller [nm]."""
     hardware, lines = config.hardware, dict[int, list[models.Vibration]]()
