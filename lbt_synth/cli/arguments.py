@@ -198,8 +198,7 @@ _TABLE = """
     --order | int | dao: M of the RTC's configuration (default 20)
     --modes | int | c, cacao, dao, pyrtc: modes of the RTC (default: those of the design)
     --other-gain | float | gain of an integrator for each further mode (default: none)
-    --steps | int | cacao: frames of history (default: as many as the loss needs)
-    --loss | float | cacao: loss of residual that chooses them (default 0.01, the most)
+    --steps | int | cacao: frames of history (default: as many as the proof needs)
     -o --output | required | file to write: .c (the .h goes beside it), .mat, .fits or .npy, and its
         certificate; pyrtc: folder
   rehearse | targets | Run a gain file in the arithmetic of another program, in the loop.

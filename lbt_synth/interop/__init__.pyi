@@ -1,3 +1,2 @@
 from .pipeline import export as export
-from .pipeline import rehearse as rehearse
 from .specula.simulation import run_end_to_end as run_end_to_end

@@ -37,7 +37,7 @@ from lbt_synth.loop.simulation.run import (
 )
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
-from lbt_synth.storage.rows import column, json_record, table_row
+from lbt_synth.storage.rows import json_record
 from lbt_synth.validation import FloatArray, choice, number, require_instance
 
 CERTIFICATE = ".certificate.json"  # added to the name of what is written: its certificate
@@ -49,18 +49,6 @@ _DIGEST = re.compile(r"[0-9a-f]{64}")
 _MOST_SETTLING = 0.25  # part of the frames that the loops may settle in
 
 
-@table_row
-class Arithmetic:
-    """How the program that loads a file computes with it."""
-
-    program: str = column("program")
-    precision: str = column("precision")
-    sums: str = column("order of sums")
-    state: str = column("convention of the state")
-    clipping: str = column("clipping")
-    limits: str = column("limits")
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Target:
     """A program that runs our controllers: how it rounds, writes and reads the numbers of a design.
@@ -68,8 +56,7 @@ class Target:
     ``whole`` are the numbers of a file, of all its modes.
     """
 
-    arithmetic: Arithmetic
-    file: str  # what is written, in words
+    precision: str  # of its sums, unless an option says
     # round(designs, **options) returns the numbers of each design, in a type of the target
     round: Callable[..., list[Any]]
     # write(place, whole, design, origin, gain_digest=..., **options) returns the content of files
@@ -155,8 +142,8 @@ def export(
     Parameters
     ----------
     path : path-like
-        File to write: ``.c`` (the header goes beside it), ``.fits`` for cacao, ``.npy`` or
-        ``.fits`` for dao, ``.mat`` for MATLAB; for pyRTC a folder, whose parent is there. The
+        File to write: ``.c`` (the header goes beside it), ``.fits`` for cacao, ``.npy`` for dao,
+        ``.mat`` for MATLAB; for pyRTC a folder, whose parent is there. The
         certificate has the name of the file and ``.certificate.json``.
     design : Design, MixedController or ModalFilters
         The design. Targets ``c``, ``cacao`` and ``dao`` also take a design with integrators for
@@ -175,9 +162,7 @@ def export(
         given those that were, :func:`~lbt_synth.linear.estimator_form`; a design of several sensors
         has that form alone), precision ("double" or "single") and name (the prefix of the C names;
         by default that of the file). For ``dao``: order (M of the RTC's configuration, 20). For
-        ``cacao``: steps (of the history; by default as many as the loss needs) and loss (of
-        residual, relative, at each sensor gain of the proof, at which the length is chosen; at
-        most 0.01, the limit of the proof).
+        ``cacao``: steps (of the history; by default as many as the proof needs).
 
     Returns
     -------
@@ -236,7 +221,7 @@ def export(
     file_numbers = program.join(numbers, parts, count) if program.join else numbers[0]
     pairs = list(zip(parts, numbers, strict=True))
     error = max(rehearsal_error(part.design, program.start(held, np.inf)) for part, held in pairs)
-    precision = settings.get("precision", program.arithmetic.precision)
+    precision = settings.get("precision", program.precision)
     files = program.write(place, file_numbers, first, origin, gain_digest=gain_digest, **settings)
     again = program.read(files, file_numbers)
     if not _is_same(again, file_numbers):
@@ -251,8 +236,9 @@ def export(
     if program.contents:
         make_directory(place, parents=False)
     settings |= {"modes": count, "notes": notes, **program.facts(file_numbers, **settings)}
+    settings |= {"precision": precision}
     kept = {name: settings[name] for name in sorted(settings) if settings[name] is not None}
-    certificate = _certificate(files, target, program.arithmetic, checks, gain_digest, kept)
+    certificate = _certificate(files, target, checks, gain_digest, kept)
     return Exported(
         files=write_together(dict((*files.items(), *certificate.items()))),
         error=error,
@@ -351,7 +337,6 @@ def comment_text(text: str) -> str:
 def _certificate(
     files: Mapping[Path, bytes],
     target: str,
-    arithmetic: Arithmetic,
     checks: Sequence[Check],
     gain_digest: str | None,
     facts: Mapping[str, Any],
@@ -366,7 +351,6 @@ def _certificate(
         **({"others_sha256": {o.name: digests[o.name] for o in others}} if others else {}),
         "gain_sha256": gain_digest,
         **facts,
-        "arithmetic": json_record(arithmetic),
         "checks": [json_record(check) for check in checks],
     }
     text = json.dumps(certificate, indent=2, allow_nan=False) + "\n"
@@ -403,48 +387,8 @@ def rehearse(
 ) -> Rehearsal:
     """Run what is exported to a target in its arithmetic, and the design in double precision.
 
-    Both loops run frame by frame, on the same series.
-
-    Parameters
-    ----------
-    design : Design
-        The design.
-    target : str
-        Name of a target, whose export has its usual options.
-    disturbance : Disturbance
-        Phase and noise of one case. The pseudo-open-loop series of a record may stand for the
-        phase; its noise is then part of the residual, and ``frame_means`` keeps it out of what
-        moves within frames.
-    hardware : LoopHardware, optional
-        The loop; by default that of the design.
-    stroke : float, optional
-        Largest modulus of a command that the mirror applies; without a limit by default.
-
-    Returns
-    -------
-    Rehearsal
-        The simulations ``target`` and ``design`` of the frames after both loops have settled, the
-        ``differences`` of their commands (frames, m), and ``checks``.
-
-    Raises
-    ------
-    ProblemError
-        If the target cannot hold the design, it reads several sensors, or sizes clash.
-    CertificateError
-        If the certificate that the design carries has a failed check.
-    UnstableLoopError
-        If the loop of the design is unstable.
-    NumericalError
-        If the export is refused, or the loop grows beyond all numbers in its arithmetic.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt, numpy as np
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.5)
-    >>> wave = lbt.loop.Disturbance(phase_nm=100 * np.sin(np.arange(2000.0)[:, None] / 50))
-    >>> run = lbt.interop.rehearse(slow, "dao", wave)
-    >>> bool(0 < np.max(np.abs(run.differences)) < 1e-3)
-    True
+    Both loops, of the design's hardware or another, run frame by frame on the phase and noise of
+    one case, with a mirror that clips at the stroke.
     """
     controller = as_controller(design)
     path = require_hardware(design, "a rehearsal") if hardware is None else hardware

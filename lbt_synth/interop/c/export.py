@@ -24,7 +24,7 @@ from lbt_synth.interop.c.terms import (
     source_terms,
     used_readings,
 )
-from lbt_synth.interop.pipeline import Arithmetic, Target, comment_text
+from lbt_synth.interop.pipeline import Target, comment_text
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.storage.rows import column, table_row
@@ -317,15 +317,7 @@ def _facts(terms: SourceTerms, **_: Any) -> dict[str, Any]:
 
 
 TARGET = Target(
-    arithmetic=Arithmetic(
-        program="real-time computers, from C99 source",
-        precision="double or single",
-        sums="from left to right: states, applied commands, readings; commands from new states",
-        state="new state: x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k)",
-        clipping="yours: the estimator form takes the applied commands, the plain form none",
-        limits="none",
-    ),
-    file="source and header (.c, .h)",
+    precision="double",
     options={
         "form": None,
         "precision": "double",

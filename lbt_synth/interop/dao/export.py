@@ -29,7 +29,7 @@ from lbt_synth.design.shaping.objectives import ResidualVariance, leaves, spectr
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModeDesign
-from lbt_synth.interop.pipeline import Arithmetic, Target
+from lbt_synth.interop.pipeline import Target
 from lbt_synth.interop.proof import (
     LOSS,
     ROUNDOFF,
@@ -40,7 +40,6 @@ from lbt_synth.interop.proof import (
 )
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.array_file import fits_bytes, open_fits
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, integer
 
 # Mean square of the relative error of an operation. The error is uniform within half a step, and a
@@ -525,16 +524,9 @@ def _join(numbers: Sequence[_Matrix], parts: Sequence[ModeDesign], count: int) -
 
 
 def _write(
-    place: Path, matrix: _Matrix, design: Design, origin: Sequence[str], **_: Any
+    place: Path, matrix: _Matrix, _design: Design, _origin: Sequence[str], **_: Any
 ) -> dict[Path, bytes]:
-    """Return the matrix as FITS or as a file of numpy, by the ending."""
-    if place.suffix.lower() == ".fits":
-        cards: dict[str, Any] = {
-            "METHOD": (design.method, "synthesis"),
-            "ORDER": (len(matrix) // 2, "M: rows b_0..b_M, then a_1..a_M"),
-        }
-        comments = [*origin, _SIGN]
-        return {place: fits_bytes(cards, {"K_MAT": matrix}, comments=comments)}
+    """Return the matrix as a file of numpy."""
     buffer = io.BytesIO()
     np.save(buffer, matrix, allow_pickle=False)
     return {place: buffer.getvalue()}
@@ -542,10 +534,7 @@ def _write(
 
 def _read(files: Mapping[Path, bytes], _: _Matrix) -> _Matrix:
     """Return the matrix that a file holds."""
-    ((place, content),) = files.items()
-    if place.suffix.lower() == ".fits":
-        with open_fits(content) as units:
-            return np.array(units["K_MAT"].data, dtype=np.float32)
+    (content,) = files.values()
     return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
 
 
@@ -558,15 +547,7 @@ def _remark(design: Design, columns: _Matrix) -> str:
 
 
 TARGET = Target(
-    arithmetic=Arithmetic(
-        program="Durham's dao real-time computers",
-        precision="single",
-        sums="per mode, product by product: b_0 y(k) .. b_M y(k-M), a_1 u(k-1) .. a_M u(k-M)",
-        state="past measurements and past applied commands",
-        clipping="at the voltage limit; the memory then holds the applied commands",
-        limits="one transfer function per mode, of order M at most",
-    ),
-    file="matrix of single precision (.npy, .fits) and its certificate (.json)",
+    precision="single",
     options={"order": 20, "modes": None, "other_gain": None},
     round=_round,
     write=_write,
@@ -578,5 +559,5 @@ TARGET = Target(
     remark=_remark,
     hint="Give an even order, design with fewer states or less accurate models, or use a target in "
     "double precision.",
-    endings=(".npy", ".fits"),
+    endings=(".npy",),
 )
