@@ -376,30 +376,24 @@ def mode_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArra
             "measurements. Use a target of matrices, such as c."
         )
     A, B, C, D = (_is_significant(getattr(system, name)) for name in "ABCD")
-    paths = np.linalg.matrix_power(A | np.eye(size, dtype=np.bool_), size)
-    coupled = np.argwhere((D | (C @ paths @ B)) & ~np.eye(m, dtype=np.bool_))
+    linked = np.linalg.matrix_power(A | np.eye(size, dtype=np.bool_), size)
+    coupled = np.argwhere((D | (C @ linked @ B)) & ~np.eye(m, dtype=np.bool_))
     if coupled.size:
         raise ProblemError(
             f"the modes must decouple; here measurement {coupled[0, 1] + 1} moves command "
             f"{coupled[0, 0] + 1}. Design with --method robust, which controls each axis alone, or "
             "use a target of matrices, such as c."
         )
-    return [_shortened(*_transfer_function(system, i, row)) for i, row in enumerate(np.eye(m))]
+    return [_mode_filter(system, mode, linked) for mode in range(m)]
 
 
-def _transfer_function(
-    system: StateSpace, output: int, row: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the scalar filter of one output, for measurements along a row.
+def _mode_filter(system: StateSpace, mode: int, linked: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return the polynomials of a mode, without states that it does not drive or does not show.
 
-    Numerator and denominator have their highest power first. States that the measurements do not
-    drive, or that do not show in the output, are left out. What overflows is not a number.
+    Powers of ``z^-1`` that neither has are left out. What overflows is not a number.
     """
-    size = row @ row
-    b, c, d = system.B @ row / size, system.C[output], float(system.D[output] @ row / size)
-    linked = _is_significant(system.A) | np.eye(system.n_states, dtype=np.bool_)
-    reached = np.linalg.matrix_power(linked, system.n_states)
-    inside = (reached @ _is_significant(b)) & (_is_significant(c) @ reached)
+    b, c, d = system.B[:, mode], system.C[mode], system.D[mode, mode]
+    inside = (linked @ _is_significant(b)) & (_is_significant(c) @ linked)
     A = system.A[np.ix_(inside, inside)]
     with np.errstate(all="ignore"):
         entry = np.outer(b[inside], c[inside])
@@ -407,30 +401,23 @@ def _transfer_function(
         # det(zI - A + b c) = det(zI - A) + c adj(zI - A) b
         den, moved = _characteristic(A), _characteristic(A - scale * entry)
         num = d * den + (moved - den) / scale
-    num[np.abs(num) <= _NOTHING * np.max(np.abs(num))] = 0.0
-    return num, den
+        num[np.abs(num) <= _NOTHING * np.max(np.abs(num))] = 0.0
+        shares = [np.abs(values) / (np.max(np.abs(values)) or 1.0) for values in (num, den)]
+    used = ~(np.max(shares, axis=0) <= _NEGLIGIBLE)  # what is no number is used, and refused
+    count = 1 + int(np.flatnonzero(used)[-1])
+    return num[:count], den[:count]
 
 
 def _characteristic(A: FloatArray) -> FloatArray:
     """Return the characteristic polynomial, highest power first."""
-    if not A.size:
-        return np.ones(1)
-    finite = bool(np.all(np.isfinite(A)))
-    return np.asarray(np.real(np.poly(A))) if finite else np.full(len(A) + 1, np.nan)
+    if not A.size or not np.all(np.isfinite(A)):
+        return np.full(len(A) + 1, np.nan if A.size else 1.0)
+    return np.asarray(np.real(np.poly(A)))
 
 
 def _is_significant(entries: FloatArray) -> BoolArray:
     """Return which entries are more than what a solver leaves of a zero."""
     return np.asarray(np.abs(entries) > _COUPLED * np.max(np.abs(entries), initial=0.0))
-
-
-def _shortened(num: FloatArray, den: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Leave out the powers of ``z^-1`` that neither polynomial has."""
-    with np.errstate(all="ignore"):
-        shares = [np.abs(values) / (np.max(np.abs(values)) or 1.0) for values in (num, den)]
-    used = ~(np.max(shares, axis=0) <= _NEGLIGIBLE)  # what is no number is used, and refused
-    count = 1 + int(np.flatnonzero(used)[-1])
-    return num[:count], den[:count]
 
 
 def direct_form(rows: FloatArray, dt_s: float) -> Controller:
