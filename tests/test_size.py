@@ -15,7 +15,7 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3861,
-    "config": 1848,
+    "config": 1822,
     "design": 7690,
     "files": 1242,
     "identification": 9965,
@@ -27,13 +27,13 @@ LINES = {
     "report": 4312,
     "storage": 1033,
     "studies": 3135,
-    "errors, validation": 642,
+    "errors, validation": 617,
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 206,
+    "public names": 205,
     "tuned constants": 540,
-    "lines of tests": 33020,
+    "lines of tests": 32450,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }
