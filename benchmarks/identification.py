@@ -33,6 +33,7 @@ from harness import (
 )
 
 import lbt_synth as lbt
+from lbt_synth.identification.stretches import split_halves
 
 RATE = 1000.0
 NEAR_HZ = 0.1
@@ -302,18 +303,13 @@ def studied(seed: int, frames: int) -> dict:
     axis = model.axes[0]
     best = left(it, lbt.kalman(exact_plant(it)).controller)
     limit = lbt.loop.least_residual(it.path, it.truth, frame_means=True).rms_nm ** 2
-    half, other = lbt.identification.split_halves(it.record.stretches(), it.record.frames)
+    half, _ = split_halves(it.record.stretches())
     halved = lbt.identify(it.record, stretches=half)
-    true_open = it.record.pseudo_open_loop(it.truth.sensor_gain)
-    filtered = lbt.identification.replayed_residual(
-        true_open,
-        lbt.kalman(halved.plant()).controller,
-        replace(it.path, sensor_matrix=it.truth.sensor_gain * it.path.sensor),
-        noise_nm=it.truth.noise_nm,
-        stretches=it.record.stretches(),
-        test=other,
+    table = lbt.identification.prediction_against_data(
+        it.record, exact_plant(it), {"Kalman": lbt.kalman(halved.plant()).controller}
     )
-    ((start, stop),) = other
+    filtered, ((start, stop),) = table["Kalman"].replayed, table.test
+    true_open = it.record.pseudo_open_loop(it.truth.sensor_gain)
     predicted = least_squares(true_open, it.path.mirror_taps, 32, half)[start:stop]
     noise_nm2 = (it.truth.noise_nm / it.truth.sensor_gain) ** 2
     error = axis.sensor_gain_error

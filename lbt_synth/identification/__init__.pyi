@@ -11,10 +11,8 @@ from .fit.identify import identify as identify
 from .prediction.comparison import PredictionTable as PredictionTable
 from .prediction.comparison import prediction_against_data as prediction_against_data
 from .prediction.residual import ResidualEstimate as ResidualEstimate
-from .prediction.residual import replayed_residual as replayed_residual
 from .records.from_file import load_record as load_record
 from .records.from_series import loop_record as loop_record
 from .records.record import LoopRecord as LoopRecord
 from .records.record import SpectrumRecord as SpectrumRecord
-from .stretches import split_halves as split_halves
 from .tracking import TrackingController as TrackingController

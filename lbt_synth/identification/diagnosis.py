@@ -371,7 +371,7 @@ class Diagnosis:
 
     def row(self, name: str) -> PredictionRow | None:
         """Return a row of the comparison, None where there is none."""
-        return next((row for row in self.residuals if row.name == name), None)
+        return None if self.comparison is None else self.comparison.row(name)
 
 
 def diagnose(
@@ -481,7 +481,7 @@ def _compare(
     Its sensor gain is that of the whole record, because a half shows it less well.
     """
     record, imaging = diagnosis.record, diagnosis.imaging
-    first, _ = split_halves(record.stretches(), record.frames)
+    first, _ = split_halves(record.stretches())
     fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
     half = identify(record, **{**options, **fixed})
     more = [m for m in METHODS.values() if m.plant_section is not None or m.of_record]
