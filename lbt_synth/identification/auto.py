@@ -196,13 +196,9 @@ def design_from_record(
     step(1)
     names = quick_methods() if method is None else [method]
     requests = {name: {} if method else method_named(name).reference_options for name in names}
-    inputs: dict[str, Any] = {
-        "imaging": imaging or Imaging(),
-        "channels": beside,
-        "defaults": defaults,
-    }
-    compare = partial(compare_designs, record, half, **inputs)
-    held_out, designs = compare(requests)
+    inputs: dict[str, Any] = {"channels": beside, "defaults": defaults}
+    camera = imaging or Imaging()
+    held_out, designs = compare_designs(record, half, requests, imaging=camera, **inputs)
     if not designs:
         raise NumericalError(f"no design holds the loop: {'; '.join(held_out.notes)}.")
     if method is None:
@@ -212,7 +208,7 @@ def design_from_record(
         notes.append(note)
     step(1)
     model, request = identify(record, start=half, **options), design_request(method, {})
-    made_of = partial(design_inputs, record, model, channels=beside, defaults=defaults)
+    made_of = partial(design_inputs, record, model, **inputs)
     made, noise, price = design_for_gains(
         model,
         lambda noise: request.build(made_of(noise=noise)),
@@ -221,7 +217,8 @@ def design_from_record(
     )
     title, tested = request.method.title, held_out
     if noise > 1:
-        tested, _ = compare({method: requests[method]}, noise=noise)
+        one = {method: requests[method]}
+        tested, _ = compare_designs(record, half, one, noise=noise, **inputs)
         notes.append(_say_price(price, tested.row(title), held_out.row(title)))
     if of_record := request.method.of_record:
         made = replace(made, claims={**made.claims, **_claims(tested, title)})
