@@ -14,11 +14,11 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 4246,
+    "cli": 4216,
     "config": 1876,
     "design": 7690,
     "files": 1608,
-    "identification": 9810,
+    "identification": 9748,
     "interop": 4400,
     "linear": 5763,
     "loop": 4905,
@@ -32,7 +32,7 @@ LINES = {
 COUNTS = {
     "files of the package": 216,
     "public names": 217,
-    "tuned constants": 536,
+    "tuned constants": 535,
     "lines of tests": 33020,
     "lines of benchmarks": 4042,
     "words of docs": 61300,

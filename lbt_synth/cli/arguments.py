@@ -70,9 +70,6 @@ _SHARED = """
     reading
     > what is known beforehand
     --noise-nm | float nargs:+ | noise per frame of the sensor [nm], beside a spectrum without
-    --lines-hz | float nargs:+ | frequencies of vibrations [Hz]
-    --lines-error-hz | float =0.1 | standard error of --lines-hz [Hz]
-    --lines-file | | text file with one frequency per row [Hz]
     --lowest-line-hz | float =3 | what is below counts as turbulence [Hz]
     --most-lines | int =20 | most vibrations per axis
     >

@@ -98,7 +98,6 @@ def design_from_record(
     method: str | None = None,
     gamma_ratio: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
-    announced: ArrayLike = (),
     imaging: Imaging | None = None,
     accept_record: bool = False,
     command_scale_known: bool = False,
@@ -125,7 +124,7 @@ def design_from_record(
         Method of synthesis that needs no more than a plant; chosen by default.
     gamma_ratio : float, optional
         For methods with a bound: the norm as a multiple of the least one; 1.2 by default.
-    sensor_gain, announced
+    sensor_gain : float or one per axis, optional
         As for :func:`identify`.
     imaging : Imaging, optional
         The camera, for Strehl ratios; 2.2 um by default.
@@ -187,7 +186,7 @@ def design_from_record(
     seconds = _require_able(record, method, defaults)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
-    options |= {"sensor_gain": sensor_gain, "announced": announced}
+    options |= {"sensor_gain": sensor_gain}
     first, _ = split_halves(record.stretches())
     half = identify(record, stretches=first, **options)
     finds_gain = record.commands is not None and sensor_gain is None

@@ -80,17 +80,6 @@ def test_a_spectrum(tmp_path, capsys):
     assert "got a spectrum" in error
 
 
-def test_lists_announce_lines(tmp_path, capsys, recorded_night):
-    (tmp_path / "named.csv").write_text("error_hz,frequency_hz\n0.1,31.0\n,77\n")
-    words = (recorded_night, "-o", tmp_path / "m.yaml", "--no-figure", "--json")
-    for options in (("--lines-file", tmp_path / "named.csv"), ("--lines-hz", 31, 77)):
-        status, text, error = run(capsys, "identify", *words, *options)
-        assert (status, error) == (0, "")
-        (line,) = json.loads(text)["axes"][0]["vibrations"]
-        assert line["announced"]
-        assert line["frequency_hz"] == pytest.approx(LINE_HZ, abs=0.2)
-
-
 def test_accelerometers_are_compared_with_the_lines_of_the_model(
     tmp_path, capsys, recorded_loop, tip_night
 ):
@@ -314,9 +303,7 @@ def test_a_dead_axis_leaves_the_other(capsys, tmp_path):
         ("identify NIGHT -o m.yaml --columns a", "--columns takes ROLE=NAME or ROLE=NAME,NAME"),
         ("identify NIGHT -o m.yaml --acceleration-unit g", "goes with --accelerometers."),
         ("identify NIGHT -o m.yaml --obstruction 0.1", "give --diameter-m."),
-        ("identify NIGHT -o m.yaml --lines-file L.csv", "must have a frequency_hz in each row"),
         ("identify NIGHT -o m.yaml --figure a.png --no-figure", "give one of --figure and --no-"),
-        ("auto NIGHT -o t.fits --lines-hz 12 -5", "--lines-hz must be above 0; got -5"),
         ("auto SHORT -o t.fits --delay-frames 2", "4 s at 1000 Hz) in stretches of at least 256"),
         ("diagnose NIGHT --pdf a.pdf", "--pdf is the page of -o on paper; give -o, too."),
         ("diagnose PSD.csv --kind spectrum --unit nm^2/Hz", "diagnose examines recorded series; "),
@@ -324,7 +311,6 @@ def test_a_dead_axis_leaves_the_other(capsys, tmp_path):
 )
 def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, recorded_night, words, message):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "L.csv").write_text("1,2,3\n")
     (tmp_path / "PSD.csv").write_text(
         "frequency_hz,psd\n" + "".join(f"{i},1\n" for i in range(1, 99))
     )

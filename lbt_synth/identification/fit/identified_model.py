@@ -68,8 +68,6 @@ class IdentifiedLine:
         Density at its frequency over that of all the rest.
     evidence : float
         What it adds to the logarithm of the likelihood.
-    announced : bool
-        Whether its frequency was given beforehand.
     direction : tuple of float or None
         Unit vector over the axes along which it shakes, the first number at least 0. None on an
         axis that has the line for itself.
@@ -93,7 +91,6 @@ class IdentifiedLine:
     rms_error_nm: float
     prominence: float
     evidence: float
-    announced: bool
     direction: tuple[float, ...] | None = None
     direction_error_deg: float | None = None
     corner_hz: float | None = None
@@ -448,7 +445,6 @@ def _describe_line(
         rms_error_nm=rms * float(np.sqrt(max(variance, 0.0))),
         prominence=height / rest if rest > 0 else float("inf"),
         evidence=model.evidence[i],
-        announced=line.announced is not None,
         sections=line.sections,
     )
 
@@ -557,9 +553,7 @@ def model_tables(model: IdentifiedModel) -> list[Table]:
             axis=_direction_text(line, names),
             damping=f"{line.damping:.3g}" if line.resolved else f"< {line.damping:.2g}",
             damping_error=line.damping_error if line.resolved else None,
-            origin=line.kind
-            + f", {line.sections} sections" * (line.sections > 1)
-            + ", announced" * line.announced,
+            origin=line.kind + f", {line.sections} sections" * (line.sections > 1),
         )
         for line in model.parts
     ]
