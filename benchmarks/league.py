@@ -24,6 +24,7 @@ from scipy.signal import lfilter
 
 import lbt_synth as lbt
 from lbt_synth.identification.prediction.residual import (
+    ResidualEstimate,
     estimate_residual,
     gather,
     mode_noise,
@@ -150,7 +151,7 @@ class Split:
     def open_loop(self) -> FloatArray:
         return self.record.pseudo_open_loop(self.model.sensor_gains)
 
-    def residual(self, entry: Entry) -> lbt.identification.ResidualEstimate:
+    def residual(self, entry: Entry) -> ResidualEstimate:
         """Return what a controller would have left of the test, or a series leaves (frames, n)."""
         runs, left_nm = self.record.stretches(), entry
         kept = settled_test(runs, self.test, self.hardware)
@@ -227,7 +228,7 @@ def past(split: Split) -> lbt.identification.LoopRecord:
 
 def residuals_of(
     record: lbt.identification.LoopRecord, splits: int
-) -> dict[str, list[lbt.identification.ResidualEstimate]]:
+) -> dict[str, list[ResidualEstimate]]:
     """Return what each entry leaves of each test, without those that fail."""
     model, residuals, failed = None, {name: [] for name in ENTRIES}, set()
     stretches, usable = record.stretches(), int(np.sum(record.usable))
@@ -247,8 +248,8 @@ def residuals_of(
 
 
 def relative_residual(
-    parts: Sequence[lbt.identification.ResidualEstimate],
-    best: Sequence[lbt.identification.ResidualEstimate],
+    parts: Sequence[ResidualEstimate],
+    best: Sequence[ResidualEstimate],
 ) -> tuple[float, float]:
     """Return a measured residual over the least one, less 1, and its standard error."""
     least = np.mean([part.measured_nm2 for part in best])

@@ -23,11 +23,14 @@ from lbt_synth.config.write import RAISED, config_text, require_writable_facts
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
-from lbt_synth.identification import IdentifiedAxis, IdentifiedModel, LoopRecord, SpectrumRecord
+from lbt_synth.identification import IdentifiedModel, LoopRecord, SpectrumRecord
 from lbt_synth.identification.accelerometers.readings import Readings, load_readings
-from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
+from lbt_synth.identification.accelerometers.transfers import (
+    AccelerometerTransfers,
+    accelerometer_transfers,
+)
 from lbt_synth.identification.commands.verdict import explain_commands
-from lbt_synth.identification.fit.identified_model import model_tables
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis, model_tables
 from lbt_synth.identification.records.record import LEAST_SECONDS, require_length
 from lbt_synth.loop import Imaging, loop_margins
 from lbt_synth.report.draw import require_figure_name, save_figure
@@ -39,8 +42,8 @@ from lbt_synth.storage.rows import json_record, row_table
 from lbt_synth.storage.words import count_text
 
 if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not need
-    from lbt_synth.identification import Diagnosis
     from lbt_synth.identification.auto import RecordedDesign
+    from lbt_synth.identification.diagnosis import Diagnosis
 
 
 _STEPS = 3  # that diagnose and auto count
@@ -68,9 +71,7 @@ def run_identify(arguments: Namespace) -> Report:
         channels, values, notes = readings
         report.notes += [f"note: {note}." for note in notes]
         try:
-            transfers = identification.accelerometer_transfers(
-                model, record, values, channels=channels
-            )
+            transfers = accelerometer_transfers(model, record, values, channels=channels)
         except LbtSynthError as error:  # the model is not lost
             report.notes.append(f"warning: the accelerometers were not compared: {error}")
         else:

@@ -1,16 +1,10 @@
-from .accelerometers.transfers import accelerometer_transfers as accelerometer_transfers
 from .auto import design_from_record as design_from_record
 from .commands.control_law import fit_control_law as fit_control_law
 from .commands.repair import CommandRepair as CommandRepair
-from .diagnosis import Diagnosis as Diagnosis
 from .diagnosis import diagnose as diagnose
-from .fit.identified_model import IdentifiedAxis as IdentifiedAxis
-from .fit.identified_model import IdentifiedLine as IdentifiedLine
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identify import identify as identify
-from .prediction.comparison import PredictionTable as PredictionTable
 from .prediction.comparison import prediction_against_data as prediction_against_data
-from .prediction.residual import ResidualEstimate as ResidualEstimate
 from .records.from_file import load_record as load_record
 from .records.from_series import loop_record as loop_record
 from .records.record import LoopRecord as LoopRecord

@@ -14,6 +14,7 @@ from support.night import GAIN, LINE_HZ, NOISE
 from support.recorded_loops import RATE, spliced_record
 
 import lbt_synth as lbt
+from lbt_synth.cli import records
 from lbt_synth.identification.fit import whittle
 
 FACTS = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm")
@@ -117,7 +118,7 @@ def test_a_model_is_written_whatever_becomes_of_its_accelerometers(
 ):
     run_, _, _ = recorded_loop
     np.save(tmp_path / "a.npy", 1e-3 * np.diff(run_.total_nm[0][:, 0], n=2, prepend=[0, 0]))
-    real = lbt.identification.accelerometer_transfers
+    real = records.accelerometer_transfers
 
     def fails(*_, **__):
         raise lbt.errors.NumericalError("gone.")
@@ -131,7 +132,7 @@ def test_a_model_is_written_whatever_becomes_of_its_accelerometers(
         (fails, "warning: the accelerometers were not compared: gone."),
         (is_noiseless, "warning: the model is written without accelerometers: "),
     ):
-        monkeypatch.setattr(lbt.identification, "accelerometer_transfers", wrong)
+        monkeypatch.setattr(records, "accelerometer_transfers", wrong)
         out = tmp_path / f"{wrong.__name__}.yaml"
         base = ("identify", tip_night, *FACTS, "-o", out, "--no-figure")
         status, text, _ = run(capsys, *base, "--accelerometers", tmp_path / "a.npy")
@@ -276,7 +277,7 @@ def test_a_gain_file_the_page_and_json(capsys, night, tmp_path):
     data = json.loads(text)
     assert data["doubt"] is None
     assert data["control_law"]["kind"] == "integrator"
-    assert any(note.startswith("mine promises") for note in data["notes"])
+    assert any(note.startswith("mine assumes") for note in data["notes"])
     assert {row["name"] for row in data["residuals"]} > {"mine", data["best"], "what ran"}
     assert data["costs"][-1]["part"] == "all"
     assert data["lines"][0]["frequency_hz"] == pytest.approx(31, abs=0.2)

@@ -82,23 +82,14 @@ class PredictionRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PredictionTable:
-    """What ran, controllers, and the limit, on the same data.
-
-    Attributes
-    ----------
-    entries : tuple of PredictionRow
-        The rows.
-    fit, test : tuple of (start, stop)
-        Frames that controllers may be fitted to, and those that all rows are measured on: the
-        halves of the usable frames, without the first half second of a stretch.
-    notes : tuple of str
-        What is left out of the table or cannot be, and why.
-    """
+    """What ran, controllers, and the limit, on the same data."""
 
     entries: tuple[PredictionRow, ...]
+    # frames that controllers may be fitted to, and those that all rows are measured on: the halves
+    # of the usable frames, without the first half second of a stretch
     fit: Stretches
     test: Stretches
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what is left out of the table or cannot be, and why
 
     def row(self, name: str) -> PredictionRow | None:
         """Return the row of a name, None where there is none."""

@@ -43,26 +43,13 @@ class ResidualEstimate:
     The variance of the noise is subtracted: an estimate may be negative within its error. Its rms
     is then nan, and :attr:`upper_nm` an upper bound. One that is negative by more refutes the
     noise (:attr:`refuted`).
-
-    Attributes
-    ----------
-    measured_nm : (frames, n) ndarray
-        Measured residual e(k) of the frames that count [nm].
-    stretches : tuple of (start, stop)
-        Where in the record they are.
-    noise_nm2 : (n, n) ndarray
-        Covariance of the noise in e [nm^2].
-    covariance_nm2 : (n, n) ndarray
-        Covariance of the residual: mean of ``e e'`` less that of the noise [nm^2].
-    error_nm4 : (n, n) ndarray
-        Covariance of the errors of the axes' variances [nm^4].
     """
 
-    measured_nm: FloatArray
-    stretches: Stretches
-    noise_nm2: FloatArray
-    covariance_nm2: FloatArray
-    error_nm4: FloatArray
+    measured_nm: FloatArray  # (frames, n): measured residual e(k) of the frames that count
+    stretches: Stretches  # where in the record they are
+    noise_nm2: FloatArray  # (n, n): covariance of the noise in e
+    covariance_nm2: FloatArray  # (n, n): mean of ``e e'`` less that of the noise
+    error_nm4: FloatArray  # (n, n): covariance of the errors of the axes' variances
 
     @property
     def variance_nm2(self) -> FloatArray:
