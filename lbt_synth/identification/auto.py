@@ -238,10 +238,47 @@ def design_from_record(
     )
 
 
+<<<<<<< HEAD
 def _say_price(price: str, now: PredictionRow | None, before: PredictionRow | None) -> str:
     """Say what a design that assumes more noise leaves on unseen data, and without that."""
     leaves = [nm_text(np.nan if row is None else row.replayed_nm) for row in (now, before)]
     return f"{price}. It leaves {leaves[0]} on unseen data, and without that {leaves[1]}"
+=======
+class _Predictor:
+    """The predictors of a whole record; what they claim is what those of its first half leave."""
+
+    def __init__(
+        self,
+        record: LoopRecord,
+        half: IdentifiedModel,
+        model: IdentifiedModel,
+        channels: Channels | None,
+    ) -> None:
+        self._half, self._model = half, model
+        self._claims = partial(unseen_claims, record, half, channels=channels)
+        self._fit = partial(regress, record, channels=channels)
+        self._first, self._later = split_halves(record.stretches(), record.frames)
+        self._whole, self._past = self._fit(model), self._fit(half, stretches=self._first)
+
+    def design(self, noise: float) -> Design:
+        """Return the design that assumes a multiple of the model's noise, without claims."""
+        whole = self._whole if noise == 1 else self._fit(self._model, noise=noise)
+        return whole.design(self._whole.penalty)
+
+    def claimed(self, design: Design, noise: float) -> Design:
+        """Return the design with what that of the first half leaves of the second."""
+        past = self._past
+        if noise != 1:
+            past = self._fit(self._half, stretches=self._first, noise=noise)
+        claims = self._claims(past.design(self._past.penalty))
+        return replace(design, claims={**design.claims, **claims})
+
+    def channel_values(self) -> tuple[ChannelValue, ...]:
+        """Return what each channel is worth on the second half of the record."""
+        noise_nm2 = float(np.sum(np.array([axis.noise_nm for axis in self._half.axes]) ** 2))
+        unseen = self._fit(self._half, stretches=self._later)
+        return tuple(channel_values(self._past, unseen, noise_nm2))
+>>>>>>> main
 
 
 def _claims(table: PredictionTable, title: str) -> dict[str, float]:
