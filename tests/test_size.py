@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3861,
+    "cli": 3825,
     "config": 1876,
     "design": 7690,
     "files": 1283,
@@ -31,8 +31,8 @@ LINES = {
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 211,
-    "tuned constants": 534,
+    "public names": 209,
+    "tuned constants": 530,
     "lines of tests": 33020,
     "lines of benchmarks": 4042,
     "words of docs": 61300,

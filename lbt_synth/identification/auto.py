@@ -39,7 +39,11 @@ from lbt_synth.identification.prediction.comparison import (
     compare_designs,
     design_inputs,
 )
-from lbt_synth.identification.prediction.regression import ChannelValue, channel_values
+from lbt_synth.identification.prediction.regression import (
+    ChannelValue,
+    channel_values,
+    regress,
+)
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
@@ -190,8 +194,7 @@ def design_from_record(
     first, _ = split_halves(record.stretches())
     half = identify(record, stretches=first, **options)
     finds_gain = record.commands is not None and sensor_gain is None
-    if finds_gain:
-        assumptions += _judge_gains(half, accept_record)
+    assumptions += _judge_gains(half, accept_record) if finds_gain else ()
     step(1)
     names = quick_methods() if method is None else [method]
     requests = {name: {} if method else method_named(name).reference_options for name in names}
@@ -207,6 +210,8 @@ def design_from_record(
         notes.append(note)
     step(1)
     model, request = identify(record, start=half, **options), design_request(method, {})
+    if request.method.of_record:  # one penalty, that of the noise as it is, for all trials
+        inputs["penalty"] = regress(record, model, channels=beside).penalty
     made_of = partial(design_inputs, record, model, **inputs)
     made, noise, price = design_for_gains(
         model,
@@ -238,47 +243,10 @@ def design_from_record(
     )
 
 
-<<<<<<< HEAD
 def _say_price(price: str, now: PredictionRow | None, before: PredictionRow | None) -> str:
     """Say what a design that assumes more noise leaves on unseen data, and without that."""
     leaves = [nm_text(np.nan if row is None else row.replayed_nm) for row in (now, before)]
     return f"{price}. It leaves {leaves[0]} on unseen data, and without that {leaves[1]}"
-=======
-class _Predictor:
-    """The predictors of a whole record; what they claim is what those of its first half leave."""
-
-    def __init__(
-        self,
-        record: LoopRecord,
-        half: IdentifiedModel,
-        model: IdentifiedModel,
-        channels: Channels | None,
-    ) -> None:
-        self._half, self._model = half, model
-        self._claims = partial(unseen_claims, record, half, channels=channels)
-        self._fit = partial(regress, record, channels=channels)
-        self._first, self._later = split_halves(record.stretches(), record.frames)
-        self._whole, self._past = self._fit(model), self._fit(half, stretches=self._first)
-
-    def design(self, noise: float) -> Design:
-        """Return the design that assumes a multiple of the model's noise, without claims."""
-        whole = self._whole if noise == 1 else self._fit(self._model, noise=noise)
-        return whole.design(self._whole.penalty)
-
-    def claimed(self, design: Design, noise: float) -> Design:
-        """Return the design with what that of the first half leaves of the second."""
-        past = self._past
-        if noise != 1:
-            past = self._fit(self._half, stretches=self._first, noise=noise)
-        claims = self._claims(past.design(self._past.penalty))
-        return replace(design, claims={**design.claims, **claims})
-
-    def channel_values(self) -> tuple[ChannelValue, ...]:
-        """Return what each channel is worth on the second half of the record."""
-        noise_nm2 = float(np.sum(np.array([axis.noise_nm for axis in self._half.axes]) ** 2))
-        unseen = self._fit(self._half, stretches=self._later)
-        return tuple(channel_values(self._past, unseen, noise_nm2))
->>>>>>> main
 
 
 def _claims(table: PredictionTable, title: str) -> dict[str, float]:

@@ -242,13 +242,14 @@ def design_inputs(
     stretches: Stretches | None = None,
     channels: Channels | None = None,
     noise: float = 1.0,
+    penalty: float | None = None,
     defaults: Mapping[str, Any] | None = None,
 ) -> PlantInputs:
     """Return what a method makes a design of: a model with more noise, its record and channels."""
 
     def predict() -> Design:
         past = regress(record, model, stretches=stretches, channels=channels, noise=noise)
-        return past.design()
+        return past.design(penalty)
 
     plant = noisier(model, noise).plant()
     return PlantInputs(plant=plant, design_defaults=defaults or {}, predict=predict)
