@@ -1,7 +1,5 @@
 from .accelerometers.transfers import accelerometer_transfers as accelerometer_transfers
 from .auto import design_from_record as design_from_record
-from .commands.control_law import fit_control_law as fit_control_law
-from .commands.repair import CommandRepair as CommandRepair
 from .diagnosis import Diagnosis as Diagnosis
 from .diagnosis import diagnose as diagnose
 from .fit.identified_model import IdentifiedAxis as IdentifiedAxis
