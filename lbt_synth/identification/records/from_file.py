@@ -131,6 +131,7 @@ def load_record(
         "averages": averages,
         "source": str(source) if telemetry is None else telemetry.name or "telemetry",
     }
+<<<<<<< HEAD
     with name_in_errors(path := Path(stated["source"])):
         if telemetry is None and is_telemetry(path):
             telemetry = load_telemetry(path)
@@ -141,6 +142,21 @@ def load_record(
                     "given. Choose its modes with axes."
                 )
             return _telemetry_record(telemetry, axes=axes, mirror=mirror, **stated)
+=======
+    if kind is not None:
+        choice(kind, "kind", tuple(KINDS))
+    of_telemetry = columns is None and commands is None
+    if isinstance(source, Telemetry):
+        _require_series(of_telemetry, averages)
+        given["source"] = str(source.metadata.get("name", "telemetry"))
+        return _telemetry_record(source, kind=kind, axes=axes, **given)
+    path = Path(source)
+    given["source"] = str(path)
+    with name_in_errors(path):
+        if is_telemetry(path):
+            _require_series(of_telemetry, averages)
+            return _telemetry_record(load_telemetry(path), kind=kind, axes=axes, **given)
+>>>>>>> main
         contents = read_contents(path)
         if commands is not None:
             _join_commands(contents, Path(commands))
@@ -253,12 +269,12 @@ def _modal_columns(
 
 def _inverse_response(seen: Telemetry) -> FloatArray | None:
     """Return the matrix from measurements to modes, None for the identity."""
-    n, q, response = seen.modes, seen.measurements.shape[1], seen.modal_response
+    n, q, response = seen.modes, seen.measurements.shape[1], seen.interaction_matrix
     if (response is None and q != n) or (response is not None and q > n > 2):
         raise ProblemError(
             f"this telemetry has {q} measurements and {n} modes: slopes without modal "
             "coefficients. Multiply them by the reconstructor of the loop.",
-            in_python="As Telemetry(measurements=slopes @ R.T, slopes=slopes, reconstructor=R).",
+            in_python="As Telemetry(measurements=slopes @ reconstructor.T).",
         )
     if response is None or _is_gains(response, seen):
         return None
