@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 216,
     "public names": 209,
     "tuned constants": 530,
-    "lines of tests": 33020,
+    "lines of tests": 32890,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }
