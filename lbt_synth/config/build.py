@@ -20,6 +20,7 @@ from lbt_synth.config.schema import (
     VibrationSection,
 )
 from lbt_synth.errors import ConfigError, name_key
+from lbt_synth.models.sensor import illuminated_subapertures
 from lbt_synth.models.sensor_suite import Motions, Sensor, checked_motions
 from lbt_synth.models.vibration import TrueVibration, spread_lines
 from lbt_synth.validation import FloatArray, agree, frozen_copy
@@ -118,7 +119,7 @@ def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
     numbers = dict(pyramid)
     across = numbers.pop("subapertures_across")
     return models.pyramid_tilt_noise_nm(
-        subapertures=models.illuminated_subapertures(across, telescope.obstruction),
+        subapertures=illuminated_subapertures(across, telescope.obstruction),
         diameter_m=telescope.diameter_m,
         **numbers,
     )

@@ -27,7 +27,7 @@ from support.uneven_axes import RATE, SLOW, TABLE
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
-from lbt_synth.linear import kalman_riccati
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.budget import residual_budget
 from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
 
