@@ -239,6 +239,8 @@ def _build_true_vibrations(
         return plant.vibrations
     rate, lines = settings.loop.frame_rate_hz, list[TrueVibration]()
     for section, key, numbers in vibration_numbers(settings, "truth"):
+        if section.kind != "resonance":
+            del numbers["damping"]
         if section.kind == "drift":
             start_hz = numbers.pop("frequency_hz")
             _require_below_nyquist(section.end_hz, rate, f"{key}.end_hz")
@@ -250,7 +252,6 @@ def _build_true_vibrations(
         elif section.kind == "resonance":
             lines.append(models.Vibration(**numbers))
         else:
-            del numbers["damping"]
             lines.append(models.SinusoidalVibration(**numbers))
     return tuple(lines)
 
