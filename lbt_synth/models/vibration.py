@@ -76,13 +76,6 @@ class Vibration:
         """Return the AR process of this rms, of order 2 a section, sampled at a frame rate [Hz].
 
         A line that is not below the Nyquist frequency raises a ProblemError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
-        >>> round(line.ar_model(800).rms_nm, 6)
-        100.0
         """
         rate = number(frame_rate_hz, "frame_rate_hz", above=0)
         a, driving = sampled_lines(
@@ -95,13 +88,6 @@ class Vibration:
 
         ``hold`` says what stays: the rms of the vibration, "rms", or that of its driving noise,
         "driving". A value out of its range raises a ProblemError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
-        >>> round(line.retuned(18, frame_rate_hz=800, hold="driving").rms_nm, 2)
-        117.01
         """
         choice(hold, "hold", ("rms", "driving"))
         moved = replace(self, frequency_hz=frequency_hz)
@@ -117,13 +103,6 @@ class Vibration:
         The decay rate is damping times frequency, so the coefficient a2 of the AR2 process stays
         the same. A frequency that is not above the decay rate raises a ProblemError: nothing
         oscillates.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
-        >>> line.at_frequency(25).damping
-        0.008
         """
         rate = self.damping * self.frequency_hz
         frequency = number(frequency_hz, "frequency_hz")
