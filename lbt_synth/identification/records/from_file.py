@@ -129,9 +129,8 @@ def load_record(
         "diameter_m": diameter_m,
         "obstruction": obstruction,
         "averages": averages,
-        "source": str(source) if telemetry is None else telemetry.name or "telemetry",
+        "source": str(source if telemetry is None else telemetry.metadata.get("name", "telemetry")),
     }
-<<<<<<< HEAD
     with name_in_errors(path := Path(stated["source"])):
         if telemetry is None and is_telemetry(path):
             telemetry = load_telemetry(path)
@@ -142,21 +141,6 @@ def load_record(
                     "given. Choose its modes with axes."
                 )
             return _telemetry_record(telemetry, axes=axes, mirror=mirror, **stated)
-=======
-    if kind is not None:
-        choice(kind, "kind", tuple(KINDS))
-    of_telemetry = columns is None and commands is None
-    if isinstance(source, Telemetry):
-        _require_series(of_telemetry, averages)
-        given["source"] = str(source.metadata.get("name", "telemetry"))
-        return _telemetry_record(source, kind=kind, axes=axes, **given)
-    path = Path(source)
-    given["source"] = str(path)
-    with name_in_errors(path):
-        if is_telemetry(path):
-            _require_series(of_telemetry, averages)
-            return _telemetry_record(load_telemetry(path), kind=kind, axes=axes, **given)
->>>>>>> main
         contents = read_contents(path)
         if commands is not None:
             _join_commands(contents, Path(commands))
