@@ -14,11 +14,11 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3861,
+    "cli": 3825,
     "config": 1822,
     "design": 7690,
     "files": 1242,
-    "identification": 9965,
+    "identification": 9563,
     "interop": 3849,
     "linear": 5763,
     "loop": 4905,
@@ -32,7 +32,7 @@ LINES = {
 COUNTS = {
     "files of the package": 216,
     "public names": 205,
-    "tuned constants": 540,
+    "tuned constants": 530,
     "lines of tests": 32450,
     "lines of benchmarks": 4042,
     "words of docs": 61300,

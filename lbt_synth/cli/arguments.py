@@ -39,7 +39,6 @@ _SHARED = """
   reading
     > reading the record: what its file does not say, and what its commands need, in this order,
         to be those that the mirror followed; what lbt-synth telemetry -o writes says all of it
-    --kind | closed-loop/open-loop/spectrum
     --frame-rate-hz | float | frame rate [Hz]
     --delay-frames | float | total delay [frames]
     --unit | | of the measurements: nm, um, m, mas, arcsec, urad, rad; results are shown in it, too
@@ -49,7 +48,8 @@ _SHARED = """
     --obstruction | float | as a fraction of the diameter
     --averages | int | periodograms that a spectrum is the mean of
     --commands | | another file, with the commands
-    --columns | nargs:+ meta:ROLE=NAME | by name or number, as measurements=tip,tilt times=
+    --columns | nargs:+ meta:ROLE=NAME | by name or number, as measurements=tip,tilt times= or
+        open_loop=0,1
     --axes | int nargs:+ | which of several columns or modes, from 0
     --sensor-gain | float nargs:+ | sensor gain that is known, of both axes or of each
     --command-increments | switch | they are increments: add them up
@@ -64,9 +64,6 @@ _SHARED = """
     reading
     > what is known beforehand
     --noise-nm | float nargs:+ | noise per frame of the sensor [nm], beside a spectrum without
-    --lines-hz | float nargs:+ | frequencies of vibrations [Hz]
-    --lines-error-hz | float =0.1 | standard error of --lines-hz [Hz]
-    --lines-file | | text file with one frequency per row [Hz]
     --lowest-line-hz | float =3 | what is below counts as turbulence [Hz]
     --most-lines | int =20 | most vibrations per axis
     >

@@ -18,6 +18,7 @@ from lbt_synth.config.schema import (
     VibrationSection,
 )
 from lbt_synth.errors import ConfigError, name_key
+from lbt_synth.models.sensor import illuminated_subapertures
 from lbt_synth.models.sensor_suite import Motions, Sensor, checked_motions
 from lbt_synth.models.vibration import TrueVibration, spread_lines
 from lbt_synth.validation import FloatArray, agree, frozen_copy
@@ -111,7 +112,7 @@ def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
     numbers = dict(pyramid)
     across = numbers.pop("subapertures_across")
     return models.pyramid_tilt_noise_nm(
-        subapertures=models.illuminated_subapertures(across, telescope.obstruction),
+        subapertures=illuminated_subapertures(across, telescope.obstruction),
         diameter_m=telescope.diameter_m,
         **numbers,
     )
@@ -231,6 +232,8 @@ def _build_true_vibrations(
         return plant.vibrations
     rate, lines = settings.loop.frame_rate_hz, list[TrueVibration]()
     for section, key, numbers in vibration_numbers(settings, "truth"):
+        if section.kind != "resonance":
+            del numbers["damping"]
         if section.kind == "drift":
             start_hz = numbers.pop("frequency_hz")
             _require_below_nyquist(section.end_hz, rate, f"{key}.end_hz")
@@ -242,7 +245,6 @@ def _build_true_vibrations(
         elif section.kind == "resonance":
             lines.append(models.Vibration(**numbers))
         else:
-            del numbers["damping"]
             lines.append(models.SinusoidalVibration(**numbers))
     return tuple(lines)
 
