@@ -15,7 +15,7 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3825,
-    "config": 1822,
+    "config": 1736,
     "design": 7690,
     "files": 1242,
     "identification": 9563,
@@ -27,13 +27,13 @@ LINES = {
     "report": 4312,
     "storage": 1033,
     "studies": 3135,
-    "errors, validation": 617,
+    "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 205,
+    "public names": 186,
     "tuned constants": 530,
-    "lines of tests": 32450,
+    "lines of tests": 32251,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }
