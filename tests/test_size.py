@@ -15,17 +15,17 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3825,
-    "config": 1736,
+    "config": 1726,
     "design": 7690,
-    "files": 1242,
+    "files": 1243,
     "identification": 9563,
-    "interop": 3849,
+    "interop": 3835,
     "linear": 5763,
     "loop": 4905,
     "methods": 920,
     "models": 4400,
     "report": 4312,
-    "storage": 1033,
+    "storage": 1027,
     "studies": 3135,
     "errors, validation": 554,
 }
@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 216,
     "public names": 186,
     "tuned constants": 530,
-    "lines of tests": 32251,
+    "lines of tests": 32239,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }

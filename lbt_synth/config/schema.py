@@ -377,14 +377,9 @@ class FileSection(Section):
     end_to_end: EndToEndSection = key("the end-to-end simulation", EndToEndSection())
 
     @property
-    def usual_turbulence(self) -> str:
-        """Turbulence of a truth that names none: frozen_flow if there is an atmosphere."""
-        return "model" if self.atmosphere is None else "frozen_flow"
-
-    @property
     def true_turbulence(self) -> str:
         """Turbulence that the real loop meets: frozen_flow, model or none."""
-        return self.truth.turbulence or self.usual_turbulence
+        return self.truth.turbulence or ("frozen_flow" if self.atmosphere else "model")
 
 
 def config_schema() -> dict[str, Any]:
