@@ -226,7 +226,7 @@ def validate_sections(schema: type[Checked], raw: Mapping[str, Any], source: Pat
     try:
         return schema.model_validate(raw)
     except ValidationError as error:
-        message, key = describe_error(error, schema)
+        message, key = describe_error(error)
         raise ConfigError(f"{source}: {message}", path=key) from error
 
 
