@@ -15,7 +15,7 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3825,
-    "config": 1697,
+    "config": 1661,
     "design": 7690,
     "files": 1243,
     "identification": 9563,
@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 216,
     "public names": 186,
     "tuned constants": 530,
-    "lines of tests": 32235,
+    "lines of tests": 32229,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }

@@ -200,22 +200,11 @@ class _LineSection(Section):
     frequency_error_hz: q.HertzFromZero | None = key(
         "how far the true frequency may be off [Hz]; 0 where it is known", None
     )
-    frequency_error_percent: q.RatioFromZero | None = key(
-        "the same in percent of the frequency", None
-    )
     accelerometers: dict[str, MotionSection] | None = key(
         "accelerometer channels that move with it", None
     )
     _one_size = exactly_one("rms_nm", "rms_mas")
     _one_direction = at_most_one("axis", "direction_deg")
-    _one_error = at_most_one("frequency_error_hz", "frequency_error_percent")
-
-    @property
-    def largest_error_hz(self) -> float | None:
-        """How far the true frequency may be off [Hz], None where it is not stated."""
-        if self.frequency_error_percent is None:
-            return self.frequency_error_hz
-        return self.frequency_hz * self.frequency_error_percent / 100
 
 
 class VibrationSection(_LineSection):
@@ -281,7 +270,7 @@ class TruthSection(Section):
         | Annotated[list[TrueVibrationSection], Tag(q.EACH)],
         Discriminator(q.tag_one_or_each),
     ] = key("the vibrations, or model: those of the model", [])
-    sensor_gain: q.GainOrEach = key("real sensor gain, or one per measurement", 1.0)
+    sensor_gain: q.Gain = key("real sensor gain; the mean, where the model has several", 1.0)
 
 
 class ImagingSection(Section):

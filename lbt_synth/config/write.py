@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
@@ -148,7 +149,8 @@ def identified_config(
         content["truth"]["vibrations"] = "model"
     gains = [float(axis.sensor_gain) for axis in axes]
     if any(gain != 1 for gain in gains):
-        content["model"]["sensor_gain"] = content["truth"]["sensor_gain"] = gains
+        content["model"]["sensor_gain"] = gains
+        content["truth"]["sensor_gain"] = float(np.mean(gains))
         comments["model.sensor_gain"] = _error_comment(
             "", [axis.sensor_gain_error or 0.0 for axis in axes]
         )
