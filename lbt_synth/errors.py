@@ -12,16 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-_LONGEST_MESSAGE = 2_000  # characters; values from a file may have millions
-
-
-def shorten_middle(message: str) -> str:
-    """Return a message, a very long one without its middle."""
-    if len(message) <= _LONGEST_MESSAGE:
-        return message
-    start, end = message[: _LONGEST_MESSAGE // 2], message[-_LONGEST_MESSAGE // 4 :]
-    return f"{start} [... {len(message) - len(start) - len(end)} characters ...] {end}"
-
 
 def suggest_word(word: str, known: Iterable[str]) -> str:
     """Return which of the known words was meant, or all of them."""
@@ -48,7 +38,7 @@ class LbtSynthError(Exception):
 
     def __init__(self, message: str = "", **data: Any) -> None:
         advice = data.get("in_python", "")
-        super().__init__(shorten_middle(f"{message} {advice}" if advice else message))
+        super().__init__(f"{message} {advice}" if advice else message)
         for name, value in data.items():
             if not hasattr(type(self), name):
                 raise TypeError(f"{type(self).__name__} has no attribute {name!r}.")

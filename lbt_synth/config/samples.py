@@ -53,32 +53,21 @@ def parse_path(path: str) -> Keys:
 def find_number(content: Mapping[str, Any], path: str) -> float:
     """Return the number to which a path leads; refuse a path that leads to none."""
     value: Any = content
-    place = "the configuration"
     for key in parse_path(path):
-        if not isinstance(value, list if isinstance(key, int) else dict):
-            says = "is no list" if isinstance(key, int) else "has no keys"
-            raise ConfigError(f"{path}: {place} {says}; {_describe(value)}.")
-        if isinstance(key, int) and key >= len(value):
-            entries = count_text(len(value), "entry", "entries")
-            raise ConfigError(f"{path}: {place} has {entries}, counted from 0; got [{key}].")
-        if isinstance(key, str) and key not in value:
-            raise ConfigError(f"{path}: {place} has no {key}; {suggest_word(key, sorted(value))}")
-        step = f"[{key}]" if isinstance(key, int) else f".{key}"
-        place = step.removeprefix(".") if value is content else place + step
+        names = range(len(value)) if isinstance(value, list) else value
+        if not isinstance(value, list | dict) or key not in names:
+            held = f"it is {value!r}"
+            if isinstance(value, dict):
+                held = suggest_word(str(key), sorted(value))
+            elif isinstance(value, list):
+                held = f"it is a list of {count_text(len(value), 'entry', 'entries')}, from [0]"
+            raise ConfigError(f"{path} is not in the configuration: no {key} there; {held}")
         value = cast(Any, value)[key]
     if value is None:
         raise ConfigError(f"{path} is not set in the configuration, so it cannot be varied.")
     if type(value) not in (int, float):
-        raise ConfigError(f"{path} must lead to a number of the configuration; {_describe(value)}.")
+        raise ConfigError(f"{path} must lead to a number; got a {type(value).__name__}.")
     return cast(float, value)
-
-
-def _describe(value: Any) -> str:
-    if isinstance(value, dict):
-        return f"it is a section with {', '.join(sorted(value))}"
-    if isinstance(value, list):
-        return f"it is a list of {len(value)}"
-    return "it is not set" if value is None else f"it is {value!r}"
 
 
 def set_number(

@@ -388,22 +388,9 @@ class FileSection(Section):
 
 
 def config_schema() -> dict[str, Any]:
-    """Return the JSON schema of a configuration file.
+    """Return the JSON schema of a configuration file, of draft 2020-12, for editors.
 
-    Every key has its description, with its unit. Rules over several keys, such as one of
-    ``rms_nm`` and ``rms_mas``, are known to :func:`load_config` alone.
-
-    Returns
-    -------
-    dict
-        Schema of draft 2020-12, ready for :func:`json.dumps`.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> schema = lbt.config.config_schema()
-    >>> schema["$defs"]["LoopSection"]["properties"]["frame_rate_hz"]["description"]
-    'frame rate [Hz]'
+    Rules over several keys, such as one of ``rms_nm`` and ``rms_mas``, are not in it.
     """
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {"$schema": dialect, **FileSection.model_json_schema(), "title": "lbt-synth"}

@@ -56,7 +56,7 @@ def require_aotpy(path: Path, error: type[FileError] = OutputError, verb: str = 
     return aotpy
 
 
-def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
+def to_bytes(telemetry: Telemetry, target: Path) -> bytes:
     """Return the content of an AOT file."""
     from astropy.io import fits
 
@@ -64,7 +64,7 @@ def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
     if telemetry.commands is None:
         raise OutputError("the AOT standard holds closed loops; got an open one.", path=target)
     plain, checked = io.BytesIO(), io.BytesIO()
-    aotpy.AOTFITSWriter(_to_system(aotpy, telemetry, precision)).get_hdulist().writeto(plain)
+    aotpy.AOTFITSWriter(_to_system(aotpy, telemetry)).get_hdulist().writeto(plain)
     # astropy's checksum of a table is right only once the table has been in a file
     with fits.open(io.BytesIO(plain.getvalue()), memmap=False) as units:
         for unit in units:
@@ -73,7 +73,7 @@ def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
     return checked.getvalue()
 
 
-def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
+def _to_system(aotpy: Any, seen: Telemetry) -> Any:
     """Describe telemetry as an ``AOSystem`` of aotpy."""
     diameter, ratio, m = seen.diameter_m, seen.obstruction, seen.n_commands
     telescope = aotpy.MainTelescope(
@@ -89,13 +89,9 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
     unit = "m" if seen.command_unit == "nm" else seen.command_unit
     units, images = {"commands": unit, "measurements": seen.measurement_unit}, {}
     for name, data in _arrays(seen).items():
-        # series have a clock, and the precision that was chosen
-        digits, time = (precision, clock) if name in units else ("float64", None)
-        heading, of = (
-            name.upper().replace("_", " "),
-            {"unit": units.get(name) or None, "time": time},
-        )
-        images[name] = aotpy.Image(heading, data.astype(digits), **of)
+        time = clock if name in units else None
+        heading, unit = name.upper().replace("_", " "), units.get(name, "")
+        images[name] = aotpy.Image(heading, data, unit=unit or None, time=time)
     sensor = aotpy.Pyramid(
         "Pyramid",
         source=star,
