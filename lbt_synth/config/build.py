@@ -26,12 +26,11 @@ from lbt_synth.models.vibration import TrueVibration, spread_lines
 from lbt_synth.validation import FloatArray, agree, frozen_copy
 
 if TYPE_CHECKING:
-    from lbt_synth.interop import EndToEndSetup
+    from lbt_synth.interop.specula.optics import EndToEndSetup
 
 T = TypeVar("T")
 _AXES = {"tip": [(1.0, 0.0)], "tilt": [(0.0, 1.0)], "both": [(1.0, 0.0), (0.0, 1.0)]}
 _USUAL_LINES = 5  # of a spread vibration, unless the file says
-_OF_SYSTEM = {"pixels", "actuators_across", "wind_direction_deg", "calibration_nm"}
 
 
 def require_telescope(settings: FileSection, reason: str) -> TelescopeSection:
@@ -432,7 +431,7 @@ def build_end_to_end_setup(
     settings: FileSection, hardware: models.LoopHardware, truth: models.Truth
 ) -> EndToEndSetup:
     """Build the simulation that a configuration describes; refuse one that describes none."""
-    from lbt_synth.interop import EndToEndSetup, EndToEndSystem  # half of the time of a design
+    from lbt_synth.interop.specula.optics import EndToEndSetup  # half of the time of a design
 
     hint = "an end-to-end simulation needs it"
     telescope, air = require_telescope(settings, hint), require_atmosphere(settings, hint)
@@ -452,24 +451,19 @@ def build_end_to_end_setup(
         if not right:
             raise ConfigError(f"{key} {why}.", path=key)
     sensing: dict[str, Any] = {} if pyramid is None else pyramid.model_dump()
-    section = settings.end_to_end
     # the optics do not depend on the sensor gain that the design assumes
     modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=2)
     with name_key("end_to_end"):
-        system = EndToEndSystem(
+        return EndToEndSetup(
             hardware=modal,
             sensing_wavelength_um=sensing.pop("wavelength_um"),
             imaging_wavelength_um=settings.imaging.wavelength_um,
             modes=modes or 0,
-            **telescope.model_dump(),
-            **air.model_dump(),
-            **sensing,
-            **section.model_dump(include=_OF_SYSTEM),
-        )
-        return EndToEndSetup(
-            system=system,
             vibrations=truth.vibrations,
             motions=truth.motions,
             seed=settings.simulation.seed,
-            **section.model_dump(exclude=_OF_SYSTEM),
+            **telescope.model_dump(),
+            **air.model_dump(),
+            **sensing,
+            **settings.end_to_end.model_dump(),
         )
