@@ -156,7 +156,7 @@ class Regression:
         return weights
 
     def _factor(self, weights: FloatArray, moments: Moments) -> tuple[FloatArray, bool]:
-        """Return the factor of the squares of some signals with a penalty, for :func:`cho_solve`."""
+        """Return the factor of the squares of signals with a penalty, for :func:`cho_solve`."""
         try:
             return cho_factor(moments.squares + weights)
         except np.linalg.LinAlgError:

@@ -120,7 +120,7 @@ def test_the_filter_gives_the_sum_of_squares_of_the_moments() -> None:
 
 def test_a_fit_adds_its_coefficients_over_the_frames() -> None:
     """None where a penalty holds them all; else what two halves of a record lose to each other."""
-    _, record, model = vibrating()
+    _, record, _ = vibrating()
     fit = regression(channels=True)
     assert fit.fit_share(1e30) == pytest.approx(0, abs=1e-9)
     penalty, signals = 1e-6, range(len(fit.scales))
