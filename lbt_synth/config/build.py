@@ -21,7 +21,7 @@ from lbt_synth.errors import ConfigError, name_key
 from lbt_synth.models.sensor import illuminated_subapertures
 from lbt_synth.models.sensor_suite import Motions, Sensor, checked_motions
 from lbt_synth.models.vibration import TrueVibration, spread_lines
-from lbt_synth.validation import FloatArray, agree, frozen_copy
+from lbt_synth.validation import FloatArray, frozen_copy
 
 if TYPE_CHECKING:
     from lbt_synth.interop.specula.optics import EndToEndSetup
@@ -128,31 +128,7 @@ def _gains_per_measurement(settings: FileSection) -> FloatArray:
 
 def reference_gain(settings: FileSection) -> float:
     """Return the assumed gain with which a single number is compared: the mean of the gains."""
-    assumed = settings.model.sensor_gain
-    return (
-        float(np.mean(_gains_per_measurement(settings))) if isinstance(assumed, list) else assumed
-    )
-
-
-def relative_gain(settings: FileSection, reference: float) -> Any:
-    """Return the real sensor gain divided by that in the plant's sensor matrix; (b,) of samples.
-
-    ``reference`` is the :func:`reference_gain` of that matrix.
-    """
-    real, key = settings.truth.sensor_gain, "truth.sensor_gain"
-    if not isinstance(real, list):
-        return real / reference
-    assumed = _gains_per_measurement(settings)
-    ratios = np.array(_require_length(real, assumed.size, key, "measurement")) / assumed
-    if not agree(ratios, np.full_like(ratios, ratios[0])):
-        text = ", ".join(f"{ratio:.4g}" for ratio in ratios)
-        raise ConfigError(
-            f"{key}: must be model.sensor_gain times one factor, for the loop has one optical gain "
-            f"that may differ from the model's; got the factors {text}. Give one number: their "
-            "mean, in the proportion of model.sensor_gain.",
-            path=key,
-        )
-    return float(ratios[0])
+    return float(np.mean(settings.model.sensor_gain))
 
 
 def true_vibrations_owner(settings: FileSection) -> Literal["model", "truth"]:
@@ -254,7 +230,7 @@ def _frequency_errors(
 ) -> tuple[float, ...] | None:
     """Return the error that is stated of each vibration [Hz], 0 beside others; None if none is."""
     sections = getattr(settings, true_vibrations_owner(settings)).vibrations or []
-    if all(section.largest_error_hz is None for section in sections):
+    if all(section.frequency_error_hz is None for section in sections):
         return None
     places = np.array([section.frequency_hz for section in sections])
     starts = [
@@ -262,7 +238,7 @@ def _frequency_errors(
         for line in vibrations
     ]
     nearest = [sections[int(np.argmin(np.abs(places - start)))] for start in starts]
-    return tuple(section.largest_error_hz or 0.0 for section in nearest)
+    return tuple(section.frequency_error_hz or 0.0 for section in nearest)
 
 
 def build_plant(
@@ -417,7 +393,7 @@ def build_truth(
         vibrations=vibrations,
         motions=motions if suite.sensors else (),
         noise_nm=noise_nm,
-        sensor_gain=relative_gain(settings, reference_gain(settings)),
+        sensor_gain=settings.truth.sensor_gain / reference_gain(settings),
         frequency_errors_hz=_frequency_errors(settings, vibrations),
     )
 

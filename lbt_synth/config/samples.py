@@ -14,7 +14,6 @@ import numpy as np
 from lbt_synth.config.build import (
     measurement_noise_nm,
     model_lines,
-    relative_gain,
     true_vibrations_owner,
     turbulence_sections,
     vibration_numbers,
@@ -119,11 +118,9 @@ def array_keys(settings: FileSection) -> set[Keys]:
     kinds = {section.kind for section in turbulence_sections(settings)}
     if settings.true_turbulence != "model":
         kinds = set()
-    keys: set[Keys] = {("loop", "delay_frames")}
-    if not isinstance(truth.sensor_gain, list):
-        keys.add(("truth", "sensor_gain"))
-        if not isinstance(model.sensor_gain, list):
-            keys.add(("model", "sensor_gain"))
+    keys: set[Keys] = {("loop", "delay_frames"), ("truth", "sensor_gain")}
+    if not isinstance(model.sensor_gain, list):
+        keys.add(("model", "sensor_gain"))
     if "ar2" not in kinds:  # which is fitted above the noise
         if not isinstance(sensor.noise_nm, list):
             keys |= {("sensor", "noise_nm"), ("sensor", "noise_mas")}
@@ -160,7 +157,7 @@ def build_ensemble(
     if not isinstance(settings.sensor.noise_nm, list):
         noise = noise[..., None]
     return LoopEnsemble(
-        sensor_gain=relative_gain(settings, config.sensor_gain),
+        sensor_gain=settings.truth.sensor_gain / config.sensor_gain,
         delay_frames=delay,
         noise_nm=noise * noise_factor[:, None],
         turbulence=config.truth.turbulence if flows is None else flows,
