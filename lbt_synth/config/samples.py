@@ -23,13 +23,17 @@ from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ConfigError, suggest_word
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble
 from lbt_synth.loop.ensemble import ensemble_vibration
-from lbt_synth.models import Atmosphere, FrozenFlows
+from lbt_synth.models import Atmosphere
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
 Keys = tuple[str | int, ...]  # the path of a number, such as ("truth", "vibrations", 0, "rms_nm")
 _KEY = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
-_WEATHER = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")  # keys of FrozenFlows
+_WEATHER = (
+    "seeing_arcsec",
+    "wind_speed_m_s",
+    "outer_scale_m",
+)  # that loops may differ in
 _LINE = ("frequency_hz", "damping", "rms_nm", "rms_mas")
 _PYRAMID = ("photons", "read_noise_electrons", "modulation_lambda_over_d")
 
@@ -177,11 +181,11 @@ def _ensemble_vibrations(config: Config, settings: FileSection) -> list[Ensemble
     return vibrations
 
 
-def _frozen_flows(settings: FileSection, atmosphere: Atmosphere | None) -> FrozenFlows | None:
+def _frozen_flows(settings: FileSection, atmosphere: Atmosphere | None) -> Atmosphere | None:
     """Return the frozen flows of the samples, None if the weather does not differ."""
     air = settings.atmosphere
     if air is None or atmosphere is None:
         return None
     weather = {name: getattr(air, name) for name in _WEATHER}
     differing = {name: values for name, values in weather.items() if np.ndim(values)}
-    return FrozenFlows(atmosphere=atmosphere, **differing) if differing else None
+    return replace(atmosphere, **differing) if differing else None
