@@ -15,11 +15,11 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3825,
-    "config": 1661,
+    "config": 1665,
     "design": 7690,
     "files": 1243,
     "identification": 9563,
-    "interop": 3785,
+    "interop": 3756,
     "linear": 5763,
     "loop": 4905,
     "methods": 920,
@@ -31,9 +31,9 @@ LINES = {
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 186,
+    "public names": 185,
     "tuned constants": 530,
-    "lines of tests": 32220,
+    "lines of tests": 32218,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }
