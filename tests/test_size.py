@@ -15,7 +15,7 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3825,
-    "config": 1665,
+    "config": 1653,
     "design": 7690,
     "files": 1243,
     "identification": 9563,
@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 216,
     "public names": 185,
     "tuned constants": 530,
-    "lines of tests": 32218,
+    "lines of tests": 32207,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }
