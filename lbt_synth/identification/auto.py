@@ -47,7 +47,7 @@ from lbt_synth.identification.prediction.regression import (
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
-from lbt_synth.identification.stretches import split_halves
+from lbt_synth.identification.stretches import keep_frames, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget, stable_sensor_gains
 from lbt_synth.methods.registry import (
@@ -186,13 +186,12 @@ def design_from_record(
     if accelerations is not None:
         require_instance(record, LoopRecord)
         beside = channels_beside(record, accelerations, channels)
-        record = beside.within(record)
+        record = keep_frames(record, beside.good)
     seconds = _require_able(record, method, defaults)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     options |= {"sensor_gain": sensor_gain}
-    first, _ = split_halves(record.stretches())
-    half = identify(record, stretches=first, **options)
+    half = identify(split_halves(record)[0], **options)
     finds_gain = record.commands is not None and sensor_gain is None
     assumptions += _judge_gains(half, accept_record) if finds_gain else ()
     step(1)

@@ -443,9 +443,8 @@ def _compare(
     Its sensor gain is that of the whole record, because a half shows it less well.
     """
     record, imaging = diagnosis.record, diagnosis.imaging
-    first, _ = split_halves(record.stretches())
-    fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
-    half = identify(record, **{**options, **fixed})
+    fixed = {"start": model, "sensor_gain": list(model.sensor_gains)}
+    half = identify(split_halves(record)[0], **{**options, **fixed})
     more = [m for m in METHODS.values() if m.plant_section is not None or m.of_record]
     names = [m.name for m in (*reference_methods(estimators_only=True), *more)]
     table, designs = compare_designs(

@@ -65,7 +65,8 @@ def identify_series(
     **options: object,
 ) -> IdentifiedAxis:
     """Identify the series of one axis, at a sensor gain with an error if it is given."""
-    data = axis_periodogram(measurement, correction, frame_rate_hz, stretches)
+    pieces = stretches or ((0, len(measurement)),)
+    data = axis_periodogram(measurement, correction, frame_rate_hz, pieces)
     search = Search(data=data, gain=sensor_gain, **options)
     axis = find_axis(search, start=start)
     if not sensor_gain_error:

@@ -46,11 +46,6 @@ class Channels:
     values: FloatArray  # (frames, c): readings, zero where one is missing [m/s^2]
     good: BoolArray  # (frames,): whether all channels that live have a reading
 
-    def within(self, record: LoopRecord) -> LoopRecord:
-        """Return the record, in which frames without a reading are not usable."""
-        bridges = None if record.bridges is None else record.bridges & self.good
-        return replace(record, measured=record.measured & self.good, bridges=bridges)
-
     def hardware(self, path: LoopHardware) -> LoopHardware:
         """Return a loop that reads the channels, with the noise of each reading.
 

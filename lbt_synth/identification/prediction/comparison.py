@@ -187,7 +187,7 @@ def prediction_against_data(
             f"no controller may be called {RAN}, {INTEGRATOR} or {LIMIT}, as other rows are; got "
             f"{', '.join(controllers)}. Give other names."
         )
-    fit, later = split_halves(runs)
+    fit, later = (frames.stretches() for frames in split_halves(record))
     test = settled_test(runs, later, hardware)
     noise = mode_noise(hardware, plant.R, noise_error_nm)
     designs = {INTEGRATOR: model_integrator(plant), **controllers}
@@ -239,7 +239,6 @@ def design_inputs(
     record: LoopRecord,
     model: IdentifiedModel,
     *,
-    stretches: Stretches | None = None,
     channels: Channels | None = None,
     noise: float = 1.0,
     penalty: float | None = None,
@@ -248,7 +247,7 @@ def design_inputs(
     """Return what a method makes a design of: a model with more noise, its record and channels."""
 
     def predict() -> Design:
-        past = regress(record, model, stretches=stretches, channels=channels, noise=noise)
+        past = regress(record, model, channels=channels, noise=noise)
         return past.design(penalty)
 
     plant = noisier(model, noise).plant()
@@ -271,8 +270,7 @@ def compare_designs(
     ``inputs`` those of :func:`design_inputs`. The designs with a row are returned by their titles;
     the others have a note. One that reads channels has a row for its fall-back, too.
     """
-    first, _ = split_halves(record.stretches())
-    made_of = design_inputs(record, half, stretches=first, **inputs)
+    made_of = design_inputs(split_halves(record)[0], half, **inputs)
     designs, notes = dict[str, Design](), list[str]()
     controllers = dict[str, Controller | Design](others or {})
     for method, options in methods.items():

@@ -214,37 +214,18 @@ def regress(
     record: LoopRecord,
     model: IdentifiedModel,
     *,
-    stretches: Stretches | None = None,
     channels: Channels | None = None,
     noise: float = 1.0,
 ) -> Regression:
-    """Collect what a record tells of its future, beside its model.
+    """Collect what a record tells of its future, beside its model, of which the base is the filter.
 
     More noise than the model's is added as that of a run without any disturbance, of which nothing
     is to be corrected.
-
-    Parameters
-    ----------
-    record : LoopRecord
-        The record, which the model was identified in.
-    model : IdentifiedModel
-        The model, of which the base is the Kalman filter.
-    stretches : sequence of (start, stop), optional
-        Frames to use; by default all usable ones.
-    channels : Channels, optional
-        Accelerometers beside the record.
-    noise : float, optional
-        Multiple of the model's noise that is assumed, at least 1.
-
-    Raises
-    ------
-    ProblemError
-        If the stretches are too short, or the loop has no command for some mode.
     """
     path = model.hardware
     if len(path.influence) != path.n_commands:
         raise ProblemError("a predictor needs a command for every mode; got fewer.")
-    runs = record.stretches() if stretches is None else stretches
+    runs = record.stretches()
     base = kalman(noisier(model, noise).plant()).controller
     series = record.pseudo_open_loop(model.sensor_gains)
     steering = close_loop(path, base).steering()
@@ -314,10 +295,7 @@ def channel_values(
 
     The noise of the measurements is subtracted; nan where it hides the residual.
     """
-    past, unseen = (
-        regress(record, half, stretches=frames, channels=channels)
-        for frames in split_halves(record.stretches())
-    )
+    past, unseen = (regress(frames, half, channels=channels) for frames in split_halves(record))
     noise_nm2 = sum((axis.noise_nm / axis.sensor_gain) ** 2 for axis in half.axes)
     everything = list(range(len(past.scales)))
     coefficients = past.solve(everything, past.penalty, past.whole)
