@@ -18,7 +18,7 @@ LINES = {
     "config": 1876,
     "design": 7690,
     "files": 1283,
-    "identification": 9491,
+    "identification": 9462,
     "interop": 4400,
     "linear": 5763,
     "loop": 4905,

@@ -248,10 +248,10 @@ def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> Spectrum
     return spectrum.unpack(np.sqrt(np.maximum(np.diag(covariance), 0)))
 
 
-def gain_covariance(
+def hold_gain(
     search: Search, model: FittedModel, errors: Sequence[tuple[Sequence[int], float]]
-) -> FloatArray:
-    """Return the covariance of a fit whose gains have errors, and all that these move, (p, p).
+) -> FittedModel:
+    """Return a fit whose gains have errors, and all that these move.
 
     The errors are relative ones, each common to the gains of some axes.
     """
@@ -267,12 +267,6 @@ def gain_covariance(
         moved = derivatives(data, model.spectrum.unpack(theta + step))[1]
         moves = (step - held @ (moved - gradient)) / DIFFERENCE
         covariance = covariance + error**2 * np.outer(moves, moves)
-    return covariance
-
-
-def hold_gain(search: Search, model: FittedModel, error: float) -> FittedModel:
-    """Return a model of one axis with a relative error of its gain, and all that this moves."""
-    covariance = gain_covariance(search, model, [([0], error)])
     return replace(model, information=invert_information(covariance))
 
 

@@ -365,7 +365,7 @@ def find_axis(search: Search, *, start: IdentifiedAxis | None = None) -> Identif
     fit_error = model.gain_error
     error = max(fit_error, *(abs(rival.log_gain - background.log_gain) for rival in rivals))
     if error > fit_error:  # what the gain moves is as ambiguous
-        model = hold_gain(search, model, error)
+        model = hold_gain(search, model, [([0], error)])
     colours = np.tanh([background.colour, *(rival.colour for rival in rivals)])
     note = _gain_note(error, "found in the closed loop's data")
     return describe_axis(search, model, error, note, colour_error=float(np.ptp(colours)))
@@ -386,7 +386,7 @@ def _gain_note(error: float, origin: str) -> str:
 def refit_axis(axis: IdentifiedAxis, search: Search, error: float, note: str) -> IdentifiedAxis:
     """Fit an axis again at the gain of a search, with its error."""
     model = add_evidence(search, find_components(search, axis.fitted_model.spectrum))
-    return describe_axis(search, hold_gain(search, model, error), error, note)
+    return describe_axis(search, hold_gain(search, model, [([0], error)]), error, note)
 
 
 def axis_periodogram(
