@@ -24,6 +24,7 @@ from scipy.signal import lfilter
 
 import lbt_synth as lbt
 from lbt_synth.identification.accelerometers.transfers import accelerometer_transfers
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.simulation.disturbances import run_oscillator
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 
@@ -182,7 +183,7 @@ def loss(seed: int, frames: int) -> float:
 
 def residual_nm(it: Case, plant: lbt.models.TipTiltPlant, real: lbt.models.TipTiltPlant) -> float:
     """Return what the Kalman filter of a plant leaves in the loop of the truth."""
-    controller = plant.controller(lbt.linear.kalman_riccati(plant).gain_predictor)
+    controller = plant.controller(kalman_riccati(plant).gain_predictor)
     loop = lbt.close_loop(real.hardware, controller)
     return lbt.residual_budget(
         loop, replace(it.truth, motions=real.motions), frame_means=True

@@ -83,8 +83,8 @@ def run_identify(arguments: Namespace) -> Report:
 
 def _say_model(report: Report, model: IdentifiedModel, record: LoopRecord | SpectrumRecord) -> None:
     """Begin with the strongest vibrations, and whether the model is enough."""
-    if isinstance(record, LoopRecord) and record.health.findings:
-        report.notes.insert(0, f"note: {record.health.summary()}")
+    if isinstance(record, LoopRecord) and record.findings:
+        report.notes.insert(0, f"note: {record.summary()}")
     white = all(axis.whiteness.white for axis in model.axes)
     leaves = "is white: the model is enough" if white else "is not white: the model lacks something"
     said = "No vibration stands out of the turbulence and the noise."
@@ -230,17 +230,16 @@ def _series(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
 
 def _diagnosis_data(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return a diagnosis for JSON; what could not be said is null or empty."""
-    from lbt_synth.identification.diagnosis import disturbance_lines
+    from lbt_synth.identification.diagnosis import disturbance_lines, law_facts
 
     model, law, loop = diagnosis.model, diagnosis.law, diagnosis.loop
     commands = diagnosis.commands
-    poles = {} if law is None else {"poles": [[abs(pole) for pole in row] for row in law.poles]}
     return {
         "doubt": diagnosis.doubt or None,
         "record": record_data(diagnosis.record),
         "channels": [json_record(row) for row in diagnosis.channels],
         "commands": None if commands is None else json_record(commands.facts()),
-        "control_law": None if law is None else asdict(law) | poles,
+        "control_law": None if law is None else asdict(law) | json_record(law_facts(law)),
         "loop": None if loop is None else json_record(loop),
         "lines": [] if model is None else [asdict(line) for line in disturbance_lines(model)],
         "costs": [json_record(row) for row in diagnosis.costs],
@@ -394,10 +393,10 @@ def add_record(report: Report, record: LoopRecord | SpectrumRecord) -> None:
     if isinstance(record, SpectrumRecord):
         report.notes += [f"note: {note}" for note in record.notes]
         return
-    if record.health.findings:
-        caption = f"Record of {record.duration_s:.4g} s: {record.health.summary()}"
-        report.tables.append(row_table(caption, record.health.findings))
-    report.notes += [f"note: {note}" for note in record.health.notes]
+    if record.findings:
+        caption = f"Record of {record.duration_s:.4g} s: {record.summary()}"
+        report.tables.append(row_table(caption, record.findings))
+    report.notes += [f"note: {note}" for note in record.notes]
 
 
 def record_data(record: LoopRecord | SpectrumRecord) -> dict[str, Any]:
@@ -408,11 +407,11 @@ def record_data(record: LoopRecord | SpectrumRecord) -> dict[str, Any]:
     return {
         "kind": "open loop" if record.commands is None else "closed loop",
         "frames": record.frames,
-        "usable": record.health.usable,
+        "usable": int(record.usable.sum()),
         "frame_rate_hz": record.frame_rate_hz,
         "delay_frames": record.delay_frames,
-        "findings": [asdict(finding) for finding in record.health.findings],
-        "notes": record.health.notes,
+        "findings": [asdict(finding) for finding in record.findings],
+        "notes": record.notes,
     }
 
 

@@ -1,6 +1,4 @@
 from .auto import design_from_record as design_from_record
-from .commands.control_law import fit_control_law as fit_control_law
-from .commands.repair import CommandRepair as CommandRepair
 from .diagnosis import diagnose as diagnose
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identify import identify as identify

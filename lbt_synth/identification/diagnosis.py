@@ -102,7 +102,7 @@ def _judge_channel(
     """Return what is known of one column of the measurements or commands, (frames, axes)."""
     faults = {
         finding.kind: finding.fraction
-        for finding in record.health.findings
+        for finding in record.findings
         if (finding.series, finding.axis) == (series, axis) and finding.kind in _WORDS
     }
     steps = np.diff(values, axis=0)[good[1:] & good[:-1]]

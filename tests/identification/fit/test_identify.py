@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from support.eris import ERIS_FILE, eris_example, eris_model, eris_record
+from support.eris import eris_example, eris_model, eris_record
 from support.plants import ROOT
 from support.recorded_loops import (
     LINE,
@@ -301,7 +301,7 @@ def find_axes(y: np.ndarray, u: np.ndarray | None = None, **options: object) -> 
 
 
 def find_eris(**options: object) -> object:
-    plain = lbt.load_record(ERIS_FILE, kind="spectrum", unit="nm^2/Hz")
+    plain = eris_example().record(averages=None)
     return lbt.identify(plain, frame_rate_hz=1000, **options)
 
 
@@ -392,7 +392,7 @@ def model() -> IdentifiedModel:
 
 
 def test_spectrum_without_scatter_is_taken_for_one_periodogram(example):
-    plain = lbt.load_record(ERIS_FILE, kind="spectrum", unit="nm^2/Hz")
+    plain = eris_example().record(averages=None)
     found = lbt.identify(plain, frame_rate_hz=1000)
     assert len(found.notes) == 2
     assert all("does not scatter" in note for note in found.notes)
