@@ -14,25 +14,25 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3825,
+    "cli": 3811,
     "config": 1846,
     "design": 7690,
     "files": 1283,
-    "identification": 9462,
+    "identification": 9142,
     "interop": 3862,
     "linear": 5763,
     "loop": 4905,
     "methods": 920,
     "models": 4400,
-    "report": 4312,
+    "report": 4311,
     "storage": 1049,
     "studies": 3135,
     "errors, validation": 642,
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 206,
-    "tuned constants": 530,
+    "public names": 189,
+    "tuned constants": 524,
     "lines of tests": 32890,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
