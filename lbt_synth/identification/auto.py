@@ -49,7 +49,7 @@ from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECOR
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import keep_frames, split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, close_loop, residual_budget, stable_sensor_gains
+from lbt_synth.loop import ClosedLoop, Imaging, close_loop, residual_budget, stable_sensor_gains
 from lbt_synth.methods.registry import (
     default_method,
     method_named,
@@ -236,7 +236,7 @@ def design_from_record(
         notes=(
             *notes,
             *_compare_gains(model, half),
-            *note_drift(record, model.plant(), made),
+            *note_drift(record, model.plant(), made.close(model.hardware)),
             *_note_short(seconds, model),
         ),
     )
@@ -305,17 +305,14 @@ def _compare_gains(model: IdentifiedModel, half: IdentifiedModel) -> Iterator[st
             )
 
 
-def note_drift(
-    record: LoopRecord, plant: TipTiltPlant, controller: Controller | Design
-) -> Iterator[str]:
+def note_drift(record: LoopRecord, plant: TipTiltPlant, loop: ClosedLoop) -> Iterator[str]:
     """Yield a note on each axis whose offset and drift leave much beside its residual.
 
     The fit sees a drift in its lowest frequencies only, and an offset not at all. The filter sees
     both, and what it does not reject at zero frequency stays in the residual for ever.
     """
-    if isinstance(controller, Design) and controller.other_sensors:
+    if loop.reads_others:
         return
-    loop = close_loop(plant.hardware, controller)
     budget = residual_budget(loop, plant, frame_means=True)
     residual_nm = np.sqrt(np.diag(budget.total_nm2))
     series = record.pseudo_open_loop(np.diag(loop.hardware.sensor))[record.usable]

@@ -88,7 +88,7 @@ def test_what_a_filter_leaves_of_a_drift_is_noted():
         noise, commands = np.random.default_rng(0).standard_normal((5000, 2)), np.zeros((5000, 2))
         commands[:, 1] = offset_nm + speed_nm_s * (np.arange(5000) - 2500) / rate
         made = loop_record(noise, commands, **LOOP | {"frame_rate_hz": rate})
-        return list(note_drift(made, plant, controller))
+        return list(note_drift(made, plant, loop))
 
     assert notes(10.0, 1.0) == []
     (note,) = notes(3000.0, -200.0)
