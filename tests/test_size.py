@@ -18,7 +18,7 @@ LINES = {
     "config": 1846,
     "design": 7690,
     "files": 1283,
-    "identification": 9137,
+    "identification": 9122,
     "interop": 3862,
     "linear": 5763,
     "loop": 4905,

@@ -186,7 +186,8 @@ def _say_held_out(
 
 def run_diagnose(arguments: Namespace) -> Report:
     """Diagnose a record, with a design to try on it if one is given, and write the page."""
-    from lbt_synth.identification.diagnosis import live_axes  # with it come the methods
+    # with it come the methods
+    from lbt_synth.identification.diagnosis import judge_channels, live_axes
     from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
 
     if arguments.output is not None:
@@ -203,11 +204,14 @@ def run_diagnose(arguments: Namespace) -> Report:
         diagnosis = identification.diagnose(
             record.bridged(),
             given=designs,
-            whole=both,
             imaging=record_imaging(arguments, record),
             progress=count,
             **identification_options(arguments, record),
         )
+    if record.axes < both.axes:
+        said = "the rest is of the axis that lives: the other one is dead"
+        notes = (said, *diagnosis.notes)
+        diagnosis = replace(diagnosis, channels=judge_channels(both), notes=notes)
     sections = diagnosis_tables(diagnosis)
     report = Report(
         data={"source": str(arguments.file), **_diagnosis_data(diagnosis)},

@@ -461,35 +461,30 @@ def design_for_gains(
             if np.ptp(allowed, axis=0).any():
                 text += ", and each axis at those of both, because they differ"
         assumed.append(text)
-    bad, noise, note = unstable_gains(usual, intervals), 1.0, ""
-    if bad is not None:
-        stable = _assume_noise(design, intervals)
-        if stable is None:
-            advice = (
-                "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
-            )
-            gain = ", ".join(f"{value:.3g}" for value in bad)
-            raise CertificateError(
-                f"the loop of the design is unstable at the sensor gain {gain}, or there with a "
-                f"delay {DELAY_ERROR:g} frames off, and the record allows {_in_words(intervals)}. "
-                "Record with a higher loop gain, look for jumps in it, give the sensor "
-                f"gain{advice}."
-            )
-        usual, noise = stable
-        note = (
-            f"to be stable at sensor gains of {_in_words(intervals)}, and with a delay up to "
-            f"{DELAY_ERROR:g} frames off, the design assumes {noise:.3g} times the noise"
+    bad = unstable_gains(usual, intervals)
+    if bad is None:
+        return replace(usual, assumptions=(*assumed, *usual.assumptions)), 1.0, ""
+    wanted = list[str]()
+    if allowed is not None and not command_scale_known:
+        wanted.append("--command-scale 1 if the commands were recorded at the size applied")
+    if allowed is not None and np.any(allowed[:, 1] > (1 + DIFFERENT * OPEN_GAIN) * allowed[:, 0]):
+        wanted.append("--sensor-gain, which the record leaves open")
+    advice = f". Give {' or '.join(wanted)}" if wanted else ""
+    stable = _assume_noise(design, intervals)
+    if stable is None:
+        gain = ", ".join(f"{value:.3g}" for value in bad)
+        raise CertificateError(
+            f"the loop of the design is unstable at the sensor gain {gain}, or there with a delay "
+            f"{DELAY_ERROR:g} frames off, and the record allows {_in_words(intervals)}. Record "
+            f"with a higher loop gain, or look for jumps in it{advice}."
         )
-        wanted = list[str]()
-        if allowed is not None and not command_scale_known:
-            wanted.append("--command-scale 1 if the commands were recorded at the size applied")
-        if allowed is not None and np.any(
-            allowed[:, 1] > (1 + DIFFERENT * OPEN_GAIN) * allowed[:, 0]
-        ):
-            wanted.append("--sensor-gain, which the record leaves open")
-        if wanted:
-            note = f"warning: {note}. Give {' or '.join(wanted)}"
-    return replace(usual, assumptions=(*assumed, *usual.assumptions)), noise, note
+    safe, noise = stable
+    note = (
+        f"{'warning: ' * bool(wanted)}to be stable at sensor gains of {_in_words(intervals)}, and "
+        f"with a delay up to {DELAY_ERROR:g} frames off, the design assumes {noise:.3g} times the "
+        f"noise{advice}"
+    )
+    return replace(safe, assumptions=(*assumed, *safe.assumptions)), noise, note
 
 
 def _assume_noise(

@@ -340,7 +340,6 @@ def diagnose(
     record: LoopRecord,
     *,
     given: Mapping[str, Design] | None = None,
-    whole: LoopRecord | None = None,
     imaging: Imaging | None = None,
     progress: Callable[[int], object] | None = None,
     **options: Any,
@@ -353,8 +352,6 @@ def diagnose(
         What the loop recorded; the delay of a closed loop must be known.
     given : mapping of str to Design, optional
         Designs to try on the record, by their names.
-    whole : LoopRecord, optional
-        The record with those axes, too, that are left out of ``record`` because they are dead.
     imaging : Imaging, optional
         The camera, for Strehl ratios; 2.2 um by default.
     progress : callable, optional
@@ -396,13 +393,11 @@ def diagnose(
     if record.commands is not None:
         commands = explain_commands(record, sensor_gain=options.get("sensor_gain"))
         notes += commands.notes
-    if whole is not None and whole.axes > record.axes:
-        notes.append("the rest is of the axis that lives: the other one is dead")
     diagnosis = Diagnosis(
         record=record,
         imaging=imaging or Imaging(),
         commands=commands,
-        channels=judge_channels(record if whole is None else whole),
+        channels=judge_channels(record),
     )
     step(1)
     if diagnosis.doubt:

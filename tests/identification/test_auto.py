@@ -319,4 +319,4 @@ def test_gains_at_which_nothing_is_stable_are_refused(known: bool) -> None:
     stubborn = careless(model)(1.0)
     with pytest.raises(CertificateError, match=r"the record allows 0.0\d to 0.9") as caught:
         design_for_gains(model, lambda _: stubborn, wide, command_scale_known=known)
-    assert ("or say --command-scale 1" in str(caught.value)) is not known
+    assert ("Give --command-scale 1 if" in str(caught.value)) is not known

@@ -67,7 +67,9 @@ def find_models(
     """
     model = find_components(search, start)
     spectrum = model.spectrum
-    plain = spectrum.keep(lambda c: c.is_narrow or c.kind == "slow")
+    turbulence, *others = spectrum.components
+    narrow = (c for c in others if c.is_narrow or c.kind == "slow")
+    plain = replace(spectrum, components=(turbulence, *narrow))
     other = plain.with_background(colour=0.0 if spectrum.background.colour else _COLOUR)
     if start is not None or plain == spectrum:
         rival = fitting.fit(search, spectrum.with_background(colour=other.background.colour))
