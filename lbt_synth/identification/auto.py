@@ -63,7 +63,6 @@ from lbt_synth.validation import FloatArray, choice, require_instance
 
 _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
-_SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 DELAY_ERROR = 0.1  # frames, by which every design of a record may be off
 _MOST_NOISE = 10  # octaves of noise, by which a filter trusts its sensor no more
 _MISFIT = 1.5  # factor by which a gain may be off where the model leaves something out
@@ -187,7 +186,7 @@ def design_from_record(
         require_instance(record, LoopRecord)
         beside = channels_beside(record, accelerations, channels)
         record = keep_frames(record, beside.good)
-    seconds = _require_able(record, method, defaults)
+    _require_able(record, method, defaults)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     options |= {"sensor_gain": sensor_gain}
@@ -237,7 +236,6 @@ def design_from_record(
             *notes,
             *_compare_gains(model, half),
             *note_drift(record, model.plant(), made.close(model.hardware)),
-            *_note_short(seconds, model),
         ),
     )
 
@@ -258,15 +256,15 @@ def _claims(table: PredictionTable, title: str) -> dict[str, float]:
     return {name: value for name, value in claims.items() if value > 0}
 
 
-def _require_able(record: LoopRecord, method: str | None, defaults: Mapping[str, Any]) -> float:
-    """Return the usable seconds of a record; refuse it, or a method and options that cannot be."""
+def _require_able(record: LoopRecord, method: str | None, defaults: Mapping[str, Any]) -> None:
+    """Refuse a record that is too short, or a method and options that cannot be."""
     require_instance(record, LoopRecord)
     if method is not None:
         choice(method, "method", record_methods())
     if defaults:  # refuses what the method does not take
         design_request(method or option_owners("gamma_ratio")[0], defaults)
     _ = record.hardware  # refuses a record without a delay
-    return require_length(record, seconds=LEAST_SECONDS) / record.frame_rate_hz
+    require_length(record, seconds=LEAST_SECONDS)
 
 
 def _judge_commands(
@@ -327,16 +325,6 @@ def note_drift(record: LoopRecord, plant: TipTiltPlant, loop: ClosedLoop) -> Ite
                 f"{nm_text(speed[i])}/s. The filter sees that, and leaves up to "
                 f"{nm_text(rest_nm, '.2g')} of it. Offload it to the telescope"
             )
-
-
-def _note_short(seconds: float, model: IdentifiedModel) -> Iterator[str]:
-    """Yield what a short record leaves open."""
-    if seconds < _SHORT_SECONDS:
-        resolution_hz = max(axis.data.step_hz for axis in model.axes)
-        yield (
-            f"the record is short ({seconds:.3g} s): it does not tell lines less than "
-            f"{resolution_hz:.2g} Hz apart from one. Half a minute shows more"
-        )
 
 
 def quick_methods() -> list[str]:

@@ -58,17 +58,13 @@ _LEAST_SHARE = 0.05  # of the residual variance, of a part that is named
 class ChannelRow:
     """One channel of a record."""
 
-    channel: str = column("channel", help="What it is")
-    rms_nm: float = nm_column("rms", help="Deviation from its mean")
-    step_nm: float = column(
-        "frame to frame", unit="nm", format=".3g", help="Rms difference of two frames"
-    )
-    drift_nm: float = nm_column("drift", help="Mean of the last quarter less that of the first")
-    change: float = column(
-        "scatter, end/start", format=".2f", help="Rms difference, last quarter over first"
-    )
-    faulty: float = column(help="Part of the frames with a fault of this channel")
-    state: str = column("state", help="What is wrong with it, or good")
+    channel: str = column("channel")
+    rms_nm: float = nm_column("rms")
+    step_nm: float = column("frame to frame", unit="nm", format=".3g")  # rms difference
+    drift_nm: float = nm_column("drift")  # mean of the last quarter less that of the first
+    change: float = column("scatter, end/start", format=".2f")  # of rms differences, by quarters
+    faulty: float = column()  # part of the frames with a fault of this channel
+    state: str = column("state")  # what is wrong with it, or good
 
     @property
     def serious(self) -> bool:
@@ -233,11 +229,11 @@ def line_name(line: IdentifiedLine) -> str:
 
 @table_row
 class CostRow:
-    """One part of the disturbance, and what it costs two loops by the model."""
+    """One part of the disturbance, and the residual that it leaves in two loops by the model."""
 
-    part: str = column("part", help="Part of the disturbance")
-    running_nm: float = nm_column("running", help="Residual that it leaves in the loop that ran")
-    best_nm: float = nm_column("best design", help="Residual that it leaves in the best design")
+    part: str = column("part")
+    running_nm: float = nm_column("running")
+    best_nm: float = nm_column("best design")
 
 
 def disturbance_costs(

@@ -47,49 +47,29 @@ _DOUBT = 0.01  # chance below which a channel moves at a line more than its nois
 
 @table_row
 class TransferRow:
-    """How one channel moves with one line."""
+    """How one channel moves with one line, with standard errors."""
 
-    channel: str = column("channel", help="Name of the channel")
-    line: int = column(help="Index of the line among the resonances of the model")
-    frequency_hz: float = column("f", unit="Hz", format=".3f", help="Frequency of the line")
-    motion_nm_per_nm: float = column(
-        "motion",
-        unit="nm/nm",
-        format=".4g",
-        help="Motion of the channel per motion of the wavefront",
-    )
-    motion_error_nm_per_nm: float = column(
-        "+-", unit="nm/nm", format=".2g", help="Standard error of the motion"
-    )
-    phase_deg: float = column(
-        "phase", unit="deg", format=".1f", help="Phase of the motion against that of the wavefront"
-    )
-    phase_error_deg: float = column(
-        "+-", unit="deg", format=".2g", help="Standard error of the phase"
-    )
-    coherence: float = column(
-        "coherence",
-        format=".3f",
-        help="Share of the power at the line that goes with the wavefront",
-    )
-    chance: float = column(
-        "chance", format=".1g", help="Probability that a channel without the line shows as much"
-    )
-    useful: bool = column("used", help="Whether the line shows in the channel beyond chance")
+    channel: str = column("channel")
+    line: int = column()  # its index among the resonances of the model
+    frequency_hz: float = column("f", unit="Hz", format=".3f")
+    # of the channel per motion of the wavefront, and its phase against that
+    motion_nm_per_nm: float = column("motion", unit="nm/nm", format=".4g")
+    motion_error_nm_per_nm: float = column("+-", unit="nm/nm", format=".2g")
+    phase_deg: float = column("phase", unit="deg", format=".1f")
+    phase_error_deg: float = column("+-", unit="deg", format=".2g")
+    # share of the power at the line that goes with the wavefront
+    coherence: float = column("coherence", format=".3f")
+    chance: float = column("chance", format=".1g")  # that a channel without it shows as much
+    useful: bool = column("used")  # whether the line shows in the channel beyond chance
 
 
 @table_row
 class ChannelRow:
-    """One channel of the accelerometers."""
+    """One channel of the accelerometers: its noise near the lines, and whether it is used."""
 
-    channel: str = column("channel", help="Name of the channel")
-    noise_m_s2: float = column(
-        "noise",
-        unit="m/s^2",
-        format=".3g",
-        help="Noise of a reading, near the lines it is used for",
-    )
-    verdict: str = column("verdict", help="Whether it is used, or why not")
+    channel: str = column("channel")
+    noise_m_s2: float = column("noise", unit="m/s^2", format=".3g")
+    verdict: str = column("verdict")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -52,17 +52,14 @@ WITHOUT = ", wavefront alone"  # of the fall-back of a design that reads acceler
 class PredictionRow:
     """One controller on frames that nothing was fitted to, beside what the model promises."""
 
-    name: str = column("controller", help="What it is")
-    replayed_nm: float = nm_column(
-        "data", format=".2f", key="data_nm", help="Residual on the data, all axes"
-    )
-    replayed_error_nm: float = nm_column(
-        "+-", format=".2f", key="data_error_nm", help="Its standard error"
-    )
-    model_nm: float = nm_column("model", format=".2f", help="Residual that the model promises")
-    ratio: float = column("data/model", format=".3f", help="Residual on the data over that")
-    strehl: float = column("Strehl, data", format=".3f", help="Strehl ratio on the data")
-    model_strehl: float = column("Strehl, model", format=".3f", help="Strehl ratio by the model")
+    name: str = column("controller")
+    # residual over all axes on the data, its standard error, and what the model promises
+    replayed_nm: float = nm_column("data", format=".2f", key="data_nm")
+    replayed_error_nm: float = nm_column("+-", format=".2f", key="data_error_nm")
+    model_nm: float = nm_column("model", format=".2f")
+    ratio: float = column("data/model", format=".3f")
+    strehl: float = column("Strehl, data", format=".3f")
+    model_strehl: float = column("Strehl, model", format=".3f")
     replayed: ResidualEstimate | None  # on the test data; None for the limit, no controller
     model_axis_nm: FloatArray | None  # (n,): promised for each axis; None if unknown
 

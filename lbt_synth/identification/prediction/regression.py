@@ -281,11 +281,11 @@ def regress(
 
 @table_row
 class ChannelValue:
-    """What one channel of accelerometers is worth to a predictor, on unseen frames."""
+    """What a predictor leaves of unseen frames without a channel, and if it reads zeros."""
 
-    channel: str = column("channel", help="Name of the channel")
-    without_nm: float = nm_column("without it", unit="nm rms", help="Residual of all other sensors")
-    dead_nm: float = nm_column("zeros, unseen", unit="nm rms", help="Residual if it reads zeros")
+    channel: str = column("channel")
+    without_nm: float = nm_column("without it", unit="nm rms")
+    dead_nm: float = nm_column("zeros, unseen", unit="nm rms")
 
 
 def channel_values(
