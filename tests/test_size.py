@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3811,
+    "cli": 3805,
     "config": 1661,
     "design": 7690,
     "files": 1243,
@@ -24,15 +24,15 @@ LINES = {
     "loop": 4905,
     "methods": 920,
     "models": 4400,
-    "report": 4311,
+    "report": 4307,
     "storage": 1027,
     "studies": 3135,
     "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 186,
-    "tuned constants": 523,
+    "public names": 185,
+    "tuned constants": 520,
     "lines of tests": 32229,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
