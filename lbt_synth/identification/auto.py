@@ -223,9 +223,9 @@ def design_from_record(
         tested, designs = compare_designs(record, half, one, noise=noise, **inputs)
         notes.append(_say_price(price, tested.row(title), held_out.row(title)))
     if of_record := request.method.of_record:
-        spent = [one.claims["fit_share"] for one in (designs[title], made) if title in designs]
-        claims = _claims(tested, title, spent[0] - spent[-1])
-        made = replace(made, claims={**made.claims, **claims})
+        past = designs.get(title, made)
+        saved = past.claims["fit_share"] - made.claims["fit_share"]
+        made = replace(made, claims={**made.claims, **_claims(tested, title, saved)})
     step(1)
     return RecordedDesign(
         model=model,
