@@ -17,7 +17,6 @@ from lbt_synth.cli.loop_inputs import (
     named_difference_notes,
     own_sensor_notes,
     say_limit,
-    say_residual,
 )
 from lbt_synth.cli.output import PERCENT, RMS, Report
 from lbt_synth.cli.streams import track_progress
@@ -30,7 +29,12 @@ from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models.turbulence.ar_models import noll_orders
-from lbt_synth.report.designs.report import refine_values, require_compatible, stable_interval
+from lbt_synth.report.designs.report import (
+    refine_values,
+    require_compatible,
+    say_residual,
+    stable_interval,
+)
 from lbt_synth.report.figures import modal_figure, robustness_map_figure
 from lbt_synth.report.figures.studies import limits_figure, mirror_figure, tradeoff_figure
 from lbt_synth.storage.display_unit import nm_text

@@ -22,9 +22,10 @@ from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit, limit_o
 from lbt_synth.methods.registry import design_title
 from lbt_synth.models import nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences
+from lbt_synth.report.designs.report import say_residual
 from lbt_synth.storage.display_unit import LENGTHS, UNITS, nm_text, show_in
 from lbt_synth.storage.rows import Column, fact
-from lbt_synth.studies.limits import LimitRow, compare_in_truth
+from lbt_synth.studies.limits import compare_in_truth
 
 _MAS_PER_URAD = np.degrees(1e-6) * 3.6e6
 _WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns
@@ -215,16 +216,6 @@ def add_truth(
         report.notes.append(say_limit(comparison.limit, config))
     report.notes += [f"warning: {text}." for text in warnings]
     report.notes += [f"note: {text}" for text in comparison.notes]
-
-
-def say_residual(name: str, row: LimitRow, limit: ResidualLimit | None) -> str:
-    """Return the sentence on what a stable design leaves in the truth."""
-    said = f"{name} leaves {nm_text(row.residual_nm, '.1f')} rms in the truth (Strehl ratio "
-    said += f"{100 * row.strehl:.1f} %)"
-    if limit is None or np.isnan(row.above_limit_percent):
-        return f"{said}."
-    least = nm_text(limit.rms_nm, ".1f")
-    return f"{said}, {row.above_limit_percent:.0f} % above the {least} of the best linear one."
 
 
 def margin_columns(margins: LoopMargins | None) -> dict[str, tuple[Any, Column]]:

@@ -25,7 +25,6 @@ from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.loop.simulation.run import SHOWN_FRAMES, LoopStep
 from lbt_synth.report import design_page, design_report, write_page
 from lbt_synth.report.designs.report import WORDS, design_facts, good_range, verdict
-from lbt_synth.report.explore.exploration import explore, new_view
 from lbt_synth.report.figures import loop_figure
 from lbt_synth.report.figures.loops import (
     axes_name,
@@ -213,34 +212,19 @@ def run_explore(arguments: Namespace) -> Report:
     folder = Path(arguments.output)
     require_writable(folder / "explored-1.yaml")
     config = load_shown(arguments)
-    exploration = explore(config, load_designs(arguments.gains))
-    first = new_view(exploration)
+    designs = load_designs(arguments.gains)
 
-    from lbt_synth.report.explore.server import serve  # bokeh's server, slow to import
+    from lbt_synth.report.explore import serve  # bokeh's server, slow to import
 
-    served = []
+    report = Report()
+    said = [f"note: whoever reaches this address can use the page and write into {folder}."]
+    said = said * (arguments.host not in _LOCAL)
 
     def announce(url: str) -> None:
+        report.data["url"] = url
         stream = sys.stderr if arguments.json else sys.stdout
-        print(f"Open {url} in a browser. Ctrl-C ends.", file=stream, flush=True)
-        if arguments.host not in _LOCAL:
-            print(
-                "note: whoever reaches this address can use the page and write new files into "
-                f"{folder}.",
-                file=stream,
-                flush=True,
-            )
-        served.append(url)
+        print(f"Open {url} in a browser. Ctrl-C ends.", *said, sep="\n", file=stream, flush=True)
 
-    saved = serve(
-        exploration,
-        first,
-        folder,
-        host=arguments.host,
-        port=arguments.port,
-        origins=arguments.origin,
-        announce=announce,
-    )
-    report = Report(data={"url": served[0]})
-    report.note_files(saved)
+    place = {"host": arguments.host, "port": arguments.port, "origins": arguments.origin}
+    report.note_files(serve(config, designs, folder, **place, announce=announce))
     return report
