@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3861,
+    "cli": 3795,
     "config": 1876,
     "design": 7690,
     "files": 1608,
@@ -24,7 +24,7 @@ LINES = {
     "loop": 4905,
     "methods": 920,
     "models": 4400,
-    "report": 4312,
+    "report": 3630,
     "storage": 1049,
     "studies": 3135,
     "errors, validation": 642,

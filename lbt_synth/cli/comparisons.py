@@ -29,7 +29,7 @@ from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models.turbulence.ar_models import noll_orders
-from lbt_synth.report.designs.report import (
+from lbt_synth.report.designs import (
     refine_values,
     require_compatible,
     say_residual,

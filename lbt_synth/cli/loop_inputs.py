@@ -22,7 +22,7 @@ from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit, limit_o
 from lbt_synth.methods.registry import design_title
 from lbt_synth.models import nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.report.designs.report import say_residual
+from lbt_synth.report.designs import say_residual
 from lbt_synth.storage.display_unit import LENGTHS, UNITS, nm_text, show_in
 from lbt_synth.storage.rows import Column, fact
 from lbt_synth.studies.limits import compare_in_truth

@@ -20,7 +20,7 @@ from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
 
 _SIGMAS = 2.0  # of an interval that holds 95 %
-_RESIDUAL = {"label": "residual", "unit": "nm rms", "low": 0}
+_RESIDUAL = ("residual", "nm rms")
 
 
 def _residual_charts(diagnosis: Diagnosis) -> list[Chart]:

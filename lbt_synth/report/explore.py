@@ -44,7 +44,7 @@ from lbt_synth.methods.registry import METHODS, default_method, method_named
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Vibration
 from lbt_synth.models.vibration import stationary_vibrations
-from lbt_synth.report.designs.report import frequency_errors, require_compatible, say_residual
+from lbt_synth.report.designs import frequency_errors, require_compatible, say_residual
 from lbt_synth.report.draw import GREY, colour, dashes
 from lbt_synth.report.figures.loops import frequency_grid
 from lbt_synth.report.figures.records import SEGMENT, exact_spectrum

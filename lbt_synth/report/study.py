@@ -9,14 +9,22 @@ import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from itertools import zip_longest
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.methods.request import fixed_design
-from lbt_synth.report.draw import PANEL_IN, draw_bars, drawing
+from lbt_synth.report.draw import (
+    GUIDE,
+    PANEL_IN,
+    draw_bars,
+    draw_map,
+    drawing,
+    line_style,
+    name_axes,
+)
+from lbt_synth.report.figures.studies import STREHL
 from lbt_synth.report.page.html import (
     Block,
     Chart,
@@ -310,21 +318,21 @@ def _distribution_chart(samples: Mapping[str, Samples]) -> list[Chart]:
     top = 100 * max(float(np.max(values, initial=0.0)) for values in strehls.values())
     least = 100 / max(values.size for values in strehls.values())
     low = min(10.0, 10.0 ** np.floor(np.log10(least)))
-    x_axis = {"label": "Strehl ratio", "unit": "%", "low": 0}
-    x_axis["high"] = min(100.0, max(1.02 * top, 1.0))
-    y_axis = {"label": "samples at or below", "unit": "%", "high": 100}
+    share = ("samples at or below", "%")
     with drawing([PANEL_IN] * 2, columns=2) as (plain, tail):
-        plain.set_axes(x_axis, y_axis | {"low": 0}, title="all samples")
-        tail.set_axes(x_axis, y_axis | {"low": low, "log": True}, title="lower tail")
-        plain.rule("half of the samples", 50, "y")
+        name_axes(plain, STREHL, share, "all samples", ylim=(0, 100))
+        name_axes(tail, STREHL, share, "lower tail", ylim=(low, 100), yscale="log")
+        plain.axhline(50, label="half of the samples", **GUIDE)
         for look, (name, values) in enumerate(strehls.items()):
             if values.size:
-                level, share = cumulative_points(values)
+                level, part = cumulative_points(values)
                 # from nothing just below the first value
-                x, y = 100 * np.append(level[:1], level), 100 * np.append(0.0, share)
-                style: dict[str, Any] = {"look": look, "step": "steps-post", "width": 1.8}
-                plain.curve(name, x, y, **style)
-                tail.curve(name, x[1:], y[1:], **style)
+                x, y = 100 * np.append(level[:1], level), 100 * np.append(0.0, part)
+                style = line_style(look, drawstyle="steps-post", label=name)
+                plain.plot(x, y, **style)
+                tail.plot(x[1:], y[1:], **style)
+        for panel in (plain, tail):
+            panel.set_xlim(0, min(100.0, max(1.02 * top, 1.0)))
     return [chart("distribution", plain.figure)]
 
 
@@ -338,7 +346,7 @@ def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]
         low, high = np.maximum((value - 2 * error, value + 2 * error), 0)
         intervals[one.controller] = low, high
     listed = [names[name] for name in statistics.ranked]
-    axis = {"label": "variance explained by itself", "unit": "%", "low": 0}
+    axis = ("variance explained by itself", "%")
     return [chart("sensitivity", draw_bars(axis, listed, bars, intervals))]
 
 
@@ -358,9 +366,8 @@ def _map_charts(
         places = parameters[first][kept], parameters[second][kept]
         x, y, mean = binned_map(*places, strehl[kept])
         with drawing([2.6]) as (panel,):
-            panel.set_axes({"label": names[first]}, {"label": names[second]})
-            label: dict[str, Any] = {"label": "mean Strehl ratio", "unit": "%"}
-            panel.map(x, y, 100 * mean, blank="no sample", **label)
+            name_axes(panel, (names[first], ""), (names[second], ""))
+            draw_map([panel], [(x, y, 100 * mean)], "mean Strehl ratio [%]", blank="no sample")
         facts = {"x": names[first], "y": names[second], "x_path": first, "y_path": second}
         facts["controller"] = one.controller
         charts.append(chart(f"map-{place + 1}", panel.figure, group="study-map", **facts))

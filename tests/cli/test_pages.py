@@ -190,23 +190,23 @@ def test_a_view_writes_its_figure_and_its_points(view, tmp_path, capsys, gains):
     data = json.loads(run(capsys, "plot", view, gains["kalman"], gains["integrator"], "--json")[1])
     with table.open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert {row["design"] for row in rows} == set(data["curves"]) == {"kalman", "integrator"}
-    for name, curves in data["curves"].items():
-        for quantity, values in curves.items():
-            written = [float(row[quantity]) for row in rows if row["design"] == name]
-            assert written == values
-    assert "error" in data["curves"]["kalman"] or view != "sigma"
-    assert "error" not in data["curves"]["integrator"]
+    for curve in data["curves"]:
+        named = [
+            row for row in rows if (row["panel"], row["curve"]) == (curve["panel"], curve["name"])
+        ]
+        assert {float(row["y"]) for row in named if row["y"]} >= {y for y in curve["y"] if y}
+    names = {curve["name"].partition(":")[0] for curve in data["curves"]}
+    assert names >= ({"loop"} if view == "nyquist" else {"kalman", "integrator"})
 
 
 def test_points_of_a_loop_are_those_of_an_integrator(capsys, gains):
-    data = json.loads(run(capsys, "plot", "nyquist", gains["integrator"], "--json")[1])
-    found = {name: np.array(values) for name, values in data["curves"]["integrator"].items()}
-    z = np.exp(2j * np.pi * found["frequency_hz"] / 800)
+    data = json.loads(run(capsys, "plot", "bode", gains["integrator"], "--json")[1])
+    gain, phase = (c for c in data["curves"] if c["name"].startswith("integrator"))
+    z = np.exp(2j * np.pi * np.array(gain["x"]) / 800)
     expected = 0.5 * z**-2 / (1 - 1 / z)
-    assert found["real"] + 1j * found["imaginary"] == pytest.approx(expected, rel=1e-6)
-    assert found["gain_db"] == pytest.approx(20 * np.log10(np.abs(expected)), abs=1e-6)
-    assert (data["units"]["gain_db"], data["units"]["phase_deg"]) == ("dB", "deg")
+    assert gain["y"] == pytest.approx(20 * np.log10(np.abs(expected)), abs=1e-6)
+    assert np.exp(1j * np.radians(phase["y"])) == pytest.approx(expected / abs(expected), abs=1e-6)
+    assert (gain["panel"], gain["heading"]) == ("loop gain [dB]", "frequency [Hz]")
 
 
 def test_overshoot_and_settling_time(capsys, gains):
