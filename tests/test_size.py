@@ -17,7 +17,7 @@ LINES = {
     "cli": 3795,
     "config": 1876,
     "design": 7690,
-    "files": 1608,
+    "files": 1283,
     "identification": 9965,
     "interop": 4400,
     "linear": 5763,

@@ -90,10 +90,14 @@ def run(arguments: Namespace) -> Report:
             simulation,
             config.hardware,
             sensor_gain=truth.sensor_gain,
-            design=design,
-            controller_digest=file_sha256(arguments.gains[0], GainFileError),
             imaging=config.imaging,
-            metadata={"case": 0, "cases": len(simulation.commands), **noise},
+            metadata={
+                "controller": design.method,
+                "gain_file_sha256": file_sha256(arguments.gains[0], GainFileError),
+                "case": 0,
+                "cases": len(simulation.commands),
+                **noise,
+            },
         )
         write_telemetry(report, arguments.telemetry, recorded, key="telemetry")
     return report
