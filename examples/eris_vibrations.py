@@ -247,18 +247,19 @@ def figure(
     whole = met.whole.turbulence_per_mode(seen.axes)
     noise = 2 * NOISE_NM**2 / FRAME_RATE_HZ
     axes = (
-        (("density", "nm²/Hz"), "log", (0.1, 1e6)),
-        (("rejection", "-"), "log", (5e-3, 5.0)),
-        (("residual up to the frequency", "nm rms"), "linear", None),
+        (("density", "nm²/Hz"), {"yscale": "log", "ylim": (0.1, 1e6)}),
+        (("rejection", "-"), {"yscale": "log", "ylim": (5e-3, 5.0)}),
+        (("residual up to the frequency", "nm rms"), {}),
     )
     heights = [height for height in (2.1, 2.1, 2.6) for _ in range(seen.axes)]
     with drawing(heights, columns=seen.axes) as panels:
         for i in range(seen.axes):
             density, column = whole[i].psd(f), panels[i :: seen.axes]
-            for panel, axis, title in zip(column, axes, (("tip", "tilt")[i], "", ""), strict=True):
-                y, scale, ends = axis
-                name_axes(panel, ("frequency", "Hz"), y, title, xscale="log", yscale=scale)
-                panel.set(xlim=(0.5, 499.0), ylim=ends)
+            for panel, (y, scale), title in zip(
+                column, axes, (("tip", "tilt")[i], "", ""), strict=True
+            ):
+                name_axes(panel, ("frequency", "Hz"), y, title, xscale="log", **scale)
+                panel.set_xlim(0.5, 499.0)
             spectrum, rejection, total = column
             spectrum.plot(f, density, label="disturbance", **line_style(None, linewidth=0.7))
             spectrum.axhline(noise, label="noise", linestyle=":", **GUIDE)
@@ -269,7 +270,7 @@ def figure(
                 left = accumulated(f, rejected * density + passed * noise)
                 rejection.plot(f, np.sqrt(rejected), label=name, **line_style(look, linewidth=0.9))
                 total.plot(f, np.sqrt(left), label=name, **line_style(look))
-                total.set_ylim(bottom=0)
+            total.set_ylim(bottom=0)
     return panels[0].figure
 
 
