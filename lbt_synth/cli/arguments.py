@@ -66,7 +66,6 @@ _SHARED = """
     --noise-nm | float nargs:+ | noise per frame of the sensor [nm], beside a spectrum without
     --lines-hz | float nargs:+ | frequencies of vibrations [Hz]
     --lines-error-hz | float =0.1 | standard error of --lines-hz [Hz]
-    --lines-file | | text file with one frequency per row [Hz]
     --lowest-line-hz | float =3 | what is below counts as turbulence [Hz]
     --most-lines | int =20 | most vibrations per axis
     >
@@ -74,8 +73,7 @@ _SHARED = """
   record
     series
     --accept-record | switch | go on although the commands do not reach the measurements as given
-    --figure | | figure to write (default: the output's name, .png)
-    --no-figure | switch | write no figure
+    --no-figure | switch | write no figure beside the output (.png)
   accelerometers
     > accelerometers
     --accelerometers | | NPY or CSV with one column per channel and one row per frame of the record
@@ -164,7 +162,6 @@ _TABLE = """
     outputs
   show | design | Show a gain file: design, loop, margins, certificate.
     unit gain
-    --matrices | switch | print the gains and the controller, too
   verify | design | Recompute the certificate of a gain file.
     gain
   telemetry | telemetry | Show what telemetry or a record holds, and write it as telemetry.
@@ -183,8 +180,7 @@ _TABLE = """
     >
     --method | @record_methods | default: kalman, unless another quick one leaves less
     --gamma-ratio | float | bound of the norm as a multiple of the least (default 1.2)
-    --model | | configuration to write (default: the output's name, .yaml)
-    -o --output | required | gain file (.fits or .npz)
+    -o --output | required | gain file (.fits or .npz); the configuration goes beside it (.yaml)
   diagnose | records | Say what ran in a record, what is wrong, what it costs, and what to change.
     series
     gain | nargs:? | gain file (.fits or .npz) to try on the record

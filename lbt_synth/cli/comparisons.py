@@ -32,16 +32,20 @@ from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.designs import (
     refine_values,
     require_compatible,
-    say_residual,
     stable_interval,
 )
-from lbt_synth.report.figures import modal_figure, robustness_map_figure
-from lbt_synth.report.figures.studies import limits_figure, mirror_figure, tradeoff_figure
+from lbt_synth.report.figures import robustness_map_figure
+from lbt_synth.report.figures.studies import (
+    limits_figure,
+    mirror_figure,
+    modal_figure,
+    tradeoff_figure,
+)
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import LimitRow
-from lbt_synth.studies.limits import LimitStudy
+from lbt_synth.studies.limits import LimitStudy, say_residual
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, mirror_rows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
@@ -201,7 +205,7 @@ def run_mirror(arguments: Namespace) -> Report:
         "rows",
         f"Designs on this mirror; {config.imaging.label}",
         rows,
-        figure=lambda: mirror_figure(hardware, tolerance=arguments.tolerance),
+        figure=lambda: mirror_figure(shell, hardware, tolerance=arguments.tolerance),
     )
     report.add_facts(
         "The mirror after a step of its command",

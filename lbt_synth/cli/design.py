@@ -8,8 +8,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import add_truth, choose_design_unit, load_shown, say_accelerometers
 from lbt_synth.cli.output import Report, say_checks
@@ -98,15 +96,6 @@ def _say_model(design: Design) -> str:
     return f"{title} has {design.controller.n_states} states."
 
 
-def _add_matrices(report: Report, design: Design) -> None:
-    """Add the gains and the controller, as they are printed."""
-    arrays = {name: getattr(design.controller, name) for name in "ABCD"} | design.arrays()
-    report.data["matrices"] = arrays
-    with np.printoptions(precision=8, linewidth=160, suppress=False):
-        for name, value in arrays.items():
-            report.notes += [f"{name} =", *str(value).splitlines()]
-
-
 def add_moving_gain(report: Report, design: Design) -> None:
     """Add the intervals of a sensor gain that moves, for a design with a stable loop."""
     from lbt_synth.loop import moving_gain
@@ -157,8 +146,8 @@ def run_show(arguments: Namespace) -> Report:
         from lbt_synth.interop import frame_cost  # which a design does not need
 
         report.add_facts("Cost per frame, as exported to C", frame_cost(design), key="frame_cost")
-    if arguments.matrices:
-        _add_matrices(report, design)
+    arrays = {name: getattr(design.controller, name) for name in "ABCD"} | design.arrays()
+    report.data["matrices"] = arrays
     return report
 
 

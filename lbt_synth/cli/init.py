@@ -17,7 +17,6 @@ from lbt_synth.storage.atomic_files import (
     make_directory,
     require_ending,
     require_writable,
-    write_atomically,
     write_together,
 )
 
@@ -70,23 +69,14 @@ def _refuse_taken(contents: Mapping[Path, str], *, force: bool) -> None:
 
 
 def _script(arguments: Namespace) -> Report:
-    """Print the schema of a configuration or the completion of a shell, or write it."""
+    """Print the schema of a configuration or the completion of a shell."""
     asked = "--schema" if arguments.schema else "--completion"
-    others = ["telescope", "examples", "force", *["completion"] * arguments.schema]
+    others = ["telescope", "examples", "force", "output", *["completion"] * arguments.schema]
     refuse_options(arguments, others, f"does not go with {asked}; leave it out")
-    data, text = config_schema(), json.dumps(config_schema(), indent=1)
-    if not arguments.schema:
-        text = _completion(arguments.completion)
-        data = {"shell": arguments.completion, "script": text}
-    if arguments.output is None:
-        return Report(data=data, text=text)
-    output = Path(arguments.output)
     if arguments.schema:
-        require_ending(output, "a schema", (".json",))
-    require_writable(output)
-    report = Report()
-    report.note_written(write_atomically(output, f"{text}\n".encode()))
-    return report
+        return Report(data=config_schema(), text=json.dumps(config_schema(), indent=1))
+    script = _completion(arguments.completion)
+    return Report(data={"shell": arguments.completion, "script": script}, text=script)
 
 
 def _completion(shell: str) -> str:

@@ -22,10 +22,9 @@ from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit, limit_o
 from lbt_synth.methods.registry import design_title
 from lbt_synth.models import nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.report.designs import say_residual
 from lbt_synth.storage.display_unit import LENGTHS, UNITS, nm_text, show_in
 from lbt_synth.storage.rows import Column, fact
-from lbt_synth.studies.limits import compare_in_truth
+from lbt_synth.studies.limits import compare_in_truth, say_residual
 
 _MAS_PER_URAD = np.degrees(1e-6) * 3.6e6
 _WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns
@@ -106,25 +105,14 @@ def load_design(path: str, config: Config | None = None) -> Design:
 
 
 def load_designs(paths: list[str], config: Config | None = None) -> dict[str, Design]:
-    """Load designs, named by the stems of their files or, where these repeat, by longer tails.
+    """Load designs, named by the stems of their files.
 
     With a configuration, they may read other sensors, too.
     """
-    if len({Path(path).resolve() for path in paths}) != len(paths):
-        raise ProblemError(f"each gain file must be given once; got {', '.join(paths)}.")
-    stems = [printable(Path(path).stem) for path in paths]
-    names = stems if len(set(stems)) == len(stems) else _distinct_tails(paths)
+    names = [printable(Path(path).stem) for path in paths]
+    if len(set(names)) != len(names):
+        raise ProblemError(f"each gain file must have a name of its own; got {', '.join(paths)}.")
     return {name: load_design(path, config) for name, path in zip(names, paths, strict=True)}
-
-
-def _distinct_tails(paths: list[str]) -> list[str]:
-    """Return the last parts of different paths, as few as distinguish all of them."""
-    tails = [Path(path).resolve().parts for path in paths]
-    for count in range(1, max(map(len, tails))):
-        names = [printable("/".join(parts[-count:])) for parts in tails]
-        if len(set(names)) == len(names):
-            return names
-    return paths
 
 
 def say_accelerometers(design: Design) -> str:
@@ -150,11 +138,8 @@ def loop_difference_notes(config: Config, design: Design) -> list[str]:
 
 def named_difference_notes(config: Config, designs: Mapping[str, Design]) -> list[str]:
     """Say so of designs by their names."""
-    return [
-        f"{note[:-1]} ({name})."
-        for name, design in designs.items()
-        for note in loop_difference_notes(config, design)
-    ]
+    notes = {name: loop_difference_notes(config, design) for name, design in designs.items()}
+    return [f"{note[:-1]} ({name})." for name, those in notes.items() for note in those]
 
 
 def own_sensor_notes(config: Config) -> list[str]:

@@ -22,8 +22,12 @@ from lbt_synth.interop.specula.optics import Calibration, specula_version
 from lbt_synth.interop.specula.simulation import unread_sensors
 from lbt_synth.methods.registry import design_label, design_title
 from lbt_synth.report.draw import save_figure
-from lbt_synth.report.figures import loop_figure, robustness_figure
-from lbt_synth.report.figures.studies import end_to_end_figure, end_to_end_table_figure
+from lbt_synth.report.figures import loop_figure
+from lbt_synth.report.figures.studies import (
+    end_to_end_figure,
+    end_to_end_table_figure,
+    robustness_figure,
+)
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
 from lbt_synth.storage.display_unit import nm_text, own_display_unit
 from lbt_synth.storage.input_files import file_sha256

@@ -22,7 +22,7 @@ from lbt_synth.cli.telemetry import (
 )
 from lbt_synth.config import identified_config
 from lbt_synth.config.write import RAISED, config_text, require_writable_facts
-from lbt_synth.errors import LbtSynthError, ProblemError, TelemetryError
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import IdentifiedAxis, IdentifiedModel, LoopRecord, SpectrumRecord
@@ -30,10 +30,9 @@ from lbt_synth.identification.accelerometers.readings import Readings, load_read
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.fit.identified_model import model_tables
-from lbt_synth.identification.records.contents import TEXTS, join_names, read_contents
 from lbt_synth.identification.records.record import LEAST_SECONDS, require_length
 from lbt_synth.loop import Imaging, loop_margins
-from lbt_synth.report.draw import require_figure_name, save_figure
+from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
@@ -52,7 +51,7 @@ _STEPS = 3  # that diagnose and auto count
 
 def run_identify(arguments: Namespace) -> Report:
     """Identify a loop from its record; write a configuration and, by default, a figure."""
-    places = find_places(arguments, arguments.output)
+    places = find_places(arguments)
     record = read_record(arguments)
     choose_unit(arguments, record.diameter_m)
     readings = read_accelerations(arguments, record)
@@ -71,14 +70,8 @@ def run_identify(arguments: Namespace) -> Report:
     if readings is not None and isinstance(record, LoopRecord):
         channels, values, notes = readings
         report.notes += [f"note: {note}." for note in notes]
-        try:
-            transfers = identification.accelerometer_transfers(
-                model, record, values, channels=channels
-            )
-        except LbtSynthError as error:  # the model is not lost
-            report.notes.append(f"warning: the accelerometers were not compared: {error}")
-        else:
-            add_accelerometers(report, transfers)
+        transfers = identification.accelerometer_transfers(model, record, values, channels=channels)
+        add_accelerometers(report, transfers)
     report.notes += [marked_note(doubt) for doubt in doubts]
     write_files(report, places, arguments, record, model, accelerometers=transfers)
     return report
@@ -110,7 +103,7 @@ def run_auto(arguments: Namespace) -> Report:
     from lbt_synth.identification.auto import LEAST_SECONDS  # with it come the methods
 
     gain = require_gain_name(arguments.output)
-    places = find_places(arguments, arguments.model, gain=gain)
+    places = find_places(arguments, gain=gain)
     record = require_series(read_record(arguments, LEAST_SECONDS), "auto tests its design on")
     choose_unit(arguments, record.diameter_m)
     channels, values, notes = read_accelerations(arguments, record) or (None, None, ())
@@ -193,7 +186,7 @@ def run_diagnose(arguments: Namespace) -> Report:
     from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
 
     if arguments.output is not None:
-        paths = given_options(arguments, "file", "gain", "commands", "lines_file")
+        paths = given_options(arguments, "file", "gain", "commands")
         require_page_names(arguments.output, arguments.pdf, inputs=tuple(paths.values()))
     elif arguments.pdf is not None:
         raise ProblemError("--pdf is the page of -o on paper; give -o, too.")
@@ -301,24 +294,9 @@ def identification_options(
 
 
 def _expected_lines(arguments: Namespace) -> FloatArray:
-    """Return lines known beforehand and their errors, (lines, 2) [Hz], by arguments and a file."""
-    lines = []
-    if arguments.lines_hz is not None:
-        error = number(arguments.lines_error_hz, "lines_error_hz", at_least=0)
-        lines = [(number(line, "lines_hz", above=0), error) for line in arguments.lines_hz]
-    if arguments.lines_file is not None:
-        path = require_ending(arguments.lines_file, "a list of lines", TEXTS, TelemetryError)
-        columns = read_contents(path).columns
-        # headings, if there are any, must say which column has the frequencies
-        columns.sort(key=lambda column: bool(column.name) and column.role != "frequency")
-        roles = [column.role == "frequency" for column in columns if column.name]
-        table = np.column_stack([column.values for column in columns])
-        if table.shape[1] > 2 or sum(roles) != bool(roles) or np.isnan(table[:, 0]).any():
-            raise ProblemError(
-                f"{path} must have a frequency_hz in each row, and no more than an error_hz beside "
-                f"it; got {join_names(columns)}."
-            )
-        lines += [(row[0], np.nansum(row[1:])) for row in table]
+    """Return lines known beforehand and their errors, (lines, 2) [Hz]."""
+    error = number(arguments.lines_error_hz, "lines_error_hz", at_least=0)
+    lines = [(number(line, "lines_hz", above=0), error) for line in arguments.lines_hz or ()]
     return np.reshape(lines, (-1, 2))
 
 
@@ -350,21 +328,14 @@ def add_accelerometers(report: Report, transfers: AccelerometerTransfers) -> Non
     report.notes.append(f"note: {transfers.shift_text}")
 
 
-def find_places(arguments: Namespace, model: str | Path | None, **others: Path) -> dict[str, Path]:
-    """Return where model, figure and others go, by default beside each other.
-
-    Refuse bad places.
-    """
+def find_places(arguments: Namespace, **gain: Path) -> dict[str, Path]:
+    """Return where model, figure and gain file go, beside each other; refuse bad places."""
     output = Path(arguments.output)
-    model = require_ending(model or output.with_suffix(".yaml"), "a model", (".yaml", ".yml"))
-    places = {**others, "model": model}
+    model = output.with_suffix(".yaml") if gain else output
+    places = {**gain, "model": require_ending(model, "a model", (".yaml", ".yml"))}
     if not arguments.no_figure:
-        figure = arguments.figure or output.with_suffix(".png")
-        places["figure"] = require_figure_name(figure)
-    elif arguments.figure is not None:
-        raise ProblemError("give one of --figure and --no-figure, not both.")
-    read = ("file", "commands", "lines_file", "accelerometers")
-    inputs = given_options(arguments, *(name for name in read if name in arguments))
+        places["figure"] = output.with_suffix(".png")
+    inputs = given_options(arguments, "file", "commands", "accelerometers")
     require_writable(*places.values(), inputs=inputs.values())
     return places
 
@@ -383,27 +354,6 @@ def write_files(
     if made is not None:
         designs = {made.name: made.design}
         report.note_written(save_gain(places["gain"], made.design))
-    try:
-        text, comments = _model_text(model, arguments, record, accelerometers)
-    except ProblemError as error:
-        if accelerometers is None:
-            raise
-        report.notes.append(f"warning: the model is written without accelerometers: {error}")
-        text, comments = _model_text(model, arguments, record, None)
-    report.note_written(write_atomically(places["model"], text), "model")
-    report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
-    if "figure" in places:
-        figure = identification_figure(model, designs=designs)
-        report.note_written(save_figure(figure, places["figure"]), "figure")
-
-
-def _model_text(
-    model: IdentifiedModel,
-    arguments: Namespace,
-    record: LoopRecord | SpectrumRecord,
-    accelerometers: AccelerometerTransfers | None,
-) -> tuple[bytes, dict[str, str]]:
-    """Return the text of a configuration for an identified model, and its comments."""
     source = ascii(Path(arguments.file).name)[1:-1]
     settings, comments = identified_config(
         model,
@@ -411,7 +361,12 @@ def _model_text(
         title=f"Identified from {source} by lbt-synth {arguments.command}.",
         accelerometers=accelerometers,
     )
-    return config_text(settings, comments).encode(), comments
+    text = config_text(settings, comments).encode()
+    report.note_written(write_atomically(places["model"], text), "model")
+    report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
+    if "figure" in places:
+        figure = identification_figure(model, designs=designs)
+        report.note_written(save_figure(figure, places["figure"]), "figure")
 
 
 def add_record(report: Report, record: LoopRecord | SpectrumRecord) -> None:

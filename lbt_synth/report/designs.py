@@ -230,16 +230,6 @@ def refine_values(values: Sequence[float]) -> FloatArray:
     return np.asarray(np.interp(places, np.arange(ordered.size), ordered))
 
 
-def say_residual(name: str, row: LimitRow, limit: ResidualLimit | None) -> str:
-    """Return the sentence on what a stable design leaves in the truth."""
-    said = f"{name} leaves {nm_text(row.residual_nm, '.1f')} rms in the truth (Strehl ratio "
-    said += f"{100 * row.strehl:.1f} %)"
-    if limit is None or np.isnan(row.above_limit_percent):
-        return f"{said}."
-    least = nm_text(limit.rms_nm, ".1f")
-    return f"{said}, {row.above_limit_percent:.0f} % above the {least} of the best linear one."
-
-
 WORDS = ("origin", "certificate", "loop", "gain_margin", "stable_gains")  # facts that are texts
 
 

@@ -44,7 +44,7 @@ from lbt_synth.methods.registry import METHODS, default_method, method_named
 from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Vibration
 from lbt_synth.models.vibration import stationary_vibrations
-from lbt_synth.report.designs import frequency_errors, require_compatible, say_residual
+from lbt_synth.report.designs import frequency_errors, require_compatible
 from lbt_synth.report.draw import GREY, colour, dashes
 from lbt_synth.report.figures.loops import frequency_grid
 from lbt_synth.report.figures.records import SEGMENT, exact_spectrum
@@ -55,7 +55,7 @@ from lbt_synth.storage.rows import fact, facts, row_table
 from lbt_synth.storage.tables import Table, text_lines
 from lbt_synth.storage.words import count_text
 from lbt_synth.studies import robustness_map
-from lbt_synth.studies.limits import compare_in_truth
+from lbt_synth.studies.limits import compare_in_truth, say_residual
 from lbt_synth.validation import FloatArray
 
 Content: TypeAlias = dict[str, Any]  # of a configuration file

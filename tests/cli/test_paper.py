@@ -22,6 +22,7 @@ import lbt_synth as lbt
 from lbt_synth.cli import paper
 from lbt_synth.cli.main import main
 from lbt_synth.errors import MissingExtraError, ProblemError
+from lbt_synth.report.figures.studies import robustness_figure
 from lbt_synth.studies.paper import modal_row, paper_filters, plan_rows
 
 
@@ -46,7 +47,7 @@ def written(folder):
     drawn = []
 
     def draw(*arguments):
-        drawn.append(lbt.report.figures.robustness_figure(*arguments))
+        drawn.append(robustness_figure(*arguments))
         return drawn[-1]
 
     with pytest.MonkeyPatch.context() as patch:

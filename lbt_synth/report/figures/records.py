@@ -49,7 +49,6 @@ def simulation_figure(
     loop: ClosedLoop | None = None,
     truth: Truth | None = None,
     title: str = "",
-    axes: OwnAxes = None,
 ) -> Figure:
     """Residual series of the first second of the first case, and spectra.
 
@@ -57,7 +56,7 @@ def simulation_figure(
     axes; that of the transfer functions is beside them for a loop and a truth.
     """
     frames = min(run.residual_nm.shape[1], int(np.ceil(SERIES_S * run.frame_rate_hz)))
-    with drawing([PANEL_IN, PANEL_IN], columns=2, axes=axes) as (series, spectra):
+    with drawing([PANEL_IN, PANEL_IN], columns=2) as (series, spectra):
         _draw_series(series, run, frames, title)
         density = ("power spectrum", "nm²/Hz")
         _, factor = name_axes(spectra, FREQUENCY, density, xscale="log", yscale="log")

@@ -7,12 +7,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.interop import EndToEndRun
 from lbt_synth.methods.registry import design_label
-from lbt_synth.models import LoopHardware
+from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.report.draw import (
     GUIDE,
     PANEL_IN,
@@ -33,7 +32,7 @@ from lbt_synth.storage.rows import Facts
 from lbt_synth.studies import RobustnessMap, RobustnessRow
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES
-from lbt_synth.validation import FloatArray, positive, require_instance
+from lbt_synth.validation import FloatArray
 
 FREQUENCY_ERROR = ("frequency error, truth less design", "Hz")
 SENSOR_GAIN = ("sensor gain", "-")
@@ -43,44 +42,14 @@ _RINGS: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "marke
 
 
 def robustness_figure(
-    rows: Sequence[RobustnessRow],
-    published: Mapping[str, Sequence[tuple[float, float]]] | None = None,
-    *,
-    axes: OwnAxes = None,
+    rows: Sequence[RobustnessRow], published: Mapping[str, Sequence[tuple[float, float]]]
 ) -> Figure:
-    """Draw the Strehl ratio over the error of the model's vibration frequency.
+    """Draw the Strehl ratio over the frequency error, and the pairs that were published.
 
-    Parameters
-    ----------
-    rows : sequence of RobustnessRow
-        Rows of :func:`lbt_synth.studies.robustness`; unstable ones are marked at the bottom.
-    published : mapping, optional
-        For each method, pairs (error [Hz], Strehl ratio [%]) drawn as open markers.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes, one; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel.
-
-    Raises
-    ------
-    ProblemError
-        If there are no rows, or ``axes`` are not one.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> parts = config.plant, config.truth, config.imaging
-    >>> rows = list(lbt.studies.robustness(*parts, errors_hz=[0]))
-    >>> len(lbt.report.figures.robustness_figure(rows).axes)
-    1
+    Unstable loops are marked at the bottom, published pairs (error [Hz], Strehl ratio [%]) with
+    open markers.
     """
-    if not rows:
-        raise ProblemError("a robustness figure needs at least one row; got none.")
-    with drawing([2.5], axes=axes) as (panel,):
+    with drawing([2.5]) as (panel,):
         name_axes(panel, FREQUENCY_ERROR, STREHL)
         for look, method in enumerate(dict.fromkeys(row.method for row in rows)):
             entries = sorted((r for r in rows if r.method == method), key=lambda r: r.error_hz)
@@ -92,7 +61,7 @@ def robustness_figure(
             if not stable.all():
                 lost = errors[~stable]
                 panel.plot(lost, 0 * lost, "x", label=f"{label}: unstable", color=colour(look))
-            if published is not None and method in published:
+            if method in published:
                 x, y = np.array(published[method], dtype=float).T
                 panel.plot(x, y, label=f"{label}, paper", **dot_style(look) | _RINGS)
     return panel.figure
@@ -172,7 +141,7 @@ def robustness_map_figure(
     return panels[0].figure
 
 
-def limits_figure(study: LimitStudy, *, over_errors: bool = False, axes: OwnAxes = None) -> Figure:
+def limits_figure(study: LimitStudy, *, over_errors: bool = False) -> Figure:
     """Draw the residual of each design over the vibration's frequency or its error, and the limits.
 
     Designs that leave the same are one curve with their names; unstable ones are named and not
@@ -199,7 +168,7 @@ def limits_figure(study: LimitStudy, *, over_errors: bool = False, axes: OwnAxes
                 break
         else:
             curves.append((name, values))
-    with drawing([2.5], axes=axes) as (panel,):
+    with drawing([2.5]) as (panel,):
         _, factor = name_axes(panel, x_axis, ("residual", "nm rms"), yscale="log")
         for name, values in curves:
             shown = None if values is None else factor * values
@@ -218,21 +187,19 @@ _NAMES = dict(
 )
 
 
-def tradeoff_figure(points: Sequence[Facts], *, axes: OwnAxes = None) -> Figure:
+def tradeoff_figure(points: Sequence[Facts]) -> Figure:
     """Draw deviation and stable sensor gains over the norm of the estimation error.
 
     Above, the standard deviation; below, if there are loops, the interval of sensor gains for which
     each is stable. An end of it that is 0 has no line: the shaded area goes on to the edge. Norms
     that no filter reaches are shaded.
     """
-    if not points:
-        raise ProblemError("a trade-off figure needs at least one point; got none.")
     loops = any(point.design.hardware is not None for point in points)
     unit = "nm" if loops else "-"
     norms = [point.gamma for point in points]
     margin = 0.06 * (max(norms) - min(norms)) or 0.01 * max(norms)
     norm = ("H∞ norm of the estimation error", unit)
-    with drawing([2.3] * (1 + loops), axes=axes) as panels:
+    with drawing([2.3] * (1 + loops)) as panels:
         _, factor = name_axes(panels[0], norm, ("estimation error, rms", unit))
         ends = [end for p in points for end in (p.gain_low, p.gain_high) if 0 < end < np.inf]
         edges = min([1.0, *ends]) / 2, 2 * max([1.0, *ends])
@@ -263,88 +230,35 @@ def tradeoff_figure(points: Sequence[Facts], *, axes: OwnAxes = None) -> Figure:
 
 
 def modal_figure(
-    residuals_nm: Mapping[str, ArrayLike],
-    *,
-    gains: ArrayLike | None = None,
-    turbulence_nm: ArrayLike | None = None,
-    axes: OwnAxes = None,
+    residuals_nm: Mapping[str, FloatArray], *, gains: FloatArray, turbulence_nm: FloatArray
 ) -> Figure:
-    """Draw the residual of each mode under several controllers, and integrator gains.
-
-    Parameters
-    ----------
-    residuals_nm : mapping of str to (n,) array_like
-        Residual of each mode [nm rms] by the names of the controllers.
-    gains : (n,) array_like, optional
-        Integrator gain of each mode, for a panel of its own.
-    turbulence_nm : (n,) array_like, optional
-        Turbulence of each mode [nm rms], before any correction.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel over the other with a common axis of modes, counted from 1.
-
-    Raises
-    ------
-    ProblemError
-        If there is no controller, a value is not positive, or lengths or ``axes`` do not fit.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> len(lbt.report.figures.modal_figure({"integrator": [9.0, 5.0]}, gains=[0.5, 0.4]).axes)
-    2
-    """
-    if not residuals_nm:
-        raise ProblemError("a modal figure needs the residuals of a controller; got none.")
-    others = {"turbulence_nm": turbulence_nm, "gains": gains}
-    numbers = {**residuals_nm, **others}
-    curves = {n: positive(values, n) for n, values in numbers.items() if values is not None}
-    count = curves[next(iter(residuals_nm))].size
-    for name, curve in curves.items():
-        if curve.shape != (count,) or not count:
-            raise DimensionError(
-                f"{name} must have {count} modes, one number per mode; got shape {curve.shape}."
-            )
+    """Draw the integrator gain of each mode, and its residual under several controllers."""
+    count = gains.size
     modes, mode = np.arange(1.0, count + 1), ("mode, in Noll's order from tip on", "")
     # modes are counted, there is nothing between them
     step: dict[str, Any] = {"drawstyle": "steps-mid"}
     scale: dict[str, Any] = {"xscale": "log", "xlim": (1, max(count, 2))}
-    with drawing([1.7] * (gains is not None) + [2.6], axes=axes) as panels:
-        if gains is not None:
-            look = line_style(len(residuals_nm), dash=0, **step)  # of none of the residuals
-            name_axes(panels[0], mode, ("integrator gain", ""), **scale)
-            panels[0].plot(modes, curves["gains"], label="_integrator gain", **look)
-            panels[0].set_ylim(bottom=0)
-        panel = panels[-1]
-        _, factor = name_axes(panel, mode, ("residual", "nm rms"), yscale="log", **scale)
-        if turbulence_nm is not None:
-            grey = line_style(None, linewidth=1.0, **step)
-            panel.plot(modes, factor * curves["turbulence_nm"], label="turbulence", **grey)
-        for name in residuals_nm:
-            draw_design(panel, list(residuals_nm), name, modes, factor * curves[name], **step)
-    return panels[0].figure
+    with drawing([1.7, 2.6]) as (above, below):
+        look = line_style(len(residuals_nm), dash=0, **step)  # of none of the residuals
+        name_axes(above, mode, ("integrator gain", ""), **scale)
+        above.plot(modes, gains, label="_integrator gain", **look)
+        above.set_ylim(bottom=0)
+        _, factor = name_axes(below, mode, ("residual", "nm rms"), yscale="log", **scale)
+        grey = line_style(None, linewidth=1.0, **step)
+        below.plot(modes, factor * turbulence_nm, label="turbulence", **grey)
+        for name, rms_nm in residuals_nm.items():
+            draw_design(below, list(residuals_nm), name, modes, factor * rms_nm, **step)
+    return above.figure
 
 
-def mirror_figure(
-    hardware: LoopHardware, *, tolerance: float = 0.1, axes: OwnAxes = None
-) -> Figure:
+def mirror_figure(shell: PositionLoop, hardware: LoopHardware, *, tolerance: float = 0.1) -> Figure:
     """Draw the mirror's step response, and its taps.
 
     The step response has the ends of the frames after the command's arrival, and the band in which
     the mirror counts as settled. The taps are the weights of the commands in the position averaged
     over an exposure, with those of a settled mirror beside them.
     """
-    require_instance(hardware, LoopHardware)
-    if hardware.mirror is None:
-        raise ProblemError(
-            "a figure of the mirror needs one with dynamics; got a mirror that settles at once. "
-            "Try LoopHardware(..., mirror=PositionLoop(...))."
-        )
-    step = hardware.mirror.step_response(tolerance)
+    step = shell.step_response(tolerance)
     settling_ms, frame_ms = 1e3 * step.settling_s, 1e3 * hardware.dt_s
     end_ms = max(1.5 * settling_ms, 2 * frame_ms)
     time_ms = 1e3 * step.time_s
@@ -355,7 +269,7 @@ def mirror_figure(
     taps = hardware.mirror_taps
     ideal = replace(hardware, mirror=None).mirror_taps
     count = max(np.trim_zeros(taps.round(2), "b").size, ideal.size)  # of half a percent and more
-    with drawing([2.4, 2.4], columns=2, axes=axes) as (response, weights):
+    with drawing([2.4, 2.4], columns=2) as (response, weights):
         time = ("time since the command arrived", "ms")
         name_axes(response, time, ("position / final position", ""), xlim=(0, end_ms))
         response.axhspan(1 - tolerance, 1 + tolerance, color="0.3", **SHADE)
@@ -378,13 +292,13 @@ _SHOWN_MAS = 700.0  # from the centre of the image to its edges
 _FAINTEST = 1e-5  # of the peak
 
 
-def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
+def end_to_end_figure(run: EndToEndRun) -> Figure:
     """Image, tip and tilt over time, and residual of each mode of an end-to-end run."""
     size = run.psf.shape[0]
     position_mas = (np.arange(size) - size // 2) * run.psf_pixel_mas
     reach_mas = min(_SHOWN_MAS, size / 2 * run.psf_pixel_mas)
     seconds = np.arange(run.frames) / run.system.frame_rate_hz
-    with drawing([2.4, 2.4, PANEL_IN], columns=2, axes=axes) as (image, modes, series):
+    with drawing([2.4, 2.4, PANEL_IN], columns=2) as (image, modes, series):
         title = f"{run.system.imaging_wavelength_um:g} µm, Strehl ratio {100 * run.strehl:.1f} %"
         name_axes(image, ("x", "mas"), ("y", "mas"), title, box_aspect=1)
         values = np.maximum(run.psf / run.psf.max(), _FAINTEST)
