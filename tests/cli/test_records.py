@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -81,14 +80,12 @@ def test_a_spectrum(tmp_path, capsys):
 
 
 def test_lists_announce_lines(tmp_path, capsys, recorded_night):
-    (tmp_path / "named.csv").write_text("error_hz,frequency_hz\n0.1,31.0\n,77\n")
     words = (recorded_night, "-o", tmp_path / "m.yaml", "--no-figure", "--json")
-    for options in (("--lines-file", tmp_path / "named.csv"), ("--lines-hz", 31, 77)):
-        status, text, error = run(capsys, "identify", *words, *options)
-        assert (status, error) == (0, "")
-        (line,) = json.loads(text)["axes"][0]["vibrations"]
-        assert line["announced"]
-        assert line["frequency_hz"] == pytest.approx(LINE_HZ, abs=0.2)
+    status, text, error = run(capsys, "identify", *words, "--lines-hz", 31, 77)
+    assert (status, error) == (0, "")
+    (line,) = json.loads(text)["axes"][0]["vibrations"]
+    assert line["announced"]
+    assert line["frequency_hz"] == pytest.approx(LINE_HZ, abs=0.2)
 
 
 def test_accelerometers_are_compared_with_the_lines_of_the_model(
@@ -121,36 +118,6 @@ def test_accelerometers_are_compared_with_the_lines_of_the_model(
     status, text, error = run(capsys, *base, *own, "--accelerometer-rate-hz", 500)
     assert status == 2
     assert "at least once a frame, 1000 Hz, and last a frame; got 24000 readings at 500 Hz" in error
-
-
-def test_a_model_is_written_whatever_becomes_of_its_accelerometers(
-    tmp_path, capsys, monkeypatch, recorded_loop, tip_night
-):
-    run_, _, _ = recorded_loop
-    np.save(tmp_path / "a.npy", 1e-3 * np.diff(run_.total_nm[0][:, 0], n=2, prepend=[0, 0]))
-    real = lbt.identification.accelerometer_transfers
-
-    def fails(*_, **__):
-        raise lbt.errors.NumericalError("gone.")
-
-    def is_noiseless(*given, **options):
-        found = real(*given, **options)
-        rows = tuple(replace(row, noise_m_s2=0.0) for row in found.channels)
-        return replace(found, channels=rows)
-
-    for wrong, words in (
-        (fails, "warning: the accelerometers were not compared: gone."),
-        (is_noiseless, "warning: the model is written without accelerometers: "),
-    ):
-        monkeypatch.setattr(lbt.identification, "accelerometer_transfers", wrong)
-        out = tmp_path / f"{wrong.__name__}.yaml"
-        base = ("identify", tip_night, *FACTS, "-o", out, "--no-figure")
-        status, text, _ = run(capsys, *base, "--accelerometers", tmp_path / "a.npy")
-        assert status == 0
-        assert words in text
-        settings = lbt.load_config(out).settings
-        assert settings.sensors is None
-        assert settings.model.vibrations
 
 
 def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
@@ -230,7 +197,7 @@ def test_auto_tests_its_design_on_unseen_data(made, recorded_loop):
 
 def test_auto_says_what_it_found(capsys, recorded_night, tmp_path):
     options = ("--method", "hinf", "--gamma-ratio", 1.3, "--sensor-gain", GAIN, "--no-figure")
-    files = ("-o", tmp_path / "h.npz", "--model", tmp_path / "m.yml")
+    files = ("-o", tmp_path / "h.npz")
     status, text, error = run(capsys, "auto", recorded_night, *options, *files)
     assert (status, error) == (0, "")
     said = " ".join(text.split())
@@ -240,7 +207,7 @@ def test_auto_says_what_it_found(capsys, recorded_night, tmp_path):
     )
     assert "Kalman filter" not in text
     assert not (tmp_path / "h.png").exists()
-    assert (tmp_path / "m.yml").is_file()
+    assert (tmp_path / "h.yaml").is_file()
 
 
 def test_an_open_loop_series_and_one_axis(tmp_path, capsys, recorded_loop):
@@ -314,8 +281,6 @@ def test_a_dead_axis_leaves_the_other(capsys, tmp_path):
         ("identify NIGHT -o m.yaml --columns a", "--columns takes ROLE=NAME or ROLE=NAME,NAME"),
         ("identify NIGHT -o m.yaml --acceleration-unit g", "goes with --accelerometers."),
         ("identify NIGHT -o m.yaml --obstruction 0.1", "give --diameter-m."),
-        ("identify NIGHT -o m.yaml --lines-file L.csv", "must have a frequency_hz in each row"),
-        ("identify NIGHT -o m.yaml --figure a.png --no-figure", "give one of --figure and --no-"),
         ("auto NIGHT -o t.fits --lines-hz 12 -5", "--lines-hz must be above 0; got -5"),
         ("auto SHORT -o t.fits --delay-frames 2", "4 s at 1000 Hz) in stretches of at least 256"),
         ("diagnose NIGHT --pdf a.pdf", "--pdf is the page of -o on paper; give -o, too."),
@@ -324,7 +289,6 @@ def test_a_dead_axis_leaves_the_other(capsys, tmp_path):
 )
 def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, recorded_night, words, message):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "L.csv").write_text("1,2,3\n")
     (tmp_path / "PSD.csv").write_text(
         "frequency_hz,psd\n" + "".join(f"{i},1\n" for i in range(1, 99))
     )
