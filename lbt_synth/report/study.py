@@ -43,7 +43,6 @@ from lbt_synth.studies.study.statistics import (
     ControllerStatistics,
     Samples,
     StudyStatistics,
-    is_list,
     percent,
     read_column,
     read_controller_samples,
@@ -153,31 +152,15 @@ def _summary_blocks(
     study: Study, statistics: StudyStatistics, samples: Mapping[str, Samples]
 ) -> list[Block]:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
-    unstable = ", ".join(
-        f"{one.controller} in {one.unstable} of {one.samples} "
-        f"({percent(one.unstable_share.value, 2)} %)"
-        for one in statistics.controllers
-        if one.unstable
-    )
     failed = ", ".join(f"{c.controller} {c.failed}" for c in statistics.controllers if c.failed)
     done, total = statistics.samples, study.samples
-    blocks: list[Block] = [
-        Notice(text=text, tone=tone)
-        for text, tone, is_so in (
-            (paragraph("incomplete", done=done, samples=total), "bad", done < total),
-            (f"Unstable loops: {unstable}.", "bad", unstable),
-            (f"Evaluations that failed, and are in none of the figures: {failed}.", "bad", failed),
-            (
-                "Every controller is stable in every sample, and none failed.",
-                "good",
-                done and not unstable and not failed,
-            ),
-        )
-        if is_so
-    ]
+    wrong = [paragraph("incomplete", done=done, samples=total)] if done < total else []
+    wrong += [f"Evaluations that failed, and are in none of the figures: {failed}."] * bool(failed)
+    verdict = study_verdict(statistics)
+    wrong += [sentence for sentence in verdict if " is unstable " in sentence]
     return [
-        *blocks,
-        _verdict_text(statistics.controllers),
+        *(Notice(text=sentence, tone="bad") for sentence in wrong),
+        " ".join(sentence for sentence in verdict if sentence not in wrong),
         *survival_blocks(_design_margins(study, statistics)),
         strehl_table(statistics),
         residual_table(statistics),
@@ -201,22 +184,37 @@ def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, Loop
     return {name: loop_margins(loop) for name, loop in loops.items() if loop.is_stable}
 
 
-def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
-    """Say which controller leads by each measure; the reader decides which measure counts."""
-    with_data = [controller for controller in controllers if controller.samples]
+def study_verdict(statistics: StudyStatistics) -> list[str]:
+    """Say which controllers are unstable, which leads by each measure, and what it depends on.
+
+    The reader decides which measure counts.
+    """
+    with_data = [one for one in statistics.controllers if one.samples]
     if not with_data:
-        return "No controller was evaluated on any sample."
-
-    def leader(value: Callable[[ControllerStatistics], float]) -> str:
-        best = max(with_data, key=value)
-        return f"{best.controller}, {percent(value(best))} %"
-
-    return paragraph(
-        "leaders",
-        mean=leader(lambda controller: controller.mean),
-        median=leader(lambda controller: controller.strehl[50].value),
-        low=leader(lambda controller: controller.strehl[5].value),
-    )
+        return ["No controller was evaluated on any sample."]
+    verdict = [
+        f"{one.controller} is unstable in {percent(one.unstable_share.value, 2)} % of the samples."
+        for one in sorted(with_data, key=lambda one: -one.unstable)
+        if one.unstable
+    ]
+    measures: dict[str, Callable[[ControllerStatistics], float]] = {
+        "mean": lambda one: one.mean,
+        "median": lambda one: one.strehl[50].value,
+        "5th percentile": lambda one: one.strehl[5].value,
+    }
+    leaders = []
+    for name, measure in measures.items():
+        best = max(with_data, key=measure)
+        leaders.append(f"highest {name}, {best.controller} {percent(measure(best))} %")
+    verdict.append(f"Strehl ratios: {'; '.join(leaders)}.")
+    best = max(with_data, key=measures["mean"])
+    if best.ranked:
+        share = 100 * best.index(best.ranked[0])[0]
+        verdict.append(
+            f"That of {best.controller} depends most on {best.ranked[0]} ({share:.0f} % of its "
+            "variance)."
+        )
+    return verdict
 
 
 def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names) -> list[Block]:
@@ -386,27 +384,9 @@ def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 def binned_map(
     x: FloatArray, y: FloatArray, result: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the mean of a result (n,) over a grid of two varying parameters (n,).
-
-    It is (ny, nx), nan in a cell without samples, and comes after the centres of the cells, or
-    the values of a list, x (nx,) and y (ny,).
-    """
+    """Return centres of cells (nx,), (ny,), and the mean (ny, nx) of a result in each, or nan."""
     from scipy.stats import binned_statistic_2d
 
     cells = int(np.clip(np.sqrt(len(x) / _PER_CELL), 3, _BINS))
-    (columns, x_edges), (rows, y_edges) = (_cells(values, cells) for values in (x, y))
-    mean = binned_statistic_2d(y, x, result, bins=(y_edges, x_edges)).statistic
-    return columns, rows, np.asarray(mean)
-
-
-def _cells(values: FloatArray, cells: int) -> tuple[FloatArray, FloatArray]:
-    """Return the centres of the cells along one axis, and their edges.
-
-    A list has a cell for each value, other values have cells of equal width.
-    """
-    if is_list(np.sort(values)):
-        centres = np.unique(values)
-        inner = (centres[:-1] + centres[1:]) / 2
-        return centres, np.concatenate(([centres[0] - 1], inner, [centres[-1] + 1]))
-    edges = np.linspace(values.min(), values.max(), cells + 1)
-    return (edges[:-1] + edges[1:]) / 2, edges
+    mean, rows, columns, _ = binned_statistic_2d(y, x, result, bins=cells)
+    return (columns[:-1] + columns[1:]) / 2, (rows[:-1] + rows[1:]) / 2, np.asarray(mean)

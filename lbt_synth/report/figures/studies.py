@@ -144,8 +144,7 @@ def robustness_map_figure(
 def limits_figure(study: LimitStudy, *, over_errors: bool = False) -> Figure:
     """Draw the residual of each design over the vibration's frequency or its error, and the limits.
 
-    Designs that leave the same are one curve with their names; unstable ones are named and not
-    drawn. A study in which no vibration moves raises a ProblemError.
+    Unstable designs are named and not drawn. ProblemError if no vibration moves.
     """
     if study.shift_hz.size < 2:
         raise ProblemError(
@@ -158,21 +157,12 @@ def limits_figure(study: LimitStudy, *, over_errors: bool = False) -> Figure:
         label = shift if study.frequency_hz is None else "frequency of the true vibration"
         start_hz, x_axis = study.frequency_hz or 0.0, (label, "Hz")
     order, places = np.argsort(study.shift_hz), np.sort(study.shift_hz) + start_hz
-    curves: list[tuple[str, FloatArray | None]] = []
-    for row, residual_nm in zip(study.rows, study.residual_nm, strict=True):
-        name = row.design if over_errors else design_label(row.design)
-        values = residual_nm[order] if row.stable else None
-        for i, (twin, other) in enumerate(curves):
-            if values is not None and other is not None and np.allclose(values, other, rtol=1e-9):
-                curves[i] = f"{twin} and {name}", other
-                break
-        else:
-            curves.append((name, values))
+    names = [row.design if over_errors else design_label(row.design) for row in study.rows]
     with drawing([2.5]) as (panel,):
         _, factor = name_axes(panel, x_axis, ("residual", "nm rms"), yscale="log")
-        for name, values in curves:
-            shown = None if values is None else factor * values
-            draw_design(panel, [title for title, _ in curves], name, places, shown)
+        for name, row, residual_nm in zip(names, study.rows, study.residual_nm, strict=True):
+            shown = factor * residual_nm[order] if row.stable else None
+            draw_design(panel, names, name, places, shown)
         for label, limit, style in (
             ("limit, frequency known", study.limit, ":"),
             ("limit, frequency anywhere in this range", study.band, "--"),

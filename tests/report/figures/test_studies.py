@@ -105,16 +105,12 @@ def test_a_sensor_gain_of_zero_has_no_line():
 
 
 def test_limits_name_designs_and_what_moves(config):
-    kalman = lbt.kalman(config.plant)
-    designs = {
-        "kalman": kalman,
-        "by hand": kalman,
-        "slow": lbt.integrator(config.hardware, gain=0.3),
-    }
+    slow = lbt.integrator(config.hardware, gain=0.3)
+    designs = {"kalman": lbt.kalman(config.plant), "slow": slow}
     parts = config.hardware, config.truth, config.imaging
     study = lbt.studies.limits(designs, *parts, errors_hz=[-1, 1])
     (axes,) = limits_figure(study).axes
-    assert legend(axes)[:2] == ["Kalman and by hand", "slow"]
+    assert legend(axes)[:2] == ["Kalman", "slow"]
     assert axes.get_xlabel() == "frequency of the true vibration [Hz]"
     several = limits_figure(replace(study, frequency_hz=None)).axes[0].get_xlabel()
     assert several == "shift of the vibration that moves most, the others in proportion [Hz]"
