@@ -6,53 +6,15 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from lbt_synth.identification import Diagnosis
 from lbt_synth.identification.diagnosis import law_facts
 from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
-from lbt_synth.report.draw import draw_bars
 from lbt_synth.report.figures import identification_figure
-from lbt_synth.report.page.html import Block, Chart, Notice, Page, chart, new_page, paragraph
+from lbt_synth.report.page.html import Block, Notice, Page, chart, new_page, paragraph
 from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
-
-_SIGMAS = 2.0  # of an interval that holds 95 %
-_RESIDUAL = ("residual", "nm rms")
-
-
-def _residual_charts(diagnosis: Diagnosis) -> list[Chart]:
-    """Return bars of the residuals on unseen data, and of the parts of the disturbance."""
-    charts = []
-    if rows := diagnosis.residuals:
-        values, errors, promised = np.array(
-            [(row.replayed_nm, _SIGMAS * row.replayed_error_nm, row.model_nm) for row in rows]
-        ).T
-        bars, intervals = (
-            {"data": values, "model": promised},
-            {"data": (values - errors, values + errors)},
-        )
-        figure = draw_bars(_RESIDUAL, [row.name for row in rows], bars, intervals)
-        charts.append(chart("residuals", figure))
-    if costs := diagnosis.costs:
-        bars = {
-            "loop that ran": np.array([row.running_nm for row in costs]),
-            "best design": np.array([row.best_nm for row in costs]),
-        }
-        figure = draw_bars(_RESIDUAL, [row.part for row in costs], bars, {})
-        charts.append(chart("costs", figure, best=diagnosis.best or "none"))
-    return charts
-
-
-def _spectrum_charts(diagnosis: Diagnosis) -> list[Chart]:
-    """Return the chart of the identified model."""
-    if diagnosis.model is None:
-        return []
-    designs = {} if diagnosis.best_design is None else {diagnosis.best: diagnosis.best_design}
-    figure = identification_figure(diagnosis.model, designs=designs)
-    return [chart("identification", figure)]
 
 
 def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, list[Table]]:
@@ -92,7 +54,12 @@ def diagnosis_page(diagnosis: Diagnosis, files: Sequence[str | os.PathLike[str]]
     record, tables = diagnosis.record, diagnosis_tables(diagnosis)
     name = Path(files[0]).name if files else record.source or "a record"
     duration = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
-    disturbance: list[Block] = [*tables["disturbance"], *_spectrum_charts(diagnosis)]
+    disturbance: list[Block] = [*tables["disturbance"]]
+    if diagnosis.model is not None:
+        best = diagnosis.best_design
+        designs = {} if best is None else {diagnosis.best: best}
+        figure = identification_figure(diagnosis.model, designs=designs)
+        disturbance.append(chart("identification", figure))
     return new_page(
         f"Diagnosis of {name}",
         f"{duration}, {count_text(record.axes, 'axis', 'axes')}",
@@ -112,6 +79,5 @@ def _verdict_blocks(diagnosis: Diagnosis, tables: Sequence[Table]) -> list[Block
         Notice(text=state, tone=diagnosis.findings[0].tone),
         " ".join(rest),
         *tables,
-        *_residual_charts(diagnosis),
         *(Notice(text=f"{note[0].upper()}{note[1:]}") for note in diagnosis.notes),
     ]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import os
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.storage.atomic_files import require_ending, write_atomically
@@ -234,17 +233,17 @@ def draw_map(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Series:
-    """Numbers that a figure draws, in the units that are shown: a curve, a row of a map, bars."""
+    """Numbers that a figure draws, in the units that are shown: a curve, or a row of a map."""
 
     panel: str  # title of its panel, and what is up its y axis
     heading: str  # what x is, with its unit
     name: str  # what y is
-    x: FloatArray | tuple[str, ...]  # (n,)
+    x: FloatArray  # (n,)
     y: FloatArray  # (n,)
 
 
 def figure_series(figure: Figure) -> Iterator[Series]:
-    """Yield the numbers of the curves, bars and maps of a figure."""
+    """Yield the numbers of the curves and maps of a figure."""
     for axes in figure.axes:
         names = " ".join(axes.get_title(loc="left").split()), axes.get_ylabel()
         panel, heading = ": ".join(filter(None, names)), axes.get_xlabel()
@@ -253,45 +252,12 @@ def figure_series(figure: Figure) -> Iterator[Series]:
             if x.size and line.get_zorder() >= _CURVES:
                 name = line.get_label().removeprefix("_")  # which keeps it out of the legend
                 yield Series(panel=panel, heading=heading, name=name, x=x, y=y)
-        for bars in axes.containers:
-            categories = tuple(label.get_text() for label in axes.get_yticklabels())
-            lengths = np.array([bar.get_width() for bar in bars])
-            name = f"{bars.get_label()} {heading}"
-            yield Series(panel=panel, heading=heading, name=name, x=categories, y=lengths)
         for part in axes.collections:
             if (numbers := getattr(part, "numbers", None)) is not None:
                 label, along, up, values = numbers
                 for place, row in zip(up, values, strict=True):
                     name = f"{label} at {axes.get_ylabel()} {place:g}"
                     yield Series(panel=panel, heading=heading, name=name, x=along, y=row)
-
-
-def draw_bars(
-    axis: tuple[str, str],
-    categories: Sequence[str],
-    bars: Mapping[str, ArrayLike],
-    intervals: Mapping[str, tuple[ArrayLike, ArrayLike]],
-) -> Figure:
-    """Draw bars of each name along an axis, one per category from the top; nan draws none.
-
-    ``intervals`` are ends around the values of a name.
-    """
-    places, height = np.arange(len(categories)), 0.8 / len(bars)
-    with drawing([min(0.2 + 0.24 * max(2, len(categories) * len(bars)), 7.5)]) as (axes,):
-        factor, _ = name_axes(axes, axis, ("", ""))
-        for look, (name, lengths) in enumerate(bars.items()):
-            up = places + (look - (len(bars) - 1) / 2) * height
-            values = factor * np.asarray(lengths, dtype=np.float64)
-            axes.barh(up, values, height=0.9 * height, color=colour(look), label=name)
-            if name in intervals:
-                low, high = (factor * np.asarray(end) for end in intervals[name])
-                axes.hlines(up, low, high, color="black", linewidth=1.0)
-        axes.set_yticks(places, [shorten(name, 36) for name in categories])
-        axes.set_ylim(len(categories) - 0.4, -0.6)
-        axes.set_xlim(left=0)
-        axes.tick_params(axis="y", length=0)
-        axes.grid(visible=False, axis="y")
-    return axes.figure
 
 
 def shorten(text: str, most: int) -> str:

@@ -18,7 +18,6 @@ from lbt_synth.methods.request import fixed_design
 from lbt_synth.report.draw import (
     GUIDE,
     PANEL_IN,
-    draw_bars,
     draw_map,
     drawing,
     line_style,
@@ -271,7 +270,6 @@ def _dependence_blocks(
     if not statistics.ranked:
         return [Notice(text=paragraph("no-index"))]
     return [
-        *_sensitivity_chart(statistics, names),
         sensitivity_table(statistics, names),
         *_map_charts(statistics, samples, values, names),
     ]
@@ -332,20 +330,6 @@ def _distribution_chart(samples: Mapping[str, Samples]) -> list[Chart]:
         for panel in (plain, tail):
             panel.set_xlim(0, min(100.0, max(1.02 * top, 1.0)))
     return [chart("distribution", plain.figure)]
-
-
-def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
-    """First-order indices as bars, one series per controller."""
-    bars: dict[str, FloatArray] = {}
-    intervals: dict[str, tuple[FloatArray, FloatArray]] = {}
-    for one in statistics.controllers:
-        value, error = 100 * np.transpose([one.index(name) for name in statistics.ranked])
-        bars[one.controller] = np.maximum(value, 0)
-        low, high = np.maximum((value - 2 * error, value + 2 * error), 0)
-        intervals[one.controller] = low, high
-    listed = [names[name] for name in statistics.ranked]
-    axis = ("variance explained by itself", "%")
-    return [chart("sensitivity", draw_bars(axis, listed, bars, intervals))]
 
 
 def _map_charts(

@@ -3,14 +3,12 @@
 import hashlib
 import re
 
-import numpy as np
 import pytest
 from support.diagnoses import line_diagnosis, short_record
 from support.pages import Reader
 
 import lbt_synth as lbt
 from lbt_synth.report.diagnosis import diagnosis_page
-from lbt_synth.report.draw import figure_series
 from lbt_synth.report.page.html import write_page
 
 
@@ -27,15 +25,11 @@ def test_sections_and_charts(page):
         "Disturbance",
         "Files and versions",
     ]
-    assert [chart.key for chart in page.charts] == ["residuals", "costs", "identification"]
-    residuals, costs, spectra = page.charts
-    bars, promised = figure_series(residuals.figure)
-    assert all("nan nm" not in chart.alt for chart in page.charts)
-    rows = line_diagnosis().residuals
-    np.testing.assert_allclose(bars.y, [row.replayed_nm for row in rows])
-    np.testing.assert_allclose(promised.y, [row.model_nm for row in rows])
-    assert next(figure_series(costs.figure)).x[-1] == "all"
-    assert len(spectra.figure.axes) == 3
+    (spectra,) = page.charts
+    assert (spectra.key, len(spectra.figure.axes)) == ("identification", 3)
+    (table,) = (t for t in page.blocks if getattr(t, "caption", "").startswith("Residual on"))
+    names = [row.name for row in line_diagnosis().residuals]
+    assert [row[0] for row in table.rows] == names
 
 
 def test_files(tmp_path):

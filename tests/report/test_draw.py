@@ -46,14 +46,6 @@ def test_titles_are_whole_and_stay_above_their_panel(columns):
         assert title.y1 <= names.get_window_extent().y0 + 1
 
 
-def test_bars_are_in_view_from_the_top():
-    axes = every_mark()[2].figure.axes[0]
-    low, high = axes.get_ylim()
-    places = [bar.get_y() + bar.get_height() / 2 for bar in axes.patches]
-    assert low > max(places) > min(places) > high
-    assert [text.get_text() for text in axes.get_yticklabels()] == ["a.b", "first", "c"]
-
-
 @pytest.mark.parametrize(
     ("low", "high", "texts"),
     [
@@ -108,7 +100,7 @@ def test_axes_that_do_not_fit_are_refused():
 
 
 def test_numbers_are_those_that_are_drawn_in_the_unit_that_is_shown():
-    lines, maps, bars = (list(figure_series(chart.figure)) for chart in every_mark())
+    lines, maps = (list(figure_series(chart.figure)) for chart in every_mark())
     first, steps = (one for one in lines if one.name == "first")
     assert (first.heading, first.panel, steps.panel) == ("frequency [Hz]", "size [-]", "steps [nm]")
     np.testing.assert_allclose(first.x * first.y, 1.0)
@@ -119,8 +111,6 @@ def test_numbers_are_those_that_are_drawn_in_the_unit_that_is_shown():
     ]
     np.testing.assert_array_equal(maps[1].y, np.arange(6.0, 12.0))
     assert maps[0].panel == "first: gain [-]"
-    lengths = {one.name: (one.x, list(one.y)) for one in bars}
-    assert lengths["first order share [%]"] == (("a.b", "first", "c"), [1, 2, 3])
     with own_display_unit():
         show_in("mas", 10.0)
         figure = every_mark()[0].figure

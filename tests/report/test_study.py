@@ -103,7 +103,6 @@ def test_every_section_has_content_and_every_chart_its_words(page):
     keys = [chart.key for chart in page.charts]
     assert keys == [
         "distribution",
-        "sensitivity",
         "map-1",
         "map-2",
         "map-3",

@@ -11,7 +11,6 @@ from lbt_synth.report.draw import (
     PANEL_IN,
     SHADE,
     dot_style,
-    draw_bars,
     draw_map,
     drawing,
     line_style,
@@ -85,12 +84,7 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
         grid = np.arange(6.0), np.array([0.2, 0.4, 0.7, 1.0, 1.4]), values
         draw_map(panels, [grid, grid], "ratio [%]", blank="unstable")
     words = {"caption": "Two maps.", "alt": "Values rise to the upper right."}
-    maps = Chart(key="maps", title="Maps", figure=panels[0].figure, **words)
-    lengths = {"first order": [1, 2, 3], "total": [2, np.nan, 4]}
-    intervals = {"first order": ([0.5, 1, 2], [2, 3, 4])}
-    bars = draw_bars(("share", "%"), ("a.b", name, "c"), lengths, intervals)
-    words = {"caption": "Bars.", "alt": "Three bars, one of them twice."}
-    return lines, maps, Chart(key="rest", title="Bars", figure=bars, **words)
+    return lines, Chart(key="maps", title="Maps", figure=panels[0].figure, **words)
 
 
 def whole_page(name: str = "first") -> Page:

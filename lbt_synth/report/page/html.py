@@ -261,14 +261,14 @@ def number_tables(figure: Figure) -> Iterator[Table]:
     """
 
     def abscissae(one: Series) -> object:
-        return one.panel, one.heading, one.x if isinstance(one.x, tuple) else one.x.tobytes()
+        return one.panel, one.heading, one.x.tobytes()
 
     for _, curves in groupby(figure_series(figure), abscissae):
         group = list(curves)
         rows, x = _kept_rows(group), group[0].x
         cells = [
-            [x[i] if isinstance(x, tuple) else cell_text(float(x[i]), _FORMAT) for i in rows],
-            *([cell_text(float(one.y[i]), _FORMAT) for i in rows] for one in group),
+            [cell_text(float(numbers[i]), _FORMAT) for i in rows]
+            for numbers in (x, *(one.y for one in group))
         ]
         count = "" if len(rows) == len(x) else f" ({len(rows)} of {len(x)} rows)"
         yield Table(
