@@ -13,7 +13,7 @@ import numpy as np
 from lbt_synth.config import Config
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import LbtSynthError, ProblemError
-from lbt_synth.interop import frame_cost
+from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.linear import Controller
 from lbt_synth.loop import (
     ClosedLoop,

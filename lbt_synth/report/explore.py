@@ -37,7 +37,6 @@ from lbt_synth.config.write import config_text
 from lbt_synth.design import Design
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.linear import largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.registry import METHODS, default_method, method_named
@@ -277,7 +276,7 @@ def show_design(design: Design, config: Config, start: Config, shift_hz: float) 
         "Strehl ratio": (shifts, 100 * image.strehl[0, 0]),
     }
     if design.is_estimator:
-        error = largest_singular_values(design.error_system(), f)
+        error = spectral_norms(design.error_system().frequency_response(f))
         curves["Estimation error"] = f, shown_unit("nm")[1] * error
     now = int(np.searchsorted(shifts, shift_hz))
     return Shown(

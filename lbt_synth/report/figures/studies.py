@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.interop import EndToEndRun
+from lbt_synth.interop.specula.simulation import EndToEndRun
 from lbt_synth.methods.registry import design_label
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.report.draw import (
@@ -287,16 +287,16 @@ def end_to_end_figure(run: EndToEndRun) -> Figure:
     size = run.psf.shape[0]
     position_mas = (np.arange(size) - size // 2) * run.psf_pixel_mas
     reach_mas = min(_SHOWN_MAS, size / 2 * run.psf_pixel_mas)
-    seconds = np.arange(run.frames) / run.system.frame_rate_hz
+    seconds = np.arange(run.frames) / run.setup.hardware.frame_rate_hz
     with drawing([2.4, 2.4, PANEL_IN], columns=2) as (image, modes, series):
-        title = f"{run.system.imaging_wavelength_um:g} µm, Strehl ratio {100 * run.strehl:.1f} %"
+        title = f"{run.setup.imaging_wavelength_um:g} µm, Strehl ratio {100 * run.strehl:.1f} %"
         name_axes(image, ("x", "mas"), ("y", "mas"), title, box_aspect=1)
         values = np.maximum(run.psf / run.psf.max(), _FAINTEST)
         draw_map([image], [(position_mas, position_mas, values)], "intensity / peak", log=True)
         image.set(xlim=(-reach_mas, reach_mas), ylim=(-reach_mas, reach_mas))
         mode, residual = ("mode (1 tip, 2 tilt)", ""), ("residual", "nm rms")
         _, factor = name_axes(modes, mode, residual, "all modes", xscale="log", yscale="log")
-        numbers = np.arange(1.0, run.system.modes + 1)
+        numbers = np.arange(1.0, run.setup.modes + 1)
         thin = line_style(0, linewidth=0.8)
         modes.plot(numbers, factor * run.rms_nm, label="_residual", **thin)
         name_axes(series, ("time", "s"), ("residual", "nm rms wavefront"), "tip and tilt")
