@@ -138,11 +138,6 @@ def run_limits(arguments: Namespace) -> Report:
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
             "vibrations along principal axes of the sensor's noise."
         )
-    if config.truth.vibrations and not config.plant.vibrations:
-        report.notes.append(
-            "note: kalman and hinf are designed without a vibration, as model.vibrations is "
-            "missing; the truth has one."
-        )
     report.notes += named_difference_notes(config, designs)
     return report
 
@@ -310,17 +305,17 @@ def _stable_gains(design: Design, grid: RobustnessMap, config: Config) -> list[F
 
 def _map_points(name: str, grid: RobustnessMap) -> list[Facts]:
     """Return a row for each point of the map of a gain file."""
+    axes = grid.delay_errors_frames, grid.sensor_gains, grid.errors_hz
+    names = ("delay_error_frames", "sensor_gain", "error_hz")
     return [
         facts(
             file=fact(name),
-            delay_error_frames=fact(float(grid.delay_errors_frames[i])),
-            sensor_gain=fact(float(grid.sensor_gains[j])),
-            error_hz=fact(float(grid.errors_hz[k])),
+            **{key: fact(float(axis[i])) for key, axis, i in zip(names, axes, place, strict=True)},
             strehl=fact(float(strehl)),
-            residual_nm=fact(float(grid.residual_nm[i, j, k])),
-            stable=fact(bool(grid.stable[i, j])),
+            residual_nm=fact(float(grid.residual_nm[place])),
+            stable=fact(bool(grid.stable[place[:2]])),
         )
-        for (i, j, k), strehl in np.ndenumerate(grid.strehl)
+        for place, strehl in np.ndenumerate(grid.strehl)
     ]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -44,7 +44,7 @@ from lbt_synth.storage.rows import Facts, columns, fact, facts, row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import LimitRow, RobustnessMap, robustness_map
-from lbt_synth.studies.limits import LimitStudy, compare_in_truth
+from lbt_synth.studies.limits import LimitStudy, compare_in_truth, say_residual
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 
@@ -298,37 +298,23 @@ def _certificate_word(one: DesignAssessment) -> str:
 def verdict(report: DesignReport) -> str:
     """Return at most three sentences: which design leaves least, which is robust, what is proved.
 
-    Designs that show the same number as the best are as good. The table of the report has all.
+    The table of the report has all.
     """
     sentences = []
     if report.stable:
-        strehl = max(one.limits.strehl for one in report.stable)
-        where = ", if the vibrations are where the configuration has them"
-        least = _leaders(
-            {one.name: one.limits.residual_nm for one in report.stable},
-            lambda residual_nm: nm_text(residual_nm, ".1f", unit="nm rms"),
-        )
+        best = min((one.limits for one in report.stable), key=lambda row: row.residual_nm)
+        sentences.append(say_residual(best.design, best, report.limits.limit))
+    alone = [one for one in report.stable if one.alone]
+    if alone and report.errors_hz.size > 1:
+        tough = max(alone, key=lambda one: one.worst_strehl)
+        first, last = report.errors_hz[[0, -1]]
         sentences.append(
-            f"Least residual: {least} (Strehl ratio {100 * strehl:.1f} %)"
-            f"{where if report.config.truth.vibrations else ''}."
-        )
-    worst = {one.name: -100 * one.worst_strehl for one in report.stable if one.alone}
-    if worst and report.errors_hz.size > 1:
-        first, last = (f"{report.errors_hz[i]:+.4g}" for i in (0, -1))
-        most = _leaders(worst, lambda percent: f"{-percent:.1f} %")
-        sentences.append(
-            f"Highest Strehl ratio at worst, if their frequencies are wrong by {first} to {last} "
-            f"Hz{'' if all(o.alone for o in report.stable) else ', of one sensor'}: {most}."
+            f"{tough.name} keeps the highest Strehl ratio at worst, {100 * tough.worst_strehl:.1f} "
+            f"%, if the vibrations are elsewhere by {first:+.4g} to {last:+.4g} Hz."
         )
     sentences.append(_certificate_sentence(report))
     # a number stays in one line with its unit
     return re.sub(r"(?<=\d) (?=%|nm|um|mas|urad|Hz)", "\u00a0", " ".join(sentences))
-
-
-def _leaders(values: Mapping[str, float], show: Callable[[float], str]) -> str:
-    """Name the designs that show the same as the one of the least value, and say that."""
-    least = show(min(values.values()))
-    return f"{listing_text([n for n, value in values.items() if show(value) == least])}, {least}"
 
 
 def _certificate_sentence(report: DesignReport) -> str:

@@ -240,7 +240,7 @@ def test_a_gain_file_the_page_and_json(capsys, night, tmp_path):
     assert (status, error) == (0, "")
     data = json.loads(text)
     assert data["doubt"] is None
-    assert data["control_law"]["law"] == "integrator"
+    assert data["law"][0]["law"] == "integrator"
     assert any(note.startswith("mine assumes") for note in data["notes"])
     assert {row["name"] for row in data["residuals"]} > {"mine", data["best"], "what ran"}
     assert data["costs"][-1]["part"] == "all"

@@ -8,7 +8,7 @@ from support.diagnoses import line_diagnosis, short_record
 from support.pages import Reader
 
 import lbt_synth as lbt
-from lbt_synth.report.diagnosis import diagnosis_page
+from lbt_synth.cli.records import diagnosis_page
 from lbt_synth.report.page.html import write_page
 
 
