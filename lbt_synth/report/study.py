@@ -57,7 +57,6 @@ _BINS = 30  # along either axis of a map, at most
 _PER_CELL = 8  # samples in a cell of a map on average, at least
 _MOST_FAILURES = 10  # that are listed
 _PARAMETERS = 5  # of a worst sample: with row and Strehl ratio, they fill a sheet
-Names = Mapping[str, str]  # what each parameter is called
 
 
 def study_page(
@@ -114,7 +113,6 @@ def study_page(
     values = {
         name: read_column(columns, name, statistics.samples) for name in statistics.parameters
     }
-    names = short_names(statistics.parameters)
     varying = sum(np.ptp(column) > 0 for column in values.values())
     return new_page(
         f"Robustness study {study.source.name}",
@@ -122,29 +120,15 @@ def study_page(
         f"{count_text(len(statistics.controllers), 'controller')}",
         {
             "Summary": _summary_blocks(study, statistics, samples),
-            "What was sampled": _samples_blocks(study, values, names),
+            "What was sampled": _samples_blocks(study, values),
             "Controllers": _controllers_blocks(study, statistics, failures),
-            "What the Strehl ratio depends on": _dependence_blocks(
-                statistics, samples, values, names
-            ),
-            "Worst samples": _worst_blocks(study, statistics, columns, names, os.fspath(folder)),
+            "What the Strehl ratio depends on": _dependence_blocks(statistics, samples, values),
+            "Worst samples": _worst_blocks(study, statistics, columns, os.fspath(folder)),
             "How to read the figures": [paragraph(name) for name in ("intervals", "indices")],
         },
         sources=list(zip_longest(study.inputs, ("study", "configuration"), fillvalue="gain file")),
         facts=[_origin_table(study, statistics, computing_s)],
     )
-
-
-def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return for each path its last keys, as many as distinguish it from the others."""
-    out = {}
-    for name in names:
-        keys = name.split(".")
-        for count in range(1, len(keys) + 1):
-            out[name] = ".".join(keys[-count:])
-            if sum(f".{other}".endswith(f".{out[name]}") for other in names) == 1:
-                break
-    return out
 
 
 def _summary_blocks(
@@ -216,24 +200,23 @@ def study_verdict(statistics: StudyStatistics) -> list[str]:
     return verdict
 
 
-def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names) -> list[Block]:
+def _samples_blocks(study: Study, values: Mapping[str, FloatArray]) -> list[Block]:
     """List the parameters, and what was drawn of them."""
     settings = study.settings
     texts = {name: section.text for name, section in settings.parameters.items()}
     rows = [
         (
-            names[name],
             name,
             texts.get(name, ""),
             *(f"{q:.4g}" for q in np.quantile(c, (0, 0.5, 1))),
         )
         for name, c in values.items()
     ]
-    headings = ("parameter", "its place", "distribution", "least", "median", "greatest")
+    headings = ("parameter", "distribution", "least", "median", "greatest")
     return [
         f"{study.samples} samples (sampling: {settings.sampling}, seed: {settings.seed}, "
         f"evaluation: {settings.evaluation}).",
-        Table(caption="Parameters", headings=headings, rows=tuple(rows), words=(1, 2)),
+        Table(caption="Parameters", headings=headings, rows=tuple(rows), words=(1,)),
     ]
 
 
@@ -264,14 +247,13 @@ def _dependence_blocks(
     statistics: StudyStatistics,
     samples: Mapping[str, Samples],
     values: Mapping[str, FloatArray],
-    names: Names,
 ) -> list[Block]:
     """Show what the Strehl ratio depends on."""
     if not statistics.ranked:
         return [Notice(text=paragraph("no-index"))]
     return [
-        sensitivity_table(statistics, names),
-        *_map_charts(statistics, samples, values, names),
+        sensitivity_table(statistics),
+        *_map_charts(statistics, samples, values),
     ]
 
 
@@ -279,13 +261,12 @@ def _worst_blocks(
     study: Study,
     statistics: StudyStatistics,
     columns: Mapping[str, ArrayLike],
-    names: Names,
     folder: str,
 ) -> list[Block]:
     """List the worst samples, and the commands that replay them."""
     words = ["lbt-synth", "study", os.fspath(study.source), "-o", folder, "--row"]
     tables = [
-        worst_table(one, columns, (one.ranked or statistics.parameters)[:_PARAMETERS], names)
+        worst_table(one, columns, (one.ranked or statistics.parameters)[:_PARAMETERS])
         for one in statistics.controllers
         if one.worst
     ]
@@ -336,7 +317,6 @@ def _map_charts(
     statistics: StudyStatistics,
     samples: Mapping[str, Samples],
     parameters: Mapping[str, FloatArray],
-    names: Names,
 ) -> list[Chart]:
     """Mean Strehl ratio over the two most influential parameters, one chart per controller."""
     charts = []
@@ -348,9 +328,9 @@ def _map_charts(
         places = parameters[first][kept], parameters[second][kept]
         x, y, mean = binned_map(*places, strehl[kept])
         with drawing([2.6]) as (panel,):
-            name_axes(panel, (names[first], ""), (names[second], ""))
+            name_axes(panel, (first, ""), (second, ""))
             draw_map([panel], [(x, y, 100 * mean)], "mean Strehl ratio [%]", blank="no sample")
-        facts = {"x": names[first], "y": names[second], "x_path": first, "y_path": second}
+        facts = {"x": first, "y": second}
         facts["controller"] = one.controller
         charts.append(chart(f"map-{place + 1}", panel.figure, group="study-map", **facts))
     return charts

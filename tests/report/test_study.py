@@ -13,7 +13,6 @@ from lbt_synth.report.page.html import Chart, Notice, page_html
 from lbt_synth.report.study import (
     binned_map,
     cumulative_points,
-    short_names,
 )
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies.study.sample import evaluate_samples
@@ -207,8 +206,3 @@ def test_a_map_has_the_mean_of_each_cell():
     np.testing.assert_allclose(mean, np.outer(rows, columns), atol=0.02)
     sparse = binned_map(np.arange(9.0), np.arange(9.0), np.arange(9.0))[2]
     assert np.isnan(sparse).any()  # a cell without samples
-
-
-def test_short_names_are_different():
-    names = ["a.b.c", "d.b.c", "d.e", "e", "f.g"]
-    assert list(short_names(names).values()) == ["a.b.c", "d.b.c", "d.e", "e", "g"]
