@@ -14,26 +14,26 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3594,
-    "config": 1846,
+    "cli": 3590,
+    "config": 1661,
     "design": 7690,
-    "files": 1283,
+    "files": 1243,
     "identification": 9563,
-    "interop": 3862,
+    "interop": 3793,
     "linear": 5763,
     "loop": 4905,
     "methods": 920,
     "models": 4400,
-    "report": 3396,
-    "storage": 1049,
+    "report": 3275,
+    "storage": 1027,
     "studies": 3135,
-    "errors, validation": 642,
+    "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 206,
+    "public names": 186,
     "tuned constants": 530,
-    "lines of tests": 32890,
+    "lines of tests": 32229,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }

@@ -116,11 +116,10 @@ def _noise_nm(config: Config) -> float:
 def _scale(
     section: str, name: str, start: float, config: Config, content: Content, value: float
 ) -> None:
-    """Scale a number of a section, or a list, which keeps its proportions, from its start."""
-    usual = np.asarray(getattr(getattr(config.settings, section), name))
+    """Scale a number of a section from its start."""
+    usual = getattr(getattr(config.settings, section), name)
     # the value of the slider, and not a neighbour by rounding
-    scaled = np.vectorize(lambda number: float(f"{number:.12g}"))(usual * (value / start))
-    content.setdefault(section, {})[name] = scaled.tolist()
+    content.setdefault(section, {})[name] = float(f"{usual * value / start:.12g}")
 
 
 def _set_noise(config: Config, content: Content, value: float) -> None:
@@ -134,11 +133,7 @@ def _set_noise(config: Config, content: Content, value: float) -> None:
 def _set_shift(config: Config, content: Content, value: float) -> None:
     """Move the true lines, the one that moves most by a shift; those of the model stay."""
     for line in _true_lines(config, content):
-        place_hz = line["frequency_hz"]
-        percent = line.pop("frequency_error_percent", None)
-        if percent is not None:
-            line["frequency_error_hz"] = place_hz * percent / 100  # so that it stays as it is
-        line["frequency_hz"] += config.truth.frequency_shift_hz(place_hz, value)
+        line["frequency_hz"] += config.truth.frequency_shift_hz(line["frequency_hz"], value)
 
 
 def _scale_damping(start: float, config: Config, content: Content, value: float) -> None:

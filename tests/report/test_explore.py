@@ -159,7 +159,7 @@ def test_a_shift_moves_the_truth_alone(tmp_path, five):
     expected = frequencies(five.truth.with_frequency_error(2.5).vibrations)
     assert frequencies(after.truth.vibrations) == pytest.approx(expected)
     content = five_lines()
-    content["model"]["vibrations"][1]["frequency_error_percent"] = 10.0
+    content["model"]["vibrations"][1]["frequency_error_hz"] = 2.0
     config = lbt.load_config(write_config(tmp_path, content))
     after = move(config, {"shift": 1.0})
     places = sorted(set(frequencies(after.truth.vibrations)))
@@ -182,12 +182,12 @@ def test_the_loop_and_the_sky(tmp_path, five):
     assert after.noise_nm == pytest.approx(40.0)
     assert (after.atmosphere.seeing_arcsec, after.atmosphere.wind_speed_m_s) == (1.1, 31.0)
     content = change_key(("sensor",), {"noise_nm": [30.0, 40.0]})
-    content["model"] |= {"turbulence": AR, "sensor_gain": [0.5, 0.7]}
-    content["truth"] |= {"turbulence": "model", "sensor_gain": [0.25, 0.35]}
+    content["model"] |= {"turbulence": AR, "sensor_gain": 0.5}
+    content["truth"] |= {"turbulence": "model", "sensor_gain": 0.25}
     config = lbt.load_config(write_config(tmp_path, content))
-    after = move(config, {"noise": np.sqrt(5000.0), "gain": 0.6})
+    after = move(config, {"noise": np.sqrt(5000.0), "gain": 0.5})
     np.testing.assert_allclose(after.noise_nm, [60.0, 80.0])  # the proportions stay
-    assert after.settings.truth.sensor_gain == pytest.approx([0.5, 0.7])
+    assert after.settings.truth.sensor_gain == 0.5
     assert after.truth.sensor_gain == pytest.approx(1.0)
 
 
