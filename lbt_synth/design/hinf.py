@@ -11,7 +11,6 @@ from lbt_synth.design.kalman import error_scale
 from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import CertificateError, InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import EstimationProblem, hinf_norm
-from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.infeasibility_proof import (
     Witness,
     infeasible_level,
@@ -23,7 +22,7 @@ from lbt_synth.linear.riccati.filtering import (
     kalman_riccati,
     least_gamma,
 )
-from lbt_synth.validation import choice, number
+from lbt_synth.validation import choice, number, require_instance
 
 AT_LEAST = 1e-9  # a level this close to the least one counts as the least one itself
 LARGEST_LMI = 20  # states; the inequality takes minutes beyond
@@ -84,7 +83,7 @@ def hinf(
     >>> design.gamma <= design.gamma_requested
     True
     """
-    require_problem(problem)
+    require_instance(problem, EstimationProblem)
     if route is not None:
         choice(route, "route", ("lmi", "riccati"))
     gamma, gamma_ratio = checked_bounds(

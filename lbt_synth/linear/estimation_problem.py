@@ -20,21 +20,10 @@ from lbt_synth.validation import (
     matrix,
     read_only,
     set_fields,
-    suggest_part,
 )
 
 LONGEST_HORIZON = 100  # samples
 _NOISE_FREE = 1e-9  # singular value of readings whose noise is of size one that counts as zero
-
-
-def require_problem(problem: object) -> None:
-    """Refuse anything but an estimation problem."""
-    if not isinstance(problem, EstimationProblem):
-        hint = suggest_part(problem, EstimationProblem)
-        hint = hint or " Try EstimationProblem(A=..., B=..., C=..., D=..., L=...)."
-        raise ProblemError(
-            f"expected an EstimationProblem, such as a plant; got {type(problem).__name__}.{hint}"
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -130,6 +130,13 @@ class GeneralizedPlant(Summarised):
         D = np.block([[self.D11, self.D12], [self.D21, self.D22]])
         return StateSpace(A=self.A, B=B, C=C, D=D, dt_s=self.dt_s)
 
+    def transposed(self) -> GeneralizedPlant:
+        """Return the plant whose control is the estimation of this one, in costates."""
+        turned = {"A": "A", "B1": "C1", "B2": "C2", "C1": "B1", "C2": "B2"}
+        turned |= {"D11": "D11", "D12": "D21", "D21": "D12", "D22": "D22"}
+        parts = {name: getattr(self, other).T for name, other in turned.items()}
+        return GeneralizedPlant(**parts, dt_s=self.dt_s)
+
     def with_whole(self, system: StateSpace) -> GeneralizedPlant:
         """Return the plant of another system with the same partition."""
         m1, _, p1, _ = self.sizes

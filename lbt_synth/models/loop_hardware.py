@@ -226,9 +226,6 @@ def past_corrections(taps: FloatArray, commands: FloatArray) -> FloatArray:
     Commands (frames, m) before the first row count as zero, so the first ``len(taps)`` rows of
     the answer (frames, m) are not known.
     """
-    frames = len(commands)
-    out = np.zeros(commands.shape)
-    for i in np.flatnonzero(taps):
-        if i + 1 < frames:
-            out[i + 1 :] += taps[i] * commands[: frames - 1 - i]
-    return out
+    from scipy.signal import lfilter  # slow to import
+
+    return np.asarray(lfilter([0.0, *taps], [1.0], commands, axis=0))

@@ -63,7 +63,6 @@ def test_a_problem_of_one_phase_in_which_all_is_read():
         (lambda p: p.ahead(0), "an estimate 0 samples ahead needs a period of 1; got one of 2"),
         (lambda p: p.with_memory([[1.0, 1.0]]), "a filter with a memory needs a period of 1"),
         (lambda p: p.with_unit_weights(), "a scaling of disturbances needs a period of 1"),
-        (lambda p: lbt.kalman(p, route="sdp"), "needs a period of 1"),
         (lambda p: lbt.hinf(p, route="lmi"), "needs a period of 1"),
     ],
 )

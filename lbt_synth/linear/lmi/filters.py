@@ -1,6 +1,6 @@
-"""Solve for the Kalman and the H-infinity predictor by semidefinite programmes.
+"""Solve for the H-infinity predictor by semidefinite programmes.
 
-For the H-infinity predictor the gain is eliminated: with N a basis of the null space of
+The gain is eliminated: with N a basis of the null space of
 ``[C D]``, a filter with error norm below gamma exists if and only if some P satisfies::
 
     Nx'P Nx + gamma^2 Nw'Nw - (A Nx + B Nw)' P (A Nx + B Nw) - (L Nx)'(L Nx) > 0
@@ -92,25 +92,6 @@ def balance(
 
 
 _ADVICE = 'Try route="riccati".'
-
-
-def kalman_sdp(
-    problem: EstimationProblem, *, coordinates: FloatArray, scale: float
-) -> FilterRiccati:
-    """Maximise tr P subject to ``[[APA' + BB' - P, APC'], [CPA', DD' + CPC']] >= 0``, ``P >= 0``.
-
-    The stabilising solution of the filter Riccati equation is the greatest P that satisfies the
-    inequality (S. Boyd et al., "Linear Matrix Inequalities in System and Control Theory", SIAM
-    (1994), doi:10.1137/1.9781611970777).
-    """
-    scaled = balance(problem, coordinates, scale)
-    A, B, C, R = scaled.problem.A, scaled.problem.B, scaled.problem.C, scaled.problem.R
-    P = symmetric_variable(_parts(scaled.problem)[0])
-    riccati = cp.bmat([[A @ P @ A.T + B @ B.T - P, A @ P @ C.T], [C @ P @ A.T, R + C @ P @ C.T]])
-    run = solve(cp.Maximize(cp.trace(P)), [symmetrise(riccati) >> 0, P >> 0])
-    require_optimum(run, "the semidefinite programme of the Kalman filter", _ADVICE)
-    information = np.asarray(np.linalg.inv(P.value), dtype=np.float64)
-    return scaled.solution(P.value, information, run)
 
 
 def least_gamma_lmi(

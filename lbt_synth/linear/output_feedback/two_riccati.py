@@ -31,11 +31,8 @@ from lbt_synth.linear.matrix_functions import nearest_powers_of_two, semidefinit
 from lbt_synth.linear.norms import hinf_norm
 from lbt_synth.linear.output_feedback.lower_bound import (
     ControlWitness,
-    Side,
     WorstCase,
-    control_side,
     coupled_bursts,
-    estimation_side,
     last_step,
     steady_pairs,
 )
@@ -59,8 +56,8 @@ class FullInformation:
     the innovation and ``feedback`` its gain into the state.
     """
 
-    def __init__(self, side: Side) -> None:
-        A, B1, B2, C1, D11, D12 = side
+    def __init__(self, side: GeneralizedPlant) -> None:
+        A, B1, B2, C1, D11, D12 = _side_matrices(side)
         dare = solve_dare(A, B2, C1.T @ C1, D12.T @ D12, C1.T @ D12)
         self.side, self.least = side, dare.X
         self.weight = D12.T @ D12 + B2.T @ dare.X @ B2
@@ -126,7 +123,7 @@ class FullInformation:
 
     def refine(self, X: FloatArray, gamma: float) -> FloatArray:
         """Return X after Newton steps on a residual in extended precision."""
-        A, B1, B2, C1, D11, D12 = self.side
+        A, B1, B2, C1, D11, D12 = _side_matrices(self.side)
         D = np.hstack([D11, D12])
         R = D.T @ D - block_diag(gamma**2 * np.eye(B1.shape[1]), np.zeros((B2.shape[1],) * 2))
         parts = {"A": A, "B": np.hstack([B1, B2]), "Q": C1.T @ C1, "R": R, "S": C1.T @ D}
@@ -135,7 +132,7 @@ class FullInformation:
 
     def worst_case(self, X: FloatArray, gamma: float) -> WorstCase:
         """Return the worst case at a level, for its X."""
-        A, B1, B2, C1, D11, D12 = self.side
+        A, B1, B2, C1, D11, D12 = _side_matrices(self.side)
         B, D, m = np.hstack([B1, B2]), np.hstack([D11, D12]), B1.shape[1]
         R = D.T @ D + B.T @ X @ B
         R[:m, :m] -= gamma**2 * np.eye(m)
@@ -144,6 +141,11 @@ class FullInformation:
         last = np.linalg.eigh(R[:m, :m] - R[:m, m:] @ answer)[1][:, -1:]
         signals = np.vstack([last, -answer @ last])
         return WorstCase(A=A + B @ law, C=C1 + D @ law, entry=B @ signals, error=D @ signals)
+
+
+def _side_matrices(side: GeneralizedPlant) -> tuple[FloatArray, ...]:
+    """Return the matrices of control with known state and disturbance."""
+    return side.A, side.B1, side.B2, side.C1, side.D11, side.D12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -160,8 +162,8 @@ class TwoRiccati:
 
     def __init__(self, plant: GeneralizedPlant) -> None:
         self.plant = plant
-        self.control = FullInformation(control_side(plant))
-        self.estimation = FullInformation(estimation_side(plant))
+        self.control = FullInformation(plant)
+        self.estimation = FullInformation(plant.transposed())
 
     def least_variance(self) -> StateSpace:
         """Return the controller of least variance."""
@@ -230,8 +232,8 @@ class TwoRiccati:
             control = self.control.worst_case(solution.X, solution.gamma)
             estimation = self.estimation.worst_case(solution.Y, solution.gamma)
             cases = (
-                ("unmoved", control_side(plant), control, solution.X, _CONTROL),
-                ("unseen", estimation_side(plant), estimation, solution.Y, _ESTIMATION),
+                ("unmoved", plant, control, solution.X, _CONTROL),
+                ("unseen", plant.transposed(), estimation, solution.Y, _ESTIMATION),
             )
             for pairs, side, worst, cost, (reason, reason_at) in cases:
                 if plant is self.plant:

@@ -7,7 +7,7 @@ from scipy.linalg import block_diag
 import lbt_synth as lbt
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.lmi import filters
-from lbt_synth.linear.lmi.filters import hinf_lmi, kalman_sdp, least_gamma_lmi
+from lbt_synth.linear.lmi.filters import hinf_lmi, least_gamma_lmi
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 
 
@@ -43,7 +43,7 @@ def test_axes_that_have_nothing_in_common_stay_apart(seed):
     assert least.gamma_least == pytest.approx(max(alone), rel=1e-6)
     assert least.gamma_infeasible == pytest.approx(max(alone), rel=1e-6)
     near = lbt.hinf(whole, gamma_ratio=1.1, route="lmi")
-    for design in (lbt.kalman(whole, route="sdp"), least, near):
+    for design in (least, near):
         assert not np.any(design.gain_predictor[other])
         assert not np.any(design.gain_filter[other])
 
@@ -63,7 +63,6 @@ def test_a_programme_that_did_not_end_gives_no_filter(monkeypatch):
     monkeypatch.setattr(filters, "solve", lambda *_: ("user_limit", 200))
     P = np.eye(1)
     for call, words in (
-        (lambda: kalman_sdp(walk, coordinates=P, scale=1.0), "of the Kalman filter ended as"),
         (lambda: least_gamma_lmi(walk, coordinates=P, scale=1.0), "least gamma's .* ended as"),
         (lambda: hinf_lmi(walk, 9.0, coordinates=P, scale=1.0), "H-infinity filter ended as"),
     ):
