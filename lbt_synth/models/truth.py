@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, TypeAlias
 
@@ -19,9 +19,7 @@ from lbt_synth.models.vibration import (
     Vibration,
     stationary_vibrations,
 )
-from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import column, fact_table, table_row
-from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.storage.summaries import Summarised
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     FloatArray,
@@ -31,64 +29,6 @@ from lbt_synth.validation import (
     number,
     one_or_each,
 )
-
-_DIGITS = ".4g"
-_MOST_LINES = 6  # vibrations that are listed, the strongest
-
-
-@table_row
-class DisturbanceFacts:
-    """Turbulence, vibrations and noise, in words."""
-
-    turbulence: str = column("turbulence")
-    vibrations: str = column("vibrations")
-    noise_nm: str = column("noise per frame")
-    sensor_gain: float | None = column("sensor gain over the assumed one")
-
-
-def disturbance_facts(
-    turbulence: Iterable[Spectrum | None],
-    vibrations: Sequence[TrueVibration],
-    noise_nm: FloatArray,
-    sensor_gain: float | None = None,
-) -> DisturbanceFacts:
-    """Return the facts of disturbances; what axes have in common is said once."""
-    return DisturbanceFacts(
-        turbulence=_join(_spectrum_text(spectrum) for spectrum in turbulence),
-        vibrations=_vibrations_text(vibrations),
-        noise_nm=_join(nm_text(noise, _DIGITS) for noise in np.ravel(noise_nm)),
-        sensor_gain=sensor_gain,
-    )
-
-
-def _join(texts: Iterable[str]) -> str:
-    return ", ".join(dict.fromkeys(texts))
-
-
-def _spectrum_text(spectrum: Spectrum | None) -> str:
-    if spectrum is None:
-        return "none"
-    if isinstance(spectrum, ARModel):
-        return f"AR{spectrum.order} {nm_text(spectrum.rms_nm, _DIGITS)}"
-    rms_nm = getattr(spectrum, "tilt_rms_nm", None)
-    size = f" {nm_text(rms_nm, _DIGITS)}" if isinstance(rms_nm, float) else ""
-    return f"{type(spectrum).__name__}{size}"
-
-
-def _vibrations_text(vibrations: Sequence[TrueVibration]) -> str:
-    """Return size and frequency of the strongest vibrations, by frequency."""
-    strongest = sorted(vibrations, key=lambda line: -line.rms_nm)[:_MOST_LINES]
-    texts = sorted((_frequency(line), line.rms_nm) for line in strongest)
-    more = len(vibrations) - len(strongest)
-    listed = [
-        f"{nm_text(rms_nm, _DIGITS)} at {frequency_hz:.4g} Hz" for frequency_hz, rms_nm in texts
-    ]
-    return ", ".join(listed + ([f"{more} more"] if more else []))
-
-
-def _frequency(line: TrueVibration) -> float:
-    return line.start_hz if isinstance(line, DriftingVibration) else line.frequency_hz
-
 
 # spectra with the modes that have them, vibrations, and a root of the covariance of the noise
 Entering: TypeAlias = tuple[
@@ -190,12 +130,6 @@ class Truth(Summarised):
     def _brief(self) -> str:
         lines = count_text(len(self.vibrations), "vibration")
         return f"{lines}, sensor gain {self.sensor_gain:.4g}"
-
-    def _summarise(self) -> Summary:
-        parts = self.turbulence if isinstance(self.turbulence, tuple) else (self.turbulence,)
-        noise = np.asarray(self.noise_nm)
-        facts = disturbance_facts(parts, self.vibrations, noise, self.sensor_gain)
-        return Summary(tables=[fact_table("Truth", facts)])
 
     def _checked_errors(self) -> tuple[float, ...] | None:
         """Return the frequency errors, of which each vibration must have one."""

@@ -16,7 +16,6 @@ from typing import Annotated, Any
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.optimize import brentq
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
@@ -232,23 +231,6 @@ class PositionLoop:
             overshoot=max(float(np.max(x)) - 1, 0.0),
             settling_s=_last_outside(time, x, band),
         )
-
-    @property
-    def bandwidth_hz(self) -> float:
-        """Frequency at which the amplitude has fallen to 0.707 of its static value [Hz]."""
-        loop = self.closed_loop()
-
-        def amplitude(frequency_hz: FloatArray | float) -> FloatArray:
-            response = loop.frequency_response(frequency_hz)[:, 0, 0]
-            return np.asarray(np.abs(response) / self.static_gain)
-
-        grid = np.geomspace(1e-3 * self.natural_frequency_hz, self.sampling_hz / 2, 2000)
-        below = np.flatnonzero(amplitude(grid) < np.sqrt(0.5))
-        if below.size == 0 or below[0] == 0:
-            return float("nan") if below.size else float(grid[-1])
-        low, high = grid[below[0] - 1 : below[0] + 1].tolist()
-        level = np.sqrt(0.5)
-        return brentq(lambda f: float(amplitude(f)[0]) - level, low, high, xtol=1e-9 * low)
 
     def _law(self) -> FloatArray:
         """Acceleration [positions per sample^2] that the loop computes, over states and command."""

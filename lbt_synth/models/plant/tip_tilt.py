@@ -28,10 +28,8 @@ from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.models.plant.assembly import PlantParts, known_states, plant_matrices
 from lbt_synth.models.sensor_suite import Motions, SensorSuite, noise_factor
 from lbt_synth.models.spectra import ARModel
-from lbt_synth.models.truth import Entering, disturbance_facts
+from lbt_synth.models.truth import Entering
 from lbt_synth.models.vibration import Vibration, spread_lines
-from lbt_synth.storage.rows import fact_table
-from lbt_synth.storage.summaries import Summary
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     FloatArray,
@@ -122,11 +120,6 @@ class TipTiltPlant(EstimationProblem):
         if self.hardware.suite.sensors:
             counts.append((len(self.hardware.suite.units), "sensor"))
         return ", ".join([self.hardware._brief(), *(count_text(*count) for count in counts)])
-
-    def _summarise(self) -> Summary:
-        deviations = np.linalg.norm(self.own_noise_factor, axis=1)
-        facts = disturbance_facts(self.turbulence, self.vibrations, deviations)
-        return Summary(tables=[fact_table("Plant", self.hardware.facts(), facts)])
 
     def full(self) -> FullForm:
         """Return the same plant with the mirror's states, which are past commands if it settles.
