@@ -13,7 +13,6 @@ from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.sensor_suite import Motions
 from lbt_synth.models.spectra import ARModel, Spectrum, spectrum_key
 from lbt_synth.models.vibration import (
-    DriftingVibration,
     SinusoidalVibration,
     TrueVibration,
     Vibration,
@@ -47,7 +46,7 @@ class Truth(Summarised):
     turbulence : Spectrum, sequence of (Spectrum or None), or None
         Spectrum of each mode, the modes independent: one for all of them, or one per mode; None
         for no turbulence.
-    vibrations : tuple of Vibration, SinusoidalVibration or DriftingVibration, optional
+    vibrations : tuple of Vibration or SinusoidalVibration, optional
         The vibrations that are really there. One that drifts can only be simulated.
     noise_nm : float or (q,) array_like, optional
         Standard deviation of the noise on each measurement, per frame [nm]: one for all of
@@ -114,7 +113,7 @@ class Truth(Summarised):
         for each in self.vibrations:
             if not isinstance(each, TrueVibration):
                 raise ProblemError(
-                    "vibrations must be Vibration, SinusoidalVibration or DriftingVibration; got "
+                    "vibrations must be Vibration or SinusoidalVibration; got "
                     f"{type(each).__name__}."
                 )
         noise = one_or_each(self.noise_nm, "noise_nm", at_least=0)
@@ -190,7 +189,7 @@ class Truth(Summarised):
     @property
     def drifts(self) -> bool:
         """Whether a vibration drifts, so that the truth can only be simulated."""
-        return any(isinstance(line, DriftingVibration) for line in self.vibrations)
+        return any(getattr(line, "drifts", False) for line in self.vibrations)
 
     @property
     def is_uniform(self) -> bool:

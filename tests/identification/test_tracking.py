@@ -9,7 +9,7 @@ import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification import TrackingController
 from lbt_synth.loop.simulation.disturbances import draw_disturbance
-from lbt_synth.models import ARModel, DriftingVibration, PositionLoop, SinusoidalVibration
+from lbt_synth.models import ARModel, PositionLoop, SinusoidalVibration
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 
 AIR = ARModel(coefficients=[1.9975, -0.9976], driving_rms_nm=0.6, frame_rate_hz=800)
@@ -89,8 +89,8 @@ def test_each_filter_is_as_if_it_had_always_run(name):
 
 def test_a_line_that_moves_is_followed_and_a_fixed_filter_does_not():
     plant = axis(18)
-    moves = {"start_hz": 18, "end_hz": 22, "duration_s": 8}
-    drift = DriftingVibration(**moves, rms_nm=300, direction=(1,))
+    moves = {"frequency_hz": 18, "end_hz": 22, "duration_s": 8}
+    drift = SinusoidalVibration(**moves, rms_nm=300, direction=(1,))
     truth = lbt.Truth(turbulence=AIR, vibrations=(drift,), noise_nm=15.5)
     tracker = TrackingController(plant, window_s=2, update_s=0.75)
 
