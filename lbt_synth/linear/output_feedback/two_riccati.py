@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
-from lbt_synth.errors import DetectabilityError, NonFiniteError, NumericalError
+from lbt_synth.errors import NonFiniteError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant, invert_well_posed
 from lbt_synth.linear.infeasibility_proof import slow_angles
 from lbt_synth.linear.matrix_functions import nearest_powers_of_two, semidefinite_root
@@ -36,13 +36,13 @@ from lbt_synth.linear.output_feedback.lower_bound import (
     last_step,
     steady_pairs,
 )
-from lbt_synth.linear.riccati.dare import solve_dare, unstable_hidden_mode
+from lbt_synth.linear.riccati.dare import require_seen, solve_dare
 from lbt_synth.linear.riccati.equations import Equations, solve_by_doubling, solve_by_schur
 from lbt_synth.linear.state_space import StateSpace
-from lbt_synth.validation import FloatArray, frozen_copy, require_instance
+from lbt_synth.validation import FloatArray, require_instance
 
 _TOLERANCE = 1e-11
-_NOTHING = 1e-6  # part of the largest, of levels or of states of a mode, that counts as none
+_NOTHING = 1e-6  # part of the largest of levels, that counts as none
 _PART = 1e-10  # of the largest singular value, below which a channel cancels nothing
 _ROUNDING = 1e-9  # share of a solution that its residual, or a negative part, may be
 
@@ -514,37 +514,12 @@ def _size(*parts: FloatArray) -> float:
 
 def require_stabilisable(plant: GeneralizedPlant) -> None:
     """Raise if a mode that does not decay is not reached by u, or not seen by y."""
-    reached = unstable_hidden_mode(plant.A.T, plant.B2.T, drive=plant.C1.T)
-    seen = unstable_hidden_mode(plant.A, plant.C2, drive=plant.B1)
-    for value, A, C, words in (
-        (reached, plant.A.T, plant.B2.T, "no control reaches it. Give it a control"),
-        (seen, plant.A, plant.C2, "no measurement sees it. Measure it"),
-    ):
-        if value is None:
-            continue
-        vector = _null_vector(A, C, value)
-        raise DetectabilityError(
-            f"no controller stabilises the plant: its mode at {_number(value)} does not decay, and "
-            f"{words}, or take it out of the plant (a weight with such a pole: let it decay a "
-            f"little). The mode is made of the states {_states(vector)}.",
-            eigenvalue=value,
-            eigenvector=frozen_copy(np.abs(vector)),
-        )
-
-
-def _null_vector(A: FloatArray, C: FloatArray, value: complex) -> FloatArray:
-    """Return the unit vector that C does not see and A multiplies by a value, (n,) complex."""
-    pencil = np.vstack([A - value * np.eye(len(A)), C])
-    return np.asarray(np.linalg.svd(pencil)[2][-1].conj())
-
-
-def _states(vector: FloatArray) -> str:
-    """Name the few states that have the largest part in a mode."""
-    size = np.abs(vector) / np.max(np.abs(vector))
-    order = [int(i) for i in np.argsort(-size) if size[i] > _NOTHING]
-    named = ", ".join(f"{i} ({size[i]:.3g})" for i in order[:4])
-    return named + (", ..." if len(order) > 4 else "")
-
-
-def _number(value: complex) -> str:
-    return f"{value.real + 0.0:.6g}" if abs(value.imag) <= 1e-9 * abs(value) else f"{value:.6g}"
+    words = (
+        "no controller stabilises the plant: its mode at {{mode}} does not decay, and {}, or take "
+        "it out of the plant (a weight with such a pole: let it decay a little). The mode is made "
+        "of the states {{states}}."
+    )
+    reached = words.format("no control reaches it. Give it a control")
+    require_seen(plant.A.T, plant.B2.T, reached, drive=plant.C1.T)
+    seen = words.format("no measurement sees it. Measure it")
+    require_seen(plant.A, plant.C2, seen, drive=plant.B1)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
-from lbt_synth.errors import DetectabilityError, InfeasibleError, NumericalError
+from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import (
     EstimationProblem,
     decorrelate,
@@ -34,8 +34,8 @@ from lbt_synth.linear.matrix_functions import (
 )
 from lbt_synth.linear.riccati.dare import (
     ERROR_LIMIT,
+    require_seen,
     solve_dare,
-    unstable_hidden_mode,
     weight_root,
 )
 from lbt_synth.linear.riccati.equations import Equations, doubling
@@ -68,21 +68,17 @@ class FilterRiccati:
 
 def require_detectable(problem: EstimationProblem) -> None:
     """Raise if no stable filter exists."""
-    hidden = unstable_hidden_mode(problem.A, problem.C, drive=problem.B)
-    if hidden is not None:
-        raise DetectabilityError(
-            f"(A, C) must be detectable; the mode of A at {hidden:.6g} does not decay and no "
-            "measurement sees it. Measure it, or take it out of the model.",
-            eigenvalue=hidden,
-        )
+    words = (
+        "(A, C) must be detectable; the mode of A at {mode} does not decay and no measurement sees "
+        "it. Measure it, or take it out of the model."
+    )
+    require_seen(problem.A, problem.C, words, drive=problem.B)
     A_s, B_s, _ = decorrelate(problem)
-    hidden = unstable_hidden_mode(A_s.T, B_s.T, drive=problem.C.T, only_unit_circle=True)
-    if hidden is not None:
-        raise DetectabilityError(
-            f"every mode on the unit circle must be driven by noise; the mode of A at "
-            f"{hidden:.6g} is not, so the filter would stop correcting it. Add a column to B.",
-            eigenvalue=hidden,
-        )
+    words = (
+        "every mode on the unit circle must be driven by noise; the mode of A at {mode} is not, so "
+        "the filter would stop correcting it. Add a column to B."
+    )
+    require_seen(A_s.T, B_s.T, words, drive=problem.C.T, only_unit_circle=True)
 
 
 def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
