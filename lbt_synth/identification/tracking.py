@@ -1,9 +1,9 @@
 """Tracking: identify the last seconds of a running loop again, design again, and change over.
 
-The error of an estimator does not depend on the commands (:attr:`FilterDesign.estimator`): its
-input is the pseudo-open-loop series ``ybar(k) = y(k) + sensor_matrix c(k)``, whose correction c(k)
-follows from the commands that were given and the states of the mirror. A new filter that runs over
-the recorded ``ybar`` has the state that it would have if it had always run: no bump.
+The error of an estimator (:func:`~lbt_synth.linear.estimator_form`) does not depend on the
+commands: its input is the pseudo-open-loop series ``ybar(k) = y(k) + sensor_matrix c(k)``, whose
+correction c(k) follows from the commands that were given and the states of the mirror. A new filter
+that runs over the recorded ``ybar`` has the state that it would have if it had always run: no bump.
 """
 
 from __future__ import annotations

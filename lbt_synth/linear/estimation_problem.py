@@ -264,10 +264,6 @@ class EstimationProblem(LinearSystem):
             L=np.hstack([self.L, weights]),
         )
 
-    def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Estimator of z from all known signals: here from y(k), as :meth:`controller`."""
-        return self.controller(gain_predictor)
-
     def controller(self, gain_predictor: FloatArray) -> Controller:
         """Filter from y(k) to ``L x_hat(k+1 | k)``, the prediction of the next z.
 

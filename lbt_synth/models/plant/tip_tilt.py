@@ -74,13 +74,6 @@ class FullForm:
         D = np.zeros((len(to_command), gain.shape[-1]))
         return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s, applied=applied)
 
-    def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Return the estimator of z from ``[y(k), u(k-1)]``, in new-state form."""
-        gain = self._padded(gain_predictor)
-        B = np.concatenate([gain, self.B_known - gain @ self.D_known], axis=-1)
-        D = np.zeros((len(self.L), B.shape[-1]))
-        return Controller(A=self.A - gain @ self.C, B=B, C=self.L, D=D, dt_s=self.dt_s)
-
     def _padded(self, gain: FloatArray) -> FloatArray:
         """Return a gain over the reduced state as one over all states."""
         shape = (*gain.shape[:-2], self.n_states - gain.shape[-2], gain.shape[-1])
@@ -162,14 +155,6 @@ class TipTiltPlant(EstimationProblem):
         """
         full = self.full()
         return full.controller(self.checked_gain(gain_predictor), self.hardware.projector @ full.L)
-
-    def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Estimator of z from ``[y(k), u(k-1)]``, whatever gave that command, in new-state form.
-
-        The known input is removed exactly, so the estimation error does not depend on it. The
-        predictor gain is over the reduced state, (n, q).
-        """
-        return self.full().estimator(self.checked_gain(gain_predictor))
 
     def ahead(self, frames: int) -> TipTiltPlant:
         """Plant of the estimate of ``z(k + frames)`` from y up to k: a loop of another delay.
