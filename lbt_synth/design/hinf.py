@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from lbt_synth.design.filter_design import FilterDesign, filter_design
@@ -131,28 +129,20 @@ def _design(
     gamma_ratio: float | None,
 ) -> FilterDesign:
     """Find the least gamma by one route, and the filter of the level asked for."""
-    gains: FilterRiccati
     lower, upper = _kalman_bracket(problem, start)
     if route == "lmi":
-        from lbt_synth.linear.lmi.filters import hinf_lmi, least_gamma_lmi
+        from lbt_synth.linear.lmi.filters import least_gamma_lmi
 
-        scales: dict[str, Any] = {"coordinates": start.P, "scale": upper}
-        gains, witness = least_gamma_lmi(problem, **scales)
-
-        def central(gamma: float) -> FilterRiccati:
-            return hinf_lmi(problem, gamma, **scales)
+        gains, witness = least_gamma_lmi(problem, coordinates=start.P, scale=upper)
     else:
-        _, level, best = least_gamma(problem, lower=lower, upper=upper, start=start)
-        gains, witness = best, worst_invisible_disturbance(problem, best.P, level, start.P)
-
-        def central(gamma: float) -> FilterRiccati:
-            return _central(problem, start, gamma)
+        _, level, gains = least_gamma(problem, lower=lower, upper=upper, start=start)
+        witness = worst_invisible_disturbance(problem, gains.P, level, start.P)
 
     least, infeasible = _verified_bracket(problem, start, gains, witness)
     requested = gamma if gamma is not None else least * (gamma_ratio or 1)
     require_reachable(requested, least)
     if requested > least * (1 + AT_LEAST):
-        gains = central(requested)
+        gains = _central(problem, start, requested)
     design = filter_design(
         problem,
         gains.gain_predictor,

@@ -305,19 +305,6 @@ def decorrelate(
     return frozen_copy(A - injection @ C), frozen_copy(B - injection @ D), frozen_copy(injection)
 
 
-def filter_gains(
-    problem: EstimationProblem, information: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Predictor and filter gain of the information matrix ``M = Pt^-1``, which may be singular.
-
-    ``gain_filter = (M + C'R^-1 C)^-1 C'R^-1`` stays finite.
-    """
-    A_s, _, injection = decorrelate(problem)
-    weighted = np.linalg.solve(problem.R, problem.C).T  # C' R^-1
-    gain_filter = np.linalg.solve(information + weighted @ problem.C, weighted)
-    return frozen_copy(A_s @ gain_filter + injection), frozen_copy(gain_filter)
-
-
 def error_units(covariance: FloatArray) -> FloatArray:
     """Units (n, 1) in which errors of this covariance have size one: powers of two, to be exact.
 
