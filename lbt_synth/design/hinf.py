@@ -52,9 +52,9 @@ def hinf(
         Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
         filter (a-posteriori), 2 and more predict further, as ``problem.ahead``.
     route : {"lmi", "riccati"}, optional
-        Linear matrix inequality, or the gamma-Riccati equation. For a given
-        bound both give the central filter. By default the inequality up to 20 states, and
-        the equation beyond, where the inequality takes minutes, or where the inequality fails.
+        How the least gamma is found: linear matrix inequality, or gamma-Riccati equation, of which
+        the filter of a larger bound is the central one. By default the inequality up to 20 states,
+        and the equation beyond, where the inequality takes minutes, or where the inequality fails.
 
     Returns
     -------

@@ -131,7 +131,7 @@ def mixed(
             return bound - deviation
 
         def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
-            return programme.minimize_level((bound * (1 - _EXCESS / 2)) ** 2, grid)
+            return programme.minimize(grid, variance=(bound * (1 - _EXCESS / 2)) ** 2)
     else:
         if gamma_ratio is not None:
             gamma = least.gamma_least * number(gamma_ratio, "gamma_ratio", at_least=1)
@@ -146,7 +146,7 @@ def mixed(
             return norm - bound
 
         def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
-            return programme.minimize_variance(bound * (1 - _EXCESS / 2), grid)
+            return programme.minimize(grid, gamma=bound * (1 - _EXCESS / 2))
 
     base = _central_member(problem, least, measure)
     if not problem.reads_all:  # no impulse response: the least variance among central filters

@@ -76,15 +76,6 @@ class Truth(Summarised):
     >>> calm = lbt.Truth(turbulence=None, noise_nm=15.5)
     >>> calm.sensor_gain
     1.0
-
-    Tip and tilt that differ:
-
-    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40, frame_rate_hz=800)
-    >>> uneven = lbt.Truth(turbulence=[slow, None], noise_nm=[15.5, 12.0])
-    >>> [modes for _, modes in uneven.turbulence_groups(2)]
-    [(0,)]
-    >>> uneven.noise_per_measurement(2).tolist()
-    [15.5, 12.0]
     """
 
     turbulence: Spectrum | Sequence[Spectrum | None] | None

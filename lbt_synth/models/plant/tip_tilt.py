@@ -115,19 +115,7 @@ class TipTiltPlant(EstimationProblem):
         return ", ".join([self.hardware._brief(), *(count_text(*count) for count in counts)])
 
     def full(self) -> FullForm:
-        """Return the same plant with the mirror's states, which are past commands if it settles.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
-        >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-        >>> plant = lbt.tip_tilt_plant(
-        ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
-        ... )
-        >>> plant.full().A.shape  # 2 p + 2 n + m = 2 + 4 + 2, the paper's case
-        (8, 8)
-        """
+        """Return the same plant with the mirror's states, which are past commands if it settles."""
         A_known, B_known, C_known, D_known = known_states(self.hardware)
         (A, B, C, _), n, past = self.stacks(), self.n_states, A_known.shape[-1]
         A_full = np.zeros((self.period, n + past, n + past))
