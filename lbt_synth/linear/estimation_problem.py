@@ -72,12 +72,6 @@ class EstimationProblem(LinearSystem):
     ... )
     >>> round(lbt.kalman(walk).rms ** 2, 6)  # the golden ratio
     1.618034
-
-    The same walk, which its sensor sees in every second sample:
-
-    >>> from dataclasses import replace
-    >>> replace(walk, read=[[True], [False]]).period
-    2
     """
 
     L: FloatArray

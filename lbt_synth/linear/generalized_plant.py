@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.linear.state_space import SAMPLE_FIRST, StateSpace
+from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.storage.summaries import Summarised
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
@@ -94,10 +94,6 @@ class GeneralizedPlant(Summarised):
         for word, value in (("B1", B1.T), ("B2", B2.T), ("C1", C1), ("C2", C2)):
             if not len(value):
                 raise DimensionError(f"{word} must have at least one signal; got {value.shape}.")
-        if self.dt_s is None or self.dt_s == 0:
-            raise ProblemError(
-                f"the plant must be in discrete time; got dt_s={self.dt_s}. {SAMPLE_FIRST}"
-            )
         set_fields(self, dt_s=number(self.dt_s, "dt_s", above=0))
 
     def _brief(self) -> str:

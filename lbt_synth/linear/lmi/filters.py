@@ -69,7 +69,6 @@ def least_gamma_lmi(
         P=frozen_copy(basis @ np.linalg.inv(storage) @ basis.T),
         gain_predictor=frozen_copy(basis @ A @ gain_filter @ whitening + injection),
         gain_filter=frozen_copy(basis @ gain_filter @ whitening),
-        residual=np.nan,
         status=run[0],
         iterations=run[1],
     )

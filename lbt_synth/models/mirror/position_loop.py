@@ -42,7 +42,6 @@ class StepResponse:
     time_s: FloatArray  # (t,): time since the command arrived [s]
     position: FloatArray  # (t,): position over its final value
     tolerance: float  # half width of the band around 1 in which the mirror counts as settled
-    rise_s: float  # time from 10 % to 90 % [s]
     overshoot: float  # largest position less 1; 0 if it stays below
     settling_s: float  # time after which the position stays within the band [s]
 
@@ -227,7 +226,6 @@ class PositionLoop:
             time_s=frozen_copy(time),
             position=frozen_copy(x),
             tolerance=band,
-            rise_s=_crossing(time, x, 0.9) - _crossing(time, x, 0.1),
             overshoot=max(float(np.max(x)) - 1, 0.0),
             settling_s=_last_outside(time, x, band),
         )
@@ -268,12 +266,6 @@ def _exponential(omega: float, damping: float, time: float) -> FloatArray:
     generator[1, 3] = 1.0
     generator[2, 0] = 1.0
     return frozen_copy(expm(generator * time))
-
-
-def _crossing(time: FloatArray, x: FloatArray, level: float) -> float:
-    """Time at which a series first crosses a level from below, between its points."""
-    i = max(int(np.argmax(x >= level)), 1)
-    return float(np.interp(level, x[i - 1 : i + 1], time[i - 1 : i + 1]))
 
 
 def _last_outside(time: FloatArray, x: FloatArray, band: float) -> float:

@@ -225,24 +225,6 @@ class TipTiltPlant(EstimationProblem):
         ``motions`` hold, for each vibration of the plant in order, the :class:`Motion` of each
         channel that it moves; by default no channel moves. A rate that is no fraction of the frame
         rate, a delay that is too short, and names or sizes that clash raise a ProblemError.
-
-        Examples
-        --------
-        A 20 Hz line that shakes tip by 500 nm, and the mirror's accelerometer by 1000 nm:
-
-        >>> import lbt_synth as lbt
-        >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=1000)
-        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=500, direction=(1,))
-        >>> plant = lbt.tip_tilt_plant(
-        ...     frame_rate_hz=1000, turbulence=slow, vibrations=[line], noise_nm=15, modes=1
-        ... )
-        >>> mirror = lbt.models.Accelerometer(
-        ...     name="mirror", rate_hz=1000, delay_frames=1, channels=("m1",), noise_m_s2=2e-4
-        ... )
-        >>> suite = lbt.models.SensorSuite(sensors=(mirror,))
-        >>> shaken = plant.with_sensors(suite, ({"m1": lbt.models.Motion(size=2)},))
-        >>> shaken.period, shaken.n_states, shaken.n_measurements
-        (1, 6, 2)
         """
         require_instance(suite, SensorSuite, "suite")
         hardware = replace(self.hardware, suite=suite)
