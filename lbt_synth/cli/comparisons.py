@@ -205,12 +205,10 @@ def run_mirror(arguments: Namespace) -> Report:
     report.add_facts(
         "The mirror after a step of its command",
         facts(
-            rise_s=fact(step.rise_s, "rise, 10 % to 90 %", **ms),
             overshoot=fact(step.overshoot, "overshoot", unit="%", scale=100),
             tolerance=fact(step.tolerance, "tolerance of the settling time", unit="%", scale=100),
             settling_s=fact(step.settling_s, "settling time", **ms),
             settling_frames=fact(frames, "  in frames", unit="frames"),
-            bandwidth_hz=fact(shell.bandwidth_hz, "bandwidth, -3 dB", unit="Hz"),
             frame_s=fact(hardware.dt_s, "one frame", **ms),
             limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
         ),

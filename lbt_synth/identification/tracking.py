@@ -1,8 +1,8 @@
 """Tracking: identify the last seconds of a running loop again, design again, and change over.
 
-The error of an estimator does not depend on the commands (:attr:`FilterDesign.estimator`). A new
-filter that runs over the recorded measurements and commands has the state that it would have if it
-had always run: no bump.
+The error of an estimator (:func:`~lbt_synth.linear.estimator_form`) does not depend on the
+commands. A new filter that runs over the recorded measurements and commands has the state that it
+would have if it had always run: no bump.
 """
 
 from __future__ import annotations
