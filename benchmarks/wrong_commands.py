@@ -245,7 +245,9 @@ def judge_good(seed: int, seconds: float) -> list[tuple[str, bool, bool, float, 
         record = draw_good(kind, seed, seconds)
         start = time.perf_counter()
         verdict = explain_commands(record)
-        words = "" if verdict.accepted else f"{seed}: {verdict.explanation} {verdict.repair.options}"
+        words = (
+            "" if verdict.accepted else f"{seed}: {verdict.explanation} {verdict.repair.options}"
+        )
         passed = verdict.accepted
         out.append((kind, passed, passed, time.perf_counter() - start, words))
     return out

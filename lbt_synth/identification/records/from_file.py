@@ -121,6 +121,7 @@ def load_record(
     (1000.0, [False, True, False], [29.89])
     """
     telemetry = source if isinstance(source, Telemetry) else None
+    name = str(source if telemetry is None else telemetry.metadata.get("name", "telemetry"))
     stated: dict[str, Any] = {
         "frame_rate_hz": frame_rate_hz,
         "delay_frames": delay_frames,
@@ -129,9 +130,9 @@ def load_record(
         "diameter_m": diameter_m,
         "obstruction": obstruction,
         "averages": averages,
-        "source": str(source) if telemetry is None else telemetry.name or "telemetry",
+        "source": name,
     }
-    with name_in_errors(path := Path(stated["source"])):
+    with name_in_errors(path := Path(name)):
         if telemetry is None and is_telemetry(path):
             telemetry = load_telemetry(path)
         if telemetry is not None:
@@ -253,12 +254,12 @@ def _modal_columns(
 
 def _inverse_response(seen: Telemetry) -> FloatArray | None:
     """Return the matrix from measurements to modes, None for the identity."""
-    n, q, response = seen.modes, seen.measurements.shape[1], seen.modal_response
+    n, q, response = seen.modes, seen.measurements.shape[1], seen.interaction_matrix
     if (response is None and q != n) or (response is not None and q > n > 2):
         raise ProblemError(
             f"this telemetry has {q} measurements and {n} modes: slopes without modal "
             "coefficients. Multiply them by the reconstructor of the loop.",
-            in_python="As Telemetry(measurements=slopes @ R.T, slopes=slopes, reconstructor=R).",
+            in_python="As Telemetry(measurements=slopes @ reconstructor.T).",
         )
     if response is None or _is_gains(response, seen):
         return None

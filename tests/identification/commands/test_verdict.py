@@ -196,7 +196,9 @@ def test_a_known_gain_decides_on_the_scale() -> None:
     y, u = ordinary_loop()
     assert explain_commands(record(y, u / 2), sensor_gain=1.4).accepted
     assert explain_commands(record(y, u), sensor_gain=[0.6, 0.8]).accepted
-    assert explain_commands(record(y, u), sensor_gain=[0.1]).repair.options.startswith("--command-scale")
+    assert explain_commands(record(y, u), sensor_gain=[0.1]).repair.options.startswith(
+        "--command-scale"
+    )
     seen = loop_record(y, frame_rate_hz=RATE, delay_frames=2, unit="nm")
     with pytest.raises(lbt.errors.ProblemError, match="no commands to explain"):
         explain_commands(seen)
