@@ -10,6 +10,7 @@ laws apart is in their increments.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import NamedTuple, TypeAlias
@@ -17,8 +18,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.identification.records.faults import MAD, SURPRISING, find_saturated
+from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
@@ -26,8 +28,6 @@ from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
     IntArray,
-    matrix,
-    number,
     read_only,
     square,
 )
@@ -163,32 +163,27 @@ class ControlLaw:
         return np.asarray(self.lag_frames + np.argmax(counts, axis=1))
 
 
-def fit_control_law(
-    measurements: ArrayLike, commands: ArrayLike, *, usable: ArrayLike | None = None
-) -> ControlLaw:
-    """Return the law of least order that explains commands by measurements, (frames, axes) each.
+def fit_control_law(record: LoopRecord) -> ControlLaw | None:
+    """Return the law of least order that explains commands by measurements.
 
-    Frames that are not usable (frames,) or at which a command is at a limit do not count, nor those
-    few that do not follow the law of the others. ProblemError refuses too few frames.
+    None of an open loop, or of too few frames. Frames at which a command is at a limit do not
+    count, nor those few that do not follow the law of the others.
     """
-    y = matrix(measurements, "measurements")
-    why = f"to match measurements {y.shape}"
-    u = matrix(commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
-    good = np.ones(len(y), dtype=np.bool_) if usable is None else np.array(usable)
-    if good.dtype != np.bool_ or good.shape != (len(y),):
-        raise DimensionError(
-            f"usable must be {len(y)} truth values, one per frame; got {good.dtype} {good.shape}."
-        )
+    if record.commands is None:
+        return None
+    y, u, good = record.measurements, record.commands, record.measured & record.commanded
     for column in u.T:
         good &= ~find_saturated(column, good)
     series = _Series(y, u, good, np.ones(len(y), dtype=np.bool_))
-    law = _search(series)
-    for _ in range(2):  # jumps hide the other frames that do not follow the law
-        odd = _odd_frames(series, law)
-        if odd.any():
-            series = series._replace(lawful=series.lawful & ~odd)
-            law = _search(series)
-    return law
+    with suppress(ProblemError):
+        law = _search(series)
+        for _ in range(2):  # jumps hide the other frames that do not follow the law
+            odd = _odd_frames(series, law)
+            if odd.any():
+                series = series._replace(lawful=series.lawful & ~odd)
+                law = _search(series)
+        return law
+    return None
 
 
 class _Series(NamedTuple):
@@ -264,10 +259,7 @@ class _Regression:
             if rows.size >= needed:
                 break
             if order <= 1:
-                raise ProblemError(
-                    f"the control law needs {needed} frames whose neighbours are good; got "
-                    f"{rows.size} of {len(u)}. Give a longer record, or one with fewer holes."
-                )
+                raise ProblemError(f"a law needs {needed} good frames; got {rows.size}.")
             order //= 2
         if rows.size > _MOST_ROWS:
             rows = rows[np.linspace(0, rows.size - 1, _MOST_ROWS).astype(np.int64)]
@@ -386,7 +378,6 @@ def law_controller(law: ControlLaw, frame_rate_hz: float) -> Controller:
 
     ProblemError refuses the absence of a law, and one that knows measurements of the future.
     """
-    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     if law.kind == "none" or law.lag_frames < 0:
         raise ProblemError(f"a controller needs a law that can run; got {law.name}{law.lag_text}.")
     axes, last = len(law.gain), law.lag_frames + law.taps.shape[1] - 1
@@ -402,4 +393,6 @@ def law_controller(law: ControlLaw, frame_rate_hz: float) -> Controller:
     B[:axes] = taps[:, 0]
     if last:
         B[axes * slots : axes * (slots + 1)] = np.eye(axes)
-    return Controller(A=A, B=B, C=np.eye(axes, len(A)), D=np.zeros((axes, axes)), dt_s=1 / rate)
+    return Controller(
+        A=A, B=B, C=np.eye(axes, len(A)), D=np.zeros((axes, axes)), dt_s=1 / frame_rate_hz
+    )

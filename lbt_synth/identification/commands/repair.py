@@ -130,11 +130,5 @@ def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
         unknown = slice(0, repair.shift_frames) if late else slice(repair.shift_frames, None)
         commands[unknown], good[unknown] = 0.0, False
     commands = commands @ repair.turn(record.axes).T
-    delay_frames = record.delay_frames if repair.delay_frames is None else repair.delay_frames
-    return replace(
-        record,
-        commands=read_only(commands),
-        commanded=read_only(good),
-        delay_frames=delay_frames,
-        bridges=None,
-    )
+    repaired = replace(record, commands=read_only(commands), commanded=read_only(good))
+    return repaired.with_delay(repair.delay_frames or record.delay_frames)

@@ -8,7 +8,6 @@ ask for the repair. A factor of two in the size of commands is left to the gains
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -140,14 +139,14 @@ def explain_commands(
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
     known = None if sensor_gain is None else record.known_gains(sensor_gain)
-    law, commands = record_law(record), record.commands[record.usable]
+    law, commands = fit_control_law(record), record.commands[record.usable]
     still = np.all(commands == commands[:1], axis=0)
     if still.all() or not still.any():
         return _explain(record, law, known)
     # the loop of the other axis was open
     y, u = record.measurements[:, ~still], record.commands[:, ~still]
     moving = replace(record, measurements=y, commands=u)
-    verdict = _explain(moving, record_law(moving), None if known is None else known[~still])
+    verdict = _explain(moving, fit_control_law(moving), None if known is None else known[~still])
     gain = np.where(still, np.nan, verdict.gain)
     note = f"the commands of axis {int(np.argmax(still))} stand still: its loop was open"
     return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
@@ -261,16 +260,6 @@ def _note_law(delay_frames: float, lag: int, hiding: str) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def record_law(record: LoopRecord) -> ControlLaw | None:
-    """Return the control law of a closed-loop record; None where the frames are too few."""
-    if record.commands is None:
-        return None
-    with suppress(ProblemError):
-        good = record.measured & record.commanded
-        return fit_control_law(record.measurements, record.commands, usable=good)
-    return None
-
-
 def _doubt_law(law: ControlLaw) -> str:
     """Return what no repair undoes in a sure law, in words; empty if there is nothing."""
     followed, lags = law.axis_coherence >= FOLLOWED, law.axis_lags
@@ -305,12 +294,8 @@ def list_repairs(
     out += [CommandRepair(shift_frames=k) for k in shifts]
     out.append(CommandRepair(increments=True))
     if law is not None and law.is_sure and law.axes_kind == "general":
-        # what undoes the gain of the law: a turn, and all of it
-        U, s, Vh = np.linalg.svd(law.gain)
-        if s[-1] > _LITTLE * s[0]:
-            for undone in (np.ones(2), np.sqrt(s[0] * s[1]) / s):
-                matrix = (Vh.T * undone) @ U.T
-                out.append(CommandRepair(matrix=tuple(matrix.ravel().tolist())))
+        U, _, Vh = np.linalg.svd(law.gain)  # what undoes the turn in the gain of the law
+        out.append(CommandRepair(matrix=tuple((U @ Vh).T.ravel().tolist())))
     return out
 
 

@@ -47,32 +47,18 @@ def build_clock(
     if frame_numbers is None:
         frame = _frames_from_times(times, rate)
     rate_of_times, off = _fit_rate(times, frame)
-    notes = [f"frame rate {rate_of_times:.9g} Hz, from the times"]
-    if rate is not None:
-        notes = _compare_rates(rate, rate_of_times, int(frame[-1]), float(np.ptp(off)))
+    notes = [] if rate is not None else [f"frame rate {rate_of_times:.9g} Hz, from the times"]
     rate = rate_of_times if rate is None else rate
-    if (jitter := float(np.std(off))) > _EXACT:
-        notes.append(f"the times lie {jitter:.2g} frames rms beside a regular grid")
-    return Clock(rate, frame, notes)
-
-
-def _compare_rates(rate: float, rate_of_times: float, frames: int, loose: float) -> list[str]:
-    """Note how far a stated rate is from that of the times; refuse a contradiction.
-
-    ``loose`` frames are what rounding and jitter move the times by.
-    """
+    frames = float(frame[-1])
     apart = abs(rate_of_times / rate - 1) * frames
-    if apart > 1 + _SAME_RATE * frames + loose:
+    if apart > 1 + _SAME_RATE * frames + float(np.ptp(off)):  # what rounding and jitter move
         raise ProblemError(
             f"frame_rate_hz must be that of the times, {rate_of_times:.9g} Hz; got {rate:.9g} Hz: "
             f"{apart:.3g} frames apart over the record. Leave it away, or leave the times away."
         )
-    if apart > 0.5 + loose:
-        return [
-            f"frame rate {rate:.9g} Hz, as stated; by the times {rate_of_times:.9g} Hz, "
-            f"{apart:.3g} frames apart over the record"
-        ]
-    return []
+    if (jitter := float(np.std(off))) > _EXACT:
+        notes.append(f"the times lie {jitter:.2g} frames rms beside a regular grid")
+    return Clock(rate, frame, notes)
 
 
 def _check_rising(values: ArrayLike, name: str, rows: int) -> FloatArray:

@@ -82,12 +82,8 @@ def test_telemetry_of_ours(tmp_path):
         assert np.array_equal(seen.mirror_taps, path.mirror_taps)
         assert seen.source == str(file)
         assert lbt.load_record(file, axes=[1]).axes == 1
-        for options, words in (
-            ({"frame_rate_hz": 801}, f"{name}: frame_rate_hz must be that of the telemetry, 800"),
-            ({"columns": {"measurements": 0}}, "neither columns nor commands"),
-        ):
-            with pytest.raises(ProblemError, match=words):
-                lbt.load_record(file, **options)
+        with pytest.raises(ProblemError, match=f"{name}: .*neither columns nor commands"):
+            lbt.load_record(file, columns={"measurements": 0})
 
 
 @pytest.mark.e2e
@@ -134,17 +130,13 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     )
     seen = lbt.load_record(path)
     assert (seen.delay_frames, seen.diameter_m, seen.obstruction) == (2.5, 8.0, 0.11)
-    assert "frame_rate_hz 500, by FRAMRATE of HDU 0" in seen.notes
-    with pytest.raises(ProblemError, match="frame_rate_hz must be that of FRAMRATE of .*; got 100"):
-        lbt.load_record(path, frame_rate_hz=1000)
+    assert "frame_rate_hz 500 by FRAMRATE of HDU 0" in seen.notes
     with pytest.raises(ProblemError, match="averages are only for a spectrum"):
         lbt.load_record(path, averages=3)
     assert np.allclose(seen.measurements, lbt.models.nm_per_mas(8.0) * y)
-    other = lbt.load_record(path, delay_frames=3, diameter_m=8.4)
-    assert (other.delay_frames, other.diameter_m) == (3.0, 8.4)
-    assert any(
-        "delay_frames 3 was given; DELAYFRM of HDU 0 has 2.5" in note for note in other.notes
-    )
+    other = lbt.load_record(path, frame_rate_hz=1000, delay_frames=3, diameter_m=8.4)
+    assert (other.frame_rate_hz, other.delay_frames, other.diameter_m) == (1000.0, 3.0, 8.4)
+    assert "delay_frames 3 was given, in place of 2.5 by DELAYFRM of HDU 0" in other.notes
     # a delay of unknown unit is not taken
     unsure = hdus(tmp_path / "b.fits", image("Y", y, "nm"), image("U", u, "nm"), DELAY=0.002)
     seen = lbt.load_record(unsure, frame_rate_hz=RATE)
@@ -204,7 +196,6 @@ def test_spectra(tmp_path, form):
     # a Lorentzian's integral, arctan
     exact = [90 * 2 * (np.arctan((100 - c) / 2) - np.arctan((5 - c) / 2)) for c in (20, 45)]
     assert seen.rms_nm**2 == pytest.approx(exact, rel=1e-3)
-    assert seen.spectra[1].psd([45.0])[0] == pytest.approx(90, rel=0.02)
 
 
 def test_amplitude_spectra_and_angles(tmp_path):
@@ -332,8 +323,6 @@ def test_both_files_tell_facts_and_each_its_own_unit(tmp_path, series):
     y, u = series[0][:, 0], series[1][:, 0]
     mine = csv(tmp_path / "y.csv", ("unit = mas", "diameter_m = 8.0"), y=y)
     slow = csv(tmp_path / "u.csv", ("frame_rate_hz = 250", "delay_frames = 2"), u_nm=u)
-    with pytest.raises(ProblemError, match=r"must be that of .* in u\.csv, 250; got 500"):
-        lbt.load_record(mine, commands=slow, frame_rate_hz=RATE)
     seen = lbt.load_record(mine, commands=slow)
     assert (seen.frame_rate_hz, seen.delay_frames) == (250.0, 2.0)
     assert np.allclose(seen.measurements[:, 0], lbt.models.nm_per_mas(8.0) * y)
@@ -409,7 +398,6 @@ def test_slopes_with_their_modes_and_without():
 @pytest.mark.parametrize(
     ("telemetry_changes", "options", "words"),
     [
-        ({}, {"frame_rate_hz": 999}, "frame_rate_hz must be that of the telemetry, 1000; got 999"),
         ({}, {"unit": "mas"}, "unit must be that of the data, 'nm'; got 'mas'"),
         (
             {"measurement_unit": "pixel"},
@@ -447,6 +435,3 @@ def test_what_telemetry_does_not_tell_is_given():
     seen = lbt.load_record(half, unit="m")
     assert np.allclose(seen.measurements, 1e9 * half.measurements)
     assert np.array_equal(seen.commands, half.commands)
-    other = lbt.load_record(telemetry(diameter_m=8.0), delay_frames=3, diameter_m=6.5)
-    assert (other.delay_frames, other.diameter_m) == (3.0, 6.5)
-    assert "delay_frames 3 was given; the telemetry has 2" in other.notes
