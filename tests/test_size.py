@@ -18,7 +18,7 @@ LINES = {
     "config": 1876,
     "design": 7690,
     "files": 1283,
-    "identification": 9547,
+    "identification": 9410,
     "interop": 4400,
     "linear": 5763,
     "loop": 4905,

@@ -106,16 +106,13 @@ class ControlLaw:
 
     @property
     def coherence(self) -> float:
-        """Mean coherence of the axes: 0 of the commands of another night."""
+        """Return the part of what past commands leave that a law explains (axes,), unbiased."""
         return float(np.mean(self.axis_coherence))
 
     @property
     def leak(self) -> FloatArray:
-        """Pole nearest 1 of each axis, its size where it is complex, (axes,); nan of none."""
-        if not self.order:
-            return np.full(len(self.past), np.nan)
-        nearest = self.poles[:, 0]
-        return np.where(abs(nearest.imag) > 0, abs(nearest), nearest.real)
+        """Size of the pole nearest 1 of each axis, (axes,); (0,) of a law without memory."""
+        return np.asarray(np.abs(self.poles[:, :1]).ravel())
 
     @property
     def exact(self) -> bool:
@@ -164,11 +161,7 @@ class ControlLaw:
 
 
 def fit_control_law(record: LoopRecord) -> ControlLaw | None:
-    """Return the law of least order that explains commands by measurements.
-
-    None of an open loop, or of too few frames. Frames at which a command is at a limit do not
-    count, nor those few that do not follow the law of the others.
-    """
+    """Return the law of least order that explains commands; None of an open loop or few frames."""
     if record.commands is None:
         return None
     y, u, good = record.measurements, record.commands, record.measured & record.commanded
@@ -297,10 +290,7 @@ class _Regression:
         return float(np.mean([self.solve(axis, shape)[1] for axis in self.moving] or [1.0]))
 
     def coherence(self, shape: _Shape) -> FloatArray:
-        """Return the part of what past commands leave that a law explains, of each axis (axes,).
-
-        Corrected for the number of coefficients; zero where commands do not move.
-        """
+        """Return the part of what past commands leave that a law explains (axes,), unbiased."""
         out, used = np.zeros(self.axes), shape[0] + self.axes * len(shape[1])
         for axis in self.moving:
             (_, before), (_, after) = (
@@ -312,11 +302,7 @@ class _Regression:
         return out
 
     def simplest_shape(self, lags: range) -> _Shape:
-        """Return the shortest law that explains as much as the richest one.
-
-        Of up to three states each order and number of taps is tried, beyond them orders that
-        double. First and last taps that explain nothing are left out.
-        """
+        """Return the shortest law that explains as much as the richest one, without idle taps."""
         most = _enough(self.residual((self.order, range(lags[0], self.lags.stop)))) + _EXACT**2
         tried = [(p, taps) for p in range(SHORT_ORDER + 1) for taps in range(max(p - 1, 0), p + 1)]
         while tried[-1][0] < self.order:
@@ -358,11 +344,7 @@ class _Regression:
 
 
 def classify_matrix(values: ArrayLike) -> tuple[str, tuple[int, ...]]:
-    """Return what a matrix (n, n) of one or two axes does, the first kind that fits, and signs.
-
-    Elements below 5 % of the largest one count as zero. Signs are those on the diagonal, of a
-    swapped matrix on the other one, of each row; 0 of any other.
-    """
+    """Return what a matrix (n, n) of one or two axes does, and the sign of each row, or 0."""
     g = square(values, "values")
     g = np.where(np.abs(g) <= _SMALL * np.max(np.abs(g), initial=0.0), 0.0, g)
     on, off = np.diag(g), (g - np.diag(np.diag(g))).sum(axis=1)
@@ -374,10 +356,7 @@ def classify_matrix(values: ArrayLike) -> tuple[str, tuple[int, ...]]:
 
 
 def law_controller(law: ControlLaw, frame_rate_hz: float) -> Controller:
-    """Return a control law as a controller, whose state holds past commands and measurements.
-
-    ProblemError refuses the absence of a law, and one that knows measurements of the future.
-    """
+    """Return a law as a controller, whose state holds past commands and measurements."""
     if law.kind == "none" or law.lag_frames < 0:
         raise ProblemError(f"a controller needs a law that can run; got {law.name}{law.lag_text}.")
     axes, last = len(law.gain), law.lag_frames + law.taps.shape[1] - 1

@@ -64,11 +64,8 @@ def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
 
 
 def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
-    """Find frames at an end of the range that is reached far more often than values beside it.
-
-    The end of a sinusoid's range is reached often, too, but not by a factor of 4 more often
-    than the next values; an end that is cut off is. Zeros are those of an open loop.
-    """
+    """Find frames at an end of the range that is reached far more often than values beside it."""
+    # zeros are those of an open loop
     good, out = good & (series != 0), np.zeros(len(series), dtype=np.bool_)
     values = series[good]
     span = float(np.ptp(values)) if values.size else 0.0

@@ -154,17 +154,14 @@ def is_telemetry(path: str | os.PathLike[str]) -> bool:
     """Whether a file is telemetry of this package or of the AOT standard."""
     path = Path(path)
     try:
-        if path.suffix.lower() in FITS:
-            with open_input(path, TelemetryError) as stream:
-                header = io.BytesIO(stream.read(LARGEST_TEXT_BYTES))
-            return bool(read_cards(header, _TELEMETRY_CARDS))
-        if path.suffix.lower() != ".npz":
-            return False
         with open_input(path, TelemetryError) as stream:
-            names = ZipFile(stream).namelist()
+            if path.suffix.lower() in FITS:
+                header = io.BytesIO(stream.read(LARGEST_TEXT_BYTES))
+                return bool(read_cards(header, _TELEMETRY_CARDS))
+            names = ZipFile(stream).namelist() if path.suffix.lower() == ".npz" else []
+            return {Path(name).stem for name in names} >= _TELEMETRY_ARRAYS
     except Exception:  # zipfile raises many kinds; read_contents reports the error
         return False
-    return {Path(name).stem for name in names} >= _TELEMETRY_ARRAYS
 
 
 def _telemetry_record(
@@ -307,11 +304,7 @@ def _join_commands(contents: Contents, path: Path) -> None:
 def _lay_beside(
     contents: Contents, other: Contents, commands: list[Column], path: Path
 ) -> list[Column]:
-    """Return the commands in the rows of the measurements, NaN where there are none.
-
-    Rows are matched by the counters of both files, else by their times. Without these both files
-    must have equally many rows.
-    """
+    """Return the commands in the rows of the measurements, by counters, times or row by row."""
     for role in CLOCKS:
         clocks = [c for file in (contents, other) for c in file.columns if c.role == role]
         if len(clocks) != 2:

@@ -205,10 +205,7 @@ def _note_trends(series: FloatArray, good: BoolArray) -> Iterator[str]:
 
 
 def end_scatters(series: FloatArray, good: BoolArray) -> tuple[float, float]:
-    """Return the rms difference of two good frames in the first quarter, and in the last.
-
-    nan where these are few.
-    """
+    """Return the rms difference of two good frames in the first and last quarter, nan of few."""
     steps = np.diff(series)[good[1:] & good[:-1]]
     quarter = steps.size // 4
     if quarter < SHORTEST_SEGMENT:

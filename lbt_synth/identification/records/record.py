@@ -276,10 +276,7 @@ class LoopRecord:
 def require_length(
     record: LoopRecord, *, frames: int = _LEAST_FRAMES, seconds: float = LEAST_SECONDS
 ) -> int:
-    """Return the usable frames in stretches of at least 256; refuse a record with too few.
-
-    Frames at the start of a record, whose commands came before it, count.
-    """
+    """Return the usable frames in stretches of at least 256; refuse a record with too few."""
     rate = record.frame_rate_hz
     needed = integer(frames, "frames", at_least=1)
     needed = max(needed, int(np.ceil(rate * number(seconds, "seconds", at_least=0) * (1 - 1e-12))))

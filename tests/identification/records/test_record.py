@@ -6,17 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.records import ran
+from support.records import RATE, SHELL, ran
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification import loop_record
 from lbt_synth.identification.records.record import require_length
-
-RATE = 1000.0
-SHELL = lbt.models.PositionLoop.from_bandwidth(
-    natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
-)
 
 
 @settings(max_examples=25)
@@ -64,6 +59,7 @@ def test_a_delay_can_come_later():
     assert np.flatnonzero(~seen.usable).tolist() == [0, 1, 2, 102, 103]
     assert int(seen.usable.sum()) == 295
     other = seen.with_delay(1.0)
+    assert other.mirror is seen.mirror
     assert np.flatnonzero(~other.usable).tolist() == [0, 101]
     assert [each.kind for each in other.findings].count("correction not known") == 1
 
@@ -98,28 +94,6 @@ def test_more_than_one_hundredth_of_a_record_is_not_bridged():
     y[150:153] = np.nan
     seen = loop_record(y, frame_rate_hz=RATE, unit="nm")
     assert seen.bridged() is seen
-
-
-def test_another_delay_keeps_the_mirror_and_drops_the_bridges():
-    shell = lbt.models.PositionLoop.from_bandwidth(
-        natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
-    )
-    rng = np.random.default_rng(0)
-    y, u = np.cumsum(rng.standard_normal((2, 2000)), axis=1)
-    u[1000] = np.nan
-    seen = loop_record(y, u, frame_rate_hz=800, delay_frames=2, mirror=shell, unit="nm")
-    other = seen.with_delay(3)
-    assert other.mirror is shell
-    assert np.array_equal(
-        other.mirror_taps,
-        lbt.LoopHardware(frame_rate_hz=800, delay_frames=3, mirror=shell).mirror_taps,
-    )
-    plain = loop_record(y, u, frame_rate_hz=800, delay_frames=2, unit="nm")
-    whole = plain.bridged()
-    assert whole.usable[1002]
-    assert whole.measurements[1002, 0] != y[1002]
-    assert not whole.with_delay(3).usable[1002]
-    assert plain.with_delay(3).usable[1002]
 
 
 def test_records_are_frozen():
