@@ -64,9 +64,6 @@ _SHARED = """
     reading
     > what is known beforehand
     --noise-nm | float nargs:+ | noise per frame of the sensor [nm], beside a spectrum without
-    --lines-hz | float nargs:+ | frequencies of vibrations [Hz]
-    --lines-error-hz | float =0.1 | standard error of --lines-hz [Hz]
-    --lines-file | | text file with one frequency per row [Hz]
     --lowest-line-hz | float =3 | what is below counts as turbulence [Hz]
     --most-lines | int =20 | most vibrations per axis
     >
@@ -198,8 +195,7 @@ _TABLE = """
     --order | int | dao: M of the RTC's configuration (default 20)
     --modes | int | c, cacao, dao, pyrtc: modes of the RTC (default: those of the design)
     --other-gain | float | gain of an integrator for each further mode (default: none)
-    --steps | int | cacao: frames of history (default: as many as the loss needs)
-    --loss | float | cacao: loss of residual that chooses them (default 0.01, the most)
+    --steps | int | cacao: frames of history (default: as many as the proof needs)
     -o --output | required | file to write: .c (the .h goes beside it), .mat, .fits or .npy, and its
         certificate; pyrtc: folder
   rehearse | targets | Run a gain file in the arithmetic of another program, in the loop.
@@ -217,7 +213,6 @@ _TABLE = """
     --frames | int | frames of an exposure
     --settle-frames | int | frames to settle before, at least 200
     --seed | int | seed of the random parts, the first of several
-    --cache | | directory for calibrations and phase screens
     -o --output | required | directory to write into
     > for tables of the paper
     --tables | II/III nargs:+ | run these tables of the paper instead of one gain file

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lbt_synth.identification import Diagnosis
-from lbt_synth.identification.diagnosis import law_facts
+from lbt_synth.identification.diagnosis import Diagnosis, law_facts
 from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import draw_bars
