@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.control_laws import ordinary_loop
-from support.wrong_commands import FAULTS, record, repair_of, wrong_record
+from support.wrong_commands import FAULTS, record, wrong_record
 
 import lbt_synth as lbt
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
@@ -14,8 +14,7 @@ from lbt_synth.identification.commands.repair import CommandRepair, repair_comma
 @pytest.mark.parametrize("fault", ["one turned", "rotated", "a tenth", "late", "increments"])
 def test_a_repair_undoes_its_fault(fault) -> None:
     y, u = ordinary_loop()
-    repaired = repair_commands(wrong_record(fault), repair_of(fault))
-    assert repair_of(fault).options == FAULTS[fault][1]
+    repaired = repair_commands(wrong_record(fault), FAULTS[fault][1])
     good = record(y, u)
     start = 1 if fault == "late" else 0  # the measurement of the first frame was lost with it
     usable = np.flatnonzero(repaired.usable)

@@ -90,7 +90,7 @@ def test_a_filter_is_known_although_its_measurements_were_rounded() -> None:
 def test_a_fault_is_named_and_repaired(fault) -> None:
     wrong = wrong_record(fault)
     verdict = explain_commands(wrong)
-    assert verdict.repair.options == FAULTS[fault][1]
+    assert verdict.repair.options == FAULTS[fault][1].options
     with pytest.raises(lbt.errors.RecordError, match=verdict.explanation[:20]) as caught:
         verdict.require_accepted()
     assert caught.value.options == verdict.repair.options
@@ -148,10 +148,10 @@ def test_a_law_may_couple_the_axes_on_purpose() -> None:
     ],
 )
 def test_the_law_decides_where_crowded_lines_mislead_a_coarse_spectrum(seed, fault) -> None:
-    spoil, options = FAULTS[fault]
+    spoil, repair = FAULTS[fault]
     y, u = spoil(*hidden_gain_loop(seed))
     verdict = explain_commands(loop_record(y, u, frame_rate_hz=1000, delay_frames=2, unit="nm"))
-    assert verdict.repair.options == options
+    assert verdict.repair.options == repair.options
 
 
 def test_a_known_gain_decides_on_the_scale() -> None:

@@ -25,14 +25,8 @@ def test_gaps_of_every_kind():
         ("not finite", "measurements", 1, 5, 200),
     ]
     assert int(seen.usable.sum()) == np.sum(seen.usable) == 2000 - 46
-    assert seen.stretches() == (
-        (0, 100),
-        (101, 200),
-        (203, 300),
-        (301, 400),
-        (401, 500),
-        (540, 2000),
-    )
+    ends = np.reshape([0, 100, 101, 200, 203, 300, 301, 400, 401, 500, 540, 2000], (-1, 2))
+    assert np.array_equal(seen.stretches(), ends)
     assert np.all(np.isfinite(seen.measurements))
     assert seen.summary() == (
         "1954 of 2000 frames are usable; 1 not finite (measurements), 40 stuck (measurements), "
@@ -85,13 +79,11 @@ def test_a_scatter_that_changes_is_said():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"command_unit": "pixel"}, "unit must be one of"),
         ({"measurements": np.ones((3, 5))}, "one or two axes.*Choose tip and tilt"),
         ({"measurements": np.ones((2, 50))}, "one or two axes.*Transpose it"),
         ({"measurements": []}, "not empty"),
         ({"commands": np.ones((30, 1))}, "commands must match measurements"),
         ({"delay_frames": 0.5}, "delay_frames must be at least 1"),
-        ({"diameter_m": -1}, "diameter_m must be above 0"),
         ({"obstruction": 1}, "obstruction must be below 1"),
         ({"mirror": "shell"}, "expected a PositionLoop"),
         (

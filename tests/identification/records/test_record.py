@@ -112,18 +112,15 @@ def test_length():
     y = np.random.default_rng(0).standard_normal(6000)
     y[::200] = np.nan  # stretches of 199
     broken = loop_record(y, frame_rate_hz=RATE, unit="nm")
-    with pytest.raises(ProblemError, match=r"needs 2000 usable frames \(2 s at 1000 Hz\).*got 0 "):
-        require_length(broken)
     assert require_length(broken.bridged()) == 5999
-    whole = broken.bridged()
-    with pytest.raises(ProblemError, match=r"needs 7000 usable frames \(7 s at 1000 Hz\)"):
-        require_length(whole, seconds=7)
-    quick = loop_record(y[1:200], frame_rate_hz=2000, unit="nm")
-    with pytest.raises(ProblemError, match="needs 4000 usable frames"):
-        require_length(quick)
-    few = loop_record(y[1:1000:2], frame_rate_hz=400, unit="nm")
-    with pytest.raises(ProblemError, match="needs 1024 usable frames"):
-        require_length(few)
+    for record, seconds, words in (
+        (broken, 2, r"needs 2000 usable frames \(2 s at 1000 Hz\).*got 0 "),
+        (broken.bridged(), 7, r"needs 7000 usable frames \(7 s at 1000 Hz\)"),
+        (loop_record(y[1:200], frame_rate_hz=2000, unit="nm"), 2, "needs 4000 usable frames"),
+        (loop_record(y[1:1000:2], frame_rate_hz=400, unit="nm"), 2, "needs 1024 usable frames"),
+    ):
+        with pytest.raises(ProblemError, match=words):
+            require_length(record, seconds=seconds)
 
 
 def test_commands_before_a_record_do_not_make_it_shorter():
