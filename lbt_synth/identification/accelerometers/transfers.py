@@ -34,7 +34,7 @@ from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models.sensor_suite import LONGEST_DELAY
 from lbt_synth.storage.rows import column, table_row
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, number
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _TINY = np.finfo(np.float64).tiny
 _NOTHING = "adds nothing"
@@ -119,7 +119,6 @@ def accelerometer_transfers(
     accelerations: ArrayLike,
     *,
     channels: Sequence[str] | None = None,
-    false_alarm: float = 1e-3,
     largest_shift_s: float = 10.0,
 ) -> AccelerometerTransfers:
     """Find how the channels of accelerometers move with the lines of an identified model.
@@ -129,16 +128,14 @@ def accelerometer_transfers(
     reading, and F_cj a complex factor, whose size is the motion and whose angle the phase. Standard
     errors count those of the model's sensor gains. The readings are (frames, channels) or (frames,)
     [m/s^2], the first that of the first frame of the record, but for a shift between the clocks of
-    at most ``largest_shift_s``; NaN where one is missing. ``false_alarm`` is the probability that
-    any line shows in any of these channels without being there.
+    at most ``largest_shift_s``; NaN where one is missing. The probability that any line shows in
+    any of these channels without being there is 0.001.
     """
     read = read_channels(accelerations, channels)
     if len(model.axes) != record.axes:
         raise DimensionError(
             f"model and record must have the same axes; got {len(model.axes)} and {record.axes}."
         )
-    alarm = number(false_alarm, "false_alarm", above=0, below=1)
-    largest_s = number(largest_shift_s, "largest_shift_s", at_least=0)
     resonant = [
         resonance.kind != "turbulence" and resonance.sections == 1 for resonance in model.parts
     ]
@@ -149,9 +146,9 @@ def accelerometer_transfers(
     rows = [(name, np.nan, _NOTHING) for name in read.names]
     if read.names and lines:
         widest_hz = max(line.damping * line.frequency_hz for line in lines)
-        shifts = 1 + np.ceil(4 * widest_hz * largest_s)  # that differ
-        limit = alarm / (len(read.names) * len(lines) * shifts)
-        largest = int(largest_s * model.frame_rate_hz)
+        shifts = 1 + np.ceil(4 * widest_hz * largest_shift_s)  # that differ
+        limit = 1e-3 / (len(read.names) * len(lines) * shifts)
+        largest = int(largest_shift_s * model.frame_rate_hz)
         lag, fits, shift, error = _lay_and_fit(
             model, record, lines, read.values, read.good, largest, limit
         )
