@@ -32,7 +32,7 @@ LINES = {
 COUNTS = {
     "files of the package": 216,
     "public names": 185,
-    "tuned constants": 520,
+    "tuned constants": 518,
     "lines of tests": 32218,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
