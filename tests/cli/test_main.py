@@ -98,7 +98,10 @@ def test_shells_complete_every_option():
 
 @pytest.mark.parametrize(
     ("command", "text"),
-    [("tradeoff", "the Kalman filter's (default 9)"), ("identify", "counts as turbulence [Hz] (default 3)")],
+    [
+        ("tradeoff", "the Kalman filter's (default 9)"),
+        ("identify", "counts as turbulence [Hz] (default 3)"),
+    ],
 )
 def test_help_says_the_defaults(capsys, command, text):
     status, out, _ = run(capsys, command, "--help")
