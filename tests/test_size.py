@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3590,
+    "cli": 3483,
     "config": 1661,
     "design": 7690,
     "files": 1243,
@@ -24,7 +24,7 @@ LINES = {
     "loop": 4905,
     "methods": 920,
     "models": 4400,
-    "report": 3275,
+    "report": 3342,
     "storage": 1027,
     "studies": 3135,
     "errors, validation": 554,
