@@ -177,7 +177,6 @@ _TABLE = """
     record accelerometers
     >
     --method | @record_methods | default: kalman, unless another quick one leaves less
-    --gamma-ratio | float | bound of the norm as a multiple of the least (default 1.2)
     --model | | configuration to write (default: the output's name, .yaml)
     -o --output | required | gain file (.fits or .npz)
   diagnose | records | Say what ran in a record, what is wrong, what it costs, and what to change.
