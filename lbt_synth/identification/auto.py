@@ -22,12 +22,12 @@ from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import CertificateError, NumericalError, SynthesisError
 from lbt_synth.identification.accelerometers.readings import channels_beside
+from lbt_synth.identification.commands.control_law import fit_control_law
 from lbt_synth.identification.commands.repair import CommandRepair
 from lbt_synth.identification.commands.verdict import (
     could_have_run,
     explain_commands,
     judge_fitted_gains,
-    record_law,
 )
 from lbt_synth.identification.fit.fitting import GAIN_STEP, PLAUSIBLE_GAINS, POSSIBLE_GAINS
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
@@ -377,7 +377,7 @@ def allowed_gains(record: LoopRecord, model: IdentifiedModel) -> FloatArray:
 
 def _running_gains(record: LoopRecord) -> tuple[float, float]:
     """Return the ends of the possible gains beyond which the law that ran was unstable."""
-    law = record_law(record)
+    law = fit_control_law(record)
     if law is None or law.kind == "none" or law.lag_frames < 0:
         return POSSIBLE_GAINS
     gains = _gains_between(*POSSIBLE_GAINS)

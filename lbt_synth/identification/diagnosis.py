@@ -49,7 +49,7 @@ AXES = ("tip", "tilt")
 DEAD = "dead"
 _NOISIER = 3.0  # times the other axis, from frame to frame: turbulence and lines are more alike
 _WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel
-_WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers", "held": "held"}
+_WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers"}
 _NARROW = 0.3  # modulus margin: less is a gain margin below 1.4
 _LEAST_SHARE = 0.05  # of the residual variance, of a part that is named
 
@@ -108,8 +108,7 @@ def _judge_channel(
     change, quarter = last / first if first > 0 else np.nan, len(channel) // 4
     drift_nm = np.mean(channel[-quarter:]) - np.mean(channel[:quarter]) if quarter else np.nan
     words = [f"{_WORDS[kind]} ({100 * share:.2g} %)" for kind, share in faults.items()]
-    held = faults.get("stuck", 0.0) + faults.get("held", 0.0)
-    if np.ptp(channel) == 0 or held > 1 / 2:
+    if np.ptp(channel) == 0 or faults.get("stuck", 0.0) > 1 / 2:
         words = [DEAD]
     elif series == "measurements":
         is_so = (

@@ -29,7 +29,7 @@ from lbt_synth.models import (
     Vibration,
     tip_tilt_plant,
 )
-from lbt_synth.models.resonance_spectrum import WIDE_DAMPING, coefficients
+from lbt_synth.models.resonance_spectrum import WIDE_DAMPING, coefficient_rows, drive_ratio
 from lbt_synth.storage.display_unit import nm_text, shown_format, shown_unit
 from lbt_synth.storage.rows import cell_text, column, fill_row, nm_column, row_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -430,7 +430,8 @@ def _nearest_process(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
 def _turbulence_process(spectrum: SpectrumModel, rate: float) -> ARModel:
     """Return the turbulence as a process of the phase, of order 2, or 3 with a roll-off."""
     slow, background = spectrum.components[0], spectrum.background
-    a1, a2, drive = coefficients(*_without_fast_pole(slow.frequency, slow.damping_ratio))
+    place = _without_fast_pole(slow.frequency, slow.damping_ratio)
+    (a1, a2), drive = coefficient_rows(*map(np.array, place)), drive_ratio(*place)
     polynomial = np.array([1.0, -a1, -a2])
     size = np.exp(slow.log_power / 2) / background.gain * np.sqrt(drive)
     if background.rolls_off:
