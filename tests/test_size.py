@@ -18,7 +18,7 @@ LINES = {
     "config": 1661,
     "design": 7690,
     "files": 1243,
-    "identification": 8907,
+    "identification": 8899,
     "interop": 3756,
     "linear": 5763,
     "loop": 4905,

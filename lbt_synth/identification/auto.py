@@ -48,7 +48,6 @@ from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import keep_frames, split_halves
-from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, residual_budget, stable_sensor_gains
 from lbt_synth.methods.registry import (
     default_method,
@@ -80,11 +79,6 @@ class RecordedDesign(Summarised):
     name: str  # row of the design in held_out, the title of its method
     channels: tuple[ChannelValue, ...] = ()  # what each accelerometer is worth, if they are read
     notes: tuple[str, ...]  # warnings about the design
-
-    @property
-    def controller(self) -> Controller:
-        """The controller of the design."""
-        return self.design.controller
 
     def _brief(self) -> str:
         return f"{self.name}, {self.model.hardware._brief()}"
