@@ -14,11 +14,11 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3483,
+    "cli": 3481,
     "config": 1653,
     "design": 7690,
     "files": 1243,
-    "identification": 9045,
+    "identification": 8899,
     "interop": 3756,
     "linear": 5763,
     "loop": 4905,
@@ -31,8 +31,8 @@ LINES = {
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 185,
-    "tuned constants": 518,
+    "public names": 181,
+    "tuned constants": 505,
     "lines of tests": 32207,
     "lines of benchmarks": 4042,
     "words of docs": 61300,

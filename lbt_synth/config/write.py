@@ -123,8 +123,7 @@ def identified_config(
         content["mirror"] = {"local_loop": asdict(model.mirror)}
     vibrations = _vibration_sections(model, comments)
     if accelerometers is not None and accelerometers.used:
-        delay = model.delay_frames
-        content["sensors"] = {_NAME: _accelerometer_section(accelerometers, delay, comments)}
+        content["sensors"] = {_NAME: _accelerometer_section(accelerometers, model, comments)}
         _add_motions(vibrations, accelerometers, comments)
     content["model"] = {"turbulence": []}
     for index, (name, axis) in enumerate(zip(_AXES, axes, strict=False)):
@@ -232,18 +231,18 @@ def _vibration_sections(model: IdentifiedModel, comments: dict[str, str]) -> lis
 
 
 def _accelerometer_section(
-    transfers: AccelerometerTransfers, delay_frames: float, comments: dict[str, str]
+    transfers: AccelerometerTransfers, model: IdentifiedModel, comments: dict[str, str]
 ) -> dict[str, Any]:
     """Return the section of the channels that are used, and comment on their delay."""
-    age, path = transfers.loop_age(delay_frames), f"sensors.{_NAME}.delay_frames"
+    age, path = transfers.loop_age(model.delay_frames), f"sensors.{_NAME}.delay_frames"
     comments[path] = f"readings come {age - 1} frames after the wavefront's"
     if age != transfers.age_frames:
         apart = transfers.age_frames - 1
         comments[path] = f"not known: the clocks were {apart} frames apart; give the real delay"
     return {
         "kind": "accelerometer",
-        "rate_hz": float(transfers.rate_hz),
-        "delay_frames": float(age + delay_frames - 1),
+        "rate_hz": float(model.frame_rate_hz),
+        "delay_frames": float(age + model.delay_frames - 1),
         "channels": [row.channel for row in transfers.used],
         "noise_m_s2": [float(row.noise_m_s2) for row in transfers.used],
     }

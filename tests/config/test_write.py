@@ -208,7 +208,6 @@ def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
         shift_frames=age - 1,
         shift_error_frames=0.1,
         age_frames=age,
-        rate_hz=1000.0,
     )
     path = save_identified(tmp_path, TWO, accelerometers=found)
     plant = lbt.load_config(path).plant

@@ -233,7 +233,6 @@ def design_inputs(
     channels: Channels | None = None,
     noise: float = 1.0,
     penalty: float | None = None,
-    defaults: Mapping[str, Any] | None = None,
 ) -> PlantInputs:
     """Return what a method makes a design of: a model with more noise, its record and channels."""
 
@@ -242,7 +241,7 @@ def design_inputs(
         return past.design(penalty)
 
     plant = noisier(model, noise).plant()
-    return PlantInputs(plant=plant, design_defaults=defaults or {}, predict=predict)
+    return PlantInputs(plant=plant, predict=predict)
 
 
 def compare_designs(
