@@ -32,7 +32,7 @@ LINES = {
 COUNTS = {
     "files of the package": 216,
     "public names": 181,
-    "tuned constants": 518,
+    "tuned constants": 500,
     "lines of tests": 31423,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
