@@ -201,13 +201,6 @@ class EstimationProblem(LinearSystem):
         integer; if it is 2 or more while ``B D'`` is not zero, as part of the noise would act on
         the states before it is measured; and if it is not 1 while the period is longer than a
         sample.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-        >>> [round(lbt.kalman(walk, horizon=h).rms ** 2, 6) for h in (-1, 0, 1, 2)]
-        [0.472136, 0.618034, 1.618034, 2.618034]
         """
         steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON, at_most=LONGEST_HORIZON)
         if steps == 1:
