@@ -126,7 +126,7 @@ def composed(model: lbt.identification.IdentifiedModel) -> lbt.models.TipTiltPla
     air = lbt.models.ar2_turbulence(AIR, frame_rate_hz=FRAME_RATE_HZ, noise_nm=NOISE_NM)
     pole = np.log(np.roots([1.0, *-air.coefficients])[0].astype(complex)) * FRAME_RATE_HZ
     vibrations = []
-    for i, axis in enumerate(model.axes):
+    for i in range(len(model.axes)):
         along = tuple(float(i == j) for j in range(len(model.axes)))
         vibrations.append(
             lbt.Vibration(
@@ -136,12 +136,11 @@ def composed(model: lbt.identification.IdentifiedModel) -> lbt.models.TipTiltPla
                 direction=along,
             )
         )
-        vibrations += [part.vibration(along) for part in axis.parts]
     return lbt.tip_tilt_plant(
         frame_rate_hz=FRAME_RATE_HZ,
         delay_frames=DELAY_FRAMES,
         turbulence=[axis.turbulence for axis in model.axes],
-        vibrations=vibrations,
+        vibrations=[*vibrations, *(part.vibration() for part in model.parts)],
         noise_nm=NOISE_NM,
     )
 

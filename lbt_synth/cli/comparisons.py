@@ -206,7 +206,6 @@ def run_mirror(arguments: Namespace) -> Report:
         facts(
             settling_s=fact(step.settling_s, "settling time", **ms),
             settling_frames=fact(frames, "  in frames", unit="frames"),
-            bandwidth_hz=fact(shell.bandwidth_hz, "bandwidth, -3 dB", unit="Hz"),
             frame_s=fact(hardware.dt_s, "one frame", **ms),
             limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
         ),

@@ -177,6 +177,7 @@ def run_diagnose(arguments: Namespace) -> Report:
     """Diagnose a record, with a design to try on it if one is given, and write the page."""
     from lbt_synth.identification.diagnosis import (  # with it come the methods
         disturbance_lines,
+        judge_channels,
         live_axes,
     )
     from lbt_synth.report.pages import diagnosis_page, diagnosis_rows
@@ -195,11 +196,14 @@ def run_diagnose(arguments: Namespace) -> Report:
         diagnosis = identification.diagnose(
             record.bridged(),
             given=designs,
-            whole=both,
             imaging=record_imaging(arguments, record),
             progress=count,
             **identification_options(arguments, record),
         )
+    if record.axes < both.axes:
+        said = "the rest is of the axis that lives: the other one is dead"
+        notes = (said, *diagnosis.notes)
+        diagnosis = replace(diagnosis, channels=judge_channels(both), notes=notes)
     model = diagnosis.model
     report = Report(
         data={

@@ -25,7 +25,7 @@ CONFIG = str(LBT_YAML)
 @pytest.mark.parametrize(
     ("options", "method"),
     [
-        (("--method", "kalman", "--route", "sdp"), "kalman"),
+        (("--method", "kalman"), "kalman"),
         (("--method", "hinf", "--gamma", 200, "--route", "riccati"), "hinf"),
         (("--method", "integrator"), "integrator"),
     ],

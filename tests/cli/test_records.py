@@ -214,11 +214,9 @@ def test_names_that_no_text_can_hold(tmp_path, capsys) -> None:
     file = tmp_path / "a\x01.npz"
     np.savez(file, measurements=record.measurements, commands=record.commands)
     words = ("auto", file, "-o", tmp_path / "q.fits", *FACTS, "--no-figure")
-    status, text, error = run(capsys, *words)
+    status, _, error = run(capsys, *words)
     assert (status, error) == (0, "")
     assert "a\\x01.npz" in (tmp_path / "q.yaml").read_text()
-    said = " ".join(text.split())
-    assert "note: the record is short (9 s): it does not tell lines less than 0.11 Hz apart" in said
 
 
 def write(path, change=1.0, frames=None, **more):
