@@ -108,12 +108,11 @@ def run_limits(arguments: Namespace) -> Report:
     }
     designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}
     report, study = _begin(designs, config)
-    no_band = () if study.band is not None else ("above_band_limit_percent",)
     report.add_rows(
         "rows",
         f"Distance to the limits of any linear controller; {config.imaging.label}",
         study.rows,
-        without=no_band,
+        without=("above_band_limit_percent",) * (study.band is None),
         hidden=() if study.shift_hz.size else ("worst_nm",),
         figure=lambda: limits_figure(study),
     )
@@ -241,7 +240,7 @@ def run_robustness(arguments: Namespace) -> Report:
     where = f"frequency errors of {np.min(errors):+g} to {np.max(errors):+g} Hz"
     caption = f"At a sensor gain of {gains[real]:.3g}: {config.imaging.label}, over {where}"
     report = Report(
-        verdict=_say_maps(maps, lines, where),
+        verdict=_say_maps(maps, real, where),
         tables=[row_table(caption, lines)],
         notes=named_difference_notes(config, designs),
         rows=[point for name, grid in maps.items() for point in _map_points(name, grid)],
@@ -251,7 +250,7 @@ def run_robustness(arguments: Namespace) -> Report:
     return report
 
 
-def _say_maps(maps: Mapping[str, RobustnessMap], lines: Sequence[Facts], where: str) -> list[str]:
+def _say_maps(maps: Mapping[str, RobustnessMap], real: int, where: str) -> list[str]:
     """Return where designs are unstable, and which keeps the highest Strehl ratio at worst."""
     verdict = [
         f"{name} is unstable at {count} of {grid.stable.size} pairs of a sensor gain and a delay "
@@ -259,14 +258,11 @@ def _say_maps(maps: Mapping[str, RobustnessMap], lines: Sequence[Facts], where: 
         for name, grid in maps.items()
         if (count := np.count_nonzero(~grid.stable))
     ]
-    worst = {line.file: [x.worst for x in lines if x.file == line.file] for line in lines}
-    lowest = {name: float(np.min(values)) for name, values in worst.items()}  # nan if unstable
-    if stable := {name: value for name, value in lowest.items() if not np.isnan(value)}:
-        best = max(stable, key=lambda name: stable[name])
-        verdict.append(
-            f"{best} keeps the highest Strehl ratio at worst over {where}, "
-            f"{100 * stable[best]:.1f} %."
-        )
+    lowest = {name: float(np.min(grid.strehl[:, real])) for name, grid in maps.items()}
+    best = max(lowest, key=lambda name: np.nan_to_num(lowest[name]))  # nan is unstable
+    if lowest[best] > 0:
+        percent = f"{100 * lowest[best]:.1f} %"
+        verdict.append(f"{best} keeps the highest Strehl ratio at worst over {where}, {percent}.")
     return verdict
 
 

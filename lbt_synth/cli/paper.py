@@ -80,12 +80,8 @@ def run_paper(arguments: Namespace) -> Report:
         number: [table_entry(*pair) for pair in rows if pair[0].table == number]
         for number in ("II", "III")
     }
-    by_method = {
-        (number, method): [entry for entry in entries if entry.method == method]
-        for number, entries in tables.items()
-        for method in dict.fromkeys(entry.method for entry in entries)
-    }
-    columns = {m: rms_difference(entries) for (n, m), entries in by_method.items() if n == "III"}
+    methods = dict.fromkeys(entry.method for entry in tables["III"])
+    columns = {m: rms_difference([e for e in tables["III"] if e.method == m]) for m in methods}
     filters = paper_filters()
     with own_display_unit():  # JSON stays in nm
         parameters = parameter_rows()
@@ -102,24 +98,10 @@ def run_paper(arguments: Namespace) -> Report:
             for method, points in columns.items()
         ],
     )
-    report.add_table(
-        "Strehl ratios [%] at 2.2 um, ours less the paper's",
-        ("table", "method", "rows", "rms difference", "largest difference"),
-        [
-            (
-                number,
-                design_title(method),
-                len(entries),
-                f"{rms_difference(entries):.2f}",
-                f"{max((entry.difference for entry in entries), key=abs):+.1f}",
-            )
-            for (number, method), entries in by_method.items()
-        ],
-    )
-    report.add_table("Parameters", ("parameter", "value", "origin"), parameter_rows())
-    for number, entries in tables.items():
+    for number, entries in reversed(tables.items()):
         caption = f"Table {number}: Strehl ratio [%] at 2.2 um"
         report.tables.append(row_table(caption, entries))
+    report.add_table("Parameters", ("parameter", "value", "origin"), parameter_rows())
     report.note_files(_write_paper(folder, rows, filters))
     return report
 

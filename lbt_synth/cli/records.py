@@ -107,7 +107,8 @@ def run_auto(arguments: Namespace) -> Report:
             method=arguments.method,
             imaging=imaging,
             accept_record=arguments.accept_record,
-            command_scale_known=is_scale_known(record),
+            command_scale_known="--command-scale" in record.read_with
+            or "--command-matrix" in record.read_with,
             accelerations=values,
             channels=channels,
             progress=count,
@@ -410,8 +411,3 @@ def with_repair(record: LoopRecord, made: RecordedDesign) -> RecordedDesign:
     words = f"the commands of the record were read with {record.read_with}"
     design = replace(made.design, assumptions=(words, *made.design.assumptions))
     return replace(made, design=design)
-
-
-def is_scale_known(record: LoopRecord) -> bool:
-    """Return whether somebody said at which size commands were recorded."""
-    return "--command-scale" in record.read_with or "--command-matrix" in record.read_with

@@ -19,7 +19,7 @@ from lbt_synth.identification import LoopRecord
 from lbt_synth.identification.records.record import require_length
 from lbt_synth.interop import export
 from lbt_synth.interop.c.export import frame_cost
-from lbt_synth.interop.pipeline import Rehearsal, rehearse, target_named, target_names
+from lbt_synth.interop.pipeline import rehearse, target_named, target_names
 from lbt_synth.loop import Imaging
 from lbt_synth.loop.simulation.disturbances import Disturbance
 from lbt_synth.loop.strehl import series_strehl
@@ -115,7 +115,18 @@ def run_rehearse(arguments: Namespace) -> Report:
         rows,
         figure=lambda: simulation_figure(rehearsal.target, title=title),
     )
-    report.add_facts("The target beside the design", _difference_facts(rehearsal))
+    apart_nm = rehearsal.differences
+    differences = facts(
+        difference_rms_nm=fact(
+            float(np.sqrt(np.mean(np.sum(apart_nm**2, axis=1)))),
+            "difference of the commands",
+            unit="nm rms",
+        ),
+        difference_largest_nm=fact(float(np.max(np.abs(apart_nm))), "  largest", unit="nm"),
+        frames=fact(len(apart_nm), "frames compared"),
+        settle_frames=fact(rehearsal.settle_frames, "frames before, in which the loops settle"),
+    )
+    report.add_facts("The target beside the design", differences)
     report.add_rows("checks", f"Checks in the arithmetic of {target}", rehearsal.checks)
     report.notes += [
         "note: residuals are of means over frames, and hold the noise of the measurements.",
@@ -150,19 +161,6 @@ def _describe(
         strehl=fact(ratio, "Strehl", **PERCENT),
         largest_command_nm=fact(largest_nm, "largest command", unit="nm", format=".1f"),
         clipped_frames=fact(clipped, "clipped frames"),
-    )
-
-
-def _difference_facts(rehearsal: Rehearsal) -> Facts:
-    """Return how far the target is from the design."""
-    apart_nm = rehearsal.differences
-    rms_nm = float(np.sqrt(np.mean(np.sum(apart_nm**2, axis=1))))
-    settled = "frames before, in which the loops settle"
-    return facts(
-        difference_rms_nm=fact(rms_nm, "difference of the commands", unit="nm rms"),
-        difference_largest_nm=fact(float(np.max(np.abs(apart_nm))), "  largest", unit="nm"),
-        frames=fact(len(apart_nm), "frames compared"),
-        settle_frames=fact(rehearsal.settle_frames, settled),
     )
 
 

@@ -75,19 +75,6 @@ def test_an_angle_needs_a_diameter(capsys, tmp_path):
     assert "telescope's diameter, which is not known here" in capsys.readouterr().err
 
 
-def test_telemetry_is_shown_in_an_angle(capsys, files):
-    """The rms of the series, which files and JSON have in nm."""
-    path = str(files / "n.fits")
-    assert main(["telemetry", path, "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
-    assert data["units"]["residual_nm"] == "nm"
-    assert main(["telemetry", path, "--show-unit", "mas"]) == 0
-    (row,) = re.findall(r"residual_nm .*", capsys.readouterr().out)
-    scale = lbt.models.nm_per_mas(data["diameter_m"])
-    assert float(row.split()[-1]) == pytest.approx(data["rms"]["residual_nm"] / scale, rel=1e-5)
-    assert row.split()[-2] == "mas"
-
-
 LINE = "{kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}"
 
 

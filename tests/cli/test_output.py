@@ -120,14 +120,6 @@ def test_no_number_is_cut_for_a_narrow_terminal(capsys, monkeypatch, width):
     assert (digest in words) is (width == 200)
 
 
-def test_tables_of_any_values():
-    report = Report()
-    report.add_table("Mixed", ("name", "unit", "value"), [("a", "nm", 1 / 3), ("b", "", None)])
-    (table,) = report.tables
-    assert table.rows == (("a", "nm", "0.333333"), ("b", "", "-"))
-    assert table.words == (1,)
-
-
 def test_values_that_json_does_not_have():
     assert json_value({"a": np.array([1.0, np.nan]), 2: (np.int64(3), np.True_, 1 + 2j)}) == {
         "a": [1.0, None],

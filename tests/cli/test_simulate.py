@@ -11,7 +11,6 @@ from support.several_sensors import CONFIG as SEVERAL_SENSORS
 from support.several_sensors import write_config
 
 from lbt_synth.cli.main import main
-from lbt_synth.cli.simulate import parse_drop
 
 CONFIG = str(LBT_YAML)
 
@@ -89,7 +88,7 @@ def test_sensors_that_fail_on_the_way(tmp_path, capsys, config_file, sensors_fil
     status, text, _ = run(
         capsys,
         *("simulate", config_file, sensors_file, "--drop", "m2@0.5s", "-o", figure),
-        *("--drop", "wavefront@1s..1.2s", "--frames", 2000),
+        *("--drop", "wavefront@1s..1.2s:frozen", "--frames", 2000),
     )
     assert status == 0
     assert "m2, wavefront" in text
@@ -164,12 +163,6 @@ def test_commands_that_read_the_own_sensor_alone_say_so(capsys, config_file):
     status, text, _ = run(capsys, "tradeoff", config_file, "--points", 2)
     assert status == 0
     assert "note: the loop's own sensor is read alone, without slow, m1, m2." in text
-
-
-def test_what_a_drop_says():
-    drop = parse_drop("wavefront@20s..20.2s:frozen")
-    assert (drop.unit, drop.start_s, drop.end_s) == ("wavefront", 20, 20.2)
-    assert drop.reading == "frozen"
 
 
 def test_several_gain_files_are_a_line_each(tmp_path, capsys, gains):

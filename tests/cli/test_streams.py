@@ -69,15 +69,6 @@ def test_names_of_files_cannot_command_the_terminal(tmp_path, capsys, monkeypatc
         assert printable(line) == line
 
 
-def test_headings_of_records_cannot_command_the_terminal(tmp_path, capsys):
-    path = tmp_path / "a.csv"
-    path.write_text("a\33[2J,b\x9b\n1,2\n2,3\n")
-    status, _, error = run(capsys, "identify", path, "-o", tmp_path / "a.yaml")
-    assert status == 2
-    assert "a\\x1b[2J" in error
-    assert printable(error) == error.replace("\n", "\\n")
-
-
 def test_an_interruption_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr(
         "lbt_synth.cli.design.run_show", lambda _: signal.raise_signal(signal.SIGINT)

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from support.browser import DESK, PHONE, chain, opened
+from support.browser import DESK, PHONE, opened
 from support.pages import HOSTILE, Reader, every_mark, whole_page
 
 import lbt_synth as lbt
@@ -236,27 +236,6 @@ def test_it_fits_a_sheet_of_paper(browser, pages, name):
     assert (7 if name == "report" else 3) <= sheets <= 15
     boxes = {tuple(map(float, box.split())) for box in re.findall(rb"/MediaBox\s*\[(.*?)\]", pdf)}
     assert all(box[2:] == pytest.approx((595, 842), abs=1) for box in boxes)
-
-
-@pytest.mark.browser
-def test_the_keyboard_reaches_the_content(browser, pages):
-    opened(browser, pages["report"])
-    keys = chain(browser)
-    keys.send_keys("\ue004").perform()  # tabulator
-    active = "return document.activeElement"
-    assert browser.execute_script(f"{active}.className") == "skip"
-    assert browser.execute_script(f"return {active[7:]}.getBoundingClientRect().left") >= 0
-    chain(browser).send_keys("\ue007").perform()  # enter
-    assert browser.execute_script("return location.hash") == "#_content"
-    assert browser.execute_script(f"{active}.id") == "_content"
-    for link in browser.find_elements("css selector", "nav a"):
-        target = link.get_attribute("href").split("#")[1]
-        browser.execute_script("arguments[0].focus()", link)
-        link.send_keys("\ue007")
-        assert browser.execute_script("return location.hash") == f"#{target}"
-        box = f"return document.getElementById('{target}').getBoundingClientRect()"
-        assert browser.execute_script(f"{box}.top") < 900
-        assert browser.execute_script(f"{box}.bottom") > 0
 
 
 def test_without_the_extra_a_pdf_is_refused_before_any_work(tmp_path, monkeypatch):
