@@ -15,25 +15,25 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3825,
-    "config": 1846,
+    "config": 1661,
     "design": 7690,
-    "files": 1283,
+    "files": 1243,
     "identification": 9045,
-    "interop": 3862,
+    "interop": 3793,
     "linear": 5763,
     "loop": 4905,
     "methods": 920,
     "models": 4400,
     "report": 4312,
-    "storage": 1049,
+    "storage": 1027,
     "studies": 3135,
-    "errors, validation": 642,
+    "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 206,
-    "tuned constants": 529,
-    "lines of tests": 32890,
+    "public names": 186,
+    "tuned constants": 523,
+    "lines of tests": 32229,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }

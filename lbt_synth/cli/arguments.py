@@ -169,8 +169,6 @@ _TABLE = """
     reading
     >
     -o --output | | file to write (.fits, .npz or .aot.fits)
-    --format | fits/npz/aot | of the file to write (default: its ending)
-    --precision | float64/float32 | of the series written (default float64)
   identify | records | Identify turbulence, vibrations, noise and sensor gain from a record.
     record accelerometers
     >

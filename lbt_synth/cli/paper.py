@@ -198,7 +198,7 @@ def run_end_to_end(arguments: Namespace) -> Report:
     report.note_files(
         [
             save_figure(end_to_end_figure(loop_run), figure_file),
-            save_telemetry(telemetry_file, recorded, precision="float32"),
+            save_telemetry(telemetry_file, recorded),
             write_atomically(summary_file, summary),
         ]
     )

@@ -18,8 +18,7 @@ from lbt_synth.cli.telemetry import (
     record_telescope,
     require_series,
 )
-from lbt_synth.config import identified_config
-from lbt_synth.config.write import RAISED, config_text, require_writable_facts
+from lbt_synth.config.write import RAISED, config_text, identified_config, require_writable_facts
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name

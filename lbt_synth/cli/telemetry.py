@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.arguments import given_options, refuse_options
+from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report, write_telemetry
 from lbt_synth.errors import ProblemError
@@ -135,10 +135,8 @@ _LOOP = {  # what telemetry says of the loop that it is from: headings and units
 def run(arguments: Namespace) -> Report:
     """Show telemetry, or a record as telemetry, and write it."""
     output = arguments.output
-    if output is None:
-        refuse_options(arguments, ("format", "precision"), "is of what -o writes; give -o FILE")
-    else:
-        require_telemetry_name(output, arguments.format)
+    if output is not None:
+        require_telemetry_name(output)
         named = given_options(arguments, "file", "commands")
         require_writable(output, inputs=list(named.values()))
     notes: list[str] = []
@@ -158,10 +156,7 @@ def run(arguments: Namespace) -> Report:
     if "timing" not in telemetry.metadata:  # of another program
         report.notes.append(telemetry.convention)
     if output is not None:
-        precision = arguments.precision or "float64"
-        write_telemetry(
-            report, output, telemetry, key="output", kind=arguments.format, precision=precision
-        )
+        write_telemetry(report, output, telemetry, key="output")
     return report
 
 

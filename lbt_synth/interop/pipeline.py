@@ -22,8 +22,7 @@ import numpy as np
 import lbt_synth
 from lbt_synth.design import Check, Design
 from lbt_synth.design.modal.stack import name_modes
-from lbt_synth.design.result import require_hardware
-from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
 from lbt_synth.interop.proof import FRAMES, LOSS, Written, prove_written, rehearsal_error
 from lbt_synth.linear.controller import as_controller
@@ -38,7 +37,7 @@ from lbt_synth.loop.simulation.run import (
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
 from lbt_synth.storage.rows import json_record
-from lbt_synth.validation import FloatArray, choice, number, require_instance
+from lbt_synth.validation import FloatArray, choice, number
 
 CERTIFICATE = ".certificate.json"  # added to the name of what is written: its certificate
 # without *, \ and ? no text ends a comment, splices lines or makes a trigraph
@@ -382,30 +381,22 @@ def rehearse(
     target: str,
     disturbance: Disturbance,
     *,
-    hardware: LoopHardware | None = None,
+    hardware: LoopHardware,
     stroke: float | None = None,
 ) -> Rehearsal:
     """Run what is exported to a target in its arithmetic, and the design in double precision.
 
-    Both loops, of the design's hardware or another, run frame by frame on the phase and noise of
-    one case, with a mirror that clips at the stroke.
+    Both loops run frame by frame on the phase and noise of one case, with a mirror that clips at
+    the stroke.
     """
     controller = as_controller(design)
-    path = require_hardware(design, "a rehearsal") if hardware is None else hardware
-    require_instance(disturbance, Disturbance, "disturbance")
-    cases, frames, n = disturbance.phase_nm.shape
-    if (cases, n) != (1, path.modes):
-        raise DimensionError(
-            f"phase_nm must be (frames, {path.modes}), of one case; got "
-            f"{disturbance.phase_nm.shape}."
-        )
     limit = np.inf if stroke is None else number(stroke, "stroke", above=0, at_most=1e30)
-    loop = close_loop(path, controller, sensor_gain=disturbance.sensor_gain)
+    loop = close_loop(hardware, controller, sensor_gain=disturbance.sensor_gain)
     loop.require_stable()
-    settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * frames))
+    settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * disturbance.frames))
     with TemporaryDirectory() as folder:
         exported = export(target_named(target).path_in(Path(folder)), design, target)
-    run = partial(simulate, hardware=path, settle_frames=settle, stroke=stroke)
+    run = partial(simulate, hardware=hardware, settle_frames=settle, stroke=stroke)
     try:
         with np.errstate(all="ignore"):  # what overflows is found to be infinite
             runs = [run(c, disturbance) for c in (exported.start(limit), controller.start())]

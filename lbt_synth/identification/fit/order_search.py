@@ -82,6 +82,10 @@ def find_models(
                     held = find_components(replace(search, gain=gain), rounds=FEW_ROUNDS)
                     rival = fitting.fit(search, held.spectrum)
                     rivals += [] if rival is None else [rival]
+        for i, component in enumerate(best.spectrum.components):
+            if i and component.damping_ratio > WIDE_DAMPING / 2:  # the gain may be that without it
+                rival = fitting.fit(search, best.spectrum.exchange(i))
+                rivals += [] if rival is None else [rival]
         best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
     near = [
         rival

@@ -155,17 +155,30 @@ class Regression:
                 weights[np.ix_(rows, rows)] += (_OFFSET * scale[place]) ** 2
         return weights
 
-    def solve(self, signals: Sequence[int], penalty: float, moments: Moments) -> FloatArray:
-        """Return the coefficients of some signals, (taps m, n), for moments of these."""
-        weights = penalty * moments.frames * self._weights(signals)
+    def _factor(self, weights: FloatArray, moments: Moments) -> tuple[FloatArray, bool]:
+        """Return the factor of the squares of signals with a penalty, for :func:`cho_solve`."""
         try:
-            factor = cho_factor(moments.squares + weights)
+            return cho_factor(moments.squares + weights)
         except np.linalg.LinAlgError:
             raise NumericalError(
                 "the past readings of a record depend on each other; expected some noise in them.",
                 status="regression",
             ) from None
-        return np.asarray(cho_solve(factor, moments.products))
+
+    def solve(self, signals: Sequence[int], penalty: float, moments: Moments) -> FloatArray:
+        """Return the coefficients of some signals, (taps m, n), for moments of these."""
+        weights = penalty * moments.frames * self._weights(signals)
+        return np.asarray(cho_solve(self._factor(weights, moments), moments.products))
+
+    def fit_share(self, penalty: float) -> float:
+        """Return by which share of what it leaves the filter of all signals is worse unseen.
+
+        Its effective number of coefficients over the frames: what their errors add (H. Akaike, Ann.
+        Inst. Statist. Math. 21, 243 (1969), doi:10.1007/BF02532251).
+        """
+        weights = penalty * self.whole.frames * self._weights(range(len(self.scales)))
+        inverse = cho_solve(self._factor(weights, self.whole), np.eye(len(weights)))
+        return float(len(weights) - np.sum(inverse * weights)) / self.whole.frames
 
     @cached_property
     def whole(self) -> Moments:
@@ -207,6 +220,7 @@ class Regression:
             self.readings,
             left[0],
             what=f"penalty {penalty:.0e}",
+            fit_share=self.fit_share(penalty),
         )
 
 

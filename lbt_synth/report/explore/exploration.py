@@ -170,11 +170,7 @@ def _scale_noise(config: Config, content: Content, value: float, factor: float) 
 def _set_shift(config: Config, content: Content, value: float, factor: float) -> None:
     """Move the true lines, the one that moves most by a shift; those of the model stay."""
     for line in _true_lines(config, content):
-        place_hz = line["frequency_hz"]
-        percent = line.pop("frequency_error_percent", None)
-        if percent is not None:
-            line["frequency_error_hz"] = place_hz * percent / 100  # so that it stays as it is
-        line["frequency_hz"] += config.truth.frequency_shift_hz(place_hz, value)
+        line["frequency_hz"] += config.truth.frequency_shift_hz(line["frequency_hz"], value)
 
 
 def _scale_damping(config: Config, content: Content, value: float, factor: float) -> None:

@@ -24,7 +24,6 @@ from support.recorded_loops import (
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification import (
-    IdentifiedAxis,
     IdentifiedModel,
     LoopRecord,
     SpectrumRecord,
@@ -32,6 +31,7 @@ from lbt_synth.identification import (
 )
 from lbt_synth.identification.fit import identify, order_search
 from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.order_search import find_components
 from lbt_synth.models import ARModel, SumSpectrum
 

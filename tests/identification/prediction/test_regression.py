@@ -118,6 +118,25 @@ def test_the_filter_gives_the_sum_of_squares_of_the_moments() -> None:
     assert measured == pytest.approx(fit.whole.left(coefficients), rel=0.01)
 
 
+def test_a_fit_adds_its_coefficients_over_the_frames() -> None:
+    """None where a penalty holds them all; else what two halves of a record lose to each other."""
+    _, record, _ = vibrating()
+    fit = regression(channels=True)
+    assert fit.fit_share(1e30) == pytest.approx(0, abs=1e-9)
+    penalty, signals = 1e-6, range(len(fit.scales))
+    past, later = (sum(parts[1:], parts[0]) for parts in (fit.parts[:3], fit.parts[3:]))
+    apart = [
+        unseen.left(b) - seen.left(b)
+        for seen, unseen in ((past, later), (later, past))
+        for b in [fit.solve(signals, penalty, seen)]
+    ]
+    least = fit.whole.left(fit.solve(signals, penalty, fit.whole))
+    half = replace(fit, parts=fit.parts[:3])
+    assert np.mean(apart) == pytest.approx(2 * half.fit_share(penalty) * least, rel=0.3)
+    design = lbt.design_from_record(record, sensor_gain=1.0, method="predictor").design
+    assert 0 < design.claims["fit_share"] < 0.1
+
+
 def test_a_large_penalty_leaves_the_filter_of_the_model() -> None:
     _, _, model = vibrating()
     stiff = regression(channels=True).design(1e12)
