@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 216,
     "public names": 186,
     "tuned constants": 523,
-    "lines of tests": 32229,
+    "lines of tests": 31983,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }
