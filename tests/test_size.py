@@ -14,25 +14,25 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3825,
+    "cli": 3483,
     "config": 1661,
     "design": 7690,
     "files": 1243,
     "identification": 9045,
-    "interop": 3793,
+    "interop": 3756,
     "linear": 5763,
     "loop": 4905,
     "methods": 920,
     "models": 4400,
-    "report": 4312,
+    "report": 3342,
     "storage": 1027,
     "studies": 3135,
     "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 186,
-    "tuned constants": 523,
+    "public names": 185,
+    "tuned constants": 518,
     "lines of tests": 31983,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
