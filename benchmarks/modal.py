@@ -30,17 +30,18 @@ def main() -> None:
     modes = lbt.models.modal_turbulence(air, modes=MODES, frame_rate_hz=RATE_HZ)
     radial, _ = noll_orders(MODES)
     noise = lbt.models.pyramid_modal_noise_nm(15.5, modes=MODES, modulation_lambda_over_d=4)
-    optimised = lbt.design.modal.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ)
+    path = lbt.LoopHardware(frame_rate_hz=RATE_HZ)
+    known = {"hardware": path, "noise_nm": noise}
+    optimised = lbt.design.modal.modal_gains(modes, **known)
 
     def integrators(gains):
         control = lbt.design.modal.MixedController(gains=gains)
-        path = optimised.hardware
-        return lbt.design.modal.modal_residuals(control, modes, noise_nm=noise, hardware=path)
+        return lbt.design.modal.modal_residuals(control, modes, **known)
 
     best = minimize_scalar(
         lambda g: total(integrators(np.full(MODES, g))), bounds=(0.01, 0.9), method="bounded"
     )
-    filters = lbt.design.modal.modal_filters(modes, noise_nm=noise)
+    filters = lbt.design.modal.modal_filters(modes, **known)
     rows = {
         f"integrators, gain {best.x:.2f}": integrators(np.full(MODES, best.x)),
         "integrators, optimised gains": optimised.rms_nm,
@@ -60,28 +61,24 @@ def main() -> None:
     line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
     shaken = {0: [line], 1: [line]}
     print("with a vibration of 563.6 nm at 20 Hz on tip and on tilt:")
-    gains = lbt.design.modal.modal_gains(
-        modes, noise_nm=noise, frame_rate_hz=RATE_HZ, vibrations=shaken
-    )
+    gains = lbt.design.modal.modal_gains(modes, **known, vibrations=shaken)
     tilt = lbt.design.modal.modal_filters(
-        [modes.model(0), modes.model(1)], noise_nm=noise[:2], vibrations=shaken
+        [modes.model(0), modes.model(1)], hardware=path, noise_nm=noise[:2], vibrations=shaken
     )
     mixed = lbt.design.modal.MixedController(filter=tilt, gains=gains.gains)
-    every = lbt.design.modal.modal_filters(modes, noise_nm=noise, vibrations=shaken)
+    every = lbt.design.modal.modal_filters(modes, **known, vibrations=shaken)
     rows_shaken = {
         "integrators, optimised gains": gains.rms_nm,
         "mixed: tip/tilt Kalman, the rest so": lbt.design.modal.modal_residuals(
-            mixed, modes, noise_nm=noise, vibrations=shaken
+            mixed, modes, **known, vibrations=shaken
         ),
         "Kalman filters": every.rms_nm,
     }
     for name, rms in rows_shaken.items():
         print(f"{name:36s} {total(rms):7.1f} {total(rms[:2]):7.1f}")
 
-    design = seconds(lambda: lbt.design.modal.modal_filters(modes, noise_nm=noise), 9)
-    search = seconds(
-        lambda: lbt.design.modal.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ), 9
-    )
+    design = seconds(lambda: lbt.design.modal.modal_filters(modes, **known), 9)
+    search = seconds(lambda: lbt.design.modal.modal_gains(modes, **known), 9)
     times = f"filters {1e3 * design:.0f} ms, optimised gains {1e3 * search:.0f} ms"
     print(f"design of {MODES} modes: {times}")
     if output:

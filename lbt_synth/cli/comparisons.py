@@ -452,14 +452,13 @@ def _modal_residuals(
             if axis < noise_nm.size and abs(share) > 1e-9:
                 tilted = replace(line, rms_nm=abs(share) * line.rms_nm, direction=(1.0,))
                 lines.setdefault(axis, []).append(tilted)
-    seen: dict[str, Any] = {"noise_nm": noise_nm, "vibrations": lines}
+    seen: dict[str, Any] = {"hardware": hardware, "noise_nm": noise_nm, "vibrations": lines}
     seen["sensor_gain"] = config.sensor_gain
-    path: dict[str, Any] = {name: getattr(hardware, name) for name in ("delay_frames", "mirror")}
-    gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **path, **seen)
+    gains = modal_gains(air, **seen)
 
     def integrator_rms(gain: float) -> FloatArray:
         control = MixedController(gains=np.full(noise_nm.size, gain))
-        return modal_residuals(control, air, hardware=hardware, **seen)
+        return modal_residuals(control, air, **seen)
 
     most = gains.limit.min()
     uniform = minimize_scalar(
@@ -473,7 +472,7 @@ def _modal_residuals(
         {
             f"integrators, gain {uniform:.2f}": integrator_rms(uniform),
             "integrators, optimised gains": gains.rms_nm,
-            "Kalman filters": modal_filters(air, **path, **seen).rms_nm,
+            "Kalman filters": modal_filters(air, **seen).rms_nm,
         },
     )
 

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs, load_shown
 from lbt_synth.cli.output import PERCENT, Report, json_value
@@ -213,7 +215,7 @@ def _run_facts(loop_run: EndToEndRun, design: Design, calibration: Calibration, 
         "tip_tilt_noise_nm": ("what it leaves of their measurements", rms),
     }
     milliseconds = 1e3 * loop_run.seconds / (loop_run.frames + loop_run.settle_frames)
-    condition = calibration.reconstructor.condition_number
+    condition = float(np.linalg.cond(calibration.reconstructor))
     return facts(
         gain=fact(gain),
         method=fact(design.method),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeAlias, cast
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -68,8 +68,9 @@ def mode_designs(
     reads_others: bool,
 ) -> tuple[list[ModeDesign], int]:
     """Return the designs of a file, each certified, and the number of its modes."""
-    start = getattr(design, "start", None)  # of a stack of designs
-    design = cast("Design | MixedController", design if start is None else start())
+    if isinstance(design, ModalFilters):
+        count = design.n_modes
+        design = MixedController(filter=design, gains=np.zeros(count), filtered=range(count))
     if isinstance(design, MixedController):
         if not mixed:
             raise ProblemError(
@@ -110,8 +111,6 @@ def mode_designs(
 
 def _mode_designs(control: MixedController) -> list[ModeDesign]:
     """Return the design of each mode; modes that get no command have none."""
-    if control.reconstructor is not None:
-        raise ProblemError("the RTC reconstructs modes itself; got a reconstructor.")
     loop, kind = control.hardware, type(control.filter).__name__
     if loop is None:
         raise ProblemError(f"the filter must be a certified design or ModalFilters; got {kind}.")

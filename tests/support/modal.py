@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 
 import numpy as np
+from scipy.linalg import block_diag
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
@@ -44,21 +45,37 @@ def single_plant(air, mode, lines, noise, gain, **path):
     )
 
 
-def integrator_residuals(gains, air, *, noise_nm, vibrations=None, sensor_gain=1.0, **path):
+def path_of(**options):
+    """Return the loop of modes that have a unit sensor."""
+    return lbt.LoopHardware(**({"frame_rate_hz": RATE} | options))
+
+
+def integrator_residuals(gains, air, *, hardware=None, **conditions):
     """Return what an integrator for each mode leaves, (n,)."""
-    return lbt.design.modal.modal_residuals(
-        lbt.design.modal.MixedController(gains=gains),
-        air,
-        noise_nm=noise_nm,
-        vibrations=vibrations,
-        hardware=lbt.LoopHardware(**({"frame_rate_hz": RATE} | path)),
-        sensor_gain=sensor_gain,
+    control = lbt.design.modal.MixedController(gains=gains)
+    hardware = hardware or path_of()
+    return lbt.design.modal.modal_residuals(control, air, hardware=hardware, **conditions)
+
+
+def joint_controller(modal, n):
+    """Return all modes of a controller as one linear controller."""
+    parts = [
+        (np.eye(n)[modes], *matrices)
+        for bank in modal.banks()
+        for modes, *matrices in zip(*bank, strict=True)
+    ]
+    return lbt.Controller(
+        A=block_diag(*(A for _, A, *_ in parts)),
+        B=np.vstack([B @ mode for mode, _, B, _, _ in parts]),
+        C=np.hstack([mode.T @ C for mode, _, _, C, _ in parts]),
+        D=sum(mode.T @ D @ mode for mode, *_, D in parts),
+        dt_s=1 / RATE,
     )
 
 
-def integrator_run(gains, total, noise, *, sensor_gain=1.0, **path):
+def integrator_run(gains, total, noise, *, sensor_gain=1.0, hardware=None):
     """Return measurements and commands, (frames, n) each, of an integrator for each mode."""
-    hardware = lbt.LoopHardware(**({"frame_rate_hz": RATE, "modes": 1} | path))
+    hardware = (hardware or path_of()).single_mode()
     sensor_gains = np.broadcast_to(sensor_gain, len(total))
     runs = [
         lbt.simulate(

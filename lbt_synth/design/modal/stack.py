@@ -6,8 +6,8 @@ Modes with the same numbers share a design; the loops of all modes are an ensemb
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +17,6 @@ from lbt_synth.design.filter_design import FilterDesign
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import UNCERTIFIED, require_hardware
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError, UnstableLoopError
-from lbt_synth.linear import Controller
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble, residual_budget
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.ensemble import residuals_from_matrices, turbulence_rows
@@ -25,7 +24,6 @@ from lbt_synth.models import (
     ARModel,
     LoopHardware,
     ModalTurbulence,
-    PositionLoop,
     TipTiltPlant,
     Vibration,
     tip_tilt_plant,
@@ -110,8 +108,7 @@ def name_modes(indices: Any) -> str:
     return f"modes {listing_text(numbers)}"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Bank:
+class Bank(NamedTuple):
     """N controllers of the same size that share no mode.
 
     They are in new-state form, ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``.
@@ -122,35 +119,6 @@ class Bank:
     B: FloatArray
     C: FloatArray
     D: FloatArray
-
-    @property
-    def width(self) -> int:
-        """Number of modes w of each controller."""
-        return int(self.modes.shape[1])
-
-    def take(self, rows: IntArray) -> Bank:
-        """Return some of the controllers."""
-        return Bank(*(getattr(self, part.name)[rows] for part in fields(self)))
-
-    def for_modes(self, modes: np.ndarray) -> Bank:
-        """Return the same controllers for other modes: i becomes ``modes[i]``."""
-        return replace(self, modes=modes[self.modes])
-
-    def textbook(self) -> tuple[FloatArray, ...]:
-        """Return ``A, B, C, D`` in textbook form."""
-        return self.A, self.B, self.C @ self.A, self.C @ self.B + self.D
-
-
-def make_banks(controllers: Sequence[Controller], which: IntArray) -> tuple[Bank, ...]:
-    """Return the controllers of single modes, mode i that of ``which[i]``, by their sizes."""
-    sizes = np.array([controller.n_states for controller in controllers])[which]
-    out = []
-    for size in np.unique(sizes):
-        modes = np.flatnonzero(sizes == size)
-        chosen = [controllers[i] for i in which[modes].tolist()]
-        matrices = (np.stack([getattr(one, name) for one in chosen]) for name in "ABCD")
-        out.append(Bank(modes[:, None], *matrices))
-    return tuple(out)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -181,11 +149,6 @@ class ModalFilters:
         return int(self.which.size)
 
     @property
-    def dt_s(self) -> float:
-        """Frame period [s]."""
-        return self.hardware.dt_s
-
-    @property
     def hardware(self) -> LoopHardware:
         """Loop that the filters are designed for, of one mode with a unit sensor."""
         return require_hardware(self.designs[0], "a modal filter").single_mode()
@@ -197,24 +160,24 @@ class ModalFilters:
 
     def banks(self) -> tuple[Bank, ...]:
         """Return the controllers, those of the same size together."""
-        return make_banks([design.controller for design in self.designs], self.which)
-
-    def start(self) -> MixedController:
-        """Return running controllers with zero states, to be stepped frame by frame."""
-        from lbt_synth.design.modal.mixed_controller import MixedController
-
-        modes = range(self.n_modes)
-        return MixedController(filter=self, gains=np.zeros(self.n_modes), filtered=modes)
+        controllers = [design.controller for design in self.designs]
+        sizes = np.array([controller.n_states for controller in controllers])[self.which]
+        banks = []
+        for size in np.unique(sizes):
+            modes = np.flatnonzero(sizes == size)
+            some = [controllers[i] for i in self.which[modes].tolist()]
+            matrices = (np.stack([getattr(one, name) for one in some]) for name in "ABCD")
+            banks.append(Bank(modes[:, None], *matrices))
+        return tuple(banks)
 
 
 def modal_filters(
     turbulence: ModalTurbulence | Sequence[ARModel],
     *,
+    hardware: LoopHardware,
     noise_nm: ArrayLike,
     vibrations: Vibrations | None = None,
-    delay_frames: float = 2.0,
     sensor_gain: ArrayLike = 1.0,
-    mirror: PositionLoop | None = None,
 ) -> ModalFilters:
     """Design a Kalman filter for every mode.
 
@@ -231,16 +194,14 @@ def modal_filters(
     ----------
     turbulence : ModalTurbulence or sequence of ARModel
         Turbulence of each mode.
+    hardware : LoopHardware
+        Delay, mirror and frame rate of all modes; its matrices play no part.
     noise_nm : float or (n,) array_like
         Standard deviation of the measurement noise of each mode per frame [nm].
     vibrations : mapping of int to Vibration or list of them, optional
         Vibrations of some modes, as means over frames; their directions play no part.
-    delay_frames : float, optional
-        Total delay of the loop [frames], at least 1, fractions allowed.
     sensor_gain : float or (n,) array_like, optional
         Sensor (optical) gain that the design assumes.
-    mirror : PositionLoop, optional
-        Dynamics of the mirror, the same for all modes; one that settles at once by default.
 
     Returns
     -------
@@ -263,12 +224,19 @@ def modal_filters(
     ...     coefficients=[[0.9886], [0.98]], driving_rms_nm=[89.1, 20.0], frame_rate_hz=800
     ... )
     >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
-    >>> filters = lbt.design.modal.modal_filters(air, noise_nm=15.5, vibrations={0: [line]})
+    >>> filters = lbt.design.modal.modal_filters(
+    ...     air,
+    ...     hardware=lbt.LoopHardware(frame_rate_hz=800),
+    ...     noise_nm=15.5,
+    ...     vibrations={0: [line]},
+    ... )
     >>> filters.rms_nm.round(1).tolist(), filters.design(1).certificate.passed
     ([142.5, 31.6], True)
     """
+    require_instance(hardware, LoopHardware, "hardware")
     if not isinstance(turbulence, ModalTurbulence):
         turbulence = ModalTurbulence.of(turbulence)
+    require_loop_rate(turbulence.frame_rate_hz, hardware)
     n = turbulence.n_modes
     noise = number_per_mode(noise_nm, "noise_nm", n)
     gain = number_per_mode(sensor_gain, "sensor_gain", n)
@@ -286,10 +254,10 @@ def modal_filters(
             turbulence=turbulence.model(first),
             vibrations=lines[first] or None,
             noise_nm=float(noise[first]),
-            delay_frames=delay_frames,
+            delay_frames=hardware.delay_frames,
             sensor_gain=float(gain[first]),
             modes=1,
-            mirror=mirror,
+            mirror=hardware.mirror,
         )
         design = _design_filter(plant, modes)
         which[modes] = len(designs)
@@ -302,7 +270,12 @@ def modal_filters(
         certificate=UNCERTIFIED,
     )
     stacked = modal_residuals(
-        filters, turbulence, noise_nm=noise, vibrations=vibrations, sensor_gain=gain
+        filters,
+        turbulence,
+        hardware=hardware,
+        noise_nm=noise,
+        vibrations=vibrations,
+        sensor_gain=gain,
     )
     errors = frozen_copy(np.array([design.rms for design in designs])[which])
     joined = replace(UNCERTIFIED, checks=(joining_check(stacked, rms_nm),), rms_per_output=errors)
@@ -331,9 +304,9 @@ def modal_residuals(
     controller: MixedController | ModalFilters,
     turbulence: ModalTurbulence | Sequence[ARModel],
     *,
+    hardware: LoopHardware,
     noise_nm: ArrayLike,
     vibrations: Vibrations | None = None,
-    hardware: LoopHardware | None = None,
     sensor_gain: ArrayLike = 1.0,
     frame_means: bool = False,
 ) -> FloatArray:
@@ -342,16 +315,15 @@ def modal_residuals(
     Parameters
     ----------
     controller : MixedController or ModalFilters
-        Controllers of the modes, without a reconstructor: y are modal coefficients.
+        Controllers of the modes.
     turbulence : ModalTurbulence or sequence of ARModel
         Turbulence of each mode, as means over frames.
+    hardware : LoopHardware
+        Real delay, mirror and frame rate; its matrices play no part.
     noise_nm : float or (n,) array_like
         Measurement noise of each mode per frame [nm], at least 0.
     vibrations : mapping of int to Vibration or list of them, optional
         Vibrations of some modes, as means over frames; their directions play no part.
-    hardware : LoopHardware, optional
-        Real delay, mirror and frame rate; its matrices play no part. By default that of the
-        filters, or of the design that is the mixed controller's filter.
     sensor_gain : float or (n,) array_like, optional
         Real sensor (optical) gain, of all modes or of each.
     frame_means : bool, optional
@@ -367,8 +339,8 @@ def modal_residuals(
     UnstableLoopError
         If a loop is unstable; the message names the modes.
     ProblemError
-        If the controller has a reconstructor or is of another kind, sizes clash, a value is out of
-        its range, no filter has a loop and none is given, or frame rates differ.
+        If the controller is of another kind, sizes clash, a value is out of its range, or frame
+        rates differ.
 
     Examples
     --------
@@ -382,7 +354,18 @@ def modal_residuals(
     >>> left.round(2).tolist()
     [16.44, 8.6]
     """
-    path = _checked_path(controller, hardware)
+    require_instance(hardware, LoopHardware, "hardware")
+    if not hasattr(controller, "banks"):
+        raise ProblemError(
+            "controller must be a MixedController or ModalFilters; got "
+            f"{type(controller).__name__}. Try MixedController(gains=gains)."
+        )
+    own, path = controller.hardware, hardware.single_mode()
+    if own is not None and not np.isclose(own.dt_s, path.dt_s, rtol=1e-9):
+        raise ProblemError(
+            f"hardware must have the frame rate of the filters, {own.frame_rate_hz:.6g} Hz; got "
+            f"{path.frame_rate_hz:.6g} Hz."
+        )
     if not isinstance(turbulence, ModalTurbulence):
         turbulence = ModalTurbulence.of(turbulence)
     n = controller.n_modes
@@ -396,7 +379,7 @@ def modal_residuals(
     for bank in controller.banks():
         counts = np.array([len(lines[mode]) for mode in bank.modes[:, 0]])
         for count in np.unique(counts):  # of vibrations, the same in an ensemble
-            some = bank.take(np.flatnonzero(counts == count))
+            some = Bank(*(stack[counts == count] for stack in bank))
             rms, stable_loops = _residuals(
                 some, path, gain, turbulence, noise, lines, frame_means=frame_means
             )
@@ -408,32 +391,6 @@ def modal_residuals(
             "and sensor gain."
         )
     return read_only(residual)
-
-
-def _checked_path(
-    controller: MixedController | ModalFilters, hardware: LoopHardware | None
-) -> LoopHardware:
-    """Return the loop of one mode that a controller runs in."""
-    if not hasattr(controller, "banks"):
-        raise ProblemError(
-            "controller must be a MixedController or ModalFilters; got "
-            f"{type(controller).__name__}. Try MixedController(gains=gains)."
-        )
-    if getattr(controller, "reconstructor", None) is not None:
-        raise ProblemError(
-            "a modal loop is that of modal coefficients; got a controller with a "
-            "reconstructor. Leave it out, or use simulate with the sensor's matrix."
-        )
-    path, dt_s = hardware or controller.hardware, controller.dt_s
-    if path is None:
-        raise ProblemError("hardware must be given where no filter has a loop; got None.")
-    require_instance(path, LoopHardware, "hardware")
-    if dt_s is not None and not np.isclose(path.dt_s, dt_s, rtol=1e-9):
-        raise ProblemError(
-            f"hardware must have the frame rate of the filters, {1 / dt_s:.6g} Hz; got "
-            f"{path.frame_rate_hz:.6g} Hz."
-        )
-    return path.single_mode()
 
 
 def _residuals(
@@ -455,7 +412,7 @@ def _residuals(
         """Return how much of a line's rms is that of its means, if what moves within counts."""
         return 1.0 if frame_means else float(np.sinc(line.frequency_hz * hardware.dt_s))
 
-    w, gain, columns = bank.width, sensor_gain[bank.modes], list(bank.modes.T)
+    w, gain, columns = bank.modes.shape[1], sensor_gain[bank.modes], list(bank.modes.T)
     vibrations = [
         EnsembleVibration(
             frequency_hz=[lines[mode][i].frequency_hz for mode in column],
@@ -476,6 +433,9 @@ def _residuals(
     if w > 1:
         sensor = np.diag(gain[0])
         hardware = replace(hardware, modes=w, sensor_matrix=sensor, influence_matrix=None)
-    left = residuals_from_matrices(bank.textbook(), hardware, conditions, in_image=not frame_means)
-    power = left.turbulence_nm2 + left.noise_nm2 + left.random_vibration_nm2 + left.within_nm2
-    return np.sqrt(np.diagonal(power, axis1=1, axis2=2)), left.stable
+    textbook = bank.A, bank.B, bank.C @ bank.A, bank.C @ bank.B + bank.D
+    budget = residuals_from_matrices(textbook, hardware, conditions, in_image=not frame_means)
+    power = (
+        budget.turbulence_nm2 + budget.noise_nm2 + budget.random_vibration_nm2 + budget.within_nm2
+    )
+    return np.sqrt(np.diagonal(power, axis1=1, axis2=2)), budget.stable

@@ -10,6 +10,8 @@ from support.modal import (
     LINE,
     RATE,
     integrator_residuals,
+    joint_controller,
+    path_of,
     single_plant,
     some_air,
     tip_tilt_filter,
@@ -19,7 +21,7 @@ from support.refusals import require_refusals
 
 import lbt_synth as lbt
 import lbt_synth.design.modal.stack
-from lbt_synth.design.modal import MixedController, modal_filters, modal_residuals, reconstructor
+from lbt_synth.design.modal import MixedController, modal_filters, modal_residuals
 from lbt_synth.design.modal.stack import joining_check
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError, UnstableLoopError
 from lbt_synth.models import ARModel, ModalTurbulence, PositionLoop
@@ -37,11 +39,13 @@ def test_each_filter_is_that_of_kalman(delay, order, bandwidth):
         )
     air = some_air(n, order)
     noise, gain = np.linspace(5, 30, n), np.linspace(0.5, 1.1, n)
-    lines, known = {1: [LINE, HUM], 2: HUM}, {"delay_frames": delay, "mirror": shell}
-    filters = modal_filters(air, noise_nm=noise, vibrations=lines, sensor_gain=gain, **known)
+    known = {"delay_frames": delay, "mirror": shell}
+    conditions = {"noise_nm": noise, "vibrations": {1: [LINE, HUM], 2: HUM}, "sensor_gain": gain}
+    conditions["hardware"] = path_of(**known)
+    filters = modal_filters(air, **conditions)
     path = filters.hardware
     assert (path.mirror, path.frame_rate_hz, path.delay_frames) == (shell, RATE, delay)
-    exact = modal_residuals(filters, air, noise_nm=noise, vibrations=lines, sensor_gain=gain)
+    exact = modal_residuals(filters, air, **conditions)
     assert np.allclose(exact, filters.rms_nm, rtol=1e-9)
     for i, mode_lines in enumerate(([], [LINE, HUM], [HUM])):
         one = lbt.kalman(single_plant(air, i, mode_lines, noise[i], gain[i], **known))
@@ -64,7 +68,7 @@ def test_equal_modes_share_a_design():
     air = some_air(2)
     slow, fast = air.model(0), air.model(1)
     known = {"noise_nm": [5.0, 5.0, 5.0, 6.0, 5.0], "vibrations": {4: LINE}}
-    filters = modal_filters([slow, fast, slow, slow, slow], **known)
+    filters = modal_filters([slow, fast, slow, slow, slow], hardware=path_of(), **known)
     assert filters.which.tolist() == [0, 1, 0, 2, 3]
     assert len(filters.designs) == 4
     assert filters.rms_nm[0] == filters.rms_nm[2]
@@ -72,7 +76,7 @@ def test_equal_modes_share_a_design():
 
 def test_a_failing_mode_is_named(monkeypatch):
     air = some_air(4)
-    filters = modal_filters(air, noise_nm=10.0)
+    filters = modal_filters(air, hardware=path_of(), noise_nm=10.0)
     off = filters.rms_nm * np.array([1.0, 1.0, 1.001, 1.0])
     check = joining_check(off, filters.rms_nm)
     assert not check.passed
@@ -87,7 +91,7 @@ def test_a_failing_mode_is_named(monkeypatch):
 
     monkeypatch.setattr(lbt_synth.design.modal.stack, "kalman", failing)
     with pytest.raises(lbt.errors.CertificateError, match="filter of mode 2: no good") as caught:
-        modal_filters(air, noise_nm=10.0)
+        modal_filters(air, hardware=path_of(), noise_nm=10.0)
     assert caught.value.failed == ("distance",)
 
 
@@ -95,25 +99,24 @@ def test_bad_filters_are_refused():
     air = some_air(3)
 
     def filters(noise_nm=1, **options):
-        return lambda: modal_filters(air, noise_nm=noise_nm, **options)
+        options = {"hardware": path_of(), "noise_nm": noise_nm} | options
+        return lambda: modal_filters(air, **options)
 
-    made = modal_filters([air.model(0)], noise_nm=1.0)
+    made = modal_filters([air.model(0)], hardware=path_of(), noise_nm=1.0)
     lines = "list of Vibration"
     require_refusals(
         [
             (filters(0.0), ProblemError, "noise_nm must be above 0"),
             (filters([1.0, 2.0]), DimensionError, "one per mode .3."),
             (filters(np.nan), NonFiniteError, "noise_nm"),
-            (filters(delay_frames=0.5), ProblemError, "delay_frames"),
+            (filters(hardware=3), ProblemError, "hardware must be a LoopHardware"),
+            (filters(hardware=path_of(frame_rate_hz=400)), ProblemError, "loop's 400 Hz; got 800"),
             (filters(sensor_gain=-1), ProblemError, "sensor_gain must be above 0"),
             (filters(vibrations=[LINE]), ProblemError, "must be a mapping"),
             (filters(vibrations={3: LINE}), ProblemError, "must be at most 2; got 3"),
             (filters(vibrations={0: 3}), ProblemError, lines),
             (filters(vibrations={0: [1]}), ProblemError, lines),
-            (filters(mirror=3), ProblemError, "PositionLoop"),
             (lambda: made.design(1), ProblemError, "mode must be at most 0; got 1"),
-            (lambda: made.start().step([1.0, 2.0]), DimensionError, r"\(1,\)"),
-            (lambda: made.start().step(["a"]), ProblemError, "y must be an array of numbers"),
         ]
     )
 
@@ -124,10 +127,11 @@ def controller_of(kind, n, delay):
     if kind == "integrators":
         return MixedController(gains=gains, leak=np.linspace(0.98, 1, n))
     if kind == "filters":
-        return modal_filters(air, noise_nm=8.0, vibrations={0: [LINE]}, delay_frames=delay)
+        path = path_of(delay_frames=delay)
+        return modal_filters(air, hardware=path, noise_nm=8.0, vibrations={0: [LINE]})
     if kind == "mixed":
         return MixedController(filter=tip_tilt_filter(delay), gains=gains, filtered=(3, 1))
-    two = modal_filters([air.model(0)] * 2, noise_nm=8.0, delay_frames=delay)
+    two = modal_filters([air.model(0)] * 2, hardware=path_of(delay_frames=delay), noise_nm=8.0)
     return MixedController(filter=two, gains=gains, filtered=(2, 0))
 
 
@@ -141,9 +145,11 @@ def test_stepped_modes_are_the_linear_controller_of_all(kind, delay):
     total, noise = 100 * rng.standard_normal((frames, n)), 8 * rng.standard_normal((frames, n))
     gain = np.linspace(0.6, 1.1, n)
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, sensor_matrix=np.diag(gain))
-    running = controller.start() if kind == "filters" else controller
+    running = controller
+    if kind == "filters":
+        running = MixedController(filter=controller, gains=np.zeros(n), filtered=range(n))
     stepped = recorded_run(running, path, total, noise)
-    linear = recorded_run(running.as_controller(1 / RATE), path, total, noise)
+    linear = recorded_run(joint_controller(controller, n), path, total, noise)
     assert np.allclose(stepped, linear, atol=1e-10 * np.abs(linear).max())
 
 
@@ -158,8 +164,7 @@ def test_exact_residuals_are_those_of_the_budget(kind, frame_means):
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, sensor_matrix=np.diag(gain))
     known = {"noise_nm": noise, "vibrations": {2: [HUM], 3: [LINE, HUM]}, "hardware": path}
     residuals = modal_residuals(controller, air, sensor_gain=gain, frame_means=frame_means, **known)
-    running = controller.start() if kind == "filters" else controller
-    closed = lbt.close_loop(path, running.as_controller(1 / RATE))
+    closed = lbt.close_loop(path, joint_controller(controller, n))
 
     def along(i, line):
         held = 1 if frame_means else np.sinc(line.frequency_hz / RATE)
@@ -188,60 +193,25 @@ def test_bad_loops_are_refused():
     def residuals(gains, modes, **options):
         return lambda: integrator_residuals(gains, some_air(modes), **known, **options)
 
-    def of(control, **options):
-        return lambda: modal_residuals(control, some_air(1), **known, **options)
+    def of(control, hardware):
+        return lambda: modal_residuals(control, some_air(1), hardware=hardware, **known)
 
-    one = MixedController(gains=[0.5])
-    bent = MixedController(gains=[0.5], reconstructor=reconstructor([[2.0]]))
-    two = modal_filters(some_air(2), noise_nm=1.0)
+    two = modal_filters(some_air(2), hardware=path_of(), noise_nm=1.0)
     narrow = {"filter": two, "gains": [0.1, 0.1], "filtered": (0,)}
+    slow, odd = ARModel(coefficients=[0.9], driving_rms_nm=5, frame_rate_hz=400), "got 400 Hz"
     require_refusals(
         [
             (residuals([0.5, 0.5, 1.2], 3), UnstableLoopError, "mode 2"),
             (residuals([0.5, 1.1, 1.2], 3), UnstableLoopError, "modes 1 and 2"),
             (residuals([0.5, 0.5, 0.5], 2), DimensionError, "must have 3 modes; got 2"),
-            (of([0.5]), ProblemError, "MixedController or ModalFilters"),
-            (of(bent), ProblemError, "reconstructor"),
-            (of(one), ProblemError, "hardware must be given"),
-            (of(one, hardware=2.0), ProblemError, "hardware must be a LoopHardware"),
+            (of([0.5], path_of()), ProblemError, "MixedController or ModalFilters"),
+            (of(two, 2.0), ProblemError, "hardware must be a LoopHardware"),
+            (of(two, path_of(frame_rate_hz=400)), ProblemError, "rate of the filters, 800 Hz"),
+            (lambda: integrator_residuals([0.1], [slow], **known), ProblemError, odd),
             (lambda: MixedController(**narrow), DimensionError, "the 1 filtered modes; got 2"),
         ]
     )
     assert residuals([0.5, 0.5, 1.2], 3, sensor_gain=0.5)().size == 3
-
-
-def test_loops_have_the_rate_of_their_filters():
-    air = some_air(2)
-    slow = ARModel(coefficients=[0.9], driving_rms_nm=5, frame_rate_hz=400)
-    filters = modal_filters(air, noise_nm=10.0, delay_frames=3)
-    mixed = MixedController(filter=filters, gains=[0.0, 0.0])
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=air.model(0), noise_nm=10.0, delay_frames=3
-    )
-    both = MixedController(filter=lbt.kalman(plant), gains=[0.0, 0.0, 0.2])
-    slower, odd = lbt.LoopHardware(frame_rate_hz=400), "loop's 800 Hz; got 400 Hz"
-    for controller in (filters, mixed, both):
-        n = controller.n_modes
-        wide, other = [air.model(0)] * n, [slow] * n
-
-        def residuals(air=wide, controller=controller, **options):
-            return modal_residuals(controller, air, noise_nm=10.0, **options)
-
-        for delay in (3.0, 2.8):
-            path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay)
-            assert np.allclose(residuals(), residuals(hardware=path)) is (delay == 3.0)
-        rows = [
-            (lambda r=residuals, a=other: r(a), ProblemError, odd),
-            (lambda r=residuals: r(hardware=slower), ProblemError, "rate of the filters, 800 Hz"),
-        ]
-        if controller is not filters:
-            assert controller.as_controller().dt_s == 1 / RATE
-            late = lambda c=controller: c.as_controller(1 / 400)  # noqa: E731
-            rows.append((late, ProblemError, "dt_s must be that of the filter"))
-        require_refusals(rows)
-    assert np.allclose(modal_residuals(mixed, air, noise_nm=10.0), filters.rms_nm, rtol=1e-9)
-    with pytest.raises(ProblemError, match=odd):
-        integrator_residuals([0.1, 0.1], [slow] * 2, noise_nm=1.0)
 
 
 def test_a_process_that_is_all_but_a_walk_leaves_what_a_walk_leaves():
@@ -252,6 +222,6 @@ def test_a_process_that_is_all_but_a_walk_leaves_what_a_walk_leaves():
         air = ModalTurbulence(
             coefficients=[[0.9], [1 - distance]], driving_rms_nm=[1.0, v], frame_rate_hz=RATE
         )
-        known = {"hardware": lbt.LoopHardware(frame_rate_hz=RATE), "frame_means": True}
+        known = {"hardware": path_of(), "frame_means": True}
         residual = modal_residuals(MixedController(gains=[g, g]), air, noise_nm=n, **known)[1]
         assert residual == pytest.approx(walk, rel=1e-7)
