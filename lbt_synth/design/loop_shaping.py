@@ -26,19 +26,14 @@ from lbt_synth.design.shaping.channel import (
     laguerre_basis,
     mode_loop,
 )
-from lbt_synth.design.shaping.demands import (
-    Demand,
-    LoopErrors,
-    ModulusMargin,
-    MovingSensorGain,
-)
-from lbt_synth.design.shaping.objectives import Leaf, ResidualVariance, Total, VibrationBand, leaves
+from lbt_synth.design.shaping.demands import Bound, Demand, LoopErrors
 from lbt_synth.design.shaping.solution import ModeSolution, reduce_mode, solve_mode
 from lbt_synth.design.shaping.specification import (
     Specification,
     specified_limit,
     violated_demands,
 )
+from lbt_synth.design.shaping.terms import ResidualVariance, Term, VibrationBand
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
@@ -115,10 +110,9 @@ def shape(
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
-    >>> spec = lbt.design.shaping.Specification(
-    ...     objective=lbt.design.shaping.ResidualVariance(turbulence=slow, noise_nm=20.0),
-    ...     demands=[lbt.design.shaping.ModulusMargin(at_least=0.6)],
-    ... )
+    >>> air = lbt.design.shaping.ResidualVariance(turbulence=slow, noise_nm=20.0)
+    >>> margin = lbt.design.shaping.Bound(response="rejection", at_most=1 / 0.6)
+    >>> spec = lbt.design.shaping.Specification(terms=[air], demands=[margin])
     >>> design = lbt.design.shape(path, spec, functions=12, states=None)
     >>> loop = lbt.close_loop(path, design.controller)
     >>> lbt.loop_margins(loop).modulus > 0.6
@@ -173,7 +167,7 @@ def _check_objective(evidence: Evidence, claimed: tuple[float, ...]) -> Iterator
     for prefix, mode in design.distinct_modes():
         loop = mode_loop(design.problem, design.parameters[mode])
         try:
-            objective = float(np.sqrt(design.specifications[mode].objective.measured_nm2(loop)))
+            objective = float(np.sqrt(design.specifications[mode].measured_nm2(loop)))
         except UnstableLoopError:
             objective = np.inf
         above, below = _excess(objective, claimed[mode]), _excess(claimed[mode], objective)
@@ -339,8 +333,8 @@ class ShapedDesign(Design):
     @property
     def vibration_bands(self) -> tuple[VibrationBand, ...]:
         """Bands of the specifications, mode by mode."""
-        parts = (leaf for spec in self.specifications for leaf in leaves(spec.objective))
-        return tuple(part for part in parts if isinstance(part, VibrationBand))
+        terms = (term for spec in self.specifications for term in spec.terms)
+        return tuple(term for term in terms if isinstance(term, VibrationBand))
 
     def violated_demands(self, controller: Controller) -> tuple[str, ...]:
         """Return the demands that a controller violates, none where it couples the modes."""
@@ -356,9 +350,9 @@ class ShapedDesign(Design):
     def terms_nm(self) -> tuple[tuple[int, str, float], ...]:
         """Residual of each term in the real loop: mode, what it is, [nm rms]."""
         return tuple(
-            (mode, leaf.label, float(np.sqrt(leaf.measured_nm2(loop))))
+            (mode, term.label, float(np.sqrt(term.measured_nm2(loop))))
             for mode, (spec, loop) in enumerate(zip(self.specifications, self._loops, strict=True))
-            for leaf in leaves(spec.objective)
+            for term in spec.terms
         )
 
     def tables(self) -> tuple[RowTable, ...]:
@@ -507,16 +501,15 @@ def robust(
         raise ProblemError(f"sensor_gain must be (low, high); got {sensor_gain!r}.")
     low, high = ends
     further = sequence(demands, "demands")
-    fixed: list[Demand] = [ModulusMargin(at_least=modulus_margin)]
+    margin = number(modulus_margin, "modulus_margin", above=0, below=1)
+    fixed: list[Demand] = [Bound(response="rejection", at_most=1 / margin)]
     late = delay_error_frames
     if late is None:
         late = _DELAY_ERROR if plant.hardware.mirror is None else 0.0
-    if late or ((low, high) != (1, 1) and not moving_gain):
-        fixed.append(LoopErrors(low=low, high=high, delay_frames=late))
     if moving_gain and (low, high) == (1, 1):
         raise ProblemError("moving_gain needs the interval in which it moves; give sensor_gain.")
-    if moving_gain:
-        fixed.append(MovingSensorGain(low=low, high=high))
+    if late or (low, high) != (1, 1):
+        fixed.append(LoopErrors(low=low, high=high, delay_frames=late, moving=moving_gain))
     deviations = noise_per_mode(plant.hardware, plant.R)
     by_mode: dict[object, Specification] = {}
     specifications = []
@@ -527,9 +520,9 @@ def robust(
         key = f"{noise_nm:.9g}", id(spectrum), own, wide
         if key not in by_mode:
             air = ResidualVariance(turbulence=spectrum, noise_nm=noise_nm)
-            terms: tuple[Leaf, ...] = (air, *_resonance_terms(plant, wide), *own)
+            terms: tuple[Term, ...] = (air, *_resonance_terms(plant, wide), *own)
             terms = tuple(replace(term, sensor_gain=g) for g in gains for term in terms)
-            by_mode[key] = Specification(objective=Total(terms=terms), demands=(*fixed, *further))
+            by_mode[key] = Specification(terms=terms, demands=(*fixed, *further))
         specifications.append(by_mode[key])
     path = plant.hardware
     return shape(path, specifications, functions=functions, pole=pole, states=states, loss=loss)

@@ -215,19 +215,21 @@ def _list_demands(
 ) -> list[Demand]:
     """Return the demands of the section, those on commands under the turbulence of the design."""
     from lbt_synth.design.loop_shaping import noise_per_mode
-    from lbt_synth.design.shaping import Attenuation, CommandRms, MirrorUncertainty, NoisePeak
+    from lbt_synth.design.shaping import Bound, CommandRms
     from lbt_synth.models.spectra import spectrum_key
 
     demands: list[Demand] = []
     if section.noise_peak is not None:
-        demands.append(NoisePeak(at_most=section.noise_peak))
+        demands.append(Bound(response="noise", at_most=section.noise_peak))
     for i, step in enumerate(section.attenuation):
         gain = 1.0 if step.sensor_gain is None else step.sensor_gain / inputs.sensor_gain
         with name_key(f"{_KEY}.attenuation[{i}]"):
-            demands.append(Attenuation(**{**step.model_dump(), "sensor_gain": gain}))
+            values = {**step.model_dump(), "sensor_gain": gain}
+            demands.append(Bound(response="rejection", **values))
     for i, error in enumerate(section.mirror_uncertainty):
         with name_key(f"{_KEY}.mirror_uncertainty[{i}]"):
-            demands.append(MirrorUncertainty(**error.model_dump()))
+            ends = {"low_hz": error.low_hz, "high_hz": error.high_hz}
+            demands.append(Bound(response="complementary", at_most=1 / error.relative, **ends))
     bounds = {False: section.command_stroke_nm, True: section.command_step_nm}
     models = inputs.plant.turbulence
     for rate, bound in bounds.items():

@@ -175,11 +175,6 @@ class SingleModeLoop:
         return replace(loop, system=_held_system(loop, late)) if late else loop
 
     @property
-    def sensitivity(self) -> StateSpace:
-        """S at unit sensor gain."""
-        return self.at(1.0).output_sensitivity()
-
-    @property
     def parameter(self) -> StateSpace:
         """The Youla parameter: from the noise to the command at unit sensor gain."""
         commanding, modes = self.at(1.0).commanding(), self.hardware.modes
@@ -188,7 +183,7 @@ class SingleModeLoop:
     @property
     def complementary(self) -> StateSpace:
         """``T = 1 - S`` at unit sensor gain."""
-        s = self.sensitivity
+        s = self.at(1.0).rejection()
         return replace(s, C=-s.C, D=1 - s.D)
 
 

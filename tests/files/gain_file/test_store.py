@@ -139,10 +139,10 @@ def in_specification(*keys, **changes):
     return change
 
 
-BAND = ("objective", "terms", 1)
+BAND = ("terms", 1)
 AGAIN = "Design it again with lbt-synth design CONFIG --method METHOD -o FILE."
 SPECIFICATION = "expected a Specification"
-MARGIN = {"kind": "ModulusMargin", "at_least": 0.5}
+MARGIN = {"kind": "Bound", "response": "rejection", "at_most": 2.0}
 
 
 @pytest.mark.parametrize(
