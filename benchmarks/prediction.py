@@ -107,7 +107,7 @@ def times() -> None:
         lambda: [replayed_residual(z, k, path, noise_nm=NOISE_NM) for k in four.values()], 5
     )
     table = seconds(lambda: prediction_against_data(plant, z, four, imaging=CAMERA), 5)
-    search = seconds(lambda: lbt.design.model_integrator(plant), 5)
+    search = seconds(lambda: lbt.integrator(plant.hardware, truth=plant), 5)
     print(
         f"four replays {1e3 * replays:.0f} ms, the table {1e3 * table:.0f} ms, of which the best "
         f"integrator {1e3 * search:.0f} ms"

@@ -16,7 +16,7 @@ GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 4246,
     "config": 1876,
-    "design": 7059,
+    "design": 6800,
     "files": 1608,
     "identification": 9965,
     "interop": 4400,

@@ -8,15 +8,12 @@ from .hinf import hinf as hinf
 from .integrator import IntegratorLaw as IntegratorLaw
 from .integrator import integrator as integrator
 from .integrator import integrator_gain_limit as integrator_gain_limit
-from .integrator import model_integrator as model_integrator
-from .integrator import optimal_integrator as optimal_integrator
 from .kalman import kalman as kalman
 from .loop_shaping import ShapedDesign as ShapedDesign
 from .loop_shaping import robust as robust
 from .loop_shaping import shape as shape
 from .lqg import LqgDesign as LqgDesign
 from .lqg import lqg as lqg
-from .mixed import central_filter as central_filter
 from .mixed import mixed as mixed
 from .output_feedback import h2_controller as h2_controller
 from .output_feedback import hinf_controller as hinf_controller

@@ -81,15 +81,6 @@ def _check_bound(evidence: Evidence, gamma: float) -> Iterator[Check]:
     yield Check(name, value, ORIGIN_TOLERANCE, "relative")
 
 
-def _check_rms_bound(evidence: Evidence, bound: float) -> Iterator[Check]:
-    """Check that the deviation keeps its bound, and uses it."""
-    apart = evidence.certificate.rms / bound - 1
-    name = "standard deviation of the estimation error over its bound, less 1"
-    yield Check(name, apart, TOLERANCE, "Lyapunov equation")
-    name = "bound over the standard deviation of the estimation error, less 1"
-    yield Check(name, -apart, ORIGIN_TOLERANCE, "Lyapunov equation")
-
-
 def _check_least(evidence: Evidence, least: float) -> Iterator[Check]:
     """Check the least norm on both sides: the level above is met, the level below is not."""
     problem, sides = evidence.design.problem, (-TOLERANCE, TOLERANCE)
@@ -116,9 +107,6 @@ RMS = measured_claim("rms", "estimation error, rms")
 GAMMA = measured_claim("gamma", "estimation error, H-infinity norm")
 GAMMA_REQUESTED = Claim(
     name="gamma_requested", heading="bound asked for", unit="nm", checks=_check_bound
-)
-RMS_REQUESTED = Claim(
-    name="rms_requested", heading="rms asked for", unit="nm", checks=_check_rms_bound
 )
 GAMMA_LEAST = Claim(
     name="gamma_least",
@@ -191,7 +179,7 @@ class FilterDesign(Design):
     """
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
-        *(RMS, GAMMA, RMS_REQUESTED, GAMMA_REQUESTED, GAMMA_LEAST, GAMMA_INFEASIBLE),
+        *(RMS, GAMMA, GAMMA_REQUESTED, GAMMA_LEAST, GAMMA_INFEASIBLE),
     )
     DERIVED: ClassVar[tuple[Column, ...]] = (
         *MODEL_LIMITS,
@@ -237,7 +225,7 @@ class FilterDesign(Design):
     @property
     def is_bounded(self) -> bool:
         """Whether the design was given a bound; without one its variance is the least."""
-        return not self.claims.keys().isdisjoint({"gamma_requested", "rms_requested"})
+        return "gamma_requested" in self.claims
 
     @property
     def knows_mirror(self) -> bool:

@@ -30,7 +30,6 @@ def hinf(
     *,
     gamma: float | None = None,
     gamma_ratio: float | None = None,
-    horizon: int = 1,
     route: str | None = None,
 ) -> FilterDesign:
     """Design an H-infinity filter of an estimation problem.
@@ -47,9 +46,6 @@ def hinf(
         Bound on the H-infinity norm from w to the estimation error.
     gamma_ratio : float, optional
         The same bound as a multiple, at least 1, of the least gamma.
-    horizon : int, optional
-        Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
-        filter (a-posteriori), 2 and more predict further, as ``problem.ahead``.
     route : {"lmi", "riccati"}, optional
         Linear matrix inequality, or the gamma-Riccati equation. For a given
         bound both give the central filter. By default the inequality up to 20 states, and
@@ -86,7 +82,6 @@ def hinf(
     gamma, gamma_ratio = checked_bounds(
         gamma, gamma_ratio, far_above="the filter is the Kalman filter"
     )
-    problem = problem.ahead(horizon)
     start = kalman_riccati(problem)
     if route == "lmi":
         problem.require_one_phase("the inequality", "route='riccati'")

@@ -12,16 +12,14 @@ from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.validation import FloatArray, choice
 
 
-def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccati") -> FilterDesign:
+def kalman(problem: EstimationProblem, *, route: str = "riccati") -> FilterDesign:
     """Design the steady-state Kalman filter of an estimation problem.
 
     Parameters
     ----------
     problem : EstimationProblem
-        The problem; a plant gives a controller.
-    horizon : int, optional
-        Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
-        filter, 2 and more predict further, as ``problem.ahead``.
+        The problem; a plant gives a controller. The estimate is one frame ahead of the newest
+        measurement; ``problem.ahead`` is the problem of another one.
     route : {"riccati", "sdp"}, optional
         The Riccati equation, or a semidefinite programme, which takes from the Riccati
         solution only the coordinates and the scale of its variables.
@@ -50,7 +48,6 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccat
     """
     require_problem(problem)
     choice(route, "route", ("riccati", "sdp"))
-    problem = problem.ahead(horizon)
     solution = kalman_riccati(problem)
     gains = solution
     if route == "sdp":

@@ -159,11 +159,6 @@ class Design(Summarised, ABC):
         return float(self.claims.get("gamma_requested", np.nan))
 
     @property
-    def rms_requested(self) -> float:
-        """Bound on the standard deviation that the design was given; nan without one."""
-        return float(self.claims.get("rms_requested", np.nan))
-
-    @property
     def gamma_least(self) -> float:
         """Norm that a filter of the problem achieves, with the least gamma; nan if not computed."""
         return float(self.claims.get("gamma_least", np.nan))

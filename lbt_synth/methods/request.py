@@ -108,9 +108,8 @@ def _describe_stranger(option: str, method: Method, called: str, words: Wording)
     """Describe an option that a method does not have."""
     place, owners = words.place_of(option), option_owners(option)
     if owners:
-        extra = _extra(method_named(owners[0]), option).get("instead", "")
         others = words.method.format(" or ".join(owners))
-        return f"{place} goes with {others}; got {called}. {extra}".rstrip()
+        return f"{place} goes with {others}; got {called}."
     known = map(words.name, sorted(method.options.model_fields))
     return f"{place} is no option of {called}; {suggest_word(words.name(option), known)}"
 

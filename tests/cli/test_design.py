@@ -77,7 +77,9 @@ def test_a_fragile_design_does_not_pass_without_a_word(tmp_path, capsys):
         assert status == 0
         assert "make this loop unstable" not in " ".join(out.split())
     plant = lbt.load_config(config).plant
-    late = lbt.integrator(plant.hardware, gain=0.99 * lbt.design.integrator_gain_limit(2.5))
+    late = lbt.integrator(
+        plant.hardware, gain=0.99 * lbt.design.integrator_gain_limit(plant.hardware)
+    )
     warned = run(capsys, "show", lbt.save_gain(gain, late))[1]
     assert re.match(r"0\.0\d+ frames \(\S+ us\) more delay make this loop unstable", warned)
     status, out, _ = run(capsys, "design", LBT_YAML, "--method", "integrator", "-o", gain)

@@ -154,7 +154,7 @@ def test_what_is_left_of_the_settled_mirror():
 def test_the_other_designs_take_a_moving_mirror():
     plant = slow_plant(2.25, shell(300.0), modes=2)
     truth, path = truth_of(plant), plant.hardware
-    integrator = lbt.design.optimal_integrator(path, truth)
+    integrator = lbt.integrator(path, truth=truth)
     limit = lbt.loop.least_residual(path, truth, frame_means=True).rms_nm
     for design in (lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.3), integrator, lbt.lqg(plant)):
         loop = lbt.close_loop(path, design.controller)

@@ -123,4 +123,4 @@ def test_an_option_that_no_method_has(tmp_path, capsys):
     assert "gamma_ratio?" in error
     study.write_text(text.replace("leak_per_s: 5.0", "weird: 1.2"))
     _, _, error = run(capsys, "study", study, "-o", tmp_path / "out")
-    assert "known are gamma, gamma_ratio, horizon, route." in error
+    assert "known are gamma, gamma_ratio, route." in error

@@ -48,7 +48,7 @@ def lbt_designs():
     return {
         "kalman": lbt.kalman(config.plant),
         "hinf": lbt.hinf(config.plant, gamma_ratio=1.2),
-        "integrator": lbt.design.optimal_integrator(config.hardware, config.truth),
+        "integrator": lbt.integrator(config.hardware, truth=config.truth),
         "prior": prior(15),
         "turned": turn_states(prior(3)),
     }

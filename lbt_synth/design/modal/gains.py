@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from scipy.signal import welch
 from scipy.special import comb
 
-from lbt_synth.design.integrator import PURE, TRIED_GAINS, hardware_gain_limit
+from lbt_synth.design.integrator import PURE, TRIED_GAINS, integrator_gain_limit
 from lbt_synth.design.modal.stack import Vibrations, lines_per_mode, number_per_mode
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels, graded_edges
@@ -328,7 +328,7 @@ def _find_gains(
     sensor's.
     """
     least, most = TRIED_GAINS
-    rate, limit = path.frame_rate_hz, hardware_gain_limit(path)
+    rate, limit = path.frame_rate_hz, integrator_gain_limit(path)
     noise_nm2 = (noise_nm / gain) ** 2
     distance = number(margin, "margin", at_least=round(1 - most, 9), below=1)
     loop_gains = np.geomspace(least, _HIGHEST, _GRID) * limit

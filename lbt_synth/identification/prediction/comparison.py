@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design import Design, model_integrator
+from lbt_synth.design import Design, integrator
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification.accelerometers.readings import Channels
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
@@ -183,7 +183,7 @@ def prediction_against_data(
     fit, later = split_halves(runs, len(series))
     test = settled_test(runs, later, hardware)
     noise = mode_noise(hardware, plant.R, noise_error_nm)
-    designs = {INTEGRATOR: model_integrator(plant), **controllers}
+    designs = {INTEGRATOR: integrator(plant.hardware, truth=plant), **controllers}
     if {RAN, INTEGRATOR, LIMIT} & set(controllers):
         raise ProblemError(
             f"no controller may be called {RAN}, {INTEGRATOR} or {LIMIT}, as other rows are; got "

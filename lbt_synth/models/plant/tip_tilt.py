@@ -193,14 +193,14 @@ class TipTiltPlant(EstimationProblem):
         >>> [plant.ahead(frames).hardware.delay_frames for frames in (0, 1, 2)]
         [1.0, 2.0, 3.0]
         """
-        steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON)
+        steps = integer(frames, "frames", at_least=-LONGEST_HORIZON)
         if steps == 1:
             return self
         hw = self.hardware
         delay = hw.delay_frames + steps - 1
         if not 1 <= delay <= LONGEST_HORIZON:
             raise ProblemError(
-                f"horizon must leave the loop a delay of 1 to {LONGEST_HORIZON} frames; got "
+                f"frames must leave the loop a delay of 1 to {LONGEST_HORIZON} frames; got "
                 f"{steps}, which makes {delay:g}.",
                 in_python="For an estimate without a loop, make an EstimationProblem of the "
                 "plant's matrices.",

@@ -75,7 +75,7 @@ def design_page(report: DesignReport, *, title: str | None = None) -> Page:
     --------
     >>> import lbt_synth as lbt
     >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
+    >>> slow = lbt.integrator(config.hardware, truth=config.truth)
     >>> report = lbt.report.design_report(config, {"integrator": slow})
     >>> lbt.report.design_page(report, title="Tonight").title
     'Tonight'

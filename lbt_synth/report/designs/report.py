@@ -240,7 +240,7 @@ def design_report(
     --------
     >>> import lbt_synth as lbt
     >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
+    >>> slow = lbt.integrator(config.hardware, truth=config.truth)
     >>> report = lbt.report.design_report(config, {"integrator": slow})
     >>> one = report.assessments[0]
     >>> one.certified, f"{one.limits.residual_nm:.0f} nm, Strehl {one.limits.strehl:.2f}"

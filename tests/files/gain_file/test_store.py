@@ -225,7 +225,7 @@ def simulated_designs():
     return {
         "kalman": lbt.kalman(loaded.plant),
         "hinf": lbt.hinf(loaded.plant, gamma_ratio=1.2),
-        "integrator": lbt.design.optimal_integrator(loaded.hardware, loaded.truth),
+        "integrator": lbt.integrator(loaded.hardware, truth=loaded.truth),
     }
 
 

@@ -9,7 +9,7 @@ from scipy.stats import qmc
 from support.studies import BASE, load_small_study, study_file
 
 import lbt_synth as lbt
-from lbt_synth.design import optimal_integrator
+from lbt_synth.design import integrator
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.studies.study.study import ParameterSection, unit_points
 
@@ -120,7 +120,7 @@ def test_controllers(tmp_path):
         "kalman for the configuration",
         "hinf (gamma_ratio 1.5) for each sample",
     ]
-    assert d.gain == optimal_integrator(study.config.hardware, study.config.truth).gain
+    assert d.gain == integrator(study.config.hardware, truth=study.config.truth).gain
     assert study.result_columns[:7] == (
         "a.strehl",
         "a.residual_nm",
