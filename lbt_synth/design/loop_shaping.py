@@ -28,11 +28,7 @@ from lbt_synth.design.shaping.channel import (
 )
 from lbt_synth.design.shaping.demands import Bound, Demand, LoopErrors
 from lbt_synth.design.shaping.solution import ModeSolution, reduce_mode, solve_mode
-from lbt_synth.design.shaping.specification import (
-    Specification,
-    specified_limit,
-    violated_demands,
-)
+from lbt_synth.design.shaping.specification import Specification, violated_demands
 from lbt_synth.design.shaping.terms import ResidualVariance, Term, VibrationBand
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
@@ -238,12 +234,6 @@ class ShapedDesign(Design):
     DERIVED: ClassVar[tuple[Column, ...]] = (
         Column(name="states_per_mode", heading="states of one mode, past commands included"),
         Column(name="loss", heading="objective above the long parameter's", unit="%", scale=100),
-        Column(
-            name="limit_nm", heading="least worst residual over its bands, all modes", unit="nm"
-        ),
-        Column(
-            name="above_limit_percent", heading="residual at unit sensor gain above it", unit="%"
-        ),
         Column(name="long_objective_nm", unit="nm"),
     )
 
@@ -341,11 +331,8 @@ class ShapedDesign(Design):
         return violated_demands(self.specifications, self.problem, controller) or ()
 
     def derived(self) -> dict[str, Any]:
-        """Return what the controller is, beside the limits over its bands."""
-        limit_nm, above = specified_limit(self.specifications, self.problem, self.parameters)
-        named = {name: getattr(self, name) for name in ("states_per_mode", "loss")}
-        named["long_objective_nm"] = self.long_objective_nm
-        return {**named, "limit_nm": limit_nm, "above_limit_percent": above}
+        """Return what the reduction cost, and from what."""
+        return {column.name: getattr(self, column.name) for column in self.DERIVED}
 
     def terms_nm(self) -> tuple[tuple[int, str, float], ...]:
         """Residual of each term in the real loop: mode, what it is, [nm rms]."""

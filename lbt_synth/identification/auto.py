@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design import Design, PredictorDesign
+from lbt_synth.design import Design
+from lbt_synth.design.predictor import PredictorDesign
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import CertificateError, NumericalError, SynthesisError
 from lbt_synth.identification.accelerometers.readings import Channels, channels_beside

@@ -12,7 +12,7 @@ from lbt_synth.design.shaping import VibrationBand
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.methods.request import PlantInputs, design_request
-from lbt_synth.models import ARModel, SumSpectrum, TipTiltPlant
+from lbt_synth.models import ARModel, TipTiltPlant
 
 
 @pytest.fixture
@@ -145,16 +145,6 @@ def test_a_band_that_covers_a_wide_resonance_takes_its_place():
         band = VibrationBand(**wide, damping=damping)
         design = lbt.robust(plant, bands=[band], functions=8, states=None, modulus_margin=0.2)
         assert len(design.specifications[0].terms) == terms
-
-
-def test_the_limit_of_a_design_counts_its_wide_resonances():
-    plant = a_plant_with_a_wide_resonance()
-    design = lbt.robust(plant, functions=60, states=None, modulus_margin=0.2)
-    wide = SumSpectrum(parts=[plant.turbulence[0], plant.vibrations[-1].ar_model(800)])
-    truth = lbt.Truth(turbulence=wide, noise_nm=15.5)
-    least = lbt.loop.least_residual(plant.hardware, truth, frame_means=True).rms_nm
-    assert design.facts().limit_nm == pytest.approx(least, rel=1e-9)
-    assert 0 < design.facts().above_limit_percent < 5
 
 
 def test_a_plant_without_lines_has_no_robust_design():

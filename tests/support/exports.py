@@ -8,6 +8,7 @@ from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.design.certificate import Evidence
+from lbt_synth.design.result import SolverReport
 from lbt_synth.validation import set_fields
 
 
@@ -29,7 +30,7 @@ class BareDesign(lbt.Design):
 
 def bare_design(controller):
     """A design of any controller, without a loop."""
-    solver = lbt.design.SolverReport(route="riccati", status="made", iterations=0)
+    solver = SolverReport(route="riccati", status="made", iterations=0)
     return BareDesign(method="kalman", problem=controller, solver=solver)
 
 

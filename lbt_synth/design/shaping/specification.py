@@ -8,36 +8,22 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, get_args
 
 import numpy as np
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.plain import to_plain
-from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, held_fraction, mode_loop
+from lbt_synth.design.shaping.channel import Channel, SingleModeLoop
 from lbt_synth.design.shaping.demands import Bound, CommandRms, Demand, LoopErrors
 from lbt_synth.design.shaping.frequencies import Grid, first_grid
-from lbt_synth.design.shaping.terms import ResidualVariance, Term, VibrationBand, spectrum_of
+from lbt_synth.design.shaping.terms import Term, VibrationBand, spectrum_of
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import Constraint, Function
 from lbt_synth.linear.matrix_functions import component_labels
-from lbt_synth.loop import least_residual, least_worst_residual
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.loop.least_residuals.band_limit import BandLimit
-from lbt_synth.loop.least_residuals.residual_limit import (
-    ResidualLimit,
-    above_percent,
-    limit_or_nan,
-)
-from lbt_synth.models import (
-    ARModel,
-    LoopHardware,
-    Spectrum,
-    Truth,
-)
-from lbt_synth.models.spectra import SumSpectrum
+from lbt_synth.models import ARModel, LoopHardware, Spectrum
 from lbt_synth.validation import BoolArray, FloatArray, sequence, set_fields
 
 _ZERO = 1e-12  # of an entry, over the largest of its matrix
@@ -202,51 +188,3 @@ def _entries(matrix: FloatArray) -> BoolArray:
     """Return where a matrix has an entry that is more than rounding."""
     size = np.abs(matrix)
     return np.asarray(size > _ZERO * np.max(size, initial=0.0))
-
-
-def specified_limit(
-    specifications: Sequence[Specification],
-    hardware: LoopHardware,
-    parameters: Sequence[Controller],
-) -> tuple[float, float]:
-    """Return the limit of the specified spectra [nm rms], and the residual above it [%].
-
-    Both are over all modes at unit sensor gain: the variance plus the worst of the band. They
-    are nan where a mode has no variance at unit gain, or several bands, as the limit of their
-    sum is not known, and where a hold lies in two frames.
-    """
-    if held_fraction(hardware):
-        return np.nan, np.nan
-    limit_nm2, residual_nm2 = 0.0, 0.0
-    for spec, parameter in zip(specifications, parameters, strict=True):
-        at_unit = [term for term in spec.terms if term.sensor_gain == 1]
-        variances = [term for term in at_unit if isinstance(term, ResidualVariance)]
-        bands = [term for term in at_unit if isinstance(term, VibrationBand)]
-        if not variances or len(bands) > 1:
-            return np.nan, np.nan
-        spectra = [each.turbulence for each in variances if each.turbulence is not None]
-        truth = Truth(
-            turbulence=SumSpectrum(parts=tuple(spectra)) if spectra else None,
-            noise_nm=float(np.linalg.norm([each.noise_nm for each in variances])),
-        )
-        found = limit_or_nan(partial(_mode_limit, hardware.single_mode(), truth, bands))
-        loop = mode_loop(hardware, parameter)
-        limit_nm2 += found**2
-        residual_nm2 += sum(term.measured_nm2(loop) for term in at_unit)
-    limit_nm = float(np.sqrt(limit_nm2))
-    return limit_nm, above_percent(float(np.sqrt(residual_nm2)), limit_nm)
-
-
-def _mode_limit(
-    hardware: LoopHardware, truth: Truth, bands: list[VibrationBand]
-) -> ResidualLimit | BandLimit:
-    if not bands:
-        return least_residual(hardware, truth, frame_means=True)
-    return least_worst_residual(
-        hardware,
-        truth,
-        band_hz=(bands[0].low_hz, bands[0].high_hz),
-        rms_nm=bands[0].rms_nm,
-        direction=(1.0,),
-        frame_means=True,
-    )

@@ -20,6 +20,7 @@ from support.refusals import refused
 from support.specula_filters import noise_series, simulate_commands
 
 import lbt_synth as lbt
+from lbt_synth.design.loop_shaping import ShapedDesign
 from lbt_synth.design.record import record_design
 from lbt_synth.errors import GainFileError, OutputError, ProblemError, SchemaVersionError
 from lbt_synth.files.gain_file.store import (
@@ -106,7 +107,7 @@ def test_round_trip_keeps_every_bit(tmp_path, name, ending):
     assert (back.solver, back.claims) == (design.solver, design.claims)
     assert back.certificate.checks == design.certificate.checks
     assert back.recertify().passed
-    if isinstance(design, lbt.design.ShapedDesign):
+    if isinstance(design, ShapedDesign):
         assert back.terms_nm() == design.terms_nm()
     if design.hardware is not None:
         assert back.hardware.suite.is_same(design.hardware.suite)
