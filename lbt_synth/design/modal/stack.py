@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design.certificate import TOLERANCE, Certificate, Check
 from lbt_synth.design.filter_design import FilterDesign
 from lbt_synth.design.kalman import kalman
-from lbt_synth.design.result import UNCERTIFIED, require_hardware
+from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError, UnstableLoopError
 from lbt_synth.loop import EnsembleVibration, LoopEnsemble, residual_budget
 from lbt_synth.loop.closed_loop import require_loop_rate
@@ -24,7 +23,6 @@ from lbt_synth.models import (
     ARModel,
     LoopHardware,
     ModalTurbulence,
-    TipTiltPlant,
     Vibration,
     tip_tilt_plant,
 )
@@ -47,7 +45,6 @@ Lines: TypeAlias = tuple[tuple[Vibration, ...], ...]
 Vibrations: TypeAlias = Mapping[int, Vibration | Sequence[Vibration]]  # of some modes
 
 _NAMED = 5  # modes that a message lists
-_JOINED = "residual of each mode's loop, against that of its design"
 
 
 def number_per_mode(
@@ -133,15 +130,11 @@ class ModalFilters:
         Design of each mode.
     rms_nm : (n,) ndarray
         Residual that each mode's loop leaves in the image under its own model [nm rms].
-    certificate : Certificate
-        That the stack is what its designs are: the loops of all modes, closed as arrays, leave
-        what each design's loop leaves. ``rms_per_output`` is each mode's estimation error.
     """
 
     designs: tuple[FilterDesign, ...]
     which: IntArray
     rms_nm: FloatArray
-    certificate: Certificate
 
     @property
     def n_modes(self) -> int:
@@ -259,45 +252,15 @@ def modal_filters(
             modes=1,
             mirror=hardware.mirror,
         )
-        design = _design_filter(plant, modes)
+        try:
+            design = kalman(plant)
+        except LbtSynthError as error:
+            error.args = (f"the filter of {name_modes(modes)}: {error}",)
+            raise
         which[modes] = len(designs)
         rms_nm[modes] = residual_budget(design.close(plant.hardware), plant).rms_nm
         designs.append(design)
-    filters = ModalFilters(
-        designs=tuple(designs),
-        which=read_only(which),
-        rms_nm=read_only(rms_nm),
-        certificate=UNCERTIFIED,
-    )
-    stacked = modal_residuals(
-        filters,
-        turbulence,
-        hardware=hardware,
-        noise_nm=noise,
-        vibrations=vibrations,
-        sensor_gain=gain,
-    )
-    errors = frozen_copy(np.array([design.rms for design in designs])[which])
-    joined = replace(UNCERTIFIED, checks=(joining_check(stacked, rms_nm),), rms_per_output=errors)
-    return replace(filters, certificate=joined.require("Scale these modes to sizes that occur."))
-
-
-def _design_filter(plant: TipTiltPlant, modes: list[int]) -> FilterDesign:
-    """Design the filter of a mode; an error names all modes that it is for."""
-    try:
-        return kalman(plant)
-    except LbtSynthError as error:
-        error.args = (f"the filter of {name_modes(modes)}: {error}",)
-        raise
-
-
-def joining_check(stacked: FloatArray, alone: FloatArray) -> Check:
-    """Check the residuals (n,) of the loops of all modes against those of their designs."""
-    apart = np.abs((stacked / alone) ** 2 - 1)
-    failing = np.flatnonzero(~(apart < TOLERANCE))
-    name = f"{_JOINED} ({name_modes(failing)})" if failing.size else _JOINED
-    how = "relative variance, loops as arrays and one by one"
-    return Check(name, float(np.max(apart)), TOLERANCE, how)
+    return ModalFilters(designs=tuple(designs), which=read_only(which), rms_nm=read_only(rms_nm))
 
 
 def modal_residuals(
