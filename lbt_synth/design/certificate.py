@@ -222,20 +222,26 @@ def _rounding(error: StateSpace) -> float:
     return max(float(_NOTHING * through), _TINY)
 
 
-def certify_infeasible(problem: EstimationProblem, level: float, witness: Witness) -> Check:
-    """Check that a witness proves what is claimed of it: no filter below a level of gamma.
+def proved_level(problem: EstimationProblem, witness: Witness | None) -> float:
+    """Return a level of gamma that a witness proves no filter to reach; 0 without one.
 
     The covariance of the Kalman filter, by the Riccati equation, enters in two places only: it
     weighs what rounding took from the proof, and it spans the space of the estimation error.
     """
+    if witness is None:
+        return 0.0
     x, w, sizes = witness.states, witness.disturbances, problem.B.shape[-2:]
     if (x.shape[-2], w.shape[-2]) != sizes:
         raise DimensionError(
             f"a witness must have {sizes[0]} rows of states, {sizes[1]} rows of "
             f"disturbances and as many columns in both; got {x.shape} and {w.shape}."
         )
-    proved = infeasible_level(problem, witness, kalman_riccati(problem).P)
-    above = level / max(proved, _TINY) - 1
+    return infeasible_level(problem, witness, kalman_riccati(problem).P)
+
+
+def certify_infeasible(problem: EstimationProblem, level: float, witness: Witness | None) -> Check:
+    """Check that a witness proves a level, to a relative 1e-9; a level of 0 claims nothing."""
+    above = level / max(proved_level(problem, witness), _TINY) - 1
     name = "infeasible level over the level proved, less 1"
     return Check(name, above, INFEASIBLE_TOLERANCE, BY_DISTURBANCES)
 

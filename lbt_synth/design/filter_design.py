@@ -96,7 +96,7 @@ def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
     value = level / evidence.certificate.gamma - 1
     name = "infeasible level over the norm achieved, less 1"
     yield Check(name, value, INFEASIBLE_TOLERANCE, LEVEL_SETS)
-    proved = certify_infeasible(problem, level, evidence.design.proof)
+    proved = certify_infeasible(problem, level, evidence.design.witness)
     below = -proved.value / (1 + proved.value)
     yield proved
     name = "level proved over the infeasible level, less 1"
@@ -212,15 +212,6 @@ class FilterDesign(Design):
     def make_controller(self) -> Controller:
         """Return the controller of the predictor gain."""
         return self.problem.controller(self.gain_predictor)
-
-    @property
-    def proof(self) -> Witness:
-        """The witness; without one, no disturbance at all, which proves nothing."""
-        (n, p), N = self.problem.B.shape[-2:], self.problem.period
-        shapes = [(N, n, 1), (N, p, 1)] if N > 1 else [(n, 1), (p, 1)]
-        states, disturbances = (np.zeros(shape) for shape in shapes)
-        nothing = Witness(states=states, disturbances=disturbances)
-        return self.witness or nothing
 
     @property
     def is_bounded(self) -> bool:

@@ -210,23 +210,7 @@ class TermRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ShapedDesign(Design):
-    """A controller shaped in the closed loop, mode by mode.
-
-    It claims the root of the objective of each mode [nm].
-
-    Attributes
-    ----------
-    problem : LoopHardware
-        The loop.
-    specifications : tuple of Specification
-        One per mode.
-    parameters : tuple of Controller
-        Youla parameter of each mode, from its pseudo-open-loop measurement to its command.
-    long_objective_nm : tuple of float
-        Objective of the long parameter, before it was reduced [nm]; the solver's word.
-    long_functions : int
-        Functions of the long parameter.
-    """
+    """A controller shaped in the closed loop; it claims the root of each objective [nm]."""
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
         Claim(name="objective_nm", unit="nm", checks=_check_objective),
@@ -238,10 +222,11 @@ class ShapedDesign(Design):
     )
 
     problem: LoopHardware
-    specifications: tuple[Specification, ...]
+    specifications: tuple[Specification, ...]  # one per mode
+    # Youla parameter of each mode, from its pseudo-open-loop measurement to its command
     parameters: tuple[Controller, ...]
-    long_objective_nm: tuple[float, ...]
-    long_functions: int
+    long_objective_nm: tuple[float, ...]  # before the reduction [nm]; the solver's word
+    long_functions: int  # of the long parameter
 
     def __post_init__(self) -> None:
         per_mode = self.specifications, self.parameters, self.objective_nm, self.long_objective_nm

@@ -106,17 +106,6 @@ class LqgDesign(Design):
     The commands are ``N u(k) = gain_state x_hat(k+1|k) - N gain_mirror m(k)``, with x the
     states of :attr:`estimation` and m those of the mirror's core, one set a command. The
     error, with ``rms`` and ``gamma``, is the residual of the loop in the pieces of a hold.
-
-    Attributes
-    ----------
-    problem : TipTiltPlant
-        The plant, with the loop and the mirror.
-    gain_predictor : (n, q) ndarray
-        Kalman gain of the estimation.
-    gain_state : (modes, n) ndarray
-        From the predicted disturbance to the command of each mode.
-    gain_mirror : (c,) ndarray
-        From the states of the mirror's core to the command.
     """
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
@@ -129,9 +118,9 @@ class LqgDesign(Design):
     is_estimator: ClassVar[bool] = True
 
     problem: TipTiltPlant
-    gain_predictor: FloatArray
-    gain_state: FloatArray
-    gain_mirror: Vector
+    gain_predictor: FloatArray  # (n, q): Kalman gain of the estimation
+    gain_state: FloatArray  # (modes, n): from the predicted disturbance to each mode's command
+    gain_mirror: Vector  # (c,): from the states of the mirror's core to the command
 
     def __post_init__(self) -> None:
         model, mirror = self.estimation, mirror_core(self.problem)

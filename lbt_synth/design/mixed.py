@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
+from lbt_synth.design.certificate import proved_level
 from lbt_synth.design.filter_design import FilterDesign, filter_design
 from lbt_synth.design.hinf import hinf, require_reachable
 from lbt_synth.design.kalman import kalman
@@ -19,8 +20,8 @@ from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import (
     EstimationProblem,
     StateSpace,
+    Witness,
     hinf_norm,
-    infeasible_level,
     largest_singular_values,
 )
 from lbt_synth.linear.estimation_problem import require_problem
@@ -172,10 +173,8 @@ def _mixed_design(
     extended = problem.with_memory(taps)
     size, q = taps.shape[1], base.gain_predictor.shape[1]
     gain = _extend_gain(base.gain_predictor, size // q)
-    padding = np.zeros((size, least.proof.states.shape[1]))
-    states = frozen_copy(np.vstack([least.proof.states, padding]))
-    witness = replace(least.proof, states=states)
-    proved = infeasible_level(extended, witness, kalman_riccati(extended).P)
+    witness = least.witness and _padded(least.witness, size)
+    proved = proved_level(extended, witness)
     innovation_gain = np.vstack([base.gain_filter, np.zeros((size, q))])
     return filter_design(
         extended,
@@ -187,6 +186,12 @@ def _mixed_design(
         witness=witness,
         **claims,
     )
+
+
+def _padded(witness: Witness, size: int) -> Witness:
+    """Return a witness of a problem with further states, which are zero."""
+    padding = np.zeros((size, witness.states.shape[1]))
+    return replace(witness, states=frozen_copy(np.vstack([witness.states, padding])))
 
 
 def _extend_gain(gain_predictor: FloatArray, length: int) -> FloatArray:

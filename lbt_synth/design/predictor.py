@@ -55,14 +55,6 @@ class PredictorDesign(Design):
     It claims what it leaves on frames of its record that it was not fitted to, as does its
     fall-back without the other sensors [nm rms], and the command that a reading of unit white noise
     makes, for each reading of both filters.
-
-    Attributes
-    ----------
-    problem : LoopHardware
-        The loop, with the sensors that are read.
-    parameters : tuple of Controller
-        The filter from the pseudo-open-loop measurement and the readings of all other sensors to
-        the command; where there are others, one without them as a fall-back.
     """
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
@@ -78,7 +70,9 @@ class PredictorDesign(Design):
         Column(name="gain_high", heading="stable gain factors, to", format=".4g"),
     )
 
-    problem: LoopHardware
+    problem: LoopHardware  # with the sensors that are read
+    # the filter from the pseudo-open-loop measurement and the readings of all other sensors to
+    # the command; where there are others, one without them as a fall-back
     parameters: tuple[Controller, ...]
 
     def make_controller(self) -> Controller:

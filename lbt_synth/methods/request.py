@@ -114,12 +114,6 @@ def _describe_stranger(option: str, method: Method, called: str, words: Wording)
     return f"{place} is no option of {called}; {suggest_word(words.name(option), known)}"
 
 
-def _extra(method: Method, option: str) -> dict[str, Any]:
-    """Return what an option says beyond its type: advice where it is refused."""
-    extra = method.options.model_fields[option].json_schema_extra
-    return extra if isinstance(extra, dict) else {}
-
-
 def _describe_error(error: ValidationError, method: Method, where: str, words: Wording) -> str:
     first = error.errors()[0]
     option = str(first["loc"][0])
@@ -135,7 +129,8 @@ def _describe_error(error: ValidationError, method: Method, where: str, words: W
         text = text.replace(long, short)
     got = first["input"]
     shown = f"{got:g}" if isinstance(got, float) else repr(got)
-    hint = _extra(method, option).get("hint", "")
+    extra = field.json_schema_extra  # advice where it is refused
+    hint = extra.get("hint", "") if isinstance(extra, dict) else ""
     return f"{words.place_of(option)} must be {text}; got {shown}. {hint}".rstrip()
 
 

@@ -47,14 +47,13 @@ def test_a_moving_gain_is_demanded_and_kept_in_the_file(small, tmp_path):
 
 
 def test_every_demand_of_the_file_reaches_the_specification(small):
-    section = """    noise_peak: 3.0
-    delay_error_frames: 0.2
+    section = """    delay_error_frames: 0.2
     command_stroke_nm: 900.0
     command_step_nm: 200.0
-    attenuation:
-      - {low_hz: 0.0, high_hz: 1.0, at_most: 0.2}
-    mirror_uncertainty:
-      - {relative: 0.2, low_hz: 200.0, high_hz: 400.0}
+    bounds:
+      - {response: noise, at_most: 3.0}
+      - {response: rejection, low_hz: 0.0, high_hz: 1.0, at_most: 0.2}
+      - {response: complementary, at_most: 5.0, low_hz: 200.0, high_hz: 400.0}
 """
     design = lbt.load_config(small(SMALL + section)).design("robust")
     assert [demand.label for demand in design.specifications[0].demands] == [
