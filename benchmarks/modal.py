@@ -63,7 +63,7 @@ def main() -> None:
     print("with a vibration of 563.6 nm at 20 Hz on tip and on tilt:")
     gains = lbt.design.modal.modal_gains(modes, **known, vibrations=shaken)
     tilt = lbt.design.modal.modal_filters(
-        [modes.model(0), modes.model(1)], hardware=path, noise_nm=noise[:2], vibrations=shaken
+        [modes.take(0), modes.take(1)], hardware=path, noise_nm=noise[:2], vibrations=shaken
     )
     mixed = lbt.design.modal.MixedController(filter=tilt, gains=gains.gains)
     every = lbt.design.modal.modal_filters(modes, **known, vibrations=shaken)

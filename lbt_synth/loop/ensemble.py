@@ -18,7 +18,6 @@ from lbt_synth.models import (
     ARModel,
     FrozenFlows,
     LoopHardware,
-    ModalTurbulence,
     SinusoidalVibration,
     Spectrum,
     Vibration,
@@ -39,7 +38,7 @@ from lbt_synth.validation import (
     set_fields,
 )
 
-Turbulence: TypeAlias = Spectrum | FrozenFlows | ModalTurbulence
+Turbulence: TypeAlias = Spectrum | FrozenFlows
 _TOGETHER = 2048  # loops with the same frequencies: as many as repay their panels
 
 
@@ -114,9 +113,9 @@ class LoopEnsemble:
         Real total delay [frames], 1 to 20; that of the loop by default.
     noise_nm : float, (p,) or (p, q) array_like, optional
         Standard deviation of the noise on each measurement per frame [nm].
-    turbulence : Spectrum, FrozenFlows, ModalTurbulence, sequence of these, or None, optional
+    turbulence : Spectrum, FrozenFlows, sequence of these, or None, optional
         Spectrum of each mode, the modes independent: one for all of them, or one per mode. A
-        FrozenFlows or ModalTurbulence holds one per loop, any other spectrum serves all loops.
+        FrozenFlows or a stack of AR models holds one per loop, another spectrum serves all loops.
     vibrations : sequence of EnsembleVibration, optional
         The vibrations.
     loops : int, optional
@@ -240,12 +239,12 @@ def _turbulence_values(turbulence: Turbulence | None) -> list[FloatArray]:
     if isinstance(turbulence, FrozenFlows):
         values = turbulence.seeing_arcsec, turbulence.wind_speed_m_s, turbulence.outer_scale_m
         return [value for value in values if value is not None]
-    if isinstance(turbulence, ModalTurbulence):
+    if isinstance(turbulence, ARModel) and turbulence.coefficients.ndim > 1:
         return [*turbulence.coefficients.T, turbulence.driving_rms_nm]
     if turbulence is not None and not isinstance(turbulence, Spectrum):
         raise ProblemError(
-            "turbulence must be a spectrum, FrozenFlows, ModalTurbulence or None, or a sequence of "
-            f"these; got {type(turbulence).__name__}."
+            "turbulence must be a spectrum, FrozenFlows or None, or a sequence of these; got "
+            f" {type(turbulence).__name__}."
         )
     return []
 
@@ -254,9 +253,8 @@ def turbulence_rows(turbulence: Turbulence, rows: IntArray) -> Turbulence:
     """Return the turbulence of some loops."""
     if isinstance(turbulence, FrozenFlows) and len(turbulence) > 1:
         return turbulence.take(rows)
-    if isinstance(turbulence, ModalTurbulence) and turbulence.n_modes > 1:
-        a, driving = turbulence.coefficients[rows], turbulence.driving_rms_nm[rows]
-        return replace(turbulence, coefficients=a, driving_rms_nm=driving)
+    if isinstance(turbulence, ARModel) and turbulence.count > 1:
+        return turbulence.take(rows)
     return turbulence
 
 
@@ -340,7 +338,7 @@ def residuals_from_matrices(
     """Evaluate controllers ``A, B, C, D`` in textbook form, (1 or p, ., .) each."""
     turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
     for spectrum, _ in turbulence:
-        if isinstance(spectrum, ARModel | ModalTurbulence):
+        if isinstance(spectrum, ARModel):
             require_loop_rate(spectrum.frame_rate_hz, hardware)
     stable, groups = close_loops(matrices, hardware, ensemble.gains(), ensemble.delays(hardware))
     noise_nm, n, p = ensemble.noise(hardware), hardware.modes, ensemble.loops

@@ -26,7 +26,7 @@ from lbt_synth.linear import StateSpace
 from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_rule
-from lbt_synth.models import ARModel, FrozenFlows, ModalTurbulence, Spectrum
+from lbt_synth.models import ARModel, FrozenFlows, Spectrum
 from lbt_synth.models.mirror.frame_rate_system import Hold
 from lbt_synth.models.spectra import breakpoints_below, companions, densities, spectrum_density
 from lbt_synth.storage.display_unit import nm_text
@@ -35,7 +35,7 @@ from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
 # one for all modes and loops, or one for each loop
-Turbulence: TypeAlias = Spectrum | FrozenFlows | ModalTurbulence
+Turbulence: TypeAlias = Spectrum | FrozenFlows
 # from cycles per frame (f,), the share (f,) of a phase that its means are, and entries (k or 1, n,
 # w), to the rows of a loop, piece by piece
 _Response: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], Iterable[ComplexArray]]
@@ -130,7 +130,7 @@ class Evaluator:
 
     def of_turbulence(self, spectrum: Turbulence, entry: FloatArray) -> FloatArray:
         """Return what phases of a spectrum leave, or of sampled processes."""
-        if isinstance(spectrum, ARModel | ModalTurbulence):
+        if isinstance(spectrum, ARModel):
             coefficients = np.atleast_2d(spectrum.coefficients)
             return self.of_process(coefficients, np.atleast_1d(spectrum.driving_rms_nm), entry)
 

@@ -22,7 +22,6 @@ from lbt_synth.loop.ensemble import residuals_from_matrices, turbulence_rows
 from lbt_synth.models import (
     ARModel,
     LoopHardware,
-    ModalTurbulence,
     Vibration,
     tip_tilt_plant,
 )
@@ -165,7 +164,7 @@ class ModalFilters:
 
 
 def modal_filters(
-    turbulence: ModalTurbulence | Sequence[ARModel],
+    turbulence: ARModel | Sequence[ARModel],
     *,
     hardware: LoopHardware,
     noise_nm: ArrayLike,
@@ -185,7 +184,7 @@ def modal_filters(
 
     Parameters
     ----------
-    turbulence : ModalTurbulence or sequence of ARModel
+    turbulence : ARModel or sequence of ARModel
         Turbulence of each mode.
     hardware : LoopHardware
         Delay, mirror and frame rate of all modes; its matrices play no part.
@@ -213,7 +212,7 @@ def modal_filters(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> air = lbt.models.ModalTurbulence(
+    >>> air = lbt.models.ARModel(
     ...     coefficients=[[0.9886], [0.98]], driving_rms_nm=[89.1, 20.0], frame_rate_hz=800
     ... )
     >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
@@ -227,10 +226,9 @@ def modal_filters(
     ([142.5, 31.6], True)
     """
     require_instance(hardware, LoopHardware, "hardware")
-    if not isinstance(turbulence, ModalTurbulence):
-        turbulence = ModalTurbulence.of(turbulence)
+    turbulence = ARModel.stack(turbulence)
     require_loop_rate(turbulence.frame_rate_hz, hardware)
-    n = turbulence.n_modes
+    n = turbulence.count
     noise = number_per_mode(noise_nm, "noise_nm", n)
     gain = number_per_mode(sensor_gain, "sensor_gain", n)
     lines = lines_per_mode(vibrations, n)
@@ -244,7 +242,7 @@ def modal_filters(
         first = modes[0]
         plant = tip_tilt_plant(
             frame_rate_hz=turbulence.frame_rate_hz,
-            turbulence=turbulence.model(first),
+            turbulence=turbulence.take(first),
             vibrations=lines[first] or None,
             noise_nm=float(noise[first]),
             delay_frames=hardware.delay_frames,
@@ -265,7 +263,7 @@ def modal_filters(
 
 def modal_residuals(
     controller: MixedController | ModalFilters,
-    turbulence: ModalTurbulence | Sequence[ARModel],
+    turbulence: ARModel | Sequence[ARModel],
     *,
     hardware: LoopHardware,
     noise_nm: ArrayLike,
@@ -279,7 +277,7 @@ def modal_residuals(
     ----------
     controller : MixedController or ModalFilters
         Controllers of the modes.
-    turbulence : ModalTurbulence or sequence of ARModel
+    turbulence : ARModel or sequence of ARModel
         Turbulence of each mode, as means over frames.
     hardware : LoopHardware
         Real delay, mirror and frame rate; its matrices play no part.
@@ -309,7 +307,7 @@ def modal_residuals(
     --------
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> air = lbt.models.ModalTurbulence(
+    >>> air = lbt.models.ARModel(
     ...     coefficients=[[0.99], [0.99]], driving_rms_nm=[10.0, 5.0], frame_rate_hz=800
     ... )
     >>> control = lbt.design.modal.MixedController(gains=[0.5, 0.4])
@@ -329,11 +327,10 @@ def modal_residuals(
             f"hardware must have the frame rate of the filters, {own.frame_rate_hz:.6g} Hz; got "
             f"{path.frame_rate_hz:.6g} Hz."
         )
-    if not isinstance(turbulence, ModalTurbulence):
-        turbulence = ModalTurbulence.of(turbulence)
+    turbulence = ARModel.stack(turbulence)
     n = controller.n_modes
-    if turbulence.n_modes != n:
-        raise DimensionError(f"turbulence must have {n} modes; got {turbulence.n_modes}.")
+    if turbulence.count != n:
+        raise DimensionError(f"turbulence must have {n} modes; got {turbulence.count}.")
     require_loop_rate(turbulence.frame_rate_hz, path)
     noise = number_per_mode(noise_nm, "noise_nm", n, zero=True)
     gain = number_per_mode(sensor_gain, "sensor_gain", n)
@@ -360,7 +357,7 @@ def _residuals(
     bank: Bank,
     hardware: LoopHardware,
     sensor_gain: FloatArray,
-    turbulence: ModalTurbulence,
+    turbulence: ARModel,
     noise_nm: FloatArray,
     lines: Lines,
     *,
