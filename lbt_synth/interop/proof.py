@@ -321,16 +321,11 @@ def _demand_checks(
     """Check the demands on each mode in the loop as written; equal modes once."""
     if not design.mode_specifications:
         return []
-    hardware, s = loop.hardware, loop.system
-    n, m = hardware.modes, hardware.n_commands
-    to_modes = np.zeros((3 * n, len(s.C)))
-    to_modes[:n, :n] = np.eye(n)
-    to_modes[n : 2 * n, n : n + m] = hardware.influence
-    to_modes[2 * n :, n + m :] = np.linalg.pinv(hardware.sensor)
-    modal = replace(loop, system=replace(s, C=to_modes @ s.C, D=to_modes @ s.D))
     checks = []
     for mode in sorted(set(design.first_equal_modes)):
-        mode_alone = _mode_of(modal, mode, slice(mode, None, n))
+        mode_alone = SingleModeLoop(
+            hardware=loop.hardware, controller=loop.controller, mode=mode, in_frames=True
+        )
         for demand in design.mode_specifications[mode].demands:
             more = _demand_change(demand, change) if change else 0.0
             for check in demand.checks(mode_alone):

@@ -25,7 +25,6 @@ from lbt_synth.loop.stable_range import (
     CIRCLE_LIMIT,
     LoopChange,
     append_taps,
-    circle_norm,
     loop_changes,
 )
 from lbt_synth.models import LoopHardware, Spectrum
@@ -138,7 +137,7 @@ class Bound:
         """Check the real loop, by level sets."""
         closed, name = loop.at(self.sensor_gain), f"peak of the {self.response}"
         responses = {"rejection": closed.rejection, "noise": closed.noise_propagation}
-        system = responses.get(self.response, lambda: loop.complementary)()
+        system = responses.get(self.response, loop.complementary)()
         if self.high_hz is None:
             peak = hinf_norm(system).upper
         else:
@@ -339,7 +338,10 @@ class LoopErrors:
             for gain, delay_frames, taps in self._changes(loop.hardware)
         ]
         if self.moving:
-            value = circle_norm(loop.at(1.0), low=self.low, high=self.high)
+            middle, value = (self.low + self.high) / 2, np.inf
+            if loop.at(middle).is_stable:
+                peak = hinf_norm(loop.complementary(middle)).upper
+                value = (self.high - self.low) / (2 * middle) * peak
             name = f"circle criterion of a moving gain, {self.low:g} to {self.high:g}"
             checks.append(Check(name, value, CIRCLE_LIMIT, LEVEL_SETS))
         return tuple(checks)
