@@ -32,10 +32,12 @@ from lbt_synth.design.certificate import (
 )
 from lbt_synth.design.result import (
     MODEL_LIMITS,
+    SENSOR_FACTS,
     Design,
     RowTable,
     SolverReport,
     model_limits,
+    sensor_facts,
     with_certificate,
 )
 from lbt_synth.errors import NumericalError, ProblemError
@@ -48,7 +50,7 @@ from lbt_synth.linear.riccati.filtering import (
     kalman_riccati,
     meets_level,
 )
-from lbt_synth.loop import ClosedLoop, close_loop, residual_budget, stable_sensor_gains
+from lbt_synth.loop import ClosedLoop, close_loop, residual_budget
 from lbt_synth.loop.budget import model_readings
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import Column, column, nm_column, table_row
@@ -183,11 +185,8 @@ class FilterDesign(Design):
     )
     DERIVED: ClassVar[tuple[Column, ...]] = (
         *MODEL_LIMITS,
-        Column(name="sensors", heading="sensors and channels"),
+        *SENSOR_FACTS,
         Column(name="period", heading="common period", unit="frames"),
-        Column(name="loop_radius", heading="spectral radius of the loop, over a period"),
-        Column(name="gain_low", heading="stable gain factors, from", format=".4g"),
-        Column(name="gain_high", heading="stable gain factors, to", format=".4g"),
         Column(
             name="dwell_frames",
             heading="stable if sensors fail or return no sooner than after",
@@ -232,15 +231,9 @@ class FilterDesign(Design):
         plant = self.problem
         if not reads_several(plant):
             return dict(model_limits(self))
-        low, high = stable_sensor_gains(plant.hardware, self.controller)
-        return {
-            "sensors": ", ".join(plant.hardware.suite.units),
-            "period": plant.period,
-            "loop_radius": self.close(plant.hardware).spectral_radius,
-            "gain_low": low,
-            "gain_high": high,
-            "dwell_frames": dwell_frames(plant, self.gain_predictor, self.fallbacks),
-        }
+        dwell = dwell_frames(plant, self.gain_predictor, self.fallbacks)
+        facts = sensor_facts(self, plant.hardware)
+        return {**facts, "period": plant.period, "dwell_frames": dwell}
 
     @property
     def controllers(self) -> dict[frozenset[str], Controller]:

@@ -15,12 +15,20 @@ import numpy as np
 from scipy.linalg import block_diag, svd
 
 from lbt_synth.design.certificate import TOLERANCE, Check, Claim, Evidence, stability_check
-from lbt_synth.design.result import UNCERTIFIED, Design, RowTable, SolverReport, with_certificate
+from lbt_synth.design.result import (
+    SENSOR_FACTS,
+    UNCERTIFIED,
+    Design,
+    RowTable,
+    SolverReport,
+    sensor_facts,
+    with_certificate,
+)
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
-from lbt_synth.loop import close_loop, stable_sensor_gains
+from lbt_synth.loop import close_loop
 from lbt_synth.loop.closed_loop import youla_controller, youla_parameter
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import Column, column, table_row
@@ -63,12 +71,7 @@ class PredictorDesign(Design):
         Claim(name="alone_nm", heading="residual of the fall-back on these frames", unit="nm"),
         Claim(name="command_rms", checks=_check_noise),
     )
-    DERIVED: ClassVar[tuple[Column, ...]] = (
-        Column(name="sensors", heading="sensors and channels"),
-        Column(name="loop_radius", heading="spectral radius of the loop"),
-        Column(name="gain_low", heading="stable gain factors, from", format=".4g"),
-        Column(name="gain_high", heading="stable gain factors, to", format=".4g"),
-    )
+    DERIVED: ClassVar[tuple[Column, ...]] = SENSOR_FACTS
 
     problem: LoopHardware  # with the sensors that are read
     # the filter from the pseudo-open-loop measurement and the readings of all other sensors to
@@ -104,13 +107,7 @@ class PredictorDesign(Design):
 
     def derived(self) -> dict[str, Any]:
         """Return the sensors, and where the loop is stable."""
-        low, high = stable_sensor_gains(self.problem, self.controller)
-        return {
-            "sensors": ", ".join(self.problem.suite.units),
-            "loop_radius": self.close(self.problem).spectral_radius,
-            "gain_low": low,
-            "gain_high": high,
-        }
+        return dict(sensor_facts(self, self.problem))
 
     def tables(self) -> tuple[RowTable, ...]:
         """Return what noise of each reading becomes."""

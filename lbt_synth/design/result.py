@@ -12,7 +12,13 @@ import numpy as np
 from lbt_synth.design.certificate import Certificate, Claim, Evidence, stability_check
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
-from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget
+from lbt_synth.loop import (
+    ClosedLoop,
+    close_loop,
+    loop_margins,
+    residual_budget,
+    stable_sensor_gains,
+)
 from lbt_synth.loop.closed_loop import reads_others
 from lbt_synth.loop.least_residuals.residual_limit import (
     above_percent,
@@ -39,6 +45,12 @@ _CERTIFICATE = Column(name="certificate", heading="certificate")
 _BRIEFLY = (
     *("certificate", "gain", "residual_nm", "limit_nm", "gamma"),
     *("modulus", "gain_low", "gain_high", "phase_deg"),
+)
+SENSOR_FACTS = (
+    Column(name="sensors", heading="sensors and channels"),
+    Column(name="loop_radius", heading="spectral radius of the loop, over a period"),
+    Column(name="gain_low", heading="stable gain factors, from", format=".4g"),
+    Column(name="gain_high", heading="stable gain factors, to", format=".4g"),
 )
 MODEL_LIMITS = (
     Column(name="residual_nm", heading="residual in its model, rms", unit="nm"),
@@ -334,6 +346,14 @@ def model_limits(design: Design) -> Mapping[str, float | None]:
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
     values = residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
     return {column.name: value for column, value in zip(MODEL_LIMITS, values, strict=True)}
+
+
+def sensor_facts(design: Design, hardware: LoopHardware) -> Mapping[str, Any]:
+    """Return the sensors of a design, and where its loop is stable."""
+    radius = design.close(hardware).spectral_radius
+    gains = stable_sensor_gains(hardware, design.controller)
+    values = ", ".join(hardware.suite.units), radius, *gains
+    return {column.name: value for column, value in zip(SENSOR_FACTS, values, strict=True)}
 
 
 def without_units(table: Table) -> Table:

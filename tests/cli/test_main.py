@@ -40,7 +40,7 @@ def test_an_error_is_a_status_and_a_line(capsys, monkeypatch, kind, more):
 @pytest.mark.parametrize(
     ("arguments", "expected", "text"),
     [
-        ("design CONFIG --method kalman --gamma 200 -o OUT.fits", 2, "goes with --method hinf"),
+        ("design CONFIG --method kalman --gamma 200 -o OUT.fits", 2, "gamma goes with method hinf"),
         ("design CONFIG --method integrator --gain 1.5 -o OUT.fits", 1, "failed its certificate"),
         ("design CONFIG --method magic -o OUT.fits", 2, "invalid choice"),
         ("design CONFIG", 2, "required"),

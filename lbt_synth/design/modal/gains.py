@@ -137,8 +137,8 @@ def modal_gains(
         return out
 
     edges += [_model_edges(model) for _, model in models]
-    noise = number_per_mode(noise_nm, "noise_nm", count, zero=True)
-    gain = number_per_mode(sensor_gain, "sensor_gain", count)
+    noise = number_per_mode(noise_nm, "noise_nm", count, at_least=0)
+    gain = number_per_mode(sensor_gain, "sensor_gain", count, above=0)
     panels = np.concatenate(edges)
     return _find_gains(path, density, panels, noise_nm=noise, gain=gain, margin=margin)
 
@@ -226,7 +226,7 @@ def modal_gains_from_telemetry(
     y, u = y.T, u.T
     count, frames = y.shape
     segment = integer(segment_frames, "segment_frames", at_least=16)
-    gain = number_per_mode(sensor_gain, "sensor_gain", count)
+    gain = number_per_mode(sensor_gain, "sensor_gain", count, above=0)
     first = len(taps)  # frame whose correction is known
     if frames - first <= segment:
         raise ProblemError(
@@ -247,7 +247,7 @@ def modal_gains_from_telemetry(
         quiet = frequency > _QUIET * rate
         noise = np.sqrt(np.mean(power[:, quiet] / unit[quiet], axis=1)) * gain
     else:
-        noise = number_per_mode(noise_nm, "noise_nm", count, zero=True)
+        noise = number_per_mode(noise_nm, "noise_nm", count, at_least=0)
     table = power - np.outer((noise / gain) ** 2, unit)
 
     def density(wanted: FloatArray) -> FloatArray:

@@ -75,8 +75,8 @@ class MixedController:
         if gains.ndim != 1 or gains.size == 0:
             raise DimensionError(f"gains must be a list, one per mode; got shape {gains.shape}.")
         n = gains.size
-        self.gains = number_per_mode(gains, "gains", n, zero=True)
-        self.leak = number_per_mode(self.leak, "leak", n, zero=True, at_most=1)
+        self.gains = number_per_mode(gains, "gains", n, at_least=0)
+        self.leak = number_per_mode(self.leak, "leak", n, at_least=0, at_most=1)
         modes = np.zeros(0, dtype=np.intp)
         self._running, self._banks = None, ()
         if self.filter is not None:

@@ -32,6 +32,7 @@ from lbt_synth.validation import (
     IntArray,
     frozen_copy,
     integer,
+    number,
     read_only,
     real_array,
     require_instance,
@@ -46,21 +47,15 @@ Vibrations: TypeAlias = Mapping[int, Vibration | Sequence[Vibration]]  # of some
 _NAMED = 5  # modes that a message lists
 
 
-def number_per_mode(
-    value: Any, name: str, modes: int, *, zero: bool = False, at_most: float = np.inf
-) -> FloatArray:
-    """Return one positive number per mode, (n,), from one for all or one each."""
-    given = real_array(value, name)
-    if given.shape not in ((), (modes,)):
-        got = f"shape {given.shape}"
+def number_per_mode(value: Any, name: str, modes: int, **bounds: Any) -> FloatArray:
+    """Return one number per mode, (n,), from one for all or one each, all within bounds."""
+    values = real_array(value, name)
+    if values.shape not in ((), (modes,)):
+        got = f"shape {values.shape}"
         raise DimensionError(f"{name} must be one number, or one per mode ({modes}); got {got}.")
-    low, high = float(np.min(given, initial=np.inf)), float(np.max(given, initial=-np.inf))
-    if low < 0 or (low == 0 and not zero) or high > at_most:
-        bounds = f"{'at least' if zero else 'above'} 0"
-        if at_most < np.inf:
-            bounds += f" and at most {at_most:g}"
-        raise ProblemError(f"{name} must be {bounds}; got {low:.6g} to {high:.6g}.")
-    return frozen_copy(np.broadcast_to(given, (modes,)))
+    for extreme in (np.min(values), np.max(values)):
+        number(extreme, name, **bounds)
+    return frozen_copy(np.broadcast_to(values, (modes,)))
 
 
 def lines_per_mode(vibrations: Vibrations | None, modes: int) -> Lines:
@@ -147,8 +142,8 @@ class ModalFilters:
 
     def design(self, mode: int) -> FilterDesign:
         """Return the design of one mode, from 0; any other is a ProblemError."""
-        number = integer(mode, "mode", at_least=0, at_most=self.n_modes - 1)
-        return self.designs[int(self.which[number])]
+        place = integer(mode, "mode", at_least=0, at_most=self.n_modes - 1)
+        return self.designs[int(self.which[place])]
 
     def banks(self) -> tuple[Bank, ...]:
         """Return the controllers, those of the same size together."""
@@ -229,8 +224,8 @@ def modal_filters(
     turbulence = ARModel.stack(turbulence)
     require_loop_rate(turbulence.frame_rate_hz, hardware)
     n = turbulence.count
-    noise = number_per_mode(noise_nm, "noise_nm", n)
-    gain = number_per_mode(sensor_gain, "sensor_gain", n)
+    noise = number_per_mode(noise_nm, "noise_nm", n, above=0)
+    gain = number_per_mode(sensor_gain, "sensor_gain", n, above=0)
     lines = lines_per_mode(vibrations, n)
     numbers = np.column_stack([turbulence.coefficients, turbulence.driving_rms_nm, noise, gain])
     alike: dict[tuple[object, ...], list[int]] = {}  # modes with the same numbers
@@ -332,8 +327,8 @@ def modal_residuals(
     if turbulence.count != n:
         raise DimensionError(f"turbulence must have {n} modes; got {turbulence.count}.")
     require_loop_rate(turbulence.frame_rate_hz, path)
-    noise = number_per_mode(noise_nm, "noise_nm", n, zero=True)
-    gain = number_per_mode(sensor_gain, "sensor_gain", n)
+    noise = number_per_mode(noise_nm, "noise_nm", n, at_least=0)
+    gain = number_per_mode(sensor_gain, "sensor_gain", n, above=0)
     lines = lines_per_mode(vibrations, n)
     residual, stable = np.zeros(n), np.zeros(n, dtype=np.bool_)
     for bank in controller.banks():

@@ -183,7 +183,7 @@ controllers: {sensor: {design: kalman}} & parameters: {sensor.noise_nm: 4} => bo
 controllers: {a: {}} => expected exactly one of design, file => controllers.a
 controllers: {a: {design: kalmn}} => controllers\.a\.design: method must be one of .*Did you mean kalman\? => controllers.a.design
 controllers: {a: {file: a.fits, for: sample}} => for goes with design
-controllers: {a: {design: kalman, gain: 0.5}} => gain goes with design: integrator
+controllers: {a: {design: kalman, gain: 0.5}} => gain goes with method integrator
 controllers: {a: {design: robust}} => controllers.a: .*design.robust is missing => design.robust
 parameters: {loop.frame_rate_hz: {list: [700, 800, 900]}} => controllers.slow, parameters.loop.frame_rate_hz at 700: the controller must run at
 config: "a\0.yaml" => cannot read .*null byte
