@@ -9,7 +9,6 @@ import argparse
 
 import numpy as np
 from harness import seconds
-from scipy.optimize import minimize_scalar
 
 import lbt_synth as lbt
 from lbt_synth.models.turbulence.ar_models import noll_orders
@@ -33,17 +32,8 @@ def main() -> None:
     path = lbt.LoopHardware(frame_rate_hz=RATE_HZ)
     known = {"hardware": path, "noise_nm": noise}
     optimised = lbt.design.modal.modal_gains(modes, **known)
-
-    def integrators(gains):
-        control = lbt.design.modal.MixedController(gains=gains)
-        return lbt.design.modal.modal_residuals(control, modes, **known)
-
-    best = minimize_scalar(
-        lambda g: total(integrators(np.full(MODES, g))), bounds=(0.01, 0.9), method="bounded"
-    )
     filters = lbt.design.modal.modal_filters(modes, **known)
     rows = {
-        f"integrators, gain {best.x:.2f}": integrators(np.full(MODES, best.x)),
         "integrators, optimised gains": optimised.rms_nm,
         "Kalman filters": filters.rms_nm,
     }
@@ -62,16 +52,9 @@ def main() -> None:
     shaken = {0: [line], 1: [line]}
     print("with a vibration of 563.6 nm at 20 Hz on tip and on tilt:")
     gains = lbt.design.modal.modal_gains(modes, **known, vibrations=shaken)
-    tilt = lbt.design.modal.modal_filters(
-        [modes.take(0), modes.take(1)], hardware=path, noise_nm=noise[:2], vibrations=shaken
-    )
-    mixed = lbt.design.modal.MixedController(filter=tilt, gains=gains.gains)
     every = lbt.design.modal.modal_filters(modes, **known, vibrations=shaken)
     rows_shaken = {
         "integrators, optimised gains": gains.rms_nm,
-        "mixed: tip/tilt Kalman, the rest so": lbt.design.modal.modal_residuals(
-            mixed, modes, **known, vibrations=shaken
-        ),
         "Kalman filters": every.rms_nm,
     }
     for name, rms in rows_shaken.items():

@@ -50,25 +50,42 @@ def path_of(**options):
     return lbt.LoopHardware(**({"frame_rate_hz": RATE} | options))
 
 
-def integrator_residuals(gains, air, *, hardware=None, **conditions):
-    """Return what an integrator for each mode leaves, (n,)."""
-    control = lbt.design.modal.MixedController(gains=gains)
-    hardware = hardware or path_of()
-    return lbt.design.modal.modal_residuals(control, air, hardware=hardware, **conditions)
+def integrator_residuals(gains, air, *, noise_nm, hardware=None, vibrations=None, **conditions):
+    """Return what an integrator for each mode leaves in the image, (n,), nan if unstable."""
+    path, n = (hardware or path_of()).single_mode(), len(gains)
+    lines = {mode: np.atleast_1d(some).tolist() for mode, some in (vibrations or {}).items()}
+    nothing = lbt.Vibration(frequency_hz=20, damping=0.5, rms_nm=1e-9)
+    moving = []
+    for i in range(max(map(len, lines.values()), default=0)):
+        each = [some[i] if len(some := lines.get(mode, [])) > i else nothing for mode in range(n)]
+        frequency_hz = np.array([line.frequency_hz for line in each])
+        moving.append(
+            lbt.loop.EnsembleVibration(
+                frequency_hz=frequency_hz,
+                rms_nm=[line.rms_nm for line in each] / np.sinc(frequency_hz * path.dt_s),
+                damping=[line.damping for line in each],
+                direction=(1.0,),
+            )
+        )
+    ensemble = lbt.loop.LoopEnsemble(
+        loops=n,
+        turbulence=[air],
+        noise_nm=np.broadcast_to(noise_nm, n)[:, None],
+        vibrations=tuple(moving),
+        **conditions,
+    )
+    controllers = [lbt.Controller(A=1.0, B=g, C=1.0, D=0.0, dt_s=path.dt_s) for g in gains]
+    return lbt.loop.ensemble_residuals(controllers, path, ensemble).rms_nm
 
 
-def joint_controller(modal, n):
-    """Return all modes of a controller as one linear controller."""
-    parts = [
-        (np.eye(n)[modes], *matrices)
-        for bank in modal.banks()
-        for modes, *matrices in zip(*bank, strict=True)
-    ]
+def joint_controller(parts, n):
+    """Return controllers of some modes each as one linear controller of all."""
+    parts = [(np.eye(n)[list(modes)], controller) for modes, controller in parts]
     return lbt.Controller(
-        A=block_diag(*(A for _, A, *_ in parts)),
-        B=np.vstack([B @ mode for mode, _, B, _, _ in parts]),
-        C=np.hstack([mode.T @ C for mode, _, _, C, _ in parts]),
-        D=sum(mode.T @ D @ mode for mode, *_, D in parts),
+        A=block_diag(*(k.A for _, k in parts)),
+        B=np.vstack([k.B @ chosen for chosen, k in parts]),
+        C=np.hstack([chosen.T @ k.C for chosen, k in parts]),
+        D=sum(chosen.T @ k.D @ chosen for chosen, k in parts),
         dt_s=1 / RATE,
     )
 

@@ -8,17 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design.modal.stack import Bank, mode_indices, number_per_mode
+from lbt_synth.design.modal.stack import ModalFilters, number_per_mode
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.loop.simulation.run import SteppedController
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, float_array, real_array
+from lbt_synth.validation import FloatArray, float_array, integer, real_array
+
+
+class _Bank(NamedTuple):
+    """N controllers of one size: ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``."""
+
+    modes: np.ndarray  # (N, w), modes of each controller
+    A: FloatArray  # (N, s, s)
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -66,7 +76,7 @@ class MixedController:
     gains: FloatArray
     filtered: Sequence[int] = (0, 1)
     leak: Any = 1.0
-    _banks: tuple[Bank, ...] = field(init=False, repr=False)  # all that is linear
+    _banks: tuple[_Bank, ...] = field(init=False, repr=False)  # all that is linear
     _states: list[FloatArray] = field(init=False, repr=False)  # of the banks
     _running: SteppedController | None = field(init=False, repr=False)  # a filter that is not
 
@@ -80,14 +90,14 @@ class MixedController:
         modes = np.zeros(0, dtype=np.intp)
         self._running, self._banks = None, ()
         if self.filter is not None:
-            modes = mode_indices(self.filtered, "filtered", n)
+            modes = _mode_indices(self.filtered, n)
             self._banks, self._running = _filter_parts(self.filter, modes)
         self.filtered = tuple(modes.tolist())
         others = np.setdiff1d(np.arange(n), modes)
         if others.size:  # an integrator each
             leak, gain = self.leak[others, None, None], self.gains[others, None, None]
             one = np.ones_like(gain)
-            self._banks = (Bank(others[:, None], leak, gain, one, 0 * one), *self._banks)
+            self._banks = (_Bank(others[:, None], leak, gain, one, 0 * one), *self._banks)
         self.reset()
 
     @property
@@ -136,27 +146,25 @@ class MixedController:
             command[bank.modes] = (bank.C @ self._states[i] + bank.D @ entry)[..., 0]
         return command
 
-    def banks(self) -> tuple[Bank, ...]:
-        """Return integrators and filter as banks; one that is only stepped is a ProblemError."""
-        if self._running is not None:
-            raise ProblemError(
-                "only a filter with matrices (a design or a Controller) makes a linear "
-                f"controller; got {type(self._running).__name__}."
-            )
-        return self._banks
-
 
 def _filter_parts(
     given: Any, modes: np.ndarray
-) -> tuple[tuple[Bank, ...], SteppedController | None]:
+) -> tuple[tuple[_Bank, ...], SteppedController | None]:
     """Return a filter as banks for its modes, or as an object to step."""
-    if hasattr(given, "banks"):
-        banks = given.banks()
-        if (count := sum(bank.modes.size for bank in banks)) != modes.size:
+    if isinstance(given, ModalFilters):
+        if given.n_modes != modes.size:
             raise DimensionError(
-                f"the filters must be for the {modes.size} filtered modes; got {count}."
+                f"the filters must be for the {modes.size} filtered modes; got {given.n_modes}."
             )
-        return tuple(bank._replace(modes=modes[bank.modes]) for bank in banks), None
+        controllers = [design.controller for design in given.designs]
+        sizes = np.array([controller.n_states for controller in controllers])[given.which]
+        banks = []
+        for size in np.unique(sizes):
+            some = np.flatnonzero(sizes == size)
+            alike = [controllers[i] for i in given.which[some].tolist()]
+            matrices = (np.stack([getattr(one, name) for one in alike]) for name in "ABCD")
+            banks.append(_Bank(modes[some, None], *matrices))
+        return tuple(banks), None
     if isinstance(given, SteppedController):
         return (), given
     controller = getattr(given, "controller", given)
@@ -171,4 +179,12 @@ def _filter_parts(
             f"the filter must map the {modes.size} filtered modes to as many commands; got "
             f"{D.shape[-1]} measurements and {D.shape[-2]} commands."
         )
-    return (Bank(modes[None], A[None], B[None], C[None], D[None]),), None
+    return (_Bank(modes[None], A[None], B[None], C[None], D[None]),), None
+
+
+def _mode_indices(indices: Any, n: int) -> np.ndarray:
+    """Return different mode numbers from 0 to n - 1 as an integer array."""
+    listed = [integer(index, "filtered", at_least=0, at_most=n - 1) for index in indices]
+    if not listed or len(set(listed)) != len(listed):
+        raise ProblemError(f"filtered must be different mode numbers, at least one; got {listed}.")
+    return np.array(listed, dtype=np.intp)

@@ -1,13 +1,10 @@
-"""A stack of one-mode designs: a Kalman filter for each of many modes, and what all loops leave.
-
-Modes with the same numbers share a design; the loops of all modes are an ensemble.
-"""
+"""A stack of one-mode designs: a Kalman filter for each of many modes, equal modes the same."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,10 +12,9 @@ from numpy.typing import ArrayLike
 from lbt_synth.design.filter_design import FilterDesign
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import require_hardware
-from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError, UnstableLoopError
-from lbt_synth.loop import EnsembleVibration, LoopEnsemble, residual_budget
+from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
+from lbt_synth.loop import residual_budget
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.loop.ensemble import residuals_from_matrices, turbulence_rows
 from lbt_synth.models import (
     ARModel,
     LoopHardware,
@@ -27,7 +23,6 @@ from lbt_synth.models import (
 )
 from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import (
-    BoolArray,
     FloatArray,
     IntArray,
     frozen_copy,
@@ -37,9 +32,6 @@ from lbt_synth.validation import (
     real_array,
     require_instance,
 )
-
-if TYPE_CHECKING:
-    from lbt_synth.design.modal.mixed_controller import MixedController
 
 Lines: TypeAlias = tuple[tuple[Vibration, ...], ...]
 Vibrations: TypeAlias = Mapping[int, Vibration | Sequence[Vibration]]  # of some modes
@@ -77,18 +69,6 @@ def lines_per_mode(vibrations: Vibrations | None, modes: int) -> Lines:
     return tuple(lines)
 
 
-def mode_indices(indices: Any, name: str, n: int) -> np.ndarray:
-    """Return different mode numbers from 0 to n - 1 as an integer array."""
-    if isinstance(indices, str | bytes) or not np.iterable(indices):
-        raise ProblemError(f"{name} must be a list of mode numbers; got {indices!r}.")
-    out = [integer(index, name, at_least=0) for index in indices]
-    if not out:
-        raise ProblemError(f"{name} must name at least one mode; got none.")
-    if len(set(out)) != len(out) or any(index >= n for index in out):
-        raise ProblemError(f"{name} must be different mode numbers from 0 to {n - 1}; got {out}.")
-    return np.array(out, dtype=np.intp)
-
-
 def name_modes(indices: Any) -> str:
     """Text that names some modes: "mode 3", "modes 3, 7, 8 and 12 more"."""
     numbers = [str(int(i)) for i in indices]
@@ -97,19 +77,6 @@ def name_modes(indices: Any) -> str:
     if len(numbers) > _NAMED:
         numbers = [*numbers[:_NAMED], f"{len(numbers) - _NAMED} more"]
     return f"modes {listing_text(numbers)}"
-
-
-class Bank(NamedTuple):
-    """N controllers of the same size that share no mode.
-
-    They are in new-state form, ``x(k+1) = A x(k) + B y(k)``, ``u(k) = C x(k+1) + D y(k)``.
-    """
-
-    modes: np.ndarray  # (N, w), modes of each controller
-    A: FloatArray  # (N, s, s)
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -144,18 +111,6 @@ class ModalFilters:
         """Return the design of one mode, from 0; any other is a ProblemError."""
         place = integer(mode, "mode", at_least=0, at_most=self.n_modes - 1)
         return self.designs[int(self.which[place])]
-
-    def banks(self) -> tuple[Bank, ...]:
-        """Return the controllers, those of the same size together."""
-        controllers = [design.controller for design in self.designs]
-        sizes = np.array([controller.n_states for controller in controllers])[self.which]
-        banks = []
-        for size in np.unique(sizes):
-            modes = np.flatnonzero(sizes == size)
-            some = [controllers[i] for i in self.which[modes].tolist()]
-            matrices = (np.stack([getattr(one, name) for one in some]) for name in "ABCD")
-            banks.append(Bank(modes[:, None], *matrices))
-        return tuple(banks)
 
 
 def modal_filters(
@@ -254,143 +209,3 @@ def modal_filters(
         rms_nm[modes] = residual_budget(design.close(plant.hardware), plant).rms_nm
         designs.append(design)
     return ModalFilters(designs=tuple(designs), which=read_only(which), rms_nm=read_only(rms_nm))
-
-
-def modal_residuals(
-    controller: MixedController | ModalFilters,
-    turbulence: ARModel | Sequence[ARModel],
-    *,
-    hardware: LoopHardware,
-    noise_nm: ArrayLike,
-    vibrations: Vibrations | None = None,
-    sensor_gain: ArrayLike = 1.0,
-    frame_means: bool = False,
-) -> FloatArray:
-    """Exact stationary residual of each mode, with a unit sensor and a mirror of unit gain.
-
-    Parameters
-    ----------
-    controller : MixedController or ModalFilters
-        Controllers of the modes.
-    turbulence : ARModel or sequence of ARModel
-        Turbulence of each mode, as means over frames.
-    hardware : LoopHardware
-        Real delay, mirror and frame rate; its matrices play no part.
-    noise_nm : float or (n,) array_like
-        Measurement noise of each mode per frame [nm], at least 0.
-    vibrations : mapping of int to Vibration or list of them, optional
-        Vibrations of some modes, as means over frames; their directions play no part.
-    sensor_gain : float or (n,) array_like, optional
-        Real sensor (optical) gain, of all modes or of each.
-    frame_means : bool, optional
-        Whether to leave out what moves within frames, as :func:`residual_budget` does.
-
-    Returns
-    -------
-    (n,) ndarray
-        Residual of each mode [nm rms].
-
-    Raises
-    ------
-    UnstableLoopError
-        If a loop is unstable; the message names the modes.
-    ProblemError
-        If the controller is of another kind, sizes clash, a value is out of its range, or frame
-        rates differ.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> air = lbt.models.ARModel(
-    ...     coefficients=[[0.99], [0.99]], driving_rms_nm=[10.0, 5.0], frame_rate_hz=800
-    ... )
-    >>> control = lbt.design.modal.MixedController(gains=[0.5, 0.4])
-    >>> left = lbt.design.modal.modal_residuals(control, air, noise_nm=5.0, hardware=path)
-    >>> left.round(2).tolist()
-    [16.44, 8.6]
-    """
-    require_instance(hardware, LoopHardware, "hardware")
-    if not hasattr(controller, "banks"):
-        raise ProblemError(
-            "controller must be a MixedController or ModalFilters; got "
-            f"{type(controller).__name__}. Try MixedController(gains=gains)."
-        )
-    own, path = controller.hardware, hardware.single_mode()
-    if own is not None and not np.isclose(own.dt_s, path.dt_s, rtol=1e-9):
-        raise ProblemError(
-            f"hardware must have the frame rate of the filters, {own.frame_rate_hz:.6g} Hz; got "
-            f"{path.frame_rate_hz:.6g} Hz."
-        )
-    turbulence = ARModel.stack(turbulence)
-    n = controller.n_modes
-    if turbulence.count != n:
-        raise DimensionError(f"turbulence must have {n} modes; got {turbulence.count}.")
-    require_loop_rate(turbulence.frame_rate_hz, path)
-    noise = number_per_mode(noise_nm, "noise_nm", n, at_least=0)
-    gain = number_per_mode(sensor_gain, "sensor_gain", n, above=0)
-    lines = lines_per_mode(vibrations, n)
-    residual, stable = np.zeros(n), np.zeros(n, dtype=np.bool_)
-    for bank in controller.banks():
-        counts = np.array([len(lines[mode]) for mode in bank.modes[:, 0]])
-        for count in np.unique(counts):  # of vibrations, the same in an ensemble
-            some = Bank(*(stack[counts == count] for stack in bank))
-            rms, stable_loops = _residuals(
-                some, path, gain, turbulence, noise, lines, frame_means=frame_means
-            )
-            residual[some.modes], stable[some.modes] = rms, stable_loops[:, None]
-    if not stable.all():
-        raise UnstableLoopError(
-            "the loop of every mode must be stable; got unstable or marginal ones, "
-            f"{name_modes(np.flatnonzero(~stable))}. Lower their gains, or design for this delay "
-            "and sensor gain."
-        )
-    return read_only(residual)
-
-
-def _residuals(
-    bank: Bank,
-    hardware: LoopHardware,
-    sensor_gain: FloatArray,
-    turbulence: ARModel,
-    noise_nm: FloatArray,
-    lines: Lines,
-    *,
-    frame_means: bool,
-) -> tuple[FloatArray, BoolArray]:
-    """Residuals (N, w) of the loops of a bank, as an ensemble, and which loops are stable (N,).
-
-    The hardware is that of one mode.
-    """
-
-    def share(line: Vibration) -> float:
-        """Return how much of a line's rms is that of its means, if what moves within counts."""
-        return 1.0 if frame_means else float(np.sinc(line.frequency_hz * hardware.dt_s))
-
-    w, gain, columns = bank.modes.shape[1], sensor_gain[bank.modes], list(bank.modes.T)
-    vibrations = [
-        EnsembleVibration(
-            frequency_hz=[lines[mode][i].frequency_hz for mode in column],
-            rms_nm=[lines[mode][i].rms_nm / share(lines[mode][i]) for mode in column],
-            damping=[lines[mode][i].damping for mode in column],
-            direction=axis,
-        )
-        for axis, column in zip(np.eye(w), columns, strict=True)
-        for i in range(len(lines[column[0]]))
-    ]
-    conditions = LoopEnsemble(
-        loops=len(bank.modes),
-        sensor_gain=gain[:, 0] if w == 1 else 1.0,
-        noise_nm=noise_nm[bank.modes],
-        turbulence=[turbulence_rows(turbulence, column) for column in columns],
-        vibrations=tuple(vibrations),
-    )
-    if w > 1:
-        sensor = np.diag(gain[0])
-        hardware = replace(hardware, modes=w, sensor_matrix=sensor, influence_matrix=None)
-    textbook = bank.A, bank.B, bank.C @ bank.A, bank.C @ bank.B + bank.D
-    budget = residuals_from_matrices(textbook, hardware, conditions, in_image=not frame_means)
-    power = (
-        budget.turbulence_nm2 + budget.noise_nm2 + budget.random_vibration_nm2 + budget.within_nm2
-    )
-    return np.sqrt(np.diagonal(power, axis1=1, axis2=2)), budget.stable
