@@ -42,7 +42,6 @@ from lbt_synth.design.result import (
 )
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
-from lbt_synth.linear.estimation_problem import decorrelate
 from lbt_synth.linear.matrix_functions import relative_distance
 from lbt_synth.linear.riccati.filtering import (
     FilterRiccati,
@@ -168,8 +167,6 @@ class FilterDesign(Design):
         The problem (a plant, for a telescope).
     gain_predictor : (n, q) ndarray
         ``(A P C' + S) (C P C' + R)^-1``: of ``x(k+1|k) = A x(k|k-1) + gain (y(k) - C x(k|k-1))``.
-    gain_filter : (n, q) ndarray
-        ``P C' (C P C' + R)^-1``: of ``x(k|k) = x(k|k-1) + gain (y(k) - C x(k|k-1))``.
     witness : Witness or None
         Disturbances that no measurement shows: the proof that no filter reaches
         ``gamma_infeasible``.
@@ -177,7 +174,7 @@ class FilterDesign(Design):
         Where the loop has other sensors beside its own: the filter of the remaining ones, for each
         set of sensors and channels that may fail.
 
-    The gains are (N, n, q) where the sensors have a common period of N frames.
+    The gain is (N, n, q) where the sensors have a common period of N frames.
     """
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
@@ -198,14 +195,12 @@ class FilterDesign(Design):
 
     problem: EstimationProblem
     gain_predictor: FloatArray
-    gain_filter: FloatArray
     witness: Witness | None = None
     fallbacks: tuple[Fallback, ...] = ()
 
     def __post_init__(self) -> None:
-        gains = {"gain_predictor": self.gain_predictor, "gain_filter": self.gain_filter}
-        named = {name: self.problem.checked_gain(gain, name) for name, gain in gains.items()}
-        set_fields(self, **named)
+        gain = self.problem.checked_gain(self.gain_predictor, "gain_predictor")
+        set_fields(self, gain_predictor=gain)
         Design.__post_init__(self)
 
     def make_controller(self) -> Controller:
@@ -270,13 +265,13 @@ class FilterDesign(Design):
         return self.error_system().poles
 
     def examine(self) -> Evidence:
-        """Compute the norms of the error, and check the gains against each other."""
+        """Compute the norms of the error, and check the gains of fall-backs."""
         least = not self.is_bounded
         certificate = certify_filter(self.problem, self.gain_predictor, least_variance=least)
         if not certificate.checks[0].passed:
             return Evidence(design=self, certificate=certificate)
         kalman = kalman_riccati(self.problem)
-        checks = [*certificate.checks, self._gain_check()]
+        checks = list(certificate.checks)
         if reads_several(self.problem):
             checks += fallback_checks(self.problem, self.fallbacks)
         if least:
@@ -285,36 +280,15 @@ class FilterDesign(Design):
         certificate = replace(certificate, checks=tuple(checks))
         return Evidence(design=self, certificate=certificate, kalman=kalman)
 
-    def _gain_check(self) -> Check:
-        """Check that the two gains are of one filter, in the states that go on."""
-        problem, apart = self.problem, 0.0
-        shape = (problem.period, problem.n_states, problem.n_measurements)
-        gains = zip(
-            *(np.reshape(g, shape) for g in (self.gain_predictor, self.gain_filter)), strict=True
-        )
-        for t, (predictor, filtering) in enumerate(gains):
-            A, _, injection = decorrelate(problem, t)
-            rows, goes_on = problem.read[t], np.any(A != 0, axis=1)  # not so an innovation's memory
-            made = A @ filtering[:, rows] + injection
-            off = (made - predictor[:, rows])[goes_on]
-            apart = max(apart, float(np.max(np.abs(off), initial=0.0)))
-        size = max(float(np.max(np.abs(self.gain_predictor), initial=0.0)), 1e-300)
-        value = apart / size
-        how = "A times the filter gain, relative"
-        return Check("predictor gain against the filter gain", value, TOLERANCE, how)
-
 
 def _distance(design: FilterDesign, origin: FilterRiccati) -> float:
-    """Return how far both gains of a filter are from those of a Riccati equation, relative."""
-    gains = np.concatenate([design.gain_predictor, design.gain_filter], axis=-2)
-    other = np.concatenate([origin.gain_predictor, origin.gain_filter], axis=-2)
-    return relative_distance(gains, other)
+    """Return how far the gain of a filter is from that of a Riccati equation, relative."""
+    return relative_distance(design.gain_predictor, origin.gain_predictor)
 
 
 def filter_design(
     problem: EstimationProblem,
     gain_predictor: FloatArray,
-    gain_filter: FloatArray,
     *,
     method: str,
     solver: SolverReport,
@@ -327,7 +301,6 @@ def filter_design(
         solver=solver,
         problem=problem,
         gain_predictor=gain_predictor,
-        gain_filter=gain_filter,
         witness=witness,
         fallbacks=make_fallbacks(problem),
         claims={name: value for name, value in claims.items() if value is not None},

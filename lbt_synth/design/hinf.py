@@ -148,7 +148,6 @@ def _design(
     design = filter_design(
         problem,
         gains.gain_predictor,
-        gains.gain_filter,
         method="hinf",
         solver=SolverReport(route=route, status=gains.status, iterations=gains.iterations),
         gamma_requested=max(requested, least),

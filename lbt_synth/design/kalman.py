@@ -59,7 +59,6 @@ def kalman(problem: EstimationProblem, *, route: str = "riccati") -> FilterDesig
     return filter_design(
         problem,
         gains.gain_predictor,
-        gains.gain_filter,
         method="kalman",
         solver=SolverReport(route=route, status=gains.status, iterations=gains.iterations),
     )

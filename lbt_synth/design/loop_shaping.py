@@ -152,7 +152,6 @@ def shape(
         parameters=parameters,
         claims={"objective_nm": tuple(mode.objective_nm * (1 + TOLERANCE / 2) for mode in modes)},
         long_objective_nm=tuple(long.objective_nm for long in longs),
-        long_functions=size,
     )
     return with_certificate(design, "Try more functions, or looser demands.")
 
@@ -226,7 +225,6 @@ class ShapedDesign(Design):
     # Youla parameter of each mode, from its pseudo-open-loop measurement to its command
     parameters: tuple[Controller, ...]
     long_objective_nm: tuple[float, ...]  # before the reduction [nm]; the solver's word
-    long_functions: int  # of the long parameter
 
     def __post_init__(self) -> None:
         per_mode = self.specifications, self.parameters, self.objective_nm, self.long_objective_nm
@@ -290,11 +288,6 @@ class ShapedDesign(Design):
         pairs = zip(self.objective_nm, self.long_objective_nm, strict=True)
         return max(short / long - 1 for short, long in pairs)
 
-    @property
-    def is_reduced(self) -> bool:
-        """Whether the parameters have fewer poles than the long one."""
-        return any(p.n_states < self.long_functions for p in self.parameters)
-
     def demand_labels(self) -> tuple[tuple[int, str], ...]:
         """Demands in words: mode, demand."""
         specs = enumerate(self.specifications)
@@ -340,7 +333,7 @@ class ShapedDesign(Design):
 
     def notes(self) -> list[str]:
         """Return a warning where the long parameter is not long enough."""
-        if not (self.is_reduced and self.loss < 0):
+        if not self.loss < 0:
             return []
         return [
             f"note: the long parameter is not long enough: one of {self.states_per_mode} states "

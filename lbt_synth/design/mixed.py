@@ -175,11 +175,9 @@ def _mixed_design(
     gain = _extend_gain(base.gain_predictor, size // q)
     witness = least.witness and _padded(least.witness, size)
     proved = proved_level(extended, witness)
-    innovation_gain = np.vstack([base.gain_filter, np.zeros((size, q))])
     return filter_design(
         extended,
         gain,
-        innovation_gain,
         method="mixed",
         gamma_least=least.gamma_least,
         gamma_infeasible=min(least.gamma_infeasible, proved),
@@ -226,7 +224,6 @@ def _central_design(
     return filter_design(
         least.problem,
         gains.gain_predictor,
-        gains.gain_filter,
         method=method,
         solver=SolverReport(route="riccati", status="norm reached", iterations=0),
         gamma_requested=bound,

@@ -218,7 +218,7 @@ class TrackingController:
 def _plant_of(design: object) -> TipTiltPlant:
     """Return the plant of a filter; refuse a design that is none, or of another problem."""
     plant: TipTiltPlant | None = getattr(design, "plant", None)
-    if plant is None or not hasattr(design, "gain_filter"):
+    if plant is None or not hasattr(design, "fallbacks"):
         kind = getattr(design, "method", type(design).__name__)
         raise ProblemError(
             "only filters of a TipTiltPlant can take over in a running loop (kalman, hinf, mixed, "

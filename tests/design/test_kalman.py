@@ -25,10 +25,8 @@ def test_kalman_against_a_long_recursion_and_by_sdp(axis_plant):
         P = p.A @ P @ p.A.T + p.Q - gain @ (p.C @ P @ p.A.T)
     design, sdp = lbt.kalman(p), lbt.kalman(p, route="sdp")
     assert np.allclose(design.gain_predictor, gain, rtol=1e-8)
-    assert np.allclose(p.A @ design.gain_filter, design.gain_predictor, rtol=1e-10)
-    for name in ("gain_predictor", "gain_filter"):
-        one, other = getattr(design, name), getattr(sdp, name)
-        assert np.linalg.norm(one - other) / np.linalg.norm(one) < 1e-6
+    apart = np.linalg.norm(design.gain_predictor - sdp.gain_predictor)
+    assert apart / np.linalg.norm(design.gain_predictor) < 1e-6
     assert sdp.rms == pytest.approx(design.rms, rel=1e-9)
 
 
@@ -39,7 +37,6 @@ def test_kalman_gains_with_correlated_noise():
     predictor = (problem.A @ P @ problem.C.T + problem.S) @ np.linalg.inv(innovation)
     design = lbt.kalman(problem)
     assert np.allclose(design.gain_predictor, predictor, rtol=1e-8)
-    assert np.allclose(design.gain_filter, P @ problem.C.T @ np.linalg.inv(innovation), rtol=1e-8)
 
 
 def test_the_plant_of_uneven_axes_is_two_plants():

@@ -152,7 +152,7 @@ MARGIN = {"kind": "Bound", "response": "rejection", "at_most": 2.0}
         ("kalman", scale_gain, "A is not what plant, loop and gains make"),
         ("kalman", lambda d: d["arrays"].pop("A"), "A is missing"),
         ("kalman", arrays(B=[[1.0]]), "B must be"),
-        ("kalman", arrays(GAIN_FILTER=[[1.0]]), "gain_filter must"),
+        ("kalman", arrays(GAIN_PREDICTOR=[[1.0]]), "gain_predictor must"),
         ("kalman", arrays(A=[[float("nan")]]), "A must be finite"),
         ("kalman", lambda d: d["meta"].pop("certificate"), "certificate is missing"),
         ("kalman", meta(problem="riddle"), "riddle"),
@@ -259,7 +259,7 @@ def test_specula_commands_what_our_simulator_does(simulated_designs, specula_run
 
 # What a design does not depend on: words, what its solver said, values of checks (rounding).
 NOTES = {"solver", "assumptions", "library_version", "bound_programme", "long_objective_nm"}
-NOTES |= {"long_functions", "value", "computed_by", "configuration"}
+NOTES |= {"value", "computed_by", "configuration"}
 MISSING = object()
 
 
