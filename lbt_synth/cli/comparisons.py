@@ -97,7 +97,9 @@ def run_limits(arguments: Namespace) -> Report:
     config = load_shown(arguments)
     files = load_designs(arguments.gains, config)
     designs = {
-        method.name: config.design(method.name, **method.in_comparison)
+        method.name: config.design(
+            method.name, **method.reference_options, **method.compared_options
+        )
         for method in reference_methods()
     }
     designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}

@@ -208,11 +208,6 @@ class FilterDesign(Design):
         return self.problem.controller(self.gain_predictor)
 
     @property
-    def is_bounded(self) -> bool:
-        """Whether the design was given a bound; without one its variance is the least."""
-        return "gamma_requested" in self.claims
-
-    @property
     def knows_mirror(self) -> bool:
         """False: a filter counts on a mirror that settles."""
         return False
@@ -255,18 +250,13 @@ class FilterDesign(Design):
         return (RowTable(key="failures", title="When sensors fail", rows=rows, notes=notes),)
 
     @property
-    def estimator(self) -> Controller:
-        """Estimator of z whatever the commands are, from [y(k), u(k-1)] for a plant."""
-        return self.problem.estimator(self.gain_predictor)
-
-    @property
     def poles(self) -> ComplexArray:
         """Poles of the estimation error, (n,)."""
         return self.error_system().poles
 
     def examine(self) -> Evidence:
         """Compute the norms of the error, and check the gains of fall-backs."""
-        least = not self.is_bounded
+        least = "gamma_requested" not in self.claims
         certificate = certify_filter(self.problem, self.gain_predictor, least_variance=least)
         if not certificate.checks[0].passed:
             return Evidence(design=self, certificate=certificate)

@@ -149,7 +149,7 @@ def _design(
         problem,
         gains.gain_predictor,
         method="hinf",
-        solver=SolverReport(route=route, status=gains.status, iterations=gains.iterations),
+        solver=SolverReport(route=route, status=gains.status),
         gamma_requested=max(requested, least),
         gamma_least=least,
         gamma_infeasible=infeasible,

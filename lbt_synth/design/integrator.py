@@ -279,7 +279,7 @@ def _design_with_gain(
     """Make the design of a gain and certify it."""
     design = IntegratorDesign(
         method="integrator",
-        solver=SolverReport(route=route, status=status, iterations=0),
+        solver=SolverReport(route=route, status=status),
         problem=hardware,
         claims={"gain": gain, **law.changes()},
     )

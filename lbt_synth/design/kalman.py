@@ -60,7 +60,7 @@ def kalman(problem: EstimationProblem, *, route: str = "riccati") -> FilterDesig
         problem,
         gains.gain_predictor,
         method="kalman",
-        solver=SolverReport(route=route, status=gains.status, iterations=gains.iterations),
+        solver=SolverReport(route=route, status=gains.status),
     )
 
 

@@ -143,10 +143,10 @@ def shape(
             solved[spec.key] = long, chosen
     longs, modes = zip(*(solved[spec.key] for spec in specifications), strict=True)
     parameters = tuple(mode.parameter for mode in modes)
-    status, rounds = modes[0].status, max(long.programmes for long in longs)
+    status = modes[0].status
     design = ShapedDesign(
         method="robust",
-        solver=SolverReport(route="youla", status=status, iterations=rounds),
+        solver=SolverReport(route="youla", status=status),
         problem=hardware,
         specifications=specifications,
         parameters=parameters,

@@ -310,7 +310,6 @@ class Regulator(NamedTuple):
     gain_mirror: FloatArray
     weight: float  # ``d^2 + rho + G'XG``
     status: str
-    iterations: int
 
 
 def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
@@ -384,7 +383,6 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
         solver=SolverReport(
             route="riccati",
             status=f"{solution.status}; mirror: {regulator.status}",
-            iterations=solution.iterations + regulator.iterations,
         ),
         problem=plant,
         gain_predictor=solution.gain_predictor,
@@ -403,7 +401,7 @@ def _regulator(core: Response, pieces: Pieces, A: FloatArray, rho: float) -> Reg
     weight = float(d @ d) + rho
     if core.n_states == 0:
         gain_state = np.einsum("g,gan->an", d, L) / weight
-        return Regulator(gain_state, np.zeros(0), weight, "settled", 0)
+        return Regulator(gain_state, np.zeros(0), weight, "settled")
     solved = solve_dare(F, G[:, None], h.T @ h, [[weight]], (d @ h)[:, None])
     X = solved.X
     total = float(weight + G @ X @ G)
@@ -415,4 +413,4 @@ def _regulator(core: Response, pieces: Pieces, A: FloatArray, rho: float) -> Reg
     stein = np.eye(len(drives)) - np.kron(closed.T, A.T)
     crossed = np.linalg.solve(stein, drives).T.reshape(-1, *map(len, (F, A)))
     gain_state = (np.einsum("g,gan->an", d, L) - np.einsum("i,aij,jk->ak", G, crossed, A)) / total
-    return Regulator(gain_state, gain_mirror, total, solved.route, solved.iterations)
+    return Regulator(gain_state, gain_mirror, total, solved.route)

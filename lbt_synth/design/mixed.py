@@ -141,13 +141,13 @@ def _complete_base(
     even = np.linspace(0, 0.5 / problem.dt_s, _FIRST_GRID)
     grid = np.unique(np.concatenate([even, _frequencies_near_poles(programme.error)]))
     excess, level = np.inf, bound * (1 - _EXCESS / 2)
-    for rounds in range(1, _ROUNDS + 1):
+    for _ in range(_ROUNDS):
         taps, status = programme.minimize_variance(level, grid)
         error = problem.with_memory(taps).error_system(_extend_gain(base.gain_predictor, length))
         peak = hinf_norm(error)
         excess = peak.value / level - 1
         if excess <= _EXCESS:
-            return taps, SolverReport(route="youla", status=status, iterations=rounds)
+            return taps, SolverReport(route="youla", status=status)
         fine = np.linspace(0, 0.5 / error.dt_s, _FINE_GRID)
         fine = np.unique(np.concatenate([fine, _frequencies_near_poles(error)]))
         sigma = largest_singular_values(error, fine)
@@ -225,7 +225,7 @@ def _central_design(
         least.problem,
         gains.gain_predictor,
         method=method,
-        solver=SolverReport(route="riccati", status="norm reached", iterations=0),
+        solver=SolverReport(route="riccati", status="norm reached"),
         gamma_requested=bound,
         gamma_least=least.gamma_least,
         gamma_infeasible=least.gamma_infeasible,

@@ -22,7 +22,7 @@ from lbt_synth.design.certificate import (
     measured_claim,
 )
 from lbt_synth.design.hinf import AT_LEAST, LARGEST_LMI, checked_bounds
-from lbt_synth.design.result import Design, SolverReport, with_certificate, without_units
+from lbt_synth.design.result import Design, SolverReport, with_certificate
 from lbt_synth.errors import (
     CertificateError,
     InfeasibleError,
@@ -43,8 +43,6 @@ from lbt_synth.linear.output_feedback.two_riccati import (
     free_parameter,
     scaled_plant,
 )
-from lbt_synth.storage.rows import fact_table, row_table
-from lbt_synth.storage.summaries import Summary
 from lbt_synth.validation import integer, number
 
 # a controller in the units of the plant as given, and the checks of its loop
@@ -128,13 +126,6 @@ class ControllerDesign(Design):
         if self.regularised:
             notes.append(f"singular problem, regularised by a share of {self.regularised:g}")
         return notes
-
-    def _summarise(self) -> Summary:
-        tables = [
-            without_units(fact_table("Controller", self.facts())),
-            row_table("Certificate", self.certificate.checks),
-        ]
-        return Summary(tables=tables, notes=self.notes())
 
 
 def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:
@@ -555,7 +546,7 @@ def _certified(
         controller=controller,
         claims=claims,
         witness=witness,
-        solver=SolverReport(route=route, status="solved", iterations=0),
+        solver=SolverReport(route=route, status="solved"),
         regularised=share,
     )
     evidence = Evidence(design=design, certificate=certificate)

@@ -257,6 +257,6 @@ def predictor_design(
         problem=hardware,
         parameters=short,
         claims={**claims, "command_rms": command_rms(short)},
-        solver=SolverReport(route="least squares", status=status, iterations=1),
+        solver=SolverReport(route="least squares", status=status),
     )
     return with_certificate(design, "Try a longer record, or the method kalman.")

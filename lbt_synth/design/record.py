@@ -18,7 +18,6 @@ from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.validation import (
     FloatArray,
     frozen_copy,
-    integer,
     number,
     sequence,
     text,
@@ -57,7 +56,6 @@ class DesignRecord:
             "solver": SolverReport(
                 route=text(solver["route"], "route"),
                 status=text(solver["status"], "status"),
-                iterations=integer(solver["iterations"], "iterations", at_least=0),
             ),
             "assumptions": tuple(
                 text(a, "assumptions") for a in sequence(self.meta["assumptions"], "assumptions")

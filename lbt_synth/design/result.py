@@ -69,13 +69,10 @@ class SolverReport:
         "riccati", "sdp", "lmi" or "closed form".
     status : str
         What the solver said of itself.
-    iterations : int
-        Iterations it took.
     """
 
     route: str
     status: str
-    iterations: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -275,7 +272,8 @@ class Design(Summarised, ABC):
         notes = [f"assumes: {assumption}." for assumption in self.assumptions]
         if self.hardware is None:
             said = Facts((*self.CLAIMS, *self.DERIVED), facts.values)
-            return Summary(tables=[without_units(fact_table("Design", said, passed))], notes=notes)
+            table = without_units(fact_table("Design", said, passed))
+            return Summary(tables=[table], notes=[*notes, *self.notes()])
         loop = close_loop(self.hardware, self)
         alone = not loop.feedback().reads_others
         margins = [loop_margins(loop)] if loop.is_stable and alone else []
@@ -288,10 +286,6 @@ class Design(Summarised, ABC):
     def poles(self) -> ComplexArray:
         """Poles that the design places, (n,)."""
         return np.linalg.eigvals(self.controller.A).astype(np.complex128)
-
-    def to_control(self) -> Any:
-        """Return the controller as a ``control.StateSpace``, ``u(k) = C x(k) + D y(k)``."""
-        return self.controller.to_statespace().to_control()
 
     def recertify(self) -> Certificate:
         """Compute the certificate again from the matrices, and check each claim; passed or not."""

@@ -1,6 +1,6 @@
 """Tracking: identify the last seconds of a running loop again, design again, and change over.
 
-The error of an estimator does not depend on the commands (:attr:`FilterDesign.estimator`): its
+The error of an estimator does not depend on the commands (``plant.estimator``): its
 input is the pseudo-open-loop series ``ybar(k) = y(k) + sensor_matrix c(k)``, whose correction c(k)
 follows from the commands that were given and the states of the mirror. A new filter that runs over
 the recorded ``ybar`` has the state that it would have if it had always run: no bump.

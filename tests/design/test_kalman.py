@@ -110,7 +110,7 @@ def test_wrong_horizons(frames):
 def test_the_known_input_is_taken_out_exactly(horizon, delay):
     """Whatever the commands, the estimate is the same to rounding."""
     plant = lbt_axis_plant(modes=2, delay_frames=delay).ahead(horizon)
-    estimator, taps = lbt.kalman(plant).estimator, plant.hardware.mirror_taps
+    estimator, taps = plant.estimator(lbt.kalman(plant).gain_predictor), plant.hardware.mirror_taps
     rng, frames = np.random.default_rng(0), 400
     commands = 1e3 * rng.standard_normal((frames, 2))
     phase = np.cumsum(rng.standard_normal((frames, 2)), axis=0)

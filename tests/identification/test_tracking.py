@@ -76,7 +76,8 @@ def test_each_filter_is_as_if_it_had_always_run(name):
     scale, last = np.max(np.abs(commands)), np.vstack([0 * commands[:1], commands])
     starts = [0, 800, 1400, 1600]  # a filter runs from the frame after its update on
     for number, filter_design in enumerate(made):
-        beside, cold = filter_design.estimator.start(), filter_design.controller.start()
+        estimator = filter_design.problem.estimator(filter_design.gain_predictor)
+        beside, cold = estimator.start(), filter_design.controller.start()
         begun = []
         for k, y in enumerate(measured):
             expected = filter_design.hardware.projector @ beside.step(np.r_[y, last[k]])

@@ -44,7 +44,6 @@ class ModeSolution:
     grid: Grid  # of the last programme
     coefficients: FloatArray  # (n,)
     objectives_nm2: tuple[float, ...]  # at the optimum for unit gain, and after each programme
-    programmes: int  # number of them
     status: str  # what the solver said of the last programme
     objective_nm: float  # root of the objective in the real loop
 
@@ -78,7 +77,6 @@ def solve_mode(
                 grid=programme.grid,
                 coefficients=c,
                 objectives_nm2=tuple(values),
-                programmes=programme.solved,
                 status=programme.status,
                 objective_nm=float(np.sqrt(exact)),
             )

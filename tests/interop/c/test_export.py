@@ -171,7 +171,7 @@ def test_words_cannot_leave_the_comment(tmp_path, designs, evil):
     design = replace(
         designs["integrator"],
         method=evil,
-        solver=SolverReport(route=evil, status=evil, iterations=0),
+        solver=SolverReport(route=evil, status=evil),
         certificate=lbt.design.Certificate(
             checks=(check,), gamma=np.nan, rms_per_output=np.zeros(0)
         ),
