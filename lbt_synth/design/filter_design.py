@@ -62,8 +62,6 @@ from lbt_synth.validation import (
 )
 
 MOST_UNITS = 6  # sensors and channels of which every subset gets a filter
-LONGEST_DWELL = 10_000  # periods
-_REGULAR = 1e-2  # of the covariance's diagonal, added: some states are functions of others
 ORIGIN = "distance from its Riccati filter"
 
 
@@ -184,12 +182,6 @@ class FilterDesign(Design):
         *MODEL_LIMITS,
         *SENSOR_FACTS,
         Column(name="period", heading="common period", unit="frames"),
-        Column(
-            name="dwell_frames",
-            heading="stable if sensors fail or return no sooner than after",
-            unit="frames",
-            help="Whatever the order: a proof, where the plant is its model; sooner may be stable",
-        ),
     )
     is_estimator: ClassVar[bool] = True
 
@@ -221,9 +213,7 @@ class FilterDesign(Design):
         plant = self.problem
         if not reads_several(plant):
             return dict(model_limits(self))
-        dwell = dwell_frames(plant, self.gain_predictor, self.fallbacks)
-        facts = sensor_facts(self, plant.hardware)
-        return {**facts, "period": plant.period, "dwell_frames": dwell}
+        return {**sensor_facts(self, plant.hardware), "period": plant.period}
 
     @property
     def controllers(self) -> dict[frozenset[str], Controller]:
@@ -415,49 +405,3 @@ def _offset_nm(loop: ClosedLoop, readings: FloatArray) -> float:
 def failed_loop(plant: TipTiltPlant, gains: FloatArray, missing: tuple[str, ...]) -> ClosedLoop:
     """Return the loop of a plant in which some sensors read zero."""
     return close_loop(plant.hardware, plant.controller(gains), blind=missing)
-
-
-def dwell_frames(
-    plant: TipTiltPlant, gains: FloatArray, fallbacks: tuple[Fallback, ...]
-) -> int | None:
-    """Return frames that each filter must stay for any sequence of them to be stable.
-
-    Stable filters that take turns need not be stable. Where the plant is its model, the estimation
-    error does not depend on the commands; it shrinks in a fixed norm while a filter stays long
-    enough, whichever filter came before. The norm weighs the error by the covariance of the
-    plant's state, mean over the phases. If a filter shrinks it in any number of periods from m to
-    2 m - 1, it does in any more.
-    """
-    P = plant.error_system(np.zeros_like(gains)).covariances().mean(axis=0)
-    sizes = np.diag(P)
-    if not sizes.all():  # states that the plant leaves at zero hold past innovations
-        errors = plant.error_system(gains).covariances().mean(axis=0)
-        sizes = np.where(sizes > 0, sizes, np.diag(errors) / _REGULAR)
-    root = np.linalg.cholesky(P + _REGULAR * np.diag(sizes))
-    filters = [gains, *(each.gains for each in fallbacks)]
-    needed = [_periods(plant.error_system(own), root) for own in filters]
-    periods = [each for each in needed if each is not None]
-    return (max(periods) + 2) * plant.period - 2 if len(periods) == len(filters) else None
-
-
-def _periods(error: StateSpace, root: FloatArray) -> int | None:
-    """Return after how many whole periods an error has shrunk, wherever in a period it begins."""
-    inverse, each = np.linalg.inv(root), np.eye(len(root))
-
-    def size(transition: FloatArray) -> float:
-        return float(np.linalg.norm(inverse @ transition @ root, 2))
-
-    before = after = 1.0  # of the parts of a period at both ends
-    head = tail = each
-    transitions = error.stacks()[0]
-    for A, last in zip(transitions[:-1], transitions[:0:-1], strict=True):
-        head, tail = A @ head, tail @ last
-        after, before = max(after, size(head)), max(before, size(tail))
-    allowed, period = 1 / (before * after), error.monodromy
-    transition, shrunk = each, 0
-    for count in range(1, LONGEST_DWELL):
-        transition = period @ transition
-        shrunk = shrunk if size(transition) < allowed else count
-        if count >= 2 * shrunk + 1:
-            return shrunk + 1
-    return None

@@ -20,9 +20,7 @@ from support.sensor_loops import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.design import filter_design
 from lbt_synth.design.filter_design import (
-    dwell_frames,
     failed_loop,
     failure_rows,
     failure_sets,
@@ -31,7 +29,7 @@ from lbt_synth.design.filter_design import (
 from lbt_synth.errors import InfeasibleError, LbtSynthError, ProblemError
 from lbt_synth.linear import kalman_riccati
 from lbt_synth.loop.budget import model_readings, residual_budget
-from lbt_synth.models import Accelerometer, ARModel, SensorSuite, WavefrontSensor
+from lbt_synth.models import Accelerometer, SensorSuite, WavefrontSensor
 
 NORMS = {
     "estimation error, rms, against the one claimed",
@@ -194,51 +192,6 @@ def test_sensors_that_are_all_read_complete_the_central_filter():
     assert mixed.solver.route == "youla"
     assert lbt.kalman(plant).rms < mixed.rms < central.rms
     assert len(mixed.fallbacks) == 7
-    assert mixed.derived()["dwell_frames"] > 1
-
-
-SHARP = tuple(replace(line, damping=0.005) for line in LINES)
-CALM = ARModel(coefficients=[1.9975, -0.99755], driving_rms_nm=2, frame_rate_hz=1000)
-EARLY = replace(SLOW, delay_frames=1.25)  # its sums are empty when a period begins
-
-
-def growth_per_frame(plant, turns):
-    """Return what a cycle of turns (gains, frames) makes of the error, per frame."""
-    errors = [(plant.error_system(gains).stacks()[0], frames) for gains, frames in turns]
-    cycle, phase, total = np.eye(plant.n_states), 0, 0
-    for _ in range(plant.period):  # the cycle may end in the midst of a period
-        for A, frames in errors:
-            for _ in range(frames):
-                cycle = A[phase] @ cycle
-                phase = (phase + 1) % plant.period
-            total += frames
-    return np.max(np.abs(np.linalg.eigvals(cycle))) ** (1 / total)
-
-
-def test_stable_filters_that_take_turns_may_diverge():
-    plant, gains, others = designed((FAST,), lines=SHARP, turbulence=CALM, noise_nm=15)
-    without = next(each.gains for each in others if each.missing == ("wavefront",))
-    for filter_gains in (gains, without):
-        assert growth_per_frame(plant, [(filter_gains, 1)]) < 1
-    assert growth_per_frame(plant, [(gains, 3), (without, 30)]) > 1.04
-    frames = dwell_frames(plant, gains, others)
-    assert frames > 30
-    assert growth_per_frame(plant, [(gains, frames), (without, frames)]) < 1
-
-
-@pytest.mark.parametrize("sensors", [(FAST,), (FAST, SLOW), (EARLY,)])
-def test_filters_that_stay_do_not_diverge(monkeypatch, sensors):
-    (plant, gains, others), rng = designed(sensors), np.random.default_rng(0)
-    frames = dwell_frames(plant, gains, others)
-    assert 1 < frames < 300
-    filters = [gains, *(each.gains for each in others)]
-    for _ in range(5):
-        order = rng.permutation(len(filters))
-        turns = [(filters[i], frames + int(rng.integers(plant.period))) for i in order]
-        assert growth_per_frame(plant, turns) < 1
-    assert dwell_frames(plant, gains, ()) < 100  # a single filter is its own proof
-    monkeypatch.setattr(filter_design, "LONGEST_DWELL", 10)
-    assert dwell_frames(plant, gains, others) is None
 
 
 def test_every_set_of_sensors_may_fail():
