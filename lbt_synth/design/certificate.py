@@ -199,21 +199,10 @@ def _examine_variance(error: StateSpace) -> tuple[FloatArray, FloatArray, tuple[
     rms, other = float(np.sqrt(variances.sum())), float(np.sqrt(adjoint.sum()))
     least = min(rms, other) + _rounding(error)
     apart = 1 - min(least / max(rms, other, _TINY), 1.0) ** 2
-    checks = (
-        Check(
-            "residual of the Lyapunov equation",
-            residual / max(size, _TINY),
-            RESIDUAL_TOLERANCE,
-            "relative, 1-norm",
-        ),
-        Check(
-            "variance, against its adjoint equation",
-            apart,
-            TOLERANCE,
-            "relative, two Lyapunov equations",
-        ),
-    )
-    return P, variances, checks
+    name, left = "residual of the Lyapunov equation", residual / max(size, _TINY)
+    solved = Check(name, left, RESIDUAL_TOLERANCE, "relative, 1-norm")
+    name, how = "variance, against its adjoint equation", "relative, two Lyapunov equations"
+    return P, variances, (solved, Check(name, apart, TOLERANCE, how))
 
 
 def _rounding(error: StateSpace) -> float:

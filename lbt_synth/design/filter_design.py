@@ -102,27 +102,6 @@ def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
     yield Check(name, below, TOLERANCE, proved.computed_by)
 
 
-RMS = measured_claim("rms", "estimation error, rms")
-GAMMA = measured_claim("gamma", "estimation error, H-infinity norm")
-GAMMA_REQUESTED = Claim(
-    name="gamma_requested", heading="bound asked for", unit="nm", checks=_check_bound
-)
-GAMMA_LEAST = Claim(
-    name="gamma_least",
-    heading="least norm of any filter, upper bound",
-    unit="nm",
-    format=".9g",
-    checks=_check_least,
-)
-GAMMA_INFEASIBLE = Claim(
-    name="gamma_infeasible",
-    heading="least norm of any filter, lower bound",
-    unit="nm",
-    format=".9g",
-    checks=_check_infeasible,
-)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fallback:
     """The filter of the sensors that remain when some have failed."""
@@ -176,7 +155,23 @@ class FilterDesign(Design):
     """
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
-        *(RMS, GAMMA, GAMMA_REQUESTED, GAMMA_LEAST, GAMMA_INFEASIBLE),
+        measured_claim("rms", "estimation error, rms"),
+        measured_claim("gamma", "estimation error, H-infinity norm"),
+        Claim(name="gamma_requested", heading="bound asked for", unit="nm", checks=_check_bound),
+        Claim(
+            name="gamma_least",
+            heading="least norm of any filter, upper bound",
+            unit="nm",
+            format=".9g",
+            checks=_check_least,
+        ),
+        Claim(
+            name="gamma_infeasible",
+            heading="least norm of any filter, lower bound",
+            unit="nm",
+            format=".9g",
+            checks=_check_infeasible,
+        ),
     )
     DERIVED: ClassVar[tuple[Column, ...]] = (
         *MODEL_LIMITS,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -124,22 +126,18 @@ def _design(
 ) -> FilterDesign:
     """Find the least gamma by one route, and the filter of the level asked for."""
     gains: FilterRiccati
+    central: Callable[[float], FilterRiccati]
     lower, upper = _kalman_bracket(problem, start)
     if route == "lmi":
         from lbt_synth.linear.lmi.filters import hinf_lmi, least_gamma_lmi
 
         scales: dict[str, Any] = {"coordinates": start.P, "scale": upper}
         gains, witness = least_gamma_lmi(problem, **scales)
-
-        def central(gamma: float) -> FilterRiccati:
-            return hinf_lmi(problem, gamma, **scales)
+        central = partial(hinf_lmi, problem, **scales)
     else:
         _, level, best = least_gamma(problem, lower=lower, upper=upper, start=start)
         gains, witness = best, worst_invisible_disturbance(problem, best.P, level, start.P)
-
-        def central(gamma: float) -> FilterRiccati:
-            return _central(problem, start, gamma)
-
+        central = partial(_central, problem, start)
     least, infeasible = _verified_bracket(problem, start, gains, witness)
     requested = gamma if gamma is not None else least * (gamma_ratio or 1)
     require_reachable(requested, least)

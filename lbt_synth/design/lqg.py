@@ -138,8 +138,13 @@ class LqgDesign(Design):
 
     def make_controller(self) -> Controller:
         """Return the controller of the filter and the regulator."""
-        gains = self.gain_predictor, self.gain_state, self.gain_mirror
-        return lqg_controller(self.problem, *gains)
+        hardware = self.problem.hardware  # whose states of mirror and delay the law reads, too
+        full = replace(self.estimation, hardware=hardware).full()
+        states, law = len(self.gain_predictor), np.zeros((hardware.modes, full.n_states))
+        law[:, :states] = self.gain_state
+        end = states + self.gain_mirror.size * hardware.n_commands
+        law[:, states:end] = -np.kron(self.gain_mirror, hardware.influence)
+        return full.controller(self.gain_predictor, hardware.projector @ law)
 
     @property
     def command_weight(self) -> float:
@@ -218,19 +223,6 @@ class LqgDesign(Design):
             kalman = certify_filter(self.estimation, self.gain_predictor, least_variance=True)
             checks += [check for check in kalman.checks if check.name.startswith("distance")]
         return Evidence(design=self, certificate=replace(certificate, checks=tuple(checks)))
-
-
-def lqg_controller(
-    plant: TipTiltPlant, gain_predictor: FloatArray, gain_state: FloatArray, gain_mirror: FloatArray
-) -> Controller:
-    """Make the controller from y(k) to u(k): the filter, and the states of mirror and delay."""
-    hardware = plant.hardware
-    full = replace(estimation_plant(plant), hardware=hardware).full()
-    states, law = len(gain_predictor), np.zeros((hardware.modes, full.n_states))
-    law[:, :states] = gain_state
-    end = states + gain_mirror.size * hardware.n_commands
-    law[:, states:end] = -np.kron(gain_mirror, hardware.influence)
-    return full.controller(gain_predictor, hardware.projector @ law)
 
 
 def estimation_plant(plant: TipTiltPlant) -> TipTiltPlant:

@@ -84,13 +84,8 @@ def mixed(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> line = lbt.EstimationProblem(
-    ...     A=[[1.9, -0.99], [1.0, 0.0]],
-    ...     B=[[1.0, 0.0], [0.0, 0.0]],
-    ...     C=[[0.0, 1.0]],
-    ...     D=[[0.0, 3.0]],
-    ...     L=[[1.0, 0.0]],
-    ... )
+    >>> A, B, C = [[1.9, -0.99], [1.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0]]
+    >>> line = lbt.EstimationProblem(A=A, B=B, C=C, D=[[0.0, 3.0]], L=[[1.0, 0.0]])
     >>> central = lbt.hinf(line, gamma_ratio=1.1, route="riccati")
     >>> best = lbt.mixed(line, gamma=central.gamma)
     >>> best.gamma <= central.gamma * (1 + 1e-6) and best.rms < central.rms

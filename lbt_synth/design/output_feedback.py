@@ -159,15 +159,8 @@ def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> P = lbt.linear.GeneralizedPlant(
-    ...     A=1.0,
-    ...     B1=[[1.0, 0.0]],
-    ...     B2=1.0,
-    ...     C1=[[1.0], [0.0]],
-    ...     C2=1.0,
-    ...     D12=[[0.0], [1.0]],
-    ...     D21=[[0.0, 1.0]],
-    ... )
+    >>> sides = {"B1": [[1.0, 0]], "D21": [[0, 1.0]], "C1": [[1.0], [0]], "D12": [[0], [1.0]]}
+    >>> P = lbt.linear.GeneralizedPlant(A=1.0, B2=1.0, C2=1.0, **sides)
     >>> round(lbt.h2_controller(P).rms ** 4, 6)
     5.0
     """
@@ -241,15 +234,8 @@ def hinf_controller(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> P = lbt.linear.GeneralizedPlant(
-    ...     A=1.0,
-    ...     B1=[[1.0, 0.0]],
-    ...     B2=1.0,
-    ...     C1=[[1.0], [0.0]],
-    ...     C2=1.0,
-    ...     D12=[[0.0], [1.0]],
-    ...     D21=[[0.0, 1.0]],
-    ... )
+    >>> sides = {"B1": [[1.0, 0]], "D21": [[0, 1.0]], "C1": [[1.0], [0]], "D12": [[0], [1.0]]}
+    >>> P = lbt.linear.GeneralizedPlant(A=1.0, B2=1.0, C2=1.0, **sides)
     >>> K = lbt.hinf_controller(P, gamma_ratio=1.1)
     >>> K.gamma_infeasible <= K.gamma_least < K.gamma <= K.gamma_requested
     True
@@ -419,15 +405,8 @@ def mixed_controller(plant: GeneralizedPlant, *, gamma: float, taps: int = 24) -
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> P = lbt.linear.GeneralizedPlant(
-    ...     A=1.0,
-    ...     B1=[[1.0, 0.0]],
-    ...     B2=1.0,
-    ...     C1=[[1.0], [0.0]],
-    ...     C2=1.0,
-    ...     D12=[[0.0], [1.0]],
-    ...     D21=[[0.0, 1.0]],
-    ... )
+    >>> sides = {"B1": [[1.0, 0]], "D21": [[0, 1.0]], "C1": [[1.0], [0]], "D12": [[0], [1.0]]}
+    >>> P = lbt.linear.GeneralizedPlant(A=1.0, B2=1.0, C2=1.0, **sides)
     >>> least, quiet = lbt.hinf_controller(P), lbt.h2_controller(P)
     >>> K = lbt.mixed_controller(P, gamma=1.05 * least.gamma)
     >>> K.gamma <= 1.05 * least.gamma < quiet.gamma and quiet.rms < K.rms < least.rms
