@@ -14,26 +14,26 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3861,
-    "config": 1876,
+    "cli": 3825,
+    "config": 1661,
     "design": 6320,
-    "files": 1283,
-    "identification": 9965,
-    "interop": 4400,
+    "files": 1243,
+    "identification": 9563,
+    "interop": 3793,
     "linear": 5763,
     "loop": 4905,
     "methods": 830,
     "models": 4400,
     "report": 4312,
-    "storage": 1049,
+    "storage": 1027,
     "studies": 3135,
-    "errors, validation": 642,
+    "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 219,
-    "tuned constants": 540,
-    "lines of tests": 33020,
+    "public names": 186,
+    "tuned constants": 530,
+    "lines of tests": 32229,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from lbt_synth.cli.arguments import COMMANDS, build_parser, refuse_options
 from lbt_synth.cli.output import Report
-from lbt_synth.config import config_schema, telescope_template
+from lbt_synth.config import telescope_template
 from lbt_synth.config.load import example_files
+from lbt_synth.config.schema import config_schema
 from lbt_synth.errors import OutputError
 from lbt_synth.methods.registry import default_method
 from lbt_synth.storage.atomic_files import (

@@ -251,17 +251,14 @@ def write_telemetry(
     telemetry: Telemetry,
     *,
     key: str,
-    kind: str | None = None,
-    precision: str = "float64",
 ) -> None:
     """Write telemetry, and note in the report the file and what its format leaves out."""
     from lbt_synth.files import save_telemetry  # which few commands need
     from lbt_synth.files.telemetry.aot import lost_fields
     from lbt_synth.files.telemetry.store import require_telemetry_name
 
-    kind = require_telemetry_name(output, kind)
-    path = save_telemetry(output, telemetry, format=kind, precision=precision)
-    lost = lost_fields(telemetry) if kind == "aot" else ()
+    path = save_telemetry(output, telemetry)
+    lost = lost_fields(telemetry) if require_telemetry_name(output) == "aot" else ()
     report.note_written(path, key)
     report.data["lost"] = list(lost)
     if lost:

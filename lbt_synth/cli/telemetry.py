@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.arguments import given_options, refuse_options
+from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report, write_telemetry
 from lbt_synth.errors import ProblemError
@@ -27,12 +27,12 @@ from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
 _FACTS = (  # that a file may not hold
-    *("delay_frames", "unit", "command_unit", "diameter_m", "obstruction"),
+    *("frame_rate_hz", "delay_frames", "unit", "command_unit", "diameter_m", "obstruction"),
     *("axes", "averages", "commands"),
 )
 _READING = (  # options that say how a record is read
     *_FACTS,
-    *("kind", "frame_rate_hz", "columns", "sensor_gain", "command_increments", "swap_axes"),
+    *("columns", "sensor_gain", "command_increments", "swap_axes"),
     *("command_shift_frames", "command_sign", "command_matrix", "command_scale"),
 )
 
@@ -55,14 +55,12 @@ def load_series(
     arguments: Namespace, axes: Sequence[int] | None = None
 ) -> LoopRecord | SpectrumRecord:
     """Load the record of the command line, or some of its axes, whatever its length."""
-    kind, facts = arguments.kind, {name: getattr(arguments, name) for name in _FACTS}
+    facts = {name: getattr(arguments, name) for name in _FACTS}
     if axes is not None:
         chosen = facts["axes"]
         facts["axes"] = list(axes) if chosen is None else [chosen[axis] for axis in axes]
     record = load_record(
         arguments.file,
-        kind=None if kind is None else kind.replace("-", "_"),
-        frame_rate_hz=None if kind == "spectrum" else arguments.frame_rate_hz,
         columns=_parse_columns(arguments.columns),
         **facts,
     )
@@ -140,10 +138,8 @@ _LOOP = {  # what telemetry says of the loop that it is from: headings and units
 def run(arguments: Namespace) -> Report:
     """Show telemetry, or a record as telemetry, and write it."""
     output = arguments.output
-    if output is None:
-        refuse_options(arguments, ("format", "precision"), "is of what -o writes; give -o FILE")
-    else:
-        require_telemetry_name(output, arguments.format)
+    if output is not None:
+        require_telemetry_name(output)
         named = given_options(arguments, "file", "commands")
         require_writable(output, inputs=list(named.values()))
     notes: list[str] = []
@@ -153,8 +149,8 @@ def run(arguments: Namespace) -> Report:
         record = require_series(load_series(arguments), "telemetry holds")
         telemetry = telemetry_of_record(record)
         notes = [
-            f"note: {record.health.summary()}",
-            *(f"note: {note}" for note in record.health.notes),
+            f"note: {record.summary()}",
+            *(f"note: {note}" for note in record.notes),
         ]
     choose_unit(arguments, telemetry.diameter_m)
     report = _describe_telemetry(telemetry)
@@ -163,10 +159,7 @@ def run(arguments: Namespace) -> Report:
     if "timing" not in telemetry.metadata:  # of another program
         report.notes.append(telemetry.convention)
     if output is not None:
-        precision = arguments.precision or "float64"
-        write_telemetry(
-            report, output, telemetry, key="output", kind=arguments.format, precision=precision
-        )
+        write_telemetry(report, output, telemetry, key="output")
     return report
 
 

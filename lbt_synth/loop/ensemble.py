@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from lbt_synth.loop.evaluator import ResidualBudget
 from lbt_synth.loop.stacks import LoopStack, close_loops, stack_evaluator
 from lbt_synth.models import (
     ARModel,
-    FrozenFlows,
+    Atmosphere,
     LoopHardware,
     SinusoidalVibration,
     Spectrum,
@@ -38,7 +38,6 @@ from lbt_synth.validation import (
     set_fields,
 )
 
-Turbulence: TypeAlias = Spectrum | FrozenFlows
 _TOGETHER = 2048  # loops with the same frequencies: as many as repay their panels
 
 
@@ -113,9 +112,9 @@ class LoopEnsemble:
         Real total delay [frames], 1 to 20; that of the loop by default.
     noise_nm : float, (p,) or (p, q) array_like, optional
         Standard deviation of the noise on each measurement per frame [nm].
-    turbulence : Spectrum, FrozenFlows, sequence of these, or None, optional
+    turbulence : Spectrum, sequence of Spectrum or None, optional
         Spectrum of each mode, the modes independent: one for all of them, or one per mode. A
-        FrozenFlows or a stack of AR models holds one per loop, another spectrum serves all loops.
+        An Atmosphere or an ARModel that is a stack holds one per loop.
     vibrations : sequence of EnsembleVibration, optional
         The vibrations.
     loops : int, optional
@@ -199,14 +198,14 @@ class LoopEnsemble:
             raise DimensionError(f"noise_nm must have one column per measurement ({q}); got {got}.")
         return np.broadcast_to(given, (self.loops, q))
 
-    def groups(self, hardware: LoopHardware) -> list[tuple[Turbulence, tuple[int, ...]]]:
+    def groups(self, hardware: LoopHardware) -> list[tuple[Spectrum, tuple[int, ...]]]:
         """Return the turbulence with the modes that have it."""
         n, parts = hardware.modes, self._turbulence_parts(hardware.modes)
         if len(parts) != n:
             raise DimensionError(
                 f"turbulence must have one entry per mode ({n}); got {len(parts)}."
             )
-        groups: dict[object, tuple[Turbulence, tuple[int, ...]]] = {}
+        groups: dict[object, tuple[Spectrum, tuple[int, ...]]] = {}
         for mode, part in enumerate(parts):
             if part is not None:
                 first, modes = groups.get(spectrum_key(part), (part, ()))
@@ -234,24 +233,24 @@ class LoopEnsemble:
         return out
 
 
-def _turbulence_values(turbulence: Turbulence | None) -> list[FloatArray]:
+def _turbulence_values(turbulence: Spectrum | None) -> list[FloatArray]:
     """Return the arrays of a turbulence that have one entry per loop."""
-    if isinstance(turbulence, FrozenFlows):
+    if isinstance(turbulence, Atmosphere):
         values = turbulence.seeing_arcsec, turbulence.wind_speed_m_s, turbulence.outer_scale_m
         return [value for value in values if value is not None]
     if isinstance(turbulence, ARModel) and turbulence.coefficients.ndim > 1:
         return [*turbulence.coefficients.T, turbulence.driving_rms_nm]
     if turbulence is not None and not isinstance(turbulence, Spectrum):
         raise ProblemError(
-            "turbulence must be a spectrum, FrozenFlows or None, or a sequence of these; got "
+            "turbulence must be a spectrum, None, or a sequence of these; got "
             f" {type(turbulence).__name__}."
         )
     return []
 
 
-def turbulence_rows(turbulence: Turbulence, rows: IntArray) -> Turbulence:
+def turbulence_rows(turbulence: Spectrum, rows: IntArray) -> Spectrum:
     """Return the turbulence of some loops."""
-    if isinstance(turbulence, FrozenFlows) and len(turbulence) > 1:
+    if isinstance(turbulence, Atmosphere) and np.size(turbulence.wind_speed_m_s) > 1:
         return turbulence.take(rows)
     if isinstance(turbulence, ARModel) and turbulence.count > 1:
         return turbulence.take(rows)
@@ -408,7 +407,7 @@ def _batches(stacks: list[LoopStack], stable: BoolArray) -> list[IntArray]:
 
 def _of_part(
     stack: LoopStack,
-    turbulence: list[tuple[Turbulence, tuple[int, ...]]],
+    turbulence: list[tuple[Spectrum, tuple[int, ...]]],
     noise_nm: FloatArray,
     hardware: LoopHardware,
     *,

@@ -26,7 +26,7 @@ from lbt_synth.linear import StateSpace
 from lbt_synth.linear.lyapunov import stationary_covariances
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_rule
-from lbt_synth.models import ARModel, FrozenFlows, Spectrum
+from lbt_synth.models import ARModel, Atmosphere, Spectrum
 from lbt_synth.models.mirror.frame_rate_system import Hold
 from lbt_synth.models.spectra import breakpoints_below, companions, densities, spectrum_density
 from lbt_synth.storage.display_unit import nm_text
@@ -34,8 +34,6 @@ from lbt_synth.storage.rows import fact, fact_table, facts
 from lbt_synth.storage.summaries import Summarised, Summary
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
 
-# one for all modes and loops, or one for each loop
-Turbulence: TypeAlias = Spectrum | FrozenFlows
 # from cycles per frame (f,), the share (f,) of a phase that its means are, and entries (k or 1, n,
 # w), to the rows of a loop, piece by piece
 _Response: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], Iterable[ComplexArray]]
@@ -128,14 +126,14 @@ class Evaluator:
             out[:, 1] = power[:, None, None] * (entry @ transpose(entry))
         return out
 
-    def of_turbulence(self, spectrum: Turbulence, entry: FloatArray) -> FloatArray:
+    def of_turbulence(self, spectrum: Spectrum, entry: FloatArray) -> FloatArray:
         """Return what phases of a spectrum leave, or of sampled processes."""
         if isinstance(spectrum, ARModel):
             coefficients = np.atleast_2d(spectrum.coefficients)
             return self.of_process(coefficients, np.atleast_1d(spectrum.driving_rms_nm), entry)
 
         def density(f_hz: FloatArray) -> FloatArray:
-            if isinstance(spectrum, FrozenFlows):
+            if isinstance(spectrum, Atmosphere) and spectrum.is_stack:
                 shapes, which, factor = spectrum.factored_psd(f_hz)
                 return np.asarray(shapes.T[:, which] * factor)
             return spectrum_density(spectrum, f_hz)[:, None]

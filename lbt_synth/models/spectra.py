@@ -160,7 +160,7 @@ class ARModel:
         """
         frequency = real_array(frequency_hz, "frequency_hz")
         density = densities(self.coefficients, self.driving_rms_nm, self.frame_rate_hz, frequency)
-        return density.reshape(*self.coefficients.shape[:-1], *frequency.shape)
+        return density.reshape((*self.coefficients.shape[:-1], *frequency.shape))
 
 
 def companions(coefficients: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from support.plants import random_problem
 import lbt_synth as lbt
 from lbt_synth.design.certificate import certify_infeasible
 from lbt_synth.errors import DimensionError, NonFiniteError
-from lbt_synth.linear.infeasibility_proof import Witness
+from lbt_synth.linear.infeasibility_proof import Witness, infeasible_level
 
 
 def test_the_witness_is_a_signal_that_no_measurement_shows(axis_plant):
@@ -42,7 +42,7 @@ def test_no_witness_proves_too_much(seed, n, r):
     disturbances = rng.standard_normal((problem.B.shape[1], r))
     witness = Witness(states=states, disturbances=disturbances)
     least = lbt.hinf(problem, route="riccati").gamma_least
-    assert lbt.linear.infeasible_level(problem, witness, covariance) <= least * (1 + 1e-9)
+    assert infeasible_level(problem, witness, covariance) <= least * (1 + 1e-9)
 
 
 def test_states_without_error_prove_nothing():
@@ -93,7 +93,7 @@ def certified(plant, level, proof):
         (lambda p: witness(np.ones((2, 4, 1)), np.ones((4, 1))), DimensionError, "the same phases"),
         (lambda p: certified(p, 1.0, THREE_STATES), DimensionError, "must have 4 rows of states"),
         (
-            lambda p: lbt.linear.infeasible_level(p, TWO_PHASES, np.eye(4)),
+            lambda p: infeasible_level(p, TWO_PHASES, np.eye(4)),
             DimensionError,
             "period of the problem, 1; got 2",
         ),

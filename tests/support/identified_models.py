@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import lbt_synth as lbt
+from lbt_synth.config.write import config_text, identified_config
+from lbt_synth.identification.fit.identified_model import IdentifiedLine
 
 RATE = 1000.0
 
@@ -21,7 +23,7 @@ class Line:
     direction: tuple | None = None
     direction_error_deg: float | None = None
     sections: int = 1
-    direction_deg = lbt.identification.IdentifiedLine.direction_deg
+    direction_deg = IdentifiedLine.direction_deg
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,5 +74,6 @@ SHELL = lbt.models.PositionLoop.from_bandwidth(
 
 
 def save_identified(tmp_path, model, name="model.yaml", **options):
-    settings, comments = lbt.config.identified_config(model, **options)
-    return lbt.config.save_config(tmp_path / name, settings, comments=comments)
+    settings, comments = identified_config(model, **options)
+    (tmp_path / name).write_text(config_text(settings, comments))
+    return tmp_path / name

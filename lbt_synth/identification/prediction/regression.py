@@ -29,7 +29,7 @@ from lbt_synth.identification.prediction.residual import (
     settle_frames,
 )
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.stretches import Stretches, cut_stretches
+from lbt_synth.identification.stretches import Stretches, cut_stretches, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
@@ -155,17 +155,30 @@ class Regression:
                 weights[np.ix_(rows, rows)] += (_OFFSET * scale[place]) ** 2
         return weights
 
-    def solve(self, signals: Sequence[int], penalty: float, moments: Moments) -> FloatArray:
-        """Return the coefficients of some signals, (taps m, n), for moments of these."""
-        weights = penalty * moments.frames * self._weights(signals)
+    def _factor(self, weights: FloatArray, moments: Moments) -> tuple[FloatArray, bool]:
+        """Return the factor of the squares of signals with a penalty, for :func:`cho_solve`."""
         try:
-            factor = cho_factor(moments.squares + weights)
+            return cho_factor(moments.squares + weights)
         except np.linalg.LinAlgError:
             raise NumericalError(
                 "the past readings of a record depend on each other; expected some noise in them.",
                 status="regression",
             ) from None
-        return np.asarray(cho_solve(factor, moments.products))
+
+    def solve(self, signals: Sequence[int], penalty: float, moments: Moments) -> FloatArray:
+        """Return the coefficients of some signals, (taps m, n), for moments of these."""
+        weights = penalty * moments.frames * self._weights(signals)
+        return np.asarray(cho_solve(self._factor(weights, moments), moments.products))
+
+    def fit_share(self, penalty: float) -> float:
+        """Return by which share of what it leaves the filter of all signals is worse unseen.
+
+        Its effective number of coefficients over the frames: what their errors add (H. Akaike, Ann.
+        Inst. Statist. Math. 21, 243 (1969), doi:10.1007/BF02532251).
+        """
+        weights = penalty * self.whole.frames * self._weights(range(len(self.scales)))
+        inverse = cho_solve(self._factor(weights, self.whole), np.eye(len(weights)))
+        return float(len(weights) - np.sum(inverse * weights)) / self.whole.frames
 
     @cached_property
     def whole(self) -> Moments:
@@ -190,7 +203,7 @@ class Regression:
             least = min(range(*ends), key=left)
         return float(_PENALTIES[least])
 
-    def design(self, penalty: float | None = None, **claims: float) -> PredictorDesign:
+    def design(self, penalty: float | None = None) -> PredictorDesign:
         """Return the certified design, by default with the penalty of forward chaining."""
         everything, own = range(len(self.scales)), range(self.own)
         penalty = self.penalty if penalty is None else penalty
@@ -207,7 +220,7 @@ class Regression:
             self.readings,
             left[0],
             what=f"penalty {penalty:.0e}",
-            **claims,
+            fit_share=self.fit_share(penalty),
         )
 
 
@@ -308,11 +321,18 @@ class ChannelValue:
     dead_nm: float = nm_column("zeros, unseen", unit="nm rms", help="Residual if it reads zeros")
 
 
-def channel_values(past: Regression, unseen: Regression, noise_nm2: float) -> list[ChannelValue]:
-    """Return what a predictor of the past leaves of unseen frames, without each channel.
+def channel_values(
+    record: LoopRecord, half: IdentifiedModel, channels: Channels
+) -> tuple[ChannelValue, ...]:
+    """Return what a predictor of the first half leaves of the second, without each channel.
 
     The noise of the measurements is subtracted; nan where it hides the residual.
     """
+    past, unseen = (
+        regress(record, half, stretches=frames, channels=channels)
+        for frames in split_halves(record.stretches())
+    )
+    noise_nm2 = sum((axis.noise_nm / axis.sensor_gain) ** 2 for axis in half.axes)
     everything = list(range(len(past.scales)))
     coefficients = past.solve(everything, past.penalty, past.whole)
 
@@ -322,7 +342,7 @@ def channel_values(past: Regression, unseen: Regression, noise_nm2: float) -> li
         return float(np.sqrt(left_nm2)) if left_nm2 > 0 else float("nan")
 
     rows = []
-    for signal, name in zip(everything[past.own :], past.hardware.suite.channels, strict=True):
+    for signal, name in zip(everything[past.own :], channels.names, strict=True):
         others = [other for other in everything if other != signal]
         without = past.solve(others, past.penalty, past.whole.chosen(past.places(others)))
         silent = coefficients.copy()
@@ -334,4 +354,4 @@ def channel_values(past: Regression, unseen: Regression, noise_nm2: float) -> li
                 dead_nm=left_nm(everything, silent),
             )
         )
-    return rows
+    return tuple(rows)

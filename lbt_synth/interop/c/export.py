@@ -24,15 +24,14 @@ from lbt_synth.interop.c.terms import (
     source_terms,
     used_readings,
 )
-from lbt_synth.interop.pipeline import Arithmetic, Target, comment_text
+from lbt_synth.interop.pipeline import Target, comment_text
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.storage.rows import column, table_row
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, choice
 
-MOST_TERMS = 100_000  # 10 MB of source
-MOST_GAINS = 1_000_000  # in the table: 8 MB of memory, 25 MB of source
+MOST_NUMBERS = 1_000_000  # 8 MB of memory, 25 to 100 MB of source
 _IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 _SOURCE = re.compile(r"[A-Za-z0-9._+-]*\.c")
 _LONGEST = 25  # C99 distinguishes identifiers by 31 characters, six of them "_reset"
@@ -41,55 +40,23 @@ _WIDTH = 96
 
 @table_row
 class FrameCost:
-    """Arithmetic and memory of one frame of a controller, as exported to C."""
+    """Arithmetic of one frame of a controller, as exported to C."""
 
     multiplications: int = column(
         "multiplications per frame",
         help="Of the exported source; factors of 1 and -1 are no multiplications",
     )
     additions: int = column("additions per frame", help="Of the exported source")
-    coefficients: int = column("coefficients", help="Numbers that the exported source stores")
-    states: int = column(
-        "numbers kept between frames", help="Numbers that it keeps: states and last commands"
-    )
 
 
 def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
-    """Count the arithmetic and the memory of one frame.
-
-    Parameters
-    ----------
-    design : Design or Controller
-        The controller, or a design with one.
-
-    Returns
-    -------
-    FrameCost
-        Counts for the C source that :func:`export` writes.
-
-    Raises
-    ------
-    ProblemError
-        If it is neither.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lag = lbt.Controller(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
-    >>> cost = lbt.interop.frame_cost(lag)
-    >>> cost.multiplications, cost.additions
-    (1, 1)
-    """
+    """Count the arithmetic of one frame of the C source, in which all is read."""
     terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
-    (s, _, m), out = terms.sizes, _written_out(terms)
+    out, table = _written_out(terms), terms.gains[NONE][0].size if terms.tabled else 0
     sums = "".join([*out["errors"], *out["states"], *out["commands"]])
-    table = terms.gains[NONE][0].size if terms.tabled else 0  # of a frame in which all is read
-    varying = len(terms.read) * len(out["varying"])
     return FrameCost(
         multiplications=sums.count(" * ") + table,
         additions=sums.count(" + ") + sums.count(" - ") + table,
-        coefficients=len(out["constants"]) + varying + count_gains(terms),
-        states=s + m,
     )
 
 
@@ -107,17 +74,12 @@ def _round(designs: Sequence[Design], *, form: str, precision: str, **_: Any) ->
                 "the applied commands; got form=plain. Leave it out."
             )
         terms = source_terms(design, form=kind)
-        count = int(np.count_nonzero(terms.whole)) if not terms.tabled else 0
-        if count > MOST_TERMS:
+        count = count_gains(terms) if terms.tabled else int(np.count_nonzero(terms.whole))
+        if count > MOST_NUMBERS:
             raise ProblemError(
-                f"the terms of a controller must be at most {MOST_TERMS:,} in C, for each is "
-                f"written out; got {count:,}. Design with fewer states."
-            )
-        if count_gains(terms) > MOST_GAINS:
-            raise ProblemError(
-                f"the gains of all phases and fall-backs must be at most {MOST_GAINS:,} numbers in "
-                f"C; got {count_gains(terms):,}, in a period of {len(terms.read)} frames. Choose "
-                "rates with a shorter common period, or leave out channels."
+                f"a controller must have at most {MOST_NUMBERS:,} numbers in C; got {count:,}, in "
+                f"a period of {len(terms.read)} frames. Design with fewer states, choose rates "
+                "with a shorter common period, or leave out channels."
             )
         numbers.append(terms.rounded() if precision == "single" else terms)
     return numbers
@@ -341,15 +303,7 @@ def _facts(terms: SourceTerms, **_: Any) -> dict[str, Any]:
 
 
 TARGET = Target(
-    arithmetic=Arithmetic(
-        program="real-time computers, from C99 source",
-        precision="double or single",
-        sums="from left to right: states, applied commands, readings; commands from new states",
-        state="new state: x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k)",
-        clipping="yours: the estimator form takes the applied commands, the plain form none",
-        limits="none",
-    ),
-    file="source and header (.c, .h)",
+    precision="double",
     options={
         "form": None,
         "precision": "double",

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import clarabel
@@ -35,15 +35,13 @@ from lbt_synth.linear.convex_functions import (
     Discs,
     Fractions,
     Function,
-    FunctionBound,
     HalfPlanes,
 )
 from lbt_synth.linear.matrix_functions import semidefinite_root
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray
+from lbt_synth.validation import ComplexArray, FloatArray
 
 _LEAST_CURVATURE = 0.03  # of that of the slopes alone
 _FLAT = 1e-12  # part of the largest curvature below which a direction is flat
-_CLOSE = 0.8  # share of a bound: a programme starts with those that are used more, for speed
 # Tighter tolerances end as "optimal_inaccurate" on plants with two equal axes, and gain nothing.
 SETTINGS = {"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8, "max_iter": 200}
 # Near the edge of feasibility the solver loses its accuracy, sometimes with its own scaling of
@@ -165,35 +163,13 @@ def minimize(
     Return the coefficients, None if the constraints cannot hold together, and the solver's status.
     """
     origin = np.zeros(size) if start is None else start
-    chosen = [_use(constraint, origin) > _CLOSE for constraint in constraints]
-    while True:
-        programme = ConicProgramme(size + sum(part.worst for part in function))
-        for constraint, places in zip(constraints, chosen, strict=True):
-            _constrain(programme, _part(constraint, places), origin)
-        linear, roots = _Model(programme, origin, scale).expression(function)
-        solution = programme.minimize(linear, 2 * roots.T @ roots)
-        if solution.status not in USABLE:
-            return None, solution.status
-        c = origin + solution.x[:size]
-        exceeded = [
-            _use(constraint, c) > 1 + 10 * SETTINGS["tol_feas"] for constraint in constraints
-        ]
-        if not any(np.any(new & ~old) for new, old in zip(exceeded, chosen, strict=True)):
-            return c, solution.status
-        chosen = [new | old for new, old in zip(exceeded, chosen, strict=True)]
-
-
-def _use(constraint: Constraint, c: FloatArray) -> FloatArray:
-    """Share of each bound that is used; that of a function is always imposed."""
-    return np.ones(1) if isinstance(constraint, FunctionBound) else constraint.use(c)
-
-
-def _part(constraint: Constraint, chosen: BoolArray) -> Constraint:
-    """Return some of the bounds of a constraint."""
-    if isinstance(constraint, FunctionBound):
-        return constraint
-    values = {field.name: getattr(constraint, field.name)[chosen] for field in fields(constraint)}
-    return replace(constraint, **values)
+    programme = ConicProgramme(size + sum(part.worst for part in function))
+    for constraint in constraints:
+        _constrain(programme, constraint, origin)
+    linear, roots = _Model(programme, origin, scale).expression(function)
+    solution = programme.minimize(linear, 2 * roots.T @ roots)
+    c = origin + solution.x[:size] if solution.status in USABLE else None
+    return c, solution.status
 
 
 def minimize_relaxation(

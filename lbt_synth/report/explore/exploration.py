@@ -17,7 +17,7 @@ from lbt_synth.config import Config
 from lbt_synth.config.load import build_config, validate_sections
 from lbt_synth.config.schema import FileSection
 from lbt_synth.design import Design
-from lbt_synth.linear import hinf_norm, largest_singular_values
+from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.method import Method
@@ -170,11 +170,7 @@ def _scale_noise(config: Config, content: Content, value: float, factor: float) 
 def _set_shift(config: Config, content: Content, value: float, factor: float) -> None:
     """Move the true lines, the one that moves most by a shift; those of the model stay."""
     for line in _true_lines(config, content):
-        place_hz = line["frequency_hz"]
-        percent = line.pop("frequency_error_percent", None)
-        if percent is not None:
-            line["frequency_error_hz"] = place_hz * percent / 100  # so that it stays as it is
-        line["frequency_hz"] += config.truth.frequency_shift_hz(place_hz, value)
+        line["frequency_hz"] += config.truth.frequency_shift_hz(line["frequency_hz"], value)
 
 
 def _scale_damping(config: Config, content: Content, value: float, factor: float) -> None:
@@ -365,7 +361,7 @@ def show_design(design: Design, config: Config, start: Config, shift_hz: float) 
         "explore-poles": (poles.real, poles.imag),
     }
     if design.is_estimator:
-        error = largest_singular_values(design.error_system(), grid)
+        error = spectral_norms(design.error_system().frequency_response(grid))
         curves["explore-sigma"] = grid, shown_unit("nm")[1] * error
     now = int(np.searchsorted(shifts, shift_hz))
     return Shown(
