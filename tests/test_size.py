@@ -16,13 +16,13 @@ GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3825,
     "config": 1661,
-    "design": 6320,
+    "design": 6290,
     "files": 1243,
     "identification": 9563,
     "interop": 3793,
-    "linear": 5763,
+    "linear": 5100,
     "loop": 4905,
-    "methods": 830,
+    "methods": 861,
     "models": 4400,
     "report": 4312,
     "storage": 1027,
@@ -30,12 +30,12 @@ LINES = {
     "errors, validation": 554,
 }
 COUNTS = {
-    "files of the package": 216,
-    "public names": 186,
-    "tuned constants": 530,
-    "lines of tests": 32229,
-    "lines of benchmarks": 4042,
-    "words of docs": 61300,
+    "files of the package": 214,
+    "public names": 167,
+    "tuned constants": 518,
+    "lines of tests": 31961,
+    "lines of benchmarks": 4016,
+    "words of docs": 60600,
 }
 
 

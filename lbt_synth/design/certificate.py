@@ -100,17 +100,9 @@ class Certificate(Summarised):
         return float(np.sqrt(np.sum(self.rms_per_output**2)))
 
     def require(self, hint: str = "") -> Certificate:
-        """Return the certificate itself, or raise if a check failed.
+        """Return the certificate itself, or raise CertificateError with the checks that failed.
 
-        Parameters
-        ----------
-        hint : str, optional
-            What to try; ends the message.
-
-        Raises
-        ------
-        CertificateError
-            With the names of the failed checks.
+        The hint says what to try, and ends the message.
         """
         failed = [check for check in self.checks if not check.passed]
         if failed:
@@ -198,8 +190,8 @@ def _examine_variance(error: StateSpace) -> tuple[FloatArray, FloatArray, tuple[
     rms, other = float(np.sqrt(variances.sum())), float(np.sqrt(adjoint.sum()))
     least = min(rms, other) + _rounding(error)
     apart = 1 - min(least / max(rms, other, _TINY), 1.0) ** 2
-    name, left = "residual of the Lyapunov equation", residual / max(size, _TINY)
-    solved = Check(name, left, RESIDUAL_TOLERANCE, "relative, 1-norm")
+    name, relative = "residual of the Lyapunov equation", residual / max(size, _TINY)
+    solved = Check(name, relative, RESIDUAL_TOLERANCE, "relative, 1-norm")
     name, how = "variance, against its adjoint equation", "relative, two Lyapunov equations"
     return P, variances, (solved, Check(name, apart, TOLERANCE, how))
 

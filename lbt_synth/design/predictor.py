@@ -164,17 +164,10 @@ def command_rms(parameters: Sequence[Controller]) -> tuple[float, ...]:
 def regression_filter(
     hardware: LoopHardware, base: Controller, coefficients: FloatArray
 ) -> Controller:
-    """Return the filter of a base controller and of what a regression adds to it.
+    """Return the filter of a base, whose loop is stable, and of what a regression adds to it.
 
-    Parameters
-    ----------
-    hardware : LoopHardware
-        The loop of its own sensor; its influence matrix can be inverted.
-    base : Controller
-        From y(k) to u(k), of a loop that is stable.
-    coefficients : (taps, n, 2 n + c) array_like
-        What is added to the correction of each mode, per value of the base's correction, of the
-        pseudo-open-loop measurement and of the channels; the newest first.
+    The coefficients (taps, n, 2 n + c) are added to the correction of each mode, per value of the
+    base's correction, of the pseudo-open-loop measurement and of the channels; the newest first.
     """
     taps, n, signals = coefficients.shape
     own = youla_parameter(hardware, base)

@@ -119,14 +119,7 @@ class MixedController:
     def step(self, y: ArrayLike) -> FloatArray:
         """Take the modal coefficients y(k), (n,), and return the modal commands u(k), (n,).
 
-        Raises
-        ------
-        DimensionError
-            If y has another size.
-        NonFiniteError
-            If a measurement is not finite; the state is then as before.
-        ProblemError
-            If y is no array of real numbers.
+        A measurement that is not finite raises a NonFiniteError; the state is then as before.
         """
         measured = float_array(y, "y")
         if measured.shape != self.gains.shape:
