@@ -288,11 +288,6 @@ class ShapedDesign(Design):
         pairs = zip(self.objective_nm, self.long_objective_nm, strict=True)
         return max(short / long - 1 for short, long in pairs)
 
-    def demand_labels(self) -> tuple[tuple[int, str], ...]:
-        """Demands in words: mode, demand."""
-        specs = enumerate(self.specifications)
-        return tuple((mode, demand.label) for mode, spec in specs for demand in spec.demands)
-
     @property
     def expected_residual_nm(self) -> float:
         """Root of the sum of the squared objectives of the modes."""
@@ -322,7 +317,11 @@ class ShapedDesign(Design):
 
     def tables(self) -> tuple[RowTable, ...]:
         """Return the demands, and the residual of each term."""
-        demands = [DemandRow(demand=label, mode=mode + 1) for mode, label in self.demand_labels()]
+        demands = [
+            DemandRow(demand=demand.label, mode=mode)
+            for mode, spec in enumerate(self.specifications, 1)
+            for demand in spec.demands
+        ]
         terms = [
             TermRow(term=text, mode=mode + 1, rms_nm=rms) for mode, text, rms in self.terms_nm()
         ]
