@@ -15,9 +15,7 @@ from lbt_synth.cli.loop_inputs import (
     load_shown,
     margin_columns,
     named_difference_notes,
-    own_sensor_notes,
     say_limit,
-    say_residual,
 )
 from lbt_synth.cli.output import PERCENT, RMS, Report
 from lbt_synth.cli.streams import track_progress
@@ -30,14 +28,22 @@ from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models.turbulence.ar_models import noll_orders
-from lbt_synth.report.designs.report import refine_values, require_compatible, stable_interval
-from lbt_synth.report.figures import modal_figure, robustness_map_figure
-from lbt_synth.report.figures.studies import limits_figure, mirror_figure, tradeoff_figure
+from lbt_synth.report.designs import (
+    refine_values,
+    require_compatible,
+)
+from lbt_synth.report.figures import robustness_map_figure
+from lbt_synth.report.figures.studies import (
+    limits_figure,
+    mirror_figure,
+    modal_figure,
+    tradeoff_figure,
+)
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import LimitRow
-from lbt_synth.studies.limits import LimitStudy
+from lbt_synth.studies.limits import LimitStudy, say_residual
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, mirror_rows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
@@ -132,11 +138,6 @@ def run_limits(arguments: Namespace) -> Report:
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
             "vibrations along principal axes of the sensor's noise."
         )
-    if config.truth.vibrations and not config.plant.vibrations:
-        report.notes.append(
-            "note: kalman and hinf are designed without a vibration, as model.vibrations is "
-            "missing; the truth has one."
-        )
     report.notes += named_difference_notes(config, designs)
     return report
 
@@ -168,7 +169,8 @@ def run_tradeoff(arguments: Namespace) -> Report:
         f"The least norm of any filter lies between {nm_text(least.gamma_infeasible, '.9g')} and "
         f"{nm_text(least.gamma_least, '.9g')}.",
     ]
-    report.notes += own_sensor_notes(config)
+    if others := config.other_sensors:
+        report.notes.append(f"note: the loop's own sensor is read alone, without {others}.")
     return report
 
 
@@ -199,17 +201,13 @@ def run_mirror(arguments: Namespace) -> Report:
         "rows",
         f"Designs on this mirror; {config.imaging.label}",
         rows,
-        figure=lambda: mirror_figure(hardware, tolerance=arguments.tolerance),
+        figure=lambda: mirror_figure(shell, hardware, tolerance=arguments.tolerance),
     )
     report.add_facts(
         "The mirror after a step of its command",
         facts(
-            rise_s=fact(step.rise_s, "rise, 10 % to 90 %", **ms),
-            overshoot=fact(step.overshoot, "overshoot", unit="%", scale=100),
-            tolerance=fact(step.tolerance, "tolerance of the settling time", unit="%", scale=100),
             settling_s=fact(step.settling_s, "settling time", **ms),
             settling_frames=fact(frames, "  in frames", unit="frames"),
-            bandwidth_hz=fact(shell.bandwidth_hz, "bandwidth, -3 dB", unit="Hz"),
             frame_s=fact(hardware.dt_s, "one frame", **ms),
             limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
         ),
@@ -227,7 +225,7 @@ def run_robustness(arguments: Namespace) -> Report:
     for gain in gains:
         number(gain, "--sensor-gains", above=0)
     designs = load_designs(arguments.gains)
-    maps, intervals = {}, {}
+    maps = {}
     for name, design in designs.items():
         require_compatible(name, design, hardware)
         grid = studies.robustness_map(
@@ -239,10 +237,9 @@ def run_robustness(arguments: Namespace) -> Report:
             delay_errors_frames=delays,
             hardware=hardware,
         )
-        intervals[name] = _stable_gains(design, grid, config)
         maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
     real = int(np.argmin(np.abs(gains - config.sensor_gain * config.truth.sensor_gain)))
-    lines = [line for name in maps for line in _map_lines(name, maps[name], real, intervals[name])]
+    lines = [line for name in maps for line in _map_lines(name, maps[name], real)]
     where = f"frequency errors of {np.min(errors):+g} to {np.max(errors):+g} Hz"
     caption = f"At a sensor gain of {gains[real]:.3g}: {config.imaging.label}, over {where}"
     report = Report(
@@ -252,9 +249,7 @@ def run_robustness(arguments: Namespace) -> Report:
         rows=[point for name, grid in maps.items() for point in _map_points(name, grid)],
         figure=lambda: robustness_map_figure(maps),
     )
-    report.data["maps"] = {
-        name: asdict(grid) | {"stable_sensor_gains": intervals[name]} for name, grid in maps.items()
-    }
+    report.data["maps"] = {name: asdict(grid) for name, grid in maps.items()}
     return report
 
 
@@ -292,37 +287,25 @@ def _parse_range(
     return np.linspace(low, high, int(count))
 
 
-def _stable_gains(design: Design, grid: RobustnessMap, config: Config) -> list[FloatArray]:
-    """Return the interval of stable real sensor gains at each delay error, or nan for none."""
-    hardware, intervals = config.hardware, []
-    for delay, stable in zip(grid.delay_errors_frames, grid.stable, strict=True):
-        real = replace(hardware, delay_frames=hardware.delay_frames + delay)
-        ends = stable_interval(real, design.controller, [1.0, *grid.sensor_gains[stable]])
-        intervals.append(config.sensor_gain * np.array(ends))
-    return intervals
-
-
 def _map_points(name: str, grid: RobustnessMap) -> list[Facts]:
     """Return a row for each point of the map of a gain file."""
+    axes = grid.delay_errors_frames, grid.sensor_gains, grid.errors_hz
+    names = ("delay_error_frames", "sensor_gain", "error_hz")
     return [
         facts(
             file=fact(name),
-            delay_error_frames=fact(float(grid.delay_errors_frames[i])),
-            sensor_gain=fact(float(grid.sensor_gains[j])),
-            error_hz=fact(float(grid.errors_hz[k])),
+            **{key: fact(float(axis[i])) for key, axis, i in zip(names, axes, place, strict=True)},
             strehl=fact(float(strehl)),
-            residual_nm=fact(float(grid.residual_nm[i, j, k])),
-            stable=fact(bool(grid.stable[i, j])),
+            residual_nm=fact(float(grid.residual_nm[place])),
+            stable=fact(bool(grid.stable[place[:2]])),
         )
-        for (i, j, k), strehl in np.ndenumerate(grid.strehl)
+        for place, strehl in np.ndenumerate(grid.strehl)
     ]
 
 
-def _map_lines(
-    name: str, grid: RobustnessMap, real: int, intervals: Sequence[FloatArray]
-) -> Iterator[Facts]:
+def _map_lines(name: str, grid: RobustnessMap, real: int) -> Iterator[Facts]:
     """Yield a row for each delay error at the real sensor gain, with its worst frequency error."""
-    for i, (delay, (low, high)) in enumerate(zip(grid.delay_errors_frames, intervals, strict=True)):
+    for i, delay in enumerate(grid.delay_errors_frames):
         stable, strehls = bool(grid.stable[i, real]), grid.strehl[i, real]
         worst = int(np.argmin(strehls)) if stable else 0
         centre = strehls[grid.errors_hz == 0]
@@ -334,8 +317,6 @@ def _map_lines(
             centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **PERCENT),
             worst=fact(strehls[worst], "worst Strehl", **PERCENT),
             worst_hz=fact(at_hz, "at", unit="Hz", format="+.2f"),
-            low=fact(low, "stable gains, from", format=".4g"),
-            high=fact(high, "to", format=".4g"),
         )
 
 

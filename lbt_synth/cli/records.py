@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from lbt_synth import identification
 from lbt_synth.cli.arguments import given_options, refuse_options
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs, say_accelerometers
-from lbt_synth.cli.output import BRIEF_ROWS, Report, say_checks
+from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.cli.streams import count_progress
 from lbt_synth.cli.telemetry import (
     load_series,
@@ -19,7 +19,7 @@ from lbt_synth.cli.telemetry import (
     require_series,
 )
 from lbt_synth.config.write import RAISED, config_text, identified_config, require_writable_facts
-from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import IdentifiedModel, LoopRecord, SpectrumRecord
@@ -32,17 +32,16 @@ from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, model_tables
 from lbt_synth.identification.records.record import LEAST_SECONDS, require_length
 from lbt_synth.loop import Imaging, loop_margins
-from lbt_synth.report.draw import require_figure_name, save_figure
+from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import json_record, row_table
+from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.words import count_text
 
 if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not need
     from lbt_synth.identification.auto import RecordedDesign
-    from lbt_synth.identification.diagnosis import Diagnosis
 
 
 _STEPS = 3  # that diagnose and auto count
@@ -50,7 +49,7 @@ _STEPS = 3  # that diagnose and auto count
 
 def run_identify(arguments: Namespace) -> Report:
     """Identify a loop from its record; write a configuration and, by default, a figure."""
-    places = find_places(arguments, arguments.output)
+    places = find_places(arguments)
     record = read_record(arguments)
     choose_unit(arguments, record.diameter_m)
     readings = read_accelerations(arguments, record)
@@ -62,19 +61,15 @@ def run_identify(arguments: Namespace) -> Report:
         doubts = judge_record(arguments, record)
     model = identification.identify(record, **options)
     report = Report(data={"source": str(arguments.file)})
-    add_record(report, record)
     add_model(report, model)
+    add_record(report, record)
     _say_model(report, model, record)
     transfers: AccelerometerTransfers | None = None
     if readings is not None and isinstance(record, LoopRecord):
         channels, values, notes = readings
         report.notes += [f"note: {note}." for note in notes]
-        try:
-            transfers = accelerometer_transfers(model, record, values, channels=channels)
-        except LbtSynthError as error:  # the model is not lost
-            report.notes.append(f"warning: the accelerometers were not compared: {error}")
-        else:
-            add_accelerometers(report, transfers)
+        transfers = accelerometer_transfers(model, record, values, channels=channels)
+        add_accelerometers(report, transfers)
     report.notes += [marked_note(doubt) for doubt in doubts]
     write_files(report, places, arguments, record, model, accelerometers=transfers)
     return report
@@ -88,16 +83,11 @@ def _say_model(report: Report, model: IdentifiedModel, record: LoopRecord | Spec
     leaves = "is white: the model is enough" if white else "is not white: the model lacks something"
     said = "No vibration stands out of the turbulence and the noise."
     if lines := model.parts:
-        order = sorted(range(len(lines)), key=lambda place: -lines[place].rms_nm)
-        strongest = lines[order[0]]
+        strongest = max(lines, key=lambda line: line.rms_nm)
         said = (
             f"{count_text(len(lines), 'vibration')}, the strongest of "
             f"{nm_text(strongest.rms_nm, '.1f')} rms at {strongest.frequency_hz:.2f} Hz."
         )
-        table = model_tables(model)[-1]
-        rows = [table.rows[place] for place in order[:BRIEF_ROWS]]
-        caption = f"{table.caption}, the strongest first"
-        report.tables.insert(0, replace(table, caption=caption, rows=tuple(rows)))
     report.verdict += [said, f"What the model does not explain {leaves}."]
 
 
@@ -106,7 +96,7 @@ def run_auto(arguments: Namespace) -> Report:
     from lbt_synth.identification.auto import LEAST_SECONDS  # with it come the methods
 
     gain = require_gain_name(arguments.output)
-    places = find_places(arguments, arguments.model, gain=gain)
+    places = find_places(arguments, gain=gain)
     record = require_series(read_record(arguments, LEAST_SECONDS), "auto tests its design on")
     choose_unit(arguments, record.diameter_m)
     channels, values, notes = read_accelerations(arguments, record) or (None, None, ())
@@ -185,8 +175,12 @@ def _say_held_out(
 
 def run_diagnose(arguments: Namespace) -> Report:
     """Diagnose a record, with a design to try on it if one is given, and write the page."""
-    from lbt_synth.identification.diagnosis import live_axes  # with it come the methods
-    from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
+    from lbt_synth.identification.diagnosis import (  # with it come the methods
+        disturbance_lines,
+        judge_channels,
+        live_axes,
+    )
+    from lbt_synth.report.pages import diagnosis_page, diagnosis_rows
 
     if arguments.output is not None:
         paths = given_options(arguments, "file", "gain", "commands")
@@ -202,18 +196,30 @@ def run_diagnose(arguments: Namespace) -> Report:
         diagnosis = identification.diagnose(
             record.bridged(),
             given=designs,
-            whole=both,
             imaging=record_imaging(arguments, record),
             progress=count,
             **identification_options(arguments, record),
         )
-    sections = diagnosis_tables(diagnosis)
+    if record.axes < both.axes:
+        said = "the rest is of the axis that lives: the other one is dead"
+        notes = (said, *diagnosis.notes)
+        diagnosis = replace(diagnosis, channels=judge_channels(both), notes=notes)
+    model = diagnosis.model
     report = Report(
-        data={"source": str(arguments.file), **_diagnosis_data(diagnosis)},
+        data={
+            "source": str(arguments.file),
+            "doubt": diagnosis.doubt or None,
+            "record": record_data(record),
+            "lines": [] if model is None else [asdict(x) for x in disturbance_lines(model)],
+            "best": diagnosis.best or None,
+            "notes": diagnosis.notes,
+        },
         verdict=list(diagnosis.verdict),
-        tables=[*sections.pop("verdict")[::-1], *(t for one in sections.values() for t in one)],
         notes=[marked_note(note) for note in diagnosis.notes],
     )
+    for _, key, caption, rows in diagnosis_rows(diagnosis):
+        report.add_rows(key, caption, rows)
+    report.tables += [] if model is None else model_tables(model)[1:]
     if arguments.output is not None:
         files = (arguments.file, *([arguments.gain] if arguments.gain else []))
         page = diagnosis_page(diagnosis, files)
@@ -225,27 +231,6 @@ def _series(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
     """Load the record, or some of its axes."""
     series = load_series(arguments, axes)
     return require_series(series, "diagnose examines")
-
-
-def _diagnosis_data(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return a diagnosis for JSON; what could not be said is null or empty."""
-    from lbt_synth.identification.diagnosis import disturbance_lines, law_facts
-
-    model, law, loop = diagnosis.model, diagnosis.law, diagnosis.loop
-    commands = diagnosis.commands
-    return {
-        "doubt": diagnosis.doubt or None,
-        "record": record_data(diagnosis.record),
-        "channels": [json_record(row) for row in diagnosis.channels],
-        "commands": None if commands is None else json_record(commands.facts()),
-        "control_law": None if law is None else asdict(law) | json_record(law_facts(law)),
-        "loop": None if loop is None else json_record(loop),
-        "lines": [] if model is None else [asdict(line) for line in disturbance_lines(model)],
-        "costs": [json_record(row) for row in diagnosis.costs],
-        "residuals": [json_record(row) for row in diagnosis.residuals],
-        "best": diagnosis.best or None,
-        "notes": diagnosis.notes,
-    }
 
 
 def read_record(
@@ -322,21 +307,14 @@ def add_accelerometers(report: Report, transfers: AccelerometerTransfers) -> Non
     report.notes.append(f"note: {transfers.shift_text}")
 
 
-def find_places(arguments: Namespace, model: str | Path | None, **others: Path) -> dict[str, Path]:
-    """Return where model, figure and others go, by default beside each other.
-
-    Refuse bad places.
-    """
+def find_places(arguments: Namespace, **gain: Path) -> dict[str, Path]:
+    """Return where model, figure and gain file go, beside each other; refuse bad places."""
     output = Path(arguments.output)
-    model = require_ending(model or output.with_suffix(".yaml"), "a model", (".yaml", ".yml"))
-    places = {**others, "model": model}
+    model = output.with_suffix(".yaml") if gain else output
+    places = {**gain, "model": require_ending(model, "a model", (".yaml", ".yml"))}
     if not arguments.no_figure:
-        figure = arguments.figure or output.with_suffix(".png")
-        places["figure"] = require_figure_name(figure)
-    elif arguments.figure is not None:
-        raise ProblemError("give one of --figure and --no-figure, not both.")
-    read = ("file", "commands", "accelerometers")
-    inputs = given_options(arguments, *(name for name in read if name in arguments))
+        places["figure"] = output.with_suffix(".png")
+    inputs = given_options(arguments, "file", "commands", "accelerometers")
     require_writable(*places.values(), inputs=inputs.values())
     return places
 
@@ -355,27 +333,6 @@ def write_files(
     if made is not None:
         designs = {made.name: made.design}
         report.note_written(save_gain(places["gain"], made.design))
-    try:
-        text, comments = _model_text(model, arguments, record, accelerometers)
-    except ProblemError as error:
-        if accelerometers is None:
-            raise
-        report.notes.append(f"warning: the model is written without accelerometers: {error}")
-        text, comments = _model_text(model, arguments, record, None)
-    report.note_written(write_atomically(places["model"], text), "model")
-    report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
-    if "figure" in places:
-        figure = identification_figure(model, designs=designs)
-        report.note_written(save_figure(figure, places["figure"]), "figure")
-
-
-def _model_text(
-    model: IdentifiedModel,
-    arguments: Namespace,
-    record: LoopRecord | SpectrumRecord,
-    accelerometers: AccelerometerTransfers | None,
-) -> tuple[bytes, dict[str, str]]:
-    """Return the text of a configuration for an identified model, and its comments."""
     source = ascii(Path(arguments.file).name)[1:-1]
     settings, comments = identified_config(
         model,
@@ -383,7 +340,12 @@ def _model_text(
         title=f"Identified from {source} by lbt-synth {arguments.command}.",
         accelerometers=accelerometers,
     )
-    return config_text(settings, comments).encode(), comments
+    text = config_text(settings, comments).encode()
+    report.note_written(write_atomically(places["model"], text), "model")
+    report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
+    if "figure" in places:
+        figure = identification_figure(model, designs=designs)
+        report.note_written(save_figure(figure, places["figure"]), "figure")
 
 
 def add_record(report: Report, record: LoopRecord | SpectrumRecord) -> None:
@@ -416,7 +378,7 @@ def record_data(record: LoopRecord | SpectrumRecord) -> dict[str, Any]:
 
 def add_model(report: Report, model: IdentifiedModel) -> None:
     """Add the tables of an identified model, its notes, and its numbers."""
-    report.tables += model_tables(model)
+    report.tables += model_tables(model)[::-1]
     report.notes += [marked_note(note) for note in model.notes]
     report.data["axes"] = [_axis_record(axis) for axis in model.axes]
     report.data["vibrations"] = [asdict(line) for line in model.parts]

@@ -70,18 +70,15 @@ def load_series(
         swap_axes=arguments.swap_axes,
         sign=tuple(arguments.command_sign or ()),
         matrix=tuple(arguments.command_matrix or ()),
-        scale=arguments.command_scale or 1.0,
+        scale=tuple(arguments.command_scale or ()),
     )
     if isinstance(record, SpectrumRecord):
         if repair.options:
             raise ProblemError(f"a spectrum has no commands; leave {repair.options} out.")
         return record
-    options = repair.options
-    if arguments.command_scale is not None and not repair.scales:
-        options = f"{options} --command-scale 1".strip()
     return replace(
         repair_commands(record, repair) if repair.options else record,
-        read_with=" ".join(filter(None, (record.read_with, options))),
+        read_with=" ".join(filter(None, (record.read_with, repair.options))),
         stated_gain=tuple(arguments.sensor_gain or record.stated_gain),
     )
 

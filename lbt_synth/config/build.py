@@ -208,20 +208,14 @@ def _build_true_vibrations(
         return plant.vibrations
     rate, lines = settings.loop.frame_rate_hz, list[TrueVibration]()
     for section, key, numbers in vibration_numbers(settings, "truth"):
-        if section.kind != "resonance":
-            del numbers["damping"]
-        if section.kind == "drift":
-            start_hz = numbers.pop("frequency_hz")
-            _require_below_nyquist(section.end_hz, rate, f"{key}.end_hz")
-            with name_key(key):
-                ends = {"start_hz": start_hz, "end_hz": section.end_hz}
-                lines.append(
-                    models.DriftingVibration(**numbers, **ends, duration_s=section.duration_s)
-                )
-        elif section.kind == "resonance":
+        if section.kind == "resonance":
             lines.append(models.Vibration(**numbers))
-        else:
-            lines.append(models.SinusoidalVibration(**numbers))
+            continue
+        del numbers["damping"]
+        if section.kind == "drift":
+            _require_below_nyquist(section.end_hz, rate, f"{key}.end_hz")
+        drift = {"end_hz": section.end_hz, "duration_s": section.duration_s}
+        lines.append(models.SinusoidalVibration(**numbers, **drift))
     return tuple(lines)
 
 
@@ -233,11 +227,7 @@ def _frequency_errors(
     if all(section.frequency_error_hz is None for section in sections):
         return None
     places = np.array([section.frequency_hz for section in sections])
-    starts = [
-        line.start_hz if isinstance(line, models.DriftingVibration) else line.frequency_hz
-        for line in vibrations
-    ]
-    nearest = [sections[int(np.argmin(np.abs(places - start)))] for start in starts]
+    nearest = [sections[int(np.argmin(np.abs(places - line.frequency_hz)))] for line in vibrations]
     return tuple(section.frequency_error_hz or 0.0 for section in nearest)
 
 

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any
-
 import numpy as np
 
 from lbt_synth.design.filter_design import FilterDesign, filter_design
@@ -13,7 +9,6 @@ from lbt_synth.design.kalman import error_scale
 from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import CertificateError, InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import EstimationProblem, hinf_norm
-from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.infeasibility_proof import (
     Witness,
     infeasible_level,
@@ -25,7 +20,7 @@ from lbt_synth.linear.riccati.filtering import (
     kalman_riccati,
     least_gamma,
 )
-from lbt_synth.validation import choice, number
+from lbt_synth.validation import choice, number, require_instance
 
 AT_LEAST = 1e-9  # a level this close to the least one counts as the least one itself
 LARGEST_LMI = 20  # states; the inequality takes minutes beyond
@@ -53,9 +48,9 @@ def hinf(
     gamma_ratio : float, optional
         The same bound as a multiple, at least 1, of the least gamma.
     route : {"lmi", "riccati"}, optional
-        Linear matrix inequality, or the gamma-Riccati equation. For a given
-        bound both give the central filter. By default the inequality up to 20 states, and
-        the equation beyond, where the inequality takes minutes, or where the inequality fails.
+        How the least gamma is found: linear matrix inequality, or gamma-Riccati equation, of which
+        the filter of a larger bound is the central one. By default the inequality up to 20 states,
+        and the equation beyond, where the inequality takes minutes, or where the inequality fails.
 
     Returns
     -------
@@ -82,7 +77,7 @@ def hinf(
     >>> design.gamma <= design.gamma_requested
     True
     """
-    require_problem(problem)
+    require_instance(problem, EstimationProblem)
     if route is not None:
         choice(route, "route", ("lmi", "riccati"))
     gamma, gamma_ratio = checked_bounds(
@@ -129,24 +124,19 @@ def _design(
     gamma_ratio: float | None,
 ) -> FilterDesign:
     """Find the least gamma by one route, and the filter of the level asked for."""
-    gains: FilterRiccati
-    central: Callable[[float], FilterRiccati]
     lower, upper = _kalman_bracket(problem, start)
     if route == "lmi":
-        from lbt_synth.linear.lmi.filters import hinf_lmi, least_gamma_lmi
+        from lbt_synth.linear.lmi.filters import least_gamma_lmi
 
-        scales: dict[str, Any] = {"coordinates": start.P, "scale": upper}
-        gains, witness = least_gamma_lmi(problem, **scales)
-        central = partial(hinf_lmi, problem, **scales)
+        gains, witness = least_gamma_lmi(problem, coordinates=start.P, scale=upper)
     else:
-        _, level, best = least_gamma(problem, lower=lower, upper=upper, start=start)
-        gains, witness = best, worst_invisible_disturbance(problem, best.P, level, start.P)
-        central = partial(_central, problem, start)
+        _, level, gains = least_gamma(problem, lower=lower, upper=upper, start=start)
+        witness = worst_invisible_disturbance(problem, gains.P, level, start.P)
     least, infeasible = _verified_bracket(problem, start, gains, witness)
     requested = gamma if gamma is not None else least * (gamma_ratio or 1)
     require_reachable(requested, least)
     if requested > least * (1 + AT_LEAST):
-        gains = central(requested)
+        gains = _central(problem, start, requested)
     design = filter_design(
         problem,
         gains.gain_predictor,

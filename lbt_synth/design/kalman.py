@@ -7,12 +7,11 @@ import numpy as np
 from lbt_synth.design.filter_design import FilterDesign, filter_design
 from lbt_synth.design.result import SolverReport
 from lbt_synth.linear import EstimationProblem
-from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.validation import FloatArray, choice
+from lbt_synth.validation import FloatArray, require_instance
 
 
-def kalman(problem: EstimationProblem, *, route: str = "riccati") -> FilterDesign:
+def kalman(problem: EstimationProblem) -> FilterDesign:
     """Design the steady-state Kalman filter of an estimation problem.
 
     Parameters
@@ -20,9 +19,6 @@ def kalman(problem: EstimationProblem, *, route: str = "riccati") -> FilterDesig
     problem : EstimationProblem
         The problem; a plant gives a controller. The estimate is one frame ahead of the newest
         measurement; ``problem.ahead`` is the problem of another one.
-    route : {"riccati", "sdp"}, optional
-        The Riccati equation, or a semidefinite programme, which takes from the Riccati
-        solution only the coordinates and the scale of its variables.
 
     Returns
     -------
@@ -46,21 +42,13 @@ def kalman(problem: EstimationProblem, *, route: str = "riccati") -> FilterDesig
     >>> round(float(design.gain_predictor[0, 0]), 9), design.certificate.passed
     (0.618033989, True)
     """
-    require_problem(problem)
-    choice(route, "route", ("riccati", "sdp"))
+    require_instance(problem, EstimationProblem)
     solution = kalman_riccati(problem)
-    gains = solution
-    if route == "sdp":
-        problem.require_one_phase("the semidefinite programme", "route='riccati'")
-        from lbt_synth.linear.lmi.filters import kalman_sdp
-
-        scale = error_scale(problem, solution.P)
-        gains = kalman_sdp(problem, coordinates=solution.P, scale=scale)
     return filter_design(
         problem,
-        gains.gain_predictor,
+        solution.gain_predictor,
         method="kalman",
-        solver=SolverReport(route=route, status=gains.status),
+        solver=SolverReport(route="riccati", status=solution.status),
     )
 
 

@@ -22,11 +22,10 @@ from lbt_synth.linear import (
     StateSpace,
     hinf_norm,
 )
-from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.linear.riccati.filtering import FilterRiccati, gamma_riccati, kalman_riccati
-from lbt_synth.validation import FloatArray, frozen_copy, integer, number
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number, require_instance
 
 _DECADES = 4.0  # of gamma, over which a central filter is searched
 _ROUNDS = 20
@@ -91,7 +90,7 @@ def mixed(
     >>> best.gamma <= central.gamma * (1 + 1e-6) and best.rms < central.rms
     True
     """
-    require_problem(problem)
+    require_instance(problem, EstimationProblem)
     if (gamma is None) == (gamma_ratio is None):
         raise ProblemError(
             f"give one of gamma and gamma_ratio; got gamma={gamma!r}, gamma_ratio={gamma_ratio!r}."

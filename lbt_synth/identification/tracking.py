@@ -1,8 +1,8 @@
 """Tracking: identify the last seconds of a running loop again, design again, and change over.
 
-The error of an estimator does not depend on the commands (``plant.estimator``). A new
-filter that runs over the recorded measurements and commands has the state that it would have if it
-had always run: no bump.
+The error of an estimator (:func:`~lbt_synth.linear.estimator_form`) does not depend on the
+commands. A new filter that runs over the recorded measurements and commands has the state that it
+would have if it had always run: no bump.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
 from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records.record import FEW, LoopRecord
+from lbt_synth.linear import estimator_form
 from lbt_synth.linear.block_filtering import series_states
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
@@ -137,9 +138,9 @@ class TrackingController:
             full = _plant_of(self._design).full()
             measured = full.C @ self._filter.state + full.D_known @ self._command
         self._past.append(np.concatenate([measured, self._command, [spoilt]]))
-        estimate = self._filter.step(np.concatenate([measured, self._command]))
+        command = self._filter.step(measured, self._command)
         if not spoilt:
-            self._command = self._hardware.projector @ estimate
+            self._command = command
         self._frames += 1
         since_full = self._frames - self._window
         if since_full >= 0 and since_full % self._every == 0:
@@ -191,14 +192,17 @@ class TrackingController:
         if not close_loop(self._hardware, design.controller).is_stable:
             raise ProblemError("the loop must be stable with the new filter; it is not.")
         self._take(design)
-        inputs = np.array(self._past)[:, :-1]
-        estimator = self._filter.controller
-        self._filter.state = series_states(estimator.A, inputs @ estimator.B.T)[-1]
+        measured, commands, _ = np.split(
+            np.array(self._past), [self._hardware.n_measurements, -1], 1
+        )
+        form = self._filter.controller
+        driven = measured @ form.B.T + commands @ form.applied.T
+        self._filter.state = series_states(form.A, driven)[-1]
 
     def _take(self, design: FilterDesign) -> None:
         """Set the filter, with a zero state."""
-        estimator = _plant_of(design).estimator(design.gain_predictor)
-        self._design, self._filter = design, estimator.start()
+        _plant_of(design)
+        self._design, self._filter = design, estimator_form(design).start()
 
 
 def _plant_of(design: object) -> TipTiltPlant:

@@ -21,7 +21,11 @@ from lbt_synth.loop import (
     least_worst_residual,
     residual_budget,
 )
-from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_or_none
+from lbt_synth.loop.least_residuals.residual_limit import (
+    ResidualLimit,
+    above_percent,
+    limit_or_none,
+)
 from lbt_synth.loop.margins import phase_margin_deg
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
@@ -312,3 +316,13 @@ def _warnings(
                 f"{name} leaves less in the truth, where each vibration is at one frequency; "
                 "this design is for all frequencies of its bands"
             )
+
+
+def say_residual(name: str, row: LimitRow, limit: ResidualLimit | None) -> str:
+    """Return the sentence on what a stable design leaves in the truth."""
+    said = f"{name} leaves {nm_text(row.residual_nm, '.1f')} rms in the truth (Strehl ratio "
+    said += f"{100 * row.strehl:.1f} %)"
+    if limit is None or np.isnan(row.above_limit_percent):
+        return f"{said}."
+    least = nm_text(limit.rms_nm, ".1f")
+    return f"{said}, {row.above_limit_percent:.0f} % above the {least} of the best linear one."

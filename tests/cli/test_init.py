@@ -44,17 +44,3 @@ def test_the_examples_are_written_under_their_names(here, capsys):
     assert run(capsys, "init", "--examples")[0] == 0
     assert {file.name for file in (here / "examples").iterdir()} == set(example_files())
     lbt.studies.load_study("examples/study.yaml")
-
-
-def test_the_schema_is_printed_and_written(tmp_path, capsys):
-    schema = config_schema()
-    for words in ((), ("--json",)):
-        status, out, error = run(capsys, "init", "--schema", *words)
-        assert (status, error) == (0, "")
-        assert json.loads(out) == schema
-    file = tmp_path / "s.json"
-    assert run(capsys, "init", "--schema", "-o", file)[0] == 0
-    assert json.loads(file.read_text()) == schema
-    assert run(capsys, "init", "--schema", "-o", tmp_path / "s.yaml")[0] == 2
-    status, _, error = run(capsys, "init", "--schema", "--telescope", "vlt")
-    assert (status, "--telescope does not go with --schema; leave it out." in error) == (2, True)

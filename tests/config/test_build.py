@@ -22,7 +22,7 @@ from support.several_sensors import write_config as write_sensors
 
 import lbt_synth as lbt
 from lbt_synth.errors import ConfigError
-from lbt_synth.models import DriftingVibration
+from lbt_synth.models import SinusoidalVibration
 from lbt_synth.studies.robustness import mirror_rows
 
 SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
@@ -129,7 +129,7 @@ def test_one_axis(tmp_path, direction):
 
 def test_a_line_may_drift(tmp_path):
     (drift,) = lbt.load_config(drift_file(tmp_path)).truth.vibrations
-    assert drift == DriftingVibration(start_hz=17, end_hz=23, duration_s=60, rms_nm=797)
+    assert drift == SinusoidalVibration(frequency_hz=17, end_hz=23, duration_s=60, rms_nm=797)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from lbt_synth.loop.budget import settling_error
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.models import ARModel, PositionLoop, SinusoidalVibration
 from lbt_synth.models.plant.tip_tilt import retuned_plant
-from lbt_synth.report.figures.studies import mirror_figure
 from lbt_synth.studies.robustness import mirror_rows
 
 
@@ -197,7 +196,6 @@ def test_refusals():
             (lambda: lbt.lqg(plant, command_weight=-1.0), ProblemError, weight),
             (lambda: lbt.lqg(flat), DimensionError, "must have rank 2"),
             (lambda: mirror_rows(path, *rows), ProblemError, need),
-            (lambda: mirror_figure(settled), ProblemError, "settles at once"),
             (lambda: design.error_system(bare), ProblemError, problem),
             (lambda: design.error_system(quiet), ProblemError, "must have 5 states"),
             (lambda: replace(design, controller=design.controller), ValueError, "controller"),

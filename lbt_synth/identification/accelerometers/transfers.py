@@ -23,7 +23,7 @@ from scipy.special import gammaincc
 
 from lbt_synth.design.filter_design import MOST_UNITS
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.accelerometers.readings import LEAST_M_S2, channel_names, fill_missing
+from lbt_synth.identification.accelerometers.readings import read_channels
 from lbt_synth.identification.fit.identified_model import (
     DIFFERENT,
     IdentifiedLine,
@@ -34,7 +34,7 @@ from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models.sensor_suite import LONGEST_DELAY
 from lbt_synth.storage.rows import column, table_row
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, number
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _TINY = np.finfo(np.float64).tiny
 _NOTHING = "adds nothing"
@@ -47,49 +47,29 @@ _DOUBT = 0.01  # chance below which a channel moves at a line more than its nois
 
 @table_row
 class TransferRow:
-    """How one channel moves with one line."""
+    """How one channel moves with one line, with standard errors."""
 
-    channel: str = column("channel", help="Name of the channel")
-    line: int = column(help="Index of the line among the resonances of the model")
-    frequency_hz: float = column("f", unit="Hz", format=".3f", help="Frequency of the line")
-    motion_nm_per_nm: float = column(
-        "motion",
-        unit="nm/nm",
-        format=".4g",
-        help="Motion of the channel per motion of the wavefront",
-    )
-    motion_error_nm_per_nm: float = column(
-        "+-", unit="nm/nm", format=".2g", help="Standard error of the motion"
-    )
-    phase_deg: float = column(
-        "phase", unit="deg", format=".1f", help="Phase of the motion against that of the wavefront"
-    )
-    phase_error_deg: float = column(
-        "+-", unit="deg", format=".2g", help="Standard error of the phase"
-    )
-    coherence: float = column(
-        "coherence",
-        format=".3f",
-        help="Share of the power at the line that goes with the wavefront",
-    )
-    chance: float = column(
-        "chance", format=".1g", help="Probability that a channel without the line shows as much"
-    )
-    useful: bool = column("used", help="Whether the line shows in the channel beyond chance")
+    channel: str = column("channel")
+    line: int = column()  # its index among the resonances of the model
+    frequency_hz: float = column("f", unit="Hz", format=".3f")
+    # of the channel per motion of the wavefront, and its phase against that
+    motion_nm_per_nm: float = column("motion", unit="nm/nm", format=".4g")
+    motion_error_nm_per_nm: float = column("+-", unit="nm/nm", format=".2g")
+    phase_deg: float = column("phase", unit="deg", format=".1f")
+    phase_error_deg: float = column("+-", unit="deg", format=".2g")
+    # share of the power at the line that goes with the wavefront
+    coherence: float = column("coherence", format=".3f")
+    chance: float = column("chance", format=".1g")  # that a channel without it shows as much
+    useful: bool = column("used")  # whether the line shows in the channel beyond chance
 
 
 @table_row
 class ChannelRow:
-    """One channel of the accelerometers."""
+    """One channel of the accelerometers: its noise near the lines, and whether it is used."""
 
-    channel: str = column("channel", help="Name of the channel")
-    noise_m_s2: float = column(
-        "noise",
-        unit="m/s^2",
-        format=".3g",
-        help="Noise of a reading, near the lines it is used for",
-    )
-    verdict: str = column("verdict", help="Whether it is used, or why not")
+    channel: str = column("channel")
+    noise_m_s2: float = column("noise", unit="m/s^2", format=".3g")
+    verdict: str = column("verdict")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -139,7 +119,6 @@ def accelerometer_transfers(
     accelerations: ArrayLike,
     *,
     channels: Sequence[str] | None = None,
-    false_alarm: float = 1e-3,
     largest_shift_s: float = 10.0,
 ) -> AccelerometerTransfers:
     """Find how the channels of accelerometers move with the lines of an identified model.
@@ -149,47 +128,46 @@ def accelerometer_transfers(
     reading, and F_cj a complex factor, whose size is the motion and whose angle the phase. Standard
     errors count those of the model's sensor gains. The readings are (frames, channels) or (frames,)
     [m/s^2], the first that of the first frame of the record, but for a shift between the clocks of
-    at most ``largest_shift_s``; NaN where one is missing. ``false_alarm`` is the probability that
-    any line shows in any of these channels without being there.
+    at most ``largest_shift_s``; NaN where one is missing. The probability that any line shows in
+    any of these channels without being there is 0.001.
     """
-    readings, good = fill_missing(accelerations)
-    names = channel_names(channels, readings.shape[1])
+    read = read_channels(accelerations, channels)
     if len(model.axes) != record.axes:
         raise DimensionError(
             f"model and record must have the same axes; got {len(model.axes)} and {record.axes}."
         )
-    alarm = number(false_alarm, "false_alarm", above=0, below=1)
-    largest_s = number(largest_shift_s, "largest_shift_s", at_least=0)
-    live = np.std(readings[good], axis=0) > LEAST_M_S2
-    resonant = [part.kind != "turbulence" and part.sections == 1 for part in model.parts]
+    resonant = [
+        resonance.kind != "turbulence" and resonance.sections == 1 for resonance in model.parts
+    ]
     places = np.flatnonzero(resonant).tolist()
     places.sort(key=lambda i: model.parts[i].frequency_hz)
     lines = [model.parts[i] for i in places]
     lag, shift, error, transfers = 0, 0.0, float("inf"), tuple[TransferRow, ...]()
-    noise, verdicts = np.full(len(names), np.nan), np.where(live, _NOTHING, "dead").astype(object)
-    if live.any() and lines:
+    rows = [(name, np.nan, _NOTHING) for name in read.names]
+    if read.names and lines:
         widest_hz = max(line.damping * line.frequency_hz for line in lines)
-        shifts = 1 + np.ceil(4 * widest_hz * largest_s)  # that differ
-        limit = alarm / (np.sum(live) * len(lines) * shifts)
-        largest = int(largest_s * model.frame_rate_hz)
+        shifts = 1 + np.ceil(4 * widest_hz * largest_shift_s)  # that differ
+        limit = 1e-3 / (len(read.names) * len(lines) * shifts)
+        largest = int(largest_shift_s * model.frame_rate_hz)
         lag, fits, shift, error = _lay_and_fit(
-            model, record, lines, readings[:, live], good, largest, limit
+            model, record, lines, read.values, read.good, largest, limit
         )
         shown = fits.chances < limit
         # the channels that show most of the lines' power, as many as a design takes
         power = (fits.coherences * shown) @ np.array([line.rms_nm**2 for line in lines])
         used = shown & (power >= np.sort(power)[-(MOST_UNITS - 1) :][0])[:, None]
-        near = shown | ~shown.any(axis=1, keepdims=True)  # the lines it shows, or all
-        level = np.sum(fits.noise * near, axis=1) / np.sum(near, axis=1)
-        noise[live] = np.sqrt(level * model.frame_rate_hz / 2)
-        verdicts[live] = np.select([used.any(1), shown.any(1)], ["used", _EXTRA], _NOTHING)
-        channels = [name for name, is_live in zip(names, live, strict=True) if is_live]
-        transfers = _transfer_rows(channels, places, lines, fits, used)
+        counted = shown | ~shown.any(axis=1, keepdims=True)  # the lines it shows, or all
+        level = np.sum(fits.noise * counted, axis=1) / np.sum(counted, axis=1)
+        noise = np.sqrt(level * model.frame_rate_hz / 2).tolist()
+        verdicts = np.select([used.any(1), shown.any(1)], ["used", _EXTRA], _NOTHING).tolist()
+        rows = list(zip(read.names, noise, verdicts, strict=True))
+        transfers = _transfer_rows(read.names, places, lines, fits, used)
+    rows += [(name, np.nan, "dead") for name in read.dead]
     return AccelerometerTransfers(
         transfers=transfers,
         channels=tuple(
-            ChannelRow(channel=name, noise_m_s2=float(noise[c]), verdict=str(verdicts[c]))
-            for c, name in enumerate(names)
+            ChannelRow(channel=name, noise_m_s2=noise, verdict=verdict)
+            for name, noise, verdict in rows
         ),
         shift_frames=shift,
         shift_error_frames=error,
@@ -206,14 +184,14 @@ def _transfer_rows(
     used: BoolArray,
 ) -> tuple[TransferRow, ...]:
     """Return what the fits of channels say of lines."""
-    size = np.abs(fits.factors)
-    turned = np.minimum(np.degrees(fits.across / np.maximum(size, _TINY)), 180.0)
+    motions = np.abs(fits.factors)
+    turned = np.minimum(np.degrees(fits.across / np.maximum(motions, _TINY)), 180.0)
     return tuple(
         TransferRow(
             channel=name,
             line=places[j],
             frequency_hz=line.frequency_hz,
-            motion_nm_per_nm=float(size[c, j]),
+            motion_nm_per_nm=float(motions[c, j]),
             motion_error_nm_per_nm=float(fits.along[c, j]),
             phase_deg=float(np.angle(fits.factors[c, j], deg=True)),
             phase_error_deg=float(turned[c, j]),
@@ -356,13 +334,13 @@ def _likeliest_lag(bands: Sequence[_Bands], largest: int) -> int:
     lags = np.arange(-largest, largest + 1)
     total = np.zeros(lags.size)
     for band in bands:
-        near = np.abs(lags) <= band.frames // 2
+        covered = np.abs(lags) <= band.frames // 2
         for expected, reading in product(band.expected.T, band.readings.T):
             spectrum = np.zeros(band.frames, dtype=np.complex128)
             spectrum[band.bins] = expected.conj() * reading
             agreement = np.abs(band.frames * np.fft.ifft(spectrum)) ** 2
             power = max(float(np.sum(np.abs(spectrum) ** 2)), _TINY)
-            total[near] += agreement[lags[near] % band.frames] / power
+            total[covered] += agreement[lags[covered] % band.frames] / power
     return int(lags[np.argmax(total)])
 
 
@@ -404,21 +382,21 @@ def _fit_channel(bands: Sequence[_Bands], channel: int) -> _Fits:
         opened = np.concatenate([band.open_power(factors) for band in bands])
     error = a - x @ factors
     slopes = -bread @ (x.conj().T @ (weights[:, None] * np.einsum("fja,j->fa", moved, factors)))
-    size = np.abs(x) ** 2
-    shares = size * weights[:, None]
+    power_seen = np.abs(x) ** 2
+    shares = power_seen * weights[:, None]
     shares /= np.maximum(shares.sum(axis=0), _TINY)
     values = np.maximum(_INDEPENDENT / np.sum(shares**2, axis=0), 1.0)  # at each line
     degrees = np.maximum(values - 1, 0.5)
     excess = (np.abs(error) ** 2 * weights) @ shares
-    more = np.maximum(excess * values / degrees, 1.0)
+    inflation = np.maximum(excess * values / degrees, 1.0)
     # a channel with a motion of its own there
     doubtful = gammaincc(degrees, excess * values) < _DOUBT
-    raised, degrees = np.where(doubtful, more, 1.0), np.where(doubtful, degrees, len(a))
+    raised, degrees = np.where(doubtful, inflation, 1.0), np.where(doubtful, degrees, len(a))
     variances = np.diag(bread).real / _INDEPENDENT
     ratios = np.abs(factors) ** 2 / np.maximum(raised * variances, _TINY)
     rest = np.abs(error) ** 2 @ shares
-    shown = np.abs(factors) ** 2 * np.sum(size * shares, axis=0)
-    scatter = variances * more / 2
+    shown = np.abs(factors) ** 2 * np.sum(power_seen * shares, axis=0)
+    scatter = variances * inflation / 2
     moves = slopes * np.exp(-1j * np.angle(factors))[:, None]
     # a small shift turns the phase in proportion to the distance from the middle of the line
     turn = -1j * (angle[:, None] - angle @ shares) * factors * x
@@ -431,7 +409,7 @@ def _fit_channel(bands: Sequence[_Bands], channel: int) -> _Fits:
         coherences=shown / np.maximum(shown + rest, _TINY),
         noise=noise * raised,
         shifts=np.real((weights * error) @ turn.conj()) / turned,
-        shift_weights=2 * _INDEPENDENT * turned / more,
+        shift_weights=2 * _INDEPENDENT * turned / inflation,
     )
 
 

@@ -37,7 +37,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 from scipy.linalg.lapack import dposv
@@ -155,12 +154,12 @@ def _smear(
         half_width = c.damping_ratio * place
         if c.kind != "line" or c.sections > 1 or half_width > WIDE:
             continue
-        near = slice(*np.searchsorted(periods, [place - SKIRT, place + SKIRT]))
-        more, by_width, by_distance = log_smearing(half_width, periods[near] - place)
-        density[i, near] *= np.exp(more)
+        band = slice(*np.searchsorted(periods, [place - SKIRT, place + SKIRT]))
+        log_ratio, by_width, by_distance = log_smearing(half_width, periods[band] - place)
+        density[i, band] *= np.exp(log_ratio)
         if slopes is not None:
-            slopes[i, 0, near] += by_width - by_distance * place
-            slopes[i, 1, near] += by_width
+            slopes[i, 0, band] += by_width - by_distance * place
+            slopes[i, 1, band] += by_width
 
 
 def _log_fall(
@@ -174,26 +173,15 @@ def _log_fall(
     return fall if order == 1 else fall + data.log_frame_mean, slope
 
 
-@lru_cache(maxsize=64)
-def component_density(
-    data: LoopPeriodogram, component: Component, roll_off: tuple[float, float] | None = None
-) -> FloatArray:
-    """Return the density of a component, behind a roll-off of a corner and an order, (f,)."""
-    s, c = data.half_angle_square, component
-    density = unit_density(c.frequency, c.damping_ratio, s, c.sections)
-    if roll_off is not None:
-        density *= np.exp(_log_fall(data, *roll_off)[0])
-    _smear(data, [c], density[None])
-    return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * density)
-
-
 def part_density(data: LoopPeriodogram, spectrum: SpectrumModel, i: int) -> FloatArray:
     """Return the density of component i of a spectrum along its direction, (f,)."""
-    component = spectrum.components[i]
-    if component.kind != "turbulence":
-        return component_density(data, component)
-    log_corner = spectrum.axes[component.axis or 0].log_corner
-    return component_density(data, component, (log_corner, spectrum.roll_off_order))
+    c = spectrum.components[i]
+    density = unit_density(c.frequency, c.damping_ratio, data.half_angle_square, c.sections)
+    if c.kind == "turbulence":
+        log_corner = spectrum.axes[c.axis or 0].log_corner
+        density *= np.exp(_log_fall(data, log_corner, spectrum.roll_off_order)[0])
+    _smear(data, [c], density[None])
+    return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * density)
 
 
 def density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:
@@ -434,14 +422,14 @@ def _secant(missing: FloatArray, step: FloatArray) -> FloatArray:
 
 def _trust_step(slope: FloatArray, curvature: FloatArray, radius: float) -> FloatArray:
     """Return the step (p,) to the minimum of a quadratic form within a radius, in its axes."""
-    more = 0.0
+    shift = 0.0
     for _ in range(MOST_STEPS):
-        step = -slope / (curvature + more)
-        size = float(np.linalg.norm(step))
-        if size <= 1.001 * radius:
+        step = -slope / (curvature + shift)
+        length = float(np.linalg.norm(step))
+        if length <= 1.001 * radius:
             break
         # Newton's method for 1 / size = 1 / radius, from below
-        more += size**2 / float(np.sum(step**2 / (curvature + more))) * (size / radius - 1)
+        shift += length**2 / float(np.sum(step**2 / (curvature + shift))) * (length / radius - 1)
     return step
 
 

@@ -27,9 +27,7 @@ from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import (
-    ClosedLoop,
     Imaging,
     close_loop,
     jitter_strehl,
@@ -38,7 +36,7 @@ from lbt_synth.loop import (
 from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import PlantInputs, design_request
-from lbt_synth.models import LoopHardware, TipTiltPlant
+from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, matrix, require_instance
 
@@ -52,17 +50,14 @@ WITHOUT = ", wavefront alone"  # of the fall-back of a design that reads acceler
 class PredictionRow:
     """One controller on frames that nothing was fitted to, beside what the model promises."""
 
-    name: str = column("controller", help="What it is")
-    replayed_nm: float = nm_column(
-        "data", format=".2f", key="data_nm", help="Residual on the data, all axes"
-    )
-    replayed_error_nm: float = nm_column(
-        "+-", format=".2f", key="data_error_nm", help="Its standard error"
-    )
-    model_nm: float = nm_column("model", format=".2f", help="Residual that the model promises")
-    ratio: float = column("data/model", format=".3f", help="Residual on the data over that")
-    strehl: float = column("Strehl, data", format=".3f", help="Strehl ratio on the data")
-    model_strehl: float = column("Strehl, model", format=".3f", help="Strehl ratio by the model")
+    name: str = column("controller")
+    # residual over all axes on the data, its standard error, and what the model promises
+    replayed_nm: float = nm_column("data", format=".2f", key="data_nm")
+    replayed_error_nm: float = nm_column("+-", format=".2f", key="data_error_nm")
+    model_nm: float = nm_column("model", format=".2f")
+    ratio: float = column("data/model", format=".3f")
+    strehl: float = column("Strehl, data", format=".3f")
+    model_strehl: float = column("Strehl, model", format=".3f")
     replayed: ResidualEstimate | None  # on the test data; None for the limit, no controller
     model_axis_nm: FloatArray | None  # (n,): promised for each axis; None if unknown
 
@@ -187,13 +182,16 @@ def prediction_against_data(
             f"no controller may be called {RAN}, {INTEGRATOR} or {LIMIT}, as other rows are; got "
             f"{', '.join(controllers)}. Give other names."
         )
-    fit, later = split_halves(runs)
+    fit, later = (frames.stretches() for frames in split_halves(record))
     test = settled_test(runs, later, hardware)
     noise = mode_noise(hardware, plant.R, noise_error_nm)
     designs = {INTEGRATOR: integrator(hardware, truth=plant), **controllers}
     if running is not None:
         designs[RAN] = running
-    loops = {name: _close(hardware, design) for name, design in designs.items()}
+    loops = {
+        name: one.close(hardware) if isinstance(one, Design) else close_loop(hardware, one)
+        for name, one in designs.items()
+    }
     stable = {name: loop for name, loop in loops.items() if loop.is_stable}
     unstable = loops.keys() - stable.keys()
     notes = [f"{name} is unstable at the sensor gain of the model" for name in sorted(unstable)]
@@ -228,18 +226,10 @@ def prediction_against_data(
     return PredictionTable(entries=tuple(rows), fit=fit, test=test, notes=tuple(notes))
 
 
-def _close(hardware: LoopHardware, design: Controller | Design) -> ClosedLoop:
-    """Close the loop of a model around a controller, or a design with the sensors it reads."""
-    if isinstance(design, Design):
-        return design.close(hardware)
-    return close_loop(hardware, as_controller(design))
-
-
 def design_inputs(
     record: LoopRecord,
     model: IdentifiedModel,
     *,
-    stretches: Stretches | None = None,
     channels: Channels | None = None,
     noise: float = 1.0,
     penalty: float | None = None,
@@ -248,7 +238,7 @@ def design_inputs(
     """Return what a method makes a design of: a model with more noise, its record and channels."""
 
     def predict() -> Design:
-        past = regress(record, model, stretches=stretches, channels=channels, noise=noise)
+        past = regress(record, model, channels=channels, noise=noise)
         return past.design(penalty)
 
     plant = noisier(model, noise).plant()
@@ -271,8 +261,7 @@ def compare_designs(
     ``inputs`` those of :func:`design_inputs`. The designs with a row are returned by their titles;
     the others have a note. One that reads channels has a row for its fall-back, too.
     """
-    first, _ = split_halves(record.stretches())
-    made_of = design_inputs(record, half, stretches=first, **inputs)
+    made_of = design_inputs(split_halves(record)[0], half, **inputs)
     designs, notes = dict[str, Design](), list[str]()
     controllers = dict[str, Controller | Design](others or {})
     for method, options in methods.items():

@@ -42,8 +42,6 @@ _PENALTIES = 10.0 ** np.arange(-9, 4)  # of a coefficient whose signal changes b
 _USUAL = 5  # place of the penalty where a search begins
 _PARTS = 6  # of a record, of which each is predicted by those before, from the third on
 _FIRST = 2
-_OFFSET = 1.0  # by which a channel's readings may stand off zero, in rms changes a frame
-_SEED = 1
 _REMOTE = 16.0  # frames, from which on a penalty grows with age: old readings tell least
 
 
@@ -152,7 +150,8 @@ class Regression:
         for place, signal in enumerate(signals):
             if signal >= self.own:
                 rows = place + len(signals) * np.arange(TAPS)
-                weights[np.ix_(rows, rows)] += (_OFFSET * scale[place]) ** 2
+                # readings may stand off zero by their rms change a frame
+                weights[np.ix_(rows, rows)] += scale[place] ** 2
         return weights
 
     def _factor(self, weights: FloatArray, moments: Moments) -> tuple[FloatArray, bool]:
@@ -228,37 +227,18 @@ def regress(
     record: LoopRecord,
     model: IdentifiedModel,
     *,
-    stretches: Stretches | None = None,
     channels: Channels | None = None,
     noise: float = 1.0,
 ) -> Regression:
-    """Collect what a record tells of its future, beside its model.
+    """Collect what a record tells of its future, beside its model, of which the base is the filter.
 
     More noise than the model's is added as that of a run without any disturbance, of which nothing
     is to be corrected.
-
-    Parameters
-    ----------
-    record : LoopRecord
-        The record, which the model was identified in.
-    model : IdentifiedModel
-        The model, of which the base is the Kalman filter.
-    stretches : sequence of (start, stop), optional
-        Frames to use; by default all usable ones.
-    channels : Channels, optional
-        Accelerometers beside the record.
-    noise : float, optional
-        Multiple of the model's noise that is assumed, at least 1.
-
-    Raises
-    ------
-    ProblemError
-        If the stretches are too short, or the loop has no command for some mode.
     """
     path = model.hardware
     if len(path.influence) != path.n_commands:
         raise ProblemError("a predictor needs a command for every mode; got fewer.")
-    runs = record.stretches() if stretches is None else stretches
+    runs = record.stretches()
     base = kalman(noisier(model, noise).plant()).controller
     series = record.pseudo_open_loop(model.sensor_gains)
     steering = close_loop(path, base).steering()
@@ -296,7 +276,7 @@ def regress(
     moments = [lagged_moments(signals, left, part, TAPS) for part in parts]
     if noise > 1:
         deviation = np.array([axis.noise_nm for axis in model.axes]) / model.sensor_gains
-        drawn = np.random.default_rng(_SEED).standard_normal((count + first, path.modes))
+        drawn = np.random.default_rng(1).standard_normal((count + first, path.modes))
         drawn *= deviation * np.sqrt(noise**2 - 1)
         silence = np.zeros((len(drawn), beside.shape[1]))
         heard, left, _, target = lay(drawn, ((0, len(drawn)),), silence)
@@ -314,11 +294,11 @@ def regress(
 
 @table_row
 class ChannelValue:
-    """What one channel of accelerometers is worth to a predictor, on unseen frames."""
+    """What a predictor leaves of unseen frames without a channel, and if it reads zeros."""
 
-    channel: str = column("channel", help="Name of the channel")
-    without_nm: float = nm_column("without it", unit="nm rms", help="Residual of all other sensors")
-    dead_nm: float = nm_column("zeros, unseen", unit="nm rms", help="Residual if it reads zeros")
+    channel: str = column("channel")
+    without_nm: float = nm_column("without it", unit="nm rms")
+    dead_nm: float = nm_column("zeros, unseen", unit="nm rms")
 
 
 def channel_values(
@@ -328,10 +308,7 @@ def channel_values(
 
     The noise of the measurements is subtracted; nan where it hides the residual.
     """
-    past, unseen = (
-        regress(record, half, stretches=frames, channels=channels)
-        for frames in split_halves(record.stretches())
-    )
+    past, unseen = (regress(frames, half, channels=channels) for frames in split_halves(record))
     noise_nm2 = sum((axis.noise_nm / axis.sensor_gain) ** 2 for axis in half.axes)
     everything = list(range(len(past.scales)))
     coefficients = past.solve(everything, past.penalty, past.whole)

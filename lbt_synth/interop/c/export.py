@@ -31,7 +31,8 @@ from lbt_synth.storage.rows import column, table_row
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, choice
 
-MOST_NUMBERS = 1_000_000  # 8 MB of memory, 25 to 100 MB of source
+MOST_TERMS = 100_000  # that are written out: 10 MB of source
+MOST_GAINS = 1_000_000  # in the table: 8 MB of memory, 25 MB of source
 _IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 _SOURCE = re.compile(r"[A-Za-z0-9._+-]*\.c")
 _LONGEST = 25  # C99 distinguishes identifiers by 31 characters, six of them "_reset"
@@ -75,9 +76,10 @@ def _round(designs: Sequence[Design], *, form: str, precision: str, **_: Any) ->
             )
         terms = source_terms(design, form=kind)
         count = count_gains(terms) if terms.tabled else int(np.count_nonzero(terms.whole))
-        if count > MOST_NUMBERS:
+        most = MOST_GAINS if terms.tabled else MOST_TERMS
+        if count > most:
             raise ProblemError(
-                f"a controller must have at most {MOST_NUMBERS:,} numbers in C; got {count:,}, in "
+                f"a controller must have at most {most:,} numbers in C; got {count:,}, in "
                 f"a period of {len(terms.read)} frames. Design with fewer states, choose rates "
                 "with a shorter common period, or leave out channels."
             )

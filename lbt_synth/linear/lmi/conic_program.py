@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import TypeAlias
 
 import clarabel
@@ -92,15 +91,6 @@ def require_optimum(run: tuple[str, int], programme: str, advice: str) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ConicSolution:
-    """What the solver found."""
-
-    x: FloatArray  # (n,)
-    status: str
-    iterations: int
-
-
 class ConicProgramme:
     """Minimise ``x'P x / 2 + q'x``, with ``offsets + rows x`` in cones."""
 
@@ -127,8 +117,10 @@ class ConicProgramme:
         self._offsets.append(offsets)
         self._cones += cones
 
-    def minimize(self, linear: FloatArray, quadratic: FloatArray | None = None) -> ConicSolution:
-        """Solve for q, (n,), and P, (n, n)."""
+    def minimize(
+        self, linear: FloatArray, quadratic: FloatArray | None = None
+    ) -> tuple[FloatArray, tuple[str, int]]:
+        """Solve for q, (n,), and P, (n, n); return x, and the status and count of iterations."""
         blocks = [sparse.csr_matrix((0, self.size)), *self._rows]
         A = -sparse.vstack(blocks, format="csc")
         b = np.concatenate([np.zeros(0), *self._offsets])
@@ -146,7 +138,7 @@ class ConicProgramme:
                 ).solve()
             status = _STATUS.get(str(answer.status))
             if status is not None:
-                return ConicSolution(np.array(answer.x), status, int(answer.iterations))
+                return np.array(answer.x), (status, int(answer.iterations))
         raise solver_error("the solver lost its accuracy on the way.")
 
 
@@ -167,9 +159,8 @@ def minimize(
     for constraint in constraints:
         _constrain(programme, constraint, origin)
     linear, roots = _Model(programme, origin, scale).expression(function)
-    solution = programme.minimize(linear, 2 * roots.T @ roots)
-    c = origin + solution.x[:size] if solution.status in USABLE else None
-    return c, solution.status
+    x, (status, _) = programme.minimize(linear, 2 * roots.T @ roots)
+    return origin + x[:size] if status in USABLE else None, status
 
 
 def minimize_relaxation(
@@ -186,16 +177,16 @@ def minimize_relaxation(
     for i, group in enumerate(groups):
         for constraint in group:
             _constrain(programme, constraint, origin, None if rigid[i] else size + i)
-    relaxed = programme.minimize(slack)
-    if "infeasible" in relaxed.status:
+    x, run = programme.minimize(slack)
+    if "infeasible" in run[0]:
         return np.full(count, np.inf)
     require_optimum(
-        (relaxed.status, relaxed.iterations),
+        run,
         "the search for constraints that clash",
         "They may be close to what can be met, or very far from it; relax them, or try another "
         "number of functions.",
     )
-    return np.where(rigid, 0.0, relaxed.x[size:])
+    return np.where(rigid, 0.0, x[size:])
 
 
 class _Model:

@@ -200,7 +200,7 @@ def _bessel_j2(x: FloatArray) -> FloatArray:
 @lru_cache(maxsize=2)
 def _spatial_panels(*, is_flat: bool = False) -> tuple[FloatArray, FloatArray]:
     """Nodes over spatial frequency [1/D]: octaves below 1/4 unless all is flat there."""
-    low = np.array([0.0, 0.25]) if is_flat else np.geomspace(1e-9, 0.25, 29)
+    low = np.array([0.0, 0.25]) if is_flat else np.geomspace(1e-18, 0.25, 59)
     return gauss_panels(np.concatenate([low, [0.5], np.arange(1.0, 41.0)]), 10)
 
 

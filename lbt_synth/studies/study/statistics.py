@@ -395,12 +395,11 @@ def residual_table(statistics: StudyStatistics) -> Table:
     return _table_by_controller(caption, f"residual [{unit}]", statistics, rows)
 
 
-def sensitivity_table(statistics: StudyStatistics, names: Mapping[str, str] | None = None) -> Table:
+def sensitivity_table(statistics: StudyStatistics) -> Table:
     """First-order indices of the parameters, one column per controller, and what they lack."""
     controllers = statistics.controllers
     rows: list[_Row] = [
-        ((names or {}).get(name, name), *(_with_error(*c.index(name)) for c in controllers))
-        for name in statistics.ranked
+        (name, *(_with_error(*c.index(name)) for c in controllers)) for name in statistics.ranked
     ]
     if rows:
         rest = []
@@ -417,10 +416,9 @@ def worst_table(
     controller: ControllerStatistics,
     columns: Mapping[str, ArrayLike],
     parameters: Sequence[str],
-    names: Mapping[str, str] | None = None,
 ) -> Table:
     """List the samples on which a controller does worst, from the columns of the results."""
-    places, name, words = list(controller.worst), controller.controller, names or {}
+    places, name = list(controller.worst), controller.controller
 
     def at(column: str) -> list[float]:
         return [float(value) for value in np.asarray(columns[column], dtype=np.float64)[places]]
@@ -433,7 +431,7 @@ def worst_table(
     values = [[f"{value:.5g}" for value in at(parameter)] for parameter in parameters]
     return Table(
         caption=f"Worst samples of {name}",
-        headings=("row", "Strehl [%]", *(words.get(name, name) for name in parameters)),
+        headings=("row", "Strehl [%]", *parameters),
         rows=tuple(zip(rows, strehls, *values, strict=True)),
     )
 

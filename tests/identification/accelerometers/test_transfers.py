@@ -197,8 +197,10 @@ def test_channels_that_fail_are_named_and_left_out():
     gone = np.where(np.arange(FRAMES) < FRAMES // 4, np.nan, good)
     flicker, noise = 1e-3 * rng.integers(0, 2, FRAMES), 1e-2 * rng.standard_normal(FRAMES)
     found = find(good, np.full(FRAMES, 3.3), flicker, gone, 1e-200 * good, noise)
-    verdicts = [row.verdict for row in found.channels]
-    assert verdicts[1:] == ["dead", "adds nothing", "dead", "dead", "adds nothing"]
+    verdicts = {int(row.channel[-1]): row.verdict for row in found.channels}
+    dead = {channel for channel, verdict in verdicts.items() if verdict == "dead"}
+    assert dead == {2, 4, 5}
+    assert verdicts[3] == verdicts[6] == "adds nothing"
     assert [row.channel for row in found.used] == ["channel1"]
 
 
@@ -226,7 +228,6 @@ def test_motions_at_the_frequency_of_a_line_that_do_not_go_with_it_are_not_used(
     [
         (np.ones((100, 2, 2)), {}, r"must be \(frames, channels\)"),
         (np.ones((FRAMES, 2)), {"channels": ["a", "a"]}, "2 different names"),
-        (np.ones(FRAMES), {"false_alarm": 2}, "false_alarm"),
         (np.random.default_rng(0).standard_normal(100), {}, "usable frames in a row"),
     ],
 )

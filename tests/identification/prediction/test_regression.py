@@ -21,7 +21,7 @@ from lbt_synth.identification.prediction.regression import (
     regress,
 )
 from lbt_synth.identification.prediction.residual import replay
-from lbt_synth.identification.stretches import split_halves
+from lbt_synth.identification.stretches import keep_frames, split_halves
 from lbt_synth.loop import close_loop
 
 
@@ -80,8 +80,7 @@ def test_channels_that_see_a_structure_are_worth_what_is_claimed() -> None:
     assert left_nm2(alone) < 1.02 * base
     assert left_nm2(fused) < 0.6 * base
     assert fused.other_sensors == ("channel1", "channel2", "channel3")
-    first, _ = split_halves(record.stretches())
-    half = lbt.identify(record, stretches=first, sensor_gain=1.0)
+    half = lbt.identify(split_halves(record)[0], sensor_gain=1.0)
     beside = channels_beside(record, seen.readings[: record.frames])
     table, _ = compare_designs(record, half, {"predictor": {}}, channels=beside)
     title = "least-squares predictor"
@@ -181,6 +180,6 @@ def test_gains_and_delays_that_are_not_whole() -> None:
 def test_what_is_too_short_or_dead_is_refused() -> None:
     _, record, model = vibrating()
     with pytest.raises(ProblemError, match=f"needs {12 * TAPS} frames beyond the first"):
-        regress(record, model, stretches=((0, 900),))
+        regress(keep_frames(record, np.arange(record.frames) < 900), model)
     with pytest.raises(ProblemError, match="nothing but zeros or gaps in a, b. Leave them out"):
         channels_beside(record, np.zeros((500, 2)), ("a", "b"))

@@ -401,9 +401,9 @@ def test_a_table_that_is_too_long_is_refused(tmp_path, sensors_design, monkeypat
     terms = source_terms(sensors_design)
     count = sum(np.count_nonzero(gains.any(axis=1)) for gains in terms.gains.values())
     count *= sensors_design.problem.n_states
-    monkeypatch.setattr(c_export, "MOST_NUMBERS", count)
+    monkeypatch.setattr(c_export, "MOST_GAINS", count)
     lbt.interop.export(tmp_path / "k.c", sensors_design, "c")
-    monkeypatch.setattr(c_export, "MOST_NUMBERS", count - 1)
+    monkeypatch.setattr(c_export, "MOST_GAINS", count - 1)
     with pytest.raises(ProblemError, match=rf"got {count:,}, in a period of 2 frames"):
         lbt.interop.export(tmp_path / "long.c", sensors_design, "c")
 

@@ -175,3 +175,10 @@ def test_costs_are_those_of_the_source(tmp_path, designs, name):
     cost = frame_cost(designs[name])
     assert body.count(" * ") == cost.multiplications
     assert body.count(" + ") + body.count(" - ") == cost.additions
+
+
+def test_more_terms_than_a_compiler_takes_are_refused(tmp_path):
+    n = 320
+    full = lbt.Controller(A=np.eye(n) / 2 + 1e-5, B=np.ones((n, 1)), C=np.ones((1, n)), D=[[0.0]])
+    with pytest.raises(ProblemError, match="at most 100,000 numbers in C; got 103,040"):
+        lbt.interop.export(tmp_path / "k.c", bare_design(full), "c")
