@@ -16,13 +16,13 @@ GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3483,
     "config": 1661,
-    "design": 6290,
+    "design": 6265,
     "files": 1243,
     "identification": 9045,
     "interop": 3756,
     "linear": 5100,
     "loop": 4905,
-    "methods": 861,
+    "methods": 853,
     "models": 4400,
     "report": 3342,
     "storage": 1027,
@@ -30,10 +30,10 @@ LINES = {
     "errors, validation": 554,
 }
 COUNTS = {
-    "files of the package": 214,
-    "public names": 167,
-    "tuned constants": 518,
-    "lines of tests": 31961,
+    "files of the package": 208,
+    "public names": 163,
+    "tuned constants": 502,
+    "lines of tests": 31136,
     "lines of benchmarks": 4016,
     "words of docs": 60600,
 }
