@@ -14,9 +14,10 @@ from lbt_synth.design.certificate import LEVEL_SETS, TOLERANCE, Check, Claim, Ev
 from lbt_synth.design.result import Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller, hinf_norm
-from lbt_synth.loop import ClosedLoop, LoopEnsemble, close_loop, stable_sensor_gains
-from lbt_synth.loop.budget import noise_covariance
-from lbt_synth.loop.ensemble import ensemble_vibration, residuals_from_matrices, textbook_matrices
+from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
+from lbt_synth.loop.budget import ensemble_residuals
+from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
+from lbt_synth.loop.evaluator import textbook_matrices
 from lbt_synth.loop.margins import phase_margin_deg
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.vibration import stationary_vibrations
@@ -440,22 +441,14 @@ def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> Integ
     True
     """
     require_instance(plant, TipTiltPlant)
-    hardware, factor = plant.hardware, plant.D[:, -plant.hardware.n_measurements :]
-    lines = [  # those of a plant are means over frames
-        replace(line, rms_nm=line.rms_nm / np.sinc(line.frequency_hz / hardware.frame_rate_hz))
-        for line in plant.vibrations
-    ]
-    moving = tuple(map(ensemble_vibration, lines))
-    conditions = LoopEnsemble(turbulence=plant.turbulence, vibrations=moving)
-    disturbed = _ensemble_variances(hardware, law, conditions)
-
-    def from_noise(gain: float) -> float:
-        loop = close_loop(hardware, law.controller(hardware, gain))
-        return float(np.trace(noise_covariance(loop, factor))) if loop.is_stable else np.nan
-
-    def variances(gains: FloatArray) -> FloatArray:
-        return disturbed(gains) + [from_noise(gain) for gain in gains.tolist()]
-
+    hardware = plant.hardware
+    ensemble = LoopEnsemble(
+        turbulence=plant.turbulence,
+        vibrations=tuple(map(ensemble_vibration, plant.vibrations)),
+        noise_factor=plant.own_noise_factor,
+        of_means=True,
+    )
+    variances = _ensemble_variances(hardware, law, ensemble)
     return _least_residual(hardware, law, variances, 1.0)
 
 
@@ -469,7 +462,7 @@ def _ensemble_variances(
         factor, whole = gains[:, None, None], np.ones((gains.size, 1, 1))
         scaled = (whole * A, factor * B, whole * C, factor * D)  # a gain scales the input
         loops = replace(ensemble, loops=gains.size)
-        residuals = residuals_from_matrices(scaled, hardware, loops, in_image=True)
+        residuals = ensemble_residuals(scaled, hardware, loops)
         return np.asarray(residuals.rms_nm**2)
 
     return variances

@@ -1,10 +1,7 @@
+from .budget import ResidualBudget as ResidualBudget
 from .budget import residual_budget as residual_budget
 from .closed_loop import ClosedLoop as ClosedLoop
 from .closed_loop import close_loop as close_loop
-from .ensemble import EnsembleVibration as EnsembleVibration
-from .ensemble import LoopEnsemble as LoopEnsemble
-from .ensemble import ensemble_residuals as ensemble_residuals
-from .evaluator import ResidualBudget as ResidualBudget
 from .least_residuals.band_limit import least_worst_residual as least_worst_residual
 from .least_residuals.residual_limit import least_residual as least_residual
 from .margins import LoopMargins as LoopMargins

@@ -42,8 +42,7 @@ from lbt_synth.loop.closed_loop import (
     checked_loop_matrices,
     close_loop,
 )
-from lbt_synth.loop.ensemble import textbook_matrices
-from lbt_synth.loop.stacks import close_loops
+from lbt_synth.loop.evaluator import close_loops, textbook_matrices
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import instant_mirror, tapped_mirror
 from lbt_synth.storage.rows import column, fact_table, table_row

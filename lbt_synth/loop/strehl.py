@@ -20,7 +20,7 @@ from scipy.special import j0, j1
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.loop.evaluator import ResidualBudget
+from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,

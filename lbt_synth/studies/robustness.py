@@ -26,19 +26,20 @@ from lbt_synth.design.mixed import require_taps
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import EstimationProblem
+from lbt_synth.linear.controller import as_controller
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.loop import (
     Imaging,
-    LoopEnsemble,
     Simulation,
     close_loop,
-    ensemble_residuals,
     loop_margins,
     residual_budget,
     simulate,
 )
-from lbt_synth.loop.budget import settling_error
-from lbt_synth.loop.ensemble import ensemble_vibration
+from lbt_synth.loop.budget import ensemble_residuals, settling_error
+from lbt_synth.loop.closed_loop import require_matching_controller
+from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
+from lbt_synth.loop.evaluator import textbook_matrices
 from lbt_synth.loop.simulation.run import Drop, Segment, run_segments
 from lbt_synth.methods.registry import MIXED, record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
@@ -280,6 +281,7 @@ def robustness_map(
         raise ProblemError(
             "a frequency error needs a vibration in the truth; got a truth without any."
         )
+    require_matching_controller(hardware.own_sensor_alone(), as_controller(design))
     lines = _moved_lines(truth, errors, hardware)
     pieces = np.array_split(gains, -(-gains.size // _GAINS_AT_ONCE))
     loop = design, hardware, truth, imaging
@@ -317,7 +319,8 @@ def _map_columns(
             for line, frequencies in lines
         ),
     )
-    return residual_columns(ensemble_residuals(design.controller, hardware, ensemble), imaging)
+    matrices = textbook_matrices([design.controller])
+    return residual_columns(ensemble_residuals(matrices, hardware, ensemble), imaging)
 
 
 def _moved_lines(truth: Truth, errors_hz: FloatArray, hardware: LoopHardware) -> _MovedLines:

@@ -24,6 +24,9 @@ from lbt_synth.design.shaping import (
     Worst,
 )
 from lbt_synth.errors import InfeasibleError, ProblemError
+from lbt_synth.loop.budget import ensemble_residuals
+from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble
+from lbt_synth.loop.evaluator import textbook_matrices
 from lbt_synth.models import ARModel
 
 
@@ -183,12 +186,12 @@ def test_the_example_holds_at_every_row_and_sensor_gain(example):
     )
     worst = 100 * np.min(rows.strehl[0], axis=1)
     (line,) = noise.vibrations
-    moved = lbt.loop.EnsembleVibration(
+    moved = EnsembleVibration(
         frequency_hz=np.tile(line.frequency_hz + errors_hz, len(gains)),
         rms_nm=line.rms_nm,
         direction=line.direction,
     )
-    ensemble = lbt.loop.LoopEnsemble(
+    ensemble = LoopEnsemble(
         sensor_gain=np.repeat(gains, errors_hz.size),
         turbulence=noise.turbulence,
         noise_nm=15.5,
@@ -196,9 +199,8 @@ def test_the_example_holds_at_every_row_and_sensor_gain(example):
     )
 
     def worst_strehl(frame_means):
-        known = {"frame_means": frame_means}
-        loops = example.controller, config.hardware, ensemble
-        residuals = lbt.strehl(lbt.loop.ensemble_residuals(*loops, **known), camera)
+        loops = textbook_matrices([example.controller]), config.hardware, ensemble
+        residuals = lbt.strehl(ensemble_residuals(*loops, frame_means=frame_means), camera)
         return 100 * np.min(residuals.reshape(len(gains), -1), axis=1)
 
     means = worst_strehl(True)

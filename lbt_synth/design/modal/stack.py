@@ -18,9 +18,9 @@ from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import UNCERTIFIED, require_hardware
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
-from lbt_synth.loop import EnsembleVibration, LoopEnsemble, residual_budget
+from lbt_synth.loop.budget import ensemble_residuals, residual_budget
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.loop.ensemble import residuals_from_matrices, turbulence_rows
+from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble, turbulence_rows
 from lbt_synth.models import (
     ARModel,
     LoopHardware,
@@ -450,16 +450,11 @@ def _residuals(
 
     The hardware is that of one mode.
     """
-
-    def share(line: Vibration) -> float:
-        """Return how much of a line's rms is that of its means, if what moves within counts."""
-        return 1.0 if frame_means else float(np.sinc(line.frequency_hz * hardware.dt_s))
-
     w, gain, columns = bank.width, sensor_gain[bank.modes], list(bank.modes.T)
     vibrations = [
         EnsembleVibration(
             frequency_hz=[lines[mode][i].frequency_hz for mode in column],
-            rms_nm=[lines[mode][i].rms_nm / share(lines[mode][i]) for mode in column],
+            rms_nm=[lines[mode][i].rms_nm for mode in column],
             damping=[lines[mode][i].damping for mode in column],
             direction=axis,
         )
@@ -472,10 +467,11 @@ def _residuals(
         noise_nm=noise_nm[bank.modes],
         turbulence=[turbulence_rows(turbulence, column) for column in columns],
         vibrations=tuple(vibrations),
+        of_means=True,
     )
     if w > 1:
         sensor = np.diag(gain[0])
         hardware = replace(hardware, modes=w, sensor_matrix=sensor, influence_matrix=None)
-    left = residuals_from_matrices(bank.textbook(), hardware, conditions, in_image=not frame_means)
+    left = ensemble_residuals(bank.textbook(), hardware, conditions, frame_means=frame_means)
     power = left.turbulence_nm2 + left.noise_nm2 + left.random_vibration_nm2 + left.within_nm2
     return np.sqrt(np.diagonal(power, axis1=1, axis2=2)), left.stable

@@ -15,7 +15,8 @@ from lbt_synth.errors import CertificateError, LbtSynthError
 from lbt_synth.linear import solve_dare
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop import ClosedLoop, simulate
-from lbt_synth.loop.ensemble import residuals_from_matrices, textbook_matrices
+from lbt_synth.loop.budget import ensemble_residuals
+from lbt_synth.loop.evaluator import textbook_matrices
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.methods.request import DesignRequest, fixed_design
 from lbt_synth.models import TipTiltPlant
@@ -116,7 +117,7 @@ def _evaluate_group(
             delay_error_frames=by_name.get(DELAY_ERROR, np.zeros(len(values))),
             noise_factor=by_name.get(NOISE_FACTOR, np.ones(len(values))),
         )
-        residuals = residuals_from_matrices(matrices, hardware, loops, in_image=True)
+        residuals = ensemble_residuals(matrices, hardware, loops)
     return residual_columns(residuals, config.imaging)
 
 

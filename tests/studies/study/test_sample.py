@@ -290,12 +290,12 @@ def test_two_answers_stop_a_study(tmp_path, monkeypatch):
             parameters="{truth.sensor_gain: {uniform: [0.4, 1]}}",
         )
     )
-    real = evaluation.residuals_from_matrices
+    real = evaluation.ensemble_residuals
 
-    def wrong(matrices, hardware, ensemble, *, in_image):
-        residuals = real(matrices, hardware, ensemble, in_image=in_image)
+    def wrong(matrices, hardware, ensemble):
+        residuals = real(matrices, hardware, ensemble)
         return replace(residuals, noise_nm2=1.001 * residuals.noise_nm2)
 
-    monkeypatch.setattr(evaluation, "residuals_from_matrices", wrong)
+    monkeypatch.setattr(evaluation, "ensemble_residuals", wrong)
     with pytest.raises(lbt.errors.CertificateError, match="row 14 has slow.*by itself"):
         evaluate_samples(study, study.values(10, 16)[:8], 11)
