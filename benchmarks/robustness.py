@@ -11,6 +11,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
+from lbt_synth.loop.band_limit import least_worst_residual
 from lbt_synth.report.draw import house_style
 from lbt_synth.studies import paper as paper
 from lbt_synth.studies.paper import paper_filters
@@ -91,7 +92,7 @@ def main() -> None:
     """Print the table, draw the figure."""
     every = designs()
     bands = {
-        gain: lbt.loop.least_worst_residual(
+        gain: least_worst_residual(
             every["shaped"].hardware,
             replace(TRUTH, vibrations=(), sensor_gain=gain),
             band_hz=(16.5, 23.5),

@@ -30,7 +30,7 @@ from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, 
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.interop import frame_cost
 from lbt_synth.loop import least_residual, loop_margins
-from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
+from lbt_synth.loop.least_residual import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.designs.report import refine_values, require_compatible, stable_interval

@@ -14,7 +14,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget
 from lbt_synth.loop.closed_loop import reads_others
-from lbt_synth.loop.least_residuals.residual_limit import (
+from lbt_synth.loop.least_residual import (
     above_percent,
     least_model_residual,
     limit_or_nan,

@@ -2,8 +2,7 @@ from .budget import ResidualBudget as ResidualBudget
 from .budget import residual_budget as residual_budget
 from .closed_loop import ClosedLoop as ClosedLoop
 from .closed_loop import close_loop as close_loop
-from .least_residuals.band_limit import least_worst_residual as least_worst_residual
-from .least_residuals.residual_limit import least_residual as least_residual
+from .least_residual import least_residual as least_residual
 from .margins import LoopMargins as LoopMargins
 from .margins import broken_loops as broken_loops
 from .margins import loop_margins as loop_margins

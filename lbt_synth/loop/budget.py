@@ -28,7 +28,6 @@ from lbt_synth.loop.evaluator import (
     loop_evaluator,
     period_roots,
 )
-from lbt_synth.loop.stable_range import append_taps
 from lbt_synth.models import (
     ARModel,
     LoopHardware,
@@ -38,7 +37,6 @@ from lbt_synth.models import (
     Truth,
     Vibration,
 )
-from lbt_synth.models.mirror.frame_rate_system import instant_mirror
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.sensor_suite import Motion, Motions, checked_motions
 from lbt_synth.models.vibration import checked_direction, sampled_lines
@@ -482,24 +480,3 @@ def resonance_edges(loop: ClosedLoop) -> FloatArray:
     """Panels of (0, Nyquist) [Hz] for a loop."""
     roots = period_roots(loop.system.poles, loop.system.period)
     return graded_edges(roots) * loop.hardware.frame_rate_hz / 2
-
-
-def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
-    """Position of a settled mirror less the real one, for the commands that a loop gives.
-
-    It is by how much the paper's equation 1, ``phi_cor(k-1) = N u(k-2)``, misses the position over
-    the exposure; no residual, as the loop corrects for part of it.
-    """
-    return residual_budget(replace(loop, system=_difference_loop(loop)), truth, frame_means=True)
-
-
-def _difference_loop(loop: ClosedLoop) -> StateSpace:
-    """Return the loop to the settled mirror's position less the real one, phase less residual."""
-    hardware, s, n = loop.hardware, loop.system, loop.hardware.modes
-    if hardware.mirror is None:  # it leaves nothing, not even rounding
-        return replace(s, C=0 * s.C[:n], D=0 * s.D[:n])
-    settled = append_taps(loop.commanding(), instant_mirror(hardware.delay_frames).taps)
-    C, D = hardware.influence @ settled.C, hardware.influence @ settled.D + s.D[:n]
-    C[:, : s.n_states] += s.C[:n]
-    D[:, :n] -= np.eye(n)
-    return replace(settled, C=C, D=D)

@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,10 +17,10 @@ from lbt_synth.loop import (
     ClosedLoop,
     Imaging,
     least_residual,
-    least_worst_residual,
     residual_budget,
 )
-from lbt_synth.loop.least_residuals.residual_limit import above_percent, limit_or_none
+from lbt_synth.loop.band_limit import BandLimit, least_worst_residual
+from lbt_synth.loop.least_residual import ResidualLimit, above_percent, limit_or_none
 from lbt_synth.loop.margins import phase_margin_deg
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
@@ -30,10 +29,6 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
 from lbt_synth.studies.grid import evaluate, loop_columns
 from lbt_synth.validation import FloatArray, frozen_copy, number
-
-if TYPE_CHECKING:
-    from lbt_synth.loop.least_residuals.band_limit import BandLimit
-    from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
 
 _GRID = 65  # shifts over the range of errors, at least
 _CLEAR = 0.01  # of the residual's variance by which a reference has to be better

@@ -36,7 +36,7 @@ from lbt_synth.loop import (
     residual_budget,
     simulate,
 )
-from lbt_synth.loop.budget import ensemble_residuals, settling_error
+from lbt_synth.loop.budget import ensemble_residuals
 from lbt_synth.loop.closed_loop import require_matching_controller
 from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
 from lbt_synth.loop.evaluator import textbook_matrices
@@ -454,14 +454,13 @@ def _mirror_row(name: str, loop: _Loop) -> Facts:
     design, hardware, truth, imaging = loop
     closed = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     numbers = loop_columns(closed, truth, imaging)
-    unsettled_nm = settling_error(closed, truth).rms_nm if closed.is_stable else np.nan
-    rms: dict[str, Any] = {"unit": "nm", "format": ".2f"}
     return facts(
         design=fact(name, "design"),
         stable=fact(closed.is_stable),
-        residual_nm=fact(numbers["residual_nm"], "residual", missing="unstable", **rms),
+        residual_nm=fact(
+            numbers["residual_nm"], "residual", missing="unstable", unit="nm", format=".2f"
+        ),
         strehl=fact(numbers["strehl"], "Strehl", unit="%", scale=100, format=".2f"),
-        unsettled_nm=fact(unsettled_nm, "settled less real position", **rms),
     )
 
 

@@ -11,7 +11,7 @@ from support.uneven_axes import QUICK, RATE, SLOW
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.loop.least_residual import least_model_residual
 
 SEEDS = st.integers(0, 10_000)
 

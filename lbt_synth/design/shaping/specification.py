@@ -36,10 +36,10 @@ from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import Constraint, Function
 from lbt_synth.linear.matrix_functions import component_labels
-from lbt_synth.loop import least_residual, least_worst_residual
+from lbt_synth.loop import least_residual
+from lbt_synth.loop.band_limit import BandLimit, least_worst_residual
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.loop.least_residuals.band_limit import BandLimit
-from lbt_synth.loop.least_residuals.residual_limit import (
+from lbt_synth.loop.least_residual import (
     ResidualLimit,
     above_percent,
     limit_or_nan,

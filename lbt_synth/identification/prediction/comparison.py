@@ -36,7 +36,7 @@ from lbt_synth.loop import (
     jitter_strehl,
     residual_budget,
 )
-from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.loop.least_residual import least_model_residual
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import LoopHardware, TipTiltPlant

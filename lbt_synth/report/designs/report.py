@@ -27,8 +27,8 @@ from lbt_synth.loop import (
     simulate,
     stable_sensor_gains,
 )
-from lbt_synth.loop.least_residuals.band_limit import BandLimit
-from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
+from lbt_synth.loop.band_limit import BandLimit
+from lbt_synth.loop.least_residual import ResidualLimit
 from lbt_synth.loop.simulation.run import settling_frames
 from lbt_synth.loop.stable_range import MovingGain
 from lbt_synth.models import LoopHardware

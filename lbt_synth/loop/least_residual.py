@@ -1,103 +1,45 @@
-"""Decoupled modes of a loop with their spectra, and the best prediction of one of them.
+"""The least residual of any linear controller, by spectral factorisation.
 
-With the measured spectrum ``Phi = S + R = |F|^2``, F outer, and the path ``z^-1 M`` from a
-filter's output to the residual written as an inner factor times an outer one, the least
-variance is that of the part of F which the inner factor makes unreachable, less R. The
-inner factor is ``z^-whole`` times an all-pass factor with the mirror's zeros outside the unit
-circle: one for a settled mirror and a fraction of a frame above one half, one or two for a
-mirror that moves slowly. The unreachable part has as many coefficients as these have zeros.
-All that is needed of F are integrals of ``log Phi`` times smooth weights.
+It uses no design and no closed loop, and so is an independent check of them. With the measured
+spectrum ``Phi = S + R = |F|^2``, F outer, and a path of d whole frames from a filter's output to
+the residual, the least variance is that of the first d coefficients of F, less R; a fraction up to
+a half changes nothing, as its factor has a stable inverse. All that is needed of F are integrals of
+``log Phi`` times cosines. In the image a command of a settled mirror corrects the mean over its own
+hold, whatever part of a frame it comes late by: that mean is interpolated between the samples.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
-from scipy.linalg import toeplitz
+from scipy.linalg import block_diag, toeplitz
 
-from lbt_synth.errors import CoupledModesError, ProblemError
+from lbt_synth.errors import CoupledModesError, LbtSynthError, ProblemError
 from lbt_synth.linear.quadrature import RefinedPanels, refine_panels
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.models import ARModel, LoopHardware, SinusoidalVibration, Spectrum, Vibration
+from lbt_synth.models import (
+    ARModel,
+    LoopHardware,
+    SinusoidalVibration,
+    Spectrum,
+    TipTiltPlant,
+    Truth,
+    Vibration,
+)
+from lbt_synth.models.plant.assembly import other_exposures
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density, spectrum_key
-from lbt_synth.validation import ComplexArray, FloatArray
+from lbt_synth.models.vibration import checked_direction, stationary_vibrations
+from lbt_synth.validation import FloatArray, frozen_copy, read_only, require_instance
 
-_FEW_DIGITS = 1e-2  # a division by less than this would lose more than two digits
+T = TypeVar("T")
 POINTS = 16  # samples on each side of one between two samples
 _INDEPENDENT = 1e-13  # part of the largest eigenvalue of a covariance that is more than rounding
-_REAL = 1e-7  # relative imaginary part of what counts as a real zero
-_ALIKE = 1e9  # condition of the zeros' Gram matrix beyond which they count as equal
 _COUPLING = 1e-9  # relative size above which an off-diagonal entry counts as coupling
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class InnerFactor:
-    """The inner factor of a loop's path: a pure delay and an all-pass factor."""
-
-    whole: int  # frames of pure delay from the measured sample to the corrected one
-    zeros: tuple[float, ...]  # of the all-pass factor in the backward shift, in (-1, 1)
-    terms: int  # number of cosine integrals that are needed, the mean included
-    target: Interpolation | None = None  # what is corrected, where it is not one sample
-
-    @staticmethod
-    def of(hardware: LoopHardware, *, in_image: bool) -> InnerFactor:
-        """Return the inner factor of a loop's path to the image, or to means over frames.
-
-        In the image a command of a settled mirror corrects the mean over its own hold, whatever
-        part of a frame it comes late by.
-        """
-        if in_image:
-            if hardware.mirror is not None:
-                raise ProblemError(
-                    "the limit in the image is known for a mirror that settles at once; got one "
-                    "with dynamics."
-                )
-            whole = int(hardware.delay_frames)
-            if hardware.delay_frames == whole:
-                return InnerFactor(whole=whole, zeros=(), terms=whole)
-            return InnerFactor(whole=whole, zeros=(), terms=2 * POINTS)
-        mirror = hardware.mirror_system
-        found = mirror.core.zeros
-        late = found[np.abs(found) > 1]  # on the circle: a stable inverse, in the limit
-        whole = mirror.lead + 1
-        if np.any(np.abs(late.imag) > _REAL * np.abs(late)):
-            raise ProblemError(
-                "the limit of a mirror is known for real zeros outside the unit circle; got "
-                f"complex ones at {late[np.argmax(np.abs(late.imag))]:.6g}. Try another delay "
-                "or frame rate, or the residual of lqg."
-            )
-        zeros = tuple(sorted(float(a) for a in 1 / late.real))
-        if len(zeros) > 1 and np.linalg.cond(_gram(zeros)) > _ALIKE:
-            raise ProblemError(
-                "the limit of a mirror needs zeros outside the unit circle that differ; got "
-                f"{', '.join(f'{1 / a:.9g}' for a in zeros)}. Try another delay or frame rate."
-            )
-        # for small zeros, the quotient (F - f_0 - ...) / zero^whole is summed as a series
-        small = [abs(a) for a in zeros if abs(a) ** whole <= _FEW_DIGITS]
-        more = 1 + int(np.ceil(np.log(1e-17) / np.log(max(*small, 1e-300)))) if small else 0
-        return InnerFactor(whole=whole, zeros=zeros, terms=whole + more)
-
-    @property
-    def by_weight(self) -> tuple[float, ...]:
-        """Zeros at which the value is an integral with a weight of its own."""
-        return tuple(a for a in self.zeros if abs(a) ** self.whole > _FEW_DIGITS)
-
-    def weights(self, x: FloatArray) -> FloatArray:
-        """Weights (f, k) of the logarithm at frequencies x, in units of Nyquist."""
-        columns = [np.cos(np.pi * n * x) for n in range(self.terms)]
-        for a in self.by_weight:
-            shifted = a * np.exp(-1j * np.pi * x)
-            columns.append(np.real(shifted / (1 - shifted)))
-        return np.stack(columns, axis=-1)
-
-
-def _gram(zeros: tuple[float, ...]) -> FloatArray:
-    """Inner products of the kernels ``1 / (1 - a z^-1)``."""
-    a = np.array(zeros)
-    return np.asarray(1 / (1 - np.outer(a, a)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,59 +95,32 @@ class Interpolation:
 class Prediction:
     """Best prediction of a process whose spectrum has given integrals of its logarithm."""
 
-    inner: InnerFactor
     mean_log: float  # mean of ``log(Phi / reference)``
-    coefficients: FloatArray  # ``1, f_1, ...`` of ``F = sigma (1 + f_1 z^-1 + ...)``, (whole,)
-    tails: FloatArray  # values of the later terms of F at the zeros of the all-pass factor
+    coefficients: FloatArray  # ``1, f_1, ...`` of ``F = sigma (1 + f_1 z^-1 + ...)``
+    target: Interpolation | None  # what is predicted, where it is not one sample
 
     @staticmethod
-    def of(inner: InnerFactor, moments: FloatArray) -> Prediction:
-        """Predict from the integrals of the logarithm times the weights of an inner factor."""
-        f = _exponential(moments[: inner.terms])
-        if inner.target is not None:
-            return Prediction(inner, float(moments[0]), f, np.zeros(0))
-        whole, tails = inner.whole, np.zeros(len(inner.zeros))
-        for i, a in enumerate(inner.zeros):
-            if a in inner.by_weight:
-                value = float(np.exp(moments[inner.terms + inner.by_weight.index(a)]))
-                tails[i] = (value - float(polyval(a, f[:whole]))) / a**whole
-            else:
-                tails[i] = float(polyval(a, f[whole:]))
-        return Prediction(inner, float(moments[0]), f[:whole], tails)
-
-    @property
-    def _kernels(self) -> FloatArray:
-        """Weights of the kernels ``1 / (1 - a z^-1)`` that the unreachable part is made of."""
-        if not self.inner.zeros:
-            return np.zeros(0)
-        return np.asarray(np.linalg.solve(_gram(self.inner.zeros), self.tails))
-
-    @property
-    def later_power(self) -> float:
-        """Sum of squares of all unreachable coefficients but the first, over sigma^2."""
-        later = float(np.sum(self.coefficients[1:] ** 2))
-        return later + max(float(self.tails @ self._kernels), 0.0)
+    def of(moments: FloatArray, target: Interpolation | None) -> Prediction:
+        """Predict from the integrals of the logarithm times cosines."""
+        return Prediction(float(moments[0]), _exponential(moments), target)
 
     def variance(self, reference: float, noise: float) -> float:
         """Least variance of the residual; the reference is the noise unless that is zero."""
         sigma2 = np.exp(self.mean_log)
-        if self.inner.target is not None:
-            return self.inner.target.variance(self.coefficients, reference * sigma2, noise)
+        if self.target is not None:
+            return self.target.variance(self.coefficients, reference * sigma2, noise)
+        later = float(np.sum(self.coefficients[1:] ** 2))
         if noise > 0:  # sums of positive numbers: no digits are lost however large the noise
-            return float(reference * (np.expm1(self.mean_log) + sigma2 * self.later_power))
-        return float(reference * sigma2 * (1 + self.later_power))
+            return float(reference * (np.expm1(self.mean_log) + sigma2 * later))
+        return float(reference * sigma2 * (1 + later))
 
     def error_power(self, x: FloatArray) -> FloatArray:
         """``|P|^2 / sigma^2`` at frequencies x: the rejection is ``|P / F|^2``."""
-        if self.inner.target is not None:
+        if self.target is not None:
             raise ProblemError(
                 "the limit over a band is known for whole frames of delay; got a fraction."
             )
-        shift = np.exp(-1j * np.pi * x)
-        part: ComplexArray = polyval(shift, self.coefficients)
-        for a, weight in zip(self.inner.zeros, self._kernels, strict=True):
-            part = part + weight * shift**self.inner.whole / (1 - a * shift)
-        return np.asarray(np.abs(part) ** 2)
+        return np.asarray(np.abs(polyval(np.exp(-1j * np.pi * x), self.coefficients)) ** 2)
 
 
 def _exponential(c: FloatArray) -> FloatArray:
@@ -222,12 +137,13 @@ def _exponential(c: FloatArray) -> FloatArray:
 class ModeSpectrum:
     """One decoupled mode: its disturbance and the white noise on its measurement."""
 
-    inner: InnerFactor  # of the path to the residual
+    frames: int  # of whole delay from the measured sample to the corrected one
     rate_hz: float
     parts: tuple[Spectrum, ...]  # independent parts of the disturbance
     noise_nm2: float  # variance of the noise per frame, as a phase [nm^2]
     in_image: bool  # whether spectra are of all moments, of which frames have the means
     sinusoids: tuple[tuple[float, float], ...] = ()  # frequency [Hz] and rms [nm] of each
+    target: Interpolation | None = None  # what is corrected, where it is not one sample
 
     def power(self, x: FloatArray) -> FloatArray:
         """Two-sided disturbance spectrum per sample [nm^2] at x, in units of Nyquist."""
@@ -250,8 +166,12 @@ class ModeSpectrum:
         moments = np.zeros(lags.size)
         if self.parts:
             moments = refine_panels(covariances, self.edges()).integrals.sum(axis=0)
-        target = Interpolation.of(delay_frames, moments)
-        return replace(self, inner=replace(self.inner, target=target))
+        return replace(self, target=Interpolation.of(delay_frames, moments))
+
+    def cosines(self, x: FloatArray) -> FloatArray:
+        """Weights (f, k) of the logarithm at frequencies x, in units of Nyquist."""
+        count = self.frames if self.target is None else 2 * POINTS
+        return np.asarray(np.cos(np.pi * np.arange(count) * x[:, None]))
 
     def within_frames_nm2(self) -> float:
         """Power that moves within frames, which no command follows [nm^2]."""
@@ -286,12 +206,10 @@ class ModeSpectrum:
         edges = self.edges()
         return float(np.max(self.power((edges[1:] + edges[:-1]) / 2), initial=0.0))
 
-    def log_moments(
-        self, reference: float, *, ends: Sequence[float] = (), skip: bool = False
-    ) -> RefinedPanels | None:
-        """Integrals of ``log(Phi / reference)`` times the weights; None where Phi vanishes.
+    def log_moments(self, reference: float, ends: Sequence[float] = ()) -> RefinedPanels | None:
+        """Integrals of ``log(Phi / reference)`` times the cosines; None where Phi vanishes.
 
-        The two ``ends`` are edges of panels; with ``skip``, the integrand between them is 0.
+        The two ``ends`` are edges of panels.
         """
         noiseless = self.noise_nm2 == 0
 
@@ -303,12 +221,10 @@ class ModeSpectrum:
                     f"the noise variance {self.noise_nm2:.3g} nm^2 is too small beside the "
                     "disturbance to differ from zero; set noise_nm to 0."
                 )
-            if skip:
-                ratio = np.where((x > ends[0]) & (x < ends[1]), 1.0, ratio)
             if noiseless and np.any(ratio == 0):
                 raise ZeroDivisionError  # the process can be predicted exactly
             values = np.log(ratio) if noiseless else np.log1p(ratio)
-            return np.asarray(values[:, None] * self.inner.weights(x))
+            return np.asarray(values[:, None] * self.cosines(x))
 
         try:
             return refine_panels(integrand, self.edges(ends), floor=1e-14 if noiseless else 0.0)
@@ -352,17 +268,29 @@ def decoupled_modes(
         matrices.append((f"the vibration at {line.frequency_hz:.6g} Hz", np.outer(along, along)))
     matrices += [("the given direction", np.outer(along, along)) for along in directions]
     axes = _common_axes(matrices)
-    inner, modes = InnerFactor.of(hardware, in_image=in_image), []
+    frames, modes = _whole_frames(hardware, in_image=in_image), []
     for axis in axes:
         key = next(key for key, projector in groups.items() if axis @ projector @ axis > 0.5)
         lines = [line.ar_model(rate) for along, line in vibrations if abs(along @ axis) > 0.5]
         parts = tuple(part for part in (kinds[key], *lines) if part is not None)
         seen = tuple((s.frequency_hz, s.rms_nm * float(along @ axis)) for along, s in sinusoids)
         variance = max(float(axis @ noise @ axis), 0.0)
-        mode = ModeSpectrum(inner, rate, parts, variance, in_image, seen)
-        late = in_image and hardware.delay_frames % 1 > 0
+        mode = ModeSpectrum(frames, rate, parts, variance, in_image, seen)
+        late = in_image and hardware.delay_frames > frames
         modes.append(mode.interpolated(hardware.delay_frames) if late else mode)
     return axes, modes
+
+
+def _whole_frames(hardware: LoopHardware, *, in_image: bool) -> int:
+    """Return the whole frames of delay of a loop whose limit is known."""
+    if hardware.mirror is not None:
+        raise ProblemError("a limit is known for a mirror that settles at once; got dynamics.")
+    if hardware.delay_frames % 1 > 0.5 and not in_image:  # a zero outside the unit circle
+        raise ProblemError(
+            "the limit of means over frames is known for at most a half beyond whole frames of "
+            f"delay; got {hardware.delay_frames:g}. Take that in the image."
+        )
+    return int(hardware.delay_frames)
 
 
 def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray:
@@ -418,3 +346,201 @@ def _common_axes(matrices: Sequence[tuple[str, FloatArray]]) -> FloatArray:
             "each mode by itself."
         )
     return np.asarray(axes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResidualLimit:
+    """The least residual of any linear controller."""
+
+    variance_nm2: FloatArray  # (n,): least variance along each direction [nm^2]
+    within_nm2: FloatArray  # (n,): the part of it that moves within frames [nm^2]
+    # (n, n): directions over the modes, one per row, along which the loop decouples
+    directions: FloatArray
+
+    @property
+    def rms_nm(self) -> float:
+        """Least residual over all modes [nm rms]."""
+        return float(np.sqrt(np.sum(self.variance_nm2)))
+
+
+def least_residual(
+    hardware: LoopHardware, truth: Truth, *, frame_means: bool = False
+) -> ResidualLimit:
+    """Least stationary residual that any linear controller leaves under a truth, in the image.
+
+    By spectral factorisation, without any design: a controller that knew the spectra, the
+    noise and the sensor gain could come as close to it as it likes, none could pass it.
+    Of sinusoids there remains what moves within a frame, since no command follows it: one frequency
+    can be rejected entirely at a price as small as one likes. Random vibrations count with their
+    spectra.
+
+    With other sensors beside the loop's own it is the least residual of a loop that knows more:
+    each wavefront sensor reads each frame of its exposures at once, with as much noise as gives the
+    mean its own; accelerometers know all vibrations in advance. A sensor that reads each frame at
+    the loop's own delay loses nothing by that, a slow or late one a little.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        The loop, with any delay. The sensor must see and the mirror reach every mode.
+    truth : Truth
+        Disturbances, noise and sensor gain.
+    frame_means : bool, optional
+        As in :func:`residual_budget`.
+
+    Returns
+    -------
+    ResidualLimit
+        Least variance along each direction, and the least residual.
+
+    Raises
+    ------
+    ProblemError
+        If a mode is not seen or not reached, the modes do not decouple, or a disturbance does
+        not fit the loop; also for a mirror with dynamics, where an exposure of another sensor ends
+        within a frame, and in means over frames where a delay ends in the second half of a frame.
+    NumericalError
+        If an integral over a spectrum does not settle.
+
+    Examples
+    --------
+    An AR1 process without noise, predicted over two frames:
+
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2, modes=1)
+    >>> slow = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=2.0, frame_rate_hz=800)
+    >>> limit = lbt.loop.least_residual(path, lbt.Truth(turbulence=slow), frame_means=True)
+    >>> round(float(limit.variance_nm2[0]), 8)  # 2^2 (1 + 0.5^2)
+    5.0
+    """
+    require_instance(hardware, LoopHardware)
+    if hardware.suite.sensors:
+        return _limit_of_sensors(hardware, truth, in_image=not frame_means)
+    return _residual_limit(*truth_modes(hardware, truth, in_image=not frame_means))
+
+
+def _limit_of_sensors(hardware: LoopHardware, truth: Truth, *, in_image: bool) -> ResidualLimit:
+    """Return the limit of the loop that knows more than that of several sensors."""
+    suite = hardware.suite
+    if suite.accelerometers:
+        truth = replace(truth, vibrations=(), motions=(), frequency_errors_hz=None)
+    noise = truth.noise_per_measurement(hardware.n_measurements) / truth.sensor_gain
+    sensor, blocks = [hardware.sensor], [np.diag(noise**2)]
+    for other, seen in zip(suite.wavefront, other_exposures(hardware), strict=True):
+        if seen.age_frames % 1:
+            raise ProblemError(
+                f"no limit is known where an exposure of sensor {other.name} ends within a frame "
+                f"of the loop; it ends {seen.age_frames % 1:.3g} frames after one begins."
+            )
+        factor = other.noise_factor(hardware.modes)
+        sensor.append(seen.response)
+        blocks.append(seen.period * factor @ factor.T)
+    if not noise.any():  # nothing adds to a sensor without noise
+        sensor, blocks = sensor[:1], blocks[:1]
+    every = replace(hardware.own_sensor_alone(), sensor_matrix=np.vstack(sensor))
+    modes = truth_modes(every, truth, noise_nm2=block_diag(*blocks), in_image=in_image)
+    return _residual_limit(*modes)
+
+
+def least_model_residual(plant: TipTiltPlant, *, frame_means: bool = False) -> ResidualLimit:
+    """Least residual that any linear controller leaves where a plant's model is the truth.
+
+    It is that in the image, or of means over frames; the processes of a plant are of such means.
+    Coupled modes have a limit where nothing but whole frames of delay is between command and
+    mirror: the error of the best estimate, from a Riccati equation, and what moves within frames.
+    """
+    hardware, rate, in_image = plant.hardware, plant.hardware.frame_rate_hz, not frame_means
+    lines = [(checked_direction(line, hardware), line) for line in plant.vibrations]
+    try:
+        modes = decoupled_modes(hardware, plant.R, plant.turbulence, lines, in_image=in_image)
+    except CoupledModesError:
+        if hardware.mirror is not None or hardware.delay_frames % 1:
+            raise
+        parts = list(zip(np.eye(hardware.modes), plant.turbulence, strict=True))
+        parts += [(along, line.ar_model(rate)) for along, line in lines]
+        within = np.zeros((hardware.modes, hardware.modes))
+        for along, model in parts:
+            mode = ModeSpectrum(0, rate, (model,), 0.0, in_image)
+            within += mode.within_frames_nm2() * np.outer(along, along)
+        error = plant.L @ kalman_riccati(plant).P @ plant.L.T
+        variance, axes = np.linalg.eigh(error + within)
+        return ResidualLimit(
+            variance_nm2=frozen_copy(variance),
+            within_nm2=frozen_copy(np.einsum("in,ij,jn->n", axes, within, axes)),
+            directions=frozen_copy(axes.T),
+        )
+    return _residual_limit(*modes)
+
+
+def truth_modes(
+    hardware: LoopHardware,
+    truth: Truth,
+    directions: tuple[FloatArray, ...] = (),
+    *,
+    in_image: bool,
+    noise_nm2: FloatArray | None = None,
+) -> tuple[FloatArray, list[ModeSpectrum]]:
+    """Decouple the modes of a truth; noise (q, q) is that of the own sensor by default."""
+    require_instance(hardware, LoopHardware)
+    require_instance(truth, Truth)
+    lines, sinusoids = [], []
+    for vibration in stationary_vibrations(truth.vibrations):
+        along = checked_direction(vibration, hardware)
+        if isinstance(vibration, Vibration):
+            if in_image:  # frames have its mean
+                share = float(np.sinc(vibration.frequency_hz / hardware.frame_rate_hz))
+                vibration = replace(vibration, rms_nm=share * vibration.rms_nm)
+            lines.append((along, vibration))
+        else:
+            sinusoids.append((along, vibration))
+    if noise_nm2 is None:
+        noise = truth.noise_per_measurement(hardware.n_measurements) / truth.sensor_gain
+        noise_nm2 = np.diag(noise**2)
+    turbulence = truth.turbulence_per_mode(hardware.modes)
+    return decoupled_modes(
+        hardware,
+        noise_nm2,
+        turbulence,
+        lines,
+        directions,
+        in_image=in_image,
+        sinusoids=sinusoids,
+    )
+
+
+def _residual_limit(directions: FloatArray, modes: list[ModeSpectrum]) -> ResidualLimit:
+    within = np.array([mode.within_frames_nm2() for mode in modes])
+    return ResidualLimit(
+        variance_nm2=read_only(within + [mode_limit(mode) for mode in modes]),
+        within_nm2=read_only(within),
+        directions=frozen_copy(directions),
+    )
+
+
+def mode_limit(mode: ModeSpectrum) -> float:
+    """Least variance of the means of one mode."""
+    reference = mode.reference()
+    panels = mode.log_moments(reference) if mode.parts and reference > 0 else None
+    if panels is None:  # nothing to correct, or all of it can be predicted
+        return 0.0
+    prediction = Prediction.of(panels.integrals.sum(axis=0), mode.target)
+    return prediction.variance(reference, mode.noise_nm2)
+
+
+def above_percent(rms_nm: float, limit_nm: float) -> float:
+    """Return how far a residual is above a limit [%]; nan where the limit is 0 or nan."""
+    return 100 * (rms_nm / limit_nm - 1) if limit_nm > 0 else np.nan
+
+
+def limit_or_nan(limit: Callable[[], Any]) -> float:
+    """Return the least residual [nm rms], nan where it cannot be computed."""
+    found = limit_or_none(limit)
+    return np.nan if found is None else float(found.rms_nm)
+
+
+def limit_or_none(limit: Callable[[], T]) -> T | None:
+    """Return the limit, None where it cannot be computed."""
+    try:
+        return limit()
+    except LbtSynthError:
+        return None
