@@ -264,7 +264,7 @@ def figure(
             rejection.rule("", 1.0, "y")
             for look, (name, loop) in enumerate(loops.items()):
                 rejected = np.abs(loop.sensitivity(f)[:, i, i]) ** 2
-                passed = np.abs(loop.noise_transfer(f)[:, i, i]) ** 2
+                passed = np.abs(loop.path("noise", "residual").frequency_response(f)[:, i, i]) ** 2
                 left = accumulated(f, rejected * density + passed * noise)
                 rejection.curve(name, f, np.sqrt(rejected), look=look, width=0.9)
                 total.curve(name, f, np.sqrt(left), look=look)

@@ -139,7 +139,7 @@ class IntegratorLaw:
         if self.phase_margin_deg is not None:
             found["phase_margin_deg"] = phase_margin_deg(loop)
         if self.modulus_margin is not None:
-            found["modulus_margin"] = 1 / hinf_norm(loop.output_sensitivity()).upper
+            found["modulus_margin"] = 1 / hinf_norm(loop.path("noise", "reading")).upper
         return found
 
 

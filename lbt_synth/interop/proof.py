@@ -107,12 +107,6 @@ def command_as_state(textbook: StateSpace) -> Controller:
     )
 
 
-def history_filter(loop: ClosedLoop) -> StateSpace:
-    """Return the filter from pseudo-open-loop values to the commands of a loop of unit sensor."""
-    s, n = loop.commanding(), loop.hardware.modes
-    return replace(s, B=s.B[:, n:], D=s.D[:, n:])
-
-
 def filter_of_history(hardware: LoopHardware, system: StateSpace) -> tuple[Controller, Controller]:
     """Return the controller of a filter of pseudo-open-loop values, its command a further state.
 
@@ -184,7 +178,7 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
     inside = (gain for gain in scenario_gains(design) if low <= gain <= high)
     checks += (_residual_check(design, hardware, written, gain) for gain in inside)
     exact, other = (close_loop(hardware, c) for c in (design.controller, controller))
-    before, after = (hinf_norm(loop.output_sensitivity()).value for loop in (exact, other))
+    before, after = (hinf_norm(loop.path("noise", "reading")).value for loop in (exact, other))
     change = written.response_change
     after += change(1.0) if change else 0.0
     checks.append(Check("modulus margin, loss", float(after / before) - 1, LOSS, "level sets"))

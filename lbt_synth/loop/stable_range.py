@@ -317,7 +317,7 @@ def circle_norm(loop: ClosedLoop, *, low: float, high: float) -> float:
     centred = close_loop(loop.hardware, loop.controller, sensor_gain=middle)
     if not centred.is_stable:
         return np.inf
-    S = centred.output_sensitivity()
+    S = centred.path("noise", "reading")
     T = replace(S, C=-S.C, D=np.eye(len(S.D)) - S.D)
     return (high - low) / (2 * middle) * hinf_norm(T).upper
 
@@ -441,11 +441,6 @@ def _largest_proved(proves: Callable[[float], bool], most: float) -> float:
 
 def _answer_to_noise(loop: ClosedLoop) -> StateSpace:
     """Return the system from the noise to what the sensor sees of the commands it causes."""
-    hardware, commanding = loop.hardware, loop.commanding()
-    n, seen = hardware.modes, loop.sensor_gain * hardware.sensor @ hardware.influence
-    return replace(
-        commanding,
-        B=commanding.B[:, n:],
-        C=seen @ commanding.C,
-        D=seen @ commanding.D[:, n:],
-    )
+    hardware, commands = loop.hardware, loop.path("noise", "command")
+    seen = loop.sensor_gain * hardware.sensor @ hardware.influence
+    return replace(commands, C=seen @ commands.C, D=seen @ commands.D)

@@ -82,7 +82,7 @@ def test_every_demand_holds_in_a_loop_measured_by_other_means():
     S = np.abs(loop.sensitivity(f)[:, 0, 0])
     T = np.abs(1 - loop.sensitivity(f)[:, 0, 0])
     assert np.max(S) < 1 / 0.55
-    assert np.max(np.abs(loop.noise_transfer(f))) < 1.9
+    assert np.max(np.abs(loop.path("noise", "residual").frequency_response(f))) < 1.9
     assert np.max(S[f <= 2]) < 0.12
     assert np.max(np.abs(weak.sensitivity(f[(f >= 4) & (f <= 6)]))) < 0.5
     low, high = lbt.loop.stable_sensor_gains(ONE, design.controller)

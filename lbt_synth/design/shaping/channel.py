@@ -177,13 +177,12 @@ class SingleModeLoop:
     @property
     def sensitivity(self) -> StateSpace:
         """S at unit sensor gain."""
-        return self.at(1.0).output_sensitivity()
+        return self.at(1.0).path("noise", "reading")
 
     @property
     def parameter(self) -> StateSpace:
         """The Youla parameter: from the noise to the command at unit sensor gain."""
-        commanding, modes = self.at(1.0).commanding(), self.hardware.modes
-        return replace(commanding, B=commanding.B[:, modes:], D=commanding.D[:, modes:])
+        return self.at(1.0).path("noise", "command")
 
     @property
     def complementary(self) -> StateSpace:

@@ -109,7 +109,7 @@ class NoisePeak(CheckedFields):
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
-        peak = hinf_norm(loop.at(1.0).noise_propagation()).upper
+        peak = hinf_norm(loop.at(1.0).path("noise", "residual")).upper
         return (Check("peak of the noise transfer", peak, self.at_most, LEVEL_SETS),)
 
 
@@ -170,7 +170,7 @@ class Attenuation(Band):
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop."""
         name = f"rejection in {self.band_text} at sensor gain {self.sensor_gain:g}"
-        peak = self.peak(loop.at(self.sensor_gain).rejection())
+        peak = self.peak(loop.at(self.sensor_gain).path("phase", "residual"))
         return (self.check(name, peak, self.at_most),)
 
 

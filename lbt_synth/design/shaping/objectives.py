@@ -220,7 +220,8 @@ class VibrationBand(Band):
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the worst variance in the real loop, by level sets, and that of the skirts."""
-        inside = (self.rms_nm * self.peak(loop.held(self.sensor_gain).rejection())) ** 2
+        rejection = loop.held(self.sensor_gain).path("phase", "residual")
+        inside = (self.rms_nm * self.peak(rejection)) ** 2
         skirts = self.skirts(loop.hardware.frame_rate_hz)
         if skirts is None:
             return inside

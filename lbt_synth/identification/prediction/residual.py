@@ -7,7 +7,7 @@ which does not count.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -341,9 +341,11 @@ def replay(
     z(k) stands for phi_tot(k-1), without noise: the residual of frame k-1 is e(k). A loop that
     reads channels is given their readings (frames, c), which come in the frame of the measurement.
     """
-    path, driven = loop.rejection(), series
+    path, driven = loop.path("phase", "residual"), series
     if loop.reads_others and readings is not None:
-        path = loop.rejection_with_channels()
+        path, n = loop.path("all", "residual"), loop.hardware.modes
+        entering = np.r_[:n, n + loop.hardware.n_measurements : path.B.shape[-1]]
+        path = replace(path, B=path.B[..., entering], D=path.D[..., entering])
         driven = np.hstack([series, np.vstack([readings[:1], readings[:-1]])])
     return run_from_rest(path, driven, runs, settle_frames(loop.hardware))
 

@@ -353,7 +353,7 @@ def show_design(design: Design, config: Config, start: Config, shift_hz: float) 
     modulus, power = np.nan, np.full(grid.size, np.nan)
     rejection, noise = power, power
     if loop.is_stable:
-        modulus = 1 / float(hinf_norm(loop.output_sensitivity()))
+        modulus = 1 / float(hinf_norm(loop.path("noise", "reading")))
         power = shown_unit("nm²/Hz")[1] * exact_spectrum(loop, truth, grid, SEGMENT)
         rejection, noise = (spectral_norms(response[:, :n, s]) for s in (np.s_[:n], np.s_[n:]))
     curves = {

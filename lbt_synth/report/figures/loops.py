@@ -176,7 +176,10 @@ def sigma_curves(
             system = design.error_system(problem.with_unit_weights() if unit_weights else problem)
             error = largest_singular_values(system, grid)
         if name in loops and loops[name].is_stable:
-            S, N = loops[name].sensitivity(grid), loops[name].noise_transfer(grid)
+            S, N = (
+                loops[name].sensitivity(grid),
+                loops[name].path("noise", "residual").frequency_response(grid),
+            )
             diagonals = [np.abs(response.diagonal(axis1=1, axis2=2)).T for response in (S, N)]
             if _are_apart(S) and _are_apart(N) and not np.allclose(diagonals[0], diagonals[0][0]):
                 for axis, pair in enumerate(zip(*diagonals, strict=True)):

@@ -186,7 +186,7 @@ def _residual_density(model: IdentifiedModel, loop: ClosedLoop, i: int) -> Float
     """Density of the residual of an axis, of the phase and the noise of all axes, (f,)."""
     f = model.axes[i].frequency_hz
     rejected = np.abs(loop.sensitivity(f)[:, i]) ** 2
-    passed = np.abs(loop.noise_transfer(f)[:, i]) ** 2
+    passed = np.abs(loop.path("noise", "residual").frequency_response(f)[:, i]) ** 2
     density = np.zeros(f.size)
     for j, axis in enumerate(model.axes):
         white = _noise_density(axis)

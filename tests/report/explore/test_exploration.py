@@ -107,7 +107,7 @@ def test_curves_are_those_of_the_loop(start):
     curves = show_design(design, start, start, 0.0).curves
     grid, rejection = curves["explore-rejection"]
     np.testing.assert_allclose(rejection, spectral_norms(loop.sensitivity(grid)))
-    noise = spectral_norms(loop.noise_transfer(grid))
+    noise = spectral_norms(loop.path("noise", "residual").frequency_response(grid))
     np.testing.assert_allclose(curves["explore-noise"][1], noise)
     error = largest_singular_values(design.error_system(), grid)
     np.testing.assert_allclose(curves["explore-sigma"][1], error)
