@@ -34,7 +34,12 @@ from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.grid import timed
 from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, part_rows, replay_row
 from lbt_synth.studies.study.sample import evaluate_samples
-from lbt_synth.studies.study.statistics import StudyStatistics, summary_tables, worst_table
+from lbt_synth.studies.study.statistics import (
+    StudyStatistics,
+    study_statistics,
+    summary_tables,
+    worst_table,
+)
 from lbt_synth.validation import integer
 
 _TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
@@ -63,7 +68,7 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
     with run_in_parts(arguments, folder, total=loaded.samples, what="samples") as engine:
         run = studies.run_study(loaded, folder, **engine)
     names, columns = loaded.parameter_names, run.columns
-    statistics = studies.study_statistics(columns, names, tuple(loaded.controllers))
+    statistics = study_statistics(columns, names, tuple(loaded.controllers))
     pages = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
     draws = run.computed > 0 or not all(path.exists() for path in pages)
     if draws:

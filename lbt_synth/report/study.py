@@ -35,10 +35,9 @@ from lbt_synth.studies.study.statistics import (
     ControllerStatistics,
     Samples,
     StudyStatistics,
+    controller_samples,
     is_list,
     percent,
-    read_column,
-    read_controller_samples,
     residual_table,
     sensitivity_table,
     strehl_table,
@@ -93,21 +92,20 @@ def study_page(
     Examples
     --------
     >>> import lbt_synth as lbt
+    >>> from lbt_synth.studies.study.statistics import study_statistics
     >>> study = lbt.studies.load_study("examples/study.yaml")
-    >>> columns = dict(zip(study.parameter_names, study.values(0, 2).T))
+    >>> columns = dict(zip(study.parameter_names, study.values(0, 2).T)) | {"row": [0, 1]}
     >>> columns |= {f"kalman.{name}": [1.0, 0.5] for name in ("strehl", "residual_nm")}
     >>> columns["kalman.stable"] = [1, 1]
-    >>> statistics = lbt.studies.study_statistics(columns, study.parameter_names, ["kalman"])
+    >>> statistics = study_statistics(columns, study.parameter_names, ["kalman"])
     >>> lbt.report.study_page(study, columns, statistics).title
     'Robustness study study.yaml'
     """
     samples = {
-        controller.controller: read_controller_samples(columns, controller.controller)
+        controller.controller: controller_samples(columns, controller.controller)
         for controller in statistics.controllers
     }
-    values = {
-        name: read_column(columns, name, statistics.samples) for name in statistics.parameters
-    }
+    values = {name: np.asarray(columns[name], float) for name in statistics.parameters}
     names = short_names(statistics.parameters)
     varying = sum(np.ptp(column) > 0 for column in values.values())
     return new_page(
@@ -397,7 +395,7 @@ def _cells(values: FloatArray, cells: int) -> tuple[FloatArray, FloatArray]:
 
     A list has a cell for each value, other values have cells of equal width.
     """
-    if is_list(np.sort(values)):
+    if is_list(values):
         centres = np.unique(values)
         inner = (centres[:-1] + centres[1:]) / 2
         return centres, np.concatenate(([centres[0] - 1], inner, [centres[-1] + 1]))

@@ -7,6 +7,5 @@ from .robustness import robustness as robustness
 from .robustness import robustness_map as robustness_map
 from .robustness import tradeoff as tradeoff
 from .study.run import run_study as run_study
-from .study.statistics import study_statistics as study_statistics
 from .study.study import Study as Study
 from .study.study import load_study as load_study
