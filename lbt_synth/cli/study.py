@@ -156,7 +156,7 @@ def _controller_table(statistics: StudyStatistics) -> Table:
 
 
 def _sampling_notes(loaded: studies.Study) -> list[str]:
-    if loaded.settings.sampling != "sobol" or loaded.samples & (loaded.samples - 1) == 0:
+    if loaded.samples & (loaded.samples - 1) == 0:
         return []
     return [
         "note: Sobol's points are balanced best when their number is a power of two; "
@@ -176,10 +176,8 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     parameters = {name: section.text for name, section in loaded.settings.parameters.items()}
     controllers = {name: section.text for name, section in loaded.settings.controllers.items()}
     report = Report(data={"parameters": parameters, "controllers": controllers})
-    settings = loaded.settings
-    names = ("sampling", "seed", "evaluation")
     what = {"samples": fact(loaded.samples, "samples"), "workers": fact(count)}
-    what |= {name: fact(getattr(settings, name), name) for name in names}
+    what["seed"] = fact(loaded.settings.seed, "seed")
     report.add_facts(f"Study {loaded.source}", facts(**what), cost)
     report.verdict.append(f"The study takes about {duration_text(cost.seconds)} on {where}.")
     report.notes += [*_sampling_notes(loaded), "note: nothing was written."]

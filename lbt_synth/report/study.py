@@ -224,8 +224,7 @@ def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names
     ]
     headings = ("parameter", "its place", "distribution", "least", "median", "greatest")
     return [
-        f"{study.samples} samples (sampling: {settings.sampling}, seed: {settings.seed}, "
-        f"evaluation: {settings.evaluation}).",
+        f"{study.samples} samples of a Sobol sequence (seed: {settings.seed}).",
         Table(caption="Parameters", headings=headings, rows=tuple(rows), words=(1, 2)),
     ]
 

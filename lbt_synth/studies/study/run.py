@@ -217,9 +217,9 @@ class Replay:
 def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Replay:
     """Compute one row of a study again, and write it as a configuration.
 
-    ``row_N.yaml`` is the configuration of the sample with its real delay and noise, and with the
-    seed of its simulation: ``simulate row_N.yaml GAIN`` closes the loop of the sample. Designs
-    for each sample, which assume the delay and the noise of ``config``, are ``row_N_NAME.fits``.
+    ``row_N.yaml`` is the configuration of the sample with its real delay and noise, and with its
+    number as the seed: ``simulate row_N.yaml GAIN`` closes the loop of the sample. Designs for each
+    sample, which assume the delay and the noise of ``config``, are ``row_N_NAME.fits``.
     """
     row = integer(row, "row", at_least=0)
     if row >= study.samples:
@@ -269,5 +269,5 @@ def _row_settings(study: Study, row: int, sample: Sample) -> tuple[FileSection, 
             sections = [turbulence_content(model) for model in config.plant.turbulence]
             same = all(section == sections[0] for section in sections)
             content["model"]["turbulence"] = sections[0] if same else sections
-    content.setdefault("simulation", {})["seed"] = study.simulation_seed(row)
+    content.setdefault("simulation", {})["seed"] = row
     return validate_sections(FileSection, content, study.config.source), comments

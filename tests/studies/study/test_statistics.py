@@ -101,7 +101,6 @@ def ishigami_indices(a=7.0, b=0.1):
     ("kind", "n", "limit"),
     [
         ("independent", 20_000, 0.015),
-        ("latin", 4000, 0.03),
         ("sobol", 4096, 0.006),
     ],
 )
