@@ -39,8 +39,7 @@ from lbt_synth.report.figures.studies import limits_figure, mirror_figure, trade
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies import LimitRow
-from lbt_synth.studies.limits import LimitStudy
+from lbt_synth.studies.limits import LimitRow, LimitStudy
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, default_methods, mirror_rows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 

@@ -109,7 +109,7 @@ def _add_matrices(report: Report, design: Design) -> None:
 
 def add_moving_gain(report: Report, design: Design) -> None:
     """Add the intervals of a sensor gain that moves, for a design with a stable loop."""
-    from lbt_synth.loop import moving_gain
+    from lbt_synth.loop.stable_range import moving_gain
 
     if design.hardware is None or design.other_sensors:
         return

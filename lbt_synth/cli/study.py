@@ -40,6 +40,7 @@ from lbt_synth.studies.study.statistics import (
     summary_tables,
     worst_table,
 )
+from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import integer
 
 _TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
@@ -64,7 +65,7 @@ def run(arguments: Namespace) -> Report:
     return _run_study(loaded, folder, arguments)
 
 
-def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
+def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     with run_in_parts(arguments, folder, total=loaded.samples, what="samples") as engine:
         run = studies.run_study(loaded, folder, **engine)
     names, columns = loaded.parameter_names, run.columns
@@ -155,7 +156,7 @@ def _controller_table(statistics: StudyStatistics) -> Table:
     return row_table(f"Strehl ratio over {count_text(statistics.samples, 'sample')}", rows)
 
 
-def _sampling_notes(loaded: studies.Study) -> list[str]:
+def _sampling_notes(loaded: Study) -> list[str]:
     if loaded.samples & (loaded.samples - 1) == 0:
         return []
     return [
@@ -164,7 +165,7 @@ def _sampling_notes(loaded: studies.Study) -> list[str]:
     ]
 
 
-def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
+def _dry_run(loaded: Study, arguments: Namespace) -> Report:
     count, local = arguments.jobs, arguments.dask is None
     where = count_text(count, "process", "processes")
     if not local:
@@ -184,7 +185,7 @@ def _dry_run(loaded: studies.Study, arguments: Namespace) -> Report:
     return report
 
 
-def _estimate(loaded: studies.Study, at_once: int) -> Facts:
+def _estimate(loaded: Study, at_once: int) -> Facts:
     """Measure a part in this process, and say what the whole will cost."""
     evaluate_samples(loaded, loaded.values(0, 1), 0)  # warms up
     rows = min(part_rows(loaded), loaded.samples)
@@ -196,7 +197,7 @@ def _estimate(loaded: studies.Study, at_once: int) -> Facts:
     )
 
 
-def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
+def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     if 0 <= arguments.row < loaded.samples:  # else it is refused
         make_directory(folder)
     replay = replay_row(loaded, folder, arguments.row)

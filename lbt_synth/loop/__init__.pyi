@@ -4,13 +4,10 @@ from .closed_loop import ClosedLoop as ClosedLoop
 from .closed_loop import close_loop as close_loop
 from .least_residual import least_residual as least_residual
 from .margins import LoopMargins as LoopMargins
-from .margins import broken_loops as broken_loops
 from .margins import loop_margins as loop_margins
 from .simulation.disturbances import Disturbance as Disturbance
 from .simulation.run import Simulation as Simulation
 from .simulation.run import simulate as simulate
-from .simulation.run import step_response as step_response
-from .stable_range import moving_gain as moving_gain
 from .stable_range import stable_sensor_gains as stable_sensor_gains
 from .strehl import Imaging as Imaging
 from .strehl import jitter_strehl as jitter_strehl

@@ -93,34 +93,7 @@ class BrokenLoop:
 
 
 def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
-    """Break a stable loop at each measurement in turn, the others closed.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        The loop.
-
-    Returns
-    -------
-    tuple of BrokenLoop
-        One for each response; measurements whose responses are equal share it.
-
-    Raises
-    ------
-    UnstableLoopError
-        If the loop is not stable.
-
-    Examples
-    --------
-    An integrator of gain 0.5 in a two-frame loop has a phase margin of 90 - 3 asin(0.25) degrees:
-
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> both = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller)
-    >>> (found,) = lbt.loop.broken_loops(both)
-    >>> found.measurements, round(found.phase_margin.phase_deg, 2)
-    ((0, 1), 46.57)
-    """
+    """Break a stable loop at each measurement in turn, the others closed; equal ones share it."""
     loop.require_stable()
     system, nyquist = loop.path("noise", "reading"), loop.hardware.frame_rate_hz / 2
     panels = graded_edges(loop.controller.to_statespace().poles)  # resonances of the open loop

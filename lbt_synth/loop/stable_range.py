@@ -47,7 +47,7 @@ from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import instant_mirror, tapped_mirror
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number, require_instance
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number
 
 AffinePart: TypeAlias = tuple[FloatArray, FloatArray]  # A0 and A1 of ``A0[t] + g A1[t]``
 
@@ -323,33 +323,7 @@ def circle_norm(loop: ClosedLoop, *, low: float, high: float) -> float:
 
 
 def moving_gain(loop: ClosedLoop) -> MovingGain:
-    """Find the interval of a moving sensor gain in which a loop is proved stable.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        The loop, stable at its sensor gain.
-
-    Returns
-    -------
-    MovingGain
-        The intervals, in sensor gains relative to the sensor matrix.
-
-    Raises
-    ------
-    UnstableLoopError
-        If the loop is not stable.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
-    >>> moving = lbt.loop.moving_gain(lbt.close_loop(path, lazy))
-    >>> round(moving.constant_high, 3), round(moving.moving_low, 3), round(moving.moving_high, 3)
-    (2.0, 0.06, 1.527)
-    """
-    require_instance(loop, ClosedLoop, "loop")
+    """Find the interval of a moving sensor gain in which a loop, stable at its own, is proved."""
     loop.require_stable()
     nominal = loop.sensor_gain
     constant = stable_sensor_gains(loop.hardware, loop.controller, nominal=nominal)

@@ -29,7 +29,6 @@ from lbt_synth.report.page.html import (
 )
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, duration_text
-from lbt_synth.studies import Study
 from lbt_synth.studies.grid import Failure
 from lbt_synth.studies.study.statistics import (
     ControllerStatistics,
@@ -43,6 +42,7 @@ from lbt_synth.studies.study.statistics import (
     strehl_table,
     worst_table,
 )
+from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray
 
 _POINTS = 400  # of a cumulative distribution

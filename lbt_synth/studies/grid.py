@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent import futures
 from dataclasses import dataclass
-from itertools import islice, pairwise
+from itertools import islice, pairwise, starmap
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
@@ -180,17 +180,17 @@ def evaluate(
 
     The function and the arguments of an executor must be such that other processes can read them.
     """
-    tasks = (((i, i + 1), arguments) for i, arguments in enumerate(samples))
-    early: dict[int, Answer] = {}
-    following = 0
-    for (row, _), answer, _ in _compute(function, tasks, executor, _in_flight(executor)):
-        early[row] = answer
-        while following in early:
-            yield early.pop(following)
-            following += 1
+    if executor is None:
+        yield from starmap(function, samples)
+        return
+    tasks = [executor.submit(function, *arguments) for arguments in samples]
+    for row, task in enumerate(tasks):
+        with _explain_failure((row, row + 1)):
+            answer = task.result()
+        yield answer
 
 
-def _in_flight(executor: futures.Executor | None, workers: int | None = None) -> int:
+def _in_flight(executor: futures.Executor | None, workers: int | None) -> int:
     """Return how many tasks an executor has at once: two a worker, so that none waits."""
     if executor is None:
         return 1
@@ -198,17 +198,17 @@ def _in_flight(executor: futures.Executor | None, workers: int | None = None) ->
 
 
 def _compute(
-    function: Callable[..., Answer],
+    function: Callable[..., Result],
     tasks: Iterator[tuple[Rows, tuple[Any, ...]]],
     executor: futures.Executor | None,
     in_flight: int,
-) -> Iterator[tuple[Rows, Answer, float]]:
+) -> Iterator[tuple[Rows, Result, float]]:
     """Yield results as they come; if one task fails as a whole, the others are given up."""
     for rows, arguments in tasks if executor is None else ():
         with _explain_failure(rows):
             result, seconds = timed(function, *arguments)
         yield rows, result, seconds
-    running: dict[futures.Future[tuple[Answer, float]], Rows] = {}
+    running: dict[futures.Future[tuple[Result, float]], Rows] = {}
     try:
         while executor is not None:
             for rows, arguments in islice(tasks, in_flight - len(running)):

@@ -477,37 +477,7 @@ class LoopStep:
 
 
 def step_response(loop: ClosedLoop, *, axis: int = 0, frames: int = SHOWN_FRAMES) -> LoopStep:
-    """Return the response of a loop to a step of the wavefront.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        The loop.
-    axis : int, optional
-        Axis on which the step is, from 0.
-    frames : int, optional
-        Frames from the step on.
-
-    Returns
-    -------
-    LoopStep
-        Without other disturbances or noise.
-
-    Raises
-    ------
-    ProblemError
-        If there is no such axis, or no frame.
-
-    Examples
-    --------
-    Nothing reaches the mirror within the two frames of delay:
-
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> loop = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller)
-    >>> lbt.loop.step_response(loop, frames=5).residual.tolist()
-    [1.0, 1.0, 0.5, 0.0, -0.25]
-    """
+    """Return the response of a loop to a step of the wavefront on an axis, without noise."""
     n = loop.hardware.modes
     own = integer(axis, "axis", at_least=0, below=n)
     inputs = np.zeros((integer(frames, "frames", at_least=1), n + loop.hardware.n_measurements))

@@ -22,7 +22,6 @@ from lbt_synth.loop import (
     ResidualBudget,
     Simulation,
     loop_margins,
-    moving_gain,
     residual_budget,
     simulate,
     stable_sensor_gains,
@@ -30,7 +29,7 @@ from lbt_synth.loop import (
 from lbt_synth.loop.band_limit import BandLimit
 from lbt_synth.loop.least_residual import ResidualLimit
 from lbt_synth.loop.simulation.run import settling_frames
-from lbt_synth.loop.stable_range import MovingGain
+from lbt_synth.loop.stable_range import MovingGain, moving_gain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.page.html import words
@@ -38,8 +37,9 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, columns, fact, facts
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.storage.words import count_text, listing_text
-from lbt_synth.studies import LimitRow, RobustnessMap, robustness_map
-from lbt_synth.studies.limits import LimitStudy, compare_in_truth
+from lbt_synth.studies import robustness_map
+from lbt_synth.studies.limits import LimitRow, LimitStudy, compare_in_truth
+from lbt_synth.studies.robustness import RobustnessMap
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 _MOST_FRAMES = 8192  # of a run: its series and spectra need no more

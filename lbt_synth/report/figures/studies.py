@@ -17,9 +17,8 @@ from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, count_columns, draw
 from lbt_synth.report.figures.loops import draw_design
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts
-from lbt_synth.studies import RobustnessMap, RobustnessRow
 from lbt_synth.studies.limits import LimitStudy
-from lbt_synth.studies.robustness import FAMILIES
+from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, RobustnessRow
 from lbt_synth.validation import FloatArray, positive, require_instance
 
 FREQUENCY_ERROR = {"label": "frequency error, truth less design", "unit": "Hz"}

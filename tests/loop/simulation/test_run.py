@@ -10,7 +10,7 @@ from support.refusals import require_refusals
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.block_filtering import filter_series
-from lbt_synth.loop.simulation.run import Drop, run_segments
+from lbt_synth.loop.simulation.run import Drop, run_segments, step_response
 
 
 @pytest.mark.parametrize(
@@ -108,7 +108,7 @@ PATH = lbt.LoopHardware(frame_rate_hz=500, modes=1)
 
 def step(gain, path=PATH, **more):
     loop = lbt.close_loop(path, lbt.integrator(path, gain=gain).controller)
-    return lbt.loop.step_response(loop, **more)
+    return step_response(loop, **more)
 
 
 def test_a_step_is_answered_frame_by_frame():
