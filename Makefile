@@ -47,7 +47,7 @@ demo: $(VENV)/.ready     ## design both filters for the LBT, close the loop, wri
 	$(BIN)/lbt-synth plot sigma $(OUT)/kalman.fits $(OUT)/hinf.fits -o $(OUT)/sigma.png
 	$(BIN)/lbt-synth simulate examples/lbt.yaml $(OUT)/kalman.fits -o $(OUT)/kalman_loop.png
 	$(BIN)/lbt-synth simulate examples/lbt.yaml $(OUT)/hinf.fits -o $(OUT)/hinf_loop.png
-	$(BIN)/lbt-synth robustness examples/lbt.yaml -o $(OUT)/robustness.csv -o $(OUT)/robustness.png
+	$(BIN)/lbt-synth robustness examples/lbt.yaml $(OUT)/kalman.fits $(OUT)/hinf.fits -o $(OUT)/robustness.png
 	$(BIN)/lbt-synth report examples/lbt.yaml $(OUT)/kalman.fits $(OUT)/hinf.fits -o $(OUT)/report.html
 	$(BIN)/lbt-synth paper -o $(OUT)/paper
 

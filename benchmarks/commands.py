@@ -57,7 +57,7 @@ def record(folder: Path, seconds: int) -> str:
     truth = lbt.Truth(turbulence=air, vibrations=tuple(lines), noise_nm=15.5, sensor_gain=0.8)
     ran = lbt.integrator(path, gain=0.4)
     run = lbt.simulate(ran.controller, truth, hardware=path, frames=int(rate) * seconds, seed=1)
-    seen = lbt.files.telemetry_from_simulation(run, path, sensor_gain=0.8, design=ran)
+    seen = lbt.files.telemetry_from_simulation(run, path, sensor_gain=0.8)
     return str(lbt.files.save_telemetry(folder / f"record_{seconds}.fits", seen))
 
 

@@ -64,7 +64,7 @@ def main() -> None:
         modes, noise_nm=noise, frame_rate_hz=RATE_HZ, vibrations=shaken
     )
     tilt = lbt.design.modal.modal_filters(
-        [modes.model(0), modes.model(1)], noise_nm=noise[:2], vibrations=shaken
+        [modes.take(0), modes.take(1)], noise_nm=noise[:2], vibrations=shaken
     )
     mixed = lbt.design.modal.MixedController(filter=tilt, gains=gains.gains)
     every = lbt.design.modal.modal_filters(modes, noise_nm=noise, vibrations=shaken)

@@ -14,10 +14,10 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 4246,
+    "cli": 3861,
     "config": 1876,
     "design": 7690,
-    "files": 1608,
+    "files": 1283,
     "identification": 9965,
     "interop": 4400,
     "linear": 5763,

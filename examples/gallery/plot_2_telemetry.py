@@ -27,7 +27,7 @@ config.truth
 hardware = config.hardware
 running = lbt.integrator(hardware, gain=0.3)
 night = lbt.simulate(running, config.truth, hardware=hardware, frames=30_000)
-telemetry = lbt.files.telemetry_from_simulation(night, hardware, design=running)
+telemetry = lbt.files.telemetry_from_simulation(night, hardware)
 recorded = lbt.files.save_telemetry(folder / "night.fits", telemetry)
 
 # %%

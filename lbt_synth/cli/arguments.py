@@ -1,12 +1,12 @@
 """All commands with their arguments, in one table, and the parser that is made from it.
 
-The table is apart from what runs the commands so that help stays quick. Without an indent stands a
-group of commands, with an indent of two a command, the module that runs it and its help, and with
-an indent of four an argument: its flags, how it is read, and its help, between bars. A deeper line
-goes on with the one before. An argument is read as a type, a default (``=``), ``nargs:``, ``meta:``
-and ``dest:`` as in argparse, ``repeat`` for values of an option that is given again, and ``/`` or
-``@`` for choices. Names without bars are blocks that commands share. A line that begins with ``>``
-opens a group of arguments; those of ``> one of`` exclude each other, and ``>`` alone ends it.
+The table is apart from what runs the commands so that help stays quick. With an indent of two
+stands a command, the module that runs it and its help, and with an indent of four an argument: its
+flags, how it is read, and its help, between bars. A deeper line goes on with the one before. An
+argument is read as a type, a default (``=``), ``nargs:``, ``meta:`` and ``dest:`` as in argparse,
+``repeat`` for values of an option that is given again, and ``/`` or ``@`` for choices. Names
+without bars are blocks that commands share. A line that begins with ``>`` opens a group of
+arguments; those of ``> one of`` exclude each other, and ``>`` alone ends it.
 """
 
 from __future__ import annotations
@@ -14,20 +14,15 @@ from __future__ import annotations
 import argparse
 import importlib
 import re
-from argparse import Action, ArgumentParser, Namespace
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from textwrap import wrap
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn, cast, get_args, get_origin
+from contextlib import suppress
+from typing import Any, NamedTuple, NoReturn, cast
 
 import lbt_synth
 from lbt_synth.cli.streams import printable
-from lbt_synth.errors import ProblemError, suggest_word
+from lbt_synth.errors import ProblemError
 from lbt_synth.storage.display_unit import M_S2, UNITS
-
-if TYPE_CHECKING:  # slow to import for --help
-    from pydantic.fields import FieldInfo
-
-    from lbt_synth.methods.method import Method
 
 _SHARED = """
   config | config | | configuration file (YAML)
@@ -40,8 +35,7 @@ _SHARED = """
   jobs | --jobs | int =1 | processes
   stroke | --stroke | float | largest command that the mirror applies [nm]
   wavelength | --wavelength-um | float | of Strehl ratios (default: the file's, or 2.2)
-  target | --for | @targets nargs:? meta:NAME dest:target required target | the program
-        that loads the file; without NAME, list what each computes
+  target | --for | @targets dest:target required | the program that loads the file
   reading
     > reading the record: what its file does not say, and what its commands need, in this order,
         to be those that the mirror followed; what lbt-synth telemetry -o writes says all of it
@@ -90,20 +84,16 @@ _SHARED = """
         the headings, else m/s2)
 """
 _TABLE = """
-start: a configuration to begin with
   init | init | Write a commented configuration to begin with, a schema or a script for the shell.
     --telescope | @telescopes | published numbers and their sources (default generic: assumed ones)
-    --from | meta:RECORD dest:source | telemetry, for all that it knows of its loop
     --examples | switch | write the examples of the documentation instead (folder)
     --schema | switch | print the JSON schema for editors instead (.json)
     --completion | bash/zsh/fish | print the script with which a shell completes commands instead
     --force | switch | replace files that are there
-    -o --output | | file to write (default: telescope or record, .yaml)
-design: from a configuration to a gain file
+    -o --output | | file to write (default: the telescope, .yaml)
   design | design | Design a controller and write its gain file.
     unit config method
     -o --output | required | gain file (.fits or .npz)
-look: what a design does in the loop, and what could be better
   compare | comparisons | Compare gain files in the loop of a configuration, one line each.
     unit config gains+ outputs
   plot | pages | Plot loops of one or several designs in a classical view, and print their margins.
@@ -139,20 +129,15 @@ look: what a design does in the loop, and what could be better
     -o --output | =. | directory that the page saves into (default: this one)
   limits | comparisons | Show how far designs are from the least residual of any linear controller.
     unit config gains outputs
-  robustness | comparisons | Compute the Strehl ratio against an error of all vibration frequencies:
-        that of filters redesigned at each error, or of gain files at many sensor gains.
-    unit config gains
-    > without gain files
-    --gamma-ratio | float | H-infinity bound of each row
-    --sensor-gain | float | real sensor gain
-    > with gain files
+  robustness | comparisons | Map the Strehl ratio of gain files over an error of all vibration
+        frequencies, the sensor gain and the delay.
+    unit config gains+
     --errors-hz | float nargs:3 meta:LOW,HIGH,COUNT | true frequency less that of the design, of the
         line that moves most [Hz]: COUNT values (default: the configuration's)
     --sensor-gains | float nargs:3 meta:LOW,HIGH,COUNT | real sensor gain: COUNT values (default:
         the configuration's)
     --delay-errors | float nargs:+ meta:FRAMES dest:delay_errors_frames | real delay less that of
         the configuration [frames] (default: the configuration's, else 0)
-    >
     outputs
   tradeoff | comparisons | Design filters from the least norm to the least variance.
     unit config
@@ -167,10 +152,7 @@ look: what a design does in the loop, and what could be better
     jobs
     --dask | meta:ADDRESS | Dask scheduler, as tcp://host:8786; it can run code here: trust it
     >
-    --dask-tls | nargs:3 meta:CA,CERT,KEY | files for a scheduler at tls://host:8786
     --pdf | switch | write the page as a PDF, too (summary.pdf)
-    > one of
-    --dry-run | switch | say how many samples and how long, and write nothing
     --row | int | recompute one row, and write it as a configuration
   mirror | comparisons | Show how the mirror settles, and what ignoring its dynamics costs.
     unit config
@@ -180,13 +162,11 @@ look: what a design does in the loop, and what could be better
     unit config
     --modes | int | number of modes, at least 2 (default: mirror.modes)
     outputs
-prove: what a gain file holds, and whether it is true
   show | design | Show a gain file: design, loop, margins, certificate.
     unit gain
     --matrices | switch | print the gains and the controller, too
   verify | design | Recompute the certificate of a gain file.
     gain
-records: from what a loop recorded to a model and a design
   telemetry | telemetry | Show what telemetry or a record holds, and write it as telemetry.
     file | | telemetry, or a record of series (FITS, NPY, NPZ or CSV)
     reading
@@ -210,7 +190,6 @@ records: from what a loop recorded to a model and a design
     gain | nargs:? | gain file (.fits or .npz) to try on the record
     -o --output | | page to write, one file that opens offline (.html)
     pdf
-at the telescope: a gain file in another program
   export | targets | Write the controller of a gain file for a real-time computer.
     gain target
     --form | plain/estimator | c: as of simulate (default plain)
@@ -224,15 +203,10 @@ at the telescope: a gain file in another program
     -o --output | required | file to write: .c (the .h goes beside it), .mat, .fits or .npy, and its
         certificate; pyrtc: folder
   rehearse | targets | Run a gain file in the arithmetic of another program, in the loop.
-    file | nargs:? meta:record | what a loop recorded (default: a draw of the file's truth)
+    file | meta:record | what a loop recorded
     gain target reading
     >
-    stroke
-    --frames | int =8000 | frames to draw where there is no record
-    --seed | int =1 | seed of what is drawn
-    wavelength
-    outputs
-the paper and the simulator: Agapito et al. 2008, and loops with a pyramid
+    stroke wavelength outputs
   paper | paper | Compute the tables and figures of Agapito et al. 2008, ours beside theirs.
     unit
     -o --output | required | directory to write into
@@ -254,64 +228,30 @@ the paper and the simulator: Agapito et al. 2008, and loops with a pyramid
 
 
 class Command(NamedTuple):
-    """A command: its group in the help, the module that runs it, its help, and its arguments."""
+    """A command: the module that runs it, its help, and its arguments."""
 
-    group: str
     module: str
     text: str
     arguments: Sequence[str]
 
 
 def _blocks(table: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield what is indented least or by two, each with the lines that are indented by four."""
+    """Yield what is indented by two, each with the lines that are indented by four."""
     lines = re.sub(r"\n {8,}", " ", table).strip("\n")  # deeper lines go on
     for block in re.split(r"\n(?!    )", lines):
         title, *arguments = block.split("\n")
-        yield title, [argument.strip() for argument in arguments]
-
-
-def _read_commands() -> Iterator[tuple[str, Command]]:
-    """Yield the names of the commands and what the table says of them."""
-    group = ""
-    for title, arguments in _blocks(_TABLE):
-        if title.startswith(" "):
-            name, module, text = title.strip().split(" | ")
-            yield name, Command(group, module, text, arguments)
-        else:
-            group = title
+        yield title.strip(), [argument.strip() for argument in arguments]
 
 
 _BLOCKS = {
     title.split()[0]: [title.partition(" | ")[2]] if "|" in title else arguments
     for title, arguments in _blocks(_SHARED)
 }
-COMMANDS = dict(_read_commands())
-
-
-class TargetChoice(Action):
-    """Take the name of a target; without one, print all of them and end."""
-
-    def __call__(
-        self, parser: ArgumentParser, namespace: Namespace, values: Any, option: Any = None
-    ) -> None:
-        """Store the name, or print how each target computes."""
-        if values is not None:
-            setattr(namespace, self.dest, values)
-            return
-        from lbt_synth.cli.output import Report  # needs what makes help slow
-        from lbt_synth.interop import target_named
-        from lbt_synth.interop.pipeline import target_names
-        from lbt_synth.storage.rows import fact_table
-
-        targets = {name: target_named(name) for name in target_names()}
-        tables = [
-            fact_table(f"{name}: {target.file}", target.arithmetic)
-            for name, target in targets.items()
-        ]
-        Report(tables=tables).print(verbose=True)
-        parser.exit()
-
-
+COMMANDS = {
+    name: Command(module, text, arguments)
+    for title, arguments in _blocks(_TABLE)
+    for name, module, text in (title.split(" | "),)
+}
 _CHOICES = {  # what an argument may be: a tuple, or the function that returns it, slow to import
     "units": UNITS,
     "accelerations": tuple(M_S2),
@@ -357,8 +297,6 @@ def _keywords(how: str, text: str) -> dict[str, Any]:
             keywords |= {"action": "append", "default": []}
         elif word == "required":
             keywords["required"] = True
-        elif word == "target":
-            keywords["action"] = TargetChoice
         elif word.startswith("="):
             default = word[1:]
         elif word.startswith("@"):
@@ -395,95 +333,41 @@ def given_options(arguments: Namespace, *names: str) -> dict[str, Any]:
     return {name: value for name in names if (value := getattr(arguments, name)) is not None}
 
 
-_LIMITS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
-
-
 def _add_method_options(parser: ArgumentParser) -> None:
     """Add ``--method`` and the options of all methods; each method checks its own."""
     from lbt_synth.methods.registry import METHODS, option_names
 
-    parser.add_argument(
-        "--method",
-        choices=tuple(METHODS),
-        required=True,
-        help="; ".join(
-            name if name == method.title else f"{name}: {method.title}"
-            for name, method in METHODS.items()
-        ),
-    )
+    titles = "; ".join(f"{name}: {method.title}" for name, method in METHODS.items())
+    parser.add_argument("--method", choices=tuple(METHODS), required=True, help=titles)
     for name in option_names():
-        owners = [method for method in METHODS.values() if name in method.options.model_fields]
-        helps: dict[str, list[str]] = {}
-        for method in owners:
-            helps.setdefault(_help_text(method, name), []).append(method.name)
-        text = "; ".join(f"{', '.join(names)}: {text}" for text, names in helps.items())
-        if others := sorted({o for m in owners if name in m.exclusive for o in m.exclusive}):
-            text += f"; at most one of {', '.join(map(option_name, others))}"
-        kinds = _kinds(owners[0].options.model_fields[name])
-        words = dict.fromkeys(c for m in owners for c in _choices(m.options.model_fields[name]))
+        owners: dict[str, list[str]] = {}
+        for method in METHODS.values():
+            if (option := method.options.model_fields.get(name)) is not None:
+                help_text = option.description or ""
+                if option.default is not None and not option.is_required():
+                    usual = "the configuration's, else " * (name in method.configurable)
+                    help_text += f" (default {usual}{option.default})"
+                owners.setdefault(help_text, []).append(method.name)
+        help_text = "; ".join(f"{', '.join(names)}: {said}" for said, names in owners.items())
         parser.add_argument(
-            option_name(name),
-            type=next((kind for kind in (int, float) if kind in kinds), str),
-            metavar=f"{{{','.join(words)}}}" if words else None,
-            help=text.replace("%", "%%"),
+            option_name(name), type=_option_value, help=help_text.replace("%", "%%")
         )
 
 
-def _kinds(option: FieldInfo) -> tuple[Any, ...]:
-    """Return the types of an option, one or those of a union."""
-    if get_origin(option.annotation) is Literal:
-        return (option.annotation,)
-    return get_args(option.annotation) or (option.annotation,)
-
-
-def _choices(option: FieldInfo) -> list[str]:
-    return [c for kind in _kinds(option) if get_origin(kind) is Literal for c in get_args(kind)]
-
-
-def _help_text(method: Method, name: str) -> str:
-    """Return the description of an option with its choices or its range, and its default."""
-    option = method.options.model_fields[name]
-    choices = _choices(option)
-    limits = [
-        f"{word} {getattr(limit, end):g}"
-        for limit in option.metadata
-        for end, word in _LIMITS.items()
-        if getattr(limit, end, None) is not None
-    ]
-    text = option.description or ""
-    if choices and not all(choice in text for choice in choices):
-        text += f", {' or '.join(choices)}"
-    if limits:
-        text += f", {' and '.join(limits)}"
-    if option.is_required() or option.default is None:
-        return text
-    if name in method.configurable:
-        return f"{text} (default: the configuration's, else {option.default:g})"
-    return f"{text} (default {option.default})"
+def _option_value(word: str) -> int | float | str:
+    """Return a number where a word is one; the method says what else it takes."""
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(word)
+    return word
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line: what is wrong, what was meant, and where help is."""
+    """A parser whose errors are one line: what is wrong, and where help is."""
 
     def error(self, message: str) -> NoReturn:
         """Print what is wrong with the words, without control characters; exit with status 2."""
-        strange = message.removeprefix("unrecognized arguments: ")
-        if strange != message and (options := _option_strings(self)):
-            message += f"; {suggest_word(strange.split()[0].partition('=')[0], options)}"
         self.exit(2, f"{self.prog}: error: {printable(message)} (see {self.prog} --help)\n")
-
-    def _check_value(self, action: argparse.Action, value: object) -> None:
-        if action.choices is not None and value not in action.choices:
-            hint = suggest_word(str(value), map(str, action.choices))
-            raise argparse.ArgumentError(action, f"invalid choice {value!r}; {hint}")
-
-
-def _option_strings(parser: argparse.ArgumentParser) -> list[str]:
-    """Return the options of a parser and of the commands whose arguments it has."""
-    options = [word for word in parser._option_string_actions if word.startswith("--")]
-    commands = parser._subparsers._group_actions[0].choices if parser._subparsers else None
-    parsers = commands.values() if isinstance(commands, dict) else ()
-    return list(dict.fromkeys(options + [w for inner in parsers for w in _option_strings(inner)]))
 
 
 def build_parser(*named: str) -> argparse.ArgumentParser:
@@ -491,45 +375,17 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
     parser = Parser(
         prog="lbt-synth",
         description="Design, certify and analyse tip/tilt controllers that reject vibrations.",
-        epilog=f"{_list_commands()}\n\nExit status: 0 done, 1 a design or verification failed, 2 "
-        "wrong usage or input.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog="Exit status: 0 done, 1 a design or verification failed, 2 wrong usage or input.",
     )
     parser.add_argument("--version", action="version", version=f"lbt-synth {lbt_synth.__version__}")
-    commands = parser.add_subparsers(
-        dest="command", metavar="COMMAND", required=True, help="one of those below"
-    )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, command in COMMANDS.items():
-        # a script for a shell has the commands with a help; the groups list them for the others
-        listed: dict[str, Any] = {"help": command.text} if len(named) > 1 else {}
-        added = commands.add_parser(name, description=command.text, **listed)
-        for flag, text in (
-            ("--json", "print one JSON object instead"),
-            ("--verbose", "print all tables and notes"),
-        ):
-            added.add_argument(flag, action="store_true", help=text)
+        added = commands.add_parser(name, help=command.text, description=command.text)
+        added.add_argument("--json", action="store_true", help="print one JSON object instead")
+        added.add_argument("--verbose", action="store_true", help="print all tables and notes")
         if name in named:
             _add_arguments(added, command.arguments)
     return parser
-
-
-_NAME_WIDTH, _WIDTH = 16, 80  # columns of the names in the list of commands, and of its lines
-
-
-def _list_commands() -> str:
-    """Return the commands in their groups, each with its help."""
-    lines, group = list[str](), ""
-    for name, command in COMMANDS.items():
-        if command.group != group:
-            group = command.group
-            lines += ["", group]
-        lines += wrap(
-            command.text.rstrip("."),
-            _WIDTH,
-            initial_indent=f"  {name:{_NAME_WIDTH - 2}}",
-            subsequent_indent=" " * _NAME_WIDTH,
-        )
-    return "\n".join(lines[1:])
 
 
 def refuse_options(arguments: Namespace, names: Iterable[str], why: str) -> None:

@@ -8,10 +8,8 @@ from dataclasses import asdict, replace
 from typing import Any, NoReturn
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from lbt_synth import models, studies
-from lbt_synth.cli.arguments import refuse_options
 from lbt_synth.cli.loop_inputs import (
     load_designs,
     load_shown,
@@ -20,13 +18,12 @@ from lbt_synth.cli.loop_inputs import (
     own_sensor_notes,
     say_limit,
     say_residual,
-    truth_at_sensor_gain,
 )
-from lbt_synth.cli.output import PERCENT, RMS, Report, spread_indices
+from lbt_synth.cli.output import PERCENT, RMS, Report
 from lbt_synth.cli.streams import track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.design.modal import MixedController, modal_filters, modal_gains, modal_residuals
+from lbt_synth.design.modal import modal_filters, modal_gains
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.interop import frame_cost
 from lbt_synth.loop import least_residual, loop_margins
@@ -34,13 +31,13 @@ from lbt_synth.loop.least_residual import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.designs.report import refine_values, require_compatible, stable_interval
-from lbt_synth.report.figures import modal_figure, robustness_figure, robustness_map_figure
+from lbt_synth.report.figures import modal_figure, robustness_map_figure
 from lbt_synth.report.figures.studies import limits_figure, mirror_figure, tradeoff_figure
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies.limits import LimitRow, LimitStudy
-from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, default_methods, mirror_rows
+from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, mirror_rows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 
@@ -218,63 +215,8 @@ def run_mirror(arguments: Namespace) -> Report:
 
 
 def run_robustness(arguments: Namespace) -> Report:
-    """Compute the Strehl ratio over an error of the vibration frequency."""
-    if arguments.gains:
-        why = "is for redesigning, without gain files"
-        refuse_options(arguments, ("sensor_gain", "gamma_ratio"), why)
-    else:
-        maps = ("errors_hz", "sensor_gains", "delay_errors_frames")
-        refuse_options(arguments, maps, "goes with gain files; name some")
-    config = load_shown(arguments)
-    return (_map_designs if arguments.gains else _redesign)(config, arguments)
-
-
-def _redesign(config: Config, arguments: Namespace) -> Report:
-    """Design filters for the true frequency at each error."""
-    settings, errors, ratio = config.settings, config.errors_hz, arguments.gamma_ratio
-    methods = default_methods()
-    rows = list(
-        track_progress(
-            studies.robustness(
-                config.plant.own_sensor_alone(),
-                truth_at_sensor_gain(config, arguments.sensor_gain),
-                config.imaging,
-                errors_hz=errors,
-                gamma_ratio=settings.design.gamma_ratio if ratio is None else ratio,
-                hold=settings.robustness.hold,
-            ),
-            total=len(errors) * len(methods),
-            what="designs",
-        )
-    )
-    by_method = {name: [row for row in rows if row.method == name] for name in methods}
-    caption = f"Robustness to the vibration frequency; {config.imaging.label}"
-    centre = int(np.argmin(np.abs(errors)))
-    columns = [
-        facts(
-            error_hz=fact(errors[place], "error", unit="Hz", format="+.2f"),
-            **{f"{n}_strehl": fact(r[place].strehl, n, **PERCENT) for n, r in by_method.items()},
-            **{f"{n}_nm": fact(r[place].residual_nm, n, **RMS) for n, r in by_method.items()},
-        )
-        for place in spread_indices(len(errors), centre)
-    ]
-    report = Report(tables=[row_table(f"{caption}, and residual", columns)])
-    report.verdict = [
-        f"{name} has a Strehl ratio of {100 * r[centre].strehl:.1f} % at an error of "
-        f"{errors[centre]:+g} Hz, and of {_worst_text([row.strehl for row in r])} at worst."
-        for name, r in by_method.items()
-    ]
-    report.add_rows("rows", caption, rows, figure=lambda: robustness_figure(rows))
-    report.notes += own_sensor_notes(config)
-    return report
-
-
-def _worst_text(strehls: Sequence[float]) -> str:
-    return "none (unstable)" if np.isnan(strehls).any() else f"{100 * min(strehls):.1f} %"
-
-
-def _map_designs(config: Config, arguments: Namespace) -> Report:
     """Map the Strehl ratio of gain files over frequency error, sensor gain and delay error."""
+    config = load_shown(arguments)
     settings, hardware = config.settings.robustness, config.hardware
     errors = _parse_range(arguments.errors_hz, "--errors-hz", refine_values(config.errors_hz))
     gains = _parse_range(arguments.sensor_gains, "--sensor-gains", settings.sensor_gains)
@@ -418,12 +360,23 @@ def run_modal(arguments: Namespace) -> Report:
         noise_nm = models.pyramid_modal_noise_nm(
             float(config.noise_nm), modes=modes, modulation_lambda_over_d=modulation
         )
-    uniform, gains, residuals = _modal_residuals(config, air, noise_nm)
+    lines = dict[int, list[models.Vibration]]()
+    for line in config.plant.vibrations:  # each axis by itself
+        for axis, share in enumerate(line.direction):
+            if abs(share) > 1e-9:  # more than rounding
+                tilted = replace(line, rms_nm=abs(share) * line.rms_nm, direction=(1.0,))
+                lines.setdefault(axis, []).append(tilted)
+    loop: dict[str, Any] = {name: getattr(hardware, name) for name in ("delay_frames", "mirror")}
+    loop |= {"noise_nm": noise_nm, "vibrations": lines, "sensor_gain": config.sensor_gain}
+    gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **loop)
+    residuals = {
+        "integrators, optimised gains": gains.rms_nm,
+        "Kalman filters": modal_filters(air, **loop).rms_nm,
+    }
     totals_nm = {name: float(np.linalg.norm(rms_nm)) for name, rms_nm in residuals.items()}
     air_nm = float(np.linalg.norm(air.rms_nm))
     leaves = [f"{name} {nm_text(rms, '.1f')} rms" for name, rms in totals_nm.items()]
-    report = Report(data={"modes": modes, "uniform_gain": uniform, "residual_nm": totals_nm})
-    report.data["turbulence_nm"] = air_nm
+    report = Report(data={"modes": modes, "residual_nm": totals_nm, "turbulence_nm": air_nm})
     report.verdict.append(
         f"Of {nm_text(air_nm, '.1f')} rms of turbulence in {modes} modes, what is left is: "
         f"{'; '.join(leaves)}."
@@ -431,50 +384,14 @@ def run_modal(arguments: Namespace) -> Report:
     report.add_rows(
         "rows",
         "By radial order, residuals over its modes",
-        _order_rows(air.rms_nm, noise_nm, gains, *residuals.values()),
-        figure=lambda: modal_figure(residuals, gains=gains, turbulence_nm=air.rms_nm),
+        _order_rows(air.rms_nm, noise_nm, gains.gains, *residuals.values()),
+        figure=lambda: modal_figure(residuals, gains=gains.gains, turbulence_nm=air.rms_nm),
     )
     return report
 
 
 def _refuse_key(config: Config, key: str, why: str) -> NoReturn:
     raise ConfigError(f"{config.source}: the key {key} {why}.", path=key)
-
-
-def _modal_residuals(
-    config: Config, air: models.ModalTurbulence, noise_nm: FloatArray
-) -> tuple[float, FloatArray, dict[str, FloatArray]]:
-    """Return the best single gain, the best of each mode, and the residuals by controller [nm]."""
-    hardware, lines = config.hardware, dict[int, list[models.Vibration]]()
-    for line in config.plant.vibrations:  # each axis by itself
-        for axis, share in enumerate(line.direction):
-            if axis < noise_nm.size and abs(share) > 1e-9:
-                tilted = replace(line, rms_nm=abs(share) * line.rms_nm, direction=(1.0,))
-                lines.setdefault(axis, []).append(tilted)
-    seen: dict[str, Any] = {"noise_nm": noise_nm, "vibrations": lines}
-    seen["sensor_gain"] = config.sensor_gain
-    path: dict[str, Any] = {name: getattr(hardware, name) for name in ("delay_frames", "mirror")}
-    gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **path, **seen)
-
-    def integrator_rms(gain: float) -> FloatArray:
-        control = MixedController(gains=np.full(noise_nm.size, gain))
-        return modal_residuals(control, air, hardware=hardware, **seen)
-
-    most = gains.limit.min()
-    uniform = minimize_scalar(
-        lambda gain: np.linalg.norm(integrator_rms(gain)),
-        bounds=(1e-3 * most, most),
-        method="bounded",
-    ).x
-    return (
-        float(uniform),
-        gains.gains,
-        {
-            f"integrators, gain {uniform:.2f}": integrator_rms(uniform),
-            "integrators, optimised gains": gains.rms_nm,
-            "Kalman filters": modal_filters(air, **path, **seen).rms_nm,
-        },
-    )
 
 
 def _order_rows(
@@ -495,9 +412,8 @@ def _order_rows(
                 turbulence_nm=fact(turbulence_nm, "turbulence", **RMS),
                 noise_nm=fact(float(noise_nm[which][0]), "noise per mode", unit="nm", format=".2f"),
                 gain=fact(float(gains[which].mean()), "mean gain", format=".3f"),
-                uniform_nm=fact(left_nm[0], "one gain", **RMS),
-                optimised_nm=fact(left_nm[1], "optimised gains", **RMS),
-                kalman_nm=fact(left_nm[2], "Kalman", **RMS),
+                optimised_nm=fact(left_nm[0], "optimised gains", **RMS),
+                kalman_nm=fact(left_nm[1], "Kalman", **RMS),
             )
         )
     return rows

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from argparse import Namespace
 from collections.abc import Collection, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from lbt_synth.files import load_gain
 from lbt_synth.loop import LoopMargins, least_residual
 from lbt_synth.loop.least_residual import ResidualLimit, limit_or_none
 from lbt_synth.methods.registry import design_title
-from lbt_synth.models import Truth, nm_per_mas
+from lbt_synth.models import nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.display_unit import LENGTHS, UNITS, nm_text, show_in
 from lbt_synth.storage.rows import Column, fact
@@ -161,13 +160,6 @@ def own_sensor_notes(config: Config) -> list[str]:
     """Say that other sensors are not read, if the configuration has some."""
     others = config.other_sensors
     return [f"note: the loop's own sensor is read alone, without {others}."] if others else []
-
-
-def truth_at_sensor_gain(config: Config, sensor_gain: float | None) -> Truth:
-    """Return the configuration's truth, at the real sensor gain of the command line if given."""
-    if sensor_gain is None:
-        return config.truth
-    return replace(config.truth, sensor_gain=sensor_gain / config.sensor_gain)
 
 
 def say_limit(limit: ResidualLimit, config: Config) -> str:

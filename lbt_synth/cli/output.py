@@ -28,7 +28,6 @@ from lbt_synth.storage.rows import (
     row_table,
 )
 from lbt_synth.storage.tables import Table, text_lines
-from lbt_synth.validation import IntArray
 
 if TYPE_CHECKING:  # which few commands need
     from lbt_synth.files import Telemetry
@@ -183,21 +182,13 @@ def _wrapped(text: str, room: int, **cut: Any) -> list[str]:
     return [line.replace("\u00a0", " ") for line in lines]
 
 
-def spread_indices(count: int, *kept: int, most: int = BRIEF_ROWS) -> IntArray:
-    """Return the places of the rows that are printed of a list: from end to end, and some more."""
-    if count <= most:
-        return np.arange(count)
-    places = np.linspace(0, count - 1, most - len(kept)).round().astype(np.int64)
-    return np.unique([*places, *kept])
-
-
 def _thinned(table: Table, most: int) -> Table:
     """Return a table with so many rows: from end to end, and of facts the first and weightiest."""
     count = len(table.rows)
     if count <= most:
         return table
     facts = table.headings[0] == "quantity"
-    places = np.arange(most) if facts else spread_indices(count, most=most)
+    places = np.linspace(0, (most if facts else count) - 1, most).round().astype(int)
     rows = tuple(table.rows[place] for place in places)
     caption = f"{table.caption} ({len(rows)} of {count} rows; the others with --verbose)"
     return replace(table, caption=caption, rows=rows)

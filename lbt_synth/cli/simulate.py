@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from argparse import Namespace
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -14,7 +15,6 @@ from lbt_synth.cli.loop_inputs import (
     load_designs,
     load_shown,
     loop_difference_notes,
-    truth_at_sensor_gain,
 )
 from lbt_synth.cli.output import PERCENT, RMS, Report, write_telemetry
 from lbt_synth.config import Config
@@ -75,7 +75,9 @@ def run(arguments: Namespace) -> Report:
         single = ("output", "telemetry", "drop")
         refuse_options(arguments, single, f"goes with one gain file; got {count}")
     config = load_shown(arguments)
-    truth = truth_at_sensor_gain(config, arguments.sensor_gain)
+    truth = config.truth
+    if arguments.sensor_gain is not None:
+        truth = replace(truth, sensor_gain=arguments.sensor_gain / config.sensor_gain)
     designs = load_designs(arguments.gains, config)
     runs = [_run(arguments, name, design, truth, config) for name, design in designs.items()]
     report = _describe_runs(runs, truth, config)
@@ -88,10 +90,14 @@ def run(arguments: Namespace) -> Report:
             simulation,
             config.hardware,
             sensor_gain=truth.sensor_gain,
-            design=design,
-            controller_digest=file_sha256(arguments.gains[0], GainFileError),
             imaging=config.imaging,
-            metadata={"case": 0, "cases": len(simulation.commands), **noise},
+            metadata={
+                "controller": design.method,
+                "gain_file_sha256": file_sha256(arguments.gains[0], GainFileError),
+                "case": 0,
+                "cases": len(simulation.commands),
+                **noise,
+            },
         )
         write_telemetry(report, arguments.telemetry, recorded, key="telemetry")
     return report

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from argparse import Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, replace
@@ -19,7 +19,6 @@ import numpy as np
 
 import lbt_synth
 from lbt_synth import studies
-from lbt_synth.cli.arguments import refuse_options
 from lbt_synth.cli.loop_inputs import load_shown
 from lbt_synth.cli.output import PERCENT, Report
 from lbt_synth.cli.streams import count_progress, print_error
@@ -27,13 +26,11 @@ from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
-from lbt_synth.storage.rows import Facts, fact, facts, row_table
+from lbt_synth.storage.rows import fact, facts, row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.thread_limits import WorkerPool, limit_threads
 from lbt_synth.storage.words import count_text, duration_text
-from lbt_synth.studies.grid import timed
-from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, part_rows, replay_row
-from lbt_synth.studies.study.sample import evaluate_samples
+from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, replay_row
 from lbt_synth.studies.study.statistics import (
     StudyStatistics,
     study_statistics,
@@ -58,8 +55,6 @@ def run(arguments: Namespace) -> Report:
     loaded = studies.load_study(arguments.study)
     load_shown(arguments, loaded.config)
     refuse_replacing(output_paths(folder, loaded), loaded.inputs)
-    if arguments.dry_run:
-        return _dry_run(loaded, arguments)
     if arguments.row is not None:
         return _replay(loaded, folder, arguments)
     return _run_study(loaded, folder, arguments)
@@ -165,38 +160,6 @@ def _sampling_notes(loaded: Study) -> list[str]:
     ]
 
 
-def _dry_run(loaded: Study, arguments: Namespace) -> Report:
-    count, local = arguments.jobs, arguments.dask is None
-    where = count_text(count, "process", "processes")
-    if not local:
-        with choose_engine(arguments) as (_, count):
-            pass
-    cost = _estimate(loaded, min(count, os.cpu_count() or 1) if local else count)
-    if not local:
-        where = f"{count} threads of {arguments.dask}, as quick as this one"
-    parameters = {name: section.text for name, section in loaded.settings.parameters.items()}
-    controllers = {name: section.text for name, section in loaded.settings.controllers.items()}
-    report = Report(data={"parameters": parameters, "controllers": controllers})
-    what = {"samples": fact(loaded.samples, "samples"), "workers": fact(count)}
-    what["seed"] = fact(loaded.settings.seed, "seed")
-    report.add_facts(f"Study {loaded.source}", facts(**what), cost)
-    report.verdict.append(f"The study takes about {duration_text(cost.seconds)} on {where}.")
-    report.notes += [*_sampling_notes(loaded), "note: nothing was written."]
-    return report
-
-
-def _estimate(loaded: Study, at_once: int) -> Facts:
-    """Measure a part in this process, and say what the whole will cost."""
-    evaluate_samples(loaded, loaded.values(0, 1), 0)  # warms up
-    rows = min(part_rows(loaded), loaded.samples)
-    _, seconds = timed(evaluate_samples, loaded, loaded.values(0, rows), 0)
-    return facts(
-        measured_rows=fact(rows, "samples measured in one process"),
-        measured_s=fact(seconds, "  their time", unit="s", format=".3g"),
-        seconds=fact(seconds / rows * loaded.samples / at_once),  # said in a note, in words
-    )
-
-
 def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     if 0 <= arguments.row < loaded.samples:  # else it is refused
         make_directory(folder)
@@ -221,11 +184,8 @@ def choose_engine(
     arguments: Namespace,
 ) -> AbstractContextManager[tuple[Executor | None, int | None]]:
     """Provide the executor of ``--dask`` or of ``--jobs`` with its workers; None for one job."""
-    dask, tls = (getattr(arguments, name, None) for name in ("dask", "dask_tls"))
-    if dask is not None:
-        return connect_cluster(dask, tls=tls)
-    if tls is not None:
-        refuse_options(arguments, ("dask_tls",), "goes with --dask")
+    if (dask := getattr(arguments, "dask", None)) is not None:
+        return connect_cluster(dask)
     return nullcontext((None, None)) if arguments.jobs == 1 else _start_processes(arguments.jobs)
 
 
@@ -258,26 +218,20 @@ def run_in_parts(
 
 
 @contextmanager
-def connect_cluster(
-    address: str, *, tls: Sequence[str] | None = None
-) -> Iterator[tuple[Executor, int]]:
+def connect_cluster(address: str) -> Iterator[tuple[Executor, int]]:
     """Provide the executor of a Dask scheduler with this package, and how many threads it has.
 
-    A scheduler can run code on its clients: name only one that you trust. ``tls`` names the
-    files of the authority, of the certificate and of the key of an encrypted connection.
+    A scheduler can run code on its clients: name only one that you trust. Dask's own configuration
+    names the files of an encrypted connection.
     """
     try:
         from distributed import Client
-        from distributed.security import Security
     except ImportError as error:
         raise MissingExtraError(
             '--dask needs dask.distributed; try: pip install "lbt-synth[dask]".', extra="dask"
         ) from error
-    names = ("tls_ca_file", "tls_client_cert", "tls_client_key")
     try:
-        files = dict(zip(names, tls, strict=True)) if tls else {}
-        security = Security(**files, require_encryption=True if tls else None)
-        client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False, security=security)
+        client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         text = " ".join(str(error).split()) or "no answer"
         raise ProblemError(

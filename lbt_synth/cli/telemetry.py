@@ -128,18 +128,12 @@ def _parse_columns(pairs: Sequence[str] | None) -> dict[str, list[str | int]] | 
 
 
 _LOOP = {  # what telemetry says of the loop that it is from: headings and units
-    "name": ("system", ""),
     "frame_rate_hz": ("frame rate", "Hz"),
     "delay_frames": ("total delay", "frames"),
     "sensor_gain": ("sensor gain", ""),
-    "controller_name": ("controller", ""),
-    "controller_digest": ("gain file, SHA-256", ""),
-    "strehl": ("Strehl ratio", ""),
     "imaging_wavelength_um": ("imaging wavelength", "um"),
-    "psf_pixel_mas": ("pixel of the image", "mas"),
     "diameter_m": ("telescope diameter", "m"),
     "obstruction": ("central obstruction", ""),
-    "seed": ("seed", ""),
 }
 
 
@@ -188,10 +182,8 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
     }
     units = {name: layer.unit_in(telemetry) for name, _, layer in arrays}
     mirror = telemetry.mirror
-    states = telemetry.controller and telemetry.controller.n_states
     what = facts(
-        **{n: fact(getattr(telemetry, n), text, unit=unit) for n, (text, unit) in _LOOP.items()},
-        controller_states=fact(states, "states of the controller"),
+        **{n: fact(getattr(telemetry, n), text, unit=unit) for n, (text, unit) in _LOOP.items()}
     )
     mirror_record = None if mirror is None else asdict(mirror)
     report = Report(
@@ -202,7 +194,6 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
             "arrays": {name: list(array.shape) for name, array, _ in arrays},
             "units": json_units(what) | units,
             "rms": rms,
-            "integrator_gains": telemetry.integrator_gains,
             "metadata": dict(telemetry.metadata),
             "mirror": mirror_record,
             "mirror_taps": telemetry.mirror_taps,

@@ -265,7 +265,8 @@ class _Predictor:
         past = self._past
         if noise != 1:
             past = self._fit(self._half, stretches=self._first, noise=noise)
-        return replace(design, claims={**design.claims, **self._claims(past.design())})
+        claims = self._claims(past.design(self._past.penalty))
+        return replace(design, claims={**design.claims, **claims})
 
     def channel_values(self) -> tuple[ChannelValue, ...]:
         """Return what each channel is worth on the second half of the record."""

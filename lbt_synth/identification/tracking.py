@@ -22,7 +22,7 @@ from lbt_synth.identification.fit.identified_model import IdentifiedModel
 from lbt_synth.identification.fit.identify import axis_periodogram, find_axis
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records.record import FEW
-from lbt_synth.linear.block_filtering import last_state
+from lbt_synth.linear.block_filtering import series_states
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.validation import FloatArray, float_array, number, require_instance
@@ -205,7 +205,8 @@ class TrackingController:
         self._take(design)
         F, K, *_ = self._filter
         measured, corrections, _ = np.split(np.array(self._past), [len(K.T), -1], axis=1)
-        self._state = last_state(F, (measured + corrections @ self._hardware.sensor.T) @ K.T)
+        drive = (measured + corrections @ self._hardware.sensor.T) @ K.T
+        self._state = series_states(F, drive)[-1]
 
     def _take(self, design: FilterDesign) -> None:
         """Set the filter: its matrices F, K and C, and from state to command."""

@@ -2,7 +2,6 @@ from .controller import Controller as Controller
 from .controller import estimator_form as estimator_form
 from .estimation_problem import EstimationProblem as EstimationProblem
 from .generalized_plant import GeneralizedPlant as GeneralizedPlant
-from .generalized_plant import mixed_sensitivity as mixed_sensitivity
 from .infeasibility_proof import Witness as Witness
 from .infeasibility_proof import infeasible_level as infeasible_level
 from .norms import hinf_norm as hinf_norm

@@ -1,16 +1,12 @@
-"""The generalised plant: what a controller sees and moves, and what it is judged by.
-
-One can be given by its matrices, or built from weights of the sensitivities of a loop.
-"""
+"""The generalised plant: what a controller sees and moves, and what it is judged by."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
-from scipy.linalg import block_diag, matrix_balance
+from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.linear.state_space import SAMPLE_FIRST, StateSpace
@@ -225,114 +221,3 @@ def _partition(system: StateSpace, p1: int, m1: int) -> dict[str, Any]:
     parts = {"A": A, "B1": B[:, :m1], "B2": B[:, m1:], "C1": C[:p1], "C2": C[p1:]}
     parts |= {"D11": D[:p1, :m1], "D12": D[:p1, m1:]}
     return parts | {"D21": D[p1:, :m1], "D22": D[p1:, m1:]}
-
-
-def mixed_sensitivity(
-    plant: Any, *, performance: Any = None, control: Any = None, robustness: Any = None
-) -> GeneralizedPlant:
-    """Weight the sensitivity S, the control K S and the complementary sensitivity T of a loop.
-
-    The loop is ``e = w - G u``, ``u = K e``; the errors are ``W1 e``, ``W2 u`` and ``W3 G u``, so
-    that the closed loop from w is ``[W1 S; W2 K S; W3 T]``.
-
-    Parameters
-    ----------
-    plant : object
-        G: a StateSpace, or what :meth:`StateSpace.of` takes.
-    performance, control, robustness : object or float, optional
-        The weights W1, W2 and W3: a system, a matrix or a number. A system of one input and one
-        output weighs each signal. At least one must be given.
-
-    Returns
-    -------
-    GeneralizedPlant
-        Its measurement is e, its control u, its states those of G, W1, W2 and W3 in turn.
-
-    Raises
-    ------
-    ProblemError
-        If there is no weight, a system is in continuous time, or sampling periods differ.
-    DimensionError
-        If a weight does not fit.
-
-    References
-    ----------
-    S. Skogestad, I. Postlethwaite, "Multivariable Feedback Control", Wiley (2005), section 9.3.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lag = lbt.linear.StateSpace(A=0.9, B=0.1, C=1.0, D=0.0, dt_s=1e-3)
-    >>> W1 = lbt.linear.StateSpace(A=0.999, B=0.1, C=1.0, D=0.5, dt_s=1e-3)
-    >>> lbt.linear.mixed_sensitivity(lag, performance=W1, control=0.1)
-    <GeneralizedPlant: 2 states, 1 disturbance, 1 control, 2 errors, 1 measurement>
-    """
-    G = StateSpace.of(plant)
-    p, m = G.D.shape
-    given = {"performance": performance, "control": control, "robustness": robustness}
-    # what each weight reads of the states, of w and of u
-    reads = {
-        "performance": (-G.C, np.eye(p), -G.D),
-        "control": (np.zeros((m, len(G.A))), np.zeros((m, p)), np.eye(m)),
-        "robustness": (G.C, np.zeros((p, p)), G.D),
-    }
-    names = [name for name, value in given.items() if value is not None]
-    if not names:
-        raise ProblemError("give at least one of performance, control and robustness.")
-    weights = (_weight(given[name], name, len(reads[name][0]), G.dt_s) for name in names)
-    weight = _stack_weights(weights, G.dt_s)
-    C1, D11, D12 = (np.vstack([reads[name][i] for name in names]) for i in range(3))
-    loop = GeneralizedPlant(
-        A=G.A,
-        B1=np.zeros((len(G.A), p)),
-        B2=G.B,
-        C1=C1,
-        C2=-G.C,
-        D11=D11,
-        D12=D12,
-        D21=np.eye(p),
-        D22=-G.D,
-        dt_s=G.dt_s,
-    )
-    return _weigh_plant(loop, weight)
-
-
-def _weight(value: Any, name: str, size: int, dt_s: float) -> StateSpace:
-    """Return a weight of signals of some size, with a sampling period."""
-    if isinstance(value, int | float | np.ndarray):
-        D = matrix(value, name)
-        none = np.zeros((0, D.shape[1])), np.zeros((len(D), 0))
-        weight = StateSpace(A=np.zeros((0, 0)), B=none[0], C=none[1], D=D, dt_s=dt_s)
-    else:
-        weight = StateSpace.of(value)
-        require_same_period(dt_s, weight)
-    if weight.D.shape == (1, 1):
-        weight = _stack_weights([weight] * size, dt_s)
-    if weight.D.shape[1] != size:
-        raise DimensionError(
-            f"the weight {name} must take {size} signals; got one of {weight.D.shape[1]}."
-        )
-    return weight
-
-
-def _stack_weights(weights: Iterable[StateSpace], dt_s: float) -> StateSpace:
-    """Return weights of signals that lie one after the other, as one weight of all of them."""
-    stacks = [w.stacks() for w in weights]
-    A, B, C, D = (block_diag(*(part[0] for part in parts)) for parts in zip(*stacks, strict=True))
-    return StateSpace(A=A, B=B, C=C, D=D, dt_s=dt_s)
-
-
-def _weigh_plant(plant: GeneralizedPlant, weight: StateSpace) -> GeneralizedPlant:
-    """Return the plant with a weight after its errors; states are those of the plant, then its."""
-    P, W = plant, weight
-    n, s, none = len(P.A), len(W.A), np.zeros
-    return replace(
-        P,
-        A=np.block([[P.A, none((n, s))], [W.B @ P.C1, W.A]]),
-        B1=np.vstack([P.B1, W.B @ P.D11]),
-        B2=np.vstack([P.B2, W.B @ P.D12]),
-        C1=np.hstack([W.D @ P.C1, W.C]),
-        C2=np.hstack([P.C2, none((len(P.C2), s))]),
-        D11=W.D @ P.D11,
-        D12=W.D @ P.D12,
-    )

@@ -31,7 +31,6 @@ from lbt_synth.loop.evaluator import (
 from lbt_synth.models import (
     ARModel,
     LoopHardware,
-    ModalTurbulence,
     SinusoidalVibration,
     TipTiltPlant,
     Truth,
@@ -257,7 +256,7 @@ def residual_of_parts(
     """
     k, modes, rate = len(parts[0].start), hardware.modes, hardware.frame_rate_hz
     for spectrum, _ in turbulence:
-        if isinstance(spectrum, ARModel | ModalTurbulence):
+        if isinstance(spectrum, ARModel):
             require_loop_rate(spectrum.frame_rate_hz, hardware)
     air, shot, shaken = np.zeros((3, k, 2, modes, modes))  # of means, and within
     for part in parts:

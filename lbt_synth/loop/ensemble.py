@@ -11,9 +11,9 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop.evaluator import Turbulence
 from lbt_synth.models import (
+    ARModel,
     FrozenFlows,
     LoopHardware,
-    ModalTurbulence,
     SinusoidalVibration,
     Spectrum,
     Vibration,
@@ -97,7 +97,7 @@ class LoopEnsemble:
     """Conditions of p loops with the same sensor and mirror: one number for all, or one for each.
 
     The turbulence is one for all modes, or one for each: a spectrum for all loops, or FrozenFlows
-    or ModalTurbulence with one for each.
+    or a stack of AR models with one for each.
     """
 
     sensor_gain: Any = 1.0  # real sensor gain relative to the sensor matrix
@@ -190,12 +190,12 @@ def _turbulence_numbers(turbulence: Turbulence | None) -> list[FloatArray]:
     if isinstance(turbulence, FrozenFlows):
         values = turbulence.seeing_arcsec, turbulence.wind_speed_m_s, turbulence.outer_scale_m
         return [value for value in values if value is not None]
-    if isinstance(turbulence, ModalTurbulence):
+    if isinstance(turbulence, ARModel) and turbulence.coefficients.ndim > 1:
         return [*turbulence.coefficients.T, turbulence.driving_rms_nm]
     if turbulence is not None and not isinstance(turbulence, Spectrum):
         raise ProblemError(
-            "turbulence must be a spectrum, FrozenFlows, ModalTurbulence or None, or a sequence of "
-            f"these; got {type(turbulence).__name__}."
+            "turbulence must be a spectrum, FrozenFlows or None, or a sequence of these; got "
+            f"{type(turbulence).__name__}."
         )
     return []
 
@@ -204,7 +204,6 @@ def turbulence_rows(turbulence: Turbulence, rows: IntArray) -> Turbulence:
     """Return the turbulence of some loops."""
     if isinstance(turbulence, FrozenFlows) and len(turbulence) > 1:
         return turbulence.take(rows)
-    if isinstance(turbulence, ModalTurbulence) and turbulence.n_modes > 1:
-        a, driving = turbulence.coefficients[rows], turbulence.driving_rms_nm[rows]
-        return replace(turbulence, coefficients=a, driving_rms_nm=driving)
+    if isinstance(turbulence, ARModel) and turbulence.count > 1:
+        return turbulence.take(rows)
     return turbulence

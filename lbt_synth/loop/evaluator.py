@@ -32,7 +32,7 @@ from lbt_synth.linear.matrix_functions import component_labels, transpose
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_rule
 from lbt_synth.linear.state_space import stacked_response
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, ClosedLoop, last_frame, loop_matrices
-from lbt_synth.models import ARModel, FrozenFlows, LoopHardware, ModalTurbulence, Spectrum
+from lbt_synth.models import ARModel, FrozenFlows, LoopHardware, Spectrum
 from lbt_synth.models.mirror.frame_rate_system import (
     Hold,
     Response,
@@ -43,7 +43,7 @@ from lbt_synth.models.spectra import breakpoints_below, companions, densities, s
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 # one for all modes and loops, or one for each loop
-Turbulence: TypeAlias = Spectrum | FrozenFlows | ModalTurbulence
+Turbulence: TypeAlias = Spectrum | FrozenFlows
 Matrices: TypeAlias = tuple[FloatArray, ...]  # A, B, C, D in textbook form, (1 or p, ., .) each
 # the modes and measurements of each of c equal parts, (c, n) and (c, q), the matrices of their
 # controllers, the sensor (q, n) and the influence (n, m)
@@ -149,7 +149,7 @@ class Evaluator:
 
     def of_turbulence(self, spectrum: Turbulence, entry: FloatArray) -> FloatArray:
         """Return what phases of a spectrum leave, or of sampled processes."""
-        if isinstance(spectrum, ARModel | ModalTurbulence):
+        if isinstance(spectrum, ARModel):
             coefficients = np.atleast_2d(spectrum.coefficients)
             return self.of_process(coefficients, np.atleast_1d(spectrum.driving_rms_nm), entry)
 

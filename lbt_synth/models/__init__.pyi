@@ -16,7 +16,6 @@ from .spectra import Spectrum as Spectrum
 from .spectra import SumSpectrum as SumSpectrum
 from .spectra import TabulatedSpectrum as TabulatedSpectrum
 from .truth import Truth as Truth
-from .turbulence.ar_models import ModalTurbulence as ModalTurbulence
 from .turbulence.ar_models import ar1_turbulence as ar1_turbulence
 from .turbulence.ar_models import ar2_turbulence as ar2_turbulence
 from .turbulence.ar_models import le_roux_pole as le_roux_pole

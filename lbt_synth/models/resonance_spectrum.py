@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -105,7 +105,7 @@ def series_variance(
 
     The substitution ``w = frequency (1 + damping tan x)`` makes the integrand smooth.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    nodes, weights = _gauss_rule()
     width = damping * frequency
     low, high = math.atan(-1 / damping), math.atan((math.pi - frequency) / width)
     x = low + (high - low) * (nodes + 1) / 2
@@ -116,6 +116,12 @@ def series_variance(
     variance = float(np.sum(share))
     by_frequency, by_damping = (sections * slopes[0] @ share / variance).tolist()
     return variance, (by_frequency, by_damping)
+
+
+@cache
+def _gauss_rule() -> tuple[FloatArray, FloatArray]:
+    """Return nodes and weights of Gauss and Legendre, which cost more than their use."""
+    return np.polynomial.legendre.leggauss(_NODES)
 
 
 def section_drives(frequency: float, damping: float, sections: int) -> FloatArray:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,9 +12,11 @@ from numpy.typing import ArrayLike
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.validation import (
     FloatArray,
+    IntArray,
     Positive,
     check_fields,
     frozen_copy,
+    positive,
     real_array,
     sequence,
     set_fields,
@@ -23,19 +25,23 @@ from lbt_synth.validation import (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ARModel:
-    """Stationary process ``x(k+1) = a1 x(k) + a2 x(k-1) + ... + v(k)``.
+    """Stationary process ``x(k+1) = a1 x(k) + a2 x(k-1) + ... + v(k)``, or a stack of them.
+
+    A stack holds one process for each mode, or for each loop of an ensemble.
 
     Parameters
     ----------
-    coefficients : (order,) array_like
-        a1, a2, ...
-    driving_rms_nm, frame_rate_hz : float
-        Standard deviation of the white noise v [nm]; sampling frequency [Hz].
+    coefficients : (order,) or (k, order) array_like
+        a1, a2, ... of the process, or of each of k.
+    driving_rms_nm : float or (k,) array_like
+        Standard deviation of the white noise v [nm].
+    frame_rate_hz : float
+        Sampling frequency [Hz].
 
     Raises
     ------
     ProblemError
-        If a value is not finite or the process is not stationary.
+        If a value is not finite, a process is not stationary, or sizes clash.
 
     Examples
     --------
@@ -43,49 +49,107 @@ class ARModel:
     >>> ar1 = lbt.models.ARModel(coefficients=[0.6], driving_rms_nm=8.0, frame_rate_hz=1000)
     >>> round(ar1.rms_nm, 6)
     10.0
+    >>> air = lbt.models.ARModel(
+    ...     coefficients=[[0.99], [0.98]], driving_rms_nm=[10.0, 5.0], frame_rate_hz=800
+    ... )
+    >>> air.count, air.rms_nm.round(2).tolist()
+    (2, [70.89, 25.13])
     """
 
     coefficients: FloatArray
-    driving_rms_nm: Positive
+    driving_rms_nm: Any
     frame_rate_hz: Positive
 
     def __post_init__(self) -> None:
         a = np.atleast_1d(real_array(self.coefficients, "coefficients"))
-        if a.ndim != 1 or a.size == 0:
+        driving = positive(self.driving_rms_nm, "driving_rms_nm")
+        if a.ndim > 2 or a.size == 0 or driving.shape != a.shape[:-1]:
             raise DimensionError(
-                f"coefficients must be a list of at least one number; got shape {a.shape}."
+                "coefficients must be at least one number, or a row of as many for each process, "
+                "and driving_rms_nm one number for each process; got shapes "
+                f"{a.shape} and {driving.shape}."
             )
-        check_fields(self, coefficients=frozen_copy(a))
-        radius = float(np.max(np.abs(np.linalg.eigvals(self.companion))))
+        driving_rms_nm = driving if driving.ndim else float(driving)
+        check_fields(self, coefficients=frozen_copy(a), driving_rms_nm=driving_rms_nm)
+        radii = np.atleast_1d(np.abs(np.linalg.eigvals(self.companion)).max(axis=-1))
         with np.errstate(all="ignore"):
-            ratio = variance_ratios(self.coefficients)
-        if not (radius < 1 and 0 < ratio < np.inf):
+            ratios = np.atleast_1d(variance_ratios(a))
+        unstable = np.flatnonzero(~((radii < 1) & (ratios > 0) & (ratios < np.inf)))
+        if unstable.size:
+            first = int(unstable[0])
+            where = "" if a.ndim == 1 else f" of process {first}"
             raise ProblemError(
-                "an AR model must be stationary, all poles inside the unit circle; got a pole of "
-                f"modulus {radius:.9g} and no finite variance. "
+                "an AR model must be stationary, all poles inside the unit circle; got a pole"
+                f"{where} of modulus {radii[first]:.9g} and no finite variance. "
                 "Check the signs: x(k+1) = a1 x(k) + a2 x(k-1) + ... + v(k)."
             )
 
+    @classmethod
+    def stack(cls, models: ARModel | Sequence[ARModel]) -> ARModel:
+        """Return models of any orders as one stack, in which shorter ones have zeros.
+
+        Anything but ARModels, and different frame rates, raise a ProblemError.
+
+        Examples
+        --------
+        >>> import lbt_synth as lbt
+        >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
+        >>> lbt.models.ARModel.stack([slow, slow]).count
+        2
+        """
+        members = (models,) if isinstance(models, ARModel) else sequence(models, "models")
+        if not members or not all(isinstance(model, ARModel) for model in members):
+            kinds = sorted({type(model).__name__ for model in members}) or "an empty list"
+            raise ProblemError(f"models must be one ARModel a mode; got {kinds}.")
+        rate, order = members[0].frame_rate_hz, max(model.order for model in members)
+        if not all(np.isclose(model.frame_rate_hz, rate, rtol=1e-9) for model in members):
+            raise ProblemError("all models must be sampled at the same frame rate; they are not.")
+        rows = [np.atleast_2d(model.coefficients) for model in members]
+        padded = [np.pad(row, ((0, 0), (0, order - row.shape[1]))) for row in rows]
+        return cls(
+            coefficients=np.concatenate(padded),
+            driving_rms_nm=np.concatenate([np.atleast_1d(m.driving_rms_nm) for m in members]),
+            frame_rate_hz=rate,
+        )
+
     @property
     def order(self) -> int:
-        """Number of coefficients."""
-        return int(self.coefficients.size)
+        """Number of coefficients of a process."""
+        return int(self.coefficients.shape[-1])
+
+    @property
+    def count(self) -> int:
+        """Number of processes."""
+        return len(np.atleast_2d(self.coefficients))
+
+    def take(self, rows: int | IntArray) -> ARModel:
+        """Return one process of a stack, or some."""
+        return replace(
+            self, coefficients=self.coefficients[rows], driving_rms_nm=self.driving_rms_nm[rows]
+        )
+
+    def separate(self) -> tuple[ARModel, ...]:
+        """Return the processes of a stack one by one."""
+        if self.coefficients.ndim == 1:
+            return (self,)
+        return tuple(self.take(i) for i in range(self.count))
 
     @property
     def companion(self) -> FloatArray:
-        """State matrix (order, order) of the state [x(k), x(k-1), ...]."""
+        """State matrix (order, order) of the state [x(k), x(k-1), ...], or (k, order, order)."""
         return companions(self.coefficients)
 
     @property
-    def rms_nm(self) -> float:
-        """Stationary standard deviation [nm]."""
-        return self.driving_rms_nm * float(np.sqrt(variance_ratios(self.coefficients)))
+    def rms_nm(self) -> Any:
+        """Stationary standard deviation [nm], a float or (k,)."""
+        rms_nm = self.driving_rms_nm * np.sqrt(variance_ratios(self.coefficients))
+        return frozen_copy(rms_nm) if rms_nm.ndim else float(rms_nm)
 
     def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """One-sided power spectrum [nm^2/Hz] at frequencies [Hz] up to Nyquist, of their shape.
 
-        It is ``2 s^2 / (f_s |1 - a1 z^-1 - a2 z^-2 - ...|^2)``; a frequency that is not finite
-        raises a ProblemError.
+        It is ``2 s^2 / (f_s |1 - a1 z^-1 - a2 z^-2 - ...|^2)``; that of a stack is (k, f). A
+        frequency that is not finite raises a ProblemError.
 
         Examples
         --------
@@ -96,15 +160,7 @@ class ARModel:
         """
         frequency = real_array(frequency_hz, "frequency_hz")
         density = densities(self.coefficients, self.driving_rms_nm, self.frame_rate_hz, frequency)
-        return density.reshape(frequency.shape)
-
-
-def padded_coefficients(models: Sequence[ARModel]) -> FloatArray:
-    """Coefficients (models, largest order) of several processes."""
-    out = np.zeros((len(models), max(model.order for model in models)))
-    for row, model in zip(out, models, strict=True):
-        row[: model.order] = model.coefficients
-    return out
+        return density.reshape(*self.coefficients.shape[:-1], *frequency.shape)
 
 
 def companions(coefficients: FloatArray) -> FloatArray:
@@ -281,7 +337,7 @@ def spectrum_key(spectrum: Spectrum | None) -> object:
     if isinstance(spectrum, ARModel):
         return (
             spectrum.coefficients.tobytes(),
-            repr(spectrum.driving_rms_nm),
+            np.asarray(spectrum.driving_rms_nm).tobytes(),
             spectrum.frame_rate_hz,
         )
     return id(spectrum)

@@ -157,6 +157,8 @@ class Truth(Summarised):
 
     def __post_init__(self) -> None:
         turbulence = self.turbulence
+        if isinstance(turbulence, ARModel) and turbulence.coefficients.ndim > 1:
+            turbulence = turbulence.separate()
         parts = tuple(turbulence) if isinstance(turbulence, Sequence) else (turbulence,)
         if not parts:
             raise DimensionError(

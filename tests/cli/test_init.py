@@ -4,8 +4,6 @@ import json
 
 import pytest
 from support.commands import run
-from support.night import LINE_HZ
-from support.recorded_loops import RATE
 
 import lbt_synth as lbt
 from lbt_synth.config.load import example_files, telescope_names
@@ -45,35 +43,6 @@ def test_the_examples_are_written_under_their_names(here, capsys):
     assert run(capsys, "init", "--examples")[0] == 0
     assert {file.name for file in (here / "examples").iterdir()} == set(example_files())
     lbt.studies.load_study("examples/study.yaml")
-
-
-def test_a_record_gives_what_it_knows(here, capsys, recorded_night):
-    status, out, _ = run(
-        capsys, "init", "--from", recorded_night, "--telescope", "gemini", "-o", "n.yaml"
-    )
-    assert status == 0
-    assert "n_kalman.fits" in out
-    config = lbt.load_config("n.yaml")
-    assert config.hardware.frame_rate_hz == RATE
-    assert config.plant.vibrations[0].frequency_hz == pytest.approx(LINE_HZ, abs=0.2)
-    text = (here / "n.yaml").read_text()
-    assert f"frame_rate_hz: {RATE:.1f}" in text
-    assert "# from night.fits\n" in text
-    tail = text.split("# Not in night.fits; this is of the template gemini:\n")[1]
-    assert "# atmosphere:\n#   seeing_arcsec: 0.83" in tail
-    assert "# [2] Gemini Observatory" in tail
-    assert "[4]" not in tail  # nothing that follows cites it
-    sections = tail.partition("\n# [1] Gemini")[0].replace("\n# ", "\n").removeprefix("# ")
-    (here / "more.yaml").write_text(text + sections + "\n")
-    assert lbt.load_config("more.yaml").atmosphere is not None
-
-
-def test_records_that_know_too_little_are_refused(here, capsys):
-    (here / "a.csv").write_text("tip_mas,tilt_mas\n" + "1,2\n2,1\n" * 200)
-    status, _, error = run(capsys, "init", "--from", "a.csv")
-    assert status == 2
-    assert "Try lbt-synth identify, which takes what is missing." in error
-    assert sorted(file.name for file in here.iterdir()) == ["a.csv"]
 
 
 def test_the_schema_is_printed_and_written(tmp_path, capsys):

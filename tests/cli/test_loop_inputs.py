@@ -34,9 +34,9 @@ COMMANDS = {
     "show": ("{}/k.fits",),
     "simulate": ("{}/c.yaml", "{}/k.fits", "-o", "{}/s.svg"),
     "limits": ("{}/c.yaml", "{}/k.fits", "-o", "{}/l.svg"),
-    "robustness": ("{}/c.yaml",),
+    "robustness": ("{}/c.yaml", "{}/k.fits"),
     "identify": ("{}/n.fits", "-o", "{}/i.yaml", "--no-figure"),
-    "rehearse": ("{}/k.fits", "--for", "matlab", "--frames", "600"),
+    "rehearse": ("{}/n.fits", "{}/k.fits", "--for", "matlab"),
 }
 
 
@@ -163,7 +163,13 @@ def test_a_configuration_in_a_gain_file_that_is_damaged_is_refused(tmp_path, cap
 
 
 @pytest.mark.parametrize(
-    "command", [*(name for name in COMMANDS if name != "identify"), "report", "compare", "modal"]
+    "command",
+    [
+        *(name for name in COMMANDS if name not in ("identify", "rehearse", "robustness")),
+        "report",
+        "compare",
+        "modal",
+    ],
 )
 def test_one_configuration_is_one_unit(capsys, files, tmp_path, command):
     """With ``units`` in the configuration, no command shows a wavefront in another one."""

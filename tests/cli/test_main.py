@@ -93,7 +93,7 @@ def test_shells_complete_every_option():
     assert short == full >= {"--json", "--points", "--taps", "-o", "--output"}
     short, full = names["study"]
     assert short == {"-h", "--help", "--json", "--verbose"}
-    assert full > short | {"--jobs", "--dask", "--dry-run", "--row"}
+    assert full > short | {"--jobs", "--dask", "--row"}
 
 
 @pytest.mark.parametrize(

@@ -167,7 +167,7 @@ def test_the_command_writes_telemetry_that_is_the_run(tmp_path, cache, capsys):
     assert sorted(p.name for p in out.iterdir()) == ["run.png", "summary.json", "telemetry.fits"]
     assert json.loads((out / "summary.json").read_text())["strehl"] == data["strehl"]
     telemetry = lbt.files.load_telemetry(out / "telemetry.fits")
-    assert telemetry.strehl == data["strehl"]
+    assert telemetry.metadata["strehl"] == data["strehl"]
     assert telemetry.commands.shape == (40, 20)
     assert np.std(telemetry.residual_nm[:, 0]) <= data["tip_rms_nm"] * (1 + 1e-12)
     # y(k+1) is the gain times the residual of frame k, plus noise

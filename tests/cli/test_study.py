@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import logging
 import os
 import signal
 import subprocess
@@ -24,7 +23,6 @@ from support.studies import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.cli.study import _estimate as estimate
 from lbt_synth.cli.study import connect_cluster
 from lbt_synth.errors import NumericalError
 from lbt_synth.studies.study.sample import evaluate_samples
@@ -72,11 +70,6 @@ def children(pid):
 
 def test_the_command(tmp_path, capsys):
     path = study_file(tmp_path, samples="200", controllers=TWO, parameters=PARAMETERS)
-    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--dry-run", "--verbose")
-    assert status == 0
-    assert "200" in out
-    assert "nothing was written" in out
-    assert not (tmp_path / "out").exists()
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--verbose")
     assert status == 0
     for text in ("50th percentile", "unstable", "failed", "Worst samples of b", "sensor_gain"):
@@ -111,26 +104,8 @@ def test_the_command(tmp_path, capsys):
     assert "rows 0 to 199; got row 200" in error
 
 
-def test_an_estimate(tmp_path, monkeypatch):
-    loaded = lbt.studies.load_study(study_file(tmp_path, samples="5000"))
-
-    def slow(study, values, start):
-        time.sleep(1e-3 * len(values))
-
-    monkeypatch.setattr("lbt_synth.cli.study.evaluate_samples", slow)
-    cost = estimate(loaded, 1)
-    assert 4 < cost.seconds < 9
-    assert cost.measured_rows == 5000
-    assert estimate(loaded, 100).seconds < 0.09
-
-
 def test_json(tmp_path, capsys):
     path = study_file(tmp_path, samples="20", parameters=PARAMETERS)
-    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--dry-run", "--json")
-    cost = json.loads(out)
-    assert (status, cost["samples"], cost["workers"]) == (0, 20, 1)
-    assert cost["seconds"] > 0
-    assert "uniform from 100 to 900" in cost["parameters"].values()
     status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--json")
     data = json.loads(out)
     assert (status, data["computed"], data["failures"]) == (0, 20, 0)
@@ -208,9 +183,6 @@ def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
     path = study_file(tmp_path, samples="40", parameters=PARAMETERS)
     address = cluster.scheduler_address
     arguments = ("study", path, "-o", tmp_path / "out", "--dask", address)
-    status, out, _ = run(capsys, *arguments, "--dry-run")
-    assert status == 0
-    assert f" of {address}, as quick as this one" in out
     with monkeypatch.context() as patch:
         patch.setattr(lbt, "__version__", "9.9.9")
         status, _, error = run(capsys, *arguments)
@@ -219,57 +191,6 @@ def test_the_command_on_dask(tmp_path, capsys, cluster, monkeypatch):
     assert not (tmp_path / "out").exists()
     status, _, error = run(capsys, *arguments)
     assert status == 0, error
-    assert_whole(tmp_path / "out", lbt.studies.load_study(path), evaluate_samples)
-
-
-@pytest.fixture
-def certificate(tmp_path):
-    """The file of a certificate that is its own authority, and that of its key."""
-    files = [tmp_path / name for name in ("certificate.pem", "key.pem")]
-    options = [
-        "req",
-        "-x509",
-        "-newkey",
-        "rsa:2048",
-        "-nodes",
-        "-days",
-        "1",
-        "-subj",
-        "/CN=127.0.0.1",
-    ]
-    made = ["openssl", *options, "-out", files[0], "-keyout", files[1]]
-    subprocess.run(made, check=True, capture_output=True)
-    return files
-
-
-@pytest.mark.e2e
-def test_an_encrypted_scheduler(tmp_path, capsys, certificate, monkeypatch):
-    from distributed import LocalCluster
-    from distributed.security import Security
-
-    monkeypatch.setattr("lbt_synth.cli.study._TIMEOUT_S", 5)
-    # distributed keeps the standard error of the test that loaded it, which has ended
-    monkeypatch.setattr(logging, "raiseExceptions", False)
-    own, key = map(str, certificate)
-    sides = {
-        f"tls_{side}_{what}": name
-        for side in ("scheduler", "worker", "client")
-        for what, name in (("cert", own), ("key", key))
-    }
-    security = Security(tls_ca_file=own, require_encryption=True, **sides)
-    path = study_file(tmp_path, samples="8", parameters=PARAMETERS)
-    with LocalCluster(
-        n_workers=1, threads_per_worker=1, security=security, dashboard_address=":0"
-    ) as encrypted:
-        address = encrypted.scheduler_address
-        assert address.startswith("tls://")
-        arguments = ("study", path, "-o", tmp_path / "out", "--dask", address)
-        status, _, error = run(capsys, *arguments)  # without the certificate
-        assert status == 2
-        assert error.count("\n") == 1
-        assert not (tmp_path / "out").exists()
-        status, _, error = run(capsys, *arguments, "--dask-tls", own, own, key)
-        assert status == 0, error
     assert_whole(tmp_path / "out", lbt.studies.load_study(path), evaluate_samples)
 
 

@@ -215,7 +215,7 @@ def test_along_what_a_line_shakes(good):
 def test_what_the_model_misses_has_its_band():
     """A fit of one line takes that at 60 Hz, and leaves the other to a predictor."""
     lines = ((25.0, 0.01, 200.0), (60.0, 0.02, 60.0))
-    record = spliced_record((0,), lines=lines, frames=20_000, sensor_gain=1.0)
+    record = spliced_record((0,), lines=lines, frames=10_000, sensor_gain=1.0)
     shown = diagnose(record, sensor_gain=1.0, most_lines=1)
     (missed,) = (f.sentence for f in shown.findings if f.sentence.startswith("The model misses"))
     low, high = map(float, missed.split(" between ")[1].removesuffix(" Hz.").split(" and "))

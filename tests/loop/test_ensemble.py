@@ -15,7 +15,6 @@ from lbt_synth.loop.evaluator import split_into_parts, textbook_matrices
 from lbt_synth.models import (
     ARModel,
     FrozenFlows,
-    ModalTurbulence,
     PositionLoop,
     SinusoidalVibration,
     SumSpectrum,
@@ -132,7 +131,7 @@ def test_each_loop_on_its_own(which, request):
 
     rng = np.random.default_rng(2)
     poles, drive = rng.uniform(0.97, 0.995, 10), rng.uniform(20, 90, 10)
-    each = ModalTurbulence(coefficients=poles[:, None], driving_rms_nm=drive, frame_rate_hz=RATE)
+    each = ARModel(coefficients=poles[:, None], driving_rms_nm=drive, frame_rate_hz=RATE)
 
     def own(i):
         return ARModel(coefficients=[poles[i]], driving_rms_nm=drive[i], frame_rate_hz=RATE)

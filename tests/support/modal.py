@@ -20,14 +20,14 @@ def tip_tilt_filter(delay_frames: float = 2.0) -> lbt.design.FilterDesign:
     return lbt.kalman(lbt_axis_plant(modes=2, delay_frames=delay_frames))
 
 
-def some_air(n: int, order: int = 1, seed: int = 0) -> lbt.models.ModalTurbulence:
+def some_air(n: int, order: int = 1, seed: int = 0) -> lbt.models.ARModel:
     rng = np.random.default_rng(seed)
     if order == 1:
         coefficients = rng.uniform(0.9, 0.995, (n, 1))
     else:
         decay, turn = rng.uniform(0.9, 0.99, n), rng.uniform(0.005, 0.1, n)
         coefficients = np.stack([2 * decay * np.cos(turn), -(decay**2)], axis=1)
-    return lbt.models.ModalTurbulence(
+    return lbt.models.ARModel(
         coefficients=coefficients, driving_rms_nm=10 ** rng.uniform(0, 2, n), frame_rate_hz=RATE
     )
 
@@ -35,7 +35,7 @@ def some_air(n: int, order: int = 1, seed: int = 0) -> lbt.models.ModalTurbulenc
 def single_plant(air, mode, lines, noise, gain, **path):
     return lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
-        turbulence=air.model(mode),
+        turbulence=air.take(mode),
         vibrations=list(lines) or None,
         noise_nm=float(noise),
         sensor_gain=float(gain),

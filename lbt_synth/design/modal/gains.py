@@ -30,7 +30,7 @@ from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels, graded_edges
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.evaluator import close_loops, textbook_matrices
-from lbt_synth.models import ARModel, LoopHardware, ModalTurbulence, PositionLoop, Spectrum
+from lbt_synth.models import ARModel, LoopHardware, PositionLoop, Spectrum
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.validation import (
@@ -73,7 +73,7 @@ class ModalGains:
 
 
 def modal_gains(
-    spectra: ModalTurbulence | Sequence[Spectrum],
+    spectra: ARModel | Sequence[Spectrum],
     *,
     noise_nm: ArrayLike,
     frame_rate_hz: float,
@@ -87,7 +87,7 @@ def modal_gains(
 
     Parameters
     ----------
-    spectra : ModalTurbulence or sequence of Spectrum
+    spectra : ARModel or sequence of Spectrum
         Spectrum of each mode's phase: models, an Atmosphere, tables.
     noise_nm : float or (n,) array_like
         Measurement noise of each mode per frame [nm], at least 0.
@@ -276,20 +276,19 @@ def modal_gains_from_telemetry(
 
 
 def _spectra_per_mode(
-    spectra: ModalTurbulence | Sequence[Spectrum], path: LoopHardware
+    spectra: ARModel | Sequence[Spectrum], path: LoopHardware
 ) -> tuple[Density, int, list[FloatArray]]:
     """Return the function from frequencies (f,) to spectra of means (n, f), n, edges of panels.
 
     The edges are where spectra have peaks or kinks, over the Nyquist frequency.
     """
-    if isinstance(spectra, ModalTurbulence):
+    if isinstance(spectra, ARModel):
         require_loop_rate(spectra.frame_rate_hz, path)
-        poles = np.linalg.eigvals(spectra.companions).ravel().astype(np.complex128)
-        return spectra.psd, spectra.n_modes, [graded_edges(poles)]
+        return ARModel.stack(spectra).psd, spectra.count, [_model_edges(spectra)]
     each = tuple(spectra) if isinstance(spectra, Sequence) else ()
     if not each or not all(isinstance(spectrum, Spectrum) for spectrum in each):
         raise ProblemError(
-            "spectra must be ModalTurbulence, or a list with one spectrum per mode (objects with "
+            "spectra must be an ARModel, or a list with one spectrum per mode (objects with "
             f"psd(frequency_hz)); got {type(spectra).__name__}."
         )
     distinct, rate = {id(spectrum): spectrum for spectrum in each}, path.frame_rate_hz
@@ -310,7 +309,7 @@ def _spectra_per_mode(
 
 
 def _model_edges(model: ARModel) -> FloatArray:
-    return graded_edges(np.linalg.eigvals(model.companion).astype(np.complex128))
+    return graded_edges(np.linalg.eigvals(model.companion).ravel().astype(np.complex128))
 
 
 def _checked_spectra(

@@ -24,7 +24,6 @@ from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble, turbulence_
 from lbt_synth.models import (
     ARModel,
     LoopHardware,
-    ModalTurbulence,
     PositionLoop,
     TipTiltPlant,
     Vibration,
@@ -208,7 +207,7 @@ class ModalFilters:
 
 
 def modal_filters(
-    turbulence: ModalTurbulence | Sequence[ARModel],
+    turbulence: ARModel | Sequence[ARModel],
     *,
     noise_nm: ArrayLike,
     vibrations: Vibrations | None = None,
@@ -229,7 +228,7 @@ def modal_filters(
 
     Parameters
     ----------
-    turbulence : ModalTurbulence or sequence of ARModel
+    turbulence : ARModel or sequence of ARModel
         Turbulence of each mode.
     noise_nm : float or (n,) array_like
         Standard deviation of the measurement noise of each mode per frame [nm].
@@ -259,7 +258,7 @@ def modal_filters(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> air = lbt.models.ModalTurbulence(
+    >>> air = lbt.models.ARModel(
     ...     coefficients=[[0.9886], [0.98]], driving_rms_nm=[89.1, 20.0], frame_rate_hz=800
     ... )
     >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
@@ -267,9 +266,8 @@ def modal_filters(
     >>> filters.rms_nm.round(1).tolist(), filters.design(1).certificate.passed
     ([142.5, 31.6], True)
     """
-    if not isinstance(turbulence, ModalTurbulence):
-        turbulence = ModalTurbulence.of(turbulence)
-    n = turbulence.n_modes
+    turbulence = ARModel.stack(turbulence)
+    n = turbulence.count
     noise = number_per_mode(noise_nm, "noise_nm", n)
     gain = number_per_mode(sensor_gain, "sensor_gain", n)
     lines = lines_per_mode(vibrations, n)
@@ -283,7 +281,7 @@ def modal_filters(
         first = modes[0]
         plant = tip_tilt_plant(
             frame_rate_hz=turbulence.frame_rate_hz,
-            turbulence=turbulence.model(first),
+            turbulence=turbulence.take(first),
             vibrations=lines[first] or None,
             noise_nm=float(noise[first]),
             delay_frames=delay_frames,
@@ -329,7 +327,7 @@ def joining_check(stacked: FloatArray, alone: FloatArray) -> Check:
 
 def modal_residuals(
     controller: MixedController | ModalFilters,
-    turbulence: ModalTurbulence | Sequence[ARModel],
+    turbulence: ARModel | Sequence[ARModel],
     *,
     noise_nm: ArrayLike,
     vibrations: Vibrations | None = None,
@@ -343,7 +341,7 @@ def modal_residuals(
     ----------
     controller : MixedController or ModalFilters
         Controllers of the modes, without a reconstructor: y are modal coefficients.
-    turbulence : ModalTurbulence or sequence of ARModel
+    turbulence : ARModel or sequence of ARModel
         Turbulence of each mode, as means over frames.
     noise_nm : float or (n,) array_like
         Measurement noise of each mode per frame [nm], at least 0.
@@ -374,7 +372,7 @@ def modal_residuals(
     --------
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> air = lbt.models.ModalTurbulence(
+    >>> air = lbt.models.ARModel(
     ...     coefficients=[[0.99], [0.99]], driving_rms_nm=[10.0, 5.0], frame_rate_hz=800
     ... )
     >>> control = lbt.design.modal.MixedController(gains=[0.5, 0.4])
@@ -383,11 +381,10 @@ def modal_residuals(
     [16.44, 8.6]
     """
     path = _checked_path(controller, hardware)
-    if not isinstance(turbulence, ModalTurbulence):
-        turbulence = ModalTurbulence.of(turbulence)
+    turbulence = ARModel.stack(turbulence)
     n = controller.n_modes
-    if turbulence.n_modes != n:
-        raise DimensionError(f"turbulence must have {n} modes; got {turbulence.n_modes}.")
+    if turbulence.count != n:
+        raise DimensionError(f"turbulence must have {n} modes; got {turbulence.count}.")
     require_loop_rate(turbulence.frame_rate_hz, path)
     noise = number_per_mode(noise_nm, "noise_nm", n, zero=True)
     gain = number_per_mode(sensor_gain, "sensor_gain", n)
@@ -440,7 +437,7 @@ def _residuals(
     bank: Bank,
     hardware: LoopHardware,
     sensor_gain: FloatArray,
-    turbulence: ModalTurbulence,
+    turbulence: ARModel,
     noise_nm: FloatArray,
     lines: Lines,
     *,

@@ -13,12 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 import lbt_synth
-from lbt_synth.design import Design
 from lbt_synth.errors import OutputError, ProblemError, TelemetryError
 from lbt_synth.files.file_checks import READERS, FileKind
 from lbt_synth.files.telemetry import aot
 from lbt_synth.files.telemetry.telemetry import FACTS, LAYERS, REQUIRED, Scalar, Telemetry
-from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, Simulation
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.storage.array_file import Cards
@@ -28,14 +26,13 @@ from lbt_synth.validation import FloatArray, choice, integer, require_instance
 
 PRECISIONS = ("float64", "float32")
 Meta = dict[str, Any]
-_LARGEST_CARD = 2**63 - 1
 FORMATS = ("fits", "npz", "aot")
 _ENDINGS = ".fits, .npz or .aot.fits"
 _KINDS = {".aot.fits": "aot", ".fits": "fits", ".npz": "npz"}  # the longer ending first
 _KIND = FileKind(
     name="telemetry file",
     schema="lbt_synth telemetry",
-    version=1,
+    version=2,
     error=TelemetryError,
     version_error=TelemetryError,
     again="Try another copy, or write it again with lbt.files.save_telemetry.",
@@ -172,7 +169,7 @@ def pack(telemetry: Telemetry, precision: str) -> tuple[dict[str, npt.NDArray[An
         if precision == "float32" and layer.is_series and layer.field != "times_s":
             with np.errstate(over="ignore"):
                 arrays[name] = value.astype(np.float32)
-            if not np.all(np.isfinite(arrays[name])):
+            if np.any(np.isinf(arrays[name])):
                 raise ProblemError(
                     f"{layer.field} has values beyond the range of float32; write float64."
                 )
@@ -184,29 +181,20 @@ def pack(telemetry: Telemetry, precision: str) -> tuple[dict[str, npt.NDArray[An
         **{name: getattr(telemetry, name) for name in FACTS},
         "metadata": dict(telemetry.metadata),
     }
-    if (k := telemetry.controller) is not None:
-        arrays |= {f"CTRL_{name}": getattr(k, name) for name in "ABCD"}
-        meta["controller_dt_s"] = k.dt_s
-    if telemetry.mirror is not None:
-        meta["mirror"] = asdict(telemetry.mirror)
+    if telemetry.mirror is not None and telemetry.mirror_taps is not None:
+        meta |= {"mirror": asdict(telemetry.mirror), "mirror_taps": telemetry.mirror_taps.tolist()}
     return arrays, meta
 
 
 def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
     """Rebuild telemetry; missing keys raise KeyError, what does not fit a ProblemError."""
-    left = dict(arrays)
+    if unknown := arrays.keys() - LAYERS.keys():
+        raise ValueError(f"it has arrays that no telemetry has: {', '.join(sorted(unknown))}")
     fields: dict[str, Any] = {
-        layer.field: left.pop(name)
+        layer.field: arrays[name]
         for name, layer in LAYERS.items()
-        if name in left or layer.field in REQUIRED
+        if name in arrays or layer.field in REQUIRED
     }
-    if "controller_dt_s" in meta:
-        fields["controller"] = Controller(
-            **{name: left.pop(f"CTRL_{name}") for name in "ABCD"}, dt_s=meta["controller_dt_s"]
-        )
-    if left:
-        raise ValueError(f"it has arrays that no telemetry has: {', '.join(sorted(left))}")
-    fields.pop("mirror_taps", None)  # they follow from the mirror
     if "mirror" in meta:  # a mirror that settles at once is not in the file
         fields["mirror"] = PositionLoop(**meta["mirror"])
     fields |= {name: meta[name] for name in FACTS}
@@ -215,18 +203,14 @@ def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
 
 def primary_cards(telemetry: Telemetry, meta: Meta) -> dict[str, tuple[Any, str]]:
     """Cards for people who look at the header; META is what is read back."""
-    cards: dict[str, tuple[Any, str]] = {
+    known = {name: getattr(telemetry, name) for name in FACTS}
+    return {
         "CREATOR": (f"lbt_synth {meta['library_version']}", "writer of this file"),
         "LBTTELEM": (_KIND.version, "version of the lbt_synth telemetry layout"),
+        **{FACTS[name][0]: (v, FACTS[name][1]) for name, v in known.items() if v is not None},
+        "TIMING": (telemetry.convention, ""),
+        "SHA256": (meta["digest"], ""),
     }
-    for name, (card, comment) in FACTS.items():
-        value = getattr(telemetry, name)
-        too_large = isinstance(value, int) and value > _LARGEST_CARD
-        if card and value is not None and not too_large:
-            cards[card] = (value, comment)
-    cards["TIMING"] = (telemetry.convention, "")
-    cards["SHA256"] = (meta["digest"], "")
-    return cards
 
 
 def layer_cards(telemetry: Telemetry) -> dict[str, Cards]:
@@ -249,10 +233,7 @@ def telemetry_from_simulation(
     *,
     case: int = 0,
     sensor_gain: float | None = None,
-    design: Design | None = None,
-    controller_digest: str | None = None,
     imaging: Imaging | None = None,
-    name: str = "",
     metadata: Mapping[str, Scalar] | None = None,
 ) -> Telemetry:
     """Telemetry of one case of a simulation.
@@ -267,17 +248,11 @@ def telemetry_from_simulation(
         Which case, from 0.
     sensor_gain : float, optional
         Sensor gain of the truth, relative to the sensor matrix of the loop.
-    design : Design, optional
-        The design that ran.
-    controller_digest : str, optional
-        SHA-256 of its gain file.
     imaging : Imaging, optional
         The camera: gives the telescope, the wavelength and, of one or two modes, the Strehl
         ratio of the case.
-    name : str, optional
-        Name of the system.
     metadata : mapping, optional
-        Anything else; see :class:`Telemetry`.
+        Anything else; see :class:`Telemetry`. The seed and the Strehl ratio are added.
 
     Returns
     -------
@@ -299,7 +274,7 @@ def telemetry_from_simulation(
     ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100),),
     ... )
     >>> run = lbt.simulate(lazy.controller, shake, hardware=path, frames=100)
-    >>> seen = lbt.files.telemetry_from_simulation(run, path, design=lazy)
+    >>> seen = lbt.files.telemetry_from_simulation(run, path)
     >>> bool(abs(seen.measurements[1:] - seen.residual_nm[:-1]).max() < 1e-9)  # no noise
     True
     """
@@ -314,14 +289,10 @@ def telemetry_from_simulation(
             f"hardware must be that of the simulation, at {simulation.frame_rate_hz:g} Hz; got "
             f"one at {hardware.frame_rate_hz:g} Hz."
         )
-    gains = None
-    if design is not None:
-        require_instance(design, Design)
-        if (gain := design.integrator_gain) is not None:
-            gains = np.full(hardware.n_commands, gain)
-    residual, strehl = simulation.residual_nm[case], None
+    residual, facts = simulation.residual_nm[case], {"seed": simulation.seed, **(metadata or {})}
     if imaging is not None and residual.shape[1] <= 2:  # the jitter of an image has two axes
-        strehl = float(np.clip(simulation.strehl(imaging)[case], 0, 1))  # a mean of cosines
+        strehl = simulation.strehl(imaging)[case]
+        facts["strehl"] = float(np.clip(strehl, 0, 1))  # a mean of cosines
     return Telemetry(
         frame_rate_hz=simulation.frame_rate_hz,
         delay_frames=hardware.delay_frames,
@@ -333,15 +304,8 @@ def telemetry_from_simulation(
         interaction_matrix=hardware.sensor,
         influence_matrix=hardware.influence,
         sensor_gain=sensor_gain,
-        controller=None if design is None else design.controller,
-        controller_name=None if design is None else design.method,
-        controller_digest=controller_digest,
-        integrator_gains=gains,
         diameter_m=None if imaging is None else imaging.diameter_m,
         obstruction=None if imaging is None else imaging.obstruction,
         imaging_wavelength_um=None if imaging is None else imaging.wavelength_um,
-        strehl=strehl,
-        seed=simulation.seed,
-        name=name,
-        metadata=metadata or {},
+        metadata=facts,
     )

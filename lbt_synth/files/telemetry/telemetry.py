@@ -11,11 +11,9 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 import numpy as np
 
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.linear import Controller
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
-    Count,
     FloatArray,
     Obstruction,
     Positive,
@@ -24,7 +22,6 @@ from lbt_synth.validation import (
     frozen_copy,
     real_array,
     set_fields,
-    text,
 )
 
 Scalar: TypeAlias = str | float | int | bool
@@ -53,39 +50,28 @@ class Layer(NamedTuple):
         return str(getattr(telemetry, self.unit[1:])) if self.unit[:1] == "_" else self.unit
 
 
-_TAPS = "c: phi_cor(k) = N (c0 u(k) + c1 u(k-1) + ...)"
-_MEASURED = "y(k), of the exposure of frame k-1"
 LAYERS = {  # by their names in files
     "COMMANDS": Layer("commands", "frame, command", "_command_unit", "u(k)"),
-    "MEASURE": Layer("measurements", "frame, measurement", "_measurement_unit", _MEASURED),
+    "MEASURE": Layer(
+        "measurements", "frame, measurement", "_measurement_unit", "y(k), of the exposure of k-1"
+    ),
     "RESIDUAL": Layer("residual_nm", "frame, mode", "nm", "phi_res(k), corrected phase"),
     "TOTAL": Layer("total_nm", "frame, mode", "nm", "phi_tot(k), before correction"),
-    "SLOPES": Layer("slopes", "frame, slope", "_slope_unit", "what the sensor gave"),
     "TIMES": Layer("times_s", "frame", "s", "time of each frame"),
-    "INTERACT": Layer("interaction_matrix", "sensed, mode", "", "S"),
-    "RECONST": Layer("reconstructor", "mode, slope", "", "slopes to modes"),
+    "INTERACT": Layer("interaction_matrix", "measurement, mode", "", "S"),
     "INFLUENC": Layer("influence_matrix", "mode, command", "", "N"),
-    "MODES": Layer("mode_maps", "mode, row, column", "", "modes, of rms 1"),
-    "PSF": Layer("psf", "row, column", "", "image of the camera"),
-    "INTGAINS": Layer("integrator_gains", "command", "", "integrator gains"),
-    "MIRROR_TAPS": Layer("mirror_taps", "age", "", _TAPS),  # follows from other fields
 }
 REQUIRED = ("measurements",)
 _WITH_GAPS = ("commands", "measurements")  # in which NaN is a value that was lost
-ARRAYS = tuple(layer for layer in LAYERS.values() if layer.field != "mirror_taps")
-FACTS: Mapping[str, tuple[str, str]] = {  # their cards in a FITS header, those that have one
+FACTS: Mapping[str, tuple[str, str]] = {  # with their cards in a FITS header
     "frame_rate_hz": ("RATE_HZ", "[Hz] frame rate"),
     "delay_frames": ("DELAY", "[frames] total delay"),
     "sensor_gain": ("SENSGAIN", "sensor gain over the interaction matrix"),
-    "strehl": ("STREHL", "Strehl ratio"),
-    "imaging_wavelength_um": ("WAVELEN", "[um] of the image and the Strehl ratio"),
-    "psf_pixel_mas": ("PSFPIX", "[mas] pixel of the image"),
+    "imaging_wavelength_um": ("WAVELEN", "[um] of the camera"),
     "diameter_m": ("DIAMETER", "[m] telescope"),
     "obstruction": ("OBSTRUCT", "central obstruction over the diameter"),
-    "seed": ("SEED", "of the simulation"),
-    "subaperture_axes": ("", ""),
-    **dict.fromkeys(("name", "controller_name", "controller_digest"), ("", "")),
-    **dict.fromkeys(("command_unit", "measurement_unit", "slope_unit"), ("", "")),
+    "command_unit": ("CMDUNIT", "of the commands"),
+    "measurement_unit": ("MEASUNIT", "of the measurements"),
 }
 
 
@@ -97,7 +83,7 @@ def _check_unit(value: Any, name: str) -> None:
             f"{name} must be a word of at most {_LONGEST_UNIT} ASCII signs without a quote; got "
             f"{value!r}."
         )
-    if name != "slope_unit" and value in _LENGTHS:
+    if value in _LENGTHS:
         raise ProblemError(f"{name} must be nm for lengths; got {value!r}. Convert them.")
     if name == "command_unit" and not value:
         raise ProblemError("command_unit must not be empty; write 1 for pure numbers.")
@@ -127,8 +113,7 @@ _CONVENTION = (
     "y(k) = sensor_gain S phi_res(k-1) + noise(k): the measurement of frame k is of the exposure "
     "of frame k-1. u(k) is the command computed from y up to y(k). "
     "phi_res(k) = phi_tot(k) - phi_cor(k), {correction}. S is the interaction matrix, N the "
-    "influence matrix, each the identity where it is not given. Where slopes are recorded, "
-    "slopes(k) = sensor_gain S phi_res(k-1) + noise(k), y(k) = reconstructor slopes(k). "
+    "influence matrix, each the identity where it is not given. "
     "Units: nm rms of wavefront, unless a unit is given."
 )
 CONVENTION = _CONVENTION.format(
@@ -155,17 +140,14 @@ class Telemetry:
 
     with S the interaction and N the influence matrix, each the identity where it is not
     given. With a ``mirror`` it is ``phi_tot(k) - N (c[0] u(k) + c[1] u(k-1) + ...)`` with the
-    taps c of :attr:`mirror_taps`. Where the slopes are recorded, they are
-    ``sensor_gain S phi_res(k-1) + noise(k)``, and ``y(k)`` is the reconstructor times
-    ``slopes(k)``.
+    taps c of :attr:`mirror_taps`.
 
     Parameters
     ----------
     frame_rate_hz : float
         Frame rate [Hz].
     measurements : (frames, q) array_like
-        Measurements y(k), in ``measurement_unit``: coefficients of the modes, or what the
-        sensor gave where no ``slopes`` are beside them. NaN where they were lost.
+        Measurements y(k), in ``measurement_unit``. NaN where they were lost.
     commands : (frames, m) array_like, optional
         Commands u(k), in ``command_unit``, NaN where they were lost; None for an open loop.
     delay_frames : float, optional
@@ -175,49 +157,22 @@ class Telemetry:
         default. It needs a delay of at least one frame.
     residual_nm, total_nm : (frames, n) array_like, optional
         Phase after and before the correction [nm], known to simulations only.
-    slopes : (frames, s) array_like, optional
-        What the sensor gave, of which the measurements are the modal coefficients (q = n).
-    interaction_matrix : (s, n) array_like, optional
-        Response S of the slopes to the modes; of the measurements, where there are no slopes.
-    reconstructor : (n, s) array_like, optional
-        From slopes to modes.
-    influence_matrix : (n, m) array_like, optional
-        Response N of the modes to the commands.
-    mode_maps : (n, h, w) array_like, optional
-        The modes as maps over the pupil, of rms 1.
-    psf : (h, w) array_like, optional
-        Image of the camera.
-    psf_pixel_mas : float, optional
-        Its pixel [mas].
-    imaging_wavelength_um : float, optional
-        Wavelength of the image and of the Strehl ratio [um].
-    strehl : float, optional
-        Strehl ratio, in [0, 1].
     times_s : (frames,) array_like, optional
         Time of each frame [s], rising; Unix time where it is of the sky.
-    subaperture_axes : int, optional
-        Values that a subaperture of the sensor gives: the slopes (the measurements, where
-        there are no slopes) are that many blocks of one value per subaperture.
-    command_unit, measurement_unit, slope_unit : str, optional
-        Units; "nm" is rms of wavefront, and the only unit of length of the first two.
+    interaction_matrix : (q, n) array_like, optional
+        Response S of the measurements to the modes.
+    influence_matrix : (n, m) array_like, optional
+        Response N of the modes to the commands.
     sensor_gain : float, optional
         Real gain of the sensor as a factor on the interaction matrix.
-    controller : Controller, optional
-        The controller that ran, new-state form, from y(k) to u(k).
-    controller_name : str, optional
-        Its name.
-    controller_digest : str, optional
-        SHA-256 of its gain file, as sha256sum prints it.
-    integrator_gains : (m,) array_like, optional
-        Gain of each command's integrator.
+    command_unit, measurement_unit : str, optional
+        Units; "nm" is rms of wavefront, and the only unit of length.
     diameter_m, obstruction : float, optional
         Telescope diameter [m], and that of its central obstruction as a fraction of it.
-    seed : int, optional
-        Seed of a simulation.
-    name : str, optional
-        Name of the system.
+    imaging_wavelength_um : float, optional
+        Wavelength of the camera [um].
     metadata : mapping of str to str, float, int or bool, optional
-        Anything else.
+        What else is to be kept: the controller that ran, the digest of its gain file, a seed.
 
     Raises
     ------
@@ -246,53 +201,31 @@ class Telemetry:
     mirror: PositionLoop | None = None
     residual_nm: FloatArray | None = None
     total_nm: FloatArray | None = None
-    slopes: FloatArray | None = None
-    interaction_matrix: FloatArray | None = None
-    reconstructor: FloatArray | None = None
-    influence_matrix: FloatArray | None = None
-    mode_maps: FloatArray | None = None
-    psf: FloatArray | None = None
-    psf_pixel_mas: Positive | None = None
-    imaging_wavelength_um: Positive | None = None
-    strehl: Annotated[float, ("at_least", 0), ("at_most", 1)] | None = None
     times_s: FloatArray | None = None
-    subaperture_axes: Count = 1
+    interaction_matrix: FloatArray | None = None
+    influence_matrix: FloatArray | None = None
+    sensor_gain: Positive | None = None
     command_unit: str = "nm"
     measurement_unit: str = "nm"
-    slope_unit: str = ""
-    sensor_gain: Positive | None = None
-    controller: Controller | None = None
-    controller_name: str | None = None
-    controller_digest: str | None = None
-    integrator_gains: FloatArray | None = None
     diameter_m: Positive | None = None
     obstruction: Obstruction | None = None
-    seed: Annotated[int, ("at_least", 0)] | None = None
-    name: str = ""
+    imaging_wavelength_um: Positive | None = None
     metadata: Mapping[str, Scalar] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_fields(self, metadata=_check_metadata(self.metadata))
-        for name in ("command_unit", "measurement_unit", "slope_unit"):
+        for name in ("command_unit", "measurement_unit"):
             _check_unit(getattr(self, name), name)
-        for name in ("name", "controller_name", "controller_digest"):
-            if name == "name" or getattr(self, name) is not None:
-                text(getattr(self, name), name)
         self._check_arrays()
         if self.mirror is not None:
             if self.delay_frames is None:
                 raise ProblemError("telemetry of a mirror with dynamics needs delay_frames.")
             _ = self.mirror_taps  # what does not fit is refused
-        if self.controller is not None:
-            self._check_controller(self.controller)
 
     def _check_arrays(self) -> None:
         """Refuse arrays of other sizes than their axes have in the arrays before them."""
-        same = {"sensed": "measurement", "slope": "measurement"}
-        if self.slopes is not None:
-            same = {"sensed": "slope", "measurement": "mode"}
         sizes: dict[str, tuple[int, str]] = {}  # of each axis, and the field that gave it
-        for layer in ARRAYS:
+        for layer in LAYERS.values():
             if (value := getattr(self, layer.field)) is None and layer.field not in REQUIRED:
                 continue
             axes = layer.axes.split(", ")
@@ -311,36 +244,15 @@ class Telemetry:
                     f"{array.shape}."
                 )
             for axis, size in zip(axes, array.shape, strict=True):
-                if axis in ("row", "column"):  # each image has its own
-                    continue
-                word = same.get(axis, axis)
-                needed, giver = sizes.setdefault(word, (size, layer.field))
+                needed, giver = sizes.setdefault(axis, (size, layer.field))
                 if size != needed:
                     raise DimensionError(
-                        f"{layer.field} must have {count_text(needed, word)} to match {giver}; "
+                        f"{layer.field} must have {count_text(needed, axis)} to match {giver}; "
                         f"got shape {array.shape}."
                     )
             set_fields(self, **{layer.field: array})
         if self.times_s is not None and np.any(np.diff(self.times_s) <= 0):
             raise ProblemError("times_s must rise from frame to frame.")
-        if self.sensed.shape[1] % self.subaperture_axes:
-            raise DimensionError(
-                f"subaperture_axes must divide the {self.sensed.shape[1]} values that the sensor "
-                f"gives; got {self.subaperture_axes}."
-            )
-
-    def _check_controller(self, controller: Controller) -> None:
-        m, q = self.n_commands, self.measurements.shape[1]
-        if controller.D.shape != (m, q):
-            raise DimensionError(
-                f"controller must map {q} measurements to {m} commands; got "
-                f"{controller.D.shape[1]} to {controller.D.shape[0]}."
-            )
-        if not math.isclose(controller.dt_s * self.frame_rate_hz, 1, rel_tol=1e-9):
-            raise ProblemError(
-                f"controller must run at {self.frame_rate_hz:.9g} Hz; got one for "
-                f"{1 / controller.dt_s:.9g} Hz."
-            )
 
     @property
     def frames(self) -> int:
@@ -355,23 +267,11 @@ class Telemetry:
     @property
     def modes(self) -> int:
         """Number of modes n; that of the measurements, where no field gives it."""
-        for layer in ARRAYS:
+        for layer in LAYERS.values():
             array, axes = getattr(self, layer.field), layer.axes.split(", ")
             if array is not None and "mode" in axes:
                 return int(array.shape[axes.index("mode")])
         return int(self.measurements.shape[1])
-
-    @property
-    def sensed(self) -> FloatArray:
-        """What the sensor gave: the slopes, or the measurements where there are none."""
-        return self.measurements if self.slopes is None else self.slopes
-
-    @property
-    def modal_response(self) -> FloatArray | None:
-        """Response of the measurements to the modes, behind a reconstructor of slopes."""
-        if self.slopes is None or self.interaction_matrix is None:
-            return self.interaction_matrix
-        return None if self.reconstructor is None else self.reconstructor @ self.interaction_matrix
 
     @property
     def mirror_taps(self) -> FloatArray | None:
@@ -399,7 +299,7 @@ class Telemetry:
         if self.delay_frames is None:
             raise ProblemError("this telemetry does not tell the delay of its loop.")
         n, q, m = self.modes, self.measurements.shape[1], self.n_commands
-        sensor, influence = self.modal_response, self.influence_matrix
+        sensor, influence = self.interaction_matrix, self.influence_matrix
         for what, name, missing, size in (
             ("measurements", "interaction", sensor is None, q),
             ("commands", "influence", influence is None, m),

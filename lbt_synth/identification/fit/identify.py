@@ -326,6 +326,9 @@ def _identify_spectra(
             "the frame rate of the loop is needed to sample a spectrum's processes; got a record "
             "without one. Give frame_rate_hz."
         )
+    stated = None
+    if noise_nm is not None:
+        stated = each_of(noise_nm, "noise_nm", record.axes, above=0).tolist()
     inside = (record.frequency_hz > 0) & (record.frequency_hz < rate / 2)
     f, densities = record.frequency_hz[inside], record.density_nm2_hz[inside].T
     if f.size < 32:
@@ -363,8 +366,7 @@ def _identify_spectra(
         search = Search(data=data, gain=1.0, **options)
         model = add_evidence(search, find_components(search))
         axes.append(describe_axis(search, model, None, "1: of a spectrum it has no meaning"))
-    if noise_nm is not None:
-        stated = each_of(noise_nm, "noise_nm", record.axes, above=0).tolist()
+    if stated is not None:
         axes = [
             replace(axis, noise_nm=noise, noise_error_nm=0.0)
             for axis, noise in zip(axes, stated, strict=True)

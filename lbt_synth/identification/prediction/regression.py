@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from itertools import pairwise
+from functools import cache, cached_property
+from itertools import accumulate, pairwise
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -39,6 +39,7 @@ from lbt_synth.validation import FloatArray, IntArray
 
 TAPS = 64  # frames of the past: at 1 kHz two periods of a line at 30 Hz, below which the base is
 _PENALTIES = 10.0 ** np.arange(-9, 4)  # of a coefficient whose signal changes by 1 a frame
+_USUAL = 5  # place of the penalty where a search begins
 _PARTS = 6  # of a record, of which each is predicted by those before, from the third on
 _FIRST = 2
 _OFFSET = 1.0  # by which a channel's readings may stand off zero, in rms changes a frame
@@ -174,12 +175,20 @@ class Regression:
     @cached_property
     def penalty(self) -> float:
         """The penalty whose filters of the past leave least of what comes next."""
-        signals, left = range(len(self.scales)), np.zeros(len(_PENALTIES))
-        past = sum(self.parts[1:_FIRST], self.parts[0])
-        for part in self.parts[_FIRST:]:
-            left += [part.left(self.solve(signals, p, past)) for p in _PENALTIES]
-            past = past + part
-        return float(_PENALTIES[np.argmin(left)])
+        signals, pasts = range(len(self.scales)), [*accumulate(self.parts)][_FIRST - 1 : -1]
+
+        @cache
+        def left(i: int) -> float:
+            return sum(
+                part.left(self.solve(signals, _PENALTIES[i], past))
+                for past, part in zip(pasts, self.parts[_FIRST:], strict=True)
+            )
+
+        least, before = _USUAL, -1
+        while least != before:  # downhill: no record has two minima that differ by 1 %
+            before, ends = least, (max(least - 1, 0), min(least + 2, len(_PENALTIES)))
+            least = min(range(*ends), key=left)
+        return float(_PENALTIES[least])
 
     def design(self, penalty: float | None = None, **claims: float) -> PredictorDesign:
         """Return the certified design, by default with the penalty of forward chaining."""

@@ -145,7 +145,7 @@ def load_record(
     of_telemetry = columns is None and commands is None
     if isinstance(source, Telemetry):
         _require_series(of_telemetry, averages)
-        given["source"] = source.name or "telemetry"
+        given["source"] = str(source.metadata.get("name", "telemetry"))
         return _telemetry_record(source, kind=kind, axes=axes, **given)
     path = Path(source)
     given["source"] = str(path)
@@ -266,12 +266,12 @@ def _modal_columns(seen: Telemetry, role: str, chosen: list[int], notes: list[st
 
 def _inverse_response(seen: Telemetry) -> FloatArray | None:
     """Return the matrix from measurements to modes, None for the identity."""
-    n, q, response = seen.modes, seen.measurements.shape[1], seen.modal_response
+    n, q, response = seen.modes, seen.measurements.shape[1], seen.interaction_matrix
     if (response is None and q != n) or (response is not None and q > n > 2):
         raise ProblemError(
             f"this telemetry has {q} measurements and {n} modes: slopes without modal "
             "coefficients. Multiply them by the reconstructor of the loop.",
-            in_python="As Telemetry(measurements=slopes @ R.T, slopes=slopes, reconstructor=R).",
+            in_python="As Telemetry(measurements=slopes @ reconstructor.T).",
         )
     if response is None or _is_gains(response, seen):
         return None

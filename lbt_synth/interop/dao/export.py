@@ -28,7 +28,6 @@ from lbt_synth.design.shaping.channel import Channel, laguerre_basis
 from lbt_synth.design.shaping.objectives import ResidualVariance, leaves, spectrum_of
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.files.telemetry.time_filters import is_significant, transfer_function
 from lbt_synth.interop.modes import ModeDesign
 from lbt_synth.interop.pipeline import Arithmetic, Target
 from lbt_synth.interop.proof import (
@@ -39,10 +38,10 @@ from lbt_synth.interop.proof import (
     prove_written,
     sums_variance,
 )
-from lbt_synth.linear import Controller
+from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import fits_bytes, open_fits
-from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, integer
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, integer
 
 # Mean square of the relative error of an operation. The error is uniform within half a step, and a
 # step is 2^-24 to 2^-23 of the number: of normal numbers of any size the mean square is at most
@@ -56,6 +55,8 @@ _HASTE = 12  # power of its residual with which a scenario gains weight
 _STEEP = 5.0  # weight of what exceeds a limit
 _LINE = 0.3  # weight of a vibration's mean power; its largest is a limit
 _GAINS = 25  # sensor gains at which a step must be stable
+_NOTHING = 1e-14  # of the largest coefficient of a numerator; less counts as zero
+_COUPLED = 1e-9  # of the largest entry of a matrix; less is what a solver leaves of a zero
 _NEGLIGIBLE = 1e-13  # of the largest coefficient; single precision has no use for less
 _SIGN = "actuators = -M2V u; y and u in the units of the mode, with the mirror's sign"
 
@@ -375,7 +376,7 @@ def mode_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArra
             f"a filter per mode needs as many commands as measurements; got {m} commands and {q} "
             "measurements. Use a target of matrices, such as c."
         )
-    A, B, C, D = (is_significant(getattr(system, name)) for name in "ABCD")
+    A, B, C, D = (_is_significant(getattr(system, name)) for name in "ABCD")
     paths = np.linalg.matrix_power(A | np.eye(size, dtype=np.bool_), size)
     coupled = np.argwhere((D | (C @ paths @ B)) & ~np.eye(m, dtype=np.bool_))
     if coupled.size:
@@ -384,7 +385,44 @@ def mode_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArra
             f"{coupled[0, 0] + 1}. Design with --method robust, which controls each axis alone, or "
             "use a target of matrices, such as c."
         )
-    return [_shortened(*transfer_function(system, mode, row)) for mode, row in enumerate(np.eye(m))]
+    return [_shortened(*_transfer_function(system, i, row)) for i, row in enumerate(np.eye(m))]
+
+
+def _transfer_function(
+    system: StateSpace, output: int, row: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the scalar filter of one output, for measurements along a row.
+
+    Numerator and denominator have their highest power first. States that the measurements do not
+    drive, or that do not show in the output, are left out. What overflows is not a number.
+    """
+    size = row @ row
+    b, c, d = system.B @ row / size, system.C[output], float(system.D[output] @ row / size)
+    linked = _is_significant(system.A) | np.eye(system.n_states, dtype=np.bool_)
+    reached = np.linalg.matrix_power(linked, system.n_states)
+    inside = (reached @ _is_significant(b)) & (_is_significant(c) @ reached)
+    A = system.A[np.ix_(inside, inside)]
+    with np.errstate(all="ignore"):
+        entry = np.outer(b[inside], c[inside])
+        scale = 1 / (np.max(np.abs(entry), initial=0.0) or 1.0)
+        # det(zI - A + b c) = det(zI - A) + c adj(zI - A) b
+        den, moved = _characteristic(A), _characteristic(A - scale * entry)
+        num = d * den + (moved - den) / scale
+    num[np.abs(num) <= _NOTHING * np.max(np.abs(num))] = 0.0
+    return num, den
+
+
+def _characteristic(A: FloatArray) -> FloatArray:
+    """Return the characteristic polynomial, highest power first."""
+    if not A.size:
+        return np.ones(1)
+    finite = bool(np.all(np.isfinite(A)))
+    return np.asarray(np.real(np.poly(A))) if finite else np.full(len(A) + 1, np.nan)
+
+
+def _is_significant(entries: FloatArray) -> BoolArray:
+    """Return which entries are more than what a solver leaves of a zero."""
+    return np.asarray(np.abs(entries) > _COUPLED * np.max(np.abs(entries), initial=0.0))
 
 
 def _shortened(num: FloatArray, den: FloatArray) -> tuple[FloatArray, FloatArray]:

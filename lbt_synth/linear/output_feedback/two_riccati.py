@@ -87,8 +87,8 @@ class FullInformation:
         if np.linalg.eigvalsh(equation.R[0, :m, :m])[-1] >= 0:
             return -1.0, None
         slack = -1.0
-        for route in (solve_by_schur, solve_by_doubling):
-            slack, X = self._judge(equation, route(equation)[0], gamma)
+        for route in (solve_by_schur, lambda e: solve_by_doubling(e)[0]):
+            slack, X = self._judge(equation, route(equation), gamma)
             if X is not None:
                 return slack, self.least + X
         return slack, None
@@ -131,8 +131,7 @@ class FullInformation:
         R = D.T @ D - block_diag(gamma**2 * np.eye(B1.shape[1]), np.zeros((B2.shape[1],) * 2))
         parts = {"A": A, "B": np.hstack([B1, B2]), "Q": C1.T @ C1, "R": R, "S": C1.T @ D}
         equation = Equations(**{name: part[None] for name, part in parts.items()})
-        refined = equation.refine(X[None], np.zeros(1, dtype=np.int64))
-        return np.asarray(refined.X[0])
+        return np.asarray(equation.refine(X[None]).X[0])
 
     def worst_case(self, X: FloatArray, gamma: float) -> WorstCase:
         """Return the worst case at a level, for its X."""

@@ -7,22 +7,24 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import block_diag, eigvals
 
 from lbt_synth.errors import (
     DefinitenessError,
     DetectabilityError,
     DimensionError,
-    InfeasibleError,
     NumericalError,
     ProblemError,
 )
-from lbt_synth.linear.riccati.equations import ROUTES, Equations, Solutions
+from lbt_synth.linear.riccati.equations import (
+    Equations,
+    Solutions,
+    solve_by_doubling,
+    solve_by_schur,
+)
 from lbt_synth.linear.state_space import balancing_scales
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
-    IntArray,
     frozen_copy,
     matrix,
     read_only,
@@ -42,7 +44,6 @@ _RANK = 1e-10  # share of a matrix below which an input or an output does nothin
 # as well, where a mode that decays passes.
 _CIRCLE = 1e-3
 _ROUNDING = 1e-14  # share of a pencil that rounding of the data may be: its singular value is zero
-_ELSEWHERE = 0.37 + 0.61j  # an arbitrary point, at which only a singular pencil is singular
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,13 +61,8 @@ class DareSolution:
     # (...): estimate of the relative error of X: the size of the next Newton step. It grows with
     # the condition of the equation
     errors: FloatArray
-    # (...): number of negative eigenvalues of ``R + B'XB``. Where it is zero, X is the least cost
-    # of the control problem; elsewhere X is a saddle point
-    negative: IntArray
     iterations: int  # most doublings made for an equation
-    # routes that solved something, in the order they were tried: "doubling", "shifted doubling" and
-    # "schur"
-    route: str
+    route: str  # that solved the equations: "doubling", or "schur" where that solved some
 
     @property
     def residual(self) -> float:
@@ -84,11 +80,10 @@ def solve_dare(
 ) -> DareSolution:
     """Solve ``X = A'XA + Q - (A'XB + S)(R + B'XB)^-1 (B'XA + S')`` for its stabilising X.
 
-    Three routes are tried in turn: structured doubling in balanced units; doubling from
-    some steps of the Riccati recursion, which a singular R needs; and the ordered Schur
-    form of the extended pencil. Each answer is refined by Newton steps on a residual in
-    extended precision, and verified: a stable closed loop and a small residual make it
-    the stabilising solution, of which there is only one. For the filter equation pass
+    Structured doubling in balanced units is tried first, then the ordered Schur form of
+    the extended pencil. Each answer is refined by Newton steps on a residual in extended
+    precision, and verified: a stable closed loop and a small residual make it the
+    stabilising solution, of which there is only one. For the filter equation pass
     ``(A', C', B B', D D', B D')``.
 
     Leading dimensions of the arguments are those of a stack of equations, broadcast
@@ -104,8 +99,8 @@ def solve_dare(
         State weight, symmetric.
     R : (..., m, m) array_like
         Input weight, symmetric. It may be singular. If it has negative eigenvalues the
-        equation is that of an H-infinity problem, and X must then be positive
-        semidefinite and leave ``R + B'XB`` the signs of R.
+        equation is that of an H-infinity problem, whose level can be met if X is positive
+        semidefinite and ``R + B'XB`` has the signs of R.
     S : (..., n, m) array_like, optional
         Cross weight.
 
@@ -119,12 +114,9 @@ def solve_dare(
     DimensionError, NonFiniteError, DefinitenessError
         If the input is wrong.
     DetectabilityError
-        If there is no stabilising solution; the message names the mode, or the zero on
-        the unit circle.
-    InfeasibleError
-        If R is indefinite and the stabilising solution does not meet its conditions.
+        If a mode has no stabilising solution; the message names it.
     NumericalError
-        If no route reaches a stable closed loop, a relative residual of 1e-12 and an
+        If neither route reaches a stable closed loop, a relative residual of 1e-12 and an
         estimated error of 1e-3.
 
     Examples
@@ -139,71 +131,19 @@ def solve_dare(
     [1.618034, 2.732051, 6.872983]
     """
     equations, lead = _stack_arguments(A, B, Q, R, S)
-    parts = [] if lead else equations.independent_parts()
     with np.errstate(all="ignore"):  # anything not finite is refused
-        if len(parts) < 2:
-            return _solve_stack(equations, lead)
-        return _join_parts(equations, parts)
-
-
-def _join_parts(equations: Equations, parts: list[tuple[IntArray, IntArray]]) -> DareSolution:
-    """Solve the parts of an equation, equal ones once, and put their solutions side by side."""
-    X, gain = np.zeros_like(equations.Q[0]), np.zeros_like(equations.B[0].T)
-    solved: dict[tuple[bytes, ...], DareSolution] = {}
-    joined = []
-    for x, u in parts:
-        part = equations.part(x, u)
-        key = tuple(getattr(part, name).tobytes() for name in "ABQRS")
-        if key not in solved:
-            solved[key] = _solve_stack(part, ())
-        X[np.ix_(x, x)], gain[np.ix_(u, x)] = solved[key].X, solved[key].gain_feedback
-        joined.append(solved[key])
-    return DareSolution(
-        X=read_only(X),
-        gain_feedback=read_only(gain),
-        poles=read_only(np.concatenate([part.poles for part in joined])),
-        residuals=read_only(np.max([part.residuals for part in joined], axis=0)),
-        errors=read_only(np.max([part.errors for part in joined], axis=0)),
-        negative=read_only(np.sum([part.negative for part in joined], axis=0)),
-        iterations=max(part.iterations for part in joined),
-        route=max((part.route for part in joined), key=len),
-    )
-
-
-def _solve_stack(equations: Equations, lead: tuple[int, ...]) -> DareSolution:
-    """Solve a stack, verify each answer, and put the leading dimensions back."""
-    balanced, factors, units = equations.scaled()
-    best, route = _try_routes(balanced)
-    radius = np.abs(best.poles).max(axis=-1)
-
-    solved = (radius < 1) & (best.residuals <= RESIDUAL_LIMIT) & (best.errors <= ERROR_LIMIT)
-    near = np.flatnonzero(solved & (1 - radius <= _NEAR))
-    doubtful = balanced.take(near).contractions(best.X[near], best.gains[near])
-    solved[near] = doubtful <= _CONTRACTION
-    for i in np.flatnonzero(~solved):
-        try:
-            require_stabilising(balanced, int(i), _prefix(int(i), lead))
-        except ProblemError:
-            raise
-        except ValueError:  # numbers out of range (LinAlgError): refused without a reason
-            continue
-    if not solved.all():
-        _refuse(int(np.flatnonzero(~solved)[0]), lead, best)
-    X = best.X
-    weights = balanced.weights(X)
-    negative = np.sum(np.linalg.eigvalsh(weights) < 0, axis=-1)
-    _require_saddle(balanced.R, X, negative, lead)
-
+        balanced, factors, units = equations.scaled()
+        best, route, steps = _try_routes(balanced)
+        _require_solved(balanced, best, lead)
     column, row = units[:, None, :], units[:, :, None]
     n, m = equations.B.shape[-2:]
     return DareSolution(
-        X=frozen_copy((X / column / row * factors[:, None, None]).reshape(*lead, n, n)),
+        X=frozen_copy((best.X / column / row * factors[:, None, None]).reshape(*lead, n, n)),
         gain_feedback=frozen_copy((best.gains / column).reshape(*lead, m, n)),
         poles=read_only(best.poles.reshape(*lead, n)),
         residuals=frozen_copy(best.residuals.reshape(lead)),
         errors=frozen_copy(best.errors.reshape(lead)),
-        negative=read_only(negative.reshape(lead)),
-        iterations=int(np.max(best.steps, initial=0)),
+        iterations=steps,
         route=route,
     )
 
@@ -236,34 +176,44 @@ def _stack_arguments(A: Any, B: Any, Q: Any, R: Any, S: Any) -> tuple[Equations,
     return Equations(**stacks), lead
 
 
-def _try_routes(equations: Equations) -> tuple[Solutions, str]:
-    """Try the routes in order, each on the equations that are still unsolved; keep the best.
+def _try_routes(equations: Equations) -> tuple[Solutions, str, int]:
+    """Double, and take the Schur form where it leaves less; return the route and the doublings."""
+    X, steps = solve_by_doubling(equations)
+    best, route = _refined(equations, X), "doubling"
+    poor = np.flatnonzero(~((best.residuals <= RESIDUAL_LIMIT) & (best.errors <= _SATISFIED)))
+    if poor.size:
+        unsolved = equations.take(poor)
+        trial = _refined(unsolved, solve_by_schur(unsolved))
+        better = trial.residuals < best.residuals[poor]
+        best.replace_rows(poor[better], trial, better)
+        route = "schur" if better.any() else route
+    return best, route, steps
 
-    Return the names of the routes that solved something as well, or of all.
-    """
-    count, (n, m) = len(equations.A), equations.B.shape[-2:]
-    best = Solutions(
-        X=np.full((count, n, n), np.nan),
-        gains=np.full((count, m, n), np.nan),
-        poles=np.full((count, n), np.nan, dtype=np.complex128),
-        residuals=np.full(count, np.inf),
-        errors=np.full(count, np.inf),
-        steps=np.zeros(count, dtype=np.int64),
-    )
-    names, pending = [], np.arange(count)
-    for route, solve in ROUTES:
-        unsolved = equations.take(pending)
-        trial = unsolved.refine(*solve(unsolved))
-        stable = np.abs(trial.poles).max(axis=-1) < 1
-        trial = replace(trial, residuals=np.where(stable, trial.residuals, np.inf))
-        better = trial.residuals < best.residuals[pending]
-        best.replace_rows(pending[better], trial, better)
-        satisfied = (trial.residuals <= RESIDUAL_LIMIT) & (trial.errors <= _SATISFIED)
-        names += [route] if satisfied.any() else []
-        pending = pending[~satisfied]
-        if not pending.size:
-            break
-    return best, ", ".join(names or [route for route, _ in ROUTES])
+
+def _refined(equations: Equations, X: FloatArray) -> Solutions:
+    """Refine X, and give those without a stable closed loop an infinite residual."""
+    solutions = equations.refine(X)
+    stable = np.abs(solutions.poles).max(axis=-1) < 1
+    return replace(solutions, residuals=np.where(stable, solutions.residuals, np.inf))
+
+
+def _require_solved(equations: Equations, best: Solutions, lead: tuple[int, ...]) -> None:
+    """Raise if an equation of a stack is not solved, for a reason that can be named or without."""
+    radius = np.abs(best.poles).max(axis=-1)
+    solved = (radius < 1) & (best.residuals <= RESIDUAL_LIMIT) & (best.errors <= ERROR_LIMIT)
+    near = np.flatnonzero(solved & (1 - radius <= _NEAR))
+    doubtful = equations.take(near).contractions(best.X[near], best.gains[near])
+    solved[near] = doubtful <= _CONTRACTION
+    unsolved = np.flatnonzero(~solved)
+    for i in unsolved:
+        try:
+            require_stabilising(equations, int(i), _prefix(int(i), lead))
+        except ProblemError:
+            raise
+        except ValueError:  # numbers out of range (LinAlgError): refused without a reason
+            continue
+    if unsolved.size:
+        _refuse(int(unsolved[0]), lead, best)
 
 
 def _prefix(index: int, lead: tuple[int, ...]) -> str:
@@ -287,40 +237,14 @@ def _refuse(index: int, lead: tuple[int, ...], best: Solutions) -> None:
         )
     raise NumericalError(
         f"{_prefix(index, lead)}the Riccati equation was not solved: "
-        f"{', '.join(route for route, _ in ROUTES)} gave {outcome}; expected a stable "
-        f"closed loop, a residual below {RESIDUAL_LIMIT:g} and an estimated error below "
+        f"doubling and the Schur form gave {outcome}; expected a stable closed loop, "
+        f" a residual below {RESIDUAL_LIMIT:g} and an estimated error below "
         f"{ERROR_LIMIT:g}, and a pole further from the unit circle than rounding can move it. "
         "There may be no stabilising solution; look for modes near the unit circle that are barely "
         "driven or seen.",
         status="residual",
         residual=residual if stable else None,
     )
-
-
-def _require_saddle(
-    R: FloatArray, X: FloatArray, negative: IntArray, lead: tuple[int, ...]
-) -> None:
-    """Check the existence conditions of the H-infinity problem where R is indefinite."""
-    values = np.linalg.eigvalsh(R)
-    expected = np.sum(values < -1e-12 * np.abs(values).max(axis=-1, keepdims=True), axis=-1)
-    for i in np.flatnonzero(expected > 0):
-        spectrum = np.linalg.eigvalsh(X[i])
-        if negative[i] != expected[i]:
-            wrong = (
-                f"R + B'XB must have as many negative eigenvalues as R, {expected[i]}; got "
-                f"{negative[i]}."
-            )
-        elif spectrum[0] < -1e-9 * max(abs(spectrum[-1]), abs(spectrum[0])):
-            wrong = (
-                "X must be positive semidefinite, as R is indefinite; got an eigenvalue of "
-                f"{spectrum[0]:.3g}."
-            )
-        else:
-            continue
-        raise InfeasibleError(
-            f"{_prefix(int(i), lead)}{wrong} The level that R holds cannot be met: try a larger "
-            "one."
-        )
 
 
 def unstable_hidden_mode(
@@ -380,14 +304,6 @@ def require_stabilising(equations: Equations, index: int, name: str = "") -> Non
                 "has no weight, so there is no stabilising solution. Add a small weight on it.",
                 eigenvalue=hidden,
             )
-    zero = _unit_circle_zero(A, B, Q, R, S, name)
-    if zero is not None:
-        raise DetectabilityError(
-            f"{name}to rounding, the equation has a zero on the unit circle, at {zero:.6g}: there "
-            "its weights leave an oscillation free of cost, so there is no stabilising solution. "
-            "Add a small weight.",
-            eigenvalue=zero,
-        )
 
 
 def weight_root(weight: FloatArray) -> FloatArray:
@@ -396,30 +312,3 @@ def weight_root(weight: FloatArray) -> FloatArray:
     size = np.abs(values)
     size = np.where(size > 1e-14 * size.max(initial=0.0), size, 0.0)  # a root doubles its digits
     return np.asarray(vectors * np.sqrt(size), dtype=np.float64)
-
-
-def _unit_circle_zero(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray, name: str
-) -> complex | None:
-    """Eigenvalue on the unit circle of the extended symplectic pencil, or None."""
-    (n, m), zero = B.shape, np.zeros
-    weight = max(np.abs(Q).max(), np.abs(R).max(), np.abs(S).max(), 1e-300)
-    Q, R, S = Q / weight, R / weight, S / weight
-    M = np.block([[A, zero((n, n)), B], [-Q, np.eye(n), -S], [S.T, zero((m, n)), R]])
-    N = block_diag(np.eye(n), np.vstack([A.T, -B.T]), zero((0, m)))
-    size = float(np.linalg.norm(M, 2))
-    elsewhere = M - _ELSEWHERE * N
-    elsewhere = elsewhere / np.maximum(np.abs(elsewhere).max(axis=1, keepdims=True), 1e-300)
-    if np.linalg.svd(elsewhere, compute_uv=False)[-1] < _ROUNDING:
-        raise DefinitenessError(
-            f"{name}R + B'XB must not be singular; it is, whatever X: some input has neither a "
-            "weight nor an effect that Q sees. Give R or Q a small weight there."
-        )
-    values = eigvals(M, N)
-    for value in values[np.isfinite(values)]:
-        if abs(abs(value) - 1) > _CIRCLE:
-            continue
-        on_circle = value / abs(value)
-        if np.linalg.svd(M - on_circle * N, compute_uv=False)[-1] < _ROUNDING * size:
-            return complex(on_circle)
-    return None

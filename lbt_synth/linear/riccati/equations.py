@@ -1,14 +1,11 @@
-"""Many Riccati equations as arrays: scaling, routes to a solution, residuals and Newton steps.
+"""Many Riccati equations as arrays: scaling, two routes to X, residuals and Newton steps.
 
-A route takes a stack of equations and returns an approximate X and a count of steps for each;
-X is not finite where the route failed. The caller refines and verifies it.
+X is not finite where a route failed. The caller refines and verifies it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import TypeAlias
 
 import numpy as np
 from scipy.linalg import solve_discrete_are
@@ -36,14 +33,13 @@ _ROUNDING = 4 * np.finfo(float).eps
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solutions:
-    """Answers to N equations, found by some route and refined."""
+    """Refined answers to N equations."""
 
     X: FloatArray
     gains: FloatArray
     poles: ComplexArray
     residuals: FloatArray  # relative
     errors: FloatArray  # of X, estimated
-    steps: IntArray  # doublings
 
     def replace_rows(self, rows: IntArray, other: Solutions, chosen: BoolArray) -> None:
         """Put the chosen answers of others in these rows."""
@@ -64,29 +60,6 @@ class Equations:
     def take(self, which: IntArray) -> Equations:
         """Return some of the equations."""
         return Equations(**{name: getattr(self, name)[which] for name in "ABQRS"})
-
-    def independent_parts(self) -> list[tuple[IntArray, IntArray]]:
-        """Return the states and inputs of parts of the first equation that share none.
-
-        The parts of modes that do not mix are much smaller than the whole; it is the only part
-        where a part has no states or no inputs.
-        """
-        A, B, Q, R, S = (getattr(self, name)[0] for name in "ABQRS")
-        entry = (B != 0) | (S != 0)
-        links = np.block([[(A != 0) | (Q != 0), entry], [entry.T, R != 0]])
-        label = component_labels(links)
-        x, u = np.split(label, [len(A)])
-        parts = [(np.flatnonzero(x == i), np.flatnonzero(u == i)) for i in range(np.max(label) + 1)]
-        complete = all(states.size and inputs.size for states, inputs in parts)
-        return parts if complete else [(np.arange(len(x)), np.arange(len(u)))]
-
-    def part(self, states: IntArray, inputs: IntArray) -> Equations:
-        """Return the first equation of some states and inputs."""
-        x, u = states, inputs
-        places = {"A": (x, x), "B": (x, u), "Q": (x, x), "R": (u, u), "S": (x, u)}
-        return Equations(
-            **{name: getattr(self, name)[0][np.ix_(*at)][None] for name, at in places.items()}
-        )
 
     def scaled(self) -> tuple[Equations, FloatArray, FloatArray]:
         """Divide the weights by factors (N,), the states by units (N, n), all powers of two.
@@ -194,7 +167,7 @@ class Equations:
         root = np.sqrt(np.abs(np.diagonal(weight, axis1=-2, axis2=-1)))
         return np.asarray((np.abs(transpose(M)) @ root[..., None])[..., 0] ** 2)
 
-    def refine(self, X: FloatArray, steps: IntArray) -> Solutions:
+    def refine(self, X: FloatArray) -> Solutions:
         """Take Newton steps while they lower the residual.
 
         An equation whose closed loop is not stable is left alone. The next Newton step,
@@ -218,28 +191,20 @@ class Equations:
                 residual[done], size[done] = new_residual[better], new_size[better]
                 active = active[better & (change > _SETTLED)]
             poles = self.poles(gains)
-        return Solutions(X=X, gains=gains, poles=poles, residuals=size, errors=error, steps=steps)
+        return Solutions(X=X, gains=gains, poles=poles, residuals=size, errors=error)
 
 
-Route: TypeAlias = Callable[[Equations], tuple[FloatArray, IntArray]]
+def solve_by_doubling(equations: Equations) -> tuple[FloatArray, int]:
+    """Solve by structured doubling, which must invert R; return the most steps made as well.
 
-
-def solve_by_doubling(equations: Equations) -> tuple[FloatArray, IntArray]:
-    """Solve by structured doubling, which needs an R that can be inverted."""
-    nothing = np.zeros_like(equations.Q)
-    return _double_from(equations, nothing, _invertible(equations.R))
-
-
-def solve_by_shifted_doubling(equations: Equations) -> tuple[FloatArray, IntArray]:
-    """Solve by doubling for the excess over some steps of the Riccati recursion.
-
-    With ``X = P + Y`` the equation of Y has the weight ``R + B'PB``, which can be
-    inverted although R cannot, and for a positive semidefinite problem its constant
-    term is the next step of the recursion less P, again positive semidefinite.
+    Where R cannot be inverted, the doubling is for the excess over some steps P of the Riccati
+    recursion: with ``X = P + Y`` the equation of Y has the weight ``R + B'PB``, and for a positive
+    semidefinite problem its constant term is the next step of the recursion less P, again positive
+    semidefinite.
     """
     P = np.zeros_like(equations.Q)
-    ready = np.zeros(len(P), dtype=bool)  # without a shift it is the first route
-    for _ in range(equations.A.shape[-1] + 1):
+    ready = _invertible(equations.R)
+    for _ in range(equations.A.shape[-1]):
         if np.all(ready):
             break
         weights = equations.weights(P)
@@ -254,10 +219,23 @@ def solve_by_shifted_doubling(equations: Equations) -> tuple[FloatArray, IntArra
         )
         P = np.where(ready[:, None, None], P, step)
         ready = ready | _invertible(equations.weights(P))
-    return _double_from(equations, P, ready)
+    X, which = np.full_like(equations.Q, np.nan), np.flatnonzero(ready)
+    usable, P = equations.take(which), P[which]
+    A, B, PA = usable.A, usable.B, P @ usable.A
+    R, S = usable.weights(P), usable.S + transpose(PA) @ B
+    Q = symmetrise(usable.Q + transpose(A) @ PA - P)
+    feedback = solve_stack(R, np.concatenate([transpose(S), transpose(B)], axis=-1))
+    n = A.shape[-1]
+    Y, steps = doubling(
+        A - B @ feedback[..., :n],
+        symmetrise(B @ feedback[..., n:]),
+        symmetrise(Q - S @ feedback[..., :n]),
+    )
+    X[which] = P + Y
+    return X, steps
 
 
-def solve_by_schur(equations: Equations) -> tuple[FloatArray, IntArray]:
+def solve_by_schur(equations: Equations) -> FloatArray:
     """Solve one by one by the ordered generalised Schur form of the extended pencil (scipy)."""
     X = np.full_like(equations.Q, np.nan)
     for i in range(len(X)):
@@ -266,14 +244,7 @@ def solve_by_schur(equations: Equations) -> tuple[FloatArray, IntArray]:
             X[i] = symmetrise(solve_discrete_are(A, B, Q, R, s=S))
         except (np.linalg.LinAlgError, ValueError):
             continue
-    return X, np.zeros(len(X), dtype=np.int64)
-
-
-ROUTES: tuple[tuple[str, Route], ...] = (
-    ("doubling", solve_by_doubling),
-    ("shifted doubling", solve_by_shifted_doubling),
-    ("schur", solve_by_schur),
-)
+    return X
 
 
 def _invertible(R: FloatArray) -> BoolArray:
@@ -284,55 +255,31 @@ def _invertible(R: FloatArray) -> BoolArray:
     return np.asarray(finite & (least > _WELL_CONDITIONED * largest), dtype=np.bool_)
 
 
-def _double_from(
-    equations: Equations, P: FloatArray, usable: BoolArray
-) -> tuple[FloatArray, IntArray]:
-    """Solve the usable equations for ``X - P`` by doubling; nan for the others."""
-    X = np.full_like(equations.Q, np.nan)
-    steps = np.zeros(len(X), dtype=np.int64)
-    which = np.flatnonzero(usable)
-    if which.size == 0:
-        return X, steps
-    part, P = equations.take(which), P[which]
-    A, B = part.A, part.B
-    PA = P @ A
-    R, S = part.weights(P), part.S + transpose(PA) @ B
-    Q = symmetrise(part.Q + transpose(A) @ PA - P)
-    feedback = solve_stack(R, np.concatenate([transpose(S), transpose(B)], axis=-1))
-    n = A.shape[-1]
-    Y, steps[which] = doubling(
-        A - B @ feedback[..., :n],
-        symmetrise(B @ feedback[..., n:]),
-        symmetrise(Q - S @ feedback[..., :n]),
-    )
-    X[which] = P + Y
-    return X, steps
-
-
-def doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, IntArray]:
+def doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, int]:
     """Iterate ``X = A' X (I + G X)^-1 A + H`` to its stabilising X, for arrays (N, n, n).
 
     E. K.-W. Chu, H.-Y. Fan, W.-W. Lin, C.-S. Wang, Int. J. Control 77, 767 (2004),
     doi:10.1080/00207170410001714988. After j steps the iterate holds 2^j steps of the Riccati
     recursion; the convergence is quadratic. G need not be semidefinite. Return X, nan where the
-    iteration did not converge, and the steps made (N,). An equation leaves the stack as soon as it
-    has converged or diverged. The parts of one whose states do not act on one another are apart.
+    iteration did not converge, and the most steps made. States that do not act on one another,
+    such as those of two axes, are iterated apart.
     """
     label = component_labels(np.any((A != 0) | (G != 0) | (H != 0), axis=0))
-    solutions, steps = np.zeros_like(H), np.zeros(len(A), dtype=np.int64)
-    for part in range(np.max(label, initial=-1) + 1):
-        block = np.ix_(range(len(A)), label == part, label == part)
-        solutions[block], made = _doubling_of_part(A[block], G[block], H[block])
-        steps = np.maximum(steps, made)
+    solutions, steps = np.zeros_like(H), 0
+    for number in range(np.max(label, initial=-1) + 1):
+        block = np.ix_(range(len(A)), label == number, label == number)
+        solutions[block], made = _doubling_of_block(A[block], G[block], H[block])
+        steps = max(steps, made)
     return solutions, steps
 
 
-def _doubling_of_part(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, IntArray]:
-    X, going, n = H, np.arange(len(A)), A.shape[-1]
-    one = np.eye(n)
-    solutions, steps = np.full_like(H, np.nan), np.zeros(len(A), dtype=np.int64)
+def _doubling_of_block(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, int]:
+    """Double equations until each has converged or diverged, when it leaves the stack."""
+    X, going, n, step = H, np.arange(len(A)), A.shape[-1], 0
+    one, solutions = np.eye(n), np.full_like(H, np.nan)
     with np.errstate(all="ignore"):
-        for step in range(1, _MOST_DOUBLINGS + 1):
+        while going.size and step < _MOST_DOUBLINGS:
+            step += 1
             solved = solve_stack(one + G @ X, np.concatenate([A, G], axis=-1))
             WA, WG = solved[..., :n], solved[..., n:]
             increment = symmetrise(transpose(A) @ X @ WA)
@@ -341,12 +288,7 @@ def _doubling_of_part(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[Floa
             A = A @ WA
             size = frobenius_norms(X)
             still = frobenius_norms(increment) <= _ROUNDING * size
-            keep = ~still & np.isfinite(size)
-            steps[going] = step
-            if not keep.all():
-                converged = still & np.isfinite(size)
-                solutions[going[converged]] = X[converged]
-                going, A, G, X = going[keep], A[keep], G[keep], X[keep]
-                if going.size == 0:
-                    break
-    return solutions, steps
+            converged, keep = still & np.isfinite(size), ~still & np.isfinite(size)
+            solutions[going[converged]] = X[converged]
+            going, A, G, X = going[keep], A[keep], G[keep], X[keep]
+    return solutions, step

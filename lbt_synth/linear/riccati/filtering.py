@@ -295,7 +295,7 @@ class GammaEquation:
         residual = relative_distance(self.least[0] + X, P[0])
         if slack <= 0:
             return LevelTrial(slack=slack)
-        return LevelTrial(slack=slack, P=P, residual=residual, iterations=int(steps[0]))
+        return LevelTrial(slack=slack, P=P, residual=residual, iterations=steps)
 
     def solution(self, gamma: float, trial: LevelTrial) -> FilterRiccati | None:
         """Refine a trial and form its gains; None if it is no filter."""
@@ -331,12 +331,8 @@ class GammaEquation:
             R=block_diag(D @ D.T, -np.eye(len(self.problem.L)))[None],
             S=np.zeros((1, len(A), len(outputs))),
         )
-        out, residual = np.zeros_like(P), 0.0
-        for x, u in equation.independent_parts():
-            block = np.ix_(np.zeros(1, dtype=np.int64), x, x)
-            refined = equation.part(x, u).refine(P[block], np.zeros(1, dtype=np.int64))
-            out[block], residual = refined.X, max(residual, float(refined.residuals[0]))
-        return out, residual
+        refined = equation.refine(P)
+        return refined.X, float(refined.residuals[0])
 
 
 def _central_gains(problem: EstimationProblem, t: int, gamma: float, P: FloatArray) -> FloatArray:

@@ -17,7 +17,7 @@ from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.resonance_spectrum import coefficients, section_drives
 from lbt_synth.models.sensor_suite import WHOLE, Motions, checked_motions, period_frames
-from lbt_synth.models.spectra import ARModel, padded_coefficients
+from lbt_synth.models.spectra import ARModel
 from lbt_synth.models.vibration import Vibration, checked_direction
 from lbt_synth.validation import FloatArray, set_fields
 
@@ -34,10 +34,10 @@ class PlantParts:
 
     def __post_init__(self) -> None:
         n, rate = self.hardware.modes, self.hardware.frame_rate_hz
-        if len(self.turbulence) != n:
+        if len(self.turbulence) != n or any(m.coefficients.ndim > 1 for m in self.turbulence):
             raise DimensionError(
                 f"turbulence must be one ARModel, or one per mode ({n}); got "
-                f"{len(self.turbulence)}."
+                f"{sum(model.count for model in self.turbulence)}."
             )
         for model in self.turbulence:
             if not np.isclose(model.frame_rate_hz, rate, rtol=1e-9):
@@ -205,7 +205,7 @@ def _own_matrices(parts: PlantParts) -> PlantMatrices:
     """Return the matrices of the plant of the loop's own sensor."""
     hardware, p, n = parts.hardware, len(parts.vibrations), parts.hardware.modes
     lines, feeds, drives = _section_states(parts)
-    air = padded_coefficients(parts.turbulence)
+    air = ARModel.stack(parts.turbulence).coefficients
 
     tur = 2 * parts.sections  # where parts of the state begin, and end
     tot, size = tur + air.size, parts.size

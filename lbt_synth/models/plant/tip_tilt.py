@@ -386,11 +386,13 @@ def tip_tilt_plant(
             "vibrations is empty; expected at least one Vibration, or None (leave it out) "
             "for a plant without vibrations."
         )
-    models = (turbulence,) * hardware.modes if isinstance(turbulence, ARModel) else turbulence
+    models = turbulence.separate() if isinstance(turbulence, ARModel) else tuple(turbulence)
+    if isinstance(turbulence, ARModel) and turbulence.coefficients.ndim == 1:
+        models *= hardware.modes
     return assemble(
         PlantParts(
             hardware=hardware,
-            turbulence=tuple(models),
+            turbulence=models,
             vibrations=tuple(vibrations or ()),
             noise_factor=noise_factor(noise_nm, hardware.n_measurements),
         )

@@ -12,14 +12,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from math import factorial
 from typing import Any
 
 import numpy as np
-from numpy.polynomial import chebyshev
-from numpy.polynomial.polynomial import polyval
+from numpy.polynomial.chebyshev import chebpts1
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline, PPoly
+from scipy.interpolate import BarycentricInterpolator, CubicSpline, PPoly
 from scipy.special import j0, j1
 
 from lbt_synth.errors import DimensionError, ProblemError
@@ -36,9 +34,7 @@ from lbt_synth.validation import (
 
 ARCSEC_RAD = np.pi / 180 / 3600
 LOWEST = 1e-4  # spectra are constant below this frequency, in units of V / D
-TAIL = np.linspace(12, 120, 400)  # last knots of spectra, in these units
 _AT_ONCE = 10  # frequencies of a spectrum that are integrated together, in the cache
-_SERIES = [(-1) ** k / (factorial(k) * factorial(k + 2)) for k in range(8)]  # of J_2
 _VON_KARMAN = 0.0228956  # phase spectrum constant, Noll's 0.023 to more digits
 
 
@@ -126,9 +122,8 @@ class Atmosphere:
             raise ProblemError(f"frequency_hz must be at least 0; got {np.min(frequency)}.")
         crossing_s = self.diameter_m / self.wind_speed_m_s
         with np.errstate(divide="ignore"):
-            density = tilt_spline(self.scale_ratio, self.obstruction)(
-                np.log(frequency * crossing_s)
-            )
+            x = np.log(frequency * crossing_s)
+        density = _log_density(tilt_spline(self.scale_ratio, self.obstruction), x)
         return np.asarray(tilt_strength_nm2(self) * crossing_s * np.exp(density))
 
 
@@ -159,13 +154,8 @@ def _filtered_spectrum(scale_ratio: float, eps: float, f: FloatArray) -> FloatAr
 
 
 def _bessel_j2(x: FloatArray) -> FloatArray:
-    """J_2, by its recurrence where that loses no digits, else by its series."""
-    out = np.empty_like(x)
-    large = x > 1
-    out[large] = 2 * j1(x[large]) / x[large] - j0(x[large])
-    square = x[~large] ** 2 / 4
-    out[~large] = square * polyval(square, _SERIES)
-    return out
+    """J_2 to 2e-9, by its recurrence where that loses few digits, else by its series."""
+    return np.where(x < 0.03, x**2 / 8 * (1 - x**2 / 12), 2 * j1(x) / x - j0(x))
 
 
 @lru_cache(maxsize=2)
@@ -182,30 +172,23 @@ def tilt_variance(scale_ratio: float, obstruction: float) -> float:
     return float(np.sum(2 * np.pi * f * w * _filtered_spectrum(scale_ratio, obstruction, f)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LogSpline:
-    """Logarithm of a tilt spectrum over the logarithm of frequency, as a cubic spline.
+def _log_density(spline: PPoly, x: FloatArray) -> FloatArray:
+    """Logarithms of a tilt spectrum at logarithms of frequencies.
 
-    It is constant below its first knot, and the power law f^(-17/3) of tilt beyond the last.
+    It is constant below the first knot, and the power law f^(-17/3) of tilt beyond the last.
     """
-
-    spline: PPoly
-
-    def __call__(self, x: FloatArray) -> FloatArray:
-        """Return the logarithms of the spectrum at logarithms of frequencies."""
-        first, last = self.spline.x[[0, -1]]
-        values = self.spline(np.clip(x, first, last))
-        return np.asarray(values - 17 / 3 * np.maximum(x - last, 0))
+    first, last = spline.x[[0, -1]]
+    return np.asarray(spline(np.clip(x, first, last)) - 17 / 3 * np.maximum(x - last, 0))
 
 
 @lru_cache(maxsize=128)
-def tilt_spline(scale_ratio: float, obstruction: float) -> LogSpline:
-    """Temporal spectrum of one axis for a unit strength, over frequency in units of V / D.
+def tilt_spline(scale_ratio: float, obstruction: float) -> PPoly:
+    """Logarithm of a temporal spectrum of unit strength over that of frequency in units of V / D.
 
     ``S(f) = (4 / V) int_0^inf Phi(f/V, f_y) df_y`` (one-sided).
     """
     slow = np.geomspace(LOWEST, 0.3, 120, endpoint=False)
-    fast = np.concatenate([np.linspace(0.3, 12, 480, endpoint=False), TAIL])
+    fast = np.concatenate([np.linspace(0.3, 12, 480, endpoint=False), np.linspace(12, 120, 400)])
     density = []
     for frequency, is_flat in ((slow, False), (fast, True)):
         fy, wy = _spatial_panels(is_flat=is_flat)
@@ -213,7 +196,7 @@ def tilt_spline(scale_ratio: float, obstruction: float) -> LogSpline:
             spectrum = _filtered_spectrum(scale_ratio, obstruction, np.hypot(f[:, None], fy))
             density.append(4 * spectrum @ wy)
     knots = np.log(np.concatenate([slow, fast]))
-    return LogSpline(spline=CubicSpline(knots, np.log(np.concatenate(density))))
+    return CubicSpline(knots, np.log(np.concatenate(density)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -298,55 +281,34 @@ class FrozenFlows:
         if frequency.ndim != 1 or np.any(frequency <= 0):
             raise ProblemError("frequency_hz must be a list of frequencies above 0 Hz.")
         air = self.atmosphere
-        crossing_s = air.diameter_m / self.wind_speed_m_s
+        crossing_s, scale_ratio = air.diameter_m / self.wind_speed_m_s, np.zeros(len(self))
+        if self.outer_scale_m is not None:
+            scale_ratio = air.diameter_m / self.outer_scale_m
         # pairs as complex numbers, which are sorted several times faster
-        unique, which = np.unique(crossing_s + 1j * self._scale_ratio, return_inverse=True)
+        unique, which = np.unique(crossing_s + 1j * scale_ratio, return_inverse=True)
         x = np.log(frequency) + np.log(unique.real[:, None])
-        values = np.empty(x.shape)
-        ratios = np.unique(unique.imag)
-        if len(ratios) <= _TERMS:  # a polynomial needs as many tables
-            for ratio in ratios:
-                rows = unique.imag == ratio
-                values[rows] = tilt_spline(float(ratio), air.obstruction)(x[rows])
-        else:
-            _interpolate_over_scales(x, unique.imag, air.obstruction, values)
-        return np.exp(values), which.reshape(-1), self._strength * crossing_s
-
-    @property
-    def _strength(self) -> FloatArray:
-        seeing = self.seeing_arcsec / self.atmosphere.seeing_arcsec
-        return np.asarray(tilt_strength_nm2(self.atmosphere) * seeing ** (5 / 3))
-
-    @property
-    def _scale_ratio(self) -> FloatArray:
-        if self.outer_scale_m is None:
-            return np.zeros(len(self))
-        return np.asarray(self.atmosphere.diameter_m / self.outer_scale_m)
+        values, ratios = np.empty(x.shape), np.unique(unique.imag)
+        # a polynomial over an octave needs as many tables
+        spline_of = tilt_spline if len(ratios) <= _TERMS else _interpolated_spline
+        for ratio in ratios:
+            rows = unique.imag == ratio
+            values[rows] = _log_density(spline_of(float(ratio), air.obstruction), x[rows])
+        strength = tilt_strength_nm2(air) * (self.seeing_arcsec / air.seeing_arcsec) ** (5 / 3)
+        return np.exp(values), which.reshape(-1), strength * crossing_s
 
 
-def _interpolate_over_scales(
-    x: FloatArray, scale_ratio: FloatArray, obstruction: float, values: FloatArray
-) -> None:
-    """Fill in the logarithms of spectra that each have their own outer scale."""
-    octave = np.floor(np.log2(scale_ratio))
-    for number in np.unique(octave):
-        knots, coefficients = _octave_splines(int(number), obstruction)
-        rows = np.flatnonzero(octave == number)
-        place = 2 * (np.log2(scale_ratio[rows]) - number) - 1
-        for row, terms in zip(rows, chebyshev.chebvander(place, _TERMS - 1), strict=True):
-            spline = PPoly(coefficients @ terms, knots)
-            values[row] = LogSpline(spline=spline)(x[row])
+def _interpolated_spline(scale_ratio: float, obstruction: float) -> PPoly:
+    """Return the spline of one of many outer scales."""
+    place = float(np.log2(scale_ratio))
+    knots, polynomial = _octave_of_splines(int(np.floor(place)), obstruction)
+    return PPoly(polynomial(place), knots)
 
 
 @lru_cache(maxsize=16)
-def _octave_splines(octave: int, obstruction: float) -> tuple[FloatArray, FloatArray]:
-    """Knots, and spline coefficients (4, intervals, terms), over one octave of outer scales.
-
-    The coefficients are polynomials in the logarithm of the diameter over the outer scale.
-    """
-    nodes = chebyshev.chebpts1(_TERMS)
-    ratios = 2.0 ** (octave + (nodes + 1) / 2)
-    splines = [tilt_spline(float(ratio), obstruction).spline for ratio in ratios]
-    inverse = np.linalg.inv(chebyshev.chebvander(nodes, _TERMS - 1))
-    stacked = np.stack([spline.c for spline in splines], axis=-1)
-    return splines[0].x, stacked @ inverse.T
+def _octave_of_splines(
+    octave: int, obstruction: float
+) -> tuple[FloatArray, BarycentricInterpolator]:
+    """Knots, and the polynomial of spline coefficients over an octave of D / L0, in its log2."""
+    places = octave + (chebpts1(_TERMS) + 1) / 2
+    splines = [tilt_spline(2.0 ** float(place), obstruction) for place in places]
+    return splines[0].x, BarycentricInterpolator(places, [s.c for s in splines], rng=0)

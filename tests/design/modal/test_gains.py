@@ -15,7 +15,7 @@ import lbt_synth as lbt
 from lbt_synth.design.modal import modal_gains, modal_gains_from_telemetry
 from lbt_synth.design.modal.gains import _minimise
 from lbt_synth.errors import DimensionError, NonFiniteError, NumericalError, ProblemError
-from lbt_synth.models import ARModel, ModalTurbulence, PositionLoop, TabulatedSpectrum
+from lbt_synth.models import ARModel, PositionLoop, TabulatedSpectrum
 
 
 def ar_series(coefficients, driving, modes, frames, rng):
@@ -44,7 +44,7 @@ def best_integrator(path, truth):
 
 def air_of(pole, driving, modes=1):
     """Return turbulence of first order, the same on all modes."""
-    return ModalTurbulence(
+    return ARModel(
         coefficients=np.full((modes, 1), pole),
         driving_rms_nm=np.full(modes, driving),
         frame_rate_hz=RATE,
@@ -75,7 +75,7 @@ def test_agrees_with_the_best_integrator_of_one_mode(air, delay, noise, sensor_g
 def test_residuals_are_those_of_the_loop():
     rng = np.random.default_rng(0)
     n = 200
-    air = ModalTurbulence(
+    air = ARModel(
         coefficients=rng.uniform(0.5, 0.999, (n, 1)),
         driving_rms_nm=10 ** rng.uniform(-1, 2, n),
         frame_rate_hz=RATE,
@@ -101,7 +101,7 @@ def test_a_quiet_sensor_is_limited_by_stability():
     assert np.allclose(gains.limit, 0.5)
     weak = modal_gains([slow], noise_nm=0.0, frame_rate_hz=RATE, margin=0.5, sensor_gain=1.25)
     assert weak.gains[0] == pytest.approx(0.4)
-    air = ModalTurbulence.of([slow, fast])
+    air = ARModel.stack([slow, fast])
     residuals = integrator_residuals(gains.gains, air, noise_nm=[0.0, 0.5])
     assert np.allclose(gains.rms_nm, residuals, rtol=1e-6)
 
@@ -136,7 +136,7 @@ def test_a_slow_mirror_has_its_own_gains(bandwidth, delay):
     assert (gains.hardware.mirror, gains.hardware.delay_frames) == (shell, delay)
     assert gains.gains[0] == pytest.approx(gain, rel=1e-5)
     assert gains.rms_nm[0] == pytest.approx(rms_nm, rel=1e-6)
-    air = ModalTurbulence.of([slow])
+    air = ARModel.stack([slow])
     residual = integrator_residuals(gains.gains, air, noise_nm=5.0, **known)
     assert residual == pytest.approx(gains.rms_nm, rel=1e-6)
     limit, unit = gains.limit[0] / (1 - 0.001), known | {"sensor_gain": 1.0, "noise_nm": 5.0}
@@ -180,14 +180,14 @@ def test_bad_input_is_refused(air):
         ([ar1], {"sensor_gain": 1e-6}, ProblemError, "leave room"),
         ([ar1], {"delay_frames": 0}, ProblemError, "delay_frames"),
         ([], {}, ProblemError, "one spectrum per mode"),
-        (ar1, {}, ProblemError, "one spectrum per mode"),
+        (800, {}, ProblemError, "one spectrum per mode"),
         ([ar1, 3], {}, ProblemError, "one spectrum per mode"),
         ([ar1, Odd()], {}, ProblemError, "that of mode 1 is not"),
         ([Lines()], {"noise_nm": 0}, NumericalError, "did not settle"),
         ([ar1], {"vibrations": {0: 3}}, ProblemError, "list of Vibration"),
         ([ar1], {"mirror": 3}, ProblemError, "PositionLoop"),
         ([ar1], rate, ProblemError, "sampled at the loop's 500 Hz; got 800 Hz"),
-        (ModalTurbulence.of([ar1]), rate, ProblemError, "the loop's 500 Hz; got 800 Hz"),
+        (ARModel.stack([ar1]), rate, ProblemError, "the loop's 500 Hz; got 800 Hz"),
         ([nothing], {"noise_nm": 0}, ProblemError, "got none in mode 0"),
     ):
         refused(lambda s=spectra, a=arguments: modal_gains(s, **(known | a)), error, words)
@@ -211,7 +211,7 @@ def test_telemetry_finds_what_the_models_say():
     rng = np.random.default_rng(1)
     n, frames, noise = 40, 60_000, 20.0
     poles, driving = np.linspace(0.9, 0.995, n), np.geomspace(3, 30, n)
-    air = ModalTurbulence(coefficients=poles[:, None], driving_rms_nm=driving, frame_rate_hz=RATE)
+    air = ARModel(coefficients=poles[:, None], driving_rms_nm=driving, frame_rate_hz=RATE)
     white = driving[:, None] * rng.standard_normal((n, frames))
     total = [lfilter([1], [1, -p], w) for p, w in zip(poles, white, strict=True)]
     path = {"delay_frames": 2.5, "sensor_gain": np.linspace(0.5, 1.0, n)}

@@ -22,7 +22,7 @@ import lbt_synth.design.modal.stack
 from lbt_synth.design.modal import MixedController, modal_filters, modal_residuals, reconstructor
 from lbt_synth.design.modal.stack import joining_check
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError, UnstableLoopError
-from lbt_synth.models import ARModel, ModalTurbulence, PositionLoop
+from lbt_synth.models import ARModel, PositionLoop
 
 
 @pytest.mark.parametrize(
@@ -54,7 +54,7 @@ def test_each_filter_is_that_of_kalman(delay, order, bandwidth):
             replace(line, rms_nm=line.rms_nm / np.sinc(line.frequency_hz / RATE))
             for line in mode_lines
         ]
-        truth = lbt.Truth(turbulence=air.model(i), vibrations=moving, noise_nm=noise[i])
+        truth = lbt.Truth(turbulence=air.take(i), vibrations=moving, noise_nm=noise[i])
         path = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=[[gain[i]]], **known)
         budget = lbt.residual_budget(lbt.close_loop(path, one.controller), truth)
         assert filters.rms_nm[i] == pytest.approx(budget.rms_nm, rel=1e-8)
@@ -62,7 +62,7 @@ def test_each_filter_is_that_of_kalman(delay, order, bandwidth):
 
 def test_equal_modes_share_a_design():
     air = some_air(2)
-    slow, fast = air.model(0), air.model(1)
+    slow, fast = air.take(0), air.take(1)
     known = {"noise_nm": [5.0, 5.0, 5.0, 6.0, 5.0], "vibrations": {4: LINE}}
     filters = modal_filters([slow, fast, slow, slow, slow], **known)
     assert filters.which.tolist() == [0, 1, 0, 2, 3]
@@ -97,7 +97,7 @@ def test_bad_filters_are_refused():
     def filters(noise_nm=1, **options):
         return lambda: modal_filters(air, noise_nm=noise_nm, **options)
 
-    made = modal_filters([air.model(0)], noise_nm=1.0)
+    made = modal_filters([air.take(0)], noise_nm=1.0)
     lines = "list of Vibration"
     require_refusals(
         [
@@ -127,7 +127,7 @@ def controller_of(kind, n, delay):
         return modal_filters(air, noise_nm=8.0, vibrations={0: [LINE]}, delay_frames=delay)
     if kind == "mixed":
         return MixedController(filter=tip_tilt_filter(delay), gains=gains, filtered=(3, 1))
-    two = modal_filters([air.model(0)] * 2, noise_nm=8.0, delay_frames=delay)
+    two = modal_filters([air.take(0)] * 2, noise_nm=8.0, delay_frames=delay)
     return MixedController(filter=two, gains=gains, filtered=(2, 0))
 
 
@@ -166,7 +166,7 @@ def test_exact_residuals_are_those_of_the_budget(kind, frame_means):
         return replace(line, rms_nm=line.rms_nm / held, direction=np.eye(n)[i])
 
     truth = lbt.Truth(
-        turbulence=[air.model(i) for i in range(n)],
+        turbulence=[air.take(i) for i in range(n)],
         vibrations=[along(2, HUM), along(3, LINE), along(3, HUM)],
         noise_nm=0.0,
     )
@@ -216,13 +216,13 @@ def test_loops_have_the_rate_of_their_filters():
     filters = modal_filters(air, noise_nm=10.0, delay_frames=3)
     mixed = MixedController(filter=filters, gains=[0.0, 0.0])
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=air.model(0), noise_nm=10.0, delay_frames=3
+        frame_rate_hz=RATE, turbulence=air.take(0), noise_nm=10.0, delay_frames=3
     )
     both = MixedController(filter=lbt.kalman(plant), gains=[0.0, 0.0, 0.2])
     slower, odd = lbt.LoopHardware(frame_rate_hz=400), "loop's 800 Hz; got 400 Hz"
     for controller in (filters, mixed, both):
         n = controller.n_modes
-        wide, other = [air.model(0)] * n, [slow] * n
+        wide, other = [air.take(0)] * n, [slow] * n
 
         def residuals(air=wide, controller=controller, **options):
             return modal_residuals(controller, air, noise_nm=10.0, **options)
@@ -249,7 +249,7 @@ def test_a_process_that_is_all_but_a_walk_leaves_what_a_walk_leaves():
     g, v, n = 0.5, 10.0, 5.0
     walk = np.sqrt((1 + g) / ((1 - g) * ((1 + g) ** 2 - 1)) * (v**2 + g**2 * n**2))
     for distance in (1e-7, 1e-12, 1e-15):
-        air = ModalTurbulence(
+        air = ARModel(
             coefficients=[[0.9], [1 - distance]], driving_rms_nm=[1.0, v], frame_rate_hz=RATE
         )
         known = {"hardware": lbt.LoopHardware(frame_rate_hz=RATE), "frame_means": True}

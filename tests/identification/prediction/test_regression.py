@@ -28,7 +28,7 @@ from lbt_synth.loop import close_loop
 @cache
 def vibrating():
     """A structure of few modes with three channels, the first half of a run and its model."""
-    seen = structure(41, seconds=40, modes=(5, 5), channels=(3, 3))
+    seen = structure(41, seconds=20, modes=(5, 5), channels=(3, 3))
     record = seen.record(0, len(seen.phase) // 2)
     return seen, record, lbt.identify(record, sensor_gain=1.0)
 

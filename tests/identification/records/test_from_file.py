@@ -437,19 +437,13 @@ def test_slopes_with_their_modes_and_without():
     slopes = phase @ S.T
     R = np.linalg.pinv(S)
     seen = lbt.load_record(
-        telemetry(
-            measurements=slopes @ R.T,
-            slopes=slopes,
-            interaction_matrix=S,
-            reconstructor=R,
-            commands=phase,
-        ),
+        telemetry(measurements=slopes @ R.T, interaction_matrix=R @ S, commands=phase),
         axes=(0, 1),
     )
     assert np.allclose(seen.measurements, phase[:, :2])
     with pytest.raises(
         ProblemError,
-        match=r"has 8 measurements and 3 modes: slopes without modal .*slopes @ R.T",
+        match=r"has 8 measurements and 3 modes: slopes without modal .*slopes @ reconstructor.T",
     ):
         lbt.load_record(
             telemetry(measurements=slopes, interaction_matrix=S, commands=phase), axes=(0, 1)

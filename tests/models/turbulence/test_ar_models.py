@@ -8,6 +8,7 @@ from scipy.integrate import quad, trapezoid
 from scipy.special import gamma, jv
 
 import lbt_synth as lbt
+from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.turbulence.ar_models import noll_orders, zernike_variances
 
 SITE = {"seeing_arcsec": 0.8, "wind_speed_m_s": 20, "diameter_m": 8.22}
@@ -144,30 +145,36 @@ def test_arrays_are_the_single_models():
         lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=3.0, frame_rate_hz=RATE),
         lbt.models.ARModel(coefficients=[1.9, -0.92], driving_rms_nm=1.0, frame_rate_hz=RATE),
     ]
-    air = lbt.models.ModalTurbulence.of(models)
-    assert (air.n_modes, air.order) == (2, 2)
+    air = lbt.models.ARModel.stack(models)
+    assert (air.count, air.order) == (2, 2)
     assert np.allclose(air.rms_nm, [m.rms_nm for m in models], rtol=1e-13)
     f = np.geomspace(0.1, 400, 7)
     assert np.allclose(air.psd(f), [m.psd(f) for m in models], rtol=1e-12)
-    assert air.model(1).coefficients.tolist() == [1.9, -0.92]
+    assert air.take(1).coefficients.tolist() == [1.9, -0.92]
 
 
 def test_bad_arrays_are_refused():
     ok = {"coefficients": [[0.9], [0.8]], "driving_rms_nm": [1, 1], "frame_rate_hz": 800}
-    for change, error, words in (
-        ({"coefficients": [[0.9], [1.0]]}, lbt.errors.ProblemError, "modulus 1 in mode 1"),
-        ({"coefficients": np.zeros((0, 1))}, lbt.errors.DimensionError, "at least one of each"),
-        ({"driving_rms_nm": [1]}, lbt.errors.DimensionError, r"shape \(2,\)"),
-        ({"driving_rms_nm": [1, 0]}, lbt.errors.ProblemError, "above 0"),
-        ({"frame_rate_hz": 0}, lbt.errors.ProblemError, "frame_rate_hz"),
+    slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=500)
+    air = lbt.models.ARModel(**ok)
+    make, stack = lambda change: lbt.models.ARModel(**(ok | change)), lbt.models.ARModel.stack
+    for call, error, words in (
+        (lambda: make({"coefficients": [[0.9], [1.0]]}), ProblemError, "process 1 of modulus 1"),
+        (lambda: make({"coefficients": np.zeros((0, 1))}), DimensionError, "at least one number"),
+        (lambda: make({"driving_rms_nm": [1]}), DimensionError, r"\(2, 1\) and \(1,\)"),
+        (lambda: make({"driving_rms_nm": [1, 0]}), ProblemError, "above 0"),
+        (lambda: make({"frame_rate_hz": 0}), ProblemError, "frame_rate_hz"),
+        (lambda: stack([]), ProblemError, "one ARModel a mode"),
+        (lambda: stack([air.take(0), slow]), ProblemError, "same frame rate"),
+        (
+            lambda: lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=[air], noise_nm=1.0, modes=1),
+            DimensionError,
+            "one per mode",
+        ),
     ):
         with pytest.raises(error, match=words):
-            lbt.models.ModalTurbulence(**(ok | change))
-    air = lbt.models.ModalTurbulence(**ok)
-    with pytest.raises(lbt.errors.ProblemError, match="at most 1; got 2"):
-        air.model(2)
-    with pytest.raises(lbt.errors.ProblemError, match="one ARModel a mode"):
-        lbt.models.ModalTurbulence.of([])
-    slow = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=500)
-    with pytest.raises(lbt.errors.ProblemError, match="same frame rate"):
-        lbt.models.ModalTurbulence.of([air.model(0), slow])
+            call()
+    plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=air, noise_nm=1.0)
+    assert [model.coefficients.item() for model in plant.turbulence] == [0.9, 0.8]
+    truth = lbt.Truth(turbulence=air)
+    assert [modes for _, modes in truth.turbulence_groups(2)] == [(0,), (1,)]

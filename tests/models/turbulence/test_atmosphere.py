@@ -11,7 +11,7 @@ from support.ensembles import AIR, weather
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.turbulence.atmosphere import _octave_splines
+from lbt_synth.models.turbulence.atmosphere import _octave_of_splines
 
 
 def test_tilt_rms_of_the_lbt(air):
@@ -92,7 +92,7 @@ def test_flows_of_many_outer_scales():
     for i in (0, 7, 19):
         single = replace(AIR, outer_scale_m=float(scales[i])).psd(f)
         assert found[i] == pytest.approx(single, rel=1e-9)
-    assert _octave_splines.cache_info().currsize >= 1
+    assert _octave_of_splines.cache_info().currsize >= 1
 
 
 def test_what_is_no_flow():
