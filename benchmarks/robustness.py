@@ -85,7 +85,7 @@ def designs() -> dict[str, lbt.Design]:
 
 def limit_strehl(residual_nm: float) -> float:
     """Strehl ratio of a residual shared evenly by the axes [%]."""
-    return 100 * lbt.loop.jitter_strehl(np.eye(2) * residual_nm**2 / 2, imaging=CAMERA)
+    return 100 * lbt.strehl(np.eye(2) * residual_nm**2 / 2, CAMERA)
 
 
 def main() -> None:

@@ -185,9 +185,7 @@ def strehls(covariance_nm2: np.ndarray) -> list[float]:
     """Return the Strehl ratios [%] of J, H and K."""
     return [
         100
-        * lbt.loop.jitter_strehl(
-            covariance_nm2, imaging=lbt.Imaging(obstruction=AIR.obstruction, wavelength_um=wave)
-        )
+        * lbt.strehl(covariance_nm2, lbt.Imaging(obstruction=AIR.obstruction, wavelength_um=wave))
         for wave in WAVELENGTHS_UM
     ]
 

@@ -10,5 +10,4 @@ from .simulation.run import Simulation as Simulation
 from .simulation.run import simulate as simulate
 from .stable_range import stable_sensor_gains as stable_sensor_gains
 from .strehl import Imaging as Imaging
-from .strehl import jitter_strehl as jitter_strehl
 from .strehl import strehl as strehl

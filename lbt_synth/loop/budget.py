@@ -24,7 +24,6 @@ from lbt_synth.loop.evaluator import (
     Matrices,
     Turbulence,
     close_loops,
-    join_parts,
     loop_evaluator,
     period_roots,
 )
@@ -251,8 +250,9 @@ def residual_of_parts(
 ) -> ResidualBudget:
     """Return what k loops leave, whose independent parts are evaluated one by one.
 
-    Each turbulence comes with its modes, the noise is a factor (k or 1, q, w) of its covariance,
-    and the numbers of a line are (k or 1). ``of_means`` says of what the rms of a resonance is.
+    A line shakes the modes of one part. Each turbulence comes with its modes, the noise is a factor
+    (k or 1, q, w) of its covariance, and the numbers of a line are (k or 1). ``of_means`` says of
+    what the rms of a resonance is.
     """
     k, modes, rate = len(parts[0].start), hardware.modes, hardware.frame_rate_hz
     for spectrum, _ in turbulence:
@@ -277,24 +277,22 @@ def residual_of_parts(
                 air[at] += equal.get(key, 0.0)
     amplitudes: list[ComplexArray] = []
     for line in lines:
-        pairs = [(part, some) for part in parts for some in part.modes]
-        members = [pair for pair in pairs if np.any(line.direction[:, pair[1]])]
-        joined = join_parts(members)
-        some = np.concatenate([own for _, own in members])
+        pairs = ((part, some) for part in parts for some in part.modes)
+        part, some = next(pair for pair in pairs if np.any(line.direction[:, pair[1]]))
         at, along = np.s_[:, :, some[:, None], some], line.direction[:, some]
         f = line.frequency_hz / rate
         if line.damping is not None:
             rms_nm = line.rms_nm * (1.0 if of_means else np.sinc(f))
             numbers = line.frequency_hz, line.damping, rms_nm, rate, line.sections
-            shaken[at] += joined.of_process(*sampled_lines(*numbers), along[..., None])
+            shaken[at] += part.of_process(*sampled_lines(*numbers), along[..., None])
             continue
-        entry = np.zeros((len(f), joined.B.shape[2]), dtype=np.complex128)
+        entry = np.zeros((len(f), part.B.shape[2]), dtype=np.complex128)
         entry[:, : some.size] = along
         if line.readings is not None:
             entry[:, some.size :] = line.readings
         amplitude = np.zeros((k, modes), dtype=np.complex128)
         size_nm = np.sqrt(2) * line.rms_nm[:, None]
-        amplitude[:, some], within = joined.of_sinusoids(np.broadcast_to(f, k), size_nm * entry)
+        amplitude[:, some], within = part.of_sinusoids(np.broadcast_to(f, k), size_nm * entry)
         shaken[:, 1, some[:, None], some] += within
         amplitudes.append(amplitude)
     return ResidualBudget(
@@ -316,7 +314,14 @@ def ensemble_residuals(
     turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
     noise, n, p = ensemble.noise(hardware), hardware.modes, ensemble.loops
     gains, delays = ensemble.gains(), ensemble.delays(hardware)
-    stable, groups = close_loops(matrices, hardware, gains, delays, in_image=not frame_means)
+    stable, groups = close_loops(
+        matrices,
+        hardware,
+        gains,
+        delays,
+        in_image=not frame_means,
+        together=[np.any(line.direction, axis=0) for line in lines],
+    )
     sinusoids = sum(line.damping is None for line in lines)
     whole = {name: np.full((p, n, n), np.nan) for name in _COVARIANCES}
     amplitudes = np.full((p, sinusoids, n), np.nan, dtype=np.complex128)

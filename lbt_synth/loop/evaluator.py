@@ -344,50 +344,6 @@ def period_roots(poles: ComplexArray, period: int) -> ComplexArray:
     return np.asarray((roots[:, None] * turns).ravel())
 
 
-def join_parts(members: Sequence[tuple[Evaluator, IntArray]]) -> Evaluator:
-    """Return the evaluator of independent parts of the same loops, with the modes of each."""
-    first, _ = members[0]
-    if len(members) == 1:
-        return first
-    parts = [part for part, _ in members]
-    sizes = [part.n_modes for part in parts]
-    pieces = first._holds.weights.size
-    rows = [
-        [matrix.reshape(len(matrix), pieces, n, -1) for matrix in (part.C, part.D)]
-        for part, n in zip(parts, sizes, strict=True)
-    ]
-    C = block_diagonal([one for one, _ in rows])
-    D = _join_inputs([one for _, one in rows], sizes)
-    return replace(
-        first,
-        A=block_diagonal([part.A for part in parts]),
-        B=_join_inputs([part.B for part in parts], sizes),
-        C=C.reshape(len(C), -1, C.shape[-1]),
-        D=D.reshape(len(D), -1, D.shape[-1]),
-        modes=np.concatenate([modes for _, modes in members])[None],
-        roots=np.concatenate([part.roots for part in parts], axis=1),
-    )
-
-
-def _join_inputs(blocks: Sequence[FloatArray], sizes: Sequence[int]) -> FloatArray:
-    """Return matrices of parts over [phases, noise] as one of all phases, then all noise."""
-    halves = [np.split(block, [n], axis=-1) for block, n in zip(blocks, sizes, strict=True)]
-    joined = [block_diagonal([half[i] for half in halves]) for i in (0, 1)]
-    return np.concatenate(joined, axis=-1)
-
-
-def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
-    """Return stacks of matrices (..., m, n) along the diagonals of larger ones."""
-    rows, columns = np.sum([block.shape[-2:] for block in blocks], axis=0)
-    out = np.zeros((*blocks[0].shape[:-2], rows, columns))
-    i = j = 0
-    for block in blocks:
-        m, n = block.shape[-2:]
-        out[..., i : i + m, j : j + n] = block
-        i, j = i + m, j + n
-    return out
-
-
 def textbook_matrices(controllers: Sequence[Controller]) -> Matrices:
     """Return controllers of as many states as balanced ``A, B, C, D`` in textbook form."""
     systems = [controller.to_statespace() for controller in controllers]
@@ -402,13 +358,15 @@ def close_loops(
     delay_frames: FloatArray,
     *,
     in_image: bool = True,
+    together: Sequence[BoolArray] = (),
 ) -> tuple[BoolArray, list[tuple[IntArray, list[Evaluator]]]]:
     """Close loops of controllers at gains and delays (p,); return their stability (p,).
 
     Loops of the same whole delay come with it, by their numbers (k,): an evaluator for each part.
+    Modes that one line shakes ``together``, (n,) for each, are in one part.
     """
     stable = np.ones(sensor_gains.size, dtype=np.bool_)
-    parts, rest = split_into_parts(matrices, hardware)
+    parts, rest = split_into_parts(matrices, hardware, together)
     for A in rest:
         stable &= _are_stable(np.linalg.eigvals(A).astype(np.complex128))
     groups = []
@@ -460,9 +418,12 @@ def _interpolated_loops(
 
 
 def split_into_parts(
-    matrices: Matrices, hardware: LoopHardware
+    matrices: Matrices, hardware: LoopHardware, together: Sequence[BoolArray] = ()
 ) -> tuple[list[Part], list[FloatArray]]:
-    """Split a loop into independent parts, equal ones once, and what reaches no mode."""
+    """Split a loop into independent parts, equal ones once, and what reaches no mode.
+
+    Modes that are ``together``, (n,) for each, stay in one part.
+    """
     A, B, C, D = matrices
     sensor, influence = hardware.sensor, hardware.influence
     s, q, m, n = A.shape[-1], B.shape[-1], C.shape[-2], hardware.modes
@@ -473,6 +434,8 @@ def split_into_parts(
         sizes = np.abs(entries)
         largest = np.max(sizes, axis=(1, 2), keepdims=True, initial=0.0)
         links[np.ix_(rows, columns)] = np.any(sizes > _ZERO * largest, axis=0)
+    for shaken in together:
+        links[np.ix_(r[shaken], r[shaken])] = True
     label = component_labels(links)
     parts: dict[tuple[bytes, ...], Part] = {}
     rest = []

@@ -33,8 +33,8 @@ from lbt_synth.loop import (
     ClosedLoop,
     Imaging,
     close_loop,
-    jitter_strehl,
     residual_budget,
+    strehl,
 )
 from lbt_synth.loop.least_residual import least_model_residual
 from lbt_synth.methods.registry import method_named
@@ -313,20 +313,20 @@ def _build_row(
     imaging: Imaging | None,
 ) -> PredictionRow:
     """Return a row of a residual on the data and a covariance (n, n) that the model promises."""
-    data_nm = error_nm = model_nm = strehl = model_strehl = np.nan
+    data_nm = error_nm = model_nm = replayed_strehl = model_strehl = np.nan
     if replayed is not None:
         data_nm, error_nm = replayed.rms_nm, replayed.rms_error_nm
-        strehl = np.nan if imaging is None else replayed.strehl(imaging)
+        replayed_strehl = np.nan if imaging is None else replayed.strehl(imaging)
     if promised is not None:
         model_nm = float(np.sqrt(np.trace(promised)))
-        model_strehl = np.nan if imaging is None else jitter_strehl(promised, imaging=imaging)
+        model_strehl = np.nan if imaging is None else strehl(promised, imaging)
     return PredictionRow(
         name=name,
         replayed_nm=data_nm,
         replayed_error_nm=error_nm,
         model_nm=model_nm,
         ratio=data_nm / model_nm if model_nm > 0 else np.nan,
-        strehl=strehl,
+        strehl=replayed_strehl,
         model_strehl=model_strehl,
         replayed=replayed,
         model_axis_nm=None if promised is None else frozen_copy(np.sqrt(np.diag(promised))),

@@ -24,7 +24,7 @@ from lbt_synth.identification.stretches import (
 )
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.block_filtering import filter_series
-from lbt_synth.loop import ClosedLoop, Imaging, close_loop, jitter_strehl
+from lbt_synth.loop import ClosedLoop, Imaging, close_loop, strehl
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import (
@@ -156,7 +156,7 @@ class ResidualEstimate:
             return float("nan")
         values, vectors = np.linalg.eigh(self.covariance_nm2)
         covariance = vectors * np.maximum(values, 0.0) @ vectors.T
-        return float(jitter_strehl(covariance, imaging=imaging))
+        return float(strehl(covariance, imaging))
 
     @property
     def text(self) -> str:
