@@ -1,9 +1,8 @@
-"""One grid: samples, a function of one of them or of a stack, an executor, and parts on disk.
+"""A grid of many samples: a function of some of them, an executor, and parts on disk.
 
-What a loop leaves has the same columns for one loop and for a stack of them. A grid of a few
-samples is in memory (:func:`evaluate`). One of many is a :class:`Sweep`: a part holds the results
-of a fixed number of consecutive rows in a file that is named by them, and a sweep that was killed
-at any moment goes on with the rows that no part has.
+What a loop leaves has the same columns for one loop and for a stack of them. A part of a
+:class:`Sweep` holds the results of a fixed number of consecutive rows in a file that is named by
+them, and a sweep that was killed at any moment goes on with the rows that no part has.
 """
 
 from __future__ import annotations
@@ -13,12 +12,12 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent import futures
 from dataclasses import dataclass
-from itertools import islice, pairwise, starmap
+from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn, TypeVar
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -38,7 +37,6 @@ from lbt_synth.validation import FloatArray
 Rows = tuple[int, int]  # the first, and the one after the last
 Failure = tuple[int, str, str]  # a row, the controller without a result on it, and why
 Result = tuple[dict[str, FloatArray], list[Failure]]  # columns of some rows (b,), and failures
-Answer = TypeVar("Answer")
 RESIDUALS = {"residual_nm": "rms_nm"} | {  # columns, and the attributes of what has them
     name: name for name in ("turbulence_nm", "vibration_nm", "noise_nm", "within_nm")
 }
@@ -171,25 +169,6 @@ class Sweep:
         return Part(results, failures, sum(part.seconds for part in parts)), computed
 
 
-def evaluate(
-    function: Callable[..., Answer],
-    samples: Iterable[tuple[Any, ...]],
-    executor: futures.Executor | None = None,
-) -> Iterator[Answer]:
-    """Yield what a function returns for the arguments of each sample, in the order of samples.
-
-    The function and the arguments of an executor must be such that other processes can read them.
-    """
-    if executor is None:
-        yield from starmap(function, samples)
-        return
-    tasks = [executor.submit(function, *arguments) for arguments in samples]
-    for row, task in enumerate(tasks):
-        with _explain_failure((row, row + 1)):
-            answer = task.result()
-        yield answer
-
-
 def _in_flight(executor: futures.Executor | None, workers: int | None) -> int:
     """Return how many tasks an executor has at once: two a worker, so that none waits."""
     if executor is None:
@@ -206,14 +185,14 @@ def _compute(
     """Yield results as they come; if one task fails as a whole, the others are given up."""
     for rows, arguments in tasks if executor is None else ():
         with _explain_failure(rows):
-            result, seconds = timed(function, *arguments)
+            result, seconds = _timed(function, *arguments)
         yield rows, result, seconds
     running: dict[futures.Future[tuple[Result, float]], Rows] = {}
     try:
         while executor is not None:
             for rows, arguments in islice(tasks, in_flight - len(running)):
                 with _explain_failure(rows):
-                    running[executor.submit(timed, function, *arguments)] = rows
+                    running[executor.submit(_timed, function, *arguments)] = rows
             if not running:
                 return
             for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
@@ -231,7 +210,7 @@ def refuse(path: Path, why: str, cause: Exception | None = None) -> NoReturn:
     raise OutputError(f"{path} {why}", path=path) from cause
 
 
-def timed(function: Callable[..., Answer], *arguments: Any) -> tuple[Answer, float]:
+def _timed(function: Callable[..., Result], *arguments: Any) -> tuple[Result, float]:
     """Call a function, and return its result and its seconds."""
     before = time.perf_counter()
     result = function(*arguments)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
@@ -27,7 +26,7 @@ from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
-from lbt_synth.studies.grid import evaluate, loop_columns
+from lbt_synth.studies.grid import loop_columns
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
 _GRID = 65  # shifts over the range of errors, at least
@@ -104,7 +103,6 @@ def limits(
     imaging: Imaging,
     *,
     errors_hz: Sequence[float] = (0.0,),
-    executor: Executor | None = None,
 ) -> LimitStudy:
     """Evaluate designs exactly and compare them with the limits.
 
@@ -122,8 +120,6 @@ def limits(
         True frequency less that of the model [Hz], of the vibration that moves most; the others
         move in proportion (``truth.frequency_errors_hz``), over the whole range between the
         extremes.
-    executor : concurrent.futures.Executor, optional
-        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Returns
     -------
@@ -170,8 +166,10 @@ def limits(
         band = limit_or_none(partial(least_worst, rms_nm=line.rms_nm, direction=line.direction))
     bounds_nm = tuple(np.nan if bound is None else bound.rms_nm for bound in (limit, band))
     met = hardware, truth, imaging
-    samples = ((name, design, met, shifts, bounds_nm) for name, design in designs.items())
-    rows, curves = zip(*evaluate(_limit_row, samples, executor), strict=True)
+    rows, curves = zip(
+        *(_limit_row(name, design, met, shifts, bounds_nm) for name, design in designs.items()),
+        strict=True,
+    )
     return LimitStudy(
         rows=rows,
         limit=limit,
