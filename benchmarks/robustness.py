@@ -14,6 +14,7 @@ import lbt_synth as lbt
 from lbt_synth.loop.band_limit import least_worst_residual
 from lbt_synth.report.draw import house_style
 from lbt_synth.studies import paper as paper
+from lbt_synth.studies.limits import limits
 from lbt_synth.studies.paper import paper_filters
 
 ERRORS = np.arange(-7, 8) / 2
@@ -105,7 +106,7 @@ def main() -> None:
         end="",
     )
     print("| modulus margin | states | worst residual [nm] | above the limit [%] |")
-    study = lbt.studies.limits(every, every["shaped"].hardware, TRUTH, CAMERA, errors_hz=ERRORS)
+    study = limits(every, every["shaped"].hardware, TRUTH, CAMERA, errors_hz=ERRORS)
     for (name, design), row in zip(every.items(), study.rows, strict=True):
         margins = lbt.loop_margins(lbt.close_loop(design.hardware, design.controller))
         strehls = " | ".join(f"{s:.2f}" for s in worst_strehl(design))

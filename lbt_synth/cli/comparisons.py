@@ -36,7 +36,7 @@ from lbt_synth.report.figures.studies import limits_figure, mirror_figure, trade
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.limits import LimitRow, LimitStudy
+from lbt_synth.studies.limits import LimitRow, LimitStudy, limits
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, mirror_rows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
@@ -78,7 +78,7 @@ def _compared(design: Design, row: LimitRow, config: Config) -> Facts:
 
 def _begin(designs: Mapping[str, Design], config: Config) -> tuple[Report, LimitStudy]:
     """Return a study of designs beside the limits, and what it says first of them."""
-    study = studies.limits(
+    study = limits(
         designs, config.hardware, config.truth, config.imaging, errors_hz=config.errors_hz
     )
     report = Report(data={"limit_nm": None if study.limit is None else study.limit.rms_nm})

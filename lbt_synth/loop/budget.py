@@ -194,15 +194,6 @@ def residual_budget(
     >>> shake = lbt.Truth(turbulence=None, vibrations=(line,))
     >>> round(lbt.residual_budget(loop, shake).within_nm, 1)
     36.1
-
-    A Kalman filter leaves in its own model what it expects:
-
-    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5)
-    >>> design = lbt.kalman(plant)
-    >>> budget = lbt.residual_budget(design.close(plant.hardware), plant, frame_means=True)
-    >>> bool(abs(budget.rms_nm / design.rms - 1) < 1e-9)
-    True
     """
     require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()

@@ -1,4 +1,3 @@
-from .limits import limits as limits
 from .robustness import robustness as robustness
 from .robustness import robustness_map as robustness_map
 from .robustness import tradeoff as tradeoff

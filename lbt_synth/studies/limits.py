@@ -104,48 +104,10 @@ def limits(
     *,
     errors_hz: Sequence[float] = (0.0,),
 ) -> LimitStudy:
-    """Evaluate designs exactly and compare them with the limits.
+    """Evaluate designs exactly under a truth, and compare them with the limits.
 
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        Designs by name; each is left as it is while the truth moves.
-    hardware : LoopHardware
-        The loop in which all of them run.
-    truth : Truth
-        What the loop really meets.
-    imaging : Imaging
-        The camera.
-    errors_hz : sequence of float, optional
-        True frequency less that of the model [Hz], of the vibration that moves most; the others
-        move in proportion (``truth.frequency_errors_hz``), over the whole range between the
-        extremes.
-
-    Returns
-    -------
-    LimitStudy
-        Rows in the order of the designs.
-
-    Raises
-    ------
-    ProblemError
-        If a design or a vibration does not fit the loop, or there is no design.
-    NumericalError
-        If an integral does not settle.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
-    >>> study = lbt.studies.limits(
-    ...     {"by hand": lbt.integrator(path, gain=0.5)},
-    ...     path,
-    ...     lbt.Truth(turbulence=slow, noise_nm=5.0),
-    ...     lbt.Imaging(diameter_m=8.22),
-    ... )
-    >>> study.rows[0].above_limit_percent > 0
-    True
+    The errors are true frequencies less those of the model [Hz], of the vibration that moves most;
+    the others move in proportion, over the whole range between the extremes.
     """
     if not designs:
         raise ProblemError("a study of limits needs at least one design; got none.")

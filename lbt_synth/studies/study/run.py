@@ -120,14 +120,11 @@ def run_study(
 
     Examples
     --------
-    >>> import lbt_synth as lbt, pathlib, tempfile
-    >>> text = pathlib.Path("examples/study.yaml").read_text()
-    >>> with tempfile.TemporaryDirectory() as name:
-    ...     folder = pathlib.Path(name)
-    ...     _ = (folder / "small.yaml").write_text(text.replace("samples: 4096", "samples: 4"))
-    ...     _ = (folder / "lbt.yaml").write_bytes(pathlib.Path("examples/lbt.yaml").read_bytes())
-    ...     run = lbt.studies.run_study(lbt.studies.load_study(folder / "small.yaml"), folder)
-    ...     again = lbt.studies.run_study(lbt.studies.load_study(folder / "small.yaml"), folder)
+    >>> import dataclasses, tempfile, lbt_synth as lbt
+    >>> study = lbt.studies.load_study("examples/study.yaml")
+    >>> few = dataclasses.replace(study, settings=study.settings.model_copy(update={"samples": 4}))
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     run, again = (lbt.studies.run_study(few, folder) for _ in range(2))
     >>> run.results.name, run.computed, again.computed, run.columns["kalman.strehl"].shape
     ('results.csv', 4, 0, (4,))
     """
