@@ -23,7 +23,7 @@ from harness import log_uniform, record_options, run_all, second_order
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.disturbances import run_oscillator
+from lbt_synth.loop.disturbances import run_oscillator
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 
 RATE = 1000.0

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.loop.least_residual import least_model_residual
+from lbt_synth.loop.least_residual import least_residual
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.studies import mirror_figure
 from lbt_synth.studies.robustness import mirror_rows
@@ -60,7 +60,7 @@ def delays() -> None:
             lbt.residual_budget(lbt.close_loop(plant.hardware, d.controller), plant).rms_nm
             for d in (lbt.kalman(plant), lbt.lqg(plant))
         ]
-        limit = least_model_residual(plant).rms_nm
+        limit = least_residual(plant.hardware, plant).rms_nm
         print(f"{delay:5.2f}: {found[0]:8.3f} {found[1]:8.3f} {limit:8.3f}")
 
 

@@ -33,7 +33,7 @@ from lbt_synth.loop import (
     strehl,
 )
 from lbt_synth.loop.least_residual import above_percent, limit_or_nan
-from lbt_synth.loop.simulation.run import READINGS, Drop, Segment, settling_frames
+from lbt_synth.loop.simulation import READINGS, Drop, Segment, settling_frames
 from lbt_synth.models import Truth
 from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
 from lbt_synth.storage.atomic_files import require_writable

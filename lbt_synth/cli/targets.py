@@ -20,7 +20,7 @@ from lbt_synth.identification.records.record import require_length
 from lbt_synth.interop import Rehearsal, export, frame_cost, rehearse, target_named
 from lbt_synth.interop.pipeline import target_names
 from lbt_synth.loop import Imaging
-from lbt_synth.loop.simulation.disturbances import Disturbance
+from lbt_synth.loop.disturbances import Disturbance
 from lbt_synth.loop.strehl import series_strehl
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.figures.records import simulation_figure

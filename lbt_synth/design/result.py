@@ -16,7 +16,7 @@ from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget
 from lbt_synth.loop.closed_loop import reads_others
 from lbt_synth.loop.least_residual import (
     above_percent,
-    least_model_residual,
+    least_residual,
     limit_or_nan,
 )
 from lbt_synth.models import LoopHardware, TipTiltPlant
@@ -336,7 +336,7 @@ def model_limits(design: Design) -> Mapping[str, float | None]:
         return {}
     loop = close_loop(plant.hardware, design.controller)
     residual_nm = residual_budget(loop, plant).rms_nm if loop.is_stable else np.nan
-    limit_nm = limit_or_nan(lambda: least_model_residual(plant))
+    limit_nm = limit_or_nan(lambda: least_residual(plant.hardware, plant))
     values = residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
     return {column.name: value for column, value in zip(MODEL_LIMITS, values, strict=True)}
 

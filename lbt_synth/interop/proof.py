@@ -31,8 +31,8 @@ from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import residual_budget
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, youla_controller
-from lbt_synth.loop.simulation.disturbances import Disturbance
-from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
+from lbt_synth.loop.disturbances import Disturbance
+from lbt_synth.loop.simulation import Drop, SteppedController, simulate
 from lbt_synth.loop.stable_range import radii_by_gain
 from lbt_synth.models import ARModel, LoopHardware, Truth
 from lbt_synth.validation import FloatArray

@@ -25,7 +25,6 @@ from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.models import (
     ARModel,
     LoopHardware,
-    SinusoidalVibration,
     Spectrum,
     TipTiltPlant,
     Truth,
@@ -33,7 +32,7 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.plant.assembly import other_exposures
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density, spectrum_key
-from lbt_synth.models.vibration import checked_direction, stationary_vibrations
+from lbt_synth.models.vibration import checked_direction
 from lbt_synth.validation import FloatArray, frozen_copy, read_only, require_instance
 
 T = TypeVar("T")
@@ -232,21 +231,25 @@ class ModeSpectrum:
             return None
 
 
-def decoupled_modes(
+def truth_modes(
     hardware: LoopHardware,
-    noise_nm2: FloatArray,
-    turbulence: Sequence[Spectrum | None],
-    vibrations: Sequence[tuple[FloatArray, Vibration]],
+    truth: Truth | TipTiltPlant,
     directions: Sequence[FloatArray] = (),
     *,
     in_image: bool,
-    sinusoids: Sequence[tuple[FloatArray, SinusoidalVibration]] = (),
 ) -> tuple[FloatArray, list[ModeSpectrum]]:
-    """Rotate the modes until disturbance and noise (q, q) are diagonal.
+    """Rotate the modes until what disturbs them, and the noise on them, are diagonal.
 
-    Return the directions over the modes (rows) and the spectrum along each. Vibrations come with
-    their directions (n,); further ``directions`` must be axes, too.
+    Return the directions over the modes (rows) and the spectrum along each. Further ``directions``
+    (n,) must be axes, too.
     """
+    gain = truth.sensor_gain if isinstance(truth, Truth) else 1.0
+    groups, vibrations, factor = truth.entering(hardware, sensor_gain=gain)
+    noise_nm2 = factor @ factor.T / gain**2
+    if hardware.suite.accelerometers:
+        vibrations = ()
+    if hardware.suite.sensors:
+        hardware, noise_nm2 = _quick_sensors(hardware, noise_nm2)
     n, rate = hardware.modes, hardware.frame_rate_hz
     noise = _noise_on_modes(hardware, noise_nm2)
     rank = np.linalg.matrix_rank(hardware.influence)
@@ -255,30 +258,69 @@ def decoupled_modes(
             "the mirror must reach every mode: an influence matrix with full row rank; got rank "
             f"{rank} for {n} modes. Leave out the modes that it cannot correct."
         )
-    for model in turbulence:
-        if isinstance(model, ARModel):
-            require_loop_rate(model.frame_rate_hz, hardware)
-    # modes with the same spectrum may be turned into each other
-    keys = [spectrum_key(spectrum) for spectrum in turbulence]
-    kinds = dict(zip(keys, turbulence, strict=True))
-    groups = {key: np.diag([float(own == key) for own in keys]) for key in kinds}
+    kinds: dict[object, tuple[Spectrum | None, list[int]]] = {}
+    for spectrum, members in groups:  # modes with the same spectrum may be turned into each other
+        if isinstance(spectrum, ARModel):
+            require_loop_rate(spectrum.frame_rate_hz, hardware)
+        kinds.setdefault(spectrum_key(spectrum), (spectrum, []))[1].extend(members)
+    calm = sorted(set(range(n)).difference(*(members for _, members in kinds.values())))
+    air = [*kinds.values(), *([(None, calm)] if calm else [])]
+    lines = []
+    for vibration in vibrations:
+        along, means = checked_direction(vibration, hardware), vibration
+        if isinstance(vibration, Vibration) and in_image and not truth.is_of_means:
+            share = float(np.sinc(vibration.frequency_hz / rate))  # frames have its mean
+            means = replace(vibration, rms_nm=share * vibration.rms_nm)
+        lines.append((along, means))
     matrices = [("the noise of the sensor", noise)]
-    matrices += [("the turbulence", projector) for projector in groups.values()]
-    for along, line in vibrations:
-        matrices.append((f"the vibration at {line.frequency_hz:.6g} Hz", np.outer(along, along)))
+    matrices += [("the turbulence", np.diag(np.isin(range(n), some) * 1.0)) for _, some in air]
+    for along, line in lines:
+        if isinstance(line, Vibration):
+            name = f"the vibration at {line.frequency_hz:.6g} Hz"
+            matrices.append((name, np.outer(along, along)))
     matrices += [("the given direction", np.outer(along, along)) for along in directions]
     axes = _common_axes(matrices)
     frames, modes = _whole_frames(hardware, in_image=in_image), []
     for axis in axes:
-        key = next(key for key, projector in groups.items() if axis @ projector @ axis > 0.5)
-        lines = [line.ar_model(rate) for along, line in vibrations if abs(along @ axis) > 0.5]
-        parts = tuple(part for part in (kinds[key], *lines) if part is not None)
-        seen = tuple((s.frequency_hz, s.rms_nm * float(along @ axis)) for along, s in sinusoids)
-        variance = max(float(axis @ noise @ axis), 0.0)
-        mode = ModeSpectrum(frames, rate, parts, variance, in_image, seen)
+        parts = [next(spectrum for spectrum, some in air if np.sum(axis[some] ** 2) > 0.5)]
+        sinusoids = []
+        for along, line in lines:
+            if not isinstance(line, Vibration):
+                sinusoids.append((line.frequency_hz, line.rms_nm * float(along @ axis)))
+            elif abs(along @ axis) > 0.5:
+                parts.append(line.ar_model(rate))
+        mode = ModeSpectrum(
+            frames,
+            rate,
+            tuple(part for part in parts if part is not None),
+            max(float(axis @ noise @ axis), 0.0),
+            in_image,
+            tuple(sinusoids),
+        )
         late = in_image and hardware.delay_frames > frames
         modes.append(mode.interpolated(hardware.delay_frames) if late else mode)
     return axes, modes
+
+
+def _quick_sensors(
+    hardware: LoopHardware, noise_nm2: FloatArray
+) -> tuple[LoopHardware, FloatArray]:
+    """Return a loop whose other sensors read every frame at once, and the noise of all (q, q)."""
+    sensor, blocks = [hardware.sensor], [noise_nm2]
+    suite = hardware.suite
+    for other, seen in zip(suite.wavefront, other_exposures(hardware), strict=True):
+        if seen.age_frames % 1:
+            raise ProblemError(
+                f"no limit is known where an exposure of sensor {other.name} ends within a frame "
+                f"of the loop; it ends {seen.age_frames % 1:.3g} frames after one begins."
+            )
+        factor = other.noise_factor(hardware.modes)
+        sensor.append(seen.response)
+        blocks.append(seen.period * factor @ factor.T)
+    if not noise_nm2.any():  # nothing adds to a sensor without noise
+        sensor, blocks = sensor[:1], blocks[:1]
+    every = replace(hardware.own_sensor_alone(), sensor_matrix=np.vstack(sensor))
+    return every, block_diag(*blocks)
 
 
 def _whole_frames(hardware: LoopHardware, *, in_image: bool) -> int:
@@ -364,7 +406,7 @@ class ResidualLimit:
 
 
 def least_residual(
-    hardware: LoopHardware, truth: Truth, *, frame_means: bool = False
+    hardware: LoopHardware, truth: Truth | TipTiltPlant, *, frame_means: bool = False
 ) -> ResidualLimit:
     """Least stationary residual that any linear controller leaves under a truth, in the image.
 
@@ -383,8 +425,9 @@ def least_residual(
     ----------
     hardware : LoopHardware
         The loop, with any delay. The sensor must see and the mirror reach every mode.
-    truth : Truth
-        Disturbances, noise and sensor gain.
+    truth : Truth or TipTiltPlant
+        Disturbances, noise and sensor gain, or a plant whose model is the truth. Coupled modes of a
+        plant have a limit, too, at whole frames of delay and a mirror that settles at once.
     frame_means : bool, optional
         As in :func:`residual_budget`.
 
@@ -414,106 +457,38 @@ def least_residual(
     5.0
     """
     require_instance(hardware, LoopHardware)
-    if hardware.suite.sensors:
-        return _limit_of_sensors(hardware, truth, in_image=not frame_means)
-    return _residual_limit(*truth_modes(hardware, truth, in_image=not frame_means))
-
-
-def _limit_of_sensors(hardware: LoopHardware, truth: Truth, *, in_image: bool) -> ResidualLimit:
-    """Return the limit of the loop that knows more than that of several sensors."""
-    suite = hardware.suite
-    if suite.accelerometers:
-        truth = replace(truth, vibrations=(), motions=(), frequency_errors_hz=None)
-    noise = truth.noise_per_measurement(hardware.n_measurements) / truth.sensor_gain
-    sensor, blocks = [hardware.sensor], [np.diag(noise**2)]
-    for other, seen in zip(suite.wavefront, other_exposures(hardware), strict=True):
-        if seen.age_frames % 1:
-            raise ProblemError(
-                f"no limit is known where an exposure of sensor {other.name} ends within a frame "
-                f"of the loop; it ends {seen.age_frames % 1:.3g} frames after one begins."
-            )
-        factor = other.noise_factor(hardware.modes)
-        sensor.append(seen.response)
-        blocks.append(seen.period * factor @ factor.T)
-    if not noise.any():  # nothing adds to a sensor without noise
-        sensor, blocks = sensor[:1], blocks[:1]
-    every = replace(hardware.own_sensor_alone(), sensor_matrix=np.vstack(sensor))
-    modes = truth_modes(every, truth, noise_nm2=block_diag(*blocks), in_image=in_image)
-    return _residual_limit(*modes)
-
-
-def least_model_residual(plant: TipTiltPlant, *, frame_means: bool = False) -> ResidualLimit:
-    """Least residual that any linear controller leaves where a plant's model is the truth.
-
-    It is that in the image, or of means over frames; the processes of a plant are of such means.
-    Coupled modes have a limit where nothing but whole frames of delay is between command and
-    mirror: the error of the best estimate, from a Riccati equation, and what moves within frames.
-    """
-    hardware, rate, in_image = plant.hardware, plant.hardware.frame_rate_hz, not frame_means
-    lines = [(checked_direction(line, hardware), line) for line in plant.vibrations]
+    if not hasattr(truth, "entering"):
+        require_instance(truth, Truth)
     try:
-        modes = decoupled_modes(hardware, plant.R, plant.turbulence, lines, in_image=in_image)
+        axes, modes = truth_modes(hardware, truth, in_image=not frame_means)
     except CoupledModesError:
-        if hardware.mirror is not None or hardware.delay_frames % 1:
+        late = hardware.mirror is not None or hardware.delay_frames % 1 or hardware.suite.sensors
+        if isinstance(truth, Truth) or late:
             raise
-        parts = list(zip(np.eye(hardware.modes), plant.turbulence, strict=True))
-        parts += [(along, line.ar_model(rate)) for along, line in lines]
-        within = np.zeros((hardware.modes, hardware.modes))
-        for along, model in parts:
-            mode = ModeSpectrum(0, rate, (model,), 0.0, in_image)
-            within += mode.within_frames_nm2() * np.outer(along, along)
-        error = plant.L @ kalman_riccati(plant).P @ plant.L.T
-        variance, axes = np.linalg.eigh(error + within)
-        return ResidualLimit(
-            variance_nm2=frozen_copy(variance),
-            within_nm2=frozen_copy(np.einsum("in,ij,jn->n", axes, within, axes)),
-            directions=frozen_copy(axes.T),
-        )
-    return _residual_limit(*modes)
-
-
-def truth_modes(
-    hardware: LoopHardware,
-    truth: Truth,
-    directions: tuple[FloatArray, ...] = (),
-    *,
-    in_image: bool,
-    noise_nm2: FloatArray | None = None,
-) -> tuple[FloatArray, list[ModeSpectrum]]:
-    """Decouple the modes of a truth; noise (q, q) is that of the own sensor by default."""
-    require_instance(hardware, LoopHardware)
-    require_instance(truth, Truth)
-    lines, sinusoids = [], []
-    for vibration in stationary_vibrations(truth.vibrations):
-        along = checked_direction(vibration, hardware)
-        if isinstance(vibration, Vibration):
-            if in_image:  # frames have its mean
-                share = float(np.sinc(vibration.frequency_hz / hardware.frame_rate_hz))
-                vibration = replace(vibration, rms_nm=share * vibration.rms_nm)
-            lines.append((along, vibration))
-        else:
-            sinusoids.append((along, vibration))
-    if noise_nm2 is None:
-        noise = truth.noise_per_measurement(hardware.n_measurements) / truth.sensor_gain
-        noise_nm2 = np.diag(noise**2)
-    turbulence = truth.turbulence_per_mode(hardware.modes)
-    return decoupled_modes(
-        hardware,
-        noise_nm2,
-        turbulence,
-        lines,
-        directions,
-        in_image=in_image,
-        sinusoids=sinusoids,
-    )
-
-
-def _residual_limit(directions: FloatArray, modes: list[ModeSpectrum]) -> ResidualLimit:
+        return _coupled_limit(truth, in_image=not frame_means)
     within = np.array([mode.within_frames_nm2() for mode in modes])
     return ResidualLimit(
         variance_nm2=read_only(within + [mode_limit(mode) for mode in modes]),
         within_nm2=read_only(within),
-        directions=frozen_copy(directions),
+        directions=frozen_copy(axes),
+    )
+
+
+def _coupled_limit(plant: TipTiltPlant, *, in_image: bool) -> ResidualLimit:
+    """Return the error of the best estimate, from a Riccati equation, and what frames hide."""
+    n, rate = plant.hardware.modes, plant.hardware.frame_rate_hz
+    within = np.zeros((n, n))
+    parts = list(zip(np.eye(n), plant.turbulence, strict=True))
+    parts += [(checked_direction(v, plant.hardware), v.ar_model(rate)) for v in plant.vibrations]
+    for along, model in parts:
+        mode = ModeSpectrum(0, rate, (model,), 0.0, in_image)
+        within += mode.within_frames_nm2() * np.outer(along, along)
+    error = plant.L @ kalman_riccati(plant).P @ plant.L.T
+    variance, axes = np.linalg.eigh(error + within)
+    return ResidualLimit(
+        variance_nm2=frozen_copy(variance),
+        within_nm2=frozen_copy(np.einsum("in,ij,jn->n", axes, within, axes)),
+        directions=frozen_copy(axes.T),
     )
 
 

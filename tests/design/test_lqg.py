@@ -15,7 +15,7 @@ from lbt_synth.design.lqg import _pieces, loop_variances, mirror_core
 from lbt_synth.design.shaping import LoopErrors, ModulusMargin, ResidualVariance, Specification
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.lyapunov import stationary_covariance
-from lbt_synth.loop.least_residual import least_model_residual
+from lbt_synth.loop.least_residual import least_residual
 from lbt_synth.models import ARModel
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.report.figures.studies import mirror_figure
@@ -44,7 +44,7 @@ def test_a_settled_mirror_gives_the_kalman_controller_and_reaches_the_limit(dela
     assert design.rms == pytest.approx(kalman.rms, rel=1e-12)
     assert design.objective_nm == pytest.approx(kalman.rms, rel=1e-9)
     if delay == int(delay):
-        limit = least_model_residual(plant)
+        limit = least_residual(plant.hardware, plant)
         assert model_rms(plant, design.controller) == pytest.approx(limit.rms_nm, rel=1e-9)
         means = np.sqrt(np.sum(limit.variance_nm2 - limit.within_nm2))
         assert design.rms == pytest.approx(means, rel=1e-9)

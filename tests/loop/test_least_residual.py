@@ -13,7 +13,7 @@ import lbt_synth as lbt
 from lbt_synth.design.result import model_limits
 from lbt_synth.errors import CoupledModesError, DimensionError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.loop.least_residual import least_model_residual
+from lbt_synth.loop.least_residual import least_residual
 
 
 def test_processes_whose_variance_is_known():
@@ -91,7 +91,7 @@ def test_kalman_filters_reach_the_limit(delay, seed):
         delay_frames=delay,
         modes=1,
     )
-    limit, design = least_model_residual(plant), lbt.kalman(plant)
+    limit, design = least_residual(plant.hardware, plant), lbt.kalman(plant)
     means = np.sum(limit.variance_nm2 - limit.within_nm2)
     assert design.rms**2 == pytest.approx(means, rel=2e-8, abs=1e-12 * limit.rms_nm**2)
     left = lbt.residual_budget(lbt.close_loop(plant.hardware, design.controller), plant)
@@ -159,12 +159,15 @@ def coupled_plant(ratio=2.0, **options):
 @pytest.mark.parametrize("delay", [1.0, 3.0])
 def test_coupled_modes_have_the_limit_of_the_best_filter(delay):
     plant = coupled_plant(delay_frames=delay)
-    limit = least_model_residual(plant)
+    limit = least_residual(plant.hardware, plant)
     loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
     along = limit.directions.T * limit.variance_nm2 @ limit.directions
     assert along == pytest.approx(lbt.residual_budget(loop, plant).total_nm2, rel=1e-7)
     # a little coupling changes little
-    alone, nearly = (least_model_residual(coupled_plant(r, delay_frames=delay)) for r in (1, 1.001))
+    alone, nearly = (
+        least_residual(p.hardware, p)
+        for p in (coupled_plant(r, delay_frames=delay) for r in (1, 1.001))
+    )
     assert nearly.rms_nm == pytest.approx(alone.rms_nm, rel=1e-3)
     assert nearly.rms_nm > alone.rms_nm
 
@@ -297,6 +300,7 @@ LATE, MOVING = second(RATE / 5, 2.1, 3.0), path(mirror=shell(100))
 
 
 def test_refusals():
+    late = coupled_plant(delay_frames=2.4)
     uneven, two = np.diag([1.0, 2.0]), path(modes=2)
     rows = [
         (lambda: shaken(path(sensor_matrix=[[1.0, 1.0]])), ProblemError, "got rank 1 for 2"),
@@ -319,7 +323,7 @@ def test_refusals():
             "set noise_nm to 0",
         ),
         (
-            lambda: least_model_residual(coupled_plant(delay_frames=2.4)),
+            lambda: least_residual(late.hardware, late),
             CoupledModesError,
             "modes that decouple",
         ),

@@ -9,7 +9,7 @@ from support.plants import LBT_YAML, lbt_axis_plant
 from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.run import Drop
+from lbt_synth.loop.simulation import Drop
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import ARModel, SinusoidalVibration, TabulatedSpectrum
 from lbt_synth.models.plant.tip_tilt import retuned_plant

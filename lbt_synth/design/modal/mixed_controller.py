@@ -19,7 +19,7 @@ from lbt_synth.design.modal.stack import Bank, mode_indices, number_per_mode
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import RunningController
-from lbt_synth.loop.simulation.run import SteppedController
+from lbt_synth.loop.simulation import SteppedController
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import (
     FloatArray,

@@ -36,7 +36,7 @@ from lbt_synth.loop import (
     residual_budget,
     strehl,
 )
-from lbt_synth.loop.least_residual import least_model_residual
+from lbt_synth.loop.least_residual import least_residual
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import LoopHardware, TipTiltPlant
@@ -219,7 +219,7 @@ def prediction_against_data(
             "or another sensor gain. Identify the noise again."
         )
     try:
-        limit = least_model_residual(plant, frame_means=True)
+        limit = least_residual(plant.hardware, plant, frame_means=True)
     except ProblemError as error:  # modes that do not decouple, or a mirror without a limit
         notes.append(f"no {LIMIT}: {error}")
     else:

@@ -10,7 +10,7 @@ import numpy as np
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.loop.simulation.run import Drop
+from lbt_synth.loop.simulation import Drop
 from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.report.designs.report import DesignAssessment, DesignReport, summary_table, verdict
 from lbt_synth.report.draw import Figure, count_columns, drawing, square_in

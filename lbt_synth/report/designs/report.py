@@ -28,7 +28,7 @@ from lbt_synth.loop import (
 )
 from lbt_synth.loop.band_limit import BandLimit
 from lbt_synth.loop.least_residual import ResidualLimit
-from lbt_synth.loop.simulation.run import settling_frames
+from lbt_synth.loop.simulation import settling_frames
 from lbt_synth.loop.stable_range import MovingGain, moving_gain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences

@@ -14,7 +14,7 @@ from lbt_synth.linear import largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins
 from lbt_synth.loop.margins import BrokenLoop, broken_loops
-from lbt_synth.loop.simulation.run import SHOWN_FRAMES, LoopStep, step_response
+from lbt_synth.loop.simulation import SHOWN_FRAMES, LoopStep, step_response
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing, shorten, square_in
 from lbt_synth.validation import ComplexArray, FloatArray, choice
 

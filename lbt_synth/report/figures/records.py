@@ -15,7 +15,7 @@ from lbt_synth.identification import IdentifiedAxis, IdentifiedLine, IdentifiedM
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import ClosedLoop, Simulation, close_loop
-from lbt_synth.loop.simulation.run import Segment
+from lbt_synth.loop.simulation import Segment
 from lbt_synth.models import ARModel, Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing

@@ -14,7 +14,7 @@ import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import accelerometer_transfers, loop_record
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
-from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
+from lbt_synth.loop.disturbances import draw_others, draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
 
 RATE = 1000.0

@@ -28,7 +28,7 @@ from lbt_synth.interop.dao.export import (
     round_together,
 )
 from lbt_synth.interop.proof import _rounding_left, prove_written
-from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.loop.disturbances import draw_disturbance
 from lbt_synth.loop.stable_range import radii_by_gain
 
 BALANCE = 1e-13  # of a coefficient

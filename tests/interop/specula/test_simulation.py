@@ -11,7 +11,7 @@ from support.small_telescope import BRIGHT, PATH, PLANT, SETUP, SHAKE, needs_spe
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.interop.specula.simulation import accompany_filter
-from lbt_synth.loop.simulation.disturbances import draw_phase
+from lbt_synth.loop.disturbances import draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
 
 

@@ -10,7 +10,7 @@ from support.refusals import require_refusals
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.block_filtering import filter_series
-from lbt_synth.loop.simulation.run import Drop, run_segments, step_response
+from lbt_synth.loop.simulation import Drop, run_segments, step_response
 
 
 @pytest.mark.parametrize(
