@@ -23,6 +23,8 @@ from harness import log_uniform, record_options, run_all, second_order
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
+from lbt_synth.identification.accelerometers.transfers import accelerometer_transfers
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.disturbances import run_oscillator
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 
@@ -123,7 +125,7 @@ def examine(seed: int, frames: int) -> dict[str, list[float]]:
     """Identify one record and compare with the truth."""
     it = case(seed, frames)
     model = lbt.identify(it.record)
-    found = lbt.identification.accelerometer_transfers(model, it.record, it.accelerations)
+    found = accelerometer_transfers(model, it.record, it.accelerations)
     names = [row.channel for row in found.channels]
     used = {row.channel for row in found.used}
     out: dict[str, list[float]] = {
@@ -168,7 +170,7 @@ def loss(seed: int, frames: int) -> float:
     """Return what an identified filter of all sensors leaves in the truth, over the true one."""
     it = case(seed, frames)
     model = lbt.identify(it.record)
-    found = lbt.identification.accelerometer_transfers(model, it.record, it.accelerations)
+    found = accelerometer_transfers(model, it.record, it.accelerations)
     settings, comments = lbt.config.identified_config(model, accelerometers=found)
     with tempfile.TemporaryDirectory() as folder:
         path = lbt.config.save_config(Path(folder) / "model.yaml", settings, comments=comments)
@@ -181,7 +183,7 @@ def loss(seed: int, frames: int) -> float:
 
 def residual_nm(it: Case, plant: lbt.models.TipTiltPlant, real: lbt.models.TipTiltPlant) -> float:
     """Return what the Kalman filter of a plant leaves in the loop of the truth."""
-    controller = plant.controller(lbt.linear.kalman_riccati(plant).gain_predictor)
+    controller = plant.controller(kalman_riccati(plant).gain_predictor)
     loop = lbt.close_loop(real.hardware, controller)
     return lbt.residual_budget(
         loop, replace(it.truth, motions=real.motions), frame_means=True

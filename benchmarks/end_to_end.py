@@ -1,25 +1,41 @@
 """End-to-end figures quoted in the documentation: leak, gain with the vibration, the clamp, OMGI.
 
-Needs the extra e2e; run with ``python benchmarks/end_to_end.py leak|gain|noise|omgi|sensors
-[CACHE]``.
+Needs the extra e2e; run with ``python benchmarks/end_to_end.py leak|gain|noise|omgi|sensors``.
 """
 
 import sys
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 import lbt_synth as lbt
 from lbt_synth.interop.specula import optics
+from lbt_synth.interop.specula.simulation import EndToEndRun
 
-CACHE = sys.argv[2] if len(sys.argv) > 2 else None
 SETUP = replace(lbt.load_config("examples/lbt.yaml").end_to_end, frames=800)
 STILL = replace(SETUP, vibrations=())
 
 
-def mean(runs: list[lbt.interop.EndToEndRun]) -> str:
+@lru_cache
+def calibration(config: str) -> optics.Calibration:
+    return optics.calibrate(lbt.load_config(config).end_to_end)
+
+
+def run(
+    setup: optics.EndToEndSetup,
+    controller: Any = None,
+    config: str = "examples/lbt.yaml",
+    **options: float,
+) -> EndToEndRun:
+    known = calibration(config)
+    return lbt.interop.run_end_to_end(setup, controller, calibration=known, **options)
+
+
+def mean(runs: list[EndToEndRun]) -> str:
     strehls = [100 * run.strehl for run in runs]
     gains = [run.tip_tilt_gain for run in runs]
     noise = [run.summary()["tip_tilt_noise_nm"] for run in runs]
@@ -31,13 +47,13 @@ def mean(runs: list[lbt.interop.EndToEndRun]) -> str:
 
 def leaks() -> None:
     for leak in (1.0, 0.99, 0.98, 0.97, 0.95):
-        runs = [replace(STILL, leak=leak, seed=s).run(None, cache=CACHE) for s in (1, 2)]
+        runs = [run(replace(STILL, leak=leak, seed=s)) for s in (1, 2)]
         print(f"leak {leak} from mode 50 on: {mean(runs)}", flush=True)
 
 
 def gains() -> None:
     for gain in (0.5, 0.56, 0.7, 0.9, 1.1):
-        runs = [replace(SETUP, seed=1).run(None, tip_tilt_gain=gain, cache=CACHE)]
+        runs = [run(replace(SETUP, seed=1), tip_tilt_gain=gain)]
         rms = np.hypot(*runs[0].rms_nm[:2])
         print(f"classical, gain {gain} with the vibration: {mean(runs)}, {rms:.0f} nm", flush=True)
 
@@ -45,15 +61,15 @@ def gains() -> None:
 def clamp() -> None:
     for value, name in ((optics.NO_CLAMP, "negative pixels kept"), (0.0, "set to zero")):
         optics.NO_CLAMP = value
-        runs = [replace(STILL, seed=1).run(None, cache=CACHE)]
+        runs = [run(replace(STILL, seed=1))]
         print(f"{name}: {mean(runs)}", flush=True)
 
 
 def optimised() -> None:
     """Gains from the telemetry of one run, tried on the same air and on another."""
     setup = replace(STILL, frames=3200)
-    first = replace(setup, seed=1).run(None, cache=CACHE)
-    path = setup.system.hardware
+    first = run(replace(setup, seed=1))
+    path = setup.hardware
     gains = np.maximum(first.optical_gain()[0], 0.1)
     found = lbt.design.modal.modal_gains_from_telemetry(
         first.measurements,
@@ -72,11 +88,11 @@ def optimised() -> None:
         )
     control = lbt.design.modal.MixedController(gains=found.gains, leak=setup.leaks)
     for seed in (1, 2):
-        uniform = first if seed == 1 else replace(setup, seed=seed).run(None, cache=CACHE)
+        uniform = first if seed == 1 else run(replace(setup, seed=seed))
         still = replace(setup, vibrations=(), motions=(), settle_frames=400, seed=seed)
-        run = lbt.interop.run_end_to_end(still, control, cache=CACHE)
+        best = run(still, control)
         print(f"seed {seed}, gain {setup.gain}: {mean([uniform])}", flush=True)
-        print(f"seed {seed}, optimised: {mean([run])}", flush=True)
+        print(f"seed {seed}, optimised: {mean([best])}", flush=True)
 
 
 def sensors() -> None:
@@ -103,16 +119,16 @@ def sensors() -> None:
 def sensor_row(config: lbt.config.Config, design: lbt.Design, seed: int) -> list[float]:
     """Return Strehl ratio, tip and its exact residual, tilt and its own, and the optical gain."""
     setup = replace(config.end_to_end, seed=seed)
-    run = setup.run(design, cache=CACHE)
+    seen = run(setup, design, "examples/several_sensors.yaml")
     # gains are relative to what the design assumes
-    gain = run.tip_tilt_gain / config.sensor_gain
-    truth = replace(config.truth, noise_nm=run.summary()["tip_tilt_noise_nm"], sensor_gain=gain)
+    gain = seen.tip_tilt_gain / config.sensor_gain
+    truth = replace(config.truth, noise_nm=seen.summary()["tip_tilt_noise_nm"], sensor_gain=gain)
     missing = ("truth",) if design.other_sensors else ()
     own = design.controllers[frozenset(missing)]
     loop = lbt.close_loop(config.hardware, own, sensor_gain=gain, blind=missing)
     exact = np.sqrt(np.diag(lbt.residual_budget(loop, truth, frame_means=True).total_nm2))
-    tip, tilt = run.rms_nm[:2]
-    return [run.strehl, tip, exact[0], tilt, exact[1], run.tip_tilt_gain]
+    tip, tilt = seen.rms_nm[:2]
+    return [seen.strehl, tip, exact[0], tilt, exact[1], seen.tip_tilt_gain]
 
 
 if __name__ == "__main__":

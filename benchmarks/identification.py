@@ -33,6 +33,8 @@ from harness import (
 )
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
+from lbt_synth.identification.stretches import split_halves
 
 RATE = 1000.0
 NEAR_HZ = 0.1
@@ -163,8 +165,8 @@ def background(it: Case, line: lbt.Vibration) -> float:
 
 
 def paired(
-    it: Case, axis: lbt.identification.IdentifiedAxis
-) -> tuple[list[tuple[lbt.Vibration, lbt.identification.IdentifiedLine | None, float]], list]:
+    it: Case, axis: IdentifiedAxis
+) -> tuple[list[tuple[lbt.Vibration, IdentifiedLine | None, float]], list]:
     """Pair the lines there are with those found, and how far away; then those that are spare."""
     spare, out = list(axis.lines), []
     for line in sorted(it.truth.vibrations, key=lambda v: -v.rms_nm):
@@ -183,7 +185,7 @@ def bound(it: Case, line: lbt.Vibration) -> float:
     return float(np.sqrt(line.frequency_hz * line.damping / (2 * np.pi * it.record.duration_s)))
 
 
-def judged(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, list[tuple[float, ...]]]:
+def judged(it: Case, axis: IdentifiedAxis) -> dict[str, list[tuple[float, ...]]]:
     """Return which lines were found, the strongest first, which missed, and which are false."""
     out: dict[str, list[tuple[float, ...]]] = {"found": [], "missed": [], "false": []}
     pairs, spare = paired(it, axis)
@@ -203,9 +205,7 @@ def judged(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, list[
     return out
 
 
-def stood_for(
-    it: Case, axis: lbt.identification.IdentifiedAxis
-) -> list[tuple[lbt.identification.IdentifiedLine, list[lbt.Vibration]]]:
+def stood_for(it: Case, axis: IdentifiedAxis) -> list[tuple[IdentifiedLine, list[lbt.Vibration]]]:
     """Return each line found, with the true lines to which it is nearest, within 4 half widths."""
     out: dict[int, list[lbt.Vibration]] = {i: [] for i in range(len(axis.lines))}
     for line in it.truth.vibrations:
@@ -215,7 +215,7 @@ def stood_for(
     return [(axis.lines[i], lines) for i, lines in out.items() if lines]
 
 
-def deviations(it: Case, axis: lbt.identification.IdentifiedAxis) -> dict[str, list[float]]:
+def deviations(it: Case, axis: IdentifiedAxis) -> dict[str, list[float]]:
     """Return how far estimates are from the truth, in their standard errors."""
     truth, gain_error = it.truth, axis.sensor_gain_error
     pairs = stood_for(it, axis)
@@ -302,18 +302,13 @@ def studied(seed: int, frames: int) -> dict:
     axis = model.axes[0]
     best = left(it, lbt.kalman(exact_plant(it)).controller)
     limit = lbt.loop.least_residual(it.path, it.truth, frame_means=True).rms_nm ** 2
-    half, other = lbt.identification.split_halves(it.record.stretches(), it.record.frames)
+    half, _ = split_halves(it.record.stretches())
     halved = lbt.identify(it.record, stretches=half)
-    true_open = it.record.pseudo_open_loop(it.truth.sensor_gain)
-    filtered = lbt.identification.replayed_residual(
-        true_open,
-        lbt.kalman(halved.plant()).controller,
-        replace(it.path, sensor_matrix=it.truth.sensor_gain * it.path.sensor),
-        noise_nm=it.truth.noise_nm,
-        stretches=it.record.stretches(),
-        test=other,
+    table = lbt.identification.prediction_against_data(
+        it.record, exact_plant(it), {"Kalman": lbt.kalman(halved.plant()).controller}
     )
-    ((start, stop),) = other
+    filtered, ((start, stop),) = table["Kalman"].replayed, table.test
+    true_open = it.record.pseudo_open_loop(it.truth.sensor_gain)
     predicted = least_squares(true_open, it.path.mirror_taps, 32, half)[start:stop]
     noise_nm2 = (it.truth.noise_nm / it.truth.sensor_gain) ** 2
     error = axis.sensor_gain_error

@@ -24,9 +24,11 @@ from scipy.signal import lfilter
 
 import lbt_synth as lbt
 from lbt_synth.identification.prediction.residual import (
+    ResidualEstimate,
     estimate_residual,
     gather,
     mode_noise,
+    replay,
     settled_test,
 )
 from lbt_synth.identification.stretches import Stretches, cut_stretches
@@ -149,21 +151,17 @@ class Split:
     def open_loop(self) -> FloatArray:
         return self.record.pseudo_open_loop(self.model.sensor_gains)
 
-    def residual(self, entry: Entry) -> lbt.identification.ResidualEstimate:
+    def residual(self, entry: Entry) -> ResidualEstimate:
         """Return what a controller would have left of the test, or a series leaves (frames, n)."""
-        noise = [axis.noise_nm for axis in self.model.axes]
-        if isinstance(entry, np.ndarray):
-            kept = settled_test(self.record.stretches(), self.test, self.hardware)
-            noise_nm2, error = mode_noise(self.hardware, np.diag(np.square(noise)), 0.0)
-            return estimate_residual(gather(entry, kept), kept, noise_nm2, error)
-        return lbt.identification.replayed_residual(
-            self.open_loop,
-            as_controller(entry),
-            self.hardware,
-            noise_nm=noise,
-            stretches=self.record.stretches(),
-            test=self.test,
-        )
+        runs, left_nm = self.record.stretches(), entry
+        kept = settled_test(runs, self.test, self.hardware)
+        if not isinstance(left_nm, np.ndarray):
+            loop = lbt.close_loop(self.hardware, as_controller(entry))
+            loop.require_stable()
+            left_nm = replay(loop, self.open_loop, runs)
+        noise_nm2 = np.diag([axis.noise_nm**2 for axis in self.model.axes])
+        noise = mode_noise(self.hardware, noise_nm2, 0.0)
+        return estimate_residual(gather(left_nm, kept), kept, *noise)
 
 
 def best_integrator(split: Split) -> lbt.Controller:
@@ -230,14 +228,14 @@ def past(split: Split) -> lbt.identification.LoopRecord:
 
 def residuals_of(
     record: lbt.identification.LoopRecord, splits: int
-) -> dict[str, list[lbt.identification.ResidualEstimate]]:
+) -> dict[str, list[ResidualEstimate]]:
     """Return what each entry leaves of each test, without those that fail."""
     model, residuals, failed = None, {name: [] for name in ENTRIES}, set()
     stretches, usable = record.stretches(), int(np.sum(record.usable))
     for k in range(splits):
-        share = (1 + k / splits) / 2
-        training, rest = lbt.identification.split_halves(stretches, record.frames, fit_share=share)
-        test = cut_stretches(rest, 0, usable // (2 * splits))
+        end = int((1 + k / splits) / 2 * usable)
+        training = cut_stretches(stretches, 0, end)
+        test = cut_stretches(stretches, end, end + usable // (2 * splits))
         model = lbt.identify(record, stretches=training, start=model)
         split = Split(record, training, test, model)
         for name in [name for name in ENTRIES if name not in failed]:
@@ -250,8 +248,8 @@ def residuals_of(
 
 
 def relative_residual(
-    parts: Sequence[lbt.identification.ResidualEstimate],
-    best: Sequence[lbt.identification.ResidualEstimate],
+    parts: Sequence[ResidualEstimate],
+    best: Sequence[ResidualEstimate],
 ) -> tuple[float, float]:
     """Return a measured residual over the least one, less 1, and its standard error."""
     least = np.mean([part.measured_nm2 for part in best])

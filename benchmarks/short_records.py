@@ -19,6 +19,13 @@ import numpy as np
 from harness import log_uniform, record_options, run_all
 
 import lbt_synth as lbt
+from lbt_synth.identification.prediction.residual import (
+    estimate_residual,
+    gather,
+    mode_noise,
+    replay,
+    settled_test,
+)
 
 UNSEEN_S = 60.0
 POLES = (0.99995, 0.999)
@@ -42,17 +49,13 @@ def replayed(
     it: loops.Case, controller: lbt.Controller, run: tuple[int, int], test: tuple[int, int]
 ) -> tuple[float, float]:
     """Variance that a controller leaves of recorded frames and its error [nm^2], by a replay."""
-    try:
-        found = lbt.identification.replayed_residual(
-            it.record.pseudo_open_loop(it.truth.sensor_gain),
-            controller,
-            replace(it.path, sensor_matrix=it.truth.sensor_gain * it.path.sensor),
-            noise_nm=it.truth.noise_nm,
-            stretches=[run],
-            test=[test],
-        )
-    except lbt.errors.UnstableLoopError:
+    path = replace(it.path, sensor_matrix=it.truth.sensor_gain * it.path.sensor)
+    loop = lbt.close_loop(path, controller)
+    if not loop.is_stable:
         return float("inf"), float("nan")
+    kept, z = settled_test((run,), (test,), path), it.record.pseudo_open_loop(it.truth.sensor_gain)
+    noise = mode_noise(path, np.array([[it.truth.noise_nm**2]]), 0.0)
+    found = estimate_residual(gather(replay(loop, z, (run,)), kept), kept, *noise)
     return found.total_nm2, found.total_error_nm2
 
 

@@ -10,6 +10,7 @@ import scipy.linalg
 from harness import Row, once, paired, seconds, with_growth
 
 import lbt_synth as lbt
+from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 
 RATE_HZ = 800.0
@@ -98,7 +99,7 @@ def responses() -> dict[int, Row]:
         G = error_system(lines)
         peer = G.to_control()
         rows[G.n_states] = paired(
-            lambda g=G: lbt.linear.largest_singular_values(g, frequency),
+            lambda g=G: spectral_norms(g.frequency_response(frequency)),
             lambda g=peer: control.singular_values_response(g, 2 * np.pi * frequency),
             9,
             calls=3,

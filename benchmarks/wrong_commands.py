@@ -150,11 +150,11 @@ def judge(
         start = time.perf_counter()
         verdict = explain_commands(record)
         seconds = time.perf_counter() - start
-        right = verdict.options.startswith(options) and verdict.accepted == (fault == "none")
+        right = verdict.repair.options.startswith(options) and verdict.accepted == (fault == "none")
         words = {"other night": "nothing to do", "axis late": "later than those of axis 0"}
         if fault in words:
             right = not verdict.accepted and words[fault] in verdict.explanation
-        said = "" if right else f"{seed}: {verdict.explanation} {verdict.options}"
+        said = "" if right else f"{seed}: {verdict.explanation} {verdict.repair.options}"
         made = try_design(loop, record) if design and verdict.accepted else ("", np.nan)
         if made[0].startswith("named:"):  # by the gains of the fit
             right = bool(options) and made[0].startswith(f"named: {options}")
@@ -245,7 +245,9 @@ def judge_good(seed: int, seconds: float) -> list[tuple[str, bool, bool, float, 
         record = draw_good(kind, seed, seconds)
         start = time.perf_counter()
         verdict = explain_commands(record)
-        words = "" if verdict.accepted else f"{seed}: {verdict.explanation} {verdict.options}"
+        words = (
+            "" if verdict.accepted else f"{seed}: {verdict.explanation} {verdict.repair.options}"
+        )
         passed = verdict.accepted
         out.append((kind, passed, passed, time.perf_counter() - start, words))
     return out

@@ -26,6 +26,7 @@ import lbt_synth as lbt
 from lbt_synth.report.draw import drawing, save_figure
 
 FILE = Path(__file__).parent / "data" / "eris_vibrations_psd.fits"
+COLUMNS = {"frequency": 0, "density": (1, 2)}
 BACKGROUND_NM2_HZ = 4e4  # at 1 Hz, falling with the square of the frequency; see docs/eris.md
 
 # Assumed: the file tells nothing of all this.
@@ -70,12 +71,12 @@ class Disturbance:
         )
 
 
-def record(averages: int = AVERAGES) -> lbt.identification.SpectrumRecord:
+def record(averages: int | None = AVERAGES) -> lbt.identification.SpectrumRecord:
     """Read the file; its columns have no names, and it does not tell their unit.
 
     The rows are taken for frequency, tip and tilt.
     """
-    found = lbt.load_record(FILE, kind="spectrum", unit="nm^2/Hz", averages=averages)
+    found = lbt.load_record(FILE, columns=COLUMNS, unit="nm^2/Hz", averages=averages)
     assert isinstance(found, lbt.identification.SpectrumRecord)
     return found
 

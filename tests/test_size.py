@@ -14,12 +14,12 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3861,
-    "config": 1876,
+    "cli": 3825,
+    "config": 1846,
     "design": 7690,
     "files": 1283,
-    "identification": 9965,
-    "interop": 4400,
+    "identification": 9563,
+    "interop": 3862,
     "linear": 5763,
     "loop": 4905,
     "methods": 920,
@@ -31,9 +31,9 @@ LINES = {
 }
 COUNTS = {
     "files of the package": 216,
-    "public names": 219,
-    "tuned constants": 540,
-    "lines of tests": 33020,
+    "public names": 206,
+    "tuned constants": 530,
+    "lines of tests": 32890,
     "lines of benchmarks": 4042,
     "words of docs": 61300,
 }

@@ -50,7 +50,7 @@ axes[0].legend()
 
 frequency_hz = np.geomspace(0.01, 4.99, 300)
 for name, design in {"Kalman": kalman, "H-infinity": hinf}.items():
-    sigma = lbt.linear.largest_singular_values(design.error_system(), frequency_hz)
+    sigma = np.linalg.norm(design.error_system().frequency_response(frequency_hz), 2, axis=(1, 2))
     axes[1].loglog(frequency_hz, sigma, label=name)
 axes[1].set(xlabel="frequency [Hz]", ylabel="largest singular value", title="disturbance to error")
 axes[1].legend()

@@ -31,12 +31,6 @@ print(f"the commands differ by at most {exported.error:.1e} of the largest one")
 print((folder / "tip.h").read_text())
 
 # %%
-# What a frame costs:
-
-cost = lbt.interop.frame_cost(design)
-print(f"{cost.multiplications} multiplications, {cost.additions} additions")
-
-# %%
 # The gain file is what other programs read, and what ``lbt-synth verify`` certifies again.
 
 gain = lbt.save_gain(folder / "tip.fits", design)

@@ -39,7 +39,6 @@ _SHARED = """
   reading
     > reading the record: what its file does not say, and what its commands need, in this order,
         to be those that the mirror followed; what lbt-synth telemetry -o writes says all of it
-    --kind | closed-loop/open-loop/spectrum
     --frame-rate-hz | float | frame rate [Hz]
     --delay-frames | float | total delay [frames]
     --unit | | of the measurements: nm, um, m, mas, arcsec, urad, rad; results are shown in it, too
@@ -49,7 +48,8 @@ _SHARED = """
     --obstruction | float | as a fraction of the diameter
     --averages | int | periodograms that a spectrum is the mean of
     --commands | | another file, with the commands
-    --columns | nargs:+ meta:ROLE=NAME | by name or number, as measurements=tip,tilt times=
+    --columns | nargs:+ meta:ROLE=NAME | by name or number, as measurements=tip,tilt times= or
+        open_loop=0,1
     --axes | int nargs:+ | which of several columns or modes, from 0
     --sensor-gain | float nargs:+ | sensor gain that is known, of both axes or of each
     --command-increments | switch | they are increments: add them up
@@ -64,9 +64,6 @@ _SHARED = """
     reading
     > what is known beforehand
     --noise-nm | float nargs:+ | noise per frame of the sensor [nm], beside a spectrum without
-    --lines-hz | float nargs:+ | frequencies of vibrations [Hz]
-    --lines-error-hz | float =0.1 | standard error of --lines-hz [Hz]
-    --lines-file | | text file with one frequency per row [Hz]
     --lowest-line-hz | float =3 | what is below counts as turbulence [Hz]
     --most-lines | int =20 | most vibrations per axis
     >
@@ -198,8 +195,7 @@ _TABLE = """
     --order | int | dao: M of the RTC's configuration (default 20)
     --modes | int | c, cacao, dao, pyrtc: modes of the RTC (default: those of the design)
     --other-gain | float | gain of an integrator for each further mode (default: none)
-    --steps | int | cacao: frames of history (default: as many as the loss needs)
-    --loss | float | cacao: loss of residual that chooses them (default 0.01, the most)
+    --steps | int | cacao: frames of history (default: as many as the proof needs)
     -o --output | required | file to write: .c (the .h goes beside it), .mat, .fits or .npy, and its
         certificate; pyrtc: folder
   rehearse | targets | Run a gain file in the arithmetic of another program, in the loop.
@@ -217,7 +213,6 @@ _TABLE = """
     --frames | int | frames of an exposure
     --settle-frames | int | frames to settle before, at least 200
     --seed | int | seed of the random parts, the first of several
-    --cache | | directory for calibrations and phase screens
     -o --output | required | directory to write into
     > for tables of the paper
     --tables | II/III nargs:+ | run these tables of the paper instead of one gain file

@@ -25,7 +25,7 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.design.modal import modal_filters, modal_gains
 from lbt_synth.errors import ConfigError, ProblemError
-from lbt_synth.interop import frame_cost
+from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residual import limit_or_nan
 from lbt_synth.methods.registry import reference_methods

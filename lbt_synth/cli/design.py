@@ -154,7 +154,7 @@ def run_show(arguments: Namespace) -> Report:
         f"not proved, the file's word: {'; '.join(unproved)}.",
     ]
     if not design.other_sensors:
-        from lbt_synth.interop import frame_cost  # which a design does not need
+        from lbt_synth.interop.c.export import frame_cost  # which a design does not need
 
         report.add_facts("Cost per frame, as exported to C", frame_cost(design), key="frame_cost")
     if arguments.matrices:

@@ -17,9 +17,14 @@ from lbt_synth.cli.study import run_in_parts
 from lbt_synth.design import Design, FilterDesign
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, load_gain, save_gain, save_telemetry
-from lbt_synth.interop import EndToEndRun, EndToEndSetup, calibrate
-from lbt_synth.interop.specula.optics import Calibration, specula_version
-from lbt_synth.interop.specula.simulation import unread_sensors
+from lbt_synth.interop.specula import simulation
+from lbt_synth.interop.specula.optics import (
+    Calibration,
+    EndToEndSetup,
+    calibrate,
+    specula_version,
+)
+from lbt_synth.interop.specula.simulation import EndToEndRun, mix_controller, unread_sensors
 from lbt_synth.methods.registry import design_label, design_title
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import loop_figure, robustness_figure
@@ -144,6 +149,7 @@ def _write_paper(
 
 
 _LEAST_GAIN = 0.01  # optical gain of tip and tilt; less is what a saturated pyramid shows
+_SETTINGS = ("frames", "settle_frames", "seed", "pixels")
 _FILES = ("run.png", "telemetry.fits", "summary.json")
 
 
@@ -161,24 +167,25 @@ def run_end_to_end(arguments: Namespace) -> Report:
     refuse_replacing(outputs, [arguments.config, gain])
     setup = _load_setup(arguments)
     design = load_gain(gain)
-    setup.controller(design)  # refuses a filter of another loop before any work
+    mix_controller(setup, design)  # refuses a filter of another loop before any work
     specula_version()  # refuses where it is missing
     make_directory(arguments.output)
     figure_file, telemetry_file, summary_file = outputs
-    calibration = _calibrate(setup, arguments)
+    with count_progress(total=setup.modes, what="calibration") as count:
+        calibration = calibrate(setup, progress=count)
     total = setup.frames + setup.settle_frames
     with count_progress(total=total, what="frames") as count:
-        loop_run = setup.run(design, calibration=calibration, cache=arguments.cache, progress=count)
+        loop_run = simulation.run_end_to_end(setup, design, calibration=calibration, progress=count)
     _require_seen(loop_run)
-    system, (tip_nm, tilt_nm, *_) = loop_run.system, loop_run.rms_nm
+    tip_nm, tilt_nm, *_ = loop_run.rms_nm
     report = Report()
     report.verdict.append(
         f"The Strehl ratio is {100 * loop_run.strehl:.1f} %, with "
         f"{nm_text(tip_nm, '.1f')} rms of tip and {nm_text(tilt_nm, '.1f')} of tilt left."
     )
     report.add_facts(
-        f"End to end, Strehl ratio at {system.imaging_wavelength_um:g} um: {system.modes} modes, "
-        f"{loop_run.frames} frames after {loop_run.settle_frames}, seed {loop_run.seed}",
+        f"End to end, Strehl ratio at {setup.imaging_wavelength_um:g} um: {setup.modes} modes, "
+        f"{setup.frames} frames after {setup.settle_frames}, seed {setup.seed}",
         _run_facts(loop_run, design, calibration, gain),
     )
     if unread := unread_sensors(design):
@@ -187,7 +194,7 @@ def run_end_to_end(arguments: Namespace) -> Report:
             f"filter of the gain file runs, without {listing_text(unread)}."
         )
     summary = json.dumps(json_value(report.data), indent=1).encode() + b"\n"
-    recorded = _telemetry(loop_run, design, calibration, gain)
+    recorded = _telemetry(loop_run, design, gain)
     report.note_files(
         [
             save_figure(end_to_end_figure(loop_run), figure_file),
@@ -212,17 +219,14 @@ def _run_facts(loop_run: EndToEndRun, design: Design, calibration: Calibration, 
         "tip_tilt_gain_error": ("  standard error", {"format": ".3f"}),
         "tip_tilt_noise_nm": ("what it leaves of their measurements", rms),
     }
-    milliseconds = 1e3 * loop_run.seconds / (loop_run.frames + loop_run.settle_frames)
     condition = calibration.reconstructor.condition_number
     return facts(
         gain=fact(gain),
         method=fact(design.method),
         specula=fact(specula_version()),
-        **{name: fact(getattr(loop_run, name)) for name in ("frames", "settle_frames", "seed")},
-        pixels=fact(loop_run.system.pixels),
+        **{name: fact(getattr(loop_run.setup, name)) for name in _SETTINGS},
         **{name: fact(numbers[name], text, **how) for name, (text, how) in headings.items()},
         condition_number=fact(condition, "condition of the reconstructor", format=".1f"),
-        milliseconds_a_frame=fact(milliseconds, "time per frame", unit="ms", format=".1f"),
     )
 
 
@@ -230,7 +234,7 @@ def _require_seen(loop_run: EndToEndRun) -> None:
     """Refuse a run in which the pyramid no longer sees tip and tilt."""
     if not loop_run.tip_tilt_gain > _LEAST_GAIN:
         tip, tilt, *_ = loop_run.rms_nm
-        pixels = loop_run.system.pixels
+        pixels = loop_run.setup.pixels
         raise UnstableLoopError(
             "the pyramid must see tip and tilt; got an optical gain of "
             f"{loop_run.tip_tilt_gain:.2g} at residuals of {tip:.3g} and {tilt:.3g} nm rms: the "
@@ -242,37 +246,26 @@ def _require_seen(loop_run: EndToEndRun) -> None:
 def _load_setup(arguments: Namespace) -> EndToEndSetup:
     """Load the end-to-end setup of a configuration, with the changes of the command line."""
     setup = load_shown(arguments, all_modes=True).end_to_end
-    if arguments.pixels is not None:
-        setup = replace(setup, system=replace(setup.system, pixels=arguments.pixels))
-    return replace(setup, **given_options(arguments, "frames", "settle_frames", "seed"))
+    return replace(setup, **given_options(arguments, "pixels", "frames", "settle_frames", "seed"))
 
 
-def _calibrate(setup: EndToEndSetup, arguments: Namespace) -> Calibration:
-    """Calibrate a system, or take its calibration from the cache, behind a progress bar."""
-    with count_progress(total=setup.system.modes, what="calibration") as count:
-        return calibrate(setup.system, cache=arguments.cache, progress=count)
-
-
-def _telemetry(
-    loop_run: EndToEndRun, design: Design, calibration: Calibration, gain: str
-) -> Telemetry:
-    system, optical = loop_run.system, loop_run.tip_tilt_gain
+def _telemetry(loop_run: EndToEndRun, design: Design, gain: str) -> Telemetry:
+    setup, optical = loop_run.setup, loop_run.tip_tilt_gain
     return fill_row(
         Telemetry,
-        *(loop_run, system, system.hardware),
+        *(loop_run, setup, setup.hardware),
         influence_matrix=None,
         sensor_gain=optical if optical > 0 else None,
         metadata={
-            "name": f"end to end, {system.modes} modes",
+            "name": f"end to end, {setup.modes} modes",
             "controller": f"mixed: tip and tilt by {design.method}, integrators for the rest",
             "gain_file": Path(gain).name,
             "gain_file_sha256": file_sha256(gain, GainFileError),
             "simulator": f"SPECULA {specula_version()}",
-            "seed": loop_run.seed,
+            "seed": setup.seed,
             "strehl": min(loop_run.strehl, 1.0),
-            "pixels": system.pixels,
-            "settle_frames": loop_run.settle_frames,
-            "calibration": calibration.key,
+            "pixels": setup.pixels,
+            "settle_frames": setup.settle_frames,
             "sensor_gain_is": "optical gain of tip and tilt, measured in the loop",
         },
     )
@@ -298,12 +291,9 @@ def _run_tables(arguments: Namespace) -> Report:
     }
     total = len(all_cases(plan_cases(setup, designs, **plan)))
     make_directory(folder)
-    _calibrate(setup, arguments)
     case_folder = folder / "cases"
     with run_in_parts(arguments, case_folder, total=total, what="runs") as engine:
-        table = end_to_end_tables(
-            setup, case_folder, designs, **plan, **engine, cache=arguments.cache
-        )
+        table = end_to_end_tables(setup, case_folder, designs, **plan, **engine)
     printed = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
     files = [write_atomically(folder / _TABLE_FILES[n][0], csv_rows(printed[n])) for n in printed]
     if "III" in printed:

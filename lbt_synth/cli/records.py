@@ -7,8 +7,6 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from lbt_synth import identification
 from lbt_synth.cli.arguments import given_options, refuse_options
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs, say_accelerometers
@@ -22,15 +20,17 @@ from lbt_synth.cli.telemetry import (
 )
 from lbt_synth.config import identified_config
 from lbt_synth.config.write import RAISED, config_text, require_writable_facts
-from lbt_synth.errors import LbtSynthError, ProblemError, TelemetryError
+from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
-from lbt_synth.identification import IdentifiedAxis, IdentifiedModel, LoopRecord, SpectrumRecord
+from lbt_synth.identification import IdentifiedModel, LoopRecord, SpectrumRecord
 from lbt_synth.identification.accelerometers.readings import Readings, load_readings
-from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
+from lbt_synth.identification.accelerometers.transfers import (
+    AccelerometerTransfers,
+    accelerometer_transfers,
+)
 from lbt_synth.identification.commands.verdict import explain_commands
-from lbt_synth.identification.fit.identified_model import model_tables
-from lbt_synth.identification.records.contents import TEXTS, join_names, read_contents
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis, model_tables
 from lbt_synth.identification.records.record import LEAST_SECONDS, require_length
 from lbt_synth.loop import Imaging, loop_margins
 from lbt_synth.report.draw import require_figure_name, save_figure
@@ -40,11 +40,10 @@ from lbt_synth.storage.atomic_files import require_ending, require_writable, wri
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import json_record, row_table
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import FloatArray, number
 
 if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not need
-    from lbt_synth.identification import Diagnosis
     from lbt_synth.identification.auto import RecordedDesign
+    from lbt_synth.identification.diagnosis import Diagnosis
 
 
 _STEPS = 3  # that diagnose and auto count
@@ -72,9 +71,7 @@ def run_identify(arguments: Namespace) -> Report:
         channels, values, notes = readings
         report.notes += [f"note: {note}." for note in notes]
         try:
-            transfers = identification.accelerometer_transfers(
-                model, record, values, channels=channels
-            )
+            transfers = accelerometer_transfers(model, record, values, channels=channels)
         except LbtSynthError as error:  # the model is not lost
             report.notes.append(f"warning: the accelerometers were not compared: {error}")
         else:
@@ -86,8 +83,8 @@ def run_identify(arguments: Namespace) -> Report:
 
 def _say_model(report: Report, model: IdentifiedModel, record: LoopRecord | SpectrumRecord) -> None:
     """Begin with the strongest vibrations, and whether the model is enough."""
-    if isinstance(record, LoopRecord) and record.health.findings:
-        report.notes.insert(0, f"note: {record.health.summary()}")
+    if isinstance(record, LoopRecord) and record.findings:
+        report.notes.insert(0, f"note: {record.summary()}")
     white = all(axis.whiteness.white for axis in model.axes)
     leaves = "is white: the model is enough" if white else "is not white: the model lacks something"
     said = "No vibration stands out of the turbulence and the noise."
@@ -193,7 +190,7 @@ def run_diagnose(arguments: Namespace) -> Report:
     from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
 
     if arguments.output is not None:
-        paths = given_options(arguments, "file", "gain", "commands", "lines_file")
+        paths = given_options(arguments, "file", "gain", "commands")
         require_page_names(arguments.output, arguments.pdf, inputs=tuple(paths.values()))
     elif arguments.pdf is not None:
         raise ProblemError("--pdf is the page of -o on paper; give -o, too.")
@@ -233,17 +230,16 @@ def _series(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
 
 def _diagnosis_data(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return a diagnosis for JSON; what could not be said is null or empty."""
-    from lbt_synth.identification.diagnosis import disturbance_lines
+    from lbt_synth.identification.diagnosis import disturbance_lines, law_facts
 
     model, law, loop = diagnosis.model, diagnosis.law, diagnosis.loop
     commands = diagnosis.commands
-    poles = {} if law is None else {"poles": [[abs(pole) for pole in row] for row in law.poles]}
     return {
         "doubt": diagnosis.doubt or None,
         "record": record_data(diagnosis.record),
         "channels": [json_record(row) for row in diagnosis.channels],
         "commands": None if commands is None else json_record(commands.facts()),
-        "control_law": None if law is None else asdict(law) | poles,
+        "control_law": None if law is None else asdict(law) | json_record(law_facts(law)),
         "loop": None if loop is None else json_record(loop),
         "lines": [] if model is None else [asdict(line) for line in disturbance_lines(model)],
         "costs": [json_record(row) for row in diagnosis.costs],
@@ -287,7 +283,6 @@ def identification_options(
     loop = record if isinstance(record, LoopRecord) else arguments
     require_writable_facts(record.axes, loop.frame_rate_hz, loop.delay_frames, **telescope)
     options: dict[str, Any] = {
-        "announced": _expected_lines(arguments),
         "lowest_line_hz": arguments.lowest_line_hz,
         "most_lines": arguments.most_lines,
     }
@@ -298,28 +293,6 @@ def identification_options(
     if arguments.noise_nm is not None:
         raise ProblemError("--noise-nm is for spectra; the noise of a series is found in it.")
     return options | {"sensor_gain": record.stated_gain or None}
-
-
-def _expected_lines(arguments: Namespace) -> FloatArray:
-    """Return lines known beforehand and their errors, (lines, 2) [Hz], by arguments and a file."""
-    lines = []
-    if arguments.lines_hz is not None:
-        error = number(arguments.lines_error_hz, "lines_error_hz", at_least=0)
-        lines = [(number(line, "lines_hz", above=0), error) for line in arguments.lines_hz]
-    if arguments.lines_file is not None:
-        path = require_ending(arguments.lines_file, "a list of lines", TEXTS, TelemetryError)
-        columns = read_contents(path).columns
-        # headings, if there are any, must say which column has the frequencies
-        columns.sort(key=lambda column: bool(column.name) and column.role != "frequency")
-        roles = [column.role == "frequency" for column in columns if column.name]
-        table = np.column_stack([column.values for column in columns])
-        if table.shape[1] > 2 or sum(roles) != bool(roles) or np.isnan(table[:, 0]).any():
-            raise ProblemError(
-                f"{path} must have a frequency_hz in each row, and no more than an error_hz beside "
-                f"it; got {join_names(columns)}."
-            )
-        lines += [(row[0], np.nansum(row[1:])) for row in table]
-    return np.reshape(lines, (-1, 2))
 
 
 def read_accelerations(
@@ -363,7 +336,7 @@ def find_places(arguments: Namespace, model: str | Path | None, **others: Path) 
         places["figure"] = require_figure_name(figure)
     elif arguments.figure is not None:
         raise ProblemError("give one of --figure and --no-figure, not both.")
-    read = ("file", "commands", "lines_file", "accelerometers")
+    read = ("file", "commands", "accelerometers")
     inputs = given_options(arguments, *(name for name in read if name in arguments))
     require_writable(*places.values(), inputs=inputs.values())
     return places
@@ -420,10 +393,10 @@ def add_record(report: Report, record: LoopRecord | SpectrumRecord) -> None:
     if isinstance(record, SpectrumRecord):
         report.notes += [f"note: {note}" for note in record.notes]
         return
-    if record.health.findings:
-        caption = f"Record of {record.duration_s:.4g} s: {record.health.summary()}"
-        report.tables.append(row_table(caption, record.health.findings))
-    report.notes += [f"note: {note}" for note in record.health.notes]
+    if record.findings:
+        caption = f"Record of {record.duration_s:.4g} s: {record.summary()}"
+        report.tables.append(row_table(caption, record.findings))
+    report.notes += [f"note: {note}" for note in record.notes]
 
 
 def record_data(record: LoopRecord | SpectrumRecord) -> dict[str, Any]:
@@ -434,11 +407,11 @@ def record_data(record: LoopRecord | SpectrumRecord) -> dict[str, Any]:
     return {
         "kind": "open loop" if record.commands is None else "closed loop",
         "frames": record.frames,
-        "usable": record.health.usable,
+        "usable": int(record.usable.sum()),
         "frame_rate_hz": record.frame_rate_hz,
         "delay_frames": record.delay_frames,
-        "findings": [asdict(finding) for finding in record.health.findings],
-        "notes": record.health.notes,
+        "findings": [asdict(finding) for finding in record.findings],
+        "notes": record.notes,
     }
 
 

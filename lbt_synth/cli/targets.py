@@ -17,8 +17,9 @@ from lbt_synth.errors import GainFileError, ProblemError
 from lbt_synth.files import load_gain
 from lbt_synth.identification import LoopRecord
 from lbt_synth.identification.records.record import require_length
-from lbt_synth.interop import Rehearsal, export, frame_cost, rehearse, target_named
-from lbt_synth.interop.pipeline import target_names
+from lbt_synth.interop import export
+from lbt_synth.interop.c.export import frame_cost
+from lbt_synth.interop.pipeline import Rehearsal, rehearse, target_named, target_names
 from lbt_synth.loop import Imaging
 from lbt_synth.loop.disturbances import Disturbance
 from lbt_synth.loop.strehl import series_strehl
@@ -31,7 +32,7 @@ from lbt_synth.storage.rows import Facts, fact, facts
 from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import FloatArray
 
-_OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps", "loss")
+_OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps")
 _FEWEST = 256  # frames of a record: a loop needs some to settle, and some to compare
 
 

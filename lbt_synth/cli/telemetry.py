@@ -27,12 +27,12 @@ from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
 _FACTS = (  # that a file may not hold
-    *("delay_frames", "unit", "command_unit", "diameter_m", "obstruction"),
+    *("frame_rate_hz", "delay_frames", "unit", "command_unit", "diameter_m", "obstruction"),
     *("axes", "averages", "commands"),
 )
 _READING = (  # options that say how a record is read
     *_FACTS,
-    *("kind", "frame_rate_hz", "columns", "sensor_gain", "command_increments", "swap_axes"),
+    *("columns", "sensor_gain", "command_increments", "swap_axes"),
     *("command_shift_frames", "command_sign", "command_matrix", "command_scale"),
 )
 
@@ -55,14 +55,12 @@ def load_series(
     arguments: Namespace, axes: Sequence[int] | None = None
 ) -> LoopRecord | SpectrumRecord:
     """Load the record of the command line, or some of its axes, whatever its length."""
-    kind, facts = arguments.kind, {name: getattr(arguments, name) for name in _FACTS}
+    facts = {name: getattr(arguments, name) for name in _FACTS}
     if axes is not None:
         chosen = facts["axes"]
         facts["axes"] = list(axes) if chosen is None else [chosen[axis] for axis in axes]
     record = load_record(
         arguments.file,
-        kind=None if kind is None else kind.replace("-", "_"),
-        frame_rate_hz=None if kind == "spectrum" else arguments.frame_rate_hz,
         columns=_parse_columns(arguments.columns),
         **facts,
     )
@@ -153,8 +151,8 @@ def run(arguments: Namespace) -> Report:
         record = require_series(load_series(arguments), "telemetry holds")
         telemetry = telemetry_of_record(record)
         notes = [
-            f"note: {record.health.summary()}",
-            *(f"note: {note}" for note in record.health.notes),
+            f"note: {record.summary()}",
+            *(f"note: {note}" for note in record.notes),
         ]
     choose_unit(arguments, telemetry.diameter_m)
     report = _describe_telemetry(telemetry)

@@ -20,17 +20,17 @@ from lbt_synth.config.schema import (
     VibrationSection,
 )
 from lbt_synth.errors import ConfigError, name_key
+from lbt_synth.models.sensor import illuminated_subapertures
 from lbt_synth.models.sensor_suite import Motions, Sensor, checked_motions
 from lbt_synth.models.vibration import TrueVibration, spread_lines
 from lbt_synth.validation import FloatArray, agree, frozen_copy
 
 if TYPE_CHECKING:
-    from lbt_synth.interop import EndToEndSetup
+    from lbt_synth.interop.specula.optics import EndToEndSetup
 
 T = TypeVar("T")
 _AXES = {"tip": [(1.0, 0.0)], "tilt": [(0.0, 1.0)], "both": [(1.0, 0.0), (0.0, 1.0)]}
 _USUAL_LINES = 5  # of a spread vibration, unless the file says
-_OF_SYSTEM = {"pixels", "actuators_across", "wind_direction_deg", "calibration_nm"}
 
 
 def require_telescope(settings: FileSection, reason: str) -> TelescopeSection:
@@ -118,7 +118,7 @@ def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
     numbers = dict(pyramid)
     across = numbers.pop("subapertures_across")
     return models.pyramid_tilt_noise_nm(
-        subapertures=models.illuminated_subapertures(across, telescope.obstruction),
+        subapertures=illuminated_subapertures(across, telescope.obstruction),
         diameter_m=telescope.diameter_m,
         **numbers,
     )
@@ -238,6 +238,8 @@ def _build_true_vibrations(
         return plant.vibrations
     rate, lines = settings.loop.frame_rate_hz, list[TrueVibration]()
     for section, key, numbers in vibration_numbers(settings, "truth"):
+        if section.kind != "resonance":
+            del numbers["damping"]
         if section.kind == "drift":
             start_hz = numbers.pop("frequency_hz")
             _require_below_nyquist(section.end_hz, rate, f"{key}.end_hz")
@@ -249,7 +251,6 @@ def _build_true_vibrations(
         elif section.kind == "resonance":
             lines.append(models.Vibration(**numbers))
         else:
-            del numbers["damping"]
             lines.append(models.SinusoidalVibration(**numbers))
     return tuple(lines)
 
@@ -430,7 +431,7 @@ def build_end_to_end_setup(
     settings: FileSection, hardware: models.LoopHardware, truth: models.Truth
 ) -> EndToEndSetup:
     """Build the simulation that a configuration describes; refuse one that describes none."""
-    from lbt_synth.interop import EndToEndSetup, EndToEndSystem  # half of the time of a design
+    from lbt_synth.interop.specula.optics import EndToEndSetup  # half of the time of a design
 
     hint = "an end-to-end simulation needs it"
     telescope, air = require_telescope(settings, hint), require_atmosphere(settings, hint)
@@ -450,24 +451,19 @@ def build_end_to_end_setup(
         if not right:
             raise ConfigError(f"{key} {why}.", path=key)
     sensing: dict[str, Any] = {} if pyramid is None else pyramid.model_dump()
-    section = settings.end_to_end
     # the optics do not depend on the sensor gain that the design assumes
     modal = replace(hardware, sensor_matrix=None, influence_matrix=None, modes=2)
     with name_key("end_to_end"):
-        system = EndToEndSystem(
+        return EndToEndSetup(
             hardware=modal,
             sensing_wavelength_um=sensing.pop("wavelength_um"),
             imaging_wavelength_um=settings.imaging.wavelength_um,
             modes=modes or 0,
-            **telescope.model_dump(),
-            **air.model_dump(),
-            **sensing,
-            **section.model_dump(include=_OF_SYSTEM),
-        )
-        return EndToEndSetup(
-            system=system,
             vibrations=truth.vibrations,
             motions=truth.motions,
             seed=settings.simulation.seed,
-            **section.model_dump(exclude=_OF_SYSTEM),
+            **telescope.model_dump(),
+            **air.model_dump(),
+            **sensing,
+            **settings.end_to_end.model_dump(),
         )

@@ -33,7 +33,7 @@ from lbt_synth.validation import FloatArray, choice
 
 if TYPE_CHECKING:
     from lbt_synth.design import Design
-    from lbt_synth.interop import EndToEndSetup
+    from lbt_synth.interop.specula.optics import EndToEndSetup
 
 Checked = TypeVar("Checked", bound=BaseModel)
 _LARGEST_BYTES = 2**17  # of a file; ruamel.yaml may read no more than 30 kB per second

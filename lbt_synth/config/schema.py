@@ -234,12 +234,12 @@ class TrueVibrationSection(_LineSection):
     """A vibration of the truth: a sinusoid, a resonance with its damping, or one that drifts."""
 
     kind: Literal["sinusoid", "resonance", "drift"] = key("sinusoid, resonance or drift")
-    damping: q.Damping | None = key("damping ratio of a resonance or a drift", None)
+    damping: q.Damping | None = key("damping ratio of a resonance", None)
     sections: int | None = key(_SECTIONS, None, ge=1, le=MOST_SECTIONS)
     end_hz: q.Hertz | None = key("frequency at the end of a drift [Hz]", None)
     duration_s: q.Seconds | None = key("duration of a drift [s]", None)
     _rules = by_kind(
-        sinusoid=(), resonance=("damping", "sections?"), drift=("damping?", "end_hz", "duration_s")
+        sinusoid=(), resonance=("damping", "sections?"), drift=("end_hz", "duration_s")
     )
 
 

@@ -13,11 +13,10 @@ from lbt_synth.linear import (
     EstimationProblem,
     StateSpace,
     hinf_norm,
-    infeasible_level,
-    largest_singular_values,
 )
-from lbt_synth.linear.infeasibility_proof import Witness
+from lbt_synth.linear.infeasibility_proof import Witness, infeasible_level
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
+from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.linear.riccati.filtering import kalman_gains, kalman_riccati
 from lbt_synth.loop import ClosedLoop
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
@@ -174,7 +173,7 @@ def _examine_error(error: StateSpace, stability: str) -> tuple[Certificate, Floa
     P, variances, checks = _examine_variance(error)
     norm = hinf_norm(error)
     grid = np.linspace(0, 0.5 / error.dt_s, _GRID)
-    highest = float(np.max(largest_singular_values(error, grid)))
+    highest = float(np.max(spectral_norms(error.frequency_response(grid))))
     above = (highest - _rounding(error)) / max(norm.upper, _TINY) - 1
     how = f"{_GRID} frequencies against level sets"
     peak = Check("singular values above the norm", above, TOLERANCE, how)
@@ -255,7 +254,7 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
     >>> import numpy as np
     >>> import lbt_synth as lbt
     >>> p = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> push = lbt.linear.Witness(states=np.zeros((1, 1)), disturbances=np.array([[1.0], [0.0]]))
+    >>> push = Witness(states=np.zeros((1, 1)), disturbances=np.array([[1.0], [0.0]]))
     >>> (
     ...     lbt.design.certify_infeasible(p, 1.0, push).passed,
     ...     lbt.design.certify_infeasible(p, 1.1, push).passed,

@@ -39,8 +39,9 @@ from lbt_synth.design.result import (
     with_certificate,
 )
 from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.linear import Controller, EstimationProblem, StateSpace, Witness
+from lbt_synth.linear import Controller, EstimationProblem, StateSpace
 from lbt_synth.linear.estimation_problem import decorrelate
+from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.matrix_functions import relative_distance
 from lbt_synth.linear.riccati.filtering import (
     FilterRiccati,

@@ -10,9 +10,13 @@ from lbt_synth.design.filter_design import FilterDesign, filter_design
 from lbt_synth.design.kalman import error_scale
 from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import CertificateError, InfeasibleError, NumericalError, ProblemError
-from lbt_synth.linear import EstimationProblem, hinf_norm, infeasible_level
+from lbt_synth.linear import EstimationProblem, hinf_norm
 from lbt_synth.linear.estimation_problem import require_problem
-from lbt_synth.linear.infeasibility_proof import Witness, worst_invisible_disturbance
+from lbt_synth.linear.infeasibility_proof import (
+    Witness,
+    infeasible_level,
+    worst_invisible_disturbance,
+)
 from lbt_synth.linear.riccati.filtering import (
     FilterRiccati,
     gamma_riccati,

@@ -21,10 +21,10 @@ from lbt_synth.linear import (
     EstimationProblem,
     StateSpace,
     hinf_norm,
-    infeasible_level,
-    largest_singular_values,
 )
 from lbt_synth.linear.estimation_problem import require_problem
+from lbt_synth.linear.infeasibility_proof import infeasible_level
+from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.linear.riccati.filtering import FilterRiccati, gamma_riccati, kalman_riccati
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
@@ -189,7 +189,7 @@ def _complete_base(
             return taps, SolverReport(route="youla", status=status, iterations=rounds)
         fine = np.linspace(0, 0.5 / error.dt_s, _FINE_GRID)
         fine = np.unique(np.concatenate([fine, _frequencies_near_poles(error)]))
-        sigma = largest_singular_values(error, fine)
+        sigma = spectral_norms(error.frequency_response(fine))
         inner = np.r_[True, sigma[1:] >= sigma[:-1]] & np.r_[sigma[:-1] >= sigma[1:], True]
         high = fine[inner & (sigma > level * (1 + _EXCESS / 4))]
         grid = np.unique(np.concatenate([grid, high, [peak.peak_frequency_hz]]))

@@ -12,7 +12,8 @@ from lbt_synth.design.certificate import Certificate
 from lbt_synth.design.filter_design import Fallback
 from lbt_synth.design.plain import from_plain, to_plain
 from lbt_synth.design.result import Design, SolverReport
-from lbt_synth.linear import Controller, EstimationProblem, Witness
+from lbt_synth.linear import Controller, EstimationProblem
+from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.models import LoopHardware, SensorSuite, TipTiltPlant
 from lbt_synth.models.plant.assembly import PlantParts
 from lbt_synth.models.plant.tip_tilt import assemble

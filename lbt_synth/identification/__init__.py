@@ -1,6 +1,6 @@
 """Identification of a recorded loop, and designs tested on its data.
 
-Records come from files of any origin, with a report on their health.
+Records come from files of any origin, with a report on their faults.
 The fit returns turbulence, vibration lines, noise and sensor gain with standard errors.
 Predictions are tested on data that nothing was fitted to.
 """

@@ -7,6 +7,7 @@ stable at all sensor gains that the record allows.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -17,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design import Design, PredictorDesign
+from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import CertificateError, NumericalError, SynthesisError
-from lbt_synth.identification.accelerometers.readings import Channels, channels_beside
+from lbt_synth.identification.accelerometers.readings import channels_beside
 from lbt_synth.identification.commands.repair import CommandRepair
 from lbt_synth.identification.commands.verdict import (
     could_have_run,
@@ -32,14 +33,15 @@ from lbt_synth.identification.fit.fitting import GAIN_STEP, PLAUSIBLE_GAINS, POS
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
 from lbt_synth.identification.fit.identify import OPEN_GAIN, identify
 from lbt_synth.identification.prediction.comparison import (
+    WITHOUT,
+    PredictionRow,
     PredictionTable,
     compare_designs,
-    unseen_claims,
+    design_inputs,
 )
 from lbt_synth.identification.prediction.regression import (
     ChannelValue,
     channel_values,
-    noisier,
     regress,
 )
 from lbt_synth.identification.prediction.residual import ResidualEstimate
@@ -53,7 +55,7 @@ from lbt_synth.methods.registry import (
     method_named,
     record_methods,
 )
-from lbt_synth.methods.request import PlantInputs, design_request, option_owners
+from lbt_synth.methods.request import design_request, option_owners
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -64,7 +66,6 @@ LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a mod
 _SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 DELAY_ERROR = 0.1  # frames, by which every design of a record may be off
 _MOST_NOISE = 10  # octaves of noise, by which a filter trusts its sensor no more
-_HALVINGS = 3  # of an octave: to a tenth of the noise that is assumed
 _MISFIT = 1.5  # factor by which a gain may be off where the model leaves something out
 
 
@@ -101,7 +102,6 @@ def design_from_record(
     method: str | None = None,
     gamma_ratio: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
-    announced: ArrayLike = (),
     imaging: Imaging | None = None,
     accept_record: bool = False,
     command_scale_known: bool = False,
@@ -128,7 +128,7 @@ def design_from_record(
         Method of synthesis that needs no more than a plant; chosen by default.
     gamma_ratio : float, optional
         For methods with a bound: the norm as a multiple of the least one; 1.2 by default.
-    sensor_gain, announced
+    sensor_gain : float or one per axis, optional
         As for :func:`identify`.
     imaging : Imaging, optional
         The camera, for Strehl ratios; 2.2 um by default.
@@ -190,48 +190,52 @@ def design_from_record(
     seconds = _require_able(record, method, defaults)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
-    options |= {"sensor_gain": sensor_gain, "announced": announced}
-    first, _ = split_halves(record.stretches(), record.frames)
+    options |= {"sensor_gain": sensor_gain}
+    first, _ = split_halves(record.stretches())
     half = identify(record, stretches=first, **options)
     finds_gain = record.commands is not None and sensor_gain is None
-    if finds_gain:
-        assumptions += _judge_gains(half, accept_record)
+    assumptions += _judge_gains(half, accept_record) if finds_gain else ()
     step(1)
     names = quick_methods() if method is None else [method]
     requests = {name: {} if method else method_named(name).reference_options for name in names}
-    held_out, designs = compare_designs(
-        record, half, requests, defaults=defaults, imaging=imaging or Imaging(), channels=beside
-    )
+    inputs: dict[str, Any] = {"channels": beside, "defaults": defaults}
+    camera = imaging or Imaging()
+    held_out, designs = compare_designs(record, half, requests, imaging=camera, **inputs)
     if not designs:
         raise NumericalError(f"no design holds the loop: {'; '.join(held_out.notes)}.")
     if method is None:
-        rows = [(row.name, row.replayed) for row in held_out.entries if row.name in designs]
-        title, note = choose_method({name: data for name, data in rows if data is not None})
+        rows = {row.name: row.replayed for row in held_out.entries if row.name in designs}
+        title, note = choose_method({name: data for name, data in rows.items() if data})
         method = next(name for name in names if method_named(name).title == title)
         notes.append(note)
     step(1)
-    model = identify(record, start=half, **options)
-    predictor = None
-    if method_named(method).of_record:
-        predictor = _Predictor(record, half, model, beside)
-    made, price = design_for_gains(
+    model, request = identify(record, start=half, **options), design_request(method, {})
+    if request.method.of_record:  # one penalty, that of the noise as it is, for all trials
+        inputs["penalty"] = regress(record, model, channels=beside).penalty
+    made_of = partial(design_inputs, record, model, **inputs)
+    made, noise, price = design_for_gains(
         model,
-        predictor.design if predictor else partial(_design, method, model, defaults),
+        lambda noise: request.build(made_of(noise=noise)),
         allowed_gains(record, model) if finds_gain else None,
         command_scale_known=command_scale_known,
-        claimed=predictor.claimed if predictor else _as_it_is,
     )
+    title, tested = request.method.title, held_out
+    if noise > 1:
+        one = {method: requests[method]}
+        tested, _ = compare_designs(record, half, one, noise=noise, **inputs)
+        notes.append(_say_price(price, tested.row(title), held_out.row(title)))
+    if of_record := request.method.of_record:
+        made = replace(made, claims={**made.claims, **_claims(tested, title)})
     step(1)
     return RecordedDesign(
         model=model,
         design=replace(made, assumptions=(*assumptions, *made.assumptions)),
         half_model=half,
         held_out=held_out,
-        name=method_named(method).title,
-        channels=predictor.channel_values() if predictor else (),
+        name=title,
+        channels=channel_values(record, half, beside) if of_record and beside else (),
         notes=(
             *notes,
-            *price,
             *_compare_gains(model, half),
             *note_drift(record, model.plant(), made),
             *_note_short(seconds, model),
@@ -239,48 +243,20 @@ def design_from_record(
     )
 
 
-class _Predictor:
-    """The predictors of a whole record; what they claim is what those of its first half leave."""
-
-    def __init__(
-        self,
-        record: LoopRecord,
-        half: IdentifiedModel,
-        model: IdentifiedModel,
-        channels: Channels | None,
-    ) -> None:
-        self._half, self._model = half, model
-        self._claims = partial(unseen_claims, record, half, channels=channels)
-        self._fit = partial(regress, record, channels=channels)
-        self._first, self._later = split_halves(record.stretches(), record.frames)
-        self._whole, self._past = self._fit(model), self._fit(half, stretches=self._first)
-
-    def design(self, noise: float) -> Design:
-        """Return the design that assumes a multiple of the model's noise, without claims."""
-        whole = self._whole if noise == 1 else self._fit(self._model, noise=noise)
-        return whole.design(self._whole.penalty)
-
-    def claimed(self, design: Design, noise: float) -> Design:
-        """Return the design with what that of the first half leaves of the second."""
-        past = self._past
-        if noise != 1:
-            past = self._fit(self._half, stretches=self._first, noise=noise)
-        claims = self._claims(past.design(self._past.penalty))
-        return replace(design, claims={**design.claims, **claims})
-
-    def channel_values(self) -> tuple[ChannelValue, ...]:
-        """Return what each channel is worth on the second half of the record."""
-        noise_nm2 = float(np.sum(np.array([axis.noise_nm for axis in self._half.axes]) ** 2))
-        unseen = self._fit(self._half, stretches=self._later)
-        return tuple(channel_values(self._past, unseen, noise_nm2))
+def _say_price(price: str, now: PredictionRow | None, before: PredictionRow | None) -> str:
+    """Say what a design that assumes more noise leaves on unseen data, and without that."""
+    leaves = [nm_text(np.nan if row is None else row.replayed_nm) for row in (now, before)]
+    return f"{price}. It leaves {leaves[0]} on unseen data, and without that {leaves[1]}"
 
 
-def _design(
-    method: str, model: IdentifiedModel, defaults: Mapping[str, Any], noise: float = 1.0
-) -> Design:
-    """Return the design of a method for a model, and a multiple of its noise."""
-    inputs = PlantInputs(plant=noisier(model, noise).plant(), design_defaults=defaults)
-    return design_request(method, {}).build(inputs)
+def _claims(table: PredictionTable, title: str) -> dict[str, float]:
+    """Return what a predictor claims: what that of the first half leaves, where it is above 0."""
+    claims, alone = dict[str, float](), table.row(f"{title}{WITHOUT}")
+    if row := table.row(title):
+        claims = {"residual_nm": row.replayed_nm, "residual_error_nm": row.replayed_error_nm}
+    if alone:
+        claims["alone_nm"] = alone.replayed_nm
+    return {name: value for name, value in claims.items() if value > 0}
 
 
 def _require_able(record: LoopRecord, method: str | None, defaults: Mapping[str, Any]) -> float:
@@ -457,28 +433,21 @@ def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:
     return None
 
 
-def _as_it_is(design: Design, noise: float) -> Design:
-    """Return a design that claims all that it will."""
-    return design
-
-
 def design_for_gains(
     model: IdentifiedModel,
     design: Callable[[float], Design],
     allowed: FloatArray | None,
     *,
     command_scale_known: bool,
-    claimed: Callable[[Design, float], Design] = _as_it_is,
-) -> tuple[Design, tuple[str, ...]]:
-    """Return a design that is stable at all sensor gains that a record allows, and notes.
+) -> tuple[Design, float, str]:
+    """Return a design that is stable at all sensor gains that a record allows, and its noise.
 
-    ``design`` makes one that assumes a multiple of the model's noise, and ``claimed`` adds what
-    only the one that is taken claims. Its first assumption says which gains are possible. Commands
-    that were recorded at half their size look like twice the sensor gain, and no record can tell;
-    so unless the scale of the commands is known, half of the gains are possible, and each axis may
-    have those of both. Where the design is unstable at one of them, or with a delay a tenth of a
-    frame off, the one that assumes the least more noise and is stable takes its place: the more
-    noise, the less a filter trusts its sensor.
+    ``design`` makes one that assumes a multiple of the model's noise. Its first assumption says
+    which gains are possible. Commands that were recorded at half their size look like twice the
+    sensor gain, and no record can tell; so unless the scale of the commands is known, half of the
+    gains are possible, and each axis may have those of both. Where the design is unstable at one of
+    them, or with a delay a tenth of a frame off, the one that assumes the least more noise and is
+    stable takes its place: the more noise, the less a filter trusts its sensor. A note says so.
     """
     usual, assumed = design(1.0), list[str]()
     intervals = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1)
@@ -496,67 +465,53 @@ def design_for_gains(
             if np.ptp(allowed, axis=0).any():
                 text += ", and each axis at those of both, because they differ"
         assumed.append(text)
-    bad, usual = unstable_gains(usual, intervals), claimed(usual, 1.0)
-    if bad is None:
-        return replace(usual, assumptions=(*assumed, *usual.assumptions)), ()
-    stable = _assume_noise(design, intervals)
-    advice = "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
-    if stable is None:
-        gain = ", ".join(f"{value:.3g}" for value in bad)
-        raise CertificateError(
-            f"the loop of the design is unstable at the sensor gain {gain}, or there with a delay "
-            f"{DELAY_ERROR:g} frames off, and the record allows {_in_words(intervals)}. Record "
-            f"with a higher loop gain, look for jumps in it, give the sensor gain{advice}."
+    bad, noise, note = unstable_gains(usual, intervals), 1.0, ""
+    if bad is not None:
+        stable = _assume_noise(design, intervals)
+        if stable is None:
+            advice = (
+                "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
+            )
+            gain = ", ".join(f"{value:.3g}" for value in bad)
+            raise CertificateError(
+                f"the loop of the design is unstable at the sensor gain {gain}, or there with a "
+                f"delay {DELAY_ERROR:g} frames off, and the record allows {_in_words(intervals)}. "
+                "Record with a higher loop gain, look for jumps in it, give the sensor "
+                f"gain{advice}."
+            )
+        usual, noise = stable
+        note = (
+            f"to be stable at sensor gains of {_in_words(intervals)}, and with a delay up to "
+            f"{DELAY_ERROR:g} frames off, the design assumes {noise:.3g} times the noise"
         )
-    safe = claimed(*stable)
-    note = (
-        f"to be stable at sensor gains of {_in_words(intervals)}, and with a delay up to "
-        f"{DELAY_ERROR:g} frames off, the design leaves {nm_text(_residual_nm(safe, model))}; "
-        f"without that it would leave {nm_text(_residual_nm(usual, model))}"
-    )
-    wanted = list[str]()
-    if allowed is not None and not command_scale_known:
-        wanted.append("--command-scale 1 if the commands were recorded at the size applied")
-    if allowed is not None and np.any(allowed[:, 1] > (1 + DIFFERENT * OPEN_GAIN) * allowed[:, 0]):
-        wanted.append("--sensor-gain, which the record leaves open")
-    if wanted:
-        note = f"warning: {note}. Give {' or '.join(wanted)}"
-    return replace(safe, assumptions=(*assumed, *safe.assumptions)), (note,)
+        wanted = list[str]()
+        if allowed is not None and not command_scale_known:
+            wanted.append("--command-scale 1 if the commands were recorded at the size applied")
+        if allowed is not None and np.any(
+            allowed[:, 1] > (1 + DIFFERENT * OPEN_GAIN) * allowed[:, 0]
+        ):
+            wanted.append("--sensor-gain, which the record leaves open")
+        if wanted:
+            note = f"warning: {note}. Give {' or '.join(wanted)}"
+    return replace(usual, assumptions=(*assumed, *usual.assumptions)), noise, note
 
 
 def _assume_noise(
     design: Callable[[float], Design], intervals: FloatArray
 ) -> tuple[Design, float] | None:
     """Return the design of least more noise that is stable at all gains, and the factor."""
-    stable, low, high = None, 0.0, 1.0  # binary logarithms of factors
-    while stable is None and high <= _MOST_NOISE:
-        stable = _if_stable(design, 2.0**high, intervals)
-        low, high = (low, high) if stable else (high, high + 1)
-    for _ in range(_HALVINGS if stable else 0):
-        middle = (low + high) / 2
-        nearer = _if_stable(design, 2.0**middle, intervals)
-        low, high = (low, middle) if nearer else (middle, high)
-        stable = nearer or stable
-    return None if stable is None else (stable, 2.0**high)
+    designs = dict[int, Design]()
 
+    def is_stable(step: int) -> bool:
+        """Whether there is a design that assumes so many eighths of an octave, and it is stable."""
+        with suppress(SynthesisError):
+            designs[step] = design(2.0 ** (step / 8))
+            return unstable_gains(designs[step], intervals) is None
+        return False
 
-def _if_stable(
-    design: Callable[[float], Design], factor: float, intervals: FloatArray
-) -> Design | None:
-    """Return the design that assumes more noise, if there is one and it is stable at all gains."""
-    with suppress(SynthesisError):
-        careful = design(factor)
-        if unstable_gains(careful, intervals) is None:
-            return careful
-    return None
-
-
-def _residual_nm(design: Design, model: IdentifiedModel) -> float:
-    """Return what a design claims of its record, or else leaves in a model; inf if unstable."""
-    if isinstance(design, PredictorDesign):
-        return design.expected_residual_nm or np.nan
-    loop = close_loop(model.hardware, design.controller)
-    return residual_budget(loop, model.truth()).rms_nm if loop.is_stable else float("inf")
+    steps = range(8 * _MOST_NOISE + 1)
+    least = bisect_left(steps, True, lo=1, key=is_stable)
+    return (designs[least], 2.0 ** (least / 8)) if least < len(steps) else None
 
 
 def _in_words(intervals: FloatArray) -> str:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy.signal import welch
 
 from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import LbtSynthError, ProblemError
@@ -37,12 +36,7 @@ from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, loop_margins, residual_budget
 from lbt_synth.loop.stable_range import stable_sensor_gains
-from lbt_synth.methods.registry import (
-    METHODS,
-    default_method,
-    method_named,
-    reference_methods,
-)
+from lbt_synth.methods.registry import METHODS, reference_methods
 from lbt_synth.models import TipTiltPlant, Truth
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.display_unit import nm_text
@@ -55,8 +49,6 @@ DEAD = "dead"
 _NOISIER = 3.0  # times the other axis, from frame to frame: turbulence and lines are more alike
 _WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel
 _WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers", "held": "held"}
-_ALL = "all"  # parts together
-_SEGMENT = 256  # frames of a spectrum: 4 Hz at 1 kHz, as finely as a miss is told
 _NARROW = 0.3  # modulus margin: less is a gain margin below 1.4
 _LEAST_SHARE = 0.05  # of the residual variance, of a part that is named
 
@@ -109,7 +101,7 @@ def _judge_channel(
     """Return what is known of one column of the measurements or commands, (frames, axes)."""
     faults = {
         finding.kind: finding.fraction
-        for finding in record.health.findings
+        for finding in record.findings
         if (finding.series, finding.axis) == (series, axis) and finding.kind in _WORDS
     }
     steps = np.diff(values, axis=0)[good[1:] & good[:-1]]
@@ -173,8 +165,11 @@ def loop_facts(model: IdentifiedModel, running: Controller | None) -> Facts:
     if running is not None:
         loop = close_loop(model.hardware, running)
         radius = loop.spectral_radius
-        stable = _stable_gains(model, running) or "unstable at this one"
+        stable = "unstable at this one"
         if loop.is_stable:
+            low, high = stable_sensor_gains(model.hardware, running)
+            nominal = float(np.mean(model.sensor_gains))
+            stable = f"{low * nominal:.3g} to {high * nominal:.3g}"
             margins = loop_margins(loop)
             modulus, crossover = margins.modulus, margins.crossover_hz
     return facts(
@@ -186,15 +181,6 @@ def loop_facts(model: IdentifiedModel, running: Controller | None) -> Facts:
         modulus=fact(modulus, "modulus margin", format=".3f"),
         crossover_hz=fact(crossover, "crossover", unit="Hz", format=".3g"),
     )
-
-
-def _stable_gains(model: IdentifiedModel, controller: Controller) -> str:
-    """Return the real sensor gains at which the loop is stable, empty if not at the model's."""
-    if not close_loop(model.hardware, controller).is_stable:
-        return ""
-    nominal = float(np.mean(model.sensor_gains))
-    low, high = stable_sensor_gains(model.hardware, controller)
-    return f"{low * nominal:.3g} to {high * nominal:.3g}"
 
 
 def given_controller(design: Design, model: IdentifiedModel) -> Controller:
@@ -215,12 +201,8 @@ def given_controller(design: Design, model: IdentifiedModel) -> Controller:
 
 
 def given_design_notes(name: str, design: Design, model: IdentifiedModel) -> list[str]:
-    """Say what a given design promises, and how its loop differs from that of the record."""
-    stable = _stable_gains(model, given_controller(design, model))
-    notes = [
-        f"{name} promises {nm_text(design.rms)} by its own model, and its loop is "
-        f"{f'stable at sensor gains of {stable}' if stable else 'unstable'}"
-    ]
+    """Say how the loop of a given design differs from that of the record."""
+    notes = list[str]()
     if (path := design.hardware) is None:
         return notes
     if path.sensor.shape == (path.modes, path.modes):
@@ -244,12 +226,8 @@ def disturbance_lines(model: IdentifiedModel) -> tuple[IdentifiedLine, ...]:
 def line_name(line: IdentifiedLine) -> str:
     """Return what a table of costs calls a resonance, and along what it shakes."""
     kind = "line" if line.kind == "line" else "broad resonance"
-    name, direction = f"{kind} at {line.frequency_hz:.4g} Hz", line.direction or (1.0,)
-    if len(direction) == 1:
-        return name
-    if np.count_nonzero(direction) == 1:
-        return f"{name} in {AXES[int(np.argmax(np.abs(direction)))]}"
-    return f"{name} along {line.direction_deg:.0f} deg"
+    where = "" if line.direction in (None, (1.0,)) else f" ({line.axis_text(AXES)})"
+    return f"{kind} at {line.frequency_hz:.4g} Hz{where}"
 
 
 @table_row
@@ -265,12 +243,13 @@ def disturbance_costs(
     plant: TipTiltPlant,
     lines: Sequence[IdentifiedLine],
     running: Controller | None,
-    best: Controller | None,
+    best: Controller,
 ) -> tuple[CostRow, ...]:
     """Return a row per part of the disturbance, the most costly first, and one of all."""
     ran, designed = (_costs(plant, lines, controller) for controller in (running, best))
     costs = ran or designed
-    order = sorted(costs, key=lambda name: (name == _ALL, -costs[name]))
+    *parts, everything = costs
+    order = [*sorted(parts, key=lambda name: -costs[name]), everything]
     return tuple(
         CostRow(part=name, running_nm=ran.get(name, np.nan), best_nm=designed.get(name, np.nan))
         for name in order
@@ -280,7 +259,7 @@ def disturbance_costs(
 def _costs(
     plant: TipTiltPlant, lines: Sequence[IdentifiedLine], controller: Controller | None
 ) -> dict[str, float]:
-    """Return the rms that each part leaves, and that of all [nm]; none of no stable loop."""
+    """Return the rms that each part leaves, and last that of all [nm]; none of no stable loop."""
     if controller is None or not (loop := close_loop(plant.hardware, controller)).is_stable:
         return {}
     budget = residual_budget(loop, plant, frame_means=True)
@@ -291,8 +270,9 @@ def _costs(
         parts[line_name(line)] = parts.get(line_name(line), 0.0) + rms_nm**2
     total = float(np.trace(budget.total_nm2))
     parts["turbulence"] = total - sum(parts.values())  # slow resonances are turbulence
-    variances = {**parts, _ALL: total}
-    return {name: float(np.sqrt(max(value, 0.0))) for name, value in variances.items()}
+    return {
+        name: float(np.sqrt(max(value, 0.0))) for name, value in (parts | {"all": total}).items()
+    }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -306,39 +286,22 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Diagnosis:
-    """What a record tells of its loop.
-
-    Attributes
-    ----------
-    record, imaging, commands : LoopRecord, Imaging, CommandVerdict or None
-        The record, the camera of Strehl ratios, and how commands reach the measurements (None of an
-        open loop).
-    channels : tuple of ChannelRow
-        Measurements and commands, one by one.
-    model, loop : IdentifiedModel or None, Facts or None
-        The model of the whole record, and the loop that ran, by law and model.
-    comparison : PredictionTable or None
-        Residuals on the second half of the record, by models of the first.
-    best, best_design : str, Design or None
-        Row of the comparison that leaves least, of the designs, and that design.
-    costs : tuple of CostRow
-        What each part of the disturbance costs by the model of the first half, the most costly
-        first; the last row is all.
-    notes : tuple of str
-        What could not be said and why, and what else should be known.
-    """
+    """What a record tells of its loop."""
 
     record: LoopRecord
-    imaging: Imaging
-    commands: CommandVerdict | None = None
-    channels: tuple[ChannelRow, ...] = ()
-    model: IdentifiedModel | None = None
-    loop: Facts | None = None
+    imaging: Imaging  # the camera of Strehl ratios
+    commands: CommandVerdict | None = None  # how they reach the measurements; None of an open loop
+    channels: tuple[ChannelRow, ...] = ()  # measurements and commands, one by one
+    model: IdentifiedModel | None = None  # of the whole record
+    loop: Facts | None = None  # that ran, by law and model
+    # residuals on the second half of the record, by models of the first
     comparison: PredictionTable | None = None
-    best: str = ""
+    best: str = ""  # row of the comparison that leaves least, of the designs
     best_design: Design | None = None
+    # what each part of the disturbance costs by the model of the first half, the most costly first;
+    # the last row is all
     costs: tuple[CostRow, ...] = ()
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what could not be said and why, and what else should be known
 
     @property
     def law(self) -> ControlLaw | None:
@@ -359,7 +322,6 @@ class Diagnosis:
     def findings(self) -> tuple[Finding, ...]:
         """What the record tells, the most urgent first; the last one is about its residual."""
         faults = list(_find_faults(self)) or [_judge_loop(self)]
-        faults += _missed_by_the_model(self)
         return (*faults, Finding(sentence=_residual_text(self), advice=_advice_text(self)))
 
     @property
@@ -371,7 +333,7 @@ class Diagnosis:
 
     def row(self, name: str) -> PredictionRow | None:
         """Return a row of the comparison, None where there is none."""
-        return next((row for row in self.residuals if row.name == name), None)
+        return None if self.comparison is None else self.comparison.row(name)
 
 
 def diagnose(
@@ -481,7 +443,7 @@ def _compare(
     Its sensor gain is that of the whole record, because a half shows it less well.
     """
     record, imaging = diagnosis.record, diagnosis.imaging
-    first, _ = split_halves(record.stretches(), record.frames)
+    first, _ = split_halves(record.stretches())
     fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
     half = identify(record, **{**options, **fixed})
     more = [m for m in METHODS.values() if m.plant_section is not None or m.of_record]
@@ -511,30 +473,6 @@ def _find_faults(diagnosis: Diagnosis) -> Iterator[Finding]:
             sentence=f"The commands are not those that the mirror followed: {diagnosis.doubt}.",
             advice=f"First {diagnosis.commands.advice}.",
         )
-
-
-def _missed_by_the_model(diagnosis: Diagnosis) -> Iterator[Finding]:
-    """Say where the model misses what past readings tell: a predictor leaves clearly less."""
-    rows = {row.name: row.replayed for row in diagnosis.residuals}
-    model, data = (
-        rows.get(method_named(name).title)
-        for name in (default_method(), *(m.name for m in METHODS.values() if m.of_record))
-    )
-    if model is None or data is None or not model.is_clearly_above(data):
-        return
-    series = (one.measured_nm for one in (model, data))
-    first, second = (np.sum(welch(e, nperseg=_SEGMENT, axis=0)[1], axis=1) for e in series)
-    more, peak = first - second, int(np.argmax(first - second))
-    below = np.flatnonzero(more < more[peak] / 2)
-    low = max(below[below < peak], default=-1) + 0.5
-    high = min(below[below > peak], default=len(more)) - 0.5
-    low_hz, high_hz = (diagnosis.record.frame_rate_hz / _SEGMENT * end for end in (low, high))
-    less_nm = float(np.sqrt(model.total_nm2 - data.total_nm2))
-    yield Finding(
-        tone="note",
-        sentence=f"The model misses {nm_text(less_nm)} that past readings tell, above all "
-        f"between {low_hz:.0f} and {high_hz:.0f} Hz.",
-    )
 
 
 def _judge_loop(diagnosis: Diagnosis) -> Finding:

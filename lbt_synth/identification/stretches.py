@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.validation import integer, number
+from lbt_synth.validation import integer
 
 Stretches: TypeAlias = tuple[tuple[int, int], ...]
 StretchesLike: TypeAlias = Sequence[tuple[int, int]]
@@ -33,45 +33,15 @@ def checked_stretches(stretches: StretchesLike | None, frames: int) -> Stretches
     return tuple(out)
 
 
-def split_halves(
-    stretches: StretchesLike | None, frames: int, *, fit_share: float = 0.5
-) -> tuple[Stretches, Stretches]:
-    """Split a record into frames to fit and later frames to test on.
-
-    Parameters
-    ----------
-    stretches : sequence of (start, stop), or None
-        Contiguous usable frames, in order; None for the whole record of so many ``frames``.
-    frames : int
-        Frames of the record.
-    fit_share : float, optional
-        Part of the usable frames that is fitted, in (0, 1).
-
-    Returns
-    -------
-    tuple of ((start, stop), ...)
-        Stretches of the fit and of the test.
-
-    Raises
-    ------
-    ProblemError
-        If the stretches do not fit the record, or a half is left without frames.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lbt.identification.split_halves([(0, 400), (500, 900)], 1000, fit_share=0.25)
-    (((0, 200),), ((200, 400), (500, 900)))
-    """
-    usable = checked_stretches(stretches, integer(frames, "frames", at_least=1))
-    count = sum(stop - start for start, stop in usable)
-    cut = int(number(fit_share, "fit_share", above=0, below=1) * count)
-    if not 1 <= cut < count:
+def split_halves(stretches: Stretches) -> tuple[Stretches, Stretches]:
+    """Split the usable frames of a record into those to fit and later ones to test on."""
+    count = sum(stop - start for start, stop in stretches)
+    if count < 2:
         raise ProblemError(
             f"a record must leave frames to fit and to test on; got {count} usable frames. Record "
             "more."
         )
-    return cut_stretches(usable, 0, cut), cut_stretches(usable, cut, count)
+    return cut_stretches(stretches, 0, count // 2), cut_stretches(stretches, count // 2, count)
 
 
 def cut_stretches(stretches: Stretches, first: int, last: int) -> Stretches:

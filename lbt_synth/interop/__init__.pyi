@@ -1,13 +1,2 @@
-from .c.export import frame_cost as frame_cost
-from .pipeline import Arithmetic as Arithmetic
-from .pipeline import Exported as Exported
-from .pipeline import Rehearsal as Rehearsal
-from .pipeline import Target as Target
 from .pipeline import export as export
-from .pipeline import rehearse as rehearse
-from .pipeline import target_named as target_named
-from .specula.optics import EndToEndSystem as EndToEndSystem
-from .specula.optics import calibrate as calibrate
-from .specula.simulation import EndToEndRun as EndToEndRun
-from .specula.simulation import EndToEndSetup as EndToEndSetup
 from .specula.simulation import run_end_to_end as run_end_to_end

@@ -37,7 +37,7 @@ from lbt_synth.loop.simulation import (
 )
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
-from lbt_synth.storage.rows import column, json_record, table_row
+from lbt_synth.storage.rows import json_record
 from lbt_synth.validation import FloatArray, choice, number, require_instance
 
 CERTIFICATE = ".certificate.json"  # added to the name of what is written: its certificate
@@ -49,69 +49,33 @@ _DIGEST = re.compile(r"[0-9a-f]{64}")
 _MOST_SETTLING = 0.25  # part of the frames that the loops may settle in
 
 
-@table_row
-class Arithmetic:
-    """How the program that loads a file computes with it."""
-
-    program: str = column("program")
-    precision: str = column("precision")
-    sums: str = column("order of sums")
-    state: str = column("convention of the state")
-    clipping: str = column("clipping")
-    limits: str = column("limits")
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Target:
     """A program that runs our controllers: how it rounds, writes and reads the numbers of a design.
 
-    Attributes
-    ----------
-    arithmetic : Arithmetic
-        How it computes.
-    file, hint : str
-        What is written, in words; what to try where the proof fails.
-    options : mapping
-        Options of :func:`export` that the target takes, each with its default.
-    round : callable
-        ``round(designs, **options)`` returns the numbers of each design, in a type of the target.
-    write, read : callable
-        ``write(place, whole, design, origin, gain_digest=..., **options)`` returns the content of
-        each file, and ``read(files, whole)`` the numbers in it; ``whole`` has their sizes.
-    computed : callable
-        ``computed(design, numbers)`` returns the :class:`Written` that is proved.
-    start : callable
-        ``start(numbers, limit)`` returns a twin, which clips where the program knows the limit.
-    join : callable or None
-        ``join(numbers, parts, count)`` returns the numbers of a file of so many modes. Without it a
-        file holds one design, of any matrices.
-    facts, remark : callable
-        ``facts(whole, **options)`` returns what else the certificate names, and
-        ``remark(design, numbers)`` what a user is told, or nothing.
-    endings, beside, contents : tuple of str
-        Endings of a file, those of what goes beside it; names in a folder.
-    modal, reads_others : bool
-        Whether measurements and commands of one design must be the modes, too, as those of several
-        must; whether a design may read further sensors.
+    ``whole`` are the numbers of a file, of all its modes.
     """
 
-    arithmetic: Arithmetic
-    file: str
+    precision: str  # of its sums, unless an option says
+    # round(designs, **options) returns the numbers of each design, in a type of the target
     round: Callable[..., list[Any]]
+    # write(place, whole, design, origin, gain_digest=..., **options) returns the content of files
     write: Callable[..., dict[Path, bytes]]
-    read: Callable[[Mapping[Path, bytes], Any], Any]
-    computed: Callable[[Design, Any], Written]
+    read: Callable[[Mapping[Path, bytes], Any], Any]  # read(files, whole), which has the sizes
+    computed: Callable[[Design, Any], Written]  # what is proved of the numbers of a design
+    # start(numbers, limit) returns a twin, which clips where the program knows the limit
     start: Callable[[Any, float], SteppedController]
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)  # of export, with their defaults
+    # join(numbers, parts, count) returns the numbers of a file; without it it holds one design
     join: Callable[[Sequence[Any], Sequence[ModeDesign], int], Any] | None = None
-    facts: Callable[..., Mapping[str, Any]] = lambda _, **options: {}
-    remark: Callable[[Design, Any], str] = lambda *_: ""
-    hint: str
-    endings: tuple[str, ...] = ()
-    beside: tuple[str, ...] = ()
-    contents: tuple[str, ...] = ()
-    modal: bool = True
-    reads_others: bool = False
+    facts: Callable[..., Mapping[str, Any]] = lambda _, **options: {}  # facts(whole, **options)
+    remark: Callable[[Design, Any], str] = lambda *_: ""  # what a user is told, or nothing
+    hint: str  # what to try where the proof fails
+    endings: tuple[str, ...] = ()  # of a file
+    beside: tuple[str, ...] = ()  # endings of what goes beside it
+    contents: tuple[str, ...] = ()  # names in a folder
+    modal: bool = True  # whether measurements and commands of one design must be the modes, too
+    reads_others: bool = False  # whether a design may read further sensors
 
     def path_in(self, folder: Path) -> Path:
         """Return a path in a folder that can be written."""
@@ -126,40 +90,13 @@ class Target:
 
 
 def target_names() -> tuple[str, ...]:
-    """Return the names of the targets, sorted, without loading them.
-
-    >>> from lbt_synth.interop.pipeline import target_names
-    >>> target_names()
-    ('c', 'cacao', 'dao', 'matlab', 'pyrtc')
-    """
+    """Return the names of the targets, sorted, without loading them."""
     exports = Path(__file__).parent.glob("*/export.py")
     return tuple(sorted(path.parent.name for path in exports))
 
 
 def target_named(name: str) -> Target:
-    """Return one target.
-
-    Parameters
-    ----------
-    name : str
-        One of :func:`target_names`.
-
-    Returns
-    -------
-    Target
-        The target.
-
-    Raises
-    ------
-    ProblemError
-        If there is none of that name.
-
-    Examples
-    --------
-    >>> from lbt_synth.interop.pipeline import target_named
-    >>> target_named("dao").arithmetic.precision
-    'single'
-    """
+    """Return one target."""
     module: Any = import_module(
         f"lbt_synth.interop.{choice(name, 'target', target_names())}.export"
     )
@@ -169,28 +106,15 @@ def target_named(name: str) -> Target:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Exported:
-    """Files that were written, and how far they are from the controller.
+    """Files that were written, and how far they are from the controller."""
 
-    Attributes
-    ----------
-    files : tuple of Path
-        The files; the certificate is the last one.
-    error : float
-        Largest difference of commands from the controller's in the arithmetic of the file, over the
-        largest command: in the closed loop where the design is of one, on white noise elsewhere.
-    start : callable
-        ``start(limit)`` returns what was written, stepped in the arithmetic of the target.
-    checks : tuple of Check
-        The proof in the loop, with the numbers of the file.
-    notes : tuple of str
-        What a user should know of the export.
-    """
-
-    files: tuple[Path, ...]
+    files: tuple[Path, ...]  # the certificate is the last one
+    # largest difference of commands from the controller's in the arithmetic of the file, over the
+    # largest command: in the closed loop where the design is of one, on white noise elsewhere
     error: float
-    start: Callable[[float], SteppedController]
-    checks: tuple[Check, ...]
-    notes: tuple[str, ...]
+    start: Callable[[float], SteppedController]  # what was written, from the limit of the stroke
+    checks: tuple[Check, ...]  # the proof in the loop, with the numbers of the file
+    notes: tuple[str, ...]  # what a user should know of the export
 
 
 def export(
@@ -218,8 +142,8 @@ def export(
     Parameters
     ----------
     path : path-like
-        File to write: ``.c`` (the header goes beside it), ``.fits`` for cacao, ``.npy`` or
-        ``.fits`` for dao, ``.mat`` for MATLAB; for pyRTC a folder, whose parent is there. The
+        File to write: ``.c`` (the header goes beside it), ``.fits`` for cacao, ``.npy`` for dao,
+        ``.mat`` for MATLAB; for pyRTC a folder, whose parent is there. The
         certificate has the name of the file and ``.certificate.json``.
     design : Design, MixedController or ModalFilters
         The design. Targets ``c``, ``cacao`` and ``dao`` also take a design with integrators for
@@ -238,14 +162,14 @@ def export(
         given those that were, :func:`~lbt_synth.linear.estimator_form`; a design of several sensors
         has that form alone), precision ("double" or "single") and name (the prefix of the C names;
         by default that of the file). For ``dao``: order (M of the RTC's configuration, 20). For
-        ``cacao``: steps (of the history; by default as many as the loss needs) and loss (of
-        residual, relative, at each sensor gain of the proof, at which the length is chosen; at
-        most 0.01, the limit of the proof).
+        ``cacao``: steps (of the history; by default as many as the proof needs).
 
     Returns
     -------
     Exported
-        Files, errors, the checks in the arithmetic of the target, and notes.
+        The ``files``, of which the certificate is the last; ``error``, the largest difference of
+        commands from the controller's over the largest command; ``checks``, the proof in the
+        arithmetic of the target; ``start(limit)``, what was written, stepped; and ``notes``.
 
     Raises
     ------
@@ -297,7 +221,7 @@ def export(
     file_numbers = program.join(numbers, parts, count) if program.join else numbers[0]
     pairs = list(zip(parts, numbers, strict=True))
     error = max(rehearsal_error(part.design, program.start(held, np.inf)) for part, held in pairs)
-    precision = settings.get("precision", program.arithmetic.precision)
+    precision = settings.get("precision", program.precision)
     files = program.write(place, file_numbers, first, origin, gain_digest=gain_digest, **settings)
     again = program.read(files, file_numbers)
     if not _is_same(again, file_numbers):
@@ -312,8 +236,9 @@ def export(
     if program.contents:
         make_directory(place, parents=False)
     settings |= {"modes": count, "notes": notes, **program.facts(file_numbers, **settings)}
+    settings |= {"precision": precision}
     kept = {name: settings[name] for name in sorted(settings) if settings[name] is not None}
-    certificate = _certificate(files, target, program.arithmetic, checks, gain_digest, kept)
+    certificate = _certificate(files, target, checks, gain_digest, kept)
     return Exported(
         files=write_together(dict((*files.items(), *certificate.items()))),
         error=error,
@@ -412,7 +337,6 @@ def comment_text(text: str) -> str:
 def _certificate(
     files: Mapping[Path, bytes],
     target: str,
-    arithmetic: Arithmetic,
     checks: Sequence[Check],
     gain_digest: str | None,
     facts: Mapping[str, Any],
@@ -427,7 +351,6 @@ def _certificate(
         **({"others_sha256": {o.name: digests[o.name] for o in others}} if others else {}),
         "gain_sha256": gain_digest,
         **facts,
-        "arithmetic": json_record(arithmetic),
         "checks": [json_record(check) for check in checks],
     }
     text = json.dumps(certificate, indent=2, allow_nan=False) + "\n"
@@ -436,23 +359,13 @@ def _certificate(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Rehearsal:
-    """A target and the design itself on the same series, after both loops have settled.
+    """A target and the design itself on the same series, after both loops have settled."""
 
-    Attributes
-    ----------
-    target, design : Simulation
-        In the arithmetic of the target, and in double precision; commands are as they were applied.
-    settle_frames, stroke : int, float
-        Frames at the beginning that are left out; largest modulus of a command, or infinity.
-    checks : tuple of Check
-        The proof of what the target runs, as in its certificate.
-    """
-
-    target: Simulation
-    design: Simulation
-    settle_frames: int
-    stroke: float
-    checks: tuple[Check, ...]
+    target: Simulation  # in its arithmetic; commands are as they were applied
+    design: Simulation  # in double precision
+    settle_frames: int  # at the beginning, left out
+    stroke: float  # largest modulus of a command, or infinity
+    checks: tuple[Check, ...]  # the proof of what the target runs, as in its certificate
 
     @property
     def differences(self) -> FloatArray:
@@ -474,47 +387,8 @@ def rehearse(
 ) -> Rehearsal:
     """Run what is exported to a target in its arithmetic, and the design in double precision.
 
-    Both loops run frame by frame, on the same series.
-
-    Parameters
-    ----------
-    design : Design
-        The design.
-    target : str
-        Name of a target, whose export has its usual options.
-    disturbance : Disturbance
-        Phase and noise of one case. The pseudo-open-loop series of a record may stand for the
-        phase; its noise is then part of the residual, and ``frame_means`` keeps it out of what
-        moves within frames.
-    hardware : LoopHardware, optional
-        The loop; by default that of the design.
-    stroke : float, optional
-        Largest modulus of a command that the mirror applies; without a limit by default.
-
-    Returns
-    -------
-    Rehearsal
-        Both loops, on the frames after they have settled.
-
-    Raises
-    ------
-    ProblemError
-        If the target cannot hold the design, it reads several sensors, or sizes clash.
-    CertificateError
-        If the certificate that the design carries has a failed check.
-    UnstableLoopError
-        If the loop of the design is unstable.
-    NumericalError
-        If the export is refused, or the loop grows beyond all numbers in its arithmetic.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt, numpy as np
-    >>> slow = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=1), gain=0.5)
-    >>> wave = lbt.loop.Disturbance(phase_nm=100 * np.sin(np.arange(2000.0)[:, None] / 50))
-    >>> run = lbt.interop.rehearse(slow, "dao", wave)
-    >>> bool(0 < np.max(np.abs(run.differences)) < 1e-3)
-    True
+    Both loops, of the design's hardware or another, run frame by frame on the phase and noise of
+    one case, with a mirror that clips at the stroke.
     """
     controller = as_controller(design)
     path = require_hardware(design, "a rehearsal") if hardware is None else hardware

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -34,7 +33,7 @@ from lbt_synth.loop.closed_loop import STABILITY_MARGIN, youla_controller
 from lbt_synth.loop.disturbances import Disturbance
 from lbt_synth.loop.simulation import Drop, SteppedController, simulate
 from lbt_synth.loop.stable_range import radii_by_gain
-from lbt_synth.models import ARModel, LoopHardware, Truth
+from lbt_synth.models import ARModel, LoopHardware
 from lbt_synth.validation import FloatArray
 
 ROUNDOFF = {"double": 2.0**-53, "single": 2.0**-24}  # largest relative error of an operation
@@ -356,91 +355,41 @@ def _demand_change(demand: Demand, change: Callable[[float], float]) -> float:
     return factor * change(1.0)
 
 
-def rehearsal_error(design: Design, other: Any) -> float:
+def rehearsal_error(design: Design, twin: SteppedController) -> float:
     """Largest difference of commands from the controller's, over the largest command.
 
-    Both close the loop of the design around the same disturbance; without a loop they get noise.
-    One of several sensors gets the readings and commands of its loop, each missing for a while.
+    Both close the loop of the design around the same disturbance, in which each further sensor is
+    missing for a while; without a loop they get noise.
     """
     with np.errstate(all="ignore"):  # what overflows is found to be infinite
-        expected, readings = _own_commands(design)
+        expected = _rehearse(design, design.controller.start(design.controllers))
         try:
-            if readings is None:
-                commands = _rehearse(design, other)
-            else:
-                commands = _rehearse_sensors(design, other, expected, readings)
+            differences = np.abs(_rehearse(design, twin) - expected)
         except ProblemError:
             return float("inf")
-        size = float(np.max(np.abs(expected))) or 1.0
-        error = float(np.max(np.abs(commands - expected))) / size
+        error = float(np.max(differences)) / (float(np.max(np.abs(expected))) or 1.0)
     return error if np.isfinite(error) else float("inf")
-
-
-def _own_commands(design: Design) -> tuple[FloatArray, FloatArray | None]:
-    """Return the commands of the controller itself, and the readings of several sensors."""
-    if not design.other_sensors or design.hardware is None:
-        return _rehearse(design, design.controller.start()), None
-    (starts, length), rate = _absences(design), design.hardware.frame_rate_hz
-    frames = (2 * len(starts) + 1) * length
-    disturbance: Disturbance | Truth = _reference(design.hardware, frames)
-    if (plant := design.plant) is not None:
-        disturbance = Truth(
-            turbulence=plant.turbulence,
-            vibrations=plant.vibrations,
-            motions=plant.motions,
-            noise_nm=np.linalg.norm(plant.own_noise_factor, axis=1),
-        )
-    run = simulate(
-        design,
-        disturbance,
-        hardware=design.hardware,
-        frames=frames,
-        settle_frames=0,
-        drops=[
-            Drop(unit=unit, start_s=start / rate, end_s=(start + length) / rate)
-            for unit, start in starts.items()
-        ],
-    )
-    return run.commands[0], run.measurements[0]
-
-
-def _absences(design: Design) -> tuple[dict[str, int], int]:
-    """Return the first frame in which each sensor is missing, and for how many frames it is."""
-    units, period = sorted(frozenset().union(*design.controllers)), design.controller.period
-    turns = 2 * len(units) + 1
-    length = period * int(np.ceil(FRAMES / turns / period))  # all are due at its begin
-    return {unit: (2 * i + 1) * length for i, unit in enumerate(units)}, length
-
-
-def _reference(hardware: LoopHardware, frames: int) -> Disturbance:
-    """Return white noise of the readings, and a slow phase."""
-    rng = np.random.default_rng(0)
-    total = rng.standard_normal((1, frames, hardware.modes))
-    for k in range(1, frames):
-        total[0, k] = POLE * total[0, k - 1] + np.sqrt(1 - POLE**2) * total[0, k]
-    noise = NOISE * rng.standard_normal((1, frames, hardware.n_readings))
-    return Disturbance(phase_nm=total, noise=noise, frame_means=True)
 
 
 def _rehearse(design: Design, controller: SteppedController | RunningController) -> FloatArray:
     """Return the commands (frames, m) of a controller that takes the place of a design's own."""
-    hardware, q = design.hardware, design.controller.D.shape[1]
+    hardware, rng = design.hardware, np.random.default_rng(0)
     if hardware is None:
         controller.reset()
-        noise = np.random.default_rng(0).standard_normal((FRAMES, q))
+        noise = rng.standard_normal((FRAMES, design.controller.D.shape[1]))
         return np.array([controller.step(y) for y in noise])
-    disturbance = _reference(hardware, FRAMES)
-    return np.asarray(simulate(controller, disturbance, hardware=hardware).commands[0])
-
-
-def _rehearse_sensors(
-    design: Design, source: Any, expected: FloatArray, readings: FloatArray
-) -> FloatArray:
-    """Return the commands (frames, m) of a source that is told what is new in each frame."""
-    (starts, length), commands = _absences(design), np.empty_like(expected)
-    applied = np.zeros_like(expected[0])
-    for k, y in enumerate(readings):
-        fresh = {unit: not 0 <= k - start < length for unit, start in starts.items()}
-        commands[k] = source.step(y, fresh, applied)
-        applied = expected[k]
-    return commands
+    units, period = sorted(frozenset().union(*design.controllers)), design.controller.period
+    turns, rate = 2 * len(units) + 1, hardware.frame_rate_hz
+    length = period * int(np.ceil(FRAMES / turns / period))  # all are due at its begin
+    absent = {unit: (2 * i + 1) * length / rate for i, unit in enumerate(units)}
+    total = rng.standard_normal((1, turns * length, hardware.modes))
+    for k in range(1, turns * length):  # a slow phase
+        total[0, k] = POLE * total[0, k - 1] + np.sqrt(1 - POLE**2) * total[0, k]
+    noise = NOISE * rng.standard_normal((1, turns * length, hardware.n_readings))
+    run = simulate(
+        controller,
+        Disturbance(phase_nm=total, noise=noise, frame_means=True),
+        hardware=hardware,
+        drops=[Drop(unit=u, start_s=s, end_s=s + length / rate) for u, s in absent.items()],
+    )
+    return np.asarray(run.commands[0])

@@ -2,11 +2,6 @@ from .controller import Controller as Controller
 from .controller import estimator_form as estimator_form
 from .estimation_problem import EstimationProblem as EstimationProblem
 from .generalized_plant import GeneralizedPlant as GeneralizedPlant
-from .infeasibility_proof import Witness as Witness
-from .infeasibility_proof import infeasible_level as infeasible_level
 from .norms import hinf_norm as hinf_norm
-from .norms import largest_singular_values as largest_singular_values
 from .riccati.dare import solve_dare as solve_dare
-from .riccati.filtering import gamma_riccati as gamma_riccati
-from .riccati.filtering import kalman_riccati as kalman_riccati
 from .state_space import StateSpace as StateSpace

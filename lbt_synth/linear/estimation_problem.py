@@ -188,13 +188,6 @@ class EstimationProblem(LinearSystem):
         The gain (n, q), or one for each phase (N, n, q), is that of ``x_hat(k+1) = A x_hat(k) +
         gain (y(k) - C x_hat(k))``; one of another size raises a DimensionError. What is not read
         has no gain.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> p = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-        >>> float(p.error_system([[0.4]]).A[0, 0])
-        0.5
         """
         gain = self.checked_gain(gain_predictor)
         D = np.zeros((len(self.L), self.B.shape[-1]))
@@ -207,13 +200,6 @@ class EstimationProblem(LinearSystem):
 
         The columns of ``[B; D]`` are divided by their norms, so that the disturbances of
         the generalised plant act with identity weights.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> p = lbt.EstimationProblem(A=0.9, B=[[5.0, 0.0]], C=1.0, D=[[0.0, 2.0]], L=1.0)
-        >>> p.with_unit_weights().B.tolist()
-        [[1.0, 0.0]]
         """
         self.require_one_phase("a scaling of disturbances", "phase(t).with_unit_weights()")
         size = np.linalg.norm(np.vstack([self.B, self.D]), axis=0)
@@ -228,22 +214,10 @@ class EstimationProblem(LinearSystem):
         With 2 or more the measurement gets states of its own, and the disturbances that
         arrive in between count in the error, where they are not delayed.
 
-        Parameters
-        ----------
-        frames : int
-            Samples from the newest measurement to the estimate.
-
-        Returns
-        -------
-        EstimationProblem
-            The problem, with more states; the first ones are x(k + max(frames, 1) - 1).
-
-        Raises
-        ------
-        ProblemError
-            If ``frames`` is no integer, or is 2 or more while ``B D'`` is not zero: part of
-            the noise would act on the states before it is measured. If it is not 1 while the
-            period is longer than a sample.
+        The first states are x(k + max(frames, 1) - 1). A ProblemError is raised if ``frames`` is no
+        integer; if it is 2 or more while ``B D'`` is not zero, as part of the noise would act on
+        the states before it is measured; and if it is not 1 while the period is longer than a
+        sample.
 
         Examples
         --------
@@ -283,13 +257,6 @@ class EstimationProblem(LinearSystem):
         its innovations into them, with gain 1, estimates ``L x + taps [nu(k); nu(k-1); ...]``. The
         taps are (l, T q), the newest first, and add T q states; taps that do not fit raise a
         DimensionError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-        >>> walk.with_memory([[0.3, 0.1]]).n_states
-        3
         """
         self.require_one_phase("a filter with a memory", "one without")
         weights = matrix(taps, "taps", rows=(len(self.L), f"to match L {self.L.shape}"))
@@ -316,13 +283,6 @@ class EstimationProblem(LinearSystem):
         """Filter from y(k) to ``L x_hat(k+1 | k)``, the prediction of the next z.
 
         The predictor gain is (n, q) or (N, n, q); one of another size raises a DimensionError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> p = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-        >>> float(p.controller([[0.4]]).start().step([1.0])[0])
-        0.4
         """
         gain = self.checked_gain(gain_predictor)
         A, D = self.A - gain @ self.C, np.zeros_like(self.L @ gain)

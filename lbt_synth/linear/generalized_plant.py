@@ -114,17 +114,8 @@ class GeneralizedPlant(Summarised):
     def of(cls, system: Any, *, measurements: int, controls: int) -> GeneralizedPlant:
         """Partition a system whose last inputs are the controls, whose last outputs are measured.
 
-        Parameters
-        ----------
-        system : object
-            A StateSpace, or what :meth:`StateSpace.of` takes.
-        measurements, controls : int
-            Numbers of the last outputs and of the last inputs.
-
-        Raises
-        ------
-        ProblemError
-            If no disturbance or no error is left, or the system is in continuous time.
+        It is a StateSpace, or what :meth:`StateSpace.of` takes. If no disturbance or no error is
+        left, or the system is in continuous time, a ProblemError is raised.
         """
         G = StateSpace.of(system)
         p, m = G.D.shape
@@ -145,21 +136,11 @@ class GeneralizedPlant(Summarised):
         return GeneralizedPlant(**_partition(system, p1, m1), dt_s=system.dt_s)
 
     def closed_loop(self, controller: StateSpace) -> StateSpace:
-        """Return the system from w to z with ``u = K y``.
+        """Return the system from w to z with ``u = K y``, for K from y (p2) to u (m2).
 
-        Parameters
-        ----------
-        controller : StateSpace
-            From y (p2) to u (m2), in textbook form.
-
-        Raises
-        ------
-        DimensionError
-            If the controller does not fit.
-        ProblemError
-            If it is no StateSpace, or has another sampling period.
-        NumericalError
-            If ``I - D22 D`` is singular, so that the loop has no solution.
+        A controller that does not fit is a DimensionError or, as another sampling period, a
+        ProblemError; a singular ``I - D22 D``, with which the loop has no solution, is a
+        NumericalError.
 
         Examples
         --------

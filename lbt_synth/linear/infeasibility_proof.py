@@ -67,39 +67,11 @@ class Witness:
 
 
 def infeasible_level(problem: EstimationProblem, witness: Witness, covariance: FloatArray) -> float:
-    """Level of gamma below which a witness proves that no filter exists.
+    """Level of gamma below which a witness proves that no filter exists; 0 if it proves nothing.
 
-    Parameters
-    ----------
-    problem : EstimationProblem
-        The problem.
-    witness : Witness
-        The disturbances; the part that the measurements would show is removed first.
-    covariance : (n, n) or (N, n, n) ndarray
-        Least covariance of the prediction error (Kalman), which bounds the storage matrix
-        of every filter, ``P <= gamma^2 covariance^-1``; it weighs the shortfall by rounding.
-
-    Returns
-    -------
-    float
-        The level; 0 if the witness proves nothing.
-
-    Raises
-    ------
-    DimensionError
-        If witness and problem do not have the same period.
-
-    Examples
-    --------
-    Of ``x(k+1) = w1(k)``, ``y = x + w2``, nothing is known when z = x is predicted:
-
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> from lbt_synth.linear import Witness, infeasible_level
-    >>> p = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> push = Witness(states=np.zeros((1, 1)), disturbances=np.array([[1.0], [0.0]]))
-    >>> infeasible_level(p, push, np.eye(1))
-    1.0
+    What the measurements would show is removed first. The covariance, (n, n) or (N, n, n), is the
+    least one of the prediction error (Kalman). It bounds the storage matrix of every filter,
+    ``P <= gamma^2 covariance^-1``, and weighs the shortfall by rounding.
     """
     if witness.period != problem.period:
         raise DimensionError(

@@ -11,7 +11,6 @@ from lbt_synth.errors import UnstableLoopError
 from lbt_synth.linear.matrix_functions import (
     complex_schur,
     frobenius_norms,
-    part_labels,
     semidefinite_root,
     symmetrise,
     transpose,
@@ -40,13 +39,6 @@ def stationary_covariance(A: FloatArray, Q: FloatArray) -> FloatArray:
             spectral_radius=radius,
         )
     return np.asarray(X)
-
-
-def _triangular_form(A: FloatArray) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-    """Return T, U and V with ``T = U A V`` upper triangular and ``U V = I``, in balanced units."""
-    balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
-    triangle, basis = complex_schur(np.asarray(balanced, dtype=np.float64))
-    return triangle, basis.conj().T / units, units[:, None] * basis
 
 
 def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -113,30 +105,21 @@ def stationary_root(A: FloatArray, B: FloatArray) -> FloatArray:
 
     By squaring, with sums of roots by QR: variances of outputs are sums of squares, with the error
     of their rms a share of the largest rms of a state, where a covariance has that of its square.
-    The triangular form of A keeps its eigenvalues in every power. Like any squaring, it loses
-    digits as A nears the unit circle. States that share no input and do not act on one another are
-    apart.
+    The triangular form of A, in balanced units, keeps its eigenvalues in every power. Like any
+    squaring, it loses digits as A nears the unit circle.
     """
-    label, inputs, _ = part_labels(A, B, np.zeros((0, len(A))), np.zeros((0, B.shape[1])))
-    roots = [np.zeros((len(A), min(B.shape[1], 1)))]  # of states that no input reaches
-    for part in np.unique(label):
-        x, u = label == part, inputs == part
-        root = _root_of_part(A[np.ix_(x, x)], B[np.ix_(x, u)])
-        roots.append(np.zeros((len(A), root.shape[1])))
-        roots[-1][x] = root
-    return np.hstack(roots)
-
-
-def _root_of_part(A: FloatArray, B: FloatArray) -> FloatArray:
-    triangle, into, back = _triangular_form(A)
-    root = into @ B
+    if not (A.size and B.size):
+        return np.zeros((len(A), 0))
+    balanced, (units, _) = matrix_balance(A, permute=False, separate=True)
+    triangle, basis = complex_schur(np.asarray(balanced, dtype=np.float64))
+    root = (basis.conj().T / units) @ B
     with np.errstate(all="ignore"):
         for _ in range(60):
             root = join_roots(root, triangle @ root)
             triangle = triangle @ triangle
             if not np.linalg.norm(triangle) > 1e-16:
                 break
-    root = back @ root
+    root = units[:, None] * (basis @ root)
     return np.asarray(join_roots(root.real, root.imag), dtype=np.float64)
 
 

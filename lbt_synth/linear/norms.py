@@ -16,7 +16,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.linalg import eigvals
 
 from lbt_synth.errors import DimensionError, NumericalError, UnstableLoopError
@@ -223,58 +222,20 @@ def _climb(
     )
 
 
-def largest_singular_values(system: StateSpace, frequency_hz: ArrayLike) -> FloatArray:
-    """Largest singular value of the transfer matrix at each frequency.
-
-    Parameters
-    ----------
-    system : StateSpace
-        The system.
-    frequency_hz : (f,) array_like
-        Frequencies [Hz].
-
-    Returns
-    -------
-    (f,) ndarray
-        Largest singular values.
-
-    Raises
-    ------
-    ProblemError
-        If a frequency is not finite.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lag = lbt.linear.StateSpace(A=[[0.5]], B=[[3.0, 4.0]], C=[[1.0]], D=[[0.0, 0.0]])
-    >>> float(lbt.linear.largest_singular_values(lag, [0.0])[0].round(12))
-    10.0
-    """
-    return spectral_norms(system.frequency_response(frequency_hz))
-
-
 def spectral_norms(matrices: ComplexArray) -> FloatArray:
-    """Largest singular value of each matrix of a stack, (N,).
+    """Largest singular value of each matrix of a stack, (N,); nan where one is not finite.
 
     By the Gram matrix of the smaller side, which costs the largest one no accuracy.
     """
     if matrices.shape[-2] > matrices.shape[-1]:
         matrices = matrices.swapaxes(-1, -2)
     size = np.abs(matrices).max(axis=(-2, -1), initial=0.0)
-    scale = np.maximum(size, np.finfo(np.float64).tiny)  # by less, a quotient may overflow
-    with np.errstate(invalid="ignore"):  # a response that is not finite has no norm
-        scaled = matrices / scale[:, None, None]
-    if scaled.shape[-2] == 1:
-        largest = np.einsum("nij,nij->n", scaled, scaled.conj()).real
-    elif scaled.shape[-2] == 2:
-        gram = scaled @ scaled.conj().swapaxes(-1, -2)
-        mean = (gram[:, 0, 0].real + gram[:, 1, 1].real) / 2
-        half = (gram[:, 0, 0].real - gram[:, 1, 1].real) / 2
-        largest = mean + np.hypot(half, np.abs(gram[:, 0, 1]))
-    else:
-        gram = scaled @ scaled.conj().swapaxes(-1, -2)
-        largest = np.linalg.eigvalsh(gram)[:, -1]
-    return np.asarray(scale * np.sqrt(np.maximum(largest, 0.0)), dtype=np.float64)
+    size = np.maximum(size, np.finfo(np.float64).tiny)  # by less, a quotient may overflow
+    with np.errstate(invalid="ignore"):
+        scaled = matrices / size[:, None, None]
+        scaled = np.where(np.isfinite(size)[:, None, None], scaled, 0.0)
+        largest = np.linalg.eigvalsh(scaled @ scaled.conj().swapaxes(-1, -2))[:, -1]
+        return np.asarray(size * np.sqrt(np.maximum(largest, 0.0)), dtype=np.float64)
 
 
 def fold_angles(angles: FloatArray, low: float, high: float) -> FloatArray:

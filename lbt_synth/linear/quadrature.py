@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -55,12 +55,12 @@ def _halve_panels(
     integrand: Callable[[FloatArray], FloatArray],
     edges: FloatArray,
     order: int,
-    measure: Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]],
+    limits_of: Callable[[FloatArray, FloatArray], FloatArray],
 ) -> RefinedPanels:
-    """Halve panels until the measures (panels, k) of their last changes are below limits.
+    """Halve panels until the last changes (panels, ...) of their integrals are below limits.
 
-    Measures and limits are functions of the changes (panels, ...), of the integral over all panels,
-    and of the lengths (panels,).
+    The limits are a function of the sum of the sizes of all integrals, and of the lengths
+    (panels,).
     """
     low, high = edges[:-1], edges[1:]
     coarse = _panel_integrals(integrand, low, high, order)
@@ -70,13 +70,13 @@ def _halve_panels(
         middle, count = (low + high) / 2, low.size
         low, high = np.concatenate([low, middle]), np.concatenate([middle, high])
         halves = _panel_integrals(integrand, low, high, order)
-        fine = halves[:count] + halves[count:]
-        lengths = high[count:] - low[:count]
-        change, limits = measure(fine - coarse, total + fine.sum(axis=0), lengths)
-        done = np.all(change <= limits, axis=1)
+        fine, lengths = halves[:count] + halves[count:], high[count:] - low[:count]
+        change = np.abs(fine - coarse)
+        limits = limits_of(total + np.abs(fine).sum(axis=0), lengths)
+        done = np.all((change <= limits).reshape(count, -1), axis=1)
         settled.append((low[:count][done], high[count:][done], fine[done]))
-        total = total + fine[done].sum(axis=0)
-        moved += float(change[done].max(axis=1, initial=0.0).sum())
+        total = total + np.abs(fine[done]).sum(axis=0)
+        moved += float(change.reshape(count, -1).max(axis=1)[done].sum())
         if done.all():
             begin, end, integrals = (np.concatenate(rows) for rows in zip(*settled, strict=True))
             rank = np.argsort(begin)
@@ -96,34 +96,23 @@ def _halve_panels(
 def adaptive_integral(
     integrand: Callable[[FloatArray], FloatArray], edges: FloatArray
 ) -> FloatArray:
-    """Integrate a matrix-valued function, halving panels until its trace converges to 1e-7."""
+    """Integrate a semidefinite function until a panel changes by at most 1e-7 of the trace."""
 
-    def measure(
-        change: FloatArray, total: FloatArray, lengths: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        traces = np.abs(np.trace(change, axis1=-2, axis2=-1)).reshape(lengths.size, -1)
-        return traces, 1e-7 * np.trace(total, axis1=-2, axis2=-1).ravel()
+    def limits(total: FloatArray, lengths: FloatArray) -> FloatArray:
+        return np.asarray(1e-7 * np.trace(total, axis1=-2, axis2=-1)[..., None, None])
 
-    return np.asarray(_halve_panels(integrand, edges, 6, measure).integrals.sum(axis=0))
+    return np.asarray(_halve_panels(integrand, edges, 6, limits).integrals.sum(axis=0))
 
 
 def refine_panels(
     integrand: Callable[[FloatArray], FloatArray], edges: FloatArray, *, floor: float = 0.0
 ) -> RefinedPanels:
-    """Halve panels until the integral of a vector of either sign converges to 1e-10."""
+    """Halve panels until a panel changes by at most 1e-10, and of the first entry, of a vector."""
 
-    def with_size(x: FloatArray) -> FloatArray:
-        values = integrand(x)
-        return np.concatenate([values, np.abs(values[:, :1])], axis=1)
+    def limits(total: FloatArray, lengths: FloatArray) -> FloatArray:
+        return np.maximum(1e-10 * min(1.0, float(total[0])), floor * lengths)[:, None]
 
-    def measure(
-        change: FloatArray, total: FloatArray, lengths: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        limits = np.maximum(1e-10 * min(1.0, float(total[-1])), floor * lengths)
-        return np.abs(change[:, :-1]), limits[:, None]
-
-    panels = _halve_panels(with_size, edges, 10, measure)
-    return replace(panels, integrals=panels.integrals[:, :-1])
+    return _halve_panels(integrand, edges, 10, limits)
 
 
 def graded_edges(poles: ComplexArray) -> FloatArray:

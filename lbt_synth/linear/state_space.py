@@ -8,7 +8,7 @@ doi:10.1007/978-1-84800-911-0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -24,8 +24,7 @@ from lbt_synth.linear.matrix_functions import (
     solve_stack,
     transpose,
 )
-from lbt_synth.storage.rows import column, fact_table, table_row
-from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.storage.summaries import Summarised
 from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
@@ -49,17 +48,6 @@ SAMPLE_FIRST = (
 
 _AGREEMENT = 1e-9  # relative, of partial fractions with solved linear systems at five points
 _CHUNK = 60_000  # complex numbers that a frequency response computes at once; they fit a cache
-
-
-@table_row
-class SystemFacts:
-    """Sizes and poles of a linear system."""
-
-    n_states: int = column("states")
-    inputs: int = column("inputs")
-    outputs: int = column("outputs")
-    frame_rate_hz: float | None = column("frame rate", unit="Hz")
-    spectral_radius: float = column("largest modulus of a pole")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,16 +119,6 @@ class LinearSystem(Summarised):
         sizes = zip((self.n_states, inputs, outputs), ("state", "input", "output"), strict=True)
         return ", ".join(count_text(*size) for size in sizes) + rate + phases
 
-    def _summarise(self) -> Summary:
-        facts = SystemFacts(
-            n_states=self.n_states,
-            inputs=self.D.shape[-1],
-            outputs=self.D.shape[-2],
-            frame_rate_hz=None if self.dt_s == 1 else 1 / self.dt_s,
-            spectral_radius=float(np.max(np.abs(np.linalg.eigvals(self.monodromy)), initial=0.0)),
-        )
-        return Summary(tables=[fact_table("System", facts)])
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StateSpace(LinearSystem):
@@ -175,11 +153,6 @@ class StateSpace(LinearSystem):
     2.0
     """
 
-    # outputs, inputs, system and Schur form of each part once they are asked for, see part_labels
-    _parts: tuple[tuple[IntArray, IntArray, StateSpace, SchurForm], ...] = field(
-        default=(), init=False, repr=False
-    )
-
     @classmethod
     def of(cls, system: Any) -> StateSpace:
         """Take a discrete system of python-control or scipy, or a tuple (A, B, C, D).
@@ -198,15 +171,7 @@ class StateSpace(LinearSystem):
         return cls(A=A, B=B, C=C, D=D, dt_s=dt_s)
 
     def to_control(self) -> Any:
-        """Return the system as a ``control.StateSpace`` with its sampling period.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> lag = lbt.linear.StateSpace(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.01)
-        >>> lag.to_control().dt
-        0.01
-        """
+        """Return the system as a ``control.StateSpace`` with its sampling period."""
         self.require_one_phase("a system of python-control", "lifted().to_control()")
         import control
 
@@ -217,13 +182,6 @@ class StateSpace(LinearSystem):
         """Scale the states by powers of two, which leaves the input-output map as it is.
 
         Rows and columns of ``[[A, B], [C, 0]]`` are then of similar size, state by state.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> lag = lbt.linear.StateSpace(A=[[0.5]], B=[[1024.0]], C=[[2.0**-10]], D=[[0.0]])
-        >>> float(lag.balanced().B[0, 0])
-        1.0
         """
         self.require_one_phase("balancing", "lifted().balanced()")
         n = self.n_states
@@ -342,23 +300,9 @@ class StateSpace(LinearSystem):
         return out
 
     def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:
-        """Transfer matrix ``D + C (zI - A)^-1 B`` at ``z = exp(2 pi i f dt)``.
+        """Transfer matrices (f, p, m), ``D + C (zI - A)^-1 B`` at ``z = exp(2 pi i f dt)``.
 
-        Parameters
-        ----------
-        frequency_hz : (f,) array_like
-            Frequencies [Hz].
-
-        Returns
-        -------
-        (f, p, m) complex ndarray
-            One matrix per frequency.
-
-        Raises
-        ------
-        ProblemError
-            If a frequency is not finite, or is that of a pole on the unit circle, or if the period
-            is longer than a sample.
+        A frequency [Hz] of a pole on the unit circle and a longer period are a ProblemError.
 
         Examples
         --------
@@ -373,9 +317,14 @@ class StateSpace(LinearSystem):
         few = z.size <= self.n_states  # solved one by one, which is more accurate next to a pole
         response = np.empty((z.size, *self.D.shape), dtype=np.complex128)
         response[:] = self.D
-        for outputs, inputs, part, form in self._independent_parts():
-            block = pointwise_response(part, z) if few else schur_response(form, z)
-            response[:, outputs[:, None], inputs] = block
+        for outputs, inputs, part in split_into_parts(self):
+            if part.n_states:
+                block = (
+                    pointwise_response(part, z)
+                    if few
+                    else schur_response(schur_form(part.balanced()), z)
+                )
+                response[:, outputs[:, None], inputs] = block
         undefined = ~np.isfinite(response).all(axis=(1, 2))
         if undefined.any():
             raise ProblemError(
@@ -383,15 +332,6 @@ class StateSpace(LinearSystem):
                 "and no response there; leave that frequency out."
             )
         return response
-
-    def _independent_parts(
-        self,
-    ) -> tuple[tuple[IntArray, IntArray, StateSpace, SchurForm], ...]:
-        """Return outputs, inputs, system and Schur form of the parts with all of them."""
-        if not self._parts:
-            split = (part for part in split_into_parts(self) if part[2].n_states)
-            set_fields(self, _parts=tuple((*p, schur_form(p[2].balanced())) for p in split))
-        return self._parts
 
 
 def split_into_parts(system: StateSpace) -> list[tuple[IntArray, IntArray, StateSpace]]:
@@ -515,24 +455,23 @@ def _system_parts(system: Any) -> tuple[Any, Any, Any, Any, float]:
     and whatever else has these matrices and ``dt_s``. A period that is not given is 1.
     """
     if isinstance(system, tuple | list) and len(system) == 4:
-        A, B, C, D = system
-        return A, B, C, D, 1.0
+        return (*system, 1.0)
     library = type(system).__module__.partition(".")[0]
     if library == "scipy" and hasattr(system, "to_ss"):
-        states = system.to_ss()
-        dt = 0 if states.dt is None else states.dt  # scipy writes None in continuous time
-        return states.A, states.B, states.C, states.D, _period(dt)
+        system = system.to_ss()
     if library == "control" and not hasattr(system, "A"):
         import control
 
         system = control.ss(system)
-    if all(hasattr(system, name) for name in ("A", "B", "C", "D")):
-        dt = system.dt if hasattr(system, "dt") else getattr(system, "dt_s", 0)
-        return system.A, system.B, system.C, system.D, _period(dt)
-    raise ProblemError(
-        "a system must be a StateSpace, a control.StateSpace, a scipy.signal.StateSpace or a "
-        f"tuple (A, B, C, D); got {type(system).__name__}."
-    )
+    if not all(hasattr(system, name) for name in "ABCD"):
+        raise ProblemError(
+            "a system must be a StateSpace, a control.StateSpace, a scipy.signal.StateSpace or a "
+            f"tuple (A, B, C, D); got {type(system).__name__}."
+        )
+    dt = system.dt if hasattr(system, "dt") else getattr(system, "dt_s", 0)
+    # scipy writes None in continuous time, python-control where the period is not given
+    period = _period(0 if library == "scipy" and dt is None else dt)
+    return system.A, system.B, system.C, system.D, period
 
 
 def _period(dt: Any) -> float:

@@ -215,8 +215,8 @@ def _draw_line(
     """Return a line of its rms, (cases, frames), and its frequencies of the moment [Hz]."""
     rate, frames = hardware.frame_rate_hz, len(time_s)
     if isinstance(vibration, DriftingVibration):
-        drift = _draw_drift(vibration, time_s, rate, cases, rng)
-        return drift, vibration.frequency_hz_at(time_s)
+        phase = 2 * np.pi * vibration.turns_at(time_s) + rng.uniform(0, 2 * np.pi, (cases, 1))
+        return vibration.amplitude_nm * np.cos(phase), vibration.frequency_hz_at(time_s)
     constant_hz = np.full(frames, vibration.frequency_hz)
     if isinstance(vibration, Vibration):
         return _draw_ar(vibration.ar_model(rate), frames, cases, rng), constant_hz
@@ -286,10 +286,7 @@ def _acceleration(
     moved: Motion,
     time_s: FloatArray,
 ) -> FloatArray:
-    """Return what a channel reads of a sinusoid, (cases, frames) [m/s^2].
-
-    That of a line which drifts and has a damping is an approximation, good for a narrow line.
-    """
+    """Return what a channel reads of a sinusoid, (cases, frames) [m/s^2]."""
     if isinstance(line, DriftingVibration):
         frequency_hz = line.frequency_hz_at(time_s)
     else:
@@ -343,25 +340,6 @@ def _bin_powers(spectrum: Spectrum, rate: float, length: int) -> FloatArray:
     panels = (spectrum.psd(nodes) * weights).reshape(-1, 4).sum(axis=1)
     first = np.searchsorted(edges, ends[:-1])
     return np.asarray(np.add.reduceat(panels, first))
-
-
-def _draw_drift(
-    line: DriftingVibration, time_s: FloatArray, rate: float, cases: int, rng: np.random.Generator
-) -> FloatArray:
-    if line.damping is None:
-        phase = rng.uniform(0, 2 * np.pi, (cases, 1))
-        return np.asarray(line.amplitude_nm * np.cos(2 * np.pi * line.turns_at(time_s) + phase))
-    a1, a2, driving = line.ar_process(time_s, rate)
-    # two frames of the past at the first frequency: E x(-1) x(-2) = a1 / (1 - a2) of the variance
-    together = a1[0] / (1 - a2)
-    past = line.rms_nm * rng.standard_normal((2, cases))
-    past[1] = together * past[0] + np.sqrt((1 - together) * (1 + together)) * past[1]
-    series = driving[:, None] * rng.standard_normal((len(time_s), cases))
-    older, newer = past
-    for k, now in enumerate(series):
-        now += a1[k] * newer + a2 * older
-        older, newer = newer, series[k]
-    return series.T
 
 
 def _draw_ar(model: ARModel, frames: int, cases: int, rng: np.random.Generator) -> FloatArray:

@@ -242,7 +242,7 @@ def _started(
     if isinstance(controller, EstimatorForm):
         return controller.start(), alone, None
     if isinstance(controller, SteppedController):
-        ours = controller.controller if isinstance(controller, RunningController) else None
+        ours = getattr(controller, "controller", None)  # of a twin, what it computes
         reads = isinstance(ours, Controller) and reads_others(hardware, ours)
         return controller, hardware if reads else alone, None
     others = ", an object with step(y) and reset()"
@@ -349,19 +349,25 @@ def _step(
     state, y = np.zeros((held.n_states, cases)), np.zeros((noise.shape[2], cases))
     out = np.zeros((cases, frames, n + m + len(y)))
     wrong: Mapping[str, str] = {}
+    missing: tuple[str, ...] = ()
 
     def measure(k: int) -> FloatArray:
-        nonlocal wrong
+        nonlocal wrong, missing
         if k in events:
-            wrong = events[k].wrong
+            wrong, missing = events[k].wrong, events[k].missing
             if isinstance(controller, RunningController):
-                controller.miss(events[k].missing)
+                controller.miss(missing)
         t, last = k % len(read), y.copy()
         y[read[t]] = noise[:, k, read[t]].T
         y[: seen.shape[1]][wavefront[t]] += (seen[t] @ state)[wavefront[t]]
         for unit, reading in wrong.items():
             y[rows[unit]] = last[rows[unit]] if reading == "frozen" else 0.0
-        return y if together else y[:, 0]
+        if together:
+            return y
+        shown = y[:, 0].copy()
+        for unit in missing:
+            shown[rows[unit]] = np.nan
+        return shown
 
     def expose(k: int, correction: FloatArray, command: FloatArray) -> None:
         nonlocal state

@@ -3,7 +3,6 @@ from .mirror.position_loop import PositionLoop as PositionLoop
 from .plant.tip_tilt import TipTiltPlant as TipTiltPlant
 from .plant.tip_tilt import spread_plant as spread_plant
 from .plant.tip_tilt import tip_tilt_plant as tip_tilt_plant
-from .sensor import illuminated_subapertures as illuminated_subapertures
 from .sensor import nm_per_mas as nm_per_mas
 from .sensor import pyramid_modal_noise_nm as pyramid_modal_noise_nm
 from .sensor import pyramid_tilt_noise_nm as pyramid_tilt_noise_nm
@@ -18,7 +17,6 @@ from .spectra import TabulatedSpectrum as TabulatedSpectrum
 from .truth import Truth as Truth
 from .turbulence.ar_models import ar1_turbulence as ar1_turbulence
 from .turbulence.ar_models import ar2_turbulence as ar2_turbulence
-from .turbulence.ar_models import le_roux_pole as le_roux_pole
 from .turbulence.ar_models import modal_turbulence as modal_turbulence
 from .turbulence.atmosphere import Atmosphere as Atmosphere
 from .turbulence.atmosphere import FrozenFlows as FrozenFlows

@@ -40,31 +40,7 @@ def nm_per_mas(diameter_m: float) -> float:
 
 
 def illuminated_subapertures(across: float, obstruction: float = 0.0) -> float:
-    """Count the subapertures of a square grid inside an annular pupil.
-
-    Parameters
-    ----------
-    across : float
-        Subapertures over the diameter.
-    obstruction : float, optional
-        Diameter of the central obstruction as a fraction of the pupil's.
-
-    Returns
-    -------
-    float
-        ``pi / 4 (1 - obstruction^2) across^2``.
-
-    Raises
-    ------
-    ProblemError
-        If a value is out of its range.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> round(lbt.models.illuminated_subapertures(30, 0.11))
-    698
-    """
+    """Return how many subapertures of a square grid lie inside an annular pupil, on average."""
     n = number(across, "across", at_least=1)
     eps = number(obstruction, "obstruction", at_least=0, below=1)
     return float(np.pi / 4 * (1 - eps**2) * n**2)

@@ -76,13 +76,6 @@ class Vibration:
         """Return the AR process of this rms, of order 2 a section, sampled at a frame rate [Hz].
 
         A line that is not below the Nyquist frequency raises a ProblemError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
-        >>> round(line.ar_model(800).rms_nm, 6)
-        100.0
         """
         rate = number(frame_rate_hz, "frame_rate_hz", above=0)
         a, driving = sampled_lines(
@@ -95,13 +88,6 @@ class Vibration:
 
         ``hold`` says what stays: the rms of the vibration, "rms", or that of its driving noise,
         "driving". A value out of its range raises a ProblemError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
-        >>> round(line.retuned(18, frame_rate_hz=800, hold="driving").rms_nm, 2)
-        117.01
         """
         choice(hold, "hold", ("rms", "driving"))
         moved = replace(self, frequency_hz=frequency_hz)
@@ -117,13 +103,6 @@ class Vibration:
         The decay rate is damping times frequency, so the coefficient a2 of the AR2 process stays
         the same. A frequency that is not above the decay rate raises a ProblemError: nothing
         oscillates.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=100)
-        >>> line.at_frequency(25).damping
-        0.008
         """
         rate = self.damping * self.frequency_hz
         frequency = number(frequency_hz, "frequency_hz")
@@ -245,13 +224,10 @@ class SinusoidalVibration:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriftingVibration:
-    """A vibration whose frequency moves linearly in time, and stays where it arrived.
+    """A sinusoid whose frequency moves linearly in time, and stays where it arrived.
 
-    Without a damping it is a sinusoid whose phase is the integral of its frequency. With one it
-    is a resonance with a constant decay rate, damping times frequency, and a constant rms: an
-    AR2 process whose coefficient a1 follows the frequency, with a driving noise that keeps
-    the variance exactly constant. Only simulations accept it; whatever needs a stationary
-    truth refuses it.
+    Its phase is the integral of its frequency. Only simulations accept it; whatever needs a
+    stationary truth refuses it.
 
     Parameters
     ----------
@@ -261,16 +237,13 @@ class DriftingVibration:
         Duration of the drift [s].
     rms_nm : float
         Standard deviation of the displacement along its direction [nm rms wavefront].
-    damping : float, optional
-        Damping ratio at ``start_hz``, in (0, 1); None for a sinusoid.
     direction : tuple of float, optional
         Direction over the modes, made a unit vector; ``(1, 0)`` shakes tip.
 
     Raises
     ------
     ProblemError
-        If a value is not finite or out of its range, or a resonance arrives at a frequency
-        that is not above its decay rate.
+        If a value is not finite or out of its range.
 
     Examples
     --------
@@ -284,14 +257,10 @@ class DriftingVibration:
     end_hz: Positive
     duration_s: Positive
     rms_nm: Positive
-    damping: Annotated[float, ("above", 0), ("below", 1)] | None = None
     direction: tuple[float, ...] = (1.0, 0.0)
 
     def __post_init__(self) -> None:
         check_fields(self, direction=unit_direction(self.direction))
-        if self.damping is not None:
-            start = Vibration(frequency_hz=self.start_hz, damping=self.damping, rms_nm=self.rms_nm)
-            start.at_frequency(self.end_hz)
 
     @property
     def highest_hz(self) -> float:
@@ -316,56 +285,6 @@ class DriftingVibration:
         arrived = np.maximum(t - self.duration_s, 0.0)
         before = self.start_hz * (t - arrived)
         return np.asarray(before + rise * inside**2 / 2 + self.end_hz * arrived)
-
-    def ar_process(
-        self, time_s: FloatArray, frame_rate_hz: float
-    ) -> tuple[FloatArray, float, FloatArray]:
-        """Return the AR2 process of the resonance: ``x(k) = a1(k) x(k-1) + a2 x(k-2) + s(k) v(k)``.
-
-        With unit white noise v and a process that was stationary at the first frame's frequency,
-        the variance is ``rms_nm^2`` in every frame: s follows from the recursion of
-        ``E x(k) x(k-1)``.
-
-        Parameters
-        ----------
-        time_s : (frames,) ndarray
-            Times of the frames [s], one frame period apart.
-        frame_rate_hz : float
-            Frame rate [Hz].
-
-        Returns
-        -------
-        a1, a2, driving_rms_nm : (frames,) ndarray, float, (frames,) ndarray
-            Coefficients, and the standard deviation s of the driving noise [nm], in each frame.
-
-        Raises
-        ------
-        ProblemError
-            If this is a sinusoid, or the frequency falls faster than the decay lets the
-            variance follow.
-        """
-        from scipy.signal import lfilter  # slow to import
-
-        if self.damping is None:
-            raise ProblemError("a sinusoid has no AR2 process; got one that drifts.")
-        decay = 2 * np.pi * self.damping * self.start_hz / frame_rate_hz  # per frame
-        natural = 2 * np.pi * self.frequency_hz_at(time_s) / frame_rate_hz
-        a1 = 2 * np.exp(-decay) * np.cos(np.sqrt(natural**2 - decay**2))
-        a2 = -float(np.exp(-2 * decay))
-        # E x(k-1) x(k-2) over the variance, less its value at a constant a1, a1 / (1 - a2)
-        step = np.diff(a1, prepend=a1[:1]) / (1 - a2)
-        late = lfilter([-a2], [1.0, -a2], step)
-        behind = np.concatenate([[0.0], late[:-1]]) - step
-        still = 1 / variance_ratios(np.stack([a1, np.full_like(a1, a2)], axis=-1))
-        variance = still - 2 * a1 * a2 * behind
-        if np.any(variance < 0):
-            raise ProblemError(
-                "the frequency of a resonance must move slowly beside its decay, or its rms cannot "
-                f"be held; got {self.start_hz:.6g} to {self.end_hz:.6g} Hz in "
-                f"{self.duration_s:.6g} s at a damping of {self.damping:.6g}. Try a longer drift, "
-                "more damping, or a sinusoid (no damping)."
-            )
-        return a1, a2, np.asarray(self.rms_nm * np.sqrt(variance))
 
 
 TrueVibration: TypeAlias = Vibration | SinusoidalVibration | DriftingVibration

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lbt_synth.identification import Diagnosis
-from lbt_synth.identification.diagnosis import law_facts
+from lbt_synth.identification.diagnosis import Diagnosis, law_facts
 from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.report.draw import draw_bars
@@ -57,11 +56,11 @@ def _spectrum_charts(diagnosis: Diagnosis) -> list[Chart]:
 
 def diagnosis_tables(diagnosis: Diagnosis) -> dict[str, list[Table]]:
     """Return the tables of a diagnosis by their sections, without those of what is not known."""
-    record, health = diagnosis.record, diagnosis.record.health
+    record = diagnosis.record
     text = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
-    channels = [row_table(f"Record: {text}. {health.summary()}", diagnosis.channels)]
+    channels = [row_table(f"Record: {text}. {record.summary()}", diagnosis.channels)]
     # what a correction lacks is a consequence of other faults, and of the beginning
-    if faults := [finding for finding in health.findings if finding.kind != NOT_KNOWN]:
+    if faults := [finding for finding in record.findings if finding.kind != NOT_KNOWN]:
         channels.append(row_table("Faults", faults))
     commands, law = diagnosis.commands, diagnosis.law
     loop = {

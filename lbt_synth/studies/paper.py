@@ -17,6 +17,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,8 +26,14 @@ import numpy as np
 import lbt_synth
 from lbt_synth.design import Design, FilterDesign, hinf, integrator, kalman, optimal_integrator
 from lbt_synth.errors import ProblemError
-from lbt_synth.interop import EndToEndSetup, calibrate
-from lbt_synth.interop.specula.optics import specula_version
+from lbt_synth.interop import run_end_to_end
+from lbt_synth.interop.specula.optics import (
+    Calibration,
+    EndToEndSetup,
+    calibrate,
+    specula_version,
+)
+from lbt_synth.interop.specula.simulation import mix_controller
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.registry import HINF, KALMAN
 from lbt_synth.methods.request import reference_design
@@ -316,14 +323,14 @@ def plan_cases(
     tables: Sequence[str] = ("II", "III"),
 ) -> list[tuple[PaperRow, dict[str, dict[str, Any]]]]:
     """Plan the rows of both tables for a system, each with its runs by name, one for each seed."""
-    hardware = setup.system.hardware
+    hardware = setup.hardware
     if (hardware.frame_rate_hz, hardware.delay_frames) != (FRAME_RATE_HZ, DELAY_FRAMES):
         raise ProblemError(
             f"the paper's loop runs at {FRAME_RATE_HZ:g} Hz with a delay of {DELAY_FRAMES:g} "
             f"frames; got {hardware.frame_rate_hz:g} Hz and {hardware.delay_frames:g} frames."
         )
     for name, design in (designs or {}).items():
-        setup.controller(design)  # refuses a filter of another loop or of other sizes
+        mix_controller(setup, design)  # refuses a filter of another loop or of other sizes
         if name in ("classical", *filter_problems()):
             raise ProblemError(f"the name {name} is taken by the paper's own; rename the file.")
     planned = []
@@ -351,7 +358,6 @@ def end_to_end_tables(
     tables: Sequence[str] = ("II", "III"),
     executor: Executor | None = None,
     workers: int | None = None,
-    cache: str | os.PathLike[str] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[Facts]:
     """Run Tables II and III of Agapito et al. 2008 end to end, or what is missing of them.
@@ -364,7 +370,7 @@ def end_to_end_tables(
     """
     planned = plan_cases(setup, designs, seeds=seeds, row_seeds=row_seeds, tables=tables)
     cases = all_cases(planned)
-    calibrate(setup.system, cache=cache)  # once for all processes
+    calibrated = lru_cache(partial(calibrate, setup))  # once for all processes
     versions = {"lbt-synth": lbt_synth.__version__, "specula": specula_version()}
     content = json.dumps({"versions": versions, "cases": cases}, sort_keys=True, default=_plain)
     waiting = list(cases.values())
@@ -376,7 +382,7 @@ def end_to_end_tables(
     )
     runs, _ = sweep.run(
         _run_cases,
-        lambda some: (waiting[slice(*some)], cache),
+        lambda some: (waiting[slice(*some)], calibrated()),
         part_rows=1,
         executor=executor,
         workers=workers,
@@ -390,10 +396,10 @@ def end_to_end_tables(
 
 
 def _run_cases(
-    cases: Sequence[Mapping[str, Any]], cache: str | os.PathLike[str] | None
+    cases: Sequence[Mapping[str, Any]], calibration: Calibration
 ) -> tuple[dict[str, FloatArray], list[Any]]:
     """Return the main numbers of some runs."""
-    runs = [case["setup"].run(case["controller"], cache=cache).summary() for case in cases]
+    runs = [run_end_to_end(**case, calibration=calibration).summary() for case in cases]
     return {name: np.array([run[name] for run in runs]) for name in _NUMBERS}, []
 
 
@@ -449,9 +455,9 @@ def _predict_strehl(row: PaperRow, run: Mapping[str, Any], setup: EndToEndSetup)
     if run["tip_tilt_gain"] <= 0:
         return 0.0
     camera = Imaging(
-        diameter_m=setup.system.diameter_m,
-        obstruction=setup.system.obstruction,
-        wavelength_um=setup.system.imaging_wavelength_um,
+        diameter_m=setup.diameter_m,
+        obstruction=setup.obstruction,
+        wavelength_um=setup.imaging_wavelength_um,
         other_modes=run["other_modes_strehl"],
     )
     modal = modal_row(row, camera, run["tip_tilt_gain"])

@@ -17,6 +17,7 @@ from lbt_synth.cli.design import describe_design
 from lbt_synth.cli.main import main
 from lbt_synth.cli.output import Report
 from lbt_synth.files.gain_file.store import load_with_digest
+from lbt_synth.interop.c.export import frame_cost
 
 CONFIG = str(LBT_YAML)
 
@@ -127,7 +128,7 @@ def test_show_prints_the_cost(tmp_path, capsys, monkeypatch, name):
         design = turn_states(lbt.kalman(spread))
     gain = lbt.save_gain(tmp_path / "kalman.fits", kalman)
     monkeypatch.setattr("lbt_synth.cli.design.load_with_digest", lambda path: (design, "0"))
-    cost = lbt.interop.frame_cost(design)
+    cost = frame_cost(design)
     status, text, _ = run(capsys, "show", gain, "--verbose")
     assert status == 0
     assert re.search(rf"multiplications per frame +{cost.multiplications}\b", text)

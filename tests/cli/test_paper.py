@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +21,7 @@ import lbt_synth as lbt
 from lbt_synth.cli import paper
 from lbt_synth.cli.main import main
 from lbt_synth.errors import MissingExtraError, ProblemError
+from lbt_synth.interop.specula.simulation import mix_controller
 from lbt_synth.studies.paper import modal_row, paper_filters, plan_rows
 
 
@@ -82,11 +82,6 @@ def setup():
     return load_setup()
 
 
-@pytest.fixture(scope="module")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
-
-
 @pytest.mark.parametrize("found", [None, "1.0.3", "1.2.0"])
 def test_without_the_extra_the_command_says_how_to_get_it(monkeypatch, tmp_path, capsys, found):
     def version(name):
@@ -107,7 +102,7 @@ def test_without_the_extra_the_command_says_how_to_get_it(monkeypatch, tmp_path,
         assert main(arguments) == 2
         assert 'pip install "lbt-synth[e2e]"' in capsys.readouterr().err
     with pytest.raises(MissingExtraError) as caught:
-        lbt.interop.calibrate(lbt.load_config(CONFIG).end_to_end.system, cache=tmp_path)
+        lbt.interop.run_end_to_end(lbt.load_config(CONFIG).end_to_end, None)
     assert caught.value.extra == "e2e"
 
 
@@ -115,12 +110,12 @@ def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
     shell = lbt.models.PositionLoop.from_bandwidth(
         natural_frequency_hz=20, damping=0.5, bandwidth_hz=150
     )
-    slow = replace(setup.system.hardware, mirror=shell)
-    run = make_run(replace(setup.system, modes=3, hardware=slow), frames=20)
+    slow = replace(setup.hardware, mirror=shell)
+    run = make_run(replace(setup, modes=3, hardware=slow), frames=20)
     design = lbt.integrator(slow, gain=0.1)
     gain = lbt.save_gain(tmp_path / "i.fits", design)
     monkeypatch.setattr(paper, "specula_version", lambda: "1.1")
-    seen = paper._telemetry(run, design, SimpleNamespace(key="k"), str(gain))
+    seen = paper._telemetry(run, design, str(gain))
     seen = lbt.files.load_telemetry(lbt.files.save_telemetry(tmp_path / "t.fits", seen))
     assert np.array_equal(seen.hardware.mirror_taps, slow.mirror_taps)
     assert "with the mirror taps c" in seen.convention
@@ -128,14 +123,14 @@ def test_the_telemetry_of_a_run_has_its_mirror(monkeypatch, tmp_path, setup):
 
 def test_a_loop_that_ran_away_ends_in_words(monkeypatch, tmp_path, capsys, setup):
     """A pyramid out of its range returns the same slopes whatever the tilt."""
-    run = make_run(replace(setup.system, modes=3), frames=100)
+    run = make_run(replace(setup, modes=3), frames=100)
     lost = replace(run, residual_nm=1e9 * (1 + run.residual_nm), measurements=run.measurements)
     gain = lbt.save_gain(
         tmp_path / "i.fits", lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.1)
     )
     monkeypatch.setattr(paper, "specula_version", lambda: "1.1")
-    monkeypatch.setattr(paper, "_calibrate", lambda *_: None)
-    monkeypatch.setattr(lbt.interop.EndToEndSetup, "run", lambda *_, **__: lost)
+    monkeypatch.setattr(paper, "calibrate", lambda *_, **__: None)
+    monkeypatch.setattr(paper.simulation, "run_end_to_end", lambda *_, **__: lost)
     assert main(["end-to-end", CONFIG, str(gain), "-o", str(tmp_path / "run")]) == 1
     captured = capsys.readouterr()
     assert "the loop ran away. Try more than 60 pixels" in captured.err
@@ -156,11 +151,11 @@ def test_bad_input_at_the_command_line(tmp_path, capsys, arguments):
 
 
 @needs_specula
-def test_the_command_writes_telemetry_that_is_the_run(tmp_path, cache, capsys):
+def test_the_command_writes_telemetry_that_is_the_run(tmp_path, capsys):
     config, gain = small_config(tmp_path), tmp_path / "k.fits"
     lbt.save_gain(gain, lbt.kalman(lbt.load_config(config).plant))
     out = tmp_path / "run"
-    arguments = ["end-to-end", str(config), str(gain), "-o", str(out), "--cache", str(cache)]
+    arguments = ["end-to-end", str(config), str(gain), "-o", str(out)]
     arguments += ["--json"]
     assert main(arguments) == 0
     data = json.loads(capsys.readouterr().out)
@@ -186,9 +181,7 @@ sensors:
 
 
 @needs_specula
-def test_a_design_of_several_sensors_runs_without_those_that_are_not_simulated(
-    tmp_path, cache, capsys
-):
+def test_a_design_of_several_sensors_runs_without_those_that_are_not_simulated(tmp_path, capsys):
     file = small_config(tmp_path)
     text = file.read_text()
     for old in ("{axis: both, frequency_hz: 20.0", "{kind: sinusoid, axis: tip"):
@@ -198,21 +191,21 @@ def test_a_design_of_several_sensors_runs_without_those_that_are_not_simulated(
     file.write_text(text + SENSORS)
     gain, out = tmp_path / "sensors.fits", tmp_path / "run"
     lbt.save_gain(gain, lbt.load_config(file).design("kalman"))
-    arguments = ["end-to-end", str(file), str(gain), "-o", str(out), "--cache", str(cache)]
+    arguments = ["end-to-end", str(file), str(gain), "-o", str(out)]
     assert main(arguments) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "the fall-back filter of the gain file runs, without truth." in printed
     assert json.loads((out / "summary.json").read_text())["method"] == "kalman"
     alone = lbt.load_config(small_config(tmp_path)).end_to_end
     with pytest.raises(ProblemError, match=r"moves a channel of the design \(m1\)"):
-        alone.controller(lbt.files.load_gain(gain))
+        mix_controller(alone, lbt.load_gain(gain))
 
 
 @needs_specula
-def test_a_table_that_was_killed_goes_on(tmp_path, cache):
+def test_a_table_that_was_killed_goes_on(tmp_path):
     config, out = small_config(tmp_path), tmp_path / "table"
     arguments = [sys.executable, "-m", "lbt_synth.cli.main", "end-to-end", str(config)]
-    arguments += f"-o {out} --cache {cache} --seeds 1 --tables II --jobs 2 --json".split()
+    arguments += f"-o {out} --seeds 1 --tables II --jobs 2 --json".split()
     first = subprocess.Popen(arguments, stdout=subprocess.DEVNULL)
     end = time.monotonic() + 120
     while len(list(out.glob("cases/*.npz"))) < 2:

@@ -14,6 +14,7 @@ from support.night import GAIN, LINE_HZ, NOISE
 from support.recorded_loops import RATE, spliced_record
 
 import lbt_synth as lbt
+from lbt_synth.cli import records
 from lbt_synth.identification.fit import whittle
 
 FACTS = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm")
@@ -62,33 +63,18 @@ def test_a_spectrum(tmp_path, capsys):
         header="frequency_hz,psd_nm2/Hz",
     )
     options = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm^2/Hz")
-    status, _, error = run(
-        capsys, "identify", file, "-o", tmp_path / "m.yaml", *options, "--kind", "spectrum"
-    )
+    status, _, error = run(capsys, "identify", file, "-o", tmp_path / "m.yaml", *options)
     assert (status, error) == (0, "")
     config = lbt.load_config(tmp_path / "m.yaml")
     assert config.hardware.frame_rate_hz == 1000
     assert config.plant.vibrations[0].frequency_hz == pytest.approx(52, abs=0.3)
-    stated = ("--kind", "spectrum", "--noise-nm", 7, "-o", tmp_path / "n.yaml", "--no-figure")
+    stated = ("--noise-nm", 7, "-o", tmp_path / "n.yaml", "--no-figure")
     status, _, error = run(capsys, "identify", file, *options, *stated)
     assert (status, error) == (0, "")
     assert np.diag(lbt.load_config(tmp_path / "n.yaml").plant.R) == pytest.approx(49)
-    status, _, error = run(
-        capsys, "auto", file, "-o", tmp_path / "t.fits", *options, "--kind", "spectrum"
-    )
+    status, _, error = run(capsys, "auto", file, "-o", tmp_path / "t.fits", *options)
     assert status == 2
     assert "got a spectrum" in error
-
-
-def test_lists_announce_lines(tmp_path, capsys, recorded_night):
-    (tmp_path / "named.csv").write_text("error_hz,frequency_hz\n0.1,31.0\n,77\n")
-    words = (recorded_night, "-o", tmp_path / "m.yaml", "--no-figure", "--json")
-    for options in (("--lines-file", tmp_path / "named.csv"), ("--lines-hz", 31, 77)):
-        status, text, error = run(capsys, "identify", *words, *options)
-        assert (status, error) == (0, "")
-        (line,) = json.loads(text)["axes"][0]["vibrations"]
-        assert line["announced"]
-        assert line["frequency_hz"] == pytest.approx(LINE_HZ, abs=0.2)
 
 
 def test_accelerometers_are_compared_with_the_lines_of_the_model(
@@ -128,7 +114,7 @@ def test_a_model_is_written_whatever_becomes_of_its_accelerometers(
 ):
     run_, _, _ = recorded_loop
     np.save(tmp_path / "a.npy", 1e-3 * np.diff(run_.total_nm[0][:, 0], n=2, prepend=[0, 0]))
-    real = lbt.identification.accelerometer_transfers
+    real = records.accelerometer_transfers
 
     def fails(*_, **__):
         raise lbt.errors.NumericalError("gone.")
@@ -142,7 +128,7 @@ def test_a_model_is_written_whatever_becomes_of_its_accelerometers(
         (fails, "warning: the accelerometers were not compared: gone."),
         (is_noiseless, "warning: the model is written without accelerometers: "),
     ):
-        monkeypatch.setattr(lbt.identification, "accelerometer_transfers", wrong)
+        monkeypatch.setattr(records, "accelerometer_transfers", wrong)
         out = tmp_path / f"{wrong.__name__}.yaml"
         base = ("identify", tip_night, *FACTS, "-o", out, "--no-figure")
         status, text, _ = run(capsys, *base, "--accelerometers", tmp_path / "a.npy")
@@ -175,7 +161,7 @@ def test_a_sinusoid_without_noise_is_no_crash(tmp_path, capsys, monkeypatch) -> 
         whittle, "derivatives", lambda *given: evaluations.append(0) or plain(*given)
     )
     np.save(tmp_path / "s.npy", 100 * np.sin(2 * np.pi * 0.05 * np.arange(8192)))
-    words = ("--kind", "open-loop", "--no-figure", "-o", tmp_path / "s.yaml", *FACTS)
+    words = ("--columns", "open_loop=0", "--no-figure", "-o", tmp_path / "s.yaml", *FACTS)
     status, _, error = run(capsys, "identify", tmp_path / "s.npy", *words)
     assert status in (0, 2)
     assert "Traceback" not in error
@@ -247,7 +233,7 @@ def test_an_open_loop_series_and_one_axis(tmp_path, capsys, recorded_loop):
     run_, _, _ = recorded_loop
     noise = np.random.default_rng(0).standard_normal(len(run_.total_nm[0]))
     np.save(tmp_path / "open.npy", run_.total_nm[0][:, 0] + NOISE * noise)
-    words = ("--kind", "open-loop", "--no-figure", "-o", tmp_path / "t.fits", *FACTS)
+    words = ("--columns", "open_loop=0", "--no-figure", "-o", tmp_path / "t.fits", *FACTS)
     status, text, error = run(capsys, "auto", tmp_path / "open.npy", *words)
     assert (status, error) == (0, "")
     assert "what ran" not in text
@@ -286,8 +272,8 @@ def test_a_gain_file_the_page_and_json(capsys, night, tmp_path):
     assert (status, error) == (0, "")
     data = json.loads(text)
     assert data["doubt"] is None
-    assert data["control_law"]["kind"] == "integrator"
-    assert any(note.startswith("mine promises") for note in data["notes"])
+    assert data["control_law"]["law"] == "integrator"
+    assert any(note.startswith("mine assumes") for note in data["notes"])
     assert {row["name"] for row in data["residuals"]} > {"mine", data["best"], "what ran"}
     assert data["costs"][-1]["part"] == "all"
     assert data["lines"][0]["frequency_hz"] == pytest.approx(31, abs=0.2)
@@ -314,17 +300,14 @@ def test_a_dead_axis_leaves_the_other(capsys, tmp_path):
         ("identify NIGHT -o m.yaml --columns a", "--columns takes ROLE=NAME or ROLE=NAME,NAME"),
         ("identify NIGHT -o m.yaml --acceleration-unit g", "goes with --accelerometers."),
         ("identify NIGHT -o m.yaml --obstruction 0.1", "give --diameter-m."),
-        ("identify NIGHT -o m.yaml --lines-file L.csv", "must have a frequency_hz in each row"),
         ("identify NIGHT -o m.yaml --figure a.png --no-figure", "give one of --figure and --no-"),
-        ("auto NIGHT -o t.fits --lines-hz 12 -5", "--lines-hz must be above 0; got -5"),
         ("auto SHORT -o t.fits --delay-frames 2", "4 s at 1000 Hz) in stretches of at least 256"),
         ("diagnose NIGHT --pdf a.pdf", "--pdf is the page of -o on paper; give -o, too."),
-        ("diagnose PSD.csv --kind spectrum --unit nm^2/Hz", "diagnose examines recorded series; "),
+        ("diagnose PSD.csv --unit nm^2/Hz", "diagnose examines recorded series; "),
     ],
 )
 def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, recorded_night, words, message):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "L.csv").write_text("1,2,3\n")
     (tmp_path / "PSD.csv").write_text(
         "frequency_hz,psd\n" + "".join(f"{i},1\n" for i in range(1, 99))
     )

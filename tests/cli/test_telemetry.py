@@ -145,14 +145,12 @@ def test_a_record_is_read_once(tmp_path, capsys, recorded_loop):
 def test_an_open_loop_is_read_once_and_a_spectrum_is_not(tmp_path, capsys):
     y = 20 * np.random.default_rng(0).standard_normal((300, 2))
     np.save(tmp_path / "y.npy", y)
-    options = ("--kind", "open-loop", "--unit", "nm", "--frame-rate-hz", 500)
+    options = ("--columns", "open_loop=0,1", "--unit", "nm", "--frame-rate-hz", 500)
     night = tmp_path / "y.npz"
     assert run(capsys, "telemetry", tmp_path / "y.npy", *options, "-o", night)[0] == 0
     record = lbt.load_record(night)
     assert (record.commands, record.frame_rate_hz) == (None, 500)
     assert np.array_equal(record.measurements, y)
-    with pytest.raises(lbt.errors.ProblemError, match="is of kind open_loop; got closed_loop"):
-        lbt.load_record(night, kind="closed_loop")
     spectrum = tmp_path / "s.csv"
     spectrum.write_text("f_hz,psd_nm2_hz\n1,2\n2,3\n")
     status, _, error = run(capsys, "telemetry", spectrum)
@@ -162,7 +160,7 @@ def test_an_open_loop_is_read_once_and_a_spectrum_is_not(tmp_path, capsys):
 
 def test_bad_input_is_one_line(tmp_path, capsys, night, gain):
     for arguments, words in (
-        (("telemetry", gain), "names do not tell what the columns are"),
+        (("telemetry", gain), "Choose by --columns measurements="),
         (("telemetry", night, "--format", "npz"), "--format is of what -o writes; give -o FILE."),
         (("telemetry", night, "-o", tmp_path / "t.txt"), "must end in .fits, .npz or .aot.fits"),
         (("simulate", LBT_YAML, gain, "--telemetry", "t.txt"), "telemetry must end in"),

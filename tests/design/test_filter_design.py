@@ -29,7 +29,7 @@ from lbt_synth.design.filter_design import (
     make_fallbacks,
 )
 from lbt_synth.errors import InfeasibleError, LbtSynthError, ProblemError
-from lbt_synth.linear import kalman_riccati
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.budget import model_readings, residual_budget
 from lbt_synth.models import Accelerometer, ARModel, SensorSuite, WavefrontSensor
 

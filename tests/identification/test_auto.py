@@ -254,13 +254,13 @@ def beyond_its_margin(model: IdentifiedModel, factor: float = 1.1) -> np.ndarray
 
 def test_gains_that_the_fit_shows_keep_the_design() -> None:
     model, allowed = strong_loop()[1], np.array([[0.6, 1.2]])
-    design, notes = design_for_gains(model, noisy(model), allowed, command_scale_known=True)
+    design, noise, note = design_for_gains(model, noisy(model), allowed, command_scale_known=True)
     assert design.method == "kalman"
     (text,) = design.assumptions
     assert "the loop is stable at all of these" in text
     assert "at the size that was applied, as was stated" in text
-    assert notes == ()
-    free, _ = design_for_gains(model, noisy(model), None, command_scale_known=False)
+    assert (noise, note) == (1.0, "")
+    free, *_ = design_for_gains(model, noisy(model), None, command_scale_known=False)
     assert free.assumptions == ()
 
 
@@ -274,27 +274,28 @@ def test_more_noise_is_assumed_where_the_fitted_design_is_unstable() -> None:
         factors.append(factor)
         return noisy(model)(factor)
 
-    safe, (note,) = design_for_gains(model, design, allowed, command_scale_known=True)
+    safe, noise, note = design_for_gains(model, design, allowed, command_scale_known=True)
     assert unstable_gains(safe, allowed) is None
     assert f"to be stable at sensor gains of {allowed[0, 0]:.3g} to" in note
+    assert f"the design assumes {noise:.3g} times the noise" in note
     loops = [lbt.close_loop(model.hardware, each.controller) for each in (design(1.0), safe)]
     least, paid = (lbt.residual_budget(loop, model.truth()).rms_nm for loop in loops)
     assert least < paid < 1.1 * least
     stable = {f for f in factors if unstable_gains(noisy(model)(f), allowed) is None}
     below = max(set(factors) - stable)
-    assert min(stable) < 1.15 * below
+    assert min(stable) == noise < 1.15 * below
     # a gain that the record leaves open is asked for
     wide = beyond_its_margin(model, 1.5) * [0.5, 1.0]
-    _, (note,) = design_for_gains(model, noisy(model), wide, command_scale_known=True)
+    *_, note = design_for_gains(model, noisy(model), wide, command_scale_known=True)
     assert note.startswith("warning: to be stable")
     assert "Give --sensor-gain, which the record leaves open" in note
 
 
 def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain() -> None:
     model, allowed = narrow_line(), np.array([[0.85, 0.95]])
-    best, _ = design_for_gains(model, careless(model), allowed, command_scale_known=True)
+    best, *_ = design_for_gains(model, careless(model), allowed, command_scale_known=True)
     assert unstable_gains(best, allowed * [0.5, 1.0]) is not None
-    safe, (note,) = design_for_gains(model, careless(model), allowed, command_scale_known=False)
+    safe, _, note = design_for_gains(model, careless(model), allowed, command_scale_known=False)
     assert unstable_gains(safe, allowed * [0.5, 1.0]) is None
     assert "at half of them" in safe.assumptions[0]
     assert "--command-scale 1" in note

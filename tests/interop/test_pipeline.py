@@ -16,7 +16,7 @@ from support.sensor_loops import SLOW, example_plant
 
 import lbt_synth as lbt
 from lbt_synth.interop.cacao.export import predictive_filter
-from lbt_synth.interop.pipeline import target_named, target_names
+from lbt_synth.interop.pipeline import rehearse, target_named, target_names
 from lbt_synth.interop.pyrtc.plugin import GainFilePredictor
 from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.loop import Disturbance
@@ -202,7 +202,7 @@ def judge(folder, seed):
     verdicts = {}
     for name, oracle in ORACLES.items():
         options = random_options(name, rng)
-        target = lbt.interop.target_named(name)
+        target = target_named(name)
         try:
             written = lbt.interop.export(target.path_in(folder), design, name, **options)
         except (lbt.errors.NumericalError, lbt.errors.ProblemError):
@@ -230,7 +230,7 @@ def test_the_oracles_see_a_loop_that_is_unstable(tmp_path):
     )
     design = lbt.integrator(quick, gain=0.9)
     for name, oracle in ORACLES.items():
-        target = lbt.interop.target_named(name)
+        target = target_named(name)
         files = lbt.interop.export(target.path_in(tmp_path), design, name).files
         assert decays(quick, oracle(files, quick, {}))
         if name != "cacao":  # its configuration has the delay, so that this loop has none to miss
@@ -295,7 +295,7 @@ def test_what_no_format_takes(tmp_path, designs, file):
 @pytest.mark.usefixtures("short_rehearsal")
 @pytest.mark.parametrize("name", target_names())
 def test_the_same_design_gives_the_same_files_and_a_certificate_of_them(tmp_path, designs, name):
-    own, seen = lbt.interop.target_named(name), []
+    own, seen = target_named(name), []
     for folder in (tmp_path / "a", tmp_path / "b"):
         folder.mkdir()
         written = lbt.interop.export(
@@ -310,7 +310,7 @@ def test_the_same_design_gives_the_same_files_and_a_certificate_of_them(tmp_path
         assert digests == found
         assert [check["name"] for check in beside["checks"]] == [c.name for c in written.checks]
         assert all(check["passed"] for check in beside["checks"])
-        assert beside["arithmetic"]["program"] == own.arithmetic.program
+        assert beside["precision"] == own.precision
         assert 0 <= written.error < 1e-3
     assert seen[0] == seen[1]
 
@@ -329,7 +329,7 @@ def test_a_sensor_gain_of_each_axis_is_in_the_numbers(tmp_path, designs, name):
     )
     phase = 100 * np.cumsum(np.random.default_rng(0).standard_normal((600, 2)), axis=0) / 30
     for design in (lbt.kalman(plant), lbt.integrator(hardware, gain=0.5)):
-        target = lbt.interop.target_named(name)
+        target = target_named(name)
         written = lbt.interop.export(target.path_in(tmp_path), design, name)
         assert all(check.passed for check in written.checks)
         runs = [
@@ -353,7 +353,7 @@ def test_an_option_goes_with_its_target(tmp_path, designs):
 @pytest.mark.parametrize("name", target_names())
 def test_what_is_proved_is_what_was_read_from_the_file(tmp_path, designs, monkeypatch, name):
     """Each file holds numbers; where one is another when it is read, it is not written."""
-    own = lbt.interop.target_named(name)
+    own = target_named(name)
 
     def damaged(files, like):
         return louder(own.read(files, like))
@@ -390,9 +390,7 @@ def slow():
 @pytest.mark.parametrize("name", target_names())
 def test_each_target_runs_beside_the_design(slow, name):
     noise = np.random.default_rng(1).standard_normal((1500, 2))
-    run = lbt.interop.rehearse(
-        slow, name, Disturbance(phase_nm=PHASE, noise=noise, sensor_gain=0.8)
-    )
+    run = rehearse(slow, name, Disturbance(phase_nm=PHASE, noise=noise, sensor_gain=0.8))
     loop = lbt.close_loop(PATH, slow, sensor_gain=0.8)
     exact = filter_series(loop.system, np.hstack([PHASE, noise]))[run.settle_frames :]
     assert np.allclose(run.design.residual_nm[0], exact[:, :2], atol=1e-9)
@@ -411,7 +409,7 @@ def test_a_target_that_knows_its_limit_comes_back(slow, name):
     """After a step beyond the stroke, the residual is what it was before."""
     phase = np.zeros((1200, 2))
     phase[300:600] = 100.0
-    run = lbt.interop.rehearse(slow, name, Disturbance(phase_nm=phase), stroke=50.0)
+    run = rehearse(slow, name, Disturbance(phase_nm=phase), stroke=50.0)
     start = run.settle_frames
     assert np.max(np.abs(run.target.commands)) == 50
     assert 0 < run.clipped_frames(run.target) <= 300
@@ -436,7 +434,7 @@ def test_what_runs_is_what_is_exported(tmp_path, quick, name):
     written = lbt.interop.export(target.path_in(tmp_path), quick, name)
     rest = np.zeros(total.shape)
     alone = recorded_run(written.start(60.0), quick.hardware, total, rest, stroke=60.0)[0]
-    run = lbt.interop.rehearse(quick, name, Disturbance(phase_nm=total), stroke=60.0)
+    run = rehearse(quick, name, Disturbance(phase_nm=total), stroke=60.0)
     assert np.array_equal(run.target.commands[0], alone[run.settle_frames :, 1:2])
     assert [check.value for check in run.checks] == [check.value for check in written.checks]
     if name == "cacao":
@@ -452,7 +450,7 @@ def test_a_loop_that_the_target_makes_unstable_is_named(tmp_path, slow, monkeypa
     broken = replace(found, start=lambda _: wrong.start())
     monkeypatch.setattr("lbt_synth.interop.pipeline.export", lambda *_: broken)
     with pytest.raises(lbt.errors.NumericalError, match="of c the loop grows beyond all numbers"):
-        lbt.interop.rehearse(slow, "c", Disturbance(phase_nm=np.vstack([PHASE] * 3)))
+        rehearse(slow, "c", Disturbance(phase_nm=np.vstack([PHASE] * 3)))
 
 
 def test_what_cannot_be_rehearsed_is_refused(slow):
@@ -469,4 +467,4 @@ def test_what_cannot_be_rehearsed_is_refused(slow):
         ((several, "c", series), problem, "got one of several sensors"),
     ):
         with pytest.raises(error, match=words):
-            lbt.interop.rehearse(*given)
+            rehearse(*given)

@@ -8,8 +8,8 @@ from support.periodic_problems import lifted_problem, relative_distance
 
 import lbt_synth as lbt
 from lbt_synth.errors import DefinitenessError, DimensionError, ProblemError
-from lbt_synth.linear import EstimationProblem, kalman_riccati
-from lbt_synth.linear.riccati.filtering import least_gamma
+from lbt_synth.linear import EstimationProblem
+from lbt_synth.linear.riccati.filtering import kalman_riccati, least_gamma
 
 WALK = {
     "A": [[[1.0]]],

@@ -10,7 +10,7 @@ from support.plants import random_problem
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
-from lbt_synth.linear.infeasibility_proof import Witness
+from lbt_synth.linear.infeasibility_proof import Witness, infeasible_level
 
 
 def test_the_witness_is_a_signal_that_no_measurement_shows(axis_plant):
@@ -41,7 +41,7 @@ def test_no_witness_proves_too_much(seed, n, r):
     disturbances = rng.standard_normal((problem.B.shape[1], r))
     witness = Witness(states=states, disturbances=disturbances)
     least = lbt.hinf(problem, route="riccati").gamma_least
-    assert lbt.linear.infeasible_level(problem, witness, covariance) <= least * (1 + 1e-9)
+    assert infeasible_level(problem, witness, covariance) <= least * (1 + 1e-9)
 
 
 def test_states_without_error_prove_nothing():
@@ -93,7 +93,7 @@ def certified(plant, level, proof):
         (lambda p: certified(p, 1.0, THREE_STATES), DimensionError, "must have 4 rows of states"),
         (lambda p: certified(p, -5.0, ONE_PHASE), ProblemError, "level must be at least 0"),
         (
-            lambda p: lbt.linear.infeasible_level(p, TWO_PHASES, np.eye(4)),
+            lambda p: infeasible_level(p, TWO_PHASES, np.eye(4)),
             DimensionError,
             "period of the problem, 1; got 2",
         ),

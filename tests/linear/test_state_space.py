@@ -11,6 +11,7 @@ from support.systems import random_system
 
 import lbt_synth as lbt
 from lbt_synth.linear.lyapunov import stationary_covariance
+from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.linear.state_space import balancing_scales, pointwise_response, stacked_response
 
 
@@ -66,7 +67,7 @@ def test_many_points_and_few_points_agree(seed, n, m, p):
     few = np.concatenate([system.frequency_response(frequency[i : i + 1]) for i in range(101)])
     assert np.allclose(many, few, rtol=1e-10, atol=1e-10 * np.abs(few).max())
     sigma = np.linalg.svd(few, compute_uv=False)[:, 0]
-    assert np.allclose(lbt.linear.largest_singular_values(system, frequency), sigma, rtol=1e-10)
+    assert np.allclose(spectral_norms(system.frequency_response(frequency)), sigma, rtol=1e-10)
 
 
 def test_a_pole_on_the_unit_circle_has_no_response():
@@ -218,7 +219,6 @@ def test_a_system_without_states_is_a_system():
         assert lbt.linear.hinf_norm(gain).value == pytest.approx(5, rel=1e-9)
         assert gain.output_covariances()[0, 0, 0] == 25
         assert "0 states" in repr(gain)
-        assert "largest modulus of a pole   0" in str(gain)
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     empty = np.zeros((0, 0))
     held = lbt.Controller(A=empty, B=np.zeros((0, 1)), C=np.zeros((1, 0)), D=0.3, dt_s=1 / 800)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
-from support.drifting import drifting
 from support.uneven_axes import LOOPS, QUICK, SLOW, TABLE
 
 import lbt_synth as lbt
@@ -77,18 +76,6 @@ def test_drawn_resonances_have_their_rms_and_their_decay_from_the_first_frame():
     assert series[:, [0, 20, 39]].std(axis=0) == pytest.approx(np.full(3, 100), rel=0.05)
     correlation = np.mean(series[:, 0] * series[:, 1]) / 100**2
     assert correlation == pytest.approx(a1 / (1 - a2), abs=0.05)
-    line = drifting(duration_s=2, damping=0.02)
-    series = drawn(line, frames=2800, cases=1000, zero_frame=400)
-    for frame in (0, 1, 399, 1200, 2000, 2799):
-        assert series[:, frame].std() == pytest.approx(100, rel=0.08)
-    early, late = series[:, :2], series[:, 2400:2402]  # before the drift, and after it
-    for pair, hz in ((early, 17), (late, 23)):
-        model = (
-            lbt.Vibration(frequency_hz=17, damping=0.02, rms_nm=100).at_frequency(hz).ar_model(800)
-        )
-        a1, a2 = model.coefficients
-        correlation = np.mean(pair[:, 0] * pair[:, 1]) / np.mean(pair**2)
-        assert correlation == pytest.approx(a1 / (1 - a2), abs=2e-3)
 
 
 def path_with(channel):

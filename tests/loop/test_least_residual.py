@@ -13,6 +13,7 @@ import lbt_synth as lbt
 from lbt_synth.design.result import model_limits
 from lbt_synth.errors import CoupledModesError, DimensionError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.least_residual import least_residual
 
 
@@ -186,7 +187,7 @@ def variances_of_sensors(sensors, *, delay=2.0, lines=(), sensor_gain=1.0, own_n
     )
     motions = tuple(moves for _, moves in lines)
     plant = own.with_sensors(lbt.models.SensorSuite(sensors=tuple(sensors)), motions)
-    controller = plant.controller(lbt.linear.kalman_riccati(plant).gain_predictor)
+    controller = plant.controller(kalman_riccati(plant).gain_predictor)
     loop = lbt.close_loop(plant.hardware, controller)
     truth = lbt.Truth(
         turbulence=slow,

@@ -128,7 +128,7 @@ def test_a_loop_that_is_unstable_at_the_measured_gain_predicts_nothing(setup, ro
 
 def test_tables_of_another_loop_are_refused(setup):
     hardware = lbt.LoopHardware(frame_rate_hz=1000)
-    other = replace(setup, system=replace(setup.system, hardware=hardware))
+    other = replace(setup, hardware=hardware)
     with pytest.raises(ProblemError, match="800 Hz with a delay of 2 frames"):
         plan_cases(other)
 
@@ -144,7 +144,7 @@ def runs(monkeypatch):
     """Set-ups that were run, by what stands in for SPECULA."""
     seen = []
 
-    def run(setup, controller, cache):
+    def run(setup, controller, calibration):
         seen.append(setup)
         numbers = dict.fromkeys(("tip_tilt_gain", "other_modes_strehl"), 0.6)
         numbers |= {"strehl": 0.7 + 0.01 * setup.seed, "tip_rms_nm": 3.0, "tilt_rms_nm": 4.0}
@@ -152,7 +152,7 @@ def runs(monkeypatch):
 
     monkeypatch.setattr(given, "calibrate", lambda *_, **__: None)
     monkeypatch.setattr(given, "specula_version", lambda: "1.1")
-    monkeypatch.setattr(lbt.interop.EndToEndSetup, "run", run)
+    monkeypatch.setattr(given, "run_end_to_end", run)
     return seen
 
 

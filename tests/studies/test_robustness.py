@@ -279,7 +279,6 @@ def test_a_frozen_reading_and_a_drift_have_no_exact_answer(sensors_design, senso
         start_hz=line.frequency_hz,
         end_hz=line.frequency_hz + 0.1,
         duration_s=1,
-        damping=0.01,
         rms_nm=line.rms_nm,
         direction=line.direction,
     )

@@ -1,10 +1,12 @@
 """End-to-end runs and tables that need no SPECULA."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
 import lbt_synth as lbt
+from lbt_synth.interop.specula.simulation import EndToEndRun
 from lbt_synth.studies.paper import all_cases, make_entries, plan_cases
 
 CONFIG = "examples/lbt.yaml"
@@ -14,15 +16,15 @@ def load_setup():
     return lbt.load_config(CONFIG).end_to_end
 
 
-def make_run(system, *, gain=0.5, noise_nm=10.0, frames=4000, seed=0):
+def make_run(setup, *, gain=0.5, noise_nm=10.0, frames=4000, seed=0):
     """A run whose measurements are a gain times the residual of the frame before, and noise."""
     rng = np.random.default_rng(seed)
-    residual = 50 * rng.standard_normal((frames, system.modes))
+    residual = 50 * rng.standard_normal((frames, setup.modes))
     measured = np.zeros_like(residual)
     measured[1:] = gain * residual[:-1]
     measured += noise_nm * rng.standard_normal(measured.shape)
-    return lbt.interop.EndToEndRun(
-        system=system,
+    return EndToEndRun(
+        setup=replace(setup, frames=frames, seed=seed),
         strehl_series=0.8 + 0.01 * rng.standard_normal(frames),
         other_modes_series=np.full(frames, 0.85),
         measurements=measured,
@@ -30,9 +32,6 @@ def make_run(system, *, gain=0.5, noise_nm=10.0, frames=4000, seed=0):
         residual_nm=residual,
         psf=np.ones((4, 4)) / 16,
         psf_pixel_mas=20.0,
-        seed=seed,
-        settle_frames=200,
-        seconds=1.0,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit.identified_model import IdentifiedLine
 
 RATE = 1000.0
 
@@ -21,7 +22,7 @@ class Line:
     direction: tuple | None = None
     direction_error_deg: float | None = None
     sections: int = 1
-    direction_deg = lbt.identification.IdentifiedLine.direction_deg
+    direction_deg = IdentifiedLine.direction_deg
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,6 +6,13 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
+from lbt_synth.identification.prediction.residual import (
+    estimate_residual,
+    gather,
+    mode_noise,
+    replay,
+    settled_test,
+)
 
 RATE = 800
 CAMERA = lbt.Imaging(diameter_m=8.22)
@@ -54,6 +61,27 @@ def pseudo_open_loop(y, u, hardware, gain=1.0):
     return z
 
 
+def replayed_residual(
+    z, controller, hardware, *, noise_nm, noise_error_nm=0.0, stretches=None, test=None
+):
+    """Return what a controller would have left of a series on the frames of a test."""
+    runs = tuple(stretches or ((0, len(z)),))
+    kept = settled_test(runs, runs if test is None else tuple(test), hardware)
+    noise_nm2 = np.square(noise_nm) * np.eye(hardware.n_measurements)
+    measured = gather(replay(lbt.close_loop(hardware, controller), z, runs), kept)
+    return estimate_residual(measured, kept, *mode_noise(hardware, noise_nm2, noise_error_nm))
+
+
+def record_of(z, hardware, *, measured=None):
+    """Return the record of an open loop whose pseudo-open-loop series is z."""
+    return lbt.identification.LoopRecord(
+        frame_rate_hz=hardware.frame_rate_hz,
+        measurements=z @ hardware.sensor.T,
+        measured=np.ones(len(z), bool) if measured is None else measured,
+        commanded=np.ones(len(z), bool),
+    )
+
+
 def a_series(model, frames, rng, more=4000):
     from scipy.signal import lfilter
 
@@ -74,5 +102,4 @@ CASES = [
 GOOD = np.random.default_rng(0).standard_normal((2000, 2))
 SPOILT = np.where(np.arange(2000)[:, None] == 77, np.nan, GOOD)
 PATH = lbt.LoopHardware(frame_rate_hz=RATE)
-FLAT = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=[[1, 0], [1, 0]])
 STUCK = lbt.LoopHardware(frame_rate_hz=RATE, influence_matrix=[[1, 1], [1, 1]])

@@ -7,6 +7,7 @@ from scipy.signal import lfilter
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.identify import axis_periodogram, find_axis, refit_axis
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.models.resonance_spectrum import coefficients
@@ -60,9 +61,9 @@ def identify_series(
     stretches: object = None,
     sensor_gain: float | None = None,
     sensor_gain_error: float = 0.0,
-    start: lbt.identification.IdentifiedAxis | None = None,
+    start: IdentifiedAxis | None = None,
     **options: object,
-) -> lbt.identification.IdentifiedAxis:
+) -> IdentifiedAxis:
     """Identify the series of one axis, at a sensor gain with an error if it is given."""
     data = axis_periodogram(measurement, correction, frame_rate_hz, stretches)
     search = Search(data=data, gain=sensor_gain, **options)

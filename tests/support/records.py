@@ -34,7 +34,7 @@ def record(run, path, **more):
 
 
 def kinds(seen, *, spoils=True):
-    return {(f.kind, f.series, f.axis) for f in seen.health.findings if f.spoils == spoils}
+    return {(f.kind, f.series, f.axis) for f in seen.findings if f.spoils == spoils}
 
 
 def noise(frames, seed=0):
@@ -45,5 +45,5 @@ def findings(record):
     """What was found in a record: kind, series, axis, frames, the first of them, whether spoilt."""
     return [
         (each.kind, each.series, each.axis, each.count, each.first_frame, each.spoils)
-        for each in record.health.findings
+        for each in record.findings
     ]

@@ -5,9 +5,10 @@ from pathlib import Path
 import pytest
 
 import lbt_synth as lbt
+from lbt_synth.interop.specula.optics import EndToEndSetup
 
 PATH = lbt.LoopHardware(frame_rate_hz=800)
-BRIGHT = lbt.interop.EndToEndSystem(
+SETUP = EndToEndSetup(  # of a bright star
     hardware=PATH,
     diameter_m=1.5,
     obstruction=0.2,
@@ -22,9 +23,11 @@ BRIGHT = lbt.interop.EndToEndSystem(
     modes=20,
     actuators_across=7,
     pixels=24,
-)
-SETUP = lbt.interop.EndToEndSetup(
-    system=BRIGHT, frames=400, settle_frames=200, gain=0.5, leak=1.0, leak_from_mode=2
+    frames=400,
+    settle_frames=200,
+    gain=0.5,
+    leak=1.0,
+    leak_from_mode=2,
 )
 # a filter for 40 Hz leaves much of a line at 44 Hz
 SHAKE = lbt.models.SinusoidalVibration(frequency_hz=44, rms_nm=60.0, direction=(0.8, 0.6))

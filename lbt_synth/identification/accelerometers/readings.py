@@ -17,7 +17,7 @@ from scipy.interpolate import CubicSpline
 
 from lbt_synth.errors import DimensionError, ProblemError, TelemetryError
 from lbt_synth.identification.records.clock import build_clock
-from lbt_synth.identification.records.columns import Column, seconds_per
+from lbt_synth.identification.records.columns import Column, clock_factor
 from lbt_synth.identification.records.contents import CLOCKS, Contents, read_contents
 from lbt_synth.identification.records.faults import fill, find_outliers, find_stuck, mark, runs
 from lbt_synth.identification.records.record import BRIDGED_FRAMES, LoopRecord
@@ -181,7 +181,7 @@ def _on_own_clock(
     clock = build_clock(
         len(values),
         frame_rate_hz=own_hz or (frame_rate_hz if times is None else None),
-        times_s=None if times is None else times.values * seconds_per(times.unit),
+        times_s=None if times is None else times.values * clock_factor(times.unit, "s"),
         frame_numbers=None if counter is None else counter.values,
     )
     laid = np.full((int(clock.frame_of_row[-1]) + 1, values.shape[1]), np.nan)

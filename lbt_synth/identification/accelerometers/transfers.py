@@ -142,57 +142,15 @@ def accelerometer_transfers(
     false_alarm: float = 1e-3,
     largest_shift_s: float = 10.0,
 ) -> AccelerometerTransfers:
-    r"""Find how the channels of accelerometers move with the lines of an identified model.
+    """Find how the channels of accelerometers move with the lines of an identified model.
 
-    A channel c reads, in frame k of the loop,
-
-    ``a_c(k) = 1e-9 sum_j F_cj a_j(k-g) + noise``
-
-    with a_j(k) the mean acceleration of the line j [nm/s^2 of wavefront] over frame k, g the age of
-    the reading, and F_cj a complex factor, whose size is the motion and whose angle the phase.
-    Standard errors count those of the model's sensor gains.
-
-    Parameters
-    ----------
-    model : IdentifiedModel
-        The model that :func:`identify` found in the record.
-    record : LoopRecord
-        Record of the loop.
-    accelerations : (frames, channels) or (frames,) array_like
-        Readings [m/s^2], one per frame of the loop; the first belongs to the first frame of the
-        record, but for a shift. NaN where one is missing.
-    channels : sequence of str, optional
-        Names of the channels; channel1, channel2, ... by default.
-    false_alarm : float, optional
-        Probability that any line shows in any of these channels without being there.
-    largest_shift_s : float, optional
-        Largest shift between the clocks that is looked for [s].
-
-    Returns
-    -------
-    AccelerometerTransfers
-        Motions and phases with standard errors, noise, the shift of the clocks, and verdicts.
-
-    Raises
-    ------
-    ProblemError
-        If sizes clash, a value is out of range, or record and readings overlap too little.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> from scipy.signal import lfilter
-    >>> line = lbt.Vibration(frequency_hz=31, damping=0.01, rms_nm=60).ar_model(1000)
-    >>> rng = np.random.default_rng(1)
-    >>> drive = line.driving_rms_nm * rng.standard_normal(20_002)
-    >>> v = lfilter([1], [1, *-line.coefficients], drive)
-    >>> z = v[1:-1] + 5 * rng.standard_normal(20_000)
-    >>> a = -2 * 1e-9 * (2 * np.pi * 31) ** 2 * v[1:-1] + 1e-3 * rng.standard_normal(20_000)
-    >>> record = lbt.identification.loop_record(z, frame_rate_hz=1000, unit="nm")
-    >>> found = lbt.identification.accelerometer_transfers(lbt.identify(record), record, a)
-    >>> round(found.transfers[0].motion_nm_per_nm, 1), found.channels[0].verdict
-    (2.0, 'used')
+    A channel c reads ``a_c(k) = 1e-9 sum_j F_cj a_j(k-g) + noise`` in frame k of the loop, with
+    a_j(k) the mean acceleration of the line j [nm/s^2 of wavefront] over frame k, g the age of the
+    reading, and F_cj a complex factor, whose size is the motion and whose angle the phase. Standard
+    errors count those of the model's sensor gains. The readings are (frames, channels) or (frames,)
+    [m/s^2], the first that of the first frame of the record, but for a shift between the clocks of
+    at most ``largest_shift_s``; NaN where one is missing. ``false_alarm`` is the probability that
+    any line shows in any of these channels without being there.
     """
     readings, good = fill_missing(accelerations)
     names = channel_names(channels, readings.shape[1])

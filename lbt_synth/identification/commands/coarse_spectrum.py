@@ -46,72 +46,58 @@ _LARGEST_STEP = 1.2  # factor on a gain
 _PEAK, _SKIRT = 3.0, 1.25  # factors of a peak, and of its skirt, over the surroundings
 _REACH = 40  # frequencies on either side of a peak, which are its surroundings
 
-# minus the logarithm of the likelihood of each guess, and its best gain
-CoarseFit: TypeAlias = tuple[FloatArray, FloatArray]
+CoarseFit: TypeAlias = tuple[FloatArray, FloatArray]  # minus log-likelihoods, and best gains
+CoarseAxis: TypeAlias = tuple[LoopPeriodogram, LoopPeriodogram, FloatArray]
 
 
-class CoarseRecord:
-    """The transforms of one record, on which repairs are compared; none without ``stretches``."""
+def coarse_stretches(record: LoopRecord) -> list[tuple[int, int]]:
+    """Return the stretches (start, stop) that are long enough, and that no shift leaves."""
+    most = MOST_SHIFT_FRAMES
+    trimmed = [(start + most, stop - most) for start, stop in record.stretches()]
+    return [(start, stop) for start, stop in trimmed if stop - start >= _SHORTEST_SEGMENT]
 
-    def __init__(self, record: LoopRecord) -> None:
-        self.record = record
-        most = MOST_SHIFT_FRAMES  # no shift leaves the stretch
-        trimmed = [(a + most, b - most) for a, b in record.stretches()]
-        self.stretches = [(a, b) for a, b in trimmed if b - a >= _SHORTEST_SEGMENT]
-        self._transforms: dict[tuple[bool, int], ComplexArray] = {}
-        if self.stretches:
-            self.rows = _segments(self.stretches, record.frame_rate_hz)
-            transforms = self._transform(record.measurements)
-            self.frequency_hz, self.measured, self.independent = transforms
 
-    def _transform(self, series: FloatArray) -> tuple[FloatArray, ComplexArray, float]:
-        return segment_transforms(series, self.rows, self.record.frame_rate_hz, levelled=True)
+def repaired_corrections(record: LoopRecord, repair: CommandRepair) -> FloatArray:
+    """Return the corrections of repaired commands, but for their matrix, (frames, axes) [nm]."""
+    corrections = record.corrections()
+    if repair.increments:  # sums of commands give sums of corrections
+        corrections = np.cumsum(corrections, axis=0)
+    return np.roll(corrections, repair.shift_frames, axis=0)
 
-    def _unturned(self, repair: CommandRepair) -> FloatArray:
-        """Return the corrections of repaired commands, but for the matrix, (frames, axes) [nm]."""
-        corrections = self.record.corrections()
-        if repair.increments:  # sums of commands give sums of corrections
-            corrections = np.cumsum(corrections, axis=0)
-        return np.roll(corrections, repair.shift_frames, axis=0)
 
-    def transform(self, repair: CommandRepair) -> ComplexArray:
-        """Return the transforms of the corrections of repaired commands, (axes, segments, f)."""
-        key = (repair.increments, repair.shift_frames)
-        if key not in self._transforms:
-            self._transforms[key] = self._transform(self._unturned(repair))[1]
-        return np.tensordot(repair.turn(self.record.axes), self._transforms[key], 1)
+def compare_repairs(record: LoopRecord, repairs: Sequence[CommandRepair]) -> CoarseFit:
+    """Return minus the log-likelihood and the best gain of n repairs, (axes, n + 1).
 
-    def corrections(self, repair: CommandRepair) -> FloatArray:
-        """Return the corrections of repaired commands as series, (frames, axes) [nm]."""
-        return self._unturned(repair) @ repair.turn(self.record.axes).T
-
-    def compare(self, repairs: Sequence[CommandRepair]) -> CoarseFit:
-        """Return contrast and best gain of n repairs, (axes, n + 1).
-
-        The last column is of commands that do not reach the measurements.
-        """
-        transforms = [self.transform(repair) for repair in repairs]
-        corrections = np.array([*transforms, 0 * transforms[0]])
-        fits = [self._fit_axis(i, corrections[:, i]) for i in range(self.record.axes)]
-        contrast, gain = (np.array(values) for values in zip(*fits, strict=True))
-        return contrast, gain
-
-    def _fit_axis(self, i: int, corrections: ComplexArray) -> CoarseFit:
-        """Fit all guesses of one axis, from multiples of the gain that is natural for each."""
-        measured, rate = self.measured[i], self.record.frame_rate_hz
-        high = self.frequency_hz > 0.05 * rate
-        level = np.mean(abs(measured[:, high]) ** 2)
-        steps = np.mean(abs(corrections[..., high]) ** 2, axis=(1, 2))
+    The last column is of commands that do not reach the measurements.
+    """
+    rate = record.frame_rate_hz
+    rows = _segments(coarse_stretches(record), rate)
+    frequency_hz, measured, independent = segment_transforms(
+        record.measurements, rows, rate, levelled=True
+    )
+    plain, turned = dict[tuple[bool, int], ComplexArray](), list[ComplexArray]()
+    for repair in repairs:
+        if (key := (repair.increments, repair.shift_frames)) not in plain:
+            series = repaired_corrections(record, repair)
+            plain[key] = segment_transforms(series, rows, rate, levelled=True)[1]
+        turned.append(np.tensordot(repair.turn(record.axes), plain[key], 1))
+    corrections = np.array([*turned, 0 * turned[0]])
+    high, fits = frequency_hz > 0.05 * rate, list[CoarseFit]()
+    for i in range(record.axes):
+        level = np.mean(abs(measured[i][:, high]) ** 2)
+        steps = np.mean(abs(corrections[:, i][..., high]) ** 2, axis=(1, 2))
         rounding = np.finfo(float).eps ** 2 * level  # clipped commands may hardly move
         natural = np.sqrt(level / np.maximum(steps, max(rounding, np.finfo(float).tiny)))
-        axis = CoarseAxis(
-            self.frequency_hz,
-            measured,
-            corrections,
-            independent=self.independent,
+        data = coarse_axis(
+            frequency_hz,
+            measured[i],
+            corrections[:, i],
+            independent=independent,
             frame_rate_hz=rate,
         )
-        return axis.fit_guesses(natural[:, None] * _NATURAL_GAINS)
+        fits.append(fit_guesses(data, natural[:, None] * _NATURAL_GAINS))
+    contrast, gain = (np.array(values) for values in zip(*fits, strict=True))
+    return contrast, gain
 
 
 def _segments(stretches: Sequence[tuple[int, int]], frame_rate_hz: float) -> IntArray:
@@ -167,75 +153,72 @@ def _resonance(square: FloatArray, centre_hz: FloatArray | float, damping: float
     return np.asarray(centre**2 / ((square - centre) ** 2 + 4 * damping**2 * centre * square))
 
 
-class CoarseAxis:
-    """One axis in bands and at peaks, and fits of shapes to it for repairs of its corrections."""
+def coarse_axis(
+    frequency_hz: FloatArray,
+    measured: ComplexArray,
+    guesses: ComplexArray,
+    *,
+    independent: float,
+    frame_rate_hz: float,
+) -> CoarseAxis:
+    """Return an axis in bands, at peaks, and the shapes that a spectrum may have, (k, bands).
 
-    def __init__(
-        self,
-        frequency_hz: FloatArray,
-        measured: ComplexArray,
-        guesses: ComplexArray,
-        *,
-        independent: float,
-        frame_rate_hz: float,
-    ) -> None:
-        """Take the powers of an axis from (segments, f) and corrections (n, segments, f)."""
-        power = np.mean(abs(measured) ** 2, axis=0)
-        is_peak, lines, width = find_spectral_peaks(frequency_hz, power)
-        step = float(frequency_hz[1] - frequency_hz[0])
-        every = LoopPeriodogram(
-            frequency_hz=frequency_hz,
-            measured=power,
-            crossed=np.mean((measured.conj() * guesses).real, axis=1),
-            corrected=np.mean(guesses.real**2 + guesses.imag**2, axis=1),
-            count=np.full(power.size, independent),
-            frame_rate_hz=frame_rate_hz,
-        )
-        bands, self.peaks = every.take(~is_peak), every.take(is_peak)
-        self.bands = bands.merge(_bands(bands.frequency_hz, step))
+    The transforms are (segments, f), of n guesses of the corrections (n, segments, f).
+    """
+    power = np.mean(abs(measured) ** 2, axis=0)
+    is_peak, lines, width = find_spectral_peaks(frequency_hz, power)
+    every = LoopPeriodogram(
+        frequency_hz=frequency_hz,
+        measured=power,
+        crossed=np.mean((measured.conj() * guesses).real, axis=1),
+        corrected=np.mean(guesses.real**2 + guesses.imag**2, axis=1),
+        count=np.full(power.size, independent),
+        frame_rate_hz=frame_rate_hz,
+    )
+    bands = every.take(~is_peak)
+    bands = bands.merge(_bands(bands.frequency_hz, float(frequency_hz[1] - frequency_hz[0])))
 
-        def warp(f: FloatArray) -> FloatArray:
-            return half_angle_square(f, frame_rate_hz) * (frame_rate_hz / (2 * np.pi)) ** 2
+    def warp(f: FloatArray) -> FloatArray:  # as that of a sampled process [Hz^2]
+        return half_angle_square(f, frame_rate_hz) * (frame_rate_hz / (2 * np.pi)) ** 2
 
-        # frequency squared, as that of a sampled process [Hz^2], (b,)
-        square = warp(self.bands.frequency_hz)
-        # only the skirts of a line are compared, which do not show its damping; a line on either
-        # side of its peak stands for one between them
-        places = np.concatenate([lines - width, lines + width])
-        centres = np.sqrt(warp(places[places > 0]))
-        skirts = [_resonance(square, centre, _LINE_DAMPING) for centre in centres]
-        self.shapes = _shapes(square, frequency_hz[0], skirts)  # of at most 1, (k, b)
+    # only the skirts of a line are compared, which do not show its damping; a line on either side
+    # of its peak stands for one between them
+    places = np.concatenate([lines - width, lines + width])
+    square, centres = warp(bands.frequency_hz), np.sqrt(warp(places[places > 0]))
+    skirts = [_resonance(square, centre, _LINE_DAMPING) for centre in centres]
+    return bands, every.take(is_peak), _shapes(square, frequency_hz[0], skirts)
 
-    def fit_guesses(self, starts: FloatArray) -> CoarseFit:
-        """Fit spectrum and gain of each guess, from each of its starting gains (n, s).
 
-        The amplitudes of the shapes follow multiplicative updates (C. Fevotte, N. Bertin, J.-L.
-        Durrieu, Neural Comput. 21, 793 (2009), doi:10.1162/neco.2008.04-08-771, algorithm 1), the
-        gain follows Newton's steps with the expected curvature.
-        """
-        guesses, many = starts.shape
-        gain, guess = starts.ravel(), np.repeat(np.arange(guesses), many)
-        bands, peaks, shapes = self.bands.row(guess), self.peaks.row(guess), self.shapes
-        count, at_peaks = self.bands.count, self.peaks.count
-        level = np.median(_power(bands, gain), axis=1)[:, None]
-        a = level / (len(shapes) * np.mean(shapes, axis=1))
+def fit_guesses(axis: CoarseAxis, starts: FloatArray) -> CoarseFit:
+    """Fit spectrum and gain of each guess, from each of its starting gains (n, s).
+
+    The amplitudes of the shapes follow multiplicative updates (C. Fevotte, N. Bertin, J.-L.
+    Durrieu, Neural Comput. 21, 793 (2009), doi:10.1162/neco.2008.04-08-771, algorithm 1), the gain
+    follows Newton's steps with the expected curvature.
+    """
+    guesses, many = starts.shape
+    gain, guess = starts.ravel(), np.repeat(np.arange(guesses), many)
+    bands, peaks, shapes = axis[0].row(guess), axis[1].row(guess), axis[2]
+    count, at_peaks = bands.count, peaks.count
+    level = np.median(_power(bands, gain), axis=1)[:, None]
+    a = level / (len(shapes) * np.mean(shapes, axis=1))
+    model = a @ shapes
+    for _ in range(_PASSES):
+        weight = count / model
+        a = a * ((weight * _power(bands, gain) / model) @ shapes.T) / (weight @ shapes.T)
+        a = np.maximum(a, 1e-12 * np.max(a, axis=1, keepdims=True))
         model = a @ shapes
-        for _ in range(_PASSES):
-            weight = count / model
-            a = a * ((weight * _power(bands, gain) / model) @ shapes.T) / (weight @ shapes.T)
-            a = np.maximum(a, 1e-12 * np.max(a, axis=1, keepdims=True))
-            model = a @ shapes
-            slope = _slope(bands, gain) / model
-            steep = _slope(peaks, gain) / _power(peaks, gain)
-            gradient = slope @ count + steep @ at_peaks
-            curvature = (bands.corrected / model) @ (2 * count) + steep**2 @ at_peaks
-            step = gradient / np.maximum(curvature, np.finfo(np.float64).tiny)
-            gain = np.clip(gain - step, gain / _LARGEST_STEP, gain * _LARGEST_STEP)
-        ratio = _power(bands, gain) / model
-        contrast = (np.log(model) + ratio) @ count
-        contrast += (np.log(_power(peaks, gain)) + 1) @ at_peaks
-        best = np.argmin(contrast.reshape(starts.shape), axis=1) + many * np.arange(guesses)
-        return contrast[best], gain[best]
+        slope = _slope(bands, gain) / model
+        steep = _slope(peaks, gain) / _power(peaks, gain)
+        gradient = slope @ count + steep @ at_peaks
+        curvature = (bands.corrected / model) @ (2 * count) + steep**2 @ at_peaks
+        step = gradient / np.maximum(curvature, np.finfo(np.float64).tiny)
+        gain = np.clip(gain - step, gain / _LARGEST_STEP, gain * _LARGEST_STEP)
+    ratio = _power(bands, gain) / model
+    contrast = (np.log(model) + ratio) @ count
+    contrast += (np.log(_power(peaks, gain)) + 1) @ at_peaks
+    best = np.argmin(contrast.reshape(starts.shape), axis=1) + many * np.arange(guesses)
+    return contrast[best], gain[best]
 
 
 def _power(data: LoopPeriodogram, gain: FloatArray) -> FloatArray:

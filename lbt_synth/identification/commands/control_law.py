@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import Literal, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,10 +32,6 @@ from lbt_synth.validation import (
     square,
 )
 
-LawKind: TypeAlias = Literal[
-    "integrator", "double integrator", "proportional", "higher order", "none"
-]
-AxisKind: TypeAlias = Literal["diagonal", "swapped", "general", "zero"]
 _LAGS = range(-4, 5)  # frames by which the first measurement may be late
 _ROWS_PER_VALUE = 16  # of each coefficient: a law from fewer frames explains its own noise
 _MOST_ROWS = 16_000  # frames of a regression: more move no law, and take seconds
@@ -64,15 +60,9 @@ class ControlLaw:
     of one of higher order depends on all of its poles.
     """
 
-    kind: LawKind  # "none": the commands do not follow from the measurements
-    # of the first measurement; negative if commands know measurements of the future
-    lag_frames: int
-    gain: FloatArray  # (axes, axes); zeros where there is no law
-    axes_kind: AxisKind  # structure of the gain, as classify_matrix says
-    signs: tuple[int, ...]  # of each axis; 0 where the structure has none
-    poles: ComplexArray  # (axes, order), the one nearest 1 first
+    lag_frames: int  # of the first measurement; negative if commands know measurements to come
     past: FloatArray  # (axes, order), weights of past commands
-    taps: FloatArray  # (axes, lags, axes), weights of measurements
+    taps: FloatArray  # (axes, lags, axes), weights of measurements; zeros where there is no law
     residual: float  # unexplained part of the variance of the increments of u
     # (axes,); part that past commands leave and measurements explain: 1 of a deterministic law
     axis_coherence: FloatArray
@@ -81,6 +71,38 @@ class ControlLaw:
     def order(self) -> int:
         """Past commands of an axis that the law uses."""
         return int(self.past.shape[1])
+
+    @property
+    def kind(self) -> str:
+        """The law in a word; "none" where commands do not follow from the measurements."""
+        if not np.any(self.taps):
+            return "none"
+        if self.order == 2 and np.all(abs(self.poles - 1) < _ADDS_UP):
+            return "double integrator"
+        return {0: "proportional", 1: "integrator"}.get(self.order, "higher order")
+
+    @property
+    def poles(self) -> ComplexArray:
+        """The poles of each axis, (axes, order), the one nearest 1 first."""
+        out = np.zeros(self.past.shape, dtype=np.complex128)
+        for row, past in zip(out, self.past, strict=True):
+            roots = np.roots(np.append(1.0, -past))  # without those at 0 of weights that vanish
+            row[: roots.size] = roots
+            row[:] = row[np.argsort(abs(row - 1), kind="stable")]
+        return out
+
+    @property
+    def gain(self) -> FloatArray:
+        """The gain, (axes, axes), small elements as zero."""
+        # at low frequencies, but for the poles at 1
+        others = self.poles[:, 2 if self.kind == "double integrator" else 1 :]
+        gain = np.sum(self.taps, axis=1) / np.prod(abs(1 - others), axis=1)[:, None]
+        return np.where(abs(gain) < _EXACT * np.max(abs(gain)), 0.0, gain)
+
+    @property
+    def axes_kind(self) -> str:
+        """The structure of the gain, as classify_matrix says."""
+        return classify_matrix(self.gain)[0]
 
     @property
     def coherence(self) -> float:
@@ -114,7 +136,7 @@ class ControlLaw:
     def gain_text(self) -> str:
         """The gains that are not zero by structure; one where all are the same."""
         gains = np.diag(self.gain) if self.axes_kind == "diagonal" else self.gain.ravel()
-        texts = [f"{value:.4g}" for value in gains + 0.0]
+        texts = [f"{value:.4g}" for value in gains]
         return texts[0] if len(set(texts)) == 1 else ", ".join(texts)
 
     @property
@@ -142,41 +164,12 @@ class ControlLaw:
 
 
 def fit_control_law(
-    measurements: ArrayLike,
-    commands: ArrayLike,
-    *,
-    usable: ArrayLike | None = None,
+    measurements: ArrayLike, commands: ArrayLike, *, usable: ArrayLike | None = None
 ) -> ControlLaw:
-    """Return the law with the least order that explains commands by measurements.
+    """Return the law of least order that explains commands by measurements, (frames, axes) each.
 
-    Frames at which a command is at a limit do not count, nor those few that do not follow the
-    law of the others.
-
-    Parameters
-    ----------
-    measurements, commands : (frames, axes) array_like
-        Measurements y(k) and commands u(k) of one or two axes, in the same unit.
-    usable : (frames,) bool array_like, optional
-        Frames whose values are good; all by default.
-
-    Returns
-    -------
-    ControlLaw
-        The law; of kind "none" if the commands do not follow from the measurements.
-
-    Raises
-    ------
-    ProblemError
-        If sizes clash, or too few frames are good.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> y = np.random.default_rng(1).standard_normal((2000, 2))
-    >>> u = 0.3 * np.cumsum(y[:, ::-1], axis=0)  # axes swapped
-    >>> law = fit_control_law(y, u)
-    >>> law.kind, law.lag_frames, law.axes_kind, law.gain.round(6).tolist()
-    ('integrator', 0, 'swapped', [[0.0, 0.3], [0.3, 0.0]])
+    Frames that are not usable (frames,) or at which a command is at a limit do not count, nor those
+    few that do not follow the law of the others. ProblemError refuses too few frames.
     """
     y = matrix(measurements, "measurements")
     why = f"to match measurements {y.shape}"
@@ -289,52 +282,41 @@ class _Regression:
         self.factor: FloatArray = np.asarray(np.linalg.qr(table / self.scale, mode="r"))
         self.moving = [i for i in range(self.axes) if self.scale[i] ** 2 > 1e-30]
 
-    def columns(self, axis: int, shape: _Shape) -> list[int]:
-        """Return the columns of past commands and measurements that a law uses."""
-        order, lags = shape
-        first = self.axes * (1 + self.order + lags[0] - self.lags[0])
-        past = [axis + self.axes * (1 + lag) for lag in range(order)]
-        return past + list(range(first, first + self.axes * len(lags)))
-
-    def solve(self, axis: int, chosen: list[int], order: int) -> tuple[FloatArray, float]:
-        """Return the weights of some columns, and what they leave of the increments' variance.
+    def solve(self, axis: int, shape: _Shape) -> tuple[FloatArray, float]:
+        """Return the weights of a law, and what it leaves of the increments' variance.
 
         A law without memory gives the command in place of its increment.
         """
-        target = self.factor[:, axis]
+        order, lags = shape
+        target, past = self.factor[:, axis], axis + self.axes * np.arange(1, 1 + order)
         if not order:
-            past = axis + self.axes
-            target = target + self.factor[:, past] * self.scale[past] / self.scale[axis]
+            at = axis + self.axes
+            target = target + self.factor[:, at] * self.scale[at] / self.scale[axis]
+        first = self.axes * (1 + self.order + lags.start - self.lags.start)
+        chosen = np.append(past, first + np.arange(self.axes * len(lags)))
         table = self.factor[:, chosen]
         weights = np.linalg.lstsq(table, target, rcond=None)[0]
         unexplained = target - table @ weights
         residual = float(unexplained @ unexplained) / self.rows
         return weights * self.scale[axis] / self.scale[chosen], residual
 
-    def residuals(self, shape: _Shape) -> FloatArray:
-        """Return the part of the increments' variance that a law leaves, (axes,); 1 at rest."""
-        out = np.ones(self.axes)
-        for axis in self.moving:
-            _, out[axis] = self.solve(axis, self.columns(axis, shape), shape[0])
-        return out
-
     def residual(self, shape: _Shape) -> float:
-        """Return the mean of that over the moving axes."""
-        return float(np.mean(self.residuals(shape)[self.moving or slice(None)]))
+        """Return the part of the increments' variance that a law leaves, of the moving axes."""
+        return float(np.mean([self.solve(axis, shape)[1] for axis in self.moving] or [1.0]))
 
     def coherence(self, shape: _Shape) -> FloatArray:
         """Return the part of what past commands leave that a law explains, of each axis (axes,).
 
         Corrected for the number of coefficients; zero where commands do not move.
         """
-        out, after = np.zeros(self.axes), self.residuals(shape)
-        used = shape[0] + self.axes * len(shape[1])
+        out, used = np.zeros(self.axes), shape[0] + self.axes * len(shape[1])
         for axis in self.moving:
-            past = self.columns(axis, (self.order, self.lags))[: self.order]
-            _, before = self.solve(axis, past, self.order)
+            (_, before), (_, after) = (
+                self.solve(axis, one) for one in ((self.order, range(0)), shape)
+            )
             if before > 0:
-                ratio = after[axis] / before * (self.rows - self.order) / (self.rows - used)
-                out[axis] = max(0.0, 1 - float(ratio))
+                ratio = after / before * (self.rows - self.order) / (self.rows - used)
+                out[axis] = max(0.0, 1 - ratio)
         return out
 
     def simplest_shape(self, lags: range) -> _Shape:
@@ -362,63 +344,28 @@ class _Regression:
         return shape
 
     def describe(self, shape: _Shape) -> ControlLaw:
-        """Return the law of a shape, in words."""
-        coherence = self.coherence(shape)
-        residual, moving = self.residual(shape), self.moving
-        if np.max(coherence) < FOLLOWED:
-            shape, moving = (0, range(1)), []
-        past, taps = self.coefficients(shape, moving)
-        poles = _poles(past)
-        kind = _kind(poles) if moving else "none"
-        # at low frequencies, but for the poles at 1
-        others = poles[:, 2 if kind == "double integrator" else 1 :]
-        gain = np.sum(taps, axis=1) / np.prod(abs(1 - others), axis=1)[:, None]
-        gain[abs(gain) < _EXACT * np.max(abs(gain))] = 0.0
-        axes_kind, signs = classify_matrix(gain)
+        """Return the law of a shape, without weights where the commands do not follow from it."""
+        coherence, residual = self.coherence(shape), self.residual(shape)
+        is_law = np.max(coherence) >= FOLLOWED
+        axes, (order, lags) = self.axes, shape if is_law else (0, range(1))
+        past, taps = np.zeros((axes, order)), np.zeros((axes, len(lags), axes))
+        for axis in self.moving if is_law else ():
+            weights, _ = self.solve(axis, shape)
+            taps[axis] = weights[order:].reshape(len(lags), axes)
+            if order:
+                steps = np.append(weights[1:order], 0.0)  # of the increments before
+                past[axis] = np.diff(steps, prepend=0.0)
+                past[axis, 0] += 1 + weights[0]
         return ControlLaw(
-            kind=kind,
-            lag_frames=shape[1].start,
-            gain=read_only(gain),
-            axes_kind=axes_kind,
-            signs=signs,
-            poles=read_only(poles),
+            lag_frames=lags.start,
             past=read_only(past),
             taps=read_only(taps),
             residual=residual,
             axis_coherence=read_only(coherence),
         )
 
-    def coefficients(self, shape: _Shape, moving: list[int]) -> tuple[FloatArray, FloatArray]:
-        """Return the weights of past commands (axes, order) and measurements (axes, lags, axes)."""
-        axes, (order, lags) = self.axes, shape
-        past, taps = np.zeros((axes, order)), np.zeros((axes, len(lags), axes))
-        for axis in moving:
-            weights, _ = self.solve(axis, self.columns(axis, shape), order)
-            taps[axis] = weights[order:].reshape(len(lags), axes)
-            if order:
-                steps = np.append(weights[1:order], 0.0)  # of the increments before
-                past[axis] = np.diff(steps, prepend=0.0)
-                past[axis, 0] += 1 + weights[0]
-        return past, taps
 
-
-def _poles(past: FloatArray) -> ComplexArray:
-    """Return the poles of each axis, (axes, order), the one nearest 1 first."""
-    roots = [np.roots(np.append(1.0, -row)).astype(np.complex128) for row in past]
-    padded = [np.append(row, np.zeros(past.shape[1] - row.size)) for row in roots]
-    return np.array([row[np.argsort(abs(row - 1), kind="stable")] for row in padded])
-
-
-def _kind(poles: ComplexArray) -> LawKind:
-    """Return the word for a law with poles (axes, order)."""
-    order = poles.shape[1]
-    if order == 2 and np.all(abs(poles - 1) < _ADDS_UP):
-        return "double integrator"
-    kinds: tuple[LawKind, LawKind] = ("proportional", "integrator")
-    return kinds[order] if order <= 1 else "higher order"
-
-
-def classify_matrix(values: ArrayLike) -> tuple[AxisKind, tuple[int, ...]]:
+def classify_matrix(values: ArrayLike) -> tuple[str, tuple[int, ...]]:
     """Return what a matrix (n, n) of one or two axes does, the first kind that fits, and signs.
 
     Elements below 5 % of the largest one count as zero. Signs are those on the diagonal, of a

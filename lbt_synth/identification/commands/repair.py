@@ -15,42 +15,15 @@ from lbt_synth.validation import FloatArray, integer, number, read_only, real_ar
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommandRepair:
-    """A correction of recorded commands, in the order of the fields.
+    """A correction of recorded commands, in the order of the fields."""
 
-    Parameters
-    ----------
-    increments : bool, optional
-        The record has increments: they are added up.
-    shift_frames : int, optional
-        Frames by which the commands move to later frames; negative to earlier ones.
-    swap_axes : bool, optional
-        The commands of the two axes change places.
-    sign : tuple of int, optional
-        1 or -1 for each axis, or for both.
-    matrix : tuple of float, optional
-        Matrix from commands to the axes of the measurements, in rows.
-    scale : float or sequence of float, optional
-        Factor of the commands of both axes, or of each: from volts or counts to the unit of the
-        measurements, for example.
-
-    Raises
-    ------
-    ProblemError
-        If a value is out of range.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lbt.identification.CommandRepair(sign=(-1,), scale=0.001).options
-    '--command-sign -1 --command-scale 0.001'
-    """
-
-    increments: bool = False
-    shift_frames: int = 0
+    increments: bool = False  # they are increments, to be added up
+    shift_frames: int = 0  # by which they move to later frames
     swap_axes: bool = False
-    sign: tuple[int, ...] = ()
-    matrix: tuple[float, ...] = ()
-    scale: float | Sequence[float] = ()
+    sign: tuple[int, ...] = ()  # 1 or -1 for each axis, or for both
+    matrix: tuple[float, ...] = ()  # to the axes of the measurements, in rows
+    scale: float | Sequence[float] = ()  # of both axes, or of each
+    delay_frames: float | None = None  # total delay of the loop
 
     def __post_init__(self) -> None:
         factors = self.scale if isinstance(self.scale, Sequence) else (self.scale,)
@@ -76,11 +49,12 @@ class CommandRepair:
             f"--command-sign {values(self.sign)}" if self.sign else "",
             f"--command-matrix {values(self.matrix)}" if self.matrix else "",
             f"--command-scale {values(self.scales)}" if self.scales else "",
+            "" if self.delay_frames is None else f"--delay-frames {self.delay_frames:g}",
         ]
         return " ".join(filter(None, words))
 
     def words(self) -> list[str]:
-        """Return what is wrong with commands that need this, but for their scale."""
+        """Return what is wrong with commands that need this."""
         out = []
         if self.shift_frames:
             frames = count_text(abs(self.shift_frames), "frame")
@@ -97,6 +71,13 @@ class CommandRepair:
             turned = self.sign.index(-1)
             one = len(set(self.sign)) == 1
             out.append(f"{'they have' if one else f'axis {turned} has'} the opposite sign")
+        if self.delay_frames is not None:
+            out.append(f"the total delay is {self.delay_frames:g} frames")
+        for axis, factor in enumerate(self.scales):
+            if factor != 1:
+                whose = "they" if len(self.scales) == 1 else f"those of axis {axis}"
+                size = f"{max(factor, 1 / factor):g} times too {'large' if factor < 1 else 'small'}"
+                out.append(f"{whose} are {size}")
         return out
 
     @property
@@ -149,4 +130,11 @@ def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
         unknown = slice(0, repair.shift_frames) if late else slice(repair.shift_frames, None)
         commands[unknown], good[unknown] = 0.0, False
     commands = commands @ repair.turn(record.axes).T
-    return replace(record, commands=read_only(commands), commanded=read_only(good), bridges=None)
+    delay_frames = record.delay_frames if repair.delay_frames is None else repair.delay_frames
+    return replace(
+        record,
+        commands=read_only(commands),
+        commanded=read_only(good),
+        delay_frames=delay_frames,
+        bridges=None,
+    )

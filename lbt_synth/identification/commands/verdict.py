@@ -11,7 +11,6 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +19,9 @@ from lbt_synth.identification.commands.coarse_spectrum import (
     CLEAR,
     MOST_SHIFT_FRAMES,
     SEGMENT_S,
-    CoarseRecord,
+    coarse_stretches,
+    compare_repairs,
+    repaired_corrections,
 )
 from lbt_synth.identification.commands.control_law import (
     FOLLOWED,
@@ -30,10 +31,7 @@ from lbt_synth.identification.commands.control_law import (
     fit_control_law,
     law_controller,
 )
-from lbt_synth.identification.commands.repair import (
-    CommandRepair,
-    repair_commands,
-)
+from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
 from lbt_synth.identification.fit.fitting import PLAUSIBLE_GAINS, TYPICAL_GAIN, Search, cost
 from lbt_synth.identification.fit.order_search import FEW_ROUNDS, find_components
 from lbt_synth.identification.fit.periodogram import loop_periodogram
@@ -65,11 +63,8 @@ _ANY = np.geomspace(1.0, 1e-6, 19)  # gains of a loop that may be of no sensor
 class CommandVerdict:
     """How the commands of a record reach its measurements."""
 
-    explanation: str  # the best one, in words; "as given" if that is what was given
+    explanation: str = AS_GIVEN  # the best one, in words
     repair: CommandRepair = _GIVEN  # without options where nothing is wrong or nothing helps
-    delay_frames: float | None = None  # delay that fits, where another was given
-    # log-likelihood above that of the record as given; 0 where the law alone decides
-    nats: float = 0.0
     gain: FloatArray  # (axes,), coarse sensor gain; nan where the coarse spectrum does not show it
     law: ControlLaw | None  # None where too few frames show it
     notes: tuple[str, ...] = ()  # what to look at although the record is accepted
@@ -78,12 +73,6 @@ class CommandVerdict:
     def accepted(self) -> bool:
         """Whether a model may be fitted."""
         return self.explanation == AS_GIVEN
-
-    @property
-    def options(self) -> str:
-        """The options of the command line that repair the record; empty if there are none."""
-        delay = "" if self.delay_frames is None else f"--delay-frames {self.delay_frames:g}"
-        return f"{self.repair.options} {delay}".strip()
 
     @property
     def doubt(self) -> str:
@@ -95,8 +84,8 @@ class CommandVerdict:
         """What to do about it; empty if nothing is wrong."""
         if self.accepted:
             return ""
-        if self.options:
-            return f"read the record with {self.options}"
+        if self.repair.options:
+            return f"read the record with {self.repair.options}"
         advice = self.explanation.partition(". ")[2]
         return advice[:1].lower() + advice[1:] or _FIND
 
@@ -111,8 +100,7 @@ class CommandVerdict:
         """Return the verdict as a row of a table."""
         return facts(
             explanation=fact(self.explanation, "the commands"),
-            nats=fact(self.nats, "evidence", format=".0f"),
-            repair=fact(self.options, "repair"),
+            repair=fact(self.repair.options, "repair"),
         )
 
     def require_accepted(self) -> None:
@@ -123,12 +111,14 @@ class CommandVerdict:
         if self.accepted:
             return
         law = "" if self.law is None else f" ({self.law.name} fits them{self.law.lag_text})"
-        tried = f"{self.options}, or " if self.options else ""
+        tried = f"{self.repair.options}, or " if self.repair.options else ""
         raise RecordError(
             f"the commands do not reach the measurements as given: {self.explanation}{law}.",
             explanation=self.explanation,
-            options=self.options,
-            in_python=f"Repair them as the options {self.options} do." if self.options else "",
+            options=self.repair.options,
+            in_python=f"Repair them as the options {self.repair.options} do."
+            if self.repair.options
+            else "",
             at_terminal=f"Try {tried}--accept-record to go on as it is.",
         )
 
@@ -146,72 +136,93 @@ def explain_commands(
     known gain of the sensor is one number or one per axis; by default 0.2 to 1.25 is plausible.
     """
     require_instance(record, LoopRecord)
-    delay = record.hardware.delay_frames  # refuses a record without one
+    _ = record.hardware  # refuses a record without a delay
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
     known = None if sensor_gain is None else record.known_gains(sensor_gain)
-    shown = record_law(record)
-    commands = record.commands[record.usable]
+    law, commands = record_law(record), record.commands[record.usable]
     still = np.all(commands == commands[:1], axis=0)
-    if still.any() and not still.all():
-        return _explain_moving(record, still, shown, known)
+    if still.all() or not still.any():
+        return _explain(record, law, known)
+    # the loop of the other axis was open
+    y, u = record.measurements[:, ~still], record.commands[:, ~still]
+    moving = replace(record, measurements=y, commands=u)
+    verdict = _explain(moving, record_law(moving), None if known is None else known[~still])
+    gain = np.where(still, np.nan, verdict.gain)
+    note = f"the commands of axis {int(np.argmax(still))} stand still: its loop was open"
+    return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
+
+
+def _explain(
+    record: LoopRecord, shown: ControlLaw | None, known: FloatArray | None
+) -> CommandVerdict:
+    """Explain the commands of axes that move, of which the record shows a law."""
     law = None if shown is None or shown.kind == "none" else shown
     refuse = partial(CommandVerdict, gain=np.full(record.axes, np.nan), law=shown)
     sure = law if law is not None and law.is_sure else None
     if sure is not None and (doubt := _doubt_law(sure)):
         return refuse(explanation=doubt)
     lag = 0 if sure is None else sure.lag_frames
-    early, lag = max(-lag, 0), max(lag, 0)
-    if early:  # corrections that follow from the future have no likelihood: they are moved first
-        record = repair_commands(record, CommandRepair(shift_frames=early))
-        law = None if sure is None else replace(sure, lag_frames=0)
-    coarse = CoarseRecord(record)
-    if not coarse.stretches:
-        repair = CommandRepair(shift_frames=early)
+    if sure is not None and lag < 0:
+        # corrections that follow from the future have no likelihood: they are moved first
+        moved = CommandRepair(shift_frames=-lag)
+        verdict = _explain(repair_commands(record, moved), replace(sure, lag_frames=0), known)
+        words = [*moved.words(), *([] if verdict.accepted else [verdict.explanation])]
+        repair = replace(verdict.repair, shift_frames=-lag)
+        return replace(verdict, explanation=" and ".join(words), repair=repair, law=shown)
+    if not coarse_stretches(record):
         note = "the commands were not tested: no stretch of usable frames is long enough"
-        shifted = " and ".join(repair.words())
-        return refuse(explanation=shifted or AS_GIVEN, repair=repair, notes=(note,))
+        return refuse(notes=(note,))
     usual = PLAUSIBLE_GAINS if known is None else (float(np.min(known)), float(np.max(known)))
     limits = usual[0] / _WRONG_GAIN**2, usual[1] * _WRONG_GAIN**2
-    choice = _choose(coarse, law, lag, None if known is None else limits)
+    repair, gain, unrelated = _choose(record, law, lag, None if known is None else limits)
     scale = np.ones(record.axes)
-    if not choice.unrelated.any():
-        scale = _scale(coarse, law, choice, limits)
-    is_low = choice.gain < usual[0] / _WRONG_GAIN
-    is_hidden = bool(np.any(scale < 1) or (sure is None and np.any(is_low)))
-    if doubt := _doubt_choice(record, law, choice, is_hidden):
+    if not unrelated.any():
+        scale = _scale(record, law, repair, gain, limits)
+    is_low = sure is None and np.any(gain < usual[0] / _WRONG_GAIN)
+    if doubt := _doubt_repair(record, law, repair, unrelated, bool(is_low or np.any(scale < 1))):
         return refuse(explanation=doubt)
-    off = choice.repair.shift_frames and choice.repair.shift_frames + lag
-    shift = early or (-lag if choice.repair.shift_frames else 0)
-    repair = replace(choice.repair, shift_frames=shift, scale=tuple(scale))
-    words = repair.words()
-    if off:
-        words.append(f"the total delay is {delay + off:g} frames, not {delay:g}")
-    if np.any(scale != 1):
-        words.append(wrong_scale(scale, choice.gain))
-    gain = choice.gain / scale
-    hidden = (gain <= limits[0]) | (gain >= limits[1])
+    delay_frames = record.hardware.delay_frames
+    off = repair.shift_frames and repair.shift_frames + lag
+    repair = replace(
+        repair,
+        shift_frames=-lag if repair.shift_frames else 0,
+        delay_frames=delay_frames + off if off else None,
+        scale=tuple(scale),
+    )
+    hidden = (gain / scale <= limits[0]) | (gain / scale >= limits[1])
     return refuse(
-        explanation=" and ".join(words) or AS_GIVEN,
+        explanation=_name_repair(repair, gain),
         repair=repair,
-        delay_frames=delay + off if off else None,
-        nats=choice.nats,
-        gain=frozen_copy(np.where(hidden, np.nan, gain)),
-        notes=() if words else _note_law(delay, lag, _unexplained(law)),
+        gain=frozen_copy(np.where(hidden, np.nan, gain / scale)),
+        notes=() if repair.options else _note_law(delay_frames, lag, _unexplained(law)),
     )
 
 
-def _doubt_choice(
-    record: LoopRecord, law: ControlLaw | None, choice: _Choice, is_hidden: bool
+def _name_repair(repair: CommandRepair, gain: FloatArray) -> str:
+    """Return what a repair undoes, with the sensor gains (axes,) that show its scale."""
+    if not repair.options:
+        return AS_GIVEN
+    gains = ", ".join(f"{value:.3g}" for value in gain)
+    shown = f" (with them the sensor has a gain of {gains})" if repair.scales else ""
+    return " and ".join(repair.words()) + shown
+
+
+def _doubt_repair(
+    record: LoopRecord,
+    law: ControlLaw | None,
+    repair: CommandRepair,
+    unrelated: BoolArray,
+    is_hidden: bool,
 ) -> str:
     """Return what the best repair leaves wrong, in words; empty if there is nothing."""
-    if choice.unrelated.all():
+    if unrelated.all():
         return "they have nothing to do with the measurements, as if of another night"
-    if choice.unrelated.any():
-        axis = int(np.argmax(choice.unrelated))
+    if unrelated.any():
+        axis = int(np.argmax(unrelated))
         return f"those of axis {axis} have nothing to do with its measurements"
-    ran = law is None or not law.exact or law.order > SHORT_ORDER or choice.repair != _GIVEN
-    if not ran and law is not None and not could_have_run(_GIVEN, _ANY, record, law):
+    is_as_given = repair == _GIVEN and law is not None and law.exact and law.order <= SHORT_ORDER
+    if is_as_given and not could_have_run(repair, _ANY, record, law):
         return (
             "a loop with the law that they follow is unstable at any sensor gain. Check what the "
             "series are"
@@ -260,19 +271,6 @@ def record_law(record: LoopRecord) -> ControlLaw | None:
     return None
 
 
-def _explain_moving(
-    record: LoopRecord, still: BoolArray, law: ControlLaw | None, known: FloatArray | None
-) -> CommandVerdict:
-    """Explain the commands of the axis that moves; the other loop was open."""
-    y, u = record.measurements[:, ~still], np.asarray(record.commands)[:, ~still]
-    one = replace(record, measurements=y, commands=u)
-    verdict = explain_commands(one, sensor_gain=None if known is None else known[~still].tolist())
-    gain = np.full(still.size, np.nan)
-    gain[~still] = verdict.gain
-    note = f"the commands of axis {int(np.argmax(still))} stand still: its loop was open"
-    return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
-
-
 def _doubt_law(law: ControlLaw) -> str:
     """Return what no repair undoes in a sure law, in words; empty if there is nothing."""
     followed, lags = law.axis_coherence >= FOLLOWED, law.axis_lags
@@ -316,49 +314,35 @@ def list_repairs(
     return out
 
 
-class _Choice(NamedTuple):
-    """The best repair of the commands."""
-
-    repair: CommandRepair
-    gain: FloatArray  # (axes,), of the sensor with it
-    nats: float  # by which it is likelier than the record as given
-    unrelated: BoolArray  # (axes,), of commands that follow no law and do not reach the axis
-
-
 def _choose(
-    coarse: CoarseRecord, law: ControlLaw | None, lag: int, known: tuple[float, float] | None
-) -> _Choice:
-    """Return the repair that law and likelihood ask for.
+    record: LoopRecord, law: ControlLaw | None, lag: int, known: tuple[float, float] | None
+) -> tuple[CommandRepair, FloatArray, BoolArray]:
+    """Return the repair that law and likelihood ask for, and the sensor gain (axes,) with it.
 
+    And which axes (axes,) have commands that follow no law and do not reach their measurements.
     Where limits of a known gain hold as given, they have to hold after a repair.
     """
-    record = coarse.record
     repairs = list_repairs(record.axes, record.hardware.delay_frames, law, lag)
-    contrasts, gain = coarse.compare(repairs)
+    contrasts, gains = compare_repairs(record, repairs)
     contrasts, unrelated = contrasts[:, :-1], contrasts[:, -1]
     contrast = contrasts.sum(axis=0)
-    penalty, asked = _penalties(repairs, gain, record, law, lag)
+    penalty, asked = _penalties(repairs, gains, record, law, lag)
     if known is not None:
-        held = gain[:, : penalty.size]
+        held = gains[:, : penalty.size]
         holds = np.all((held > known[0]) & (held < known[1]), axis=0)
         penalty = np.where(holds | (not holds[0]), penalty, np.inf)
     best = int(np.argmin(contrast + penalty))
-    nats = contrast[0] - contrast
+    nats = contrast[0] - contrast[best]
     if asked[best]:
-        is_shown = penalty[0] >= _SURPRISING or nats[best] >= _ODD
+        is_shown = penalty[0] >= _SURPRISING or nats >= _ODD
     else:
-        is_shown = (
-            nats[best] >= CLEAR
-            and _fit_cost(coarse, _GIVEN) - _fit_cost(coarse, repairs[best]) >= _ODD
+        is_shown = nats >= CLEAR and (
+            _fit_cost(record, _GIVEN) - _fit_cost(record, repairs[best]) >= _ODD
         )
     best = best if is_shown else 0
     followed = np.zeros(record.axes) if law is None else law.axis_coherence
-    return _Choice(
-        repairs[best],
-        gain[:, best],
-        max(float(nats[best]), 0.0),
-        (followed < FOLLOWED) & (unrelated - np.min(contrasts, axis=1) < CLEAR),
-    )
+    reaches_not = (followed < FOLLOWED) & (unrelated - np.min(contrasts, axis=1) < CLEAR)
+    return repairs[best], gains[:, best], reaches_not
 
 
 def _penalties(
@@ -409,10 +393,13 @@ def _is_unusual(repair: CommandRepair, law: ControlLaw | None, lag: int) -> bool
 
 
 def could_have_run(
-    repair: CommandRepair, gains: Iterable[FloatArray | float], record: LoopRecord, law: ControlLaw
+    repair: CommandRepair,
+    gains: Iterable[FloatArray | float],
+    record: LoopRecord,
+    law: ControlLaw | None,
 ) -> bool:
     """Return whether the recorded law would have been stable at any gain, of all or each axis."""
-    if repair.increments:
+    if repair.increments or law is None:
         return True  # another law computes the positions
     controller = law_controller(law, record.frame_rate_hz)
     path = replace(
@@ -439,16 +426,16 @@ def _moving_radius(path: LoopHardware, controller: Controller) -> float:
     return float(np.max(abs(poles[moves]))) if moves.any() else np.inf
 
 
-def _fit_cost(coarse: CoarseRecord, repair: CommandRepair, gain: float | None = None) -> float:
+def _fit_cost(record: LoopRecord, repair: CommandRepair, gain: float | None = None) -> float:
     """Return the criterion of a quick fit over all axes, at a gain; infinite where one fails."""
-    record, total = coarse.record, 0.0
-    length = int(SEGMENT_S * record.frame_rate_hz)
+    total, length = 0.0, int(SEGMENT_S * record.frame_rate_hz)
     pieces = [
         (start, min(start + length, b))
-        for a, b in coarse.stretches
+        for a, b in coarse_stretches(record)
         for start in range(a, max(b - length, a) + 1, length)
     ]
-    for y, c in zip(record.measurements.T, coarse.corrections(repair).T, strict=True):
+    corrections = repaired_corrections(record, repair) @ repair.turn(record.axes).T
+    for y, c in zip(record.measurements.T, corrections.T, strict=True):
         data = loop_periodogram(y, c, frame_rate_hz=record.frame_rate_hz, stretches=pieces)
         search = Search(data=data, gain=gain, most_lines=_LINES, gain_error=float("inf"))
         try:
@@ -459,7 +446,11 @@ def _fit_cost(coarse: CoarseRecord, repair: CommandRepair, gain: float | None = 
 
 
 def _scale(
-    coarse: CoarseRecord, law: ControlLaw | None, choice: _Choice, limits: tuple[float, float]
+    record: LoopRecord,
+    law: ControlLaw | None,
+    repair: CommandRepair,
+    gain: FloatArray,
+    limits: tuple[float, float],
 ) -> FloatArray:
     """Return the factors (axes,) of commands whose gains lie beyond the limits of another unit.
 
@@ -468,16 +459,16 @@ def _scale(
     wide resonances, unless quick fits of plausible gains are clearly less likely.
     """
     low, high = limits
-    record, seeming = coarse.record, float(np.exp(np.mean(np.log(choice.gain))))
-    within = (choice.gain >= low) & (choice.gain <= high)
+    seeming = float(np.exp(np.mean(np.log(gain))))
+    within = (gain >= low) & (gain <= high)
     if seeming < low and law is not None and law.is_sure:
         usual = np.geomspace(*PLAUSIBLE_GAINS, 8)
-        within |= could_have_run(choice.repair, usual, record, law)
+        within |= could_have_run(repair, usual, record, law)
     if high < seeming < _ANOTHER_UNIT * high:
         tried = np.geomspace(low * _WRONG_GAIN**2, high / _WRONG_GAIN**2, 3).tolist()
-        held = [_fit_cost(coarse, choice.repair, gain) for gain in (*tried, seeming)]
+        held = [_fit_cost(record, repair, guess) for guess in (*tried, seeming)]
         within |= min(held[:-1]) < held[-1] + CLEAR
-    return likely_factors(choice.gain, within)
+    return likely_factors(gain, within)
 
 
 def likely_factors(gains: FloatArray, within: BoolArray) -> FloatArray:
@@ -497,23 +488,10 @@ def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
     """
     accepted = not np.all(gains - SURPRISING * errors > PLAUSIBLE_GAINS[1])
     scale = likely_factors(gains, np.full(gains.size, accepted))
+    repair = CommandRepair(scale=tuple(scale))
     return CommandVerdict(
-        explanation=AS_GIVEN if accepted else wrong_scale(scale, gains),
-        repair=CommandRepair(scale=tuple(scale)),
+        explanation=_name_repair(repair, gains),
+        repair=repair,
         gain=frozen_copy(gains / scale),
         law=None,
     )
-
-
-def wrong_scale(scale: FloatArray, gain: FloatArray) -> str:
-    """Return the words for commands that need a factor on each axis, (axes,)."""
-    one = not np.ptp(scale)
-    words = [
-        f"{'they' if one else f'those of axis {axis}'} are "
-        f"{max(factor, 1 / factor):g} times too {'large' if factor < 1 else 'small'}"
-        for axis, factor in enumerate(scale.tolist())
-        if factor != 1
-    ]
-    gains = ", ".join(f"{value:.3g}" for value in gain)
-    text = " and ".join(words[:1] if one else words)
-    return f"{text} (with them the sensor has a gain of {gains})"

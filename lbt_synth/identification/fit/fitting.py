@@ -7,7 +7,7 @@ price of a component is ``3 / 2 log n``, for three parameters among n values, an
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -51,8 +51,7 @@ POSSIBLE_GAINS = (0.08, 2.5)  # of a sensor at all, with light lost or commands 
 GAIN_ERROR = 0.5  # of the logarithm of a sensor gain, before the data say more
 GAIN_STEP = 0.05  # of the logarithm of a gain: nearer ones are as good as the same
 TYPICAL_GAIN = 0.7  # of a sensor, before the data say more
-_ANNOUNCED = 5.0  # log-likelihood that a line of known frequency must add
-_COLOURED = 9.0  # the same of a colour of the noise, which a wrong gain can explain, too
+_COLOURED = 9.0  # log-likelihood that a colour must add, which a wrong gain can explain, too
 _MOST_COLOUR = float(np.arctanh(0.8))  # beyond, it is a drift, no white noise for a design
 _WORTH = 1e-3  # of the innovations' variance, by which a line upon a bump must lower it
 _FAR = 2.0  # half widths of a section from the middle of a bump: what lies beyond is not upon it
@@ -92,7 +91,6 @@ class Search:
     gain: float | None = None  # sensor gain; None to find it
     lowest_line_hz: float = LOWEST_LINE_HZ  # below, a component belongs to the turbulence
     most_lines: int = MOST_LINES
-    announced: Sequence[tuple[float, float]] = ()  # (frequency, error) of known lines [Hz]
     gain_error: float = GAIN_ERROR  # of the logarithm of a gain around the typical one, beforehand
 
     def __post_init__(self) -> None:
@@ -101,9 +99,6 @@ class Search:
             number(self.gain, "sensor_gain", **GAINS)
         number(self.lowest_line_hz, "lowest_line_hz", at_least=0, below=nyquist)
         integer(self.most_lines, "most_lines", at_least=0)
-        for frequency, error in self.announced:
-            number(frequency, "an announced frequency", above=0, below=nyquist)
-            number(error, "the error of an announced frequency", at_least=0)
 
     @property
     def finds_gain(self) -> bool:
@@ -172,7 +167,7 @@ class Search:
         if component.kind == "drift":
             return self.log_angle(2 * DRIFT_RATIO * DRIFT_HZ), _WIDTH
         if component.kind == "line":
-            return component.announced or _NONE
+            return _NONE
         return self.log_angle(1.0), _WIDTH
 
     def _damping_prior(self, component: Component) -> tuple[float, float]:
@@ -237,14 +232,11 @@ def likeliest(search: Search, fits: Iterable[FittedModel | None]) -> FittedModel
 def required_evidence(search: Search, spectrum: SpectrumModel, i: int) -> float:
     """Return what component i must add to the logarithm of the likelihood.
 
-    Less for an announced line, whose place was not searched for, and for a drift, which has two
-    parameters; more for a bump, which has the number of its sections beside three. Of many data
-    these are small beside what a bump of the wrong shape lacks: a component upon one must lower the
-    variance of the innovations by a part that shows.
+    Less for a drift, which has two parameters; more for a bump, which has the number of its
+    sections beside three. Of many data these are small beside what a bump of the wrong shape lacks:
+    a component upon one must lower the variance of the innovations by a part that shows.
     """
     component = spectrum.components[i]
-    if component.announced is not None:
-        return _ANNOUNCED
     parameters = PARAMETERS + (component.sections > 1) - (component.kind == "drift")
     price = parameters * search.parameter_price
     bumps = [c for k, c in enumerate(spectrum.components) if c.sections > 1 and k != i]

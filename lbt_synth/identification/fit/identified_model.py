@@ -47,58 +47,29 @@ _FASTEST = 8.0  # nepers per frame: a pole that decays faster is gone after a fr
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IdentifiedLine:
-    """A resonance found in a spectrum.
+    """A resonance found in a spectrum, with standard errors."""
 
-    Attributes
-    ----------
-    kind : {"line", "broad", "turbulence"}
-        A narrow line; a resonance that is wide (damping ratio at least 0.1) or below the rest of
-        the spectrum; a part of the turbulence, which began below the lowest frequency of lines or
-        stands for a drift.
-    frequency_hz, frequency_error_hz : float
-        Natural frequency and its standard error [Hz].
-    damping, damping_error : float
-        Damping ratio and its standard error. If the line is not resolved, both are the largest
-        damping that the record cannot distinguish from none.
-    resolved : bool
-        Whether the record is long enough to see the line's width.
-    rms_nm, rms_error_nm : float
-        Standard deviation of the displacement and its standard error [nm rms wavefront].
-    prominence : float
-        Density at its frequency over that of all the rest.
-    evidence : float
-        What it adds to the logarithm of the likelihood.
-    announced : bool
-        Whether its frequency was given beforehand.
-    direction : tuple of float or None
-        Unit vector over the axes along which it shakes, the first number at least 0. None on an
-        axis that has the line for itself.
-    direction_error_deg : float or None
-        Standard error of the direction [degrees] of a line that both axes share. None for
-        turbulence along the direction of the rms of the axes.
-    corner_hz, corner_error_hz : float or None
-        Corner beyond which the density of the turbulence falls by another f^(-5/3), as of frozen
-        flow, and its standard error [Hz].
-    sections : int
-        How many resonances in series it is: more than one make a bump of steep flanks.
-    """
-
+    # a narrow line; a resonance that is wide (damping ratio at least 0.1) or below the rest of the
+    # spectrum; a part of the turbulence, which began below the lowest frequency of lines or stands
+    # for a drift
     kind: Kind
-    frequency_hz: float
+    frequency_hz: float  # natural
     frequency_error_hz: float
-    damping: float
+    damping: float  # ratio; if not resolved, the largest that the record cannot tell from none
     damping_error: float
-    resolved: bool
-    rms_nm: float
+    resolved: bool  # whether the record is long enough to see its width
+    rms_nm: float  # standard deviation of the displacement, wavefront
     rms_error_nm: float
-    prominence: float
-    evidence: float
-    announced: bool
+    prominence: float  # density at its frequency over that of all the rest
+    evidence: float  # what it adds to the logarithm of the likelihood
+    # unit vector over the axes, the first number at least 0; None of an axis that has it for itself
     direction: tuple[float, ...] | None = None
+    # of a line that both axes share; None of turbulence along the direction of the rms of the axes
     direction_error_deg: float | None = None
+    # beyond which the density of turbulence falls by another f^(-5/3), as of frozen flow
     corner_hz: float | None = None
     corner_error_hz: float | None = None
-    sections: int = 1
+    sections: int = 1  # resonances in series: more than one make a bump of steep flanks
 
     @property
     def direction_deg(self) -> float | None:
@@ -108,16 +79,20 @@ class IdentifiedLine:
         first, second = (*self.direction, 0.0)[:2]
         return float(np.degrees(np.arctan2(second, first)))
 
-    def vibration(self, direction: tuple[float, ...] | None = None) -> Vibration:
-        """Return the resonance as a part of a plant.
+    def axis_text(self, names: Sequence[str]) -> str:
+        """Return the axis along which it shakes, or its direction with the standard error."""
+        if self.direction is None or np.count_nonzero(self.direction) == 1:
+            return names[0 if self.direction is None else int(np.argmax(self.direction))]
+        error = self.direction_error_deg
+        return f"{self.direction_deg:.4g}{'' if error is None else f' +- {error:.1g}'} deg"
 
-        Its direction over the modes is by default the line's own, and tip for one without.
-        """
+    def vibration(self) -> Vibration:
+        """Return the resonance as a part of a plant, along its direction, or tip without one."""
         return Vibration(
             frequency_hz=self.frequency_hz,
             damping=self.damping,
             rms_nm=self.rms_nm,
-            direction=direction or self.direction or (1.0, 0.0),
+            direction=self.direction or (1.0, 0.0),
             sections=self.sections,
         )
 
@@ -143,59 +118,31 @@ class Whiteness:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class IdentifiedAxis(Summarised):
-    """One axis: turbulence, lines, noise and sensor gain.
+    """One axis: turbulence, lines, noise and sensor gain, with standard errors."""
 
-    Attributes
-    ----------
-    turbulence : ARModel
-        The turbulence as a process of order 2 or 3.
-    turbulence_fit : IdentifiedLine
-        Its parameters with standard errors; of the rms of the process. Above a damping ratio of 1
-        it has two real poles.
-    parts : tuple of IdentifiedLine
-        All other resonances, by frequency. One that has a direction is this axis's share of a
-        resonance of both axes.
-    noise_nm, noise_error_nm : float
-        Measurement noise per frame on y, at least a hundredth of the innovations' deviation, and
-        its standard error [nm].
-    noise_correlation, noise_correlation_error : float
-        Correlation of the noise of neighbouring frames, of a first-order process, and its standard
-        error. The first is 0 where the data do not ask for it; the second then says what they would
-        have shown. A plant takes white noise of the same rms.
-    sensor_gain : float
-        Sensor gain: found or given.
-    sensor_gain_error : float or None
-        Its standard error; None if it was given, or has no meaning.
-    sensor_gain_note : str
-        Where it comes from, and how well it is known.
-    whiteness : Whiteness
-        Test of the innovations.
-    frequency_hz, density_nm2_hz, fitted_nm2_hz, background_nm2_hz : (f,) ndarray
-        One-sided density [nm^2/Hz] of the pseudo-open-loop measurement: periodogram, model,
-        and model without its narrow lines.
-    fitted_model : FittedModel
-        The fit itself, to start another one from.
-    data : LoopPeriodogram
-        The periodogram that was fitted.
-    """
-
-    turbulence: ARModel
-    turbulence_fit: IdentifiedLine
+    turbulence: ARModel  # a process of order 2 or 3
+    turbulence_fit: IdentifiedLine  # its parameters; above a damping ratio of 1 with two real poles
+    # all other resonances, by frequency; with a direction, this axis's share of one of both axes
     parts: tuple[IdentifiedLine, ...]
+    # per frame on y, at least a hundredth of the innovations' deviation
     noise_nm: float
     noise_error_nm: float
+    # of the noise of neighbouring frames, a first-order process: 0 where the data do not ask for
+    # it, and the error says what they would have shown; plants take white noise of the same rms
     noise_correlation: float
     noise_correlation_error: float
-    sensor_gain: float
-    sensor_gain_error: float | None
-    sensor_gain_note: str
-    whiteness: Whiteness
+    sensor_gain: float  # found or given
+    sensor_gain_error: float | None  # None if it was given, or has no meaning
+    sensor_gain_note: str  # where it comes from, and how well it is known
+    whiteness: Whiteness  # of the innovations
+    # one-sided densities [nm^2/Hz] of the pseudo-open-loop measurement, (f,) each: periodogram,
+    # model, and model without its narrow lines
     frequency_hz: FloatArray
     density_nm2_hz: FloatArray
     fitted_nm2_hz: FloatArray
     background_nm2_hz: FloatArray
-    fitted_model: FittedModel
-    data: LoopPeriodogram
+    fitted_model: FittedModel  # to start another fit from
+    data: LoopPeriodogram  # what was fitted
 
     def _brief(self) -> str:
         lines = count_text(len(self.lines), "line")
@@ -448,7 +395,6 @@ def _describe_line(
         rms_error_nm=rms * float(np.sqrt(max(variance, 0.0))),
         prominence=height / rest if rest > 0 else float("inf"),
         evidence=model.evidence[i],
-        announced=line.announced is not None,
         sections=line.sections,
     )
 
@@ -554,12 +500,10 @@ def model_tables(model: IdentifiedModel) -> list[Table]:
         fill_row(
             VibrationRow,
             line,
-            axis=_direction_text(line, names),
+            axis=line.axis_text(names),
             damping=f"{line.damping:.3g}" if line.resolved else f"< {line.damping:.2g}",
             damping_error=line.damping_error if line.resolved else None,
-            origin=line.kind
-            + f", {line.sections} sections" * (line.sections > 1)
-            + ", announced" * line.announced,
+            origin=line.kind + f", {line.sections} sections" * (line.sections > 1),
         )
         for line in model.parts
     ]
@@ -571,15 +515,6 @@ def _shown_cells(value: float, digits: str, error: float | None, unit: str) -> t
     name, factor = shown_unit(unit)
     size = None if error is None else factor * error
     return cell_text(factor * value, shown_format(digits, factor)), cell_text(size, ".2g"), name
-
-
-def _direction_text(line: IdentifiedLine, names: Sequence[str]) -> str:
-    """Return the axis of a line, or the direction of one that both axes share."""
-    assert line.direction is not None  # of the parts of a model
-    if np.count_nonzero(line.direction) == 1:
-        return names[int(np.argmax(line.direction))]
-    error = line.direction_error_deg
-    return f"{line.direction_deg:.4g}{'' if error is None else f' +- {error:.1g}'} deg"
 
 
 def _background(

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.fitting import (
@@ -38,7 +37,7 @@ from lbt_synth.identification.records.faults import MAD, RARE
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import FloatArray, each_of, real_array, require_instance
+from lbt_synth.validation import FloatArray, each_of, require_instance
 
 _DELAY = 2.0  # frames, if neither the record nor the call has a delay
 _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
@@ -59,12 +58,10 @@ def identify(
     delay_frames: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
     noise_nm: float | Sequence[float] | None = None,
-    announced: ArrayLike = (),
     lowest_line_hz: float = LOWEST_LINE_HZ,
     most_lines: int = MOST_LINES,
     stretches: StretchesLike | None = None,
     start: IdentifiedModel | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> IdentifiedModel:
     """Identify turbulence, vibrations, noise and sensor gain of a loop from its record.
 
@@ -90,8 +87,6 @@ def identify(
     noise_nm : float or one per axis, optional
         Noise per frame of the sensor of the loop to design for [nm], for spectra alone: those of
         wind shake or of a simulation have none.
-    announced : (lines,) or (lines, 2) array_like, optional
-        Frequencies of lines that are known beforehand [Hz], alone or with their standard errors.
     lowest_line_hz : float, optional
         A resonance below is a part of the turbulence [Hz].
     most_lines : int, optional
@@ -100,8 +95,6 @@ def identify(
         Frames to use; all that are usable by default.
     start : IdentifiedModel, optional
         A model to start from.
-    progress : callable, optional
-        Called with the number of fits done and their total.
 
     Returns
     -------
@@ -133,17 +126,9 @@ def identify(
     >>> lbt.kalman(found.plant()).certificate.passed
     True
     """
-    lines = real_array(announced, "announced")
-    lines = np.column_stack([lines, 0 * lines]) if lines.ndim == 1 else lines
-    if lines.ndim != 2 or lines.shape[1] != 2:
-        raise DimensionError(f"announced must be (lines,) or (lines, 2); got {lines.shape}.")
     if start is not None:
         require_instance(start, IdentifiedModel)
-    options: dict[str, Any] = {
-        "announced": lines.tolist(),
-        "lowest_line_hz": lowest_line_hz,
-        "most_lines": most_lines,
-    }
+    options: dict[str, Any] = {"lowest_line_hz": lowest_line_hz, "most_lines": most_lines}
     if isinstance(record, SpectrumRecord):
         of_series = {"sensor_gain": sensor_gain, "stretches": stretches, "start": start}
         if names := [name for name, value in of_series.items() if value is not None]:
@@ -159,20 +144,17 @@ def identify(
     pieces = record.stretches() if stretches is None else _usable_stretches(stretches, record)
     pieces, notes = _cut_at_jumps(record.corrections(), pieces)
     starts: Sequence[IdentifiedAxis | None] = start.axes if start else [None] * record.axes
-    report = progress or (lambda done, total: None)
     series = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
     axes = list[IdentifiedAxis]()
     for y, c, gain, axis_start in series:
         data = axis_periodogram(y, c, record.frame_rate_hz, pieces)
         axes.append(find_axis(Search(data=data, gain=gain, **options), start=axis_start))
-        report(len(axes), record.axes + 1)
     if len(axes) > 1 and all(axis.sensor_gain_error is not None for axis in axes):
         axes, note = _pool_gains(axes, options)
         notes.append(note)
     shared: tuple[IdentifiedLine, ...] = ()
     if len(axes) == 2:
         axes, shared = couple_axes(record, axes, pieces, lowest_line_hz)
-    report(record.axes + 1, record.axes + 1)
     return IdentifiedModel(
         axes=tuple(axes),
         shared=shared,

@@ -129,7 +129,7 @@ def find_components(
         raise NumericalError(
             "the likelihood of the spectrum is not finite. Check the units of the series."
         )
-    model = _add_announced(search, fitting.prune(search, model))
+    model = fitting.prune(search, model)
     for _ in range(rounds if start is None else FEW_ROUNDS):
         better = _improve(search, model, moves=start is None)
         if better is None:
@@ -230,29 +230,6 @@ def _add_centred(search: Search, spectrum: SpectrumModel, new: Sequence[Excess])
     return model
 
 
-def _add_announced(search: Search, model: FittedModel) -> FittedModel:
-    """Return the model with those announced lines that add enough.
-
-    A line of the model within three errors of an announced one is taken for it.
-    """
-    if not search.announced:
-        return model
-    step, spectrum = search.data.step_hz, model.spectrum
-    seen = density(search.data, spectrum)
-    for f, error in search.announced:
-        prior = (search.log_angle(f), max(error, 0.1 * step) / f)
-        level = float(np.interp(f, search.data.frequency_hz, seen))
-        line = search.component("line", f, 0.01, level * max(0.01 * f, step))
-        place = len(spectrum.components)
-        for i, c in enumerate(model.spectrum.components):
-            if c.kind == "line" and abs(search.place(c)[0] - f) < 3 * max(error, step):
-                place, line = i, spectrum.components[i]
-                break
-        spectrum = spectrum.exchange(place, replace(line, announced=prior))
-    announced = fitting.fit(search, spectrum)
-    return model if announced is None else fitting.prune(search, announced)
-
-
 def find_excesses(search: Search, spectrum: SpectrumModel) -> list[Excess]:
     """Find components where a model lacks power, as many as there may be more lines."""
     room = search.most_lines - len(spectrum.lines)
@@ -279,11 +256,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
     """
     components, data = spectrum.components, search.merge(spectrum)
     least = contrast(data, spectrum)
-    lines = [
-        i
-        for i, c in enumerate(components)
-        if c.kind == "line" and c.announced is None and c.damping_ratio < _WIDEST
-    ]
+    lines = [i for i, c in enumerate(components) if c.kind == "line" and c.damping_ratio < _WIDEST]
     lines.sort(key=lambda i: components[i].log_frequency)
     clusters = list[list[int]]()
     for i in lines:
@@ -348,12 +321,12 @@ def _line_moves(search: Search, spectrum: SpectrumModel, i: int) -> Iterator[Spe
     rest, power = density(data, spectrum.exchange(i)), data.power(spectrum.background.gain)
     again = _highest_excess(search, power, rest, slice(int(start), int(stop)), 0.5)
     if abs(search.place(again)[0] - centre) > 0.5 * half + step:
-        yield spectrum.exchange(i, replace(again, announced=line.announced))
+        yield spectrum.exchange(i, again)
     if half > 3 * step and len(spectrum.lines) < search.most_lines:
         lower, upper = (
             line.shift(float(np.log(1 + side * half / centre)), _HALF, _HALF) for side in (-1, 1)
         )
-        yield spectrum.exchange(i, lower).add(replace(upper, announced=None))
+        yield spectrum.exchange(i, lower).add(upper)
 
 
 def fit_background(

@@ -234,7 +234,6 @@ def _share(search: Search, spectrum: SpectrumModel, pair: Pair) -> Component | N
         log_power=members[0].log_power - ratio * (pair[0] is None),
         log_ratio=ratio,
         sign=1.0 if common >= 0 else -1.0,
-        announced=next((c.announced for c in members if c.announced), None),
     )
     lost = contrast(data, _replace(spectrum, pair, shared)) - contrast(data, spectrum)
     return shared if lost < HOPE * evidence else None

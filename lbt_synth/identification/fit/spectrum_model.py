@@ -45,7 +45,6 @@ class Component:
     log_frequency: float  # of the natural frequency, an angle per frame
     damping: float
     log_power: float  # of the variance, in units of the measurement
-    announced: tuple[float, float] | None = None  # log_frequency known beforehand, and its error
     axis: int | None = 0  # None if two axes share it
     log_ratio: float = 0.0  # of its variance on the second axis over that on the first
     sign: float = 1.0  # of the ratio of the amplitudes
@@ -187,7 +186,7 @@ class SpectrumModel:
         for i, c in enumerate(self.components):
             f, damping, power, *ratio = numbers[self.place(i) : self.place(i + 1)]
             log_ratio = ratio[0] if ratio else 0.0
-            facts = c.announced, c.axis, log_ratio, c.sign, c.name, c.sections
+            facts = c.axis, log_ratio, c.sign, c.name, c.sections
             components.append(Component(c.kind, f, damping, power, *facts))
         return SpectrumModel(tuple(axes), tuple(components), self.roll_off_order)
 

@@ -13,10 +13,9 @@ from lbt_synth.design import Design, model_integrator
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification.accelerometers.readings import Channels
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
-from lbt_synth.identification.prediction.regression import regress
+from lbt_synth.identification.prediction.regression import noisier, regress
 from lbt_synth.identification.prediction.residual import (
     ResidualEstimate,
-    check_series,
     estimate_residual,
     gather,
     inverse_sensor,
@@ -26,7 +25,7 @@ from lbt_synth.identification.prediction.residual import (
 )
 from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.stretches import Stretches, StretchesLike, split_halves
+from lbt_synth.identification.stretches import Stretches, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import (
@@ -46,6 +45,7 @@ from lbt_synth.validation import FloatArray, frozen_copy, matrix, require_instan
 RAN = "what ran"
 INTEGRATOR = "best integrator"
 LIMIT = "limit of performance"
+WITHOUT = ", wavefront alone"  # of the fall-back of a design that reads accelerometers
 
 
 @table_row
@@ -82,40 +82,32 @@ class PredictionRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PredictionTable:
-    """What ran, controllers, and the limit, on the same data.
-
-    Attributes
-    ----------
-    entries : tuple of PredictionRow
-        The rows.
-    fit, test : tuple of (start, stop)
-        Frames that controllers may be fitted to, and those that all rows are measured on: the
-        halves of the usable frames, without the first half second of a stretch.
-    notes : tuple of str
-        What is left out of the table or cannot be, and why.
-    """
+    """What ran, controllers, and the limit, on the same data."""
 
     entries: tuple[PredictionRow, ...]
+    # frames that controllers may be fitted to, and those that all rows are measured on: the halves
+    # of the usable frames, without the first half second of a stretch
     fit: Stretches
     test: Stretches
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what is left out of the table or cannot be, and why
+
+    def row(self, name: str) -> PredictionRow | None:
+        """Return the row of a name, None where there is none."""
+        return next((row for row in self.entries if row.name == name), None)
 
     def __getitem__(self, name: str) -> PredictionRow:
-        """Return the row of a name."""
-        for entry in self.entries:
-            if entry.name == name:
-                return entry
+        """Return the row of a name; refuse one that there is none of."""
+        if row := self.row(name):
+            return row
         names = ", ".join(entry.name for entry in self.entries)
         raise ProblemError(f"the table has the rows {names}; got {name!r}.")
 
 
 def prediction_against_data(
+    record: LoopRecord,
     plant: TipTiltPlant,
-    open_loop: ArrayLike,
     controllers: Mapping[str, Controller | Design],
     *,
-    stretches: StretchesLike | None = None,
-    measurements: ArrayLike | None = None,
     running: Controller | Design | None = None,
     noise_error_nm: ArrayLike = 0.0,
     imaging: Imaging | None = None,
@@ -123,32 +115,35 @@ def prediction_against_data(
 ) -> PredictionTable:
     """Replay controllers on frames that nothing was fitted to, and compare with the model.
 
-    Other rows are the best integrator by the model, and the least residual of any linear controller
-    of the loop's own sensor if the model is true.
+    Other rows are what ran in a closed loop, by its own measurements, the best integrator by the
+    model, and the least residual of any linear controller of the loop's own sensor if the model is
+    true.
 
     Parameters
     ----------
+    record : LoopRecord
+        What the loop recorded. Its pseudo-open-loop series does not depend on what ran: from it,
+        each controller computes exactly the commands that it would have given.
     plant : TipTiltPlant
-        The model, with its sensor gain in the sensor matrix. For an honest comparison it was not
-        identified from the frames of the test.
-    open_loop, stretches, noise_error_nm
-        As for :func:`replayed_residual`; the halves of :func:`split_halves` are to fit and to test.
+        The model, with its sensor gain in the sensor matrix, which can be inverted. For an honest
+        comparison it was not identified from the second half of the usable frames, the test.
     controllers : mapping of str to Controller or Design
         What is compared, by name; one whose loop is unstable is left out, with a note.
-    measurements : (frames, q) array_like, optional
-        Measurements y(k) of the loop that ran, for its own row [nm].
     running : Controller or Design, optional
         The controller that ran, if it is known, for what the model says of it.
+    noise_error_nm : float or (q,) array_like, optional
+        Standard error of the noise of each measurement, independent of each other [nm].
     imaging : Imaging, optional
         The camera, for Strehl ratios on at most two axes.
     readings : (frames, c) array_like, optional
-        What accelerometers read in the frames of open_loop [m/s^2], for designs that read them; the
-        model promises nothing of these.
+        What accelerometers read in the frames of the record [m/s^2], for designs that read them;
+        the model promises nothing of these.
 
     Returns
     -------
     PredictionTable
-        Rows in this order: what ran, best integrator, controllers, limit.
+        Rows in this order: what ran, best integrator, controllers, limit. The standard errors are
+        those of Gaussian series, and of the noise, not of the sensor gain.
 
     Raises
     ------
@@ -166,29 +161,36 @@ def prediction_against_data(
     >>> night = lbt.simulate(
     ...     ran.controller, lbt.Truth(turbulence=slow, noise_nm=5.0), hardware=path, frames=8000
     ... )
-    >>> y, u = night.measurements[0], night.commands[0]
+    >>> record = lbt.identification.loop_record(
+    ...     night.measurements[0], night.commands[0], frame_rate_hz=800, delay_frames=2, unit="nm"
+    ... )
     >>> table = lbt.identification.prediction_against_data(
-    ...     plant, y[2:] + u[:-2], {"Kalman": lbt.kalman(plant)}, measurements=y[2:]
+    ...     record, plant, {"Kalman": lbt.kalman(plant)}
     ... )
     >>> [entry.name for entry in table.entries][::2]
     ['what ran', 'Kalman']
     >>> bool(abs(table["Kalman"].deviations) < 4)
     True
     """
+    require_instance(record, LoopRecord)
     require_instance(plant, TipTiltPlant)
     if imaging is not None:
         require_instance(imaging, Imaging)
-    hardware = plant.hardware
-    series, runs = check_series(open_loop, hardware.modes, stretches)
-    fit, later = split_halves(runs, len(series))
-    test = settled_test(runs, later, hardware)
-    noise = mode_noise(hardware, plant.R, noise_error_nm)
-    designs = {INTEGRATOR: model_integrator(plant), **controllers}
+    hardware, runs = plant.hardware, record.stretches()
+    if (hardware.modes, hardware.frame_rate_hz) != (record.axes, record.frame_rate_hz):
+        raise ProblemError(
+            f"plant and record must be of one loop; got {hardware.modes} modes at "
+            f"{hardware.frame_rate_hz:.6g} Hz and {record.axes} axes at {record.frame_rate_hz:.6g}."
+        )
     if {RAN, INTEGRATOR, LIMIT} & set(controllers):
         raise ProblemError(
             f"no controller may be called {RAN}, {INTEGRATOR} or {LIMIT}, as other rows are; got "
             f"{', '.join(controllers)}. Give other names."
         )
+    fit, later = split_halves(runs)
+    test = settled_test(runs, later, hardware)
+    noise = mode_noise(hardware, plant.R, noise_error_nm)
+    designs = {INTEGRATOR: model_integrator(plant), **controllers}
     if running is not None:
         designs[RAN] = running
     loops = {name: _close(hardware, design) for name, design in designs.items()}
@@ -196,15 +198,13 @@ def prediction_against_data(
     unstable = loops.keys() - stable.keys()
     notes = [f"{name} is unstable at the sensor gain of the model" for name in sorted(unstable)]
     beside = None if readings is None else matrix(readings, "readings")
+    seen = record.measurements @ inverse_sensor(hardware).T
+    series = seen + record.corrections() @ hardware.influence.T
     measured = {n: replay(loop, series, runs, beside) for n, loop in stable.items() if n != RAN}
-    if measurements is not None:
-        y, _ = check_series(measurements, hardware.n_measurements, test, "measurements")
-        if len(y) != len(series):
-            frames = f"the {len(series)} frames of open_loop"
-            raise ProblemError(f"measurements must have {frames}; got {len(y)}.")
-        measured = {RAN: y @ inverse_sensor(hardware).T, **measured}
+    if record.commands is not None:
+        measured = {RAN: seen, **measured}
     elif running is not None:
-        raise ProblemError("the controller that ran needs its measurements; got none.")
+        raise ProblemError("what ran needs commands; got the record of an open loop.")
     rows = []
     for name, residual in measured.items():
         estimate = estimate_residual(gather(residual, test), test, *noise)
@@ -235,42 +235,64 @@ def _close(hardware: LoopHardware, design: Controller | Design) -> ClosedLoop:
     return close_loop(hardware, as_controller(design))
 
 
+def design_inputs(
+    record: LoopRecord,
+    model: IdentifiedModel,
+    *,
+    stretches: Stretches | None = None,
+    channels: Channels | None = None,
+    noise: float = 1.0,
+    penalty: float | None = None,
+    defaults: Mapping[str, Any] | None = None,
+) -> PlantInputs:
+    """Return what a method makes a design of: a model with more noise, its record and channels."""
+
+    def predict() -> Design:
+        past = regress(record, model, stretches=stretches, channels=channels, noise=noise)
+        return past.design(penalty)
+
+    plant = noisier(model, noise).plant()
+    return PlantInputs(plant=plant, design_defaults=defaults or {}, predict=predict)
+
+
 def compare_designs(
     record: LoopRecord,
     half: IdentifiedModel,
-    requests: Mapping[str, Mapping[str, Any]],
+    methods: Mapping[str, Mapping[str, Any]],
     *,
-    defaults: Mapping[str, Any] | None = None,
     others: Mapping[str, Controller] | None = None,
     running: Controller | None = None,
     imaging: Imaging | None = None,
-    channels: Channels | None = None,
+    **inputs: Any,
 ) -> tuple[PredictionTable, dict[str, Design]]:
     """Return what designs for a model of the first half of a record leave of the second.
 
-    ``requests`` are the options of methods by their names, and ``others`` further controllers by
-    theirs. The designs with a row are returned by their titles; the others have a note. A predictor
-    reads the channels beside the record, too.
+    ``methods`` are options by the names of methods, ``others`` further controllers by theirs, and
+    ``inputs`` those of :func:`design_inputs`. The designs with a row are returned by their titles;
+    the others have a note. One that reads channels has a row for its fall-back, too.
     """
-
-    def predict() -> Design:
-        first, _ = split_halves(record.stretches(), record.frames)
-        return regress(record, half, stretches=first, channels=channels).design()
-
-    inputs = PlantInputs(plant=half.plant(), design_defaults=defaults or {}, predict=predict)
+    first, _ = split_halves(record.stretches())
+    made_of = design_inputs(record, half, stretches=first, **inputs)
     designs, notes = dict[str, Design](), list[str]()
-    for method, options in requests.items():
+    controllers = dict[str, Controller | Design](others or {})
+    for method, options in methods.items():
         title = method_named(method).title
         try:
-            designs[title] = design_request(method, options).build(inputs)
+            design = design_request(method, options).build(made_of)
         except LbtSynthError as error:
             notes.append(f"no {title}: {str(error).rstrip('.')}")
+            continue
+        designs[title] = controllers[title] = design
+        if design.other_sensors:
+            *_, alone = design.controllers.values()
+            q = half.hardware.n_measurements
+            alone = replace(alone, B=alone.B[:, :q], D=alone.D[:, :q])
+            controllers[f"{title}{WITHOUT}"] = alone
+    channels: Channels | None = inputs.get("channels")
     table = prediction_against_data(
-        inputs.plant,
-        record.pseudo_open_loop(half.sensor_gains),
-        {**designs, **(others or {})},
-        stretches=record.stretches(),
-        measurements=None if record.commands is None else record.measurements,
+        record,
+        half.plant(),
+        controllers,
         running=running,
         noise_error_nm=[axis.noise_error_nm for axis in half.axes],
         imaging=imaging,
@@ -281,29 +303,6 @@ def compare_designs(
         replace(table, notes=(*notes, *table.notes)),
         {title: design for title, design in designs.items() if title in rows},
     )
-
-
-def unseen_claims(
-    record: LoopRecord, half: IdentifiedModel, design: Design, channels: Channels | None
-) -> dict[str, float]:
-    """Return what a predictor of the first half of a record claims of the second [nm rms].
-
-    A residual that the noise hides is not claimed.
-    """
-    series = record.pseudo_open_loop(half.sensor_gains)
-    runs = record.stretches()
-    test = settled_test(runs, split_halves(runs, len(series))[1], half.hardware)
-    noise = mode_noise(half.hardware, half.plant().R, [a.noise_error_nm for a in half.axes])
-    names, claims = iter(("residual_nm", "alone_nm")), dict[str, float]()
-    for controller in design.controllers.values():
-        loop = close_loop(design.hardware or half.hardware, controller)
-        residual = replay(loop, series, runs, None if channels is None else channels.values)
-        estimate = estimate_residual(gather(residual, test), test, *noise)
-        name = next(names)
-        if estimate.total_nm2 > 0:
-            claims[name] = estimate.rms_nm
-            claims.setdefault("residual_error_nm", estimate.rms_error_nm)
-    return claims
 
 
 def _build_row(

@@ -29,7 +29,7 @@ from lbt_synth.identification.prediction.residual import (
     settle_frames,
 )
 from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.stretches import Stretches, cut_stretches
+from lbt_synth.identification.stretches import Stretches, cut_stretches, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
@@ -190,7 +190,7 @@ class Regression:
             least = min(range(*ends), key=left)
         return float(_PENALTIES[least])
 
-    def design(self, penalty: float | None = None, **claims: float) -> PredictorDesign:
+    def design(self, penalty: float | None = None) -> PredictorDesign:
         """Return the certified design, by default with the penalty of forward chaining."""
         everything, own = range(len(self.scales)), range(self.own)
         penalty = self.penalty if penalty is None else penalty
@@ -207,7 +207,6 @@ class Regression:
             self.readings,
             left[0],
             what=f"penalty {penalty:.0e}",
-            **claims,
         )
 
 
@@ -308,11 +307,18 @@ class ChannelValue:
     dead_nm: float = nm_column("zeros, unseen", unit="nm rms", help="Residual if it reads zeros")
 
 
-def channel_values(past: Regression, unseen: Regression, noise_nm2: float) -> list[ChannelValue]:
-    """Return what a predictor of the past leaves of unseen frames, without each channel.
+def channel_values(
+    record: LoopRecord, half: IdentifiedModel, channels: Channels
+) -> tuple[ChannelValue, ...]:
+    """Return what a predictor of the first half leaves of the second, without each channel.
 
     The noise of the measurements is subtracted; nan where it hides the residual.
     """
+    past, unseen = (
+        regress(record, half, stretches=frames, channels=channels)
+        for frames in split_halves(record.stretches())
+    )
+    noise_nm2 = sum((axis.noise_nm / axis.sensor_gain) ** 2 for axis in half.axes)
     everything = list(range(len(past.scales)))
     coefficients = past.solve(everything, past.penalty, past.whole)
 
@@ -322,7 +328,7 @@ def channel_values(past: Regression, unseen: Regression, noise_nm2: float) -> li
         return float(np.sqrt(left_nm2)) if left_nm2 > 0 else float("nan")
 
     rows = []
-    for signal, name in zip(everything[past.own :], past.hardware.suite.channels, strict=True):
+    for signal, name in zip(everything[past.own :], channels.names, strict=True):
         others = [other for other in everything if other != signal]
         without = past.solve(others, past.penalty, past.whole.chosen(past.places(others)))
         silent = coefficients.copy()
@@ -334,4 +340,4 @@ def channel_values(past: Regression, unseen: Regression, noise_nm2: float) -> li
                 dead_nm=left_nm(everything, silent),
             )
         )
-    return rows
+    return tuple(rows)

@@ -1,5 +1,11 @@
 """The residual that a controller would have left of a recorded disturbance.
 
+The pseudo-open-loop measurement ``z(k) = phi_tot(k-1) + S^-1 w(k)`` does not depend on the
+controller that ran. From ``y(k) = S (z(k) - c(k))``, with c(k) its own correction, another one
+computes exactly the commands of that loop. Its measured residual is ``e(k) = z(k) - c(k) =
+phi_res(k-1) + S^-1 w(k)``; c(k) depends on the noise up to frame k-1 only, so white noise adds
+exactly its variance, which is subtracted.
+
 The state of a loop at the beginning of contiguous frames depends on the frames before, which are
 not known. A replay begins in the equilibrium for the mean of the first half second of a stretch,
 which does not count.
@@ -14,28 +20,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import rfft
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.identification.records.faults import SURPRISING
-from lbt_synth.identification.stretches import (
-    Stretches,
-    StretchesLike,
-    checked_stretches,
-    cut_stretches,
-)
-from lbt_synth.linear import Controller, StateSpace
+from lbt_synth.identification.stretches import Stretches, cut_stretches
+from lbt_synth.linear import StateSpace
 from lbt_synth.linear.block_filtering import filter_series
-from lbt_synth.loop import ClosedLoop, Imaging, close_loop, strehl
+from lbt_synth.loop import ClosedLoop, Imaging, strehl
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.validation import (
-    ComplexArray,
-    FloatArray,
-    float_array,
-    frozen_copy,
-    one_or_each,
-    real_array,
-    require_instance,
-)
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, one_or_each
 
 MUCH = 1.25  # ratio of residuals that no error excuses: that of a line that beats is too large
 _ERRORS = 2.0  # standard errors by which one residual is clearly above another
@@ -50,26 +43,13 @@ class ResidualEstimate:
     The variance of the noise is subtracted: an estimate may be negative within its error. Its rms
     is then nan, and :attr:`upper_nm` an upper bound. One that is negative by more refutes the
     noise (:attr:`refuted`).
-
-    Attributes
-    ----------
-    measured_nm : (frames, n) ndarray
-        Measured residual e(k) of the frames that count [nm].
-    stretches : tuple of (start, stop)
-        Where in the record they are.
-    noise_nm2 : (n, n) ndarray
-        Covariance of the noise in e [nm^2].
-    covariance_nm2 : (n, n) ndarray
-        Covariance of the residual: mean of ``e e'`` less that of the noise [nm^2].
-    error_nm4 : (n, n) ndarray
-        Covariance of the errors of the axes' variances [nm^4].
     """
 
-    measured_nm: FloatArray
-    stretches: Stretches
-    noise_nm2: FloatArray
-    covariance_nm2: FloatArray
-    error_nm4: FloatArray
+    measured_nm: FloatArray  # (frames, n): measured residual e(k) of the frames that count
+    stretches: Stretches  # where in the record they are
+    noise_nm2: FloatArray  # (n, n): covariance of the noise in e
+    covariance_nm2: FloatArray  # (n, n): mean of ``e e'`` less that of the noise
+    error_nm4: FloatArray  # (n, n): covariance of the errors of the axes' variances
 
     @property
     def variance_nm2(self) -> FloatArray:
@@ -182,81 +162,6 @@ def estimate_residual(
     )
 
 
-def replayed_residual(
-    open_loop: ArrayLike,
-    controller: Controller,
-    hardware: LoopHardware,
-    *,
-    noise_nm: ArrayLike,
-    noise_error_nm: ArrayLike = 0.0,
-    stretches: StretchesLike | None = None,
-    test: StretchesLike | None = None,
-) -> ResidualEstimate:
-    """Residual that a controller would have left of a recorded disturbance.
-
-    The pseudo-open-loop measurement ``z(k) = phi_tot(k-1) + S^-1 w(k)`` does not depend on the
-    controller that ran. From ``y(k) = S (z(k) - c(k))``, with c(k) its own correction, a
-    controller computes exactly the commands of that loop. Its measured residual is ``e(k) = z(k) -
-    c(k) = phi_res(k-1) + S^-1 w(k)``; c(k) depends on the noise up to frame k-1 only, so white
-    noise adds exactly its variance, which is subtracted.
-
-    Parameters
-    ----------
-    open_loop : (frames, n) array_like
-        Recorded series z, a row per frame [nm]; what lies outside the stretches is not read.
-    controller : Controller
-        From y(k) to u(k).
-    hardware : LoopHardware
-        The loop: delay, mirror, and the sensor matrix S (square and invertible), with the sensor
-        gain g that z was formed with.
-    noise_nm : float or (q,) array_like
-        Standard deviation of the white noise w on each measurement, per frame [nm].
-    noise_error_nm : float or (q,) array_like, optional
-        Standard error of that, the errors of different measurements independent [nm].
-    stretches : sequence of (start, stop), optional
-        Contiguous usable frames, in order; by default the whole record.
-    test : sequence of (start, stop), optional
-        Frames of them that count; by default all, without the first half second of a stretch.
-
-    Returns
-    -------
-    ResidualEstimate
-        Measured residual, its variance without the noise, and standard errors: of Gaussian series
-        and of ``noise_nm``, not of the sensor gain.
-
-    Raises
-    ------
-    ProblemError
-        If a value is out of its range, sizes clash, or too few frames are left.
-    UnstableLoopError
-        If the loop is unstable or marginally stable.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
-    >>> truth = lbt.Truth(turbulence=slow, noise_nm=5.0)
-    >>> ran, new = (lbt.integrator(path, gain=gain).controller for gain in (0.1, 0.5))
-    >>> night = lbt.simulate(ran, truth, hardware=path, frames=8000)
-    >>> y, u = night.measurements[0], night.commands[0]
-    >>> z = y[2:] + u[:-2]  # a delay of two frames
-    >>> would = lbt.identification.replayed_residual(z, new, path, noise_nm=5.0)
-    >>> exact = lbt.residual_budget(lbt.close_loop(path, new), truth)
-    >>> bool(abs(would.rms_nm - exact.rms_nm) < 3 * would.rms_error_nm)
-    True
-    """
-    require_instance(hardware, LoopHardware)
-    deviation = one_or_each(noise_nm, "noise_nm", hardware.n_measurements, at_least=0)
-    series, runs = check_series(open_loop, hardware.modes, stretches)
-    noise = mode_noise(hardware, deviation**2 * np.eye(hardware.n_measurements), noise_error_nm)
-    loop = close_loop(hardware, controller)
-    loop.require_stable()
-    tested = runs if test is None else checked_stretches(test, len(series))
-    kept = settled_test(runs, tested, hardware)
-    return estimate_residual(gather(replay(loop, series, runs), kept), kept, *noise)
-
-
 def mode_noise(
     hardware: LoopHardware, noise_nm2: FloatArray, noise_error_nm: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
@@ -270,22 +175,6 @@ def mode_noise(
     # d var_i / d s_j; of white noise without correlations 2 s_j back_ij^2
     slope = 2 * back * (back @ noise_nm2) / np.where(deviation > 0, deviation, np.inf)
     return back @ noise_nm2 @ back.T, (slope * error**2) @ slope.T
-
-
-def check_series(
-    open_loop: ArrayLike, modes: int, stretches: StretchesLike | None, name: str = "open_loop"
-) -> tuple[FloatArray, Stretches]:
-    """Return a series (frames, modes) that is finite within its stretches, and the stretches."""
-    series = float_array(open_loop, name)
-    if series.ndim != 2 or series.shape[1] != modes or len(series) == 0:
-        raise DimensionError(
-            f"{name} must be (frames, {modes}), a row per frame and a column per mode; got "
-            f"{series.shape}."
-        )
-    runs = checked_stretches(stretches, len(series))
-    for start, stop in runs:
-        real_array(series[start:stop], f"{name}, frames {start} to {stop},")
-    return series, runs
 
 
 def inverse_sensor(hardware: LoopHardware) -> FloatArray:

@@ -1,1 +1,1 @@
-"""Records of a loop from files, telemetry and arrays, with their health."""
+"""Records of a loop from files, telemetry and arrays."""

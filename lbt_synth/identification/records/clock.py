@@ -13,9 +13,7 @@ from lbt_synth.validation import FloatArray, IntArray, number, real_array
 SAME_FRAME = 0.45  # of a frame, by which the step between two times may be off: less than half
 _EXACT = 0.02  # of a frame, within which all times of exact stamps lie on the grid of their rate
 _SAME_RATE = 1e-4  # by which a stated rate may differ from that of the times: a cheap clock
-_MOST_ODD = 0.1  # of the rows, whose steps may be those of lost frames and not of another rate
 _MOST_HOLES = 9  # missing frames over those that are there; more fill the memory
-_NOT_USED = "the times do not tell frames apart and were not used"
 
 
 class Clock(NamedTuple):
@@ -42,19 +40,17 @@ def build_clock(
     frame = np.arange(rows)
     if frame_numbers is not None:
         frame = _frames_from_counter(_check_rising(frame_numbers, "frame_numbers", rows))
-    if times is None or rows == 1 or (rate is not None and times[0] == times[-1]):
+    if times is None or rows == 1:
         if rate is None:
             raise ProblemError("the frame rate is not known; give frame_rate_hz, or the times.")
-        return Clock(rate, frame, [] if times is None or rows == 1 else [_NOT_USED])
+        return Clock(rate, frame, [])
     if frame_numbers is None:
         frame = _frames_from_times(times, rate)
     rate_of_times, off = _fit_rate(times, frame)
-    if rate is None:
-        rate, notes = rate_of_times, [f"frame rate {rate_of_times:.9g} Hz, from the times"]
-    else:
+    notes = [f"frame rate {rate_of_times:.9g} Hz, from the times"]
+    if rate is not None:
         notes = _compare_rates(rate, rate_of_times, int(frame[-1]), float(np.ptp(off)))
-        if _quantum(times) * rate > 1 + SAME_FRAME and np.any(np.diff(times) == 0):
-            return Clock(rate, frame, [_NOT_USED])
+    rate = rate_of_times if rate is None else rate
     if (jitter := float(np.std(off))) > _EXACT:
         notes.append(f"the times lie {jitter:.2g} frames rms beside a regular grid")
     return Clock(rate, frame, notes)
@@ -86,6 +82,8 @@ def _check_rising(values: ArrayLike, name: str, rows: int) -> FloatArray:
         raise DimensionError(
             f"{name} must have shape ({rows},), one per frame of the measurements; got {out.shape}."
         )
+    if rows > 1 and np.all(out == out[0]):
+        raise ProblemError(f"{name} must rise from row to row; all rows have {out[0]:.12g}.")
     back = np.flatnonzero(np.diff(out) < 0)
     if back.size:
         k = int(back[0])
@@ -123,12 +121,13 @@ def _require_few_holes(frames: float, rows: int) -> None:
 def _frames_from_times(times: FloatArray, rate: float | None) -> IntArray:
     """Return the frame of each row, from 0, by times.
 
-    Times on the grid of a stated rate are exact. Those that stay within the step to which they are
-    rounded are of complete rows. Others tell frames by their steps, unless these are rounded.
+    Times on the grid of a stated rate are exact. Those that stay within a step to which they are
+    rounded, of less than a frame, are of complete rows. Others tell frames by their steps, unless
+    these are rounded.
     """
     steps, complete = np.diff(times), np.arange(len(times))
-    if times[-1] == times[0]:
-        raise ProblemError("times_s must rise; all rows have the same time.")
+    if np.ptp(steps) < SAME_FRAME * float(np.median(steps)):
+        return complete  # whatever the rate is: that is compared afterwards
     period = float(np.median(steps[steps > 0])) if rate is None else 1 / rate
     _require_few_holes(float(times[-1] - times[0]) / period + 1, len(times))
     rounding, place = _quantum(times) / period, (times - times[0]) / period
@@ -140,24 +139,17 @@ def _frames_from_times(times: FloatArray, rate: float | None) -> IntArray:
         late = place - complete
         # a frame lost before a row is hidden if all later rows are later, by 1 less the rounding
         ahead = np.minimum.accumulate(late[::-1])[-2::-1] - np.maximum.accumulate(late)[:-1]
-        hides = SAME_FRAME < rounding < 1 + slack and np.any(ahead >= 1 - rounding - slack)
-        if np.ptp(late) <= max(rounding + slack, SAME_FRAME) and not hides:
+        hides = rounding > SAME_FRAME and bool(np.any(ahead >= 1 - rounding - slack))
+        if np.ptp(late) <= max(rounding + slack, SAME_FRAME) and rounding < 1 and not hides:
             return complete
-    if np.ptp(steps) < SAME_FRAME * float(np.median(steps)):
-        return complete  # whatever the rate is: that is compared afterwards
-    counts = np.round(steps / period)
-    is_ambiguous = rounding > SAME_FRAME
-    if rate is None and is_ambiguous:  # other frames, of rows that are complete at another rate
-        off = _fit_rate(times, complete)[1]
-        odd, spread = float(np.mean(counts != 1)), float(np.ptp(off))
-        is_ambiguous = odd > _MOST_ODD or spread < (1 + SAME_FRAME) * rounding
-    if is_ambiguous:
+    if rounding > SAME_FRAME:
         advice = "frame_rate_hz" if rate is None else "a counter of frames"
         raise ProblemError(
             f"times_s in steps of {_quantum(times):.6g} s may be rounded: they cannot tell which "
             f"frames are missing or repeated at {1 / period:.9g} Hz. Give {advice}, or leave the "
             "times away."
         )
+    counts = np.round(steps / period)
     away = np.abs(steps / period - counts)
     if np.any(away >= SAME_FRAME):
         k = int(np.argmax(away))
@@ -184,8 +176,5 @@ def _fit_rate(times: FloatArray, frame: IntArray) -> tuple[float, FloatArray]:
     And how far each time is from that line [frames], (rows,).
     """
     t, n = times - times.mean(), frame - frame.mean()
-    slope = float(n @ t)
-    if not slope > 0:
-        raise ProblemError("times_s must rise; all rows have the same time.")
-    rate = float(n @ n) / slope
+    rate = float(n @ n) / float(n @ t)
     return float(f"{rate:.9g}"), rate * t - n

@@ -2,110 +2,91 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from lbt_synth.errors import ProblemError, TelemetryError
 from lbt_synth.models import nm_per_mas
-from lbt_synth.validation import FloatArray, choice
+from lbt_synth.validation import FloatArray
 
-_NM = {"nm": 1.0, "um": 1e3, "m": 1e9}
-_MAS = {
-    "mas": 1.0,
-    "arcsec": 1e3,
-    "urad": math.degrees(1e-6) * 3600e3,
-    "rad": math.degrees(1.0) * 3600e3,
+UNITS = {
+    "loop": "nm, um, m of wavefront, or mas, arcsec, urad, rad of tilt",
+    "spectrum": "nm^2/Hz, or mas^2/Hz of tilt; nm/sqrt(Hz) of an amplitude",
+    "s": "s, ms, us, ns",
+    "Hz": "Hz, kHz, mHz, MHz",
 }
-UNITS = (*_NM, *_MAS)
-_ALIASES = {
-    **dict.fromkeys(("nanometer", "nanometre"), "nm"),
-    **dict.fromkeys(("micron", "micrometer", "micrometre", "µm", "μm"), "um"),
-    **dict.fromkeys(("meter", "metre"), "m"),
-    **dict.fromkeys(("µrad", "μrad", "microrad"), "urad"),
-    **dict.fromkeys(("arcsecond", "asec", '"'), "arcsec"),
-    **dict.fromkeys(("milliarcsec", "milliarcsecond"), "mas"),
-    "radian": "rad",
+VOLTS = {
+    "in_python": "Multiply volts or counts by the nm of one, and say nm.",
+    "at_terminal": "For volts or counts say nm, and give the nm of one by --command-scale.",
 }
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_HERTZ = {"hz": 1.0, "khz": 1e3, "mHz": 1e-3, "MHz": 1e6}  # capitals matter where both exist
-_CLOCK_UNITS = {*_SECONDS, *(word.lower() for word in _HERTZ)}
 _BRACKETS = re.compile(r"(?P<name>[^\[(]*?)\s*[\[(](?P<unit>.*)[\])]")
-_SQUARED = re.compile(r"^(?P<unit>.+?)(?:\^2|\*\*2|²|2)\s*(?:/|_|\s|per)\s*hz$", re.IGNORECASE)
-_ROOT = re.compile(
-    r"^(?P<unit>.+?)\s*(?:/|_|per)\s*(?:sqrt\(?hz\)?|rthz|√hz|hz\^?(?:0\.5|\(1/2\)))$",
+_LENGTH = r"(?:[num]?m|mas|arcsec|u?rad)"
+_TAIL = re.compile(  # of a name, after an underscore: a unit of a series, a spectrum or a clock
+    rf"(?P<name>.+?)_(?P<unit>{_LENGTH}(?:(?:\^|\*\*)?[2²]?[_/](?:rt)?hz)?|[num]?s|k?hz)",
     re.IGNORECASE,
 )
+_PER_HERTZ = re.compile(r"\s*(?:/|_|\bper\b)\s*(rt|√|sqrt\()?hz\)?$", re.IGNORECASE)
+_HERTZ = re.compile(r"(?<!m)hz$", re.IGNORECASE)  # capitals matter where mHz and MHz exist
+_BASES = [("s", 0), ("Hz", 0), *((base, power) for power in range(3) for base in ("nm", "mas"))]
 
 
-def unit_name(text: str) -> str | None:
-    """Return the name that this package has for a unit, None for an unknown one."""
-    lower = text.strip().lower()
-    unit = _ALIASES.get(lower) or _ALIASES.get(lower.removesuffix("s")) or lower
-    return unit if unit in UNITS else None
+class Unit(NamedTuple):
+    """What a text means as a unit."""
+
+    base: str  # nm, mas, s or Hz
+    power: int  # of the base over the root of Hz in a density; 0 of a series
+    factor: float  # of the base in one unit
 
 
-def is_angle(text: str) -> bool:
-    """Whether a text is a unit of tilt, which becomes a wavefront by the telescope."""
-    return unit_name(text) in _MAS
+def parse_unit(text: str) -> Unit | None:
+    """Return the unit of a series, a spectrum, times or frequencies; None of another text."""
+    from astropy import units
 
-
-def density_unit(text: str) -> tuple[str, int] | None:
-    """Split the unit of a spectrum into a unit and its power, 1 or 2; None for others."""
-    word = text.strip()
-    for pattern, power in ((_ROOT, 1), (_SQUARED, 2)):
-        if match := pattern.match(word):
-            unit = unit_name(match["unit"])
-            return None if unit is None else (unit, power)
+    for word in (text.strip(), text.strip().lower(), text.strip().lower().removesuffix("s")):
+        word = _PER_HERTZ.sub(lambda match: "/sqrt(Hz)" if match[1] else "/Hz", word)
+        try:
+            unit = units.Unit(_HERTZ.sub("Hz", word))
+        except (ValueError, TypeError):
+            continue
+        for base, power in _BASES:
+            plain = (units.Unit(base) / units.Hz**0.5) ** power if power else units.Unit(base)
+            if unit.is_equivalent(plain):  # astropy rounds to 15 digits
+                return Unit(base, power, float(f"{unit.to(plain):.14g}"))
     return None
 
 
-def is_unit(text: str) -> bool:
-    """Whether a text is a unit of a series, a spectrum, times or frequencies."""
-    return bool(unit_name(text) or density_unit(text)) or text.lower() in _CLOCK_UNITS
-
-
 def same_unit(one: str, other: str) -> bool:
-    """Whether two texts are the same unit."""
-    return len({unit_name(u) or density_unit(u) or u.lower() for u in map(str, (one, other))}) == 1
+    """Return whether two texts are the same unit."""
+    return len({parse_unit(word) or word.lower() for word in (one, other)}) == 1
 
 
-VOLTS = {
-    "in_python": "For volts or counts say nm, and give repair_commands the nm of one as the scale.",
-    "at_terminal": "For volts or counts say nm, and give the nm of one by --command-scale.",
-}
-
-
-def nm_per(unit: str, *, diameter_m: float | None = None, name: str = "unit") -> float:
-    """Return the nanometres of wavefront, rms over the pupil, of one unit."""
-    advice = VOLTS if name == "command_unit" else {}
-    word = (unit_name(unit) if isinstance(unit, str) else None) or unit
-    word = choice(word, name, UNITS, **advice)
-    if word in _NM:
-        return _NM[word]
+def nm_unit(
+    text: str, *, diameter_m: float | None = None, name: str = "unit", kind: str = "loop"
+) -> Unit:
+    """Return the unit of a series, or of a spectrum, in nm of wavefront, rms over the pupil."""
+    unit = parse_unit(text) if isinstance(text, str) else None
+    if unit is None or unit.base not in ("nm", "mas") or (unit.power > 0) != (kind == "spectrum"):
+        advice = VOLTS if name == "command_unit" else {}
+        raise ProblemError(f"{name} must be one of {UNITS[kind]}; got {text!r}.", **advice)
+    if unit.base == "nm":
+        return unit
     if diameter_m is None:
         raise ProblemError(
-            f"angles of tilt ({word}) become nm of wavefront by the telescope's diameter; give "
+            f"angles of tilt ({text}) become nm of wavefront by the telescope's diameter; give "
             "diameter_m."
         )
-    return _MAS[word] * nm_per_mas(diameter_m)
+    factor = unit.factor * nm_per_mas(diameter_m) ** max(unit.power, 1)
+    return unit._replace(base="nm", factor=factor)
 
 
-def seconds_per(unit: str | None) -> float:
-    """Return the seconds of a unit of time, 1 if no unit is given."""
-    factor = _SECONDS.get((unit or "s").strip().lower())
-    if factor is None:
-        raise ProblemError(f"times must be in one of {', '.join(_SECONDS)}; got {unit!r}.")
-    return factor
-
-
-def hz_per(unit: str | None) -> float:
-    """Return the hertz of a unit of frequency, 1 if no unit is given."""
-    word = (unit or "Hz").strip()
-    factor = _HERTZ.get(word) or _HERTZ.get(word.lower())
-    if factor is None:
-        raise ProblemError(f"frequencies must be in one of Hz, kHz, mHz, MHz; got {unit!r}.")
-    return factor
+def clock_factor(text: str | None, base: str) -> float:
+    """Return the s or the Hz in a unit, 1 if none is given."""
+    unit = parse_unit(text or base)
+    if unit is None or unit.base != base:
+        what = "times" if base == "s" else "frequencies"
+        raise ProblemError(f"{what} must be in one of {UNITS[base]}; got {text!r}.")
+    return unit.factor
 
 
 # Names by which columns and numbers are recognised, separated by blanks.
@@ -171,12 +152,13 @@ _FACT_NAMES = {name: fact for fact, names in FACTS.items() for name in names.spl
 
 def parse_column(name: str, values: FloatArray, *, unit: str | None = None) -> Column:
     """Make a column; its name tells its role, its axis, and its unit (in brackets or after _)."""
-    plain, named_unit = _split_unit(name.strip())
-    given = (unit or "").strip()
-    if given and named_unit and not same_unit(given, named_unit):
-        raise TelemetryError(f"{name} has the unit {given!r} in the header: which is right?")
+    match = _BRACKETS.fullmatch(name.strip()) or _TAIL.fullmatch(name.strip())
+    plain, named_unit = (match["name"], match["unit"].strip()) if match else (name, "")
+    stated = (unit or "").strip()
+    if stated and named_unit and not same_unit(stated, named_unit):
+        raise TelemetryError(f"{name} has the unit {stated!r} in the header: which is right?")
     role, axis = _COLUMN_NAMES.get(_normalise(plain), (None, None))
-    return Column(name=name, values=values, role=role, axis=axis, unit=given or named_unit)
+    return Column(name=name, values=values, role=role, axis=axis, unit=stated or named_unit or None)
 
 
 def recognise_fact(key: str) -> str | None:
@@ -186,12 +168,3 @@ def recognise_fact(key: str) -> str | None:
 
 def _normalise(name: str) -> str:
     return re.sub(r"[\s\-.]+", "_", name.strip().lower()).strip("_")
-
-
-def _split_unit(name: str) -> tuple[str, str | None]:
-    """Split a name and its unit, in brackets or after an underscore."""
-    if match := _BRACKETS.fullmatch(name):
-        return match["name"], match["unit"].strip() or None
-    ends = (at for at, sign in enumerate(name) if sign == "_" and at)
-    end = next((at for at in ends if is_unit(name[at + 1 :])), None)
-    return (name, None) if end is None else (name[:end], name[end + 1 :])

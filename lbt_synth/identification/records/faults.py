@@ -1,4 +1,4 @@
-"""Faults of series: stuck, saturated and outlying values, and the health of a record.
+"""Faults of series: stuck, saturated and outlying values.
 
 Each finder takes a series (frames,) and the frames that count so far, and returns the
 frames that are at fault. Nothing is known of the sensor, so thresholds come from the series:
@@ -8,7 +8,6 @@ a clean record, with or without strong narrow lines, quantised or not, shows non
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
@@ -167,22 +166,6 @@ class Finding:
     fraction: float = percent_column("share", format=".4g", help="Their part of all frames")
     first_frame: int = column("first frame", help="The first of them")
     spoils: bool = column("spoilt", help="Whether they are not usable, or only reported")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordHealth:
-    """What was found in a record."""
-
-    frames: int
-    usable: int  # frames that count as data
-    findings: tuple[Finding, ...] = ()  # empty for a clean record
-    notes: tuple[str, ...] = ()  # how a file was read, what was repaired, what changes with time
-
-    def summary(self) -> str:
-        """Return one line: how many frames are usable, and why the others are not."""
-        text = f"{self.usable} of {self.frames} frames are usable"
-        spoilt = [f"{f.count} {f.kind} ({f.series})" for f in self.findings if f.spoils]
-        return f"{text}; {', '.join(spoilt)}." if spoilt else f"{text}."
 
 
 def findings_in(

@@ -19,28 +19,25 @@ from lbt_synth.errors import ProblemError, TelemetryError
 from lbt_synth.files import Telemetry, load_telemetry
 from lbt_synth.identification.records.clock import SAME_FRAME
 from lbt_synth.identification.records.columns import (
+    UNITS,
     VOLTS,
     Column,
-    density_unit,
-    hz_per,
-    is_angle,
-    nm_per,
+    clock_factor,
+    nm_unit,
+    parse_unit,
     same_unit,
-    seconds_per,
-    unit_name,
 )
 from lbt_synth.identification.records.contents import (
     CLOCKS,
     FITS,
-    KINDS,
     Contents,
     Roles,
     choose_axes,
+    choose_columns,
     join_names,
     name_in_errors,
     number_axes,
     read_contents,
-    select_series,
 )
 from lbt_synth.identification.records.faults import merge_notes
 from lbt_synth.identification.records.from_series import loop_record
@@ -48,25 +45,19 @@ from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import read_cards
 from lbt_synth.storage.input_files import LARGEST_TEXT_BYTES, open_input
-from lbt_synth.validation import FloatArray, choice, number
+from lbt_synth.validation import FloatArray, number
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of this package, and of the AOT standard
 _TELEMETRY_ARRAYS = {"META", "MEASURE"}
 _FOREIGN = "timing"  # key of metadata in telemetry of other programs
 _STATED_GAIN, _READ_WITH = "stated_sensor_gain", "commands_read_with"  # of a record that was read
 _CONDITION = float(np.finfo(np.float64).eps ** -0.5)  # beyond, an inverse is half rounding
-_RATES_HZ = (5.0, 1e5)  # plausible for times without a unit
 _FACTS = ("frame_rate_hz", "diameter_m", "delay_frames", "obstruction")
-_UNITS = {
-    "loop": "nm, um, m of wavefront, or mas, arcsec, urad, rad of tilt",
-    "spectrum": "nm^2/Hz, or mas^2/Hz of tilt; nm/sqrt(Hz) of an amplitude",
-}
 
 
 def load_record(
     source: str | os.PathLike[str] | Telemetry,
     *,
-    kind: str | None = None,
     frame_rate_hz: float | None = None,
     delay_frames: float | None = None,
     unit: str | None = None,
@@ -84,15 +75,12 @@ def load_record(
     Telemetry of this package and of the AOT standard is recognised; its measurements and commands
     become modes by its matrices. In other files, series are found by the names of columns, arrays
     and HDUs, rates and units by names and headers, as the page on records lists them. What the
-    source does not tell has to be given; the notes of ``health`` say how it was read.
+    source does not tell has to be given; the notes of the record say how it was read.
 
     Parameters
     ----------
     source : path-like or Telemetry
         Telemetry, or a file that ends in .fits, .fit, .fts, .npy, .npz, .csv, .tsv, .txt or .dat.
-    kind : {"closed_loop", "open_loop", "spectrum"}, optional
-        Residual measurements with commands; the (pseudo-)open-loop series itself; or a power
-        spectrum. By default what the names tell.
     frame_rate_hz, unit, command_unit : optional
         As for :func:`loop_record`, where the source does not tell them; a contradiction is refused.
         The unit of a spectrum is nm^2/Hz or nm/sqrt(Hz) and so on.
@@ -103,11 +91,12 @@ def load_record(
     axes : sequence of int, optional
         Which columns of several, or which modes of telemetry, are the axes; from 0.
     columns : mapping, optional
-        What names do not tell: names or numbers (from 0) of columns under "measurements",
-        "open_loop", "commands", "times", "frame_numbers", "frequency" or "density".
+        What names do not tell: names or numbers (from 0) of columns under "measurements" and
+        "commands" of a closed loop, "open_loop" (the open-loop or pseudo-open-loop series),
+        "frequency" and "density" of a spectrum, and "times" and "frame_numbers".
     commands : path-like, optional
-        Another file, with the commands. Rows are matched by the frame counters of both files;
-        without these row by row, where the times of both agree.
+        Another file, with the commands. Rows are matched by the frame counters of both files, else
+        by their times; without these there is one for each row.
 
     Returns
     -------
@@ -131,47 +120,34 @@ def load_record(
     >>> seen.frame_rate_hz, seen.usable.tolist(), seen.measurements[0].round(2).tolist()
     (1000.0, [False, True, False], [29.89])
     """
-    given: dict[str, Any] = {
+    telemetry = source if isinstance(source, Telemetry) else None
+    stated: dict[str, Any] = {
         "frame_rate_hz": frame_rate_hz,
         "delay_frames": delay_frames,
         "unit": unit,
         "command_unit": command_unit,
         "diameter_m": diameter_m,
         "obstruction": obstruction,
-        "mirror": mirror,
+        "averages": averages,
+        "source": str(source if telemetry is None else telemetry.metadata.get("name", "telemetry")),
     }
-    if kind is not None:
-        choice(kind, "kind", tuple(KINDS))
-    of_telemetry = columns is None and commands is None
-    if isinstance(source, Telemetry):
-        _require_series(of_telemetry, averages)
-        given["source"] = str(source.metadata.get("name", "telemetry"))
-        return _telemetry_record(source, kind=kind, axes=axes, **given)
-    path = Path(source)
-    given["source"] = str(path)
-    with name_in_errors(path):
-        if is_telemetry(path):
-            _require_series(of_telemetry, averages)
-            return _telemetry_record(load_telemetry(path), kind=kind, axes=axes, **given)
+    with name_in_errors(path := Path(stated["source"])):
+        if telemetry is None and is_telemetry(path):
+            telemetry = load_telemetry(path)
+        if telemetry is not None:
+            if columns is not None or commands is not None:
+                raise ProblemError(
+                    "telemetry says what its series are: neither columns nor commands may be "
+                    "given. Choose its modes with axes."
+                )
+            return _telemetry_record(telemetry, axes=axes, mirror=mirror, **stated)
         contents = read_contents(path)
         if commands is not None:
             _join_commands(contents, Path(commands))
-        kind, roles = select_series(contents, kind=kind, axes=axes, columns=columns)
-        if kind == "spectrum":
-            return _build_spectrum(roles, contents, averages=averages, **given)
-        _require_series(True, averages)
-        return _build_loop(roles, contents, **given)
-
-
-def _require_series(of_telemetry: bool, averages: int | None) -> None:
-    """Refuse what telemetry and series do not take."""
-    if not of_telemetry:
-        raise ProblemError(
-            "telemetry says what its series are: neither columns nor commands may be given. Choose "
-            "its modes with axes."
-        )
-    if averages is not None:
-        raise ProblemError("averages are only for a spectrum; got a record of series.")
+        roles = choose_columns(contents, axes=axes, columns=columns)
+        if "density" in roles:
+            return _build_spectrum(roles, contents, **stated)
+        return _build_loop(roles, contents, mirror=mirror, **stated)
 
 
 def is_telemetry(path: str | os.PathLike[str]) -> bool:
@@ -194,26 +170,29 @@ def is_telemetry(path: str | os.PathLike[str]) -> bool:
 def _telemetry_record(
     telemetry: Telemetry,
     *,
-    kind: str | None,
     axes: Sequence[int] | None,
     mirror: PositionLoop | None,
-    **given: Any,
+    **stated: Any,
 ) -> LoopRecord:
-    """Make a record of tip and tilt; ``given`` are facts, None where the telemetry has to tell.
+    """Make a record of tip and tilt; ``stated`` are facts, None where the telemetry has to tell.
 
     Measurements become modes by the inverse of the interaction matrix, commands by the influence
     matrix, where there are such. A matrix of gains alone, one for each mode, is no mixture: these
     measurements stay as they were recorded, and the sensor gain of the record is what they show of
     a unit of phase.
     """
-    n, is_open = telemetry.modes, telemetry.commands is None
-    if kind not in (None, stored := "open_loop" if is_open else "closed_loop"):
-        raise ProblemError(f"this telemetry is of kind {stored}; got {kind}. Leave kind out.")
+    n = telemetry.modes
     chosen = choose_axes(axes, n, "modes")
     facts = {name: value for name in _FACTS if (value := getattr(telemetry, name)) is not None}
     contents = Contents(facts={name: {"the telemetry": value} for name, value in facts.items()})
-    held = [role for role in _MATRICES if getattr(telemetry, role) is not None]
-    roles = {role: _modal_columns(telemetry, role, chosen, contents.notes) for role in held}
+    matrix, unit = _inverse_response(telemetry), telemetry.measurement_unit
+    words, series = "measurements: the inverse of the interaction matrix", telemetry.measurements
+    roles = {"measurements": _modal_columns(telemetry, series, matrix, unit, words, contents.notes)}
+    if telemetry.commands is not None:
+        matrix, unit = _influence(telemetry), telemetry.command_unit
+        words, series = "commands: the influence matrix", telemetry.commands
+        roles["commands"] = _modal_columns(telemetry, series, matrix, unit, words, contents.notes)
+    roles = {role: [columns[axis] for axis in chosen] for role, columns in roles.items()}
     if telemetry.times_s is not None:
         roles["times"] = [Column(name="times_s", values=telemetry.times_s, unit="s")]
     if max(n, telemetry.measurements.shape[1], telemetry.n_commands) > len(chosen):
@@ -223,7 +202,7 @@ def _telemetry_record(
             "of another program: that y(k) is of the exposure of frame k-1 is taken for granted"
         )
     mirror = telemetry.mirror if mirror is None else mirror
-    record = _build_loop(roles, contents, mirror=mirror, **given)
+    record = _build_loop(roles, contents, mirror=mirror, **stated)
     gains = tuple(map(float, str(telemetry.metadata.get(_STATED_GAIN, "")).split()))
     return replace(
         record,
@@ -251,17 +230,25 @@ def telemetry_of_record(record: LoopRecord) -> Telemetry:
     )
 
 
-def _modal_columns(seen: Telemetry, role: str, chosen: list[int], notes: list[str]) -> list[Column]:
-    """Return the measurements or the commands of the chosen modes."""
-    recorded_unit = seen.measurement_unit if role == "measurements" else seen.command_unit
-    series, unit, said = getattr(seen, role), unit_name(recorded_unit), f"in {recorded_unit!r}"
-    find, word = _MATRICES[role]
-    if (matrix := find(seen)) is not None:
-        series, said = series @ matrix.T, f"behind {word}"
+def _modal_columns(
+    seen: Telemetry,
+    series: FloatArray,
+    matrix: FloatArray | None,
+    recorded_unit: str,
+    words: str,
+    notes: list[str],
+) -> list[Column]:
+    """Return the columns of all modes: a series, or a matrix times it, where there is one."""
+    unit, said = recorded_unit if parse_unit(recorded_unit) else None, f"in {recorded_unit!r}"
+    if matrix is not None:
+        series, said = series @ matrix.T, f"behind {words.partition(': ')[2]}"
         # the modes of our own telemetry are in nm
         unit = "nm" if unit or _FOREIGN not in seen.metadata else None
-        notes.append(f"{role}: {word} times what was recorded")
-    return [Column(name=f"mode {k} {said}", values=series[:, k], unit=unit) for k in chosen]
+        notes.append(f"{words} times what was recorded")
+    return [
+        Column(name=f"mode {k} {said}", values=column, unit=unit)
+        for k, column in enumerate(series.T)
+    ]
 
 
 def _inverse_response(seen: Telemetry) -> FloatArray | None:
@@ -306,12 +293,6 @@ def _influence(seen: Telemetry) -> FloatArray | None:
     return None if is_identity else influence
 
 
-_MATRICES = {  # from what was recorded to modes
-    "measurements": (_inverse_response, "the inverse of the interaction matrix"),
-    "commands": (_influence, "the influence matrix"),
-}
-
-
 def _join_commands(contents: Contents, path: Path) -> None:
     """Add the commands of another file, in place of those of the first."""
     other = read_contents(path)
@@ -342,34 +323,29 @@ def _lay_beside(
 ) -> list[Column]:
     """Return the commands in the rows of the measurements, NaN where there are none.
 
-    Rows are matched by the counters of both files. Without these both files must have equally many
-    rows, of the same times where both have times.
+    Rows are matched by the counters of both files, else by their times. Without these both files
+    must have equally many rows.
     """
-    counters, times = (
-        [c for file in (contents, other) for c in file.columns if c.role == role] for role in CLOCKS
-    )
-    if len(counters) == 2:
-        frame, command_frame = (counter.values for counter in counters)
-        if not (np.all(np.diff(frame) >= 0) and np.all(np.diff(command_frame) > 0)):
+    for role in CLOCKS:
+        clocks = [c for file in (contents, other) for c in file.columns if c.role == role]
+        if len(clocks) != 2:
+            continue
+        frame, command_frame = (clock_factor(c.unit, "s") * c.values for c in clocks)
+        steps = np.diff(command_frame)
+        row = np.searchsorted(command_frame[:-1] + steps / 2, frame)
+        far = ~(np.abs(command_frame[row] - frame) < SAME_FRAME * np.median(steps))
+        if not np.all(steps > 0) or far.all():
             raise TelemetryError(
-                "the frame numbers of both files must rise from row to row to be matched.",
-                path=path,
-            )
-        row = np.minimum(np.searchsorted(command_frame, frame), len(command_frame) - 1)
-        row = np.where(command_frame[row] == frame, row, -1)
-        if np.mean(row >= 0) < 0.5:
-            raise TelemetryError(
-                f"only {int(np.sum(row >= 0))} of {len(row)} measurements have a command in {path} "
-                f"by their frame numbers; they go from {frame[0]:.12g} to {frame[-1]:.12g} and "
-                f"from {command_frame[0]:.12g} to {command_frame[-1]:.12g}. Give files of the same "
-                "frames.",
+                f"the commands in {path} must have {role.replace('_', ' ')} that rise, and are "
+                f"those of measurements; got {command_frame[0]:.12g} to {command_frame[-1]:.12g}, "
+                f"and {frame[0]:.12g} to {frame[-1]:.12g}. Give files of the same frames.",
                 path=path,
             )
         contents.notes.append(
-            f"commands were laid beside the measurements by {counters[1].name}: "
-            f"{int(np.sum(row >= 0))} of {len(row)} rows have one"
+            f"commands were laid beside the measurements by {clocks[1].name}: "
+            f"{int(np.sum(~far))} of {len(far)} rows have one"
         )
-        return [replace(c, values=np.where(row < 0, np.nan, c.values[row])) for c in commands]
+        return [replace(c, values=np.where(far, np.nan, c.values[row])) for c in commands]
     rows = sorted({len(column.values) for column in (*contents.columns, *commands)})
     if len(rows) > 1:
         raise TelemetryError(
@@ -377,15 +353,6 @@ def _lay_beside(
             f"{', '.join(map(str, rows))}. Or give both files a counter of frames.",
             path=path,
         )
-    if len(times) == 2:
-        one, two = (seconds_per(column.unit) * column.values for column in times)
-        if not np.max(np.abs(two - one)) <= SAME_FRAME * np.median(np.diff(one)):
-            raise TelemetryError(
-                f"the times of {path} must be those of the measurements, row by row. Give both "
-                "files a counter of frames, or leave the times away in one of them if the rows do "
-                "belong together.",
-                path=path,
-            )
     return commands
 
 
@@ -397,11 +364,13 @@ def _build_loop(
     command_unit: str | None,
     mirror: PositionLoop | None,
     source: str,
-    **given: Any,
+    **stated: Any,
 ) -> LoopRecord:
-    """Make a record of series; ``given`` are facts, None where the source has to tell."""
+    """Make a record of series; ``stated`` are facts, None where the source has to tell."""
+    if stated["averages"] is not None:
+        raise ProblemError("averages are only for a spectrum; got a record of series.")
     (role, columns), commands = next(iter(roles.items())), roles.get("commands")
-    facts = {name: _find_fact(contents, name, given[name]) for name in _FACTS}
+    facts = {name: _find_fact(contents, name, stated[name]) for name in _FACTS}
     units = {role: _find_unit(columns, unit, contents)}
     if commands is not None:
         units["commands"] = (
@@ -409,10 +378,10 @@ def _build_loop(
         )
     _require_facts(roles, units, facts)
     (clock,), (counter,) = (roles.get(name, [None]) for name in ("times", "frame_numbers"))
-    times = None if clock is None else seconds_per(clock.unit) * clock.values
+    times = None if clock is None else clock_factor(clock.unit, "s") * clock.values
     if clock is not None and not clock.unit:
         contents.notes.append(f"{clock.name} was taken for seconds")
-    record = loop_record(
+    return loop_record(
         _stack_columns(columns),
         None if commands is None else _stack_columns(commands),
         unit=units[role],
@@ -424,15 +393,6 @@ def _build_loop(
         source=source,
         **facts,
     )
-    low, high = _RATES_HZ
-    plausible = facts["frame_rate_hz"] is not None or low <= record.frame_rate_hz <= high
-    if clock is not None and not clock.unit and not plausible:
-        raise ProblemError(
-            f"the frame rate would be {record.frame_rate_hz:.6g} Hz with "
-            f"{clock.name or 'the times'} in seconds, and their unit is not given; name it, as in "
-            "time_ms, or give frame_rate_hz."
-        )
-    return record
 
 
 def _require_facts(
@@ -442,19 +402,20 @@ def _require_facts(
     bare = [role for role, unit in units.items() if not unit]
     option = "command_unit" if bare == ["commands"] else "unit"
     names = join_names([column for role in bare for column in roles[role]])
-    angles = any(map(is_angle, units.values()))
-    no_rate = facts["frame_rate_hz"] is None and "times" not in roles and kind == "loop"
+    angles = any(unit and unit.base == "mas" for unit in map(parse_unit, units.values()))
+    has_times = any(column.unit for column in roles.get("times", ()))
+    no_rate = facts["frame_rate_hz"] is None and not has_times and kind == "loop"
     no_delay = "commands" in roles and facts["delay_frames"] is None
     lacks = {
-        f"the unit of {names}: give {option} ({_UNITS[kind]})": bare,
+        f"the unit of {names}: give {option} ({UNITS[kind]})": bare,
         "the telescope, by which angles become nm: give diameter_m": (
             angles and facts["diameter_m"] is None
         ),
-        "the frame rate: give frame_rate_hz, or the times": no_rate,
+        "the frame rate: give frame_rate_hz, or times whose name has a unit": no_rate,
         "the total delay: give delay_frames": no_delay,
     }
     missing = [text for text, is_missing in lacks.items() if is_missing]
-    if len(missing) > 1 or bare:
+    if len(missing) > no_delay:
         volts = VOLTS if bare and option == "command_unit" else {}
         raise ProblemError(f"nothing tells {'; '.join(missing)}.", **volts)
 
@@ -514,21 +475,15 @@ def _stack_columns(chosen: Sequence[Column]) -> FloatArray:
 
 
 def _build_spectrum(
-    roles: Roles, contents: Contents, *, unit: str | None, source: str, **given: Any
+    roles: Roles, contents: Contents, *, unit: str | None, source: str, **stated: Any
 ) -> SpectrumRecord:
-    """Make a record of densities; ``given`` are facts, None where the source has to tell."""
+    """Make a record of densities; ``stated`` are facts, None where the source has to tell."""
     densities, (frequency,) = roles["density"], roles["frequency"]
     names = ("frame_rate_hz", "diameter_m", "averages")
-    facts = {name: _find_fact(contents, name, given[name]) for name in names}
-    own_unit = _find_unit(densities, unit, contents)
-    _require_facts(roles, {"density": own_unit}, facts, "spectrum")
-    parted = density_unit(own_unit)
-    if parted is None:
-        raise ProblemError(
-            f"the unit of a density is a square over Hz (nm^2/Hz, mas^2/Hz), or a length or angle "
-            f"over sqrt(Hz) (nm/sqrt(Hz)); got {own_unit!r}."
-        )
-    name, power = parted
+    facts = {name: _find_fact(contents, name, stated[name]) for name in names}
+    density_unit = _find_unit(densities, unit, contents)
+    _require_facts(roles, {"density": density_unit}, facts, "spectrum")
+    _, power, factor = nm_unit(density_unit, diameter_m=facts["diameter_m"], kind="spectrum")
     if not frequency.unit:
         contents.notes.append("frequencies were taken for Hz")
     table = _stack_columns([frequency, *densities])
@@ -536,14 +491,14 @@ def _build_spectrum(
     if not complete.all():
         contents.notes.append(f"{int(np.sum(~complete))} rows with gaps were left out")
     table = table[complete]
-    scaled = nm_per(name, diameter_m=facts["diameter_m"]) ** power * table[:, 1:]
+    scaled = factor * table[:, 1:]
     if power == 1:
         if np.any(scaled < 0):
             raise ProblemError("an amplitude density must be at least 0; got a negative one.")
         contents.notes.append("amplitude densities were squared")
         scaled = scaled**2
     return SpectrumRecord(
-        frequency_hz=hz_per(frequency.unit) * table[:, 0],
+        frequency_hz=clock_factor(frequency.unit, "Hz") * table[:, 0],
         density_nm2_hz=scaled,
         notes=merge_notes(contents.notes),
         source=source,

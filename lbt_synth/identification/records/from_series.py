@@ -12,7 +12,7 @@ from lbt_synth.errors import DimensionError
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records import faults
 from lbt_synth.identification.records.clock import build_clock
-from lbt_synth.identification.records.columns import nm_per
+from lbt_synth.identification.records.columns import nm_unit
 from lbt_synth.identification.records.faults import Finding, findings_in, merge_notes
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models import PositionLoop
@@ -76,7 +76,7 @@ def loop_record(
     source : str, optional
         Where it is from.
     notes : sequence of str, optional
-        Notes for its ``health``.
+        What is to be noted of it.
 
     Returns
     -------
@@ -103,16 +103,16 @@ def loop_record(
     >>> y = np.random.default_rng(0).standard_normal((1000, 2))
     >>> y[400, 0] = 80.0
     >>> seen = lbt.identification.loop_record(y, frame_rate_hz=1000, unit="mas", diameter_m=8.22)
-    >>> seen.health.summary()
+    >>> seen.summary()
     '999 of 1000 frames are usable; 1 outlier (measurements).'
     >>> round(float(seen.measurements[0, 0] / y[0, 0]), 3)
     9.963
     """
-    y = _series_in_nm(measurements, "measurements", nm_per(unit, diameter_m=diameter_m))
+    y = _series_in_nm(measurements, "measurements", nm_unit(unit, diameter_m=diameter_m).factor)
     u = None
     if commands is not None:
-        scale = nm_per(command_unit or unit, diameter_m=diameter_m, name="command_unit")
-        u = _series_in_nm(commands, "commands", scale)
+        scale = nm_unit(command_unit or unit, diameter_m=diameter_m, name="command_unit")
+        u = _series_in_nm(commands, "commands", scale.factor)
         if u.shape != y.shape:
             raise DimensionError(f"commands must match measurements {y.shape}; got {u.shape}.")
     clock = build_clock(

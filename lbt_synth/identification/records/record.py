@@ -13,7 +13,6 @@ from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records.faults import (
     Finding,
-    RecordHealth,
     findings_in,
     mark,
     runs,
@@ -135,7 +134,7 @@ class LoopRecord:
         return (
             f"<LoopRecord of {self.source or 'series'}: {self.frames} frames of {series},\n"
             f" {self.axes} axes at {self.frame_rate_hz:g} Hz, delay {delay},\n"
-            f" {self.health.summary()}>"
+            f" {self.summary()}>"
         )
 
     def __post_init__(self) -> None:
@@ -175,14 +174,15 @@ class LoopRecord:
         return unknown
 
     @property
-    def health(self) -> RecordHealth:
-        """What was found in the record."""
-        return RecordHealth(
-            frames=self.frames,
-            usable=int(np.sum(self.usable)),
-            findings=self.faults + findings_in(self.unknown_corrections(), NOT_KNOWN, "frames"),
-            notes=self.notes,
-        )
+    def findings(self) -> tuple[Finding, ...]:
+        """What was found in the record; empty for a clean one."""
+        return self.faults + findings_in(self.unknown_corrections(), NOT_KNOWN, "frames")
+
+    def summary(self) -> str:
+        """Return one line: how many frames are usable, and why the others are not."""
+        usable = f"{int(np.sum(self.usable))} of {self.frames} frames are usable"
+        spoilt = [f"{f.count} {f.kind} ({f.series})" for f in self.findings if f.spoils]
+        return f"{'; '.join(filter(None, (usable, ', '.join(spoilt))))}."
 
     @property
     def frames(self) -> int:
@@ -309,7 +309,7 @@ def require_length(
         raise ProblemError(
             f"the record needs {needed} usable frames ({needed / rate:.3g} s at {rate:.6g} Hz) in "
             f"stretches of at least {SHORTEST_SEGMENT}; got {count} ({count / rate:.3g} s), the "
-            f"longest stretch {longest}. {record.health.summary()} Record for longer, or lose "
+            f"longest stretch {longest}. {record.summary()} Record for longer, or lose "
             "fewer frames."
         )
     return count
@@ -327,7 +327,7 @@ class SpectrumRecord:
         Densities [nm^2/Hz], at least 0, of the disturbance in open loop; integrated over the
         frequencies above 0 they give the variance.
     frame_rate_hz : float, optional
-        Frame rate of the series that they were computed from [Hz].
+        Frame rate of the loop [Hz].
     averages : int, optional
         Periodograms that were averaged.
     diameter_m : float, optional
@@ -340,8 +340,7 @@ class SpectrumRecord:
     Raises
     ------
     ProblemError
-        If frequencies do not increase or lie above half the frame rate, a density is negative,
-        or sizes clash.
+        If frequencies do not increase, a density is negative, or sizes clash.
 
     Examples
     --------
@@ -373,12 +372,6 @@ class SpectrumRecord:
         for column in density.T:
             TabulatedSpectrum(frequency_hz=frequency, density_nm2_hz=column)
         check_fields(self, frequency_hz=frequency, density_nm2_hz=density)
-        half = np.inf if self.frame_rate_hz is None else self.frame_rate_hz / 2
-        if frequency[-1] > half * (1 + 1e-9):
-            raise ProblemError(
-                f"frequencies must lie below half the frame rate, {half:.6g} Hz; got "
-                f"{frequency[-1]:.6g} Hz."
-            )
 
     @property
     def axes(self) -> int:

@@ -24,7 +24,7 @@ from lbt_synth.interop.c.terms import (
     source_terms,
     used_readings,
 )
-from lbt_synth.interop.pipeline import Arithmetic, Target, comment_text
+from lbt_synth.interop.pipeline import Target, comment_text
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.storage.rows import column, table_row
@@ -55,31 +55,7 @@ class FrameCost:
 
 
 def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
-    """Count the arithmetic and the memory of one frame.
-
-    Parameters
-    ----------
-    design : Design or Controller
-        The controller, or a design with one.
-
-    Returns
-    -------
-    FrameCost
-        Counts for the C source that :func:`export` writes.
-
-    Raises
-    ------
-    ProblemError
-        If it is neither.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lag = lbt.Controller(A=[[0.5]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
-    >>> cost = lbt.interop.frame_cost(lag)
-    >>> cost.multiplications, cost.additions
-    (1, 1)
-    """
+    """Count the arithmetic and the memory of one frame of the C source."""
     terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
     (s, _, m), out = terms.sizes, _written_out(terms)
     sums = "".join([*out["errors"], *out["states"], *out["commands"]])
@@ -341,15 +317,7 @@ def _facts(terms: SourceTerms, **_: Any) -> dict[str, Any]:
 
 
 TARGET = Target(
-    arithmetic=Arithmetic(
-        program="real-time computers, from C99 source",
-        precision="double or single",
-        sums="from left to right: states, applied commands, readings; commands from new states",
-        state="new state: x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k)",
-        clipping="yours: the estimator form takes the applied commands, the plain form none",
-        limits="none",
-    ),
-    file="source and header (.c, .h)",
+    precision="double",
     options={
         "form": None,
         "precision": "double",

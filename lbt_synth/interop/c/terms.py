@@ -194,6 +194,7 @@ class RunningSource:
         self._terms, self._dtype = terms, np.float32 if terms.single else np.float64
         self._matrices = [getattr(terms, name).astype(self._dtype) for name in _CONSTANT]
         self._gains = {some: gains.astype(self._dtype) for some, gains in terms.gains.items()}
+        self.controller = terms.controller()  # that it computes
         self.reset()
 
     def reset(self) -> None:

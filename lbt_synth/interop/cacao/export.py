@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModeDesign
-from lbt_synth.interop.pipeline import Arithmetic, Target
+from lbt_synth.interop.pipeline import Target
 from lbt_synth.interop.proof import (
     LOSS,
     ROUNDOFF,
@@ -37,7 +37,7 @@ from lbt_synth.linear import StateSpace, hinf_norm
 from lbt_synth.loop import ClosedLoop, close_loop
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.array_file import open_fits
-from lbt_synth.validation import FloatArray, integer, number
+from lbt_synth.validation import FloatArray, integer
 
 LONGEST_DELAY = 8  # frames; modalfilter keeps the commands of ten frames
 _LONGEST = 1 << 17  # steps that are looked for
@@ -257,14 +257,11 @@ def predictive_filter(design: Design) -> PredictiveFilter:
     return PredictiveFilter(design=design, hardware=hardware, system=system)
 
 
-def _round(
-    designs: Sequence[Design], *, steps: int | None, loss: float, **_: Any
-) -> list[_Numbers]:
+def _round(designs: Sequence[Design], *, steps: int | None, **_: Any) -> list[_Numbers]:
     """Return the matrix of each design, all of the same length."""
-    limit = number(loss, "loss", above=0, at_most=LOSS)
     filters = [predictive_filter(design) for design in designs]
     if steps is None:
-        count = max(2, *(one.fewest_steps(limit) for one in filters))
+        count = max(2, *(one.fewest_steps(LOSS) for one in filters))
     else:
         count = integer(steps, "steps", at_least=2)
     delay = filters[0].hardware.delay_frames
@@ -327,16 +324,8 @@ def _read(files: Mapping[Path, bytes], like: _Numbers) -> _Numbers:
 
 
 TARGET = Target(
-    arithmetic=Arithmetic(
-        program="cacao's applyPF, behind its modalfilter",
-        precision="single",
-        sums="per command, the newest frame first; on a GPU in any order, which the proof covers",
-        state="past pseudo-open-loop values: measurements less past applied commands",
-        clipping="none after the filter; the history must hold the applied commands",
-        limits="finite impulse response; a mirror that settles, a delay of at most 8 frames",
-    ),
-    file="matrix of single precision (.fits) and its certificate",
-    options={"steps": None, "loss": LOSS, "modes": None, "other_gain": None},
+    precision="single",
+    options={"steps": None, "modes": None, "other_gain": None},
     round=_round,
     write=_write,
     read=_read,

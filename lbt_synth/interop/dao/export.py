@@ -29,7 +29,7 @@ from lbt_synth.design.shaping.objectives import ResidualVariance, leaves, spectr
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.modes import ModeDesign
-from lbt_synth.interop.pipeline import Arithmetic, Target
+from lbt_synth.interop.pipeline import Target
 from lbt_synth.interop.proof import (
     LOSS,
     ROUNDOFF,
@@ -40,7 +40,6 @@ from lbt_synth.interop.proof import (
 )
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.array_file import fits_bytes, open_fits
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, integer
 
 # Mean square of the relative error of an operation. The error is uniform within half a step, and a
@@ -377,30 +376,24 @@ def mode_polynomials(controller: Controller) -> list[tuple[FloatArray, FloatArra
             "measurements. Use a target of matrices, such as c."
         )
     A, B, C, D = (_is_significant(getattr(system, name)) for name in "ABCD")
-    paths = np.linalg.matrix_power(A | np.eye(size, dtype=np.bool_), size)
-    coupled = np.argwhere((D | (C @ paths @ B)) & ~np.eye(m, dtype=np.bool_))
+    linked = np.linalg.matrix_power(A | np.eye(size, dtype=np.bool_), size)
+    coupled = np.argwhere((D | (C @ linked @ B)) & ~np.eye(m, dtype=np.bool_))
     if coupled.size:
         raise ProblemError(
             f"the modes must decouple; here measurement {coupled[0, 1] + 1} moves command "
             f"{coupled[0, 0] + 1}. Design with --method robust, which controls each axis alone, or "
             "use a target of matrices, such as c."
         )
-    return [_shortened(*_transfer_function(system, i, row)) for i, row in enumerate(np.eye(m))]
+    return [_mode_filter(system, mode, linked) for mode in range(m)]
 
 
-def _transfer_function(
-    system: StateSpace, output: int, row: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the scalar filter of one output, for measurements along a row.
+def _mode_filter(system: StateSpace, mode: int, linked: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return the polynomials of a mode, without states that it does not drive or does not show.
 
-    Numerator and denominator have their highest power first. States that the measurements do not
-    drive, or that do not show in the output, are left out. What overflows is not a number.
+    Powers of ``z^-1`` that neither has are left out. What overflows is not a number.
     """
-    size = row @ row
-    b, c, d = system.B @ row / size, system.C[output], float(system.D[output] @ row / size)
-    linked = _is_significant(system.A) | np.eye(system.n_states, dtype=np.bool_)
-    reached = np.linalg.matrix_power(linked, system.n_states)
-    inside = (reached @ _is_significant(b)) & (_is_significant(c) @ reached)
+    b, c, d = system.B[:, mode], system.C[mode], system.D[mode, mode]
+    inside = (linked @ _is_significant(b)) & (_is_significant(c) @ linked)
     A = system.A[np.ix_(inside, inside)]
     with np.errstate(all="ignore"):
         entry = np.outer(b[inside], c[inside])
@@ -408,30 +401,23 @@ def _transfer_function(
         # det(zI - A + b c) = det(zI - A) + c adj(zI - A) b
         den, moved = _characteristic(A), _characteristic(A - scale * entry)
         num = d * den + (moved - den) / scale
-    num[np.abs(num) <= _NOTHING * np.max(np.abs(num))] = 0.0
-    return num, den
+        num[np.abs(num) <= _NOTHING * np.max(np.abs(num))] = 0.0
+        shares = [np.abs(values) / (np.max(np.abs(values)) or 1.0) for values in (num, den)]
+    used = ~(np.max(shares, axis=0) <= _NEGLIGIBLE)  # what is no number is used, and refused
+    count = 1 + int(np.flatnonzero(used)[-1])
+    return num[:count], den[:count]
 
 
 def _characteristic(A: FloatArray) -> FloatArray:
     """Return the characteristic polynomial, highest power first."""
-    if not A.size:
-        return np.ones(1)
-    finite = bool(np.all(np.isfinite(A)))
-    return np.asarray(np.real(np.poly(A))) if finite else np.full(len(A) + 1, np.nan)
+    if not A.size or not np.all(np.isfinite(A)):
+        return np.full(len(A) + 1, np.nan if A.size else 1.0)
+    return np.asarray(np.real(np.poly(A)))
 
 
 def _is_significant(entries: FloatArray) -> BoolArray:
     """Return which entries are more than what a solver leaves of a zero."""
     return np.asarray(np.abs(entries) > _COUPLED * np.max(np.abs(entries), initial=0.0))
-
-
-def _shortened(num: FloatArray, den: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Leave out the powers of ``z^-1`` that neither polynomial has."""
-    with np.errstate(all="ignore"):
-        shares = [np.abs(values) / (np.max(np.abs(values)) or 1.0) for values in (num, den)]
-    used = ~(np.max(shares, axis=0) <= _NEGLIGIBLE)  # what is no number is used, and refused
-    count = 1 + int(np.flatnonzero(used)[-1])
-    return num[:count], den[:count]
 
 
 def direct_form(rows: FloatArray, dt_s: float) -> Controller:
@@ -525,16 +511,9 @@ def _join(numbers: Sequence[_Matrix], parts: Sequence[ModeDesign], count: int) -
 
 
 def _write(
-    place: Path, matrix: _Matrix, design: Design, origin: Sequence[str], **_: Any
+    place: Path, matrix: _Matrix, _design: Design, _origin: Sequence[str], **_: Any
 ) -> dict[Path, bytes]:
-    """Return the matrix as FITS or as a file of numpy, by the ending."""
-    if place.suffix.lower() == ".fits":
-        cards: dict[str, Any] = {
-            "METHOD": (design.method, "synthesis"),
-            "ORDER": (len(matrix) // 2, "M: rows b_0..b_M, then a_1..a_M"),
-        }
-        comments = [*origin, _SIGN]
-        return {place: fits_bytes(cards, {"K_MAT": matrix}, comments=comments)}
+    """Return the matrix as a file of numpy."""
     buffer = io.BytesIO()
     np.save(buffer, matrix, allow_pickle=False)
     return {place: buffer.getvalue()}
@@ -542,10 +521,7 @@ def _write(
 
 def _read(files: Mapping[Path, bytes], _: _Matrix) -> _Matrix:
     """Return the matrix that a file holds."""
-    ((place, content),) = files.items()
-    if place.suffix.lower() == ".fits":
-        with open_fits(content) as units:
-            return np.array(units["K_MAT"].data, dtype=np.float32)
+    (content,) = files.values()
     return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
 
 
@@ -558,15 +534,7 @@ def _remark(design: Design, columns: _Matrix) -> str:
 
 
 TARGET = Target(
-    arithmetic=Arithmetic(
-        program="Durham's dao real-time computers",
-        precision="single",
-        sums="per mode, product by product: b_0 y(k) .. b_M y(k-M), a_1 u(k-1) .. a_M u(k-M)",
-        state="past measurements and past applied commands",
-        clipping="at the voltage limit; the memory then holds the applied commands",
-        limits="one transfer function per mode, of order M at most",
-    ),
-    file="matrix of single precision (.npy, .fits) and its certificate (.json)",
+    precision="single",
     options={"order": 20, "modes": None, "other_gain": None},
     round=_round,
     write=_write,
@@ -578,5 +546,5 @@ TARGET = Target(
     remark=_remark,
     hint="Give an even order, design with fewer states or less accurate models, or use a target in "
     "double precision.",
-    endings=(".npy", ".fits"),
+    endings=(".npy",),
 )

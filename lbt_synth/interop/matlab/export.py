@@ -10,7 +10,7 @@ from typing import Any
 import lbt_synth
 from lbt_synth.design import Design
 from lbt_synth.interop.c.terms import RunningSource, SourceTerms, as_computed, controller_terms
-from lbt_synth.interop.pipeline import Arithmetic, Target
+from lbt_synth.interop.pipeline import Target
 from lbt_synth.interop.proof import command_as_state
 from lbt_synth.linear import StateSpace
 
@@ -66,15 +66,7 @@ def _read(files: Mapping[Path, bytes], like: SourceTerms) -> SourceTerms:
 
 
 TARGET = Target(
-    arithmetic=Arithmetic(
-        program="MATLAB and Simulink",
-        precision="double",
-        sums="matrix products, in an order of their library",
-        state="textbook: u(k) = C x(k) + D y(k); new_state: that of the gain file",
-        clipping="none: plain form, it assumes that its commands are applied",
-        limits="none",
-    ),
-    file="MATLAB file (.mat)",
+    precision="double",
     round=_round,
     write=_write,
     read=_read,

@@ -24,7 +24,7 @@ from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
-from lbt_synth.interop.pipeline import CERTIFICATE, Arithmetic, Target
+from lbt_synth.interop.pipeline import CERTIFICATE, Target
 from lbt_synth.interop.proof import ROUNDOFF, Written, filter_of_history
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop import close_loop
@@ -33,7 +33,6 @@ from lbt_synth.storage.array_file import open_fits
 from lbt_synth.validation import FloatArray
 
 _LARGEST_CONDITION = 1e4  # of the response; its inverse is held in single precision
-_FIT_SECONDS = 20.0  # of pseudo-open-loop series that fit_predictor identifies
 _CONFIG, _GAIN, _RESPONSE = "config.yaml", "gain.fits", "interaction_matrix.npz"
 _SYSTEM = """\
 {origin}
@@ -62,7 +61,6 @@ loop:
     type: lbt_synth
     gain_file: {gain}
     delay_frames: {delay}
-    fit_frames: {fit}
     other_gain: {other_gain!r}  # of the integrator of each further mode
 """
 
@@ -190,7 +188,6 @@ def _write(
         response=_RESPONSE,
         gain=_GAIN,
         delay=whole.delay_frames,
-        fit=int(_FIT_SECONDS / whole.system.dt_s),
         other_gain=float(other_gain or 0.0),
     )
     matrix = block_diag(whole.response, np.eye(count - len(whole.response)))
@@ -215,15 +212,7 @@ def _read(files: Mapping[Path, bytes], like: PolFilter) -> PolFilter:
 
 
 TARGET = Target(
-    arithmetic=Arithmetic(
-        program="pyRTC, its loop predictive_integrator",
-        precision="single for signals and commands, double in the controller",
-        sums="matrix products, in an order of their library",
-        state="of a stable filter, fed with the residual and the command sent delay_frames before",
-        clipping="predictor.command_limit in the controller; what the corrector clips is not seen",
-        limits="as many measurements as commands",
-    ),
-    file="folder with the configuration, the gain file and their certificate",
+    precision="single for signals and commands, double in the controller",
     options={"modes": None, "other_gain": None},
     round=lambda designs, **_: [pol_filter(design) for design in designs],
     write=_write,

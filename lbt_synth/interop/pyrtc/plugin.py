@@ -7,18 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lbt_synth.design import Design, integrator
+from lbt_synth.design import integrator
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
-from lbt_synth.identification import design_from_record, loop_record
 from lbt_synth.interop.pyrtc.export import InnerLoop, pol_filter
-from lbt_synth.methods.registry import record_methods
 from lbt_synth.validation import FloatArray, integer, number
 
 PREDICTOR = "lbt_synth"
 _ANSWER_SECONDS = 20.0  # a first frame may compile code
-_FITTED_NM = 100.0  # rms of a series that is identified
 
 
 def register() -> Any:
@@ -138,55 +135,30 @@ class GainFilePredictor:
         self._limit = np.inf
         if command_limit is not None:
             self._limit = number(command_limit, "predictor.command_limit", above=0)
-        self._gain_file = gain_file
-        self._take(load_gain(gain_file))
-
-    def _take(self, design: Design) -> None:
-        """Run another design, from a state of zero."""
-        series = pol_filter(design)
+        self._gain_file, series = gain_file, pol_filter(design := load_gain(gain_file))
         if series.delay_frames != self.horizon:
             raise ProblemError(
-                f"predictor.delay_frames must be {series.delay_frames}, that of {self._gain_file}; "
+                f"predictor.delay_frames must be {series.delay_frames}, that of {gain_file}; "
                 f"got {self.horizon}. Design for the delay of this loop."
             )
         self._own = len(series.response)
         if self._own > self.num_modes:
             raise ProblemError(
-                f"the loop must control at least the {self._own} modes of {self._gain_file}; got "
+                f"the loop must control at least the {self._own} modes of {gain_file}; got "
                 f"{self.num_modes}. Lower loop.num_dropped_modes, or raise wfc.num_modes."
             )
         if self._other_gain > 0:  # refused where its loop is unstable
             hardware = require_hardware(design, "pyRTC")
             integrator(hardware.single_mode(), gain=self._other_gain)
-        self._design, self._filter = design, InnerLoop(series, self._limit)
+        self._filter = InnerLoop(series, self._limit)
         self.reset()
 
     def fit(self, pol_history: ArrayLike) -> GainFilePredictor:
-        """Identify the loop from its pseudo-open-loop series, and design for it again.
-
-        The method is that of the gain file, or the best one where that needs more than a record.
-        """
-        history = np.asarray(pol_history, dtype=np.float64)[:, : self._own]
-        hardware = require_hardware(self._design, "pyRTC")
-        if np.any(self._filter.tap_error):
-            raise ProblemError(
-                "pyRTC's series is the phase for a mirror that settles at once and a delay of "
-                f"whole frames; that of {self._gain_file} is another. Try lbt-synth auto on a "
-                "record."
-            )
-        # in any unit: a controller does not depend on it
-        size = float(np.std(history[np.isfinite(history)])) or 1.0
-        record = loop_record(
-            history * (_FITTED_NM / size),
-            frame_rate_hz=hardware.frame_rate_hz,
-            delay_frames=self.horizon,
-            unit="nm",
+        """Refuse to identify within the loop."""
+        raise ProblemError(
+            f"the controller of {self._gain_file} does not change while the loop runs. Record the "
+            "loop, and try lbt-synth auto on the record."
         )
-        method = self._design.method
-        named = method if method in record_methods() else None
-        self._take(design_from_record(record, method=named).design)
-        self.fitted = True
-        return self
 
     def update(self, pol: ArrayLike) -> None:
         """Take the pseudo-open-loop values of a frame, (modes,)."""

@@ -1,28 +1,23 @@
-"""A system, its optics and calibration, by SPECULA (MIT licence), which no other module imports."""
+"""A telescope, its optics and calibration, by SPECULA (MIT licence), which nothing else imports."""
 
 from __future__ import annotations
 
-import contextlib
-import hashlib
 import importlib
-import json
 import logging
 import math
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lbt_synth.design.modal import Reconstructor, reconstructor
-from lbt_synth.errors import FileError, MissingExtraError, OutputError, ProblemError
-from lbt_synth.models import LoopHardware
-from lbt_synth.storage.array_file import digest, npz_bytes, open_fits, read_npz
-from lbt_synth.storage.atomic_files import make_directory, write_atomically
-from lbt_synth.storage.input_files import read_bytes
+from lbt_synth.errors import MissingExtraError, ProblemError
+from lbt_synth.models import LoopHardware, Truth
+from lbt_synth.models.sensor_suite import Motions
+from lbt_synth.models.vibration import TrueVibration
 from lbt_synth.validation import (
     Finite,
     FloatArray,
@@ -42,65 +37,13 @@ _LARGEST_SCREEN = 16384
 _PSF_SAMPLING = 3
 _REFERENCE_UM = 0.5  # wavelength at which SPECULA takes the seeing
 _MOST_PIXELS = 1024
-_UNCALIBRATED = {  # fields on which the modes and the interaction matrix do not depend
-    "hardware",
-    "seeing_arcsec",
-    "seeing_wavelength_um",
-    "wind_speed_m_s",
-    "wind_direction_deg",
-    "photons",
-    "read_noise_electrons",
-    "imaging_wavelength_um",
-}
-
-
-_LAYOUT = 1
+RAMP_FRAMES = 200  # over which the seeing rises, so that no turn of the phase is lost
+LARGEST_SEED = 2**31 - 2  # the detector doubles it, in 32 bits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EndToEndSystem:
-    """A telescope with a pyramid sensor and a mirror of many modes.
-
-    Parameters
-    ----------
-    hardware : LoopHardware
-        Frame rate and delay, or the response of a slow mirror; its sensor and influence
-        matrices are the identity, because the optics replace them.
-    diameter_m, obstruction, seeing_arcsec : float
-        Telescope diameter [m]; diameter of the central obstruction as a fraction of the
-        telescope's; seeing at ``seeing_wavelength_um`` [arcsec].
-    outer_scale_m, wind_speed_m_s, sensing_wavelength_um : float
-        Outer scale [m]; speed of the one layer [m/s]; wavelength of the pyramid [um].
-    modulation_lambda_over_d : float
-        Radius of its modulation [lambda/D].
-    subapertures_across : int
-        Subapertures across the pupil.
-    photons, read_noise_electrons : float
-        Photons per subaperture and frame; read noise per pixel [electrons].
-    modes, actuators_across : int, optional
-        Controlled modes of the mirror, tip and tilt first; actuators across the mirror, in
-        concentric rings.
-    seeing_wavelength_um, imaging_wavelength_um : float, optional
-        Wavelength of the seeing [um]; wavelength of the camera [um].
-    wind_direction_deg : float, optional
-        Direction in which the layer moves [degrees]; 0 is along tip.
-    pixels : int, optional
-        Pixels across the pupil, even.
-    calibration_nm : float, optional
-        Amplitude of each mode when the interaction matrix is measured [nm rms].
-
-    Raises
-    ------
-    ProblemError
-        If a value is not finite, out of its range, or values clash.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> config.end_to_end.system.modes, config.end_to_end.system.pixels
-    (672, 60)
-    """
+class EndToEndSetup:
+    """A telescope with a pyramid and a mirror of many modes, its vibrations, and a run with it."""
 
     hardware: LoopHardware
     diameter_m: Positive
@@ -119,10 +62,19 @@ class EndToEndSystem:
     imaging_wavelength_um: Positive = 2.2
     wind_direction_deg: Finite = 0.0
     pixels: Annotated[int, ("at_least", 8)] = 60
-    calibration_nm: Positive = 20.0
+    calibration_nm: Positive = 20.0  # of each mode, when the interaction matrix is measured
+    vibrations: tuple[TrueVibration, ...] = ()
+    motions: Motions = ()  # of channels of accelerometers with each vibration
+    frames: Annotated[int, ("at_least", 2)] = 1600
+    settle_frames: Annotated[int, ("at_least", RAMP_FRAMES)] = 400
+    seed: Annotated[int, ("at_least", 0), ("at_most", LARGEST_SEED)] = 0
+    gain: NotNegative = 0.5  # of the integrator of each mode that no filter controls
+    # it frees corners of the mirror that a pyramid traps at whole turns of the phase
+    leak: Annotated[float, ("at_least", 0), ("at_most", 1)] = 0.97
+    leak_from_mode: Annotated[int, ("at_least", 2)] = 50
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        check_fields(self, vibrations=tuple(self.vibrations))
         for name in ("sensor_matrix", "influence_matrix"):
             matrix = getattr(self.hardware, name)
             if not np.array_equal(matrix, np.eye(2)):
@@ -138,11 +90,6 @@ class EndToEndSystem:
             )
 
     @property
-    def frame_rate_hz(self) -> float:
-        """Frame rate [Hz]."""
-        return self.hardware.frame_rate_hz
-
-    @property
     def pixel_m(self) -> float:
         """Pixel in the pupil [m]."""
         return self.diameter_m / self.pixels
@@ -152,16 +99,25 @@ class EndToEndSystem:
         """Seeing at 0.5 um [arcsec]; seeing varies as the wavelength to the power of -1/5."""
         return float(self.seeing_arcsec * (self.seeing_wavelength_um / _REFERENCE_UM) ** 0.2)
 
-    def screen_pixels(self, frames: int) -> int:
-        """Return the side of a periodic screen, a power of two, that does not repeat."""
-        travelled = frames / self.frame_rate_hz * self.wind_speed_m_s
+    @property
+    def screen_pixels(self) -> int:
+        """Side of a periodic screen, a power of two, that does not repeat in a run."""
+        total = self.settle_frames + self.frames
+        travelled = total / self.hardware.frame_rate_hz * self.wind_speed_m_s
         length = max(travelled + 2 * self.diameter_m, 6 * self.outer_scale_m)
         return int(2 ** math.ceil(math.log2(length / self.pixel_m)))
 
-    def calibration_facts(self) -> dict[str, Any]:
-        """Return what the modes and the interaction matrix depend on."""
-        names = [field.name for field in fields(self) if field.name not in _UNCALIBRATED]
-        return {name: getattr(self, name) for name in names}
+    @property
+    def leaks(self) -> FloatArray:
+        """Leak of each mode's integrator, (modes,)."""
+        leaks = np.ones(self.modes)
+        leaks[self.leak_from_mode :] = self.leak
+        return leaks
+
+    @property
+    def shaken(self) -> Truth:
+        """The vibrations, and how channels of accelerometers move with them."""
+        return Truth(turbulence=None, vibrations=self.vibrations, motions=self.motions)
 
 
 def specula_version() -> str:
@@ -216,80 +172,59 @@ class Modes:
         return np.asarray(projected / self.shapes.shape[1])
 
 
-def make_modes(system: EndToEndSystem) -> Modes:
+def make_modes(setup: EndToEndSetup) -> Modes:
     """Compute Karhunen-Loeve modes of the influence functions, after tip and tilt."""
-    mask = _make_pupil(system, _make_parameters(system)).A
+    mask = _make_pupil(setup, _make_parameters(setup)).A
     functions, _, _, _ = _make(
         "lib.compute_zonal_ifunc:compute_zonal_ifunc",
-        system.pixels,
-        system.actuators_across,
+        setup.pixels,
+        setup.actuators_across,
         geom="circular",
         mask=mask.astype(np.float64),
         do_slaving=True,
         dtype=np.float64,
     )
     most = min(functions.shape) - 3
-    if system.modes > most:
+    if setup.modes > most:
         raise ProblemError(
-            f"{system.modes} modes need a mirror with more actuators: {system.actuators_across} "
-            f"across a pupil of {system.pixels} pixels carry at most {most}. Try "
-            f"actuators_across={system.actuators_across + 2}, more pixels, or fewer modes."
+            f"{setup.modes} modes need a mirror with more actuators: {setup.actuators_across} "
+            f"across a pupil of {setup.pixels} pixels carry at most {most}. Try "
+            f"actuators_across={setup.actuators_across + 2}, more pixels, or fewer modes."
         )
     base = _specula("lib.modal_base_generator:make_modal_base_from_ifs_fft")
-    size, outer = system.diameter_m, system.outer_scale_m
+    size, outer = setup.diameter_m, setup.outer_scale_m
     shapes, _, _ = base(mask, size, functions, 1.0, outer, zern_modes=2, dtype=np.float64)
-    return Modes(mask=mask > 0, shapes=np.ascontiguousarray(shapes[: system.modes], np.float32))
+    return Modes(mask=mask > 0, shapes=np.ascontiguousarray(shapes[: setup.modes], np.float32))
 
 
-def _make_parameters(system: EndToEndSystem) -> Any:
+def _make_parameters(setup: EndToEndSetup) -> Any:
     name = "data_objects.simul_params:SimulParams"
-    return _make(name, system.pixels, system.pixel_m, time_step=1 / system.frame_rate_hz)
+    return _make(name, setup.pixels, setup.pixel_m, time_step=1 / setup.hardware.frame_rate_hz)
 
 
-def _make_pupil(system: EndToEndSystem, parameters: Any) -> Any:
+def _make_pupil(setup: EndToEndSetup, parameters: Any) -> Any:
     name = "data_objects.pupilstop:Pupilstop"
-    return _make(name, parameters, mask_diam=1.0, obs_diam=system.obstruction)
-
-
-def _discard_damaged(files: Iterable[Path]) -> None:
-    """Delete truncated phase screens, so that they are computed again."""
-    for file in files:
-        try:
-            with open_fits(read_bytes(file, FileError)) as units:
-                _ = units[0].data.shape
-        except Exception:  # astropy has no common class for what damage makes it raise
-            file.unlink()
+    return _make(name, parameters, mask_diam=1.0, obs_diam=setup.obstruction)
 
 
 class Optics:
-    """One optical train, exposed frame after frame.
+    """One optical train, exposed frame after frame; without the air there is no noise either."""
 
-    Without ``screens``, a directory, there is no turbulence, and without a seed no noise.
-    """
-
-    def __init__(
-        self,
-        system: EndToEndSystem,
-        modes: Modes,
-        *,
-        screens: Path | None = None,
-        frames: int = 1,
-        seed: int | None = None,
-    ) -> None:
-        self.system, self.modes = system, modes
-        self._step_ns = round(1e9 / system.frame_rate_hz)
+    def __init__(self, setup: EndToEndSetup, modes: Modes, *, air: bool = False) -> None:
+        self.setup, self.modes = setup, modes
+        self._step_ns = round(1e9 / setup.hardware.frame_rate_hz)
         self._time_ns = 0
         self._weather: list[Any] = []  # seeing, speed and direction of the wind
         self._where = np.nonzero(modes.mask)
-        self._parameters = _make_parameters(system)
-        self._pupil = _make_pupil(system, self._parameters)
+        self._parameters = _make_parameters(setup)
+        self._pupil = _make_pupil(setup, self._parameters)
         self._commands = self._make_input(np.zeros(len(modes.shapes)))
         mirror = self._make_mirror()
         inputs = {"common_layer_list": [self._pupil, mirror.outputs["out_layer"]]}
-        air = [] if screens is None else [self._make_air(screens, frames, seed)]
-        if air:
-            inputs["atmo_layer_list"] = air[0].outputs["layer_list"]
-        source = _make("data_objects.source:Source", [0, 0], 0, 1e3 * system.sensing_wavelength_um)
+        screens = [self._make_air()] if air else []
+        for screen in screens:
+            inputs["atmo_layer_list"] = screen.outputs["layer_list"]
+        source = _make("data_objects.source:Source", [0, 0], 0, 1e3 * setup.sensing_wavelength_um)
         beam = _make(
             "processing_objects.atmo_propagation:AtmoPropagation",
             self._parameters,
@@ -298,26 +233,26 @@ class Optics:
         )
         self._field = beam.outputs["out_star_ef"]
         pyramid, indices = self._make_pyramid()
-        detector = self._make_detector(pyramid, seed)
+        detector = self._make_detector(pyramid, noisy=air)
         self._slopes = _make(
             "processing_objects.pyr_slopec:PyrSlopec",
             indices,
-            norm_factor=system.photons,
+            norm_factor=setup.photons,
             thr_value=NO_CLAMP,
             inputs={"in_pixels": detector.outputs["out_pixels"]},
         )
         self._camera = _make(
             "processing_objects.psf:PSF",
             self._parameters,
-            1e3 * system.imaging_wavelength_um,
+            1e3 * setup.imaging_wavelength_um,
             nd=_PSF_SAMPLING,
             inputs={"in_ef": self._field},
         )
-        self._train = [*air, mirror, beam, pyramid, detector, self._slopes]
+        self._train = [*screens, mirror, beam, pyramid, detector, self._slopes]
         for part in (*self._train, self._camera):
             part.setup()
         # photons per subaperture, over the whole detector
-        flux = system.photons * len(indices.ind_pup) * system.frame_rate_hz
+        flux = setup.photons * len(indices.ind_pup) * setup.hardware.frame_rate_hz
         self._field.S0 = flux / float(self._field.masked_area())
 
     def _make_mirror(self) -> Any:
@@ -344,7 +279,7 @@ class Optics:
         phase_nm[:2] += tilts_nm
         self._commands.value[:] = phase_nm
         if self._weather:
-            self._weather[0].value[:] = seeing * self.system.reference_seeing_arcsec
+            self._weather[0].value[:] = seeing * self.setup.reference_seeing_arcsec
         for signal in (self._commands, self._pupil, *self._weather):
             signal.generation_time = self._time_ns
         self._trigger(self._train)
@@ -374,61 +309,49 @@ class Optics:
                 part.trigger()
                 part.post_trigger()
 
-    def _make_air(self, screens: Path, frames: int, seed: int | None) -> Any:
-        system = self.system
-        side = system.screen_pixels(frames)
-        if side > _LARGEST_SCREEN:
+    def _make_air(self) -> Any:
+        setup = self.setup
+        if setup.screen_pixels > _LARGEST_SCREEN:
+            frames = setup.settle_frames + setup.frames
             raise ProblemError(
                 f"a run must fit into a phase screen of {_LARGEST_SCREEN} pixels; {frames} frames "
-                f"at {system.wind_speed_m_s:g} m/s need {side}. Run fewer frames, with several "
-                "seeds."
+                f"at {setup.wind_speed_m_s:g} m/s need {setup.screen_pixels}. Run fewer frames, "
+                "with several seeds."
             )
         weather = {
-            "seeing": system.reference_seeing_arcsec,
-            "wind_speed": system.wind_speed_m_s,
-            "wind_direction": system.wind_direction_deg,
+            "seeing": setup.reference_seeing_arcsec,
+            "wind_speed": setup.wind_speed_m_s,
+            "wind_direction": setup.wind_direction_deg,
         }
         inputs = {name: self._make_input(np.array([value])) for name, value in weather.items()}
         self._weather = list(inputs.values())
-        # SPECULA's file name rounds the pixel, so each kind of screen has its own directory
-        facts = [system.pixel_m, system.outer_scale_m, side, specula_version()]
-        folder = screens / hashlib.sha256(repr(facts).encode()).hexdigest()[:16]
-        seed = (seed or 0) + 1
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            _discard_damaged(folder.glob(f"ps_seed{seed}_*.fits"))
+        with TemporaryDirectory() as folder:  # SPECULA writes its screen, and reads it at once
             return _make(
                 "processing_objects.atmo_evolution:AtmoEvolution",
                 self._parameters,
-                system.outer_scale_m,
+                setup.outer_scale_m,
                 [0.0],
                 [1.0],
-                data_dir=str(folder),
-                pixel_phasescreens=side,
-                seed=seed,
+                data_dir=folder,
+                pixel_phasescreens=setup.screen_pixels,
+                seed=setup.seed + 1,
                 inputs=inputs,
             )
-        except OSError as error:
-            raise OutputError(
-                f"cannot make or read a phase screen in {folder}: {error}. Name another "
-                "directory with --cache.",
-                path=folder,
-            ) from error
 
     def _make_pyramid(self) -> tuple[Any, Any]:
-        system = self.system
-        across = system.subapertures_across
+        setup = self.setup
+        across = setup.subapertures_across
         side = 2 * across + 3 * _PUPIL_GAP
-        natural = system.sensing_wavelength_um * 1e-6 / system.pixel_m * 180 * 3600 / np.pi
-        steps = 4 * int(np.ceil(2 * np.pi * system.modulation_lambda_over_d / 4))
+        natural = setup.sensing_wavelength_um * 1e-6 / setup.pixel_m * 180 * 3600 / np.pi
+        steps = 4 * int(np.ceil(2 * np.pi * setup.modulation_lambda_over_d / 4))
         pyramid = _make(
             "processing_objects.modulated_pyramid:ModulatedPyramid",
             self._parameters,
-            1e3 * system.sensing_wavelength_um,
+            1e3 * setup.sensing_wavelength_um,
             min(natural, _FIELD_ARCSEC),
             across,
             output_resolution=side,
-            mod_amp=system.modulation_lambda_over_d,
+            mod_amp=setup.modulation_lambda_over_d,
             mod_step=steps,
             pup_dist=across + _PUPIL_GAP,
             inputs={"in_ef": self._field},
@@ -439,7 +362,7 @@ class Optics:
         y = middle + apart * np.array([-1, -1, 1, 1])
         rows, columns = np.mgrid[:side, :side]
         radius = np.hypot(columns - x[:, None, None], rows - y[:, None, None])
-        lit = (radius <= across / 2) & (radius >= system.obstruction * across / 2)
+        lit = (radius <= across / 2) & (radius >= setup.obstruction * across / 2)
         indices = np.stack([np.flatnonzero(one) for one in lit], axis=1)
         return pyramid, _make(
             "data_objects.pupdata:PupData",
@@ -450,19 +373,18 @@ class Optics:
             framesize=[side, side],
         )
 
-    def _make_detector(self, pyramid: Any, seed: int | None) -> Any:
-        noisy = seed is not None
+    def _make_detector(self, pyramid: Any, *, noisy: bool) -> Any:
         return _make(
             "processing_objects.ccd:CCD",
             self._parameters,
             [pyramid.final_ccd_side] * 2,
-            1 / self.system.frame_rate_hz,
+            1 / self.setup.hardware.frame_rate_hz,
             1.0,
             photon_noise=noisy,
             readout_noise=noisy,
-            readout_level=self.system.read_noise_electrons,
-            photon_seed=2 * (seed or 0),
-            readout_seed=2 * (seed or 0) + 1,
+            readout_level=self.setup.read_noise_electrons,
+            photon_seed=2 * self.setup.seed,
+            readout_seed=2 * self.setup.seed + 1,
             inputs={"in_i": pyramid.outputs["out_i"]},
         )
 
@@ -475,116 +397,28 @@ class Calibration:
     reference: FloatArray  # (q,): slopes of a flat wavefront
     # generalised inverse of the interaction matrix (slopes per nanometre of each mode)
     reconstructor: Reconstructor
-    key: str  # digest of everything that it depends on
-    cached: bool  # whether it came from the cache
-
-
-def cache_directory(path: str | os.PathLike[str] | None = None) -> Path:
-    """Return the directory for calibrations and phase screens; create it if it is missing."""
-    if path is None:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        path = Path(base) / "lbt_synth"
-    return make_directory(path)
 
 
 def calibrate(
-    system: EndToEndSystem,
-    *,
-    cache: str | os.PathLike[str] | None = None,
-    progress: Callable[[int], None] | None = None,
+    setup: EndToEndSetup, *, progress: Callable[[int], None] | None = None
 ) -> Calibration:
-    """Compute the modes, measure the interaction matrix without noise, and invert it.
+    """Compute the modes, push and pull each of them on a flat wavefront, without noise, and invert.
 
-    Each mode is pushed and pulled by ``system.calibration_nm`` on a flat wavefront. The
-    result is cached under a digest of everything that it depends on, including SPECULA's
-    version; what a damaged file held is measured again.
-
-    Parameters
-    ----------
-    system : EndToEndSystem
-        The system.
-    cache : path-like, optional
-        Directory of the cache; see :func:`cache_directory`.
-    progress : callable, optional
-        Called with the number of modes measured since its last call.
-
-    Returns
-    -------
-    Calibration
-        The calibration.
-
-    Raises
-    ------
-    MissingExtraError
-        If SPECULA is missing.
-    ProblemError
-        If the mirror cannot carry the modes, or the sensor cannot tell them apart.
-    OutputError
-        If the cache cannot be written.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> system = lbt.load_config("examples/lbt.yaml").end_to_end.system
-    >>> found = lbt.interop.calibrate(system)  # doctest: +SKIP
-    >>> found.reconstructor.condition_number < 12  # doctest: +SKIP
-    True
-    >>> lbt.interop.calibrate("examples/lbt.yaml")
-    Traceback (most recent call last):
-        ...
-    lbt_synth.errors.ProblemError: expected an EndToEndSystem; got str.
+    ``progress`` is called with the number of modes measured since its last call.
     """
-    require_instance(system, EndToEndSystem)
-    facts = {"layout": _LAYOUT, "specula": specula_version(), **system.calibration_facts()}
-    key = hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
-    path = cache_directory(cache) / f"calibration-{key[:16]}.npz"
-    arrays = _read_cached(path, key)
-    cached = arrays is not None
-    if arrays is None:
-        arrays = _measure(system, progress)
-        meta = {"key": key, "facts": facts}
-        meta["digest"] = digest(arrays, meta)
-        write_atomically(path, npz_bytes(arrays, json.dumps(meta)))
-    elif progress is not None:
-        progress(system.modes)
-    return Calibration(
-        modes=Modes(mask=arrays["MASK"] > 0, shapes=arrays["SHAPES"].astype(np.float32)),
-        reference=frozen_copy(arrays["REFERENCE"]),
-        reconstructor=reconstructor(arrays["INTERACTION"]),
-        key=key,
-        cached=cached,
-    )
-
-
-def _measure(
-    system: EndToEndSystem, progress: Callable[[int], None] | None
-) -> dict[str, npt.NDArray[Any]]:
-    """Compute the modes; measure the slopes of a flat wavefront and of each mode."""
-    modes = make_modes(system)
-    optics = Optics(system, modes)
+    require_instance(setup, EndToEndSetup)
+    modes = make_modes(setup)
+    optics = Optics(setup, modes)
     still, n = np.zeros(2), len(modes.shapes)
     reference = optics.expose(np.zeros(n), still)
     matrix = np.empty((reference.size, n))
     for mode in range(n):
         push = np.zeros(n)
-        push[mode] = -system.calibration_nm  # a correction is subtracted from the phase
+        push[mode] = -setup.calibration_nm  # a correction is subtracted from the phase
         pair = optics.expose(push, still) - optics.expose(-push, still)
-        matrix[:, mode] = pair / (2 * system.calibration_nm)
+        matrix[:, mode] = pair / (2 * setup.calibration_nm)
         if progress is not None:
             progress(1)
-    return {
-        "MASK": modes.mask.astype(np.uint8),
-        "SHAPES": modes.shapes,
-        "REFERENCE": reference,
-        "INTERACTION": matrix,
-    }
-
-
-def _read_cached(path: Path, key: str) -> dict[str, npt.NDArray[Any]] | None:
-    """Return the arrays of a file, None if it is missing, damaged or another one."""
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-        arrays, text = read_npz(path.read_bytes())
-        meta = json.loads(text)
-        if meta["key"] == key and meta["digest"] == digest(arrays, meta):
-            return dict(arrays)
-    return None
+    return Calibration(
+        modes=modes, reference=frozen_copy(reference), reconstructor=reconstructor(matrix)
+    )

@@ -1,13 +1,11 @@
-"""The end-to-end simulation: its set-up, and a controller in closed loop with SPECULA's optics."""
+"""The end-to-end simulation: a controller in closed loop with SPECULA's optics."""
 
 from __future__ import annotations
 
 import math
-import os
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,67 +14,35 @@ from lbt_synth.design.modal import MixedController
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.interop.specula.optics import (
+    RAMP_FRAMES,
     Calibration,
-    EndToEndSystem,
+    EndToEndSetup,
     Modes,
     Optics,
-    cache_directory,
     calibrate,
 )
 from lbt_synth.linear import Controller
 from lbt_synth.loop.disturbances import draw_others, draw_phase
 from lbt_synth.loop.simulation import SteppedController, run_frames
-from lbt_synth.models import LoopHardware, Truth
-from lbt_synth.models.sensor_suite import Motions
-from lbt_synth.models.vibration import TrueVibration
-from lbt_synth.validation import (
-    FloatArray,
-    NotNegative,
-    check_fields,
-    number,
-    require_instance,
-)
+from lbt_synth.models import LoopHardware
+from lbt_synth.validation import FloatArray, number, require_instance
 
-RAMP_FRAMES = 200
-LARGEST_SEED = 2**31 - 2  # the detector doubles it, in 32 bits
 _BATCHES = 8
 _TIP_TILT = slice(2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EndToEndRun:
-    """Series and images of a closed loop, after it has settled.
+    """Series and images of a closed loop, after it has settled; row k of a series is frame k."""
 
-    Row k of a series is frame k: ``measurements`` y(k) come from the exposure of frame
-    k-1, ``commands`` u(k) from y(k), and ``residual_nm`` is the phase of exposure k.
-
-    Attributes
-    ----------
-    system : EndToEndSystem
-        What was simulated.
-    strehl_series, other_modes_series : (frames,) ndarray
-        Intensity in the image's centre over that of a perfect image; without tip and tilt.
-    measurements, commands, residual_nm : (frames, modes) ndarray
-        Modal coefficients [nm rms].
-    psf, psf_pixel_mas : (h, h) ndarray, float
-        Mean image, of sum 1, and its pixel [mas].
-    seed, settle_frames : int
-        Seed of turbulence, vibrations and noise; frames run before these, and dropped.
-    seconds : float
-        Time that the loop took [s].
-    """
-
-    system: EndToEndSystem
-    strehl_series: FloatArray
-    other_modes_series: FloatArray
-    measurements: FloatArray
-    commands: FloatArray
-    residual_nm: FloatArray
-    psf: FloatArray
+    setup: EndToEndSetup
+    strehl_series: FloatArray  # intensity in the image's centre over that of a perfect image
+    other_modes_series: FloatArray  # the same without tip and tilt
+    measurements: FloatArray  # (frames, modes): y(k) [nm rms], from the exposure of frame k-1
+    commands: FloatArray  # (frames, modes): u(k) [nm rms], from y(k)
+    residual_nm: FloatArray  # (frames, modes): phase of exposure k [nm rms]
+    psf: FloatArray  # (h, h): mean image, of sum 1
     psf_pixel_mas: float
-    seed: int
-    settle_frames: int
-    seconds: float
 
     @property
     def frames(self) -> int:
@@ -176,13 +142,12 @@ def unread_sensors(design: Design) -> tuple[str, ...]:
     return () if hardware is None else tuple(s.name for s in hardware.suite.wavefront)
 
 
-def accompany_filter(
-    design: Design, shaken: Truth, *, frames: int, settle_frames: int, seed: int
-) -> AccompaniedFilter:
+def accompany_filter(design: Design, setup: EndToEndSetup) -> AccompaniedFilter:
     """Return a filter of tip and tilt with the readings of its accelerometers in a run.
 
     Readings follow the motions of :func:`run_end_to_end`; the pyramid is the only wavefront sensor.
     """
+    shaken = setup.shaken
     hardware = require_hardware(design, "an end-to-end simulation")
     channels = hardware.suite.channels
     if (hardware.n_measurements, hardware.n_commands) != (2, 2):
@@ -196,8 +161,9 @@ def accompany_filter(
             " Give sensors, and accelerometers of each vibration, in the configuration."
         )
     missing = frozenset(unread_sensors(design))
-    size = {"frames": settle_frames + frames, "cases": 1, "zero_frame": settle_frames}
-    rng = np.random.default_rng(seed)
+    settle = setup.settle_frames
+    size = {"frames": settle + setup.frames, "cases": 1, "zero_frame": settle}
+    rng = np.random.default_rng(setup.seed)
     _, lines = draw_phase(shaken, hardware, rng=rng, oscillators=True, frame_means=True, **size)
     (own_rng,) = rng.spawn(1)
     others = draw_others(shaken, hardware, lines, own_rng, **size)
@@ -206,126 +172,45 @@ def accompany_filter(
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class EndToEndSetup:
-    """An end-to-end simulation as a configuration describes it.
-
-    Parameters
-    ----------
-    system : EndToEndSystem
-        Telescope, air, pyramid, mirror and camera.
-    vibrations : tuple of Vibration, SinusoidalVibration or DriftingVibration
-        Vibrations of tip and tilt.
-    motions : tuple of mapping
-        For each vibration, how channels of accelerometers move with it; only designs of several
-        sensors read them.
-    frames, settle_frames, seed : int
-        Length of a run, and its seed.
-    gain : float
-        Integrator gain of every mode that no filter controls.
-    leak, leak_from_mode : float, int
-        Leak of the integrators, and the first mode, counted from 0, that has it: it frees corners
-        of the mirror that a pyramid traps at whole turns of the phase.
-
-    Raises
-    ------
-    ProblemError
-        If a value is out of its range.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> setup = lbt.load_config("examples/lbt.yaml").end_to_end
-    >>> setup.controller(None).n_modes
-    672
-    """
-
-    system: EndToEndSystem
-    vibrations: tuple[TrueVibration, ...] = ()
-    motions: Motions = ()
-    frames: Annotated[int, ("at_least", 2)] = 1600
-    settle_frames: Annotated[int, ("at_least", RAMP_FRAMES)] = 400
-    seed: Annotated[int, ("at_least", 0), ("at_most", LARGEST_SEED)] = 0
-    gain: NotNegative = 0.5
-    leak: Annotated[float, ("at_least", 0), ("at_most", 1)] = 0.97
-    leak_from_mode: Annotated[int, ("at_least", 2)] = 50
-
-    def __post_init__(self) -> None:
-        check_fields(self, vibrations=tuple(self.vibrations))
-
-    @property
-    def leaks(self) -> FloatArray:
-        """Leak of each mode's integrator, (modes,)."""
-        leaks = np.ones(self.system.modes)
-        leaks[self.leak_from_mode :] = self.leak
-        return leaks
-
-    def controller(self, filter: Any, *, tip_tilt_gain: float | None = None) -> MixedController:  # noqa: A002
-        """Return the mixed controller for :func:`run_end_to_end`, with a filter for tip and tilt.
-
-        Parameters
-        ----------
-        filter : Design, Controller, object with ``step(y)`` and ``reset()``, or None
-            Controller of tip and tilt, two measurements and two commands; None for
-            integrators, as classical control has them. One of another loop is refused. A design
-            of several sensors has accelerometers that follow the vibrations of a run with the
-            frames and the seed of this set-up; further wavefront sensors are not read.
-        tip_tilt_gain : float, optional
-            Integrator gain of tip and tilt where there is no filter.
-        """
-        if getattr(filter, "other_sensors", ()):
-            filter = accompany_filter(  # noqa: A001
-                filter,
-                self.shaken,
-                frames=self.frames,
-                settle_frames=self.settle_frames,
-                seed=self.seed,
-            )
-        expected = self.system.hardware
-        hardware = getattr(filter, "hardware", None) or expected
-        loops = [(h.frame_rate_hz, h.delay_frames, h.mirror) for h in (expected, hardware)]
-        if loops[0] != loops[1]:
-            mirror = "" if hardware.mirror == expected.mirror else ", and for another mirror"
-            raise ProblemError(
-                "the filter must be for the loop of the configuration, "
-                f"{expected.frame_rate_hz:g} Hz and {expected.delay_frames:g} frames; got one for "
-                f"{hardware.frame_rate_hz:g} Hz and {hardware.delay_frames:g} frames{mirror}. "
-                "Design it from this configuration."
-            )
-        gains = np.full(self.system.modes, self.gain)
-        if tip_tilt_gain is not None:
-            gains[:2] = number(tip_tilt_gain, "tip_tilt_gain", at_least=0)
-        return MixedController(filter=filter, gains=gains, leak=self.leaks)
-
-    @property
-    def shaken(self) -> Truth:
-        """The vibrations, and how channels of accelerometers move with them."""
-        return Truth(turbulence=None, vibrations=self.vibrations, motions=self.motions)
-
-    def run(
-        self,
-        filter: Any,  # noqa: A002
-        *,
-        tip_tilt_gain: float | None = None,
-        **options: Any,
-    ) -> EndToEndRun:
-        """Close the loop with :meth:`controller`, with options of :func:`run_end_to_end`."""
-        return run_end_to_end(self, self.controller(filter, tip_tilt_gain=tip_tilt_gain), **options)
+def mix_controller(
+    setup: EndToEndSetup,
+    filter: Any,  # noqa: A002
+    *,
+    tip_tilt_gain: float | None = None,
+) -> MixedController:
+    """Return the controller of all modes: a filter of tip and tilt, integrators for the others."""
+    if getattr(filter, "other_sensors", ()):
+        filter = accompany_filter(filter, setup)  # noqa: A001
+    expected = setup.hardware
+    hardware = getattr(filter, "hardware", None) or expected
+    loops = [(h.frame_rate_hz, h.delay_frames, h.mirror) for h in (expected, hardware)]
+    if loops[0] != loops[1]:
+        mirror = "" if hardware.mirror == expected.mirror else ", and for another mirror"
+        raise ProblemError(
+            "the filter must be for the loop of the configuration, "
+            f"{expected.frame_rate_hz:g} Hz and {expected.delay_frames:g} frames; got one for "
+            f"{hardware.frame_rate_hz:g} Hz and {hardware.delay_frames:g} frames{mirror}. "
+            "Design it from this configuration."
+        )
+    gains = np.full(setup.modes, setup.gain)
+    if tip_tilt_gain is not None:
+        gains[:2] = number(tip_tilt_gain, "tip_tilt_gain", at_least=0)
+    return MixedController(filter=filter, gains=gains, leak=setup.leaks)
 
 
 def run_end_to_end(
     setup: EndToEndSetup,
-    controller: SteppedController,
+    controller: Any,
     *,
+    tip_tilt_gain: float | None = None,
     calibration: Calibration | None = None,
-    cache: str | os.PathLike[str] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> EndToEndRun:
     """Close the loop with a pyramid, a mirror and moving air, all simulated by SPECULA.
 
     In frame k, as in :class:`LoopHardware`: the controller is given y(k), the modal
     coefficients of the slopes of exposure k-1, and returns u(k); the mirror of exposure k
-    has the shape of ``system.hardware.mirror_taps`` times u(k), u(k-1), ...; a fractional
+    has the shape of ``setup.hardware.mirror_taps`` times u(k), u(k-1), ...; a fractional
     delay and a moving mirror enter as their mean over the exposure. The seeing rises
     from zero in the first 200 frames, so that the sensor does not lose the phase by whole
     turns before the loop is closed.
@@ -336,78 +221,68 @@ def run_end_to_end(
     Parameters
     ----------
     setup : EndToEndSetup
-        Telescope, vibrations, length and seed.
-    controller : object with ``step(y)`` and ``reset()``
-        From modal measurements to modal commands, (modes,), such as :class:`MixedController`.
+        Telescope, vibrations, length and seed: ``config.end_to_end``.
+    controller : Design, Controller, object with ``step(y)`` and ``reset()``, MixedController, None
+        Controller of tip and tilt, two measurements and two commands, beside integrators for the
+        other modes; None for integrators alone; or a MixedController of all modes. One of another
+        loop is refused. A design of several sensors has accelerometers that follow the vibrations;
+        further wavefront sensors are not read.
+    tip_tilt_gain : float, optional
+        Integrator gain of tip and tilt where there is no filter.
     calibration : Calibration, optional
-        Calibration of the system; by default from the cache, or measured.
-    cache : path-like, optional
-        Directory for calibrations and phase screens.
+        Calibration of another run of this system; by default it is measured.
     progress : callable, optional
         Called with the number of frames run since its last call.
 
     Returns
     -------
     EndToEndRun
-        Strehl ratio, series, images, optical gains.
+        ``strehl`` and its ``strehl_error``, ``rms_nm`` and ``optical_gain()`` of each mode, the
+        series ``measurements``, ``commands`` and ``residual_nm`` (frames, modes) [nm rms], and the
+        mean image ``psf``.
 
     Raises
     ------
     MissingExtraError
         If SPECULA is missing.
     ProblemError
-        If the controller does not return one finite command per mode.
-    OutputError
-        If the cache cannot be written.
+        If the controller is for another loop, or does not return one finite command per mode.
 
     Examples
     --------
     >>> import lbt_synth as lbt
     >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> setup, design = config.end_to_end, lbt.kalman(config.plant)
-    >>> control = setup.controller(design)
-    >>> run = lbt.interop.run_end_to_end(setup, control)        # doctest: +SKIP
+    >>> run = lbt.interop.run_end_to_end(
+    ...     config.end_to_end, lbt.kalman(config.plant)
+    ... )  # doctest: +SKIP
 
-    It takes half a minute; what cannot run is refused at once:
+    It takes two minutes; what cannot run is refused at once:
 
-    >>> lbt.interop.run_end_to_end(setup, design)
+    >>> other = lbt.integrator(lbt.LoopHardware(frame_rate_hz=1000), gain=0.5)
+    >>> lbt.interop.run_end_to_end(config.end_to_end, other)
     Traceback (most recent call last):
         ...
-    lbt_synth.errors.ProblemError: controller must have step(y) and reset(), as MixedController \
-has; got FilterDesign.
+    lbt_synth.errors.ProblemError: the filter must be for the loop of the configuration, 800 Hz \
+and 2 frames; got one for 1000 Hz and 2 frames. Design it from this configuration.
     """
     require_instance(setup, EndToEndSetup)
-    if not isinstance(controller, SteppedController):
-        raise ProblemError(
-            "controller must have step(y) and reset(), as MixedController has; "
-            f"got {type(controller).__name__}."
-        )
-    system, settle, seed = setup.system, setup.settle_frames, setup.seed
-    total = settle + setup.frames
+    if not isinstance(controller, MixedController):
+        controller = mix_controller(setup, controller, tip_tilt_gain=tip_tilt_gain)
+    settle = setup.settle_frames
     phase, _ = draw_phase(
         setup.shaken,
-        system.hardware,
-        frames=total,
+        setup.hardware,
+        frames=settle + setup.frames,
         cases=1,
-        rng=np.random.default_rng(seed),
+        rng=np.random.default_rng(setup.seed),
         zero_frame=settle,
         frame_means=True,
         oscillators=True,
     )
-    if calibration is None:
-        calibration = calibrate(system, cache=cache)
-    screens = cache_directory(cache) / "screens"
-    optics = Optics(system, calibration.modes, screens=screens, frames=total, seed=seed)
-    started = time.perf_counter()
+    calibration = calibrate(setup) if calibration is None else calibration
+    optics = Optics(setup, calibration.modes, air=True)
     fields = _run_frames(optics, calibration, controller, phase[0], settle, progress)
-    return EndToEndRun(
-        system=system,
-        **fields,
-        psf_pixel_mas=optics.psf_pixel_mas,
-        seed=seed,
-        settle_frames=settle,
-        seconds=time.perf_counter() - started,
-    )
+    return EndToEndRun(setup=setup, **fields, psf_pixel_mas=optics.psf_pixel_mas)
 
 
 def _run_frames(
@@ -443,7 +318,7 @@ def _run_frames(
         if progress is not None:
             progress(1)
 
-    taps = optics.system.hardware.mirror_taps
+    taps = optics.setup.hardware.mirror_taps
     run_frames(controller, measure, expose, frames=len(tilts), shape=(n,), taps=taps)
     return {**out, "strehl_series": strehl, "other_modes_series": others, "psf": psf / kept}
 
@@ -453,5 +328,5 @@ def _measure_residual(modes: Modes, optics: Optics) -> tuple[FloatArray, float]:
     phase = optics.phase_nm()
     coefficients = modes.coefficients(phase)
     rest = phase - coefficients[:2].astype(np.float32) @ modes.shapes[:2]
-    turn = 2 * np.pi / (1e3 * optics.system.imaging_wavelength_um)
+    turn = 2 * np.pi / (1e3 * optics.setup.imaging_wavelength_um)
     return coefficients, float(np.abs(np.mean(np.exp(1j * turn * rest))) ** 2)

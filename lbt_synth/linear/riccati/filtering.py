@@ -86,34 +86,7 @@ def require_detectable(problem: EstimationProblem) -> None:
 
 
 def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
-    """Solve ``P = A P A' + Q - (A P C' + S)(R + C P C')^-1 (C P A' + S')``, for all phases.
-
-    ``lbt_synth.design.kalman`` returns the same filter as a certified design.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-        The problem.
-
-    Returns
-    -------
-    FilterRiccati
-        The stabilising solution and its gains.
-
-    Raises
-    ------
-    DetectabilityError
-        If there is no stabilising solution.
-    NumericalError
-        If the equation was not solved.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> p = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> round(float(lbt.linear.kalman_riccati(p).P[0, 0]), 12)
-    1.61803398875
-    """
+    """Solve ``P = A P A' + Q - (A P C' + S)(R + C P C')^-1 (C P A' + S')``, for all phases."""
     scaled, units = _in_noise_units(problem)
     constant = _over_a_period(scaled)
     require_detectable(constant)
@@ -355,38 +328,7 @@ def _central_gains(problem: EstimationProblem, t: int, gamma: float, P: FloatArr
 def gamma_riccati(
     problem: EstimationProblem, gamma: float, *, start: FilterRiccati | None = None
 ) -> FilterRiccati | None:
-    """Central H-infinity predictor of a level of gamma, by the gamma-Riccati equation.
-
-    ``lbt_synth.design.hinf`` finds the least gamma and returns a certified design.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-        The problem.
-    gamma : float
-        The level of the norm that the filter has to meet.
-    start : FilterRiccati, optional
-        The Kalman filter's solution, if it is at hand.
-
-    Returns
-    -------
-    FilterRiccati or None
-        None where no such filter exists.
-
-    Raises
-    ------
-    DetectabilityError
-        If no stable filter exists at all.
-    NumericalError
-        If the equation has a solution that was not reached accurately.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> p = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> lbt.linear.gamma_riccati(p, 1.0) is None, lbt.linear.gamma_riccati(p, 2.5) is None
-    (True, False)
-    """
+    """Return the central H-infinity predictor of a level of gamma; None where there is none."""
     start = kalman_riccati(problem) if start is None else start
     equation = GammaEquation(problem, start)
     return equation.solution(gamma, equation.trial(gamma))

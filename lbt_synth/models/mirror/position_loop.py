@@ -141,29 +141,10 @@ class PositionLoop:
     ) -> PositionLoop:
         """Choose the gains that would give a continuous loop this frequency and damping.
 
-        Sampling and delay take some of the damping away.
-
-        Parameters
-        ----------
-        natural_frequency_hz, damping : float
-            As in :class:`PositionLoop`.
-        bandwidth_hz : float
-            Natural frequency with the local loop, at least that without it [Hz].
-        bandwidth_damping : float, optional
-            Damping ratio with the local loop.
-        **options
-            feed_forward, sampling_hz, delay_samples and ramp_samples of :class:`PositionLoop`.
-
-        Returns
-        -------
-        PositionLoop
-            The loop.
-
-        Raises
-        ------
-        ProblemError
-            If a value is out of its range, the loop would lower stiffness or damping, or it
-            is unstable.
+        Sampling and delay take some of the damping away. The bandwidth is the natural frequency
+        with the local loop, at least that without it [Hz]; ``bandwidth_damping`` is the damping
+        ratio with it, and ``options`` are the other fields of the class. A value out of its range,
+        and a loop that would lower stiffness or damping or is unstable, raise a ProblemError.
         """
         natural = 2 * np.pi * number(natural_frequency_hz, "natural_frequency_hz", above=0)
         air = number(damping, "damping", at_least=0)

@@ -184,14 +184,6 @@ class TipTiltPlant(EstimationProblem):
         A prediction that reaches one frame further serves a loop that is one frame later, so the
         plant returned has a delay of ``delay_frames + frames - 1``. A delay below one frame, or
         ``frames`` that are no integer, raise a ProblemError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-        >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5)
-        >>> [plant.ahead(frames).hardware.delay_frames for frames in (0, 1, 2)]
-        [1.0, 2.0, 3.0]
         """
         steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON)
         if steps == 1:
@@ -262,26 +254,11 @@ class TipTiltPlant(EstimationProblem):
         return assemble(alone)
 
     def with_sensors(self, suite: SensorSuite, motions: Motions = ()) -> TipTiltPlant:
-        """Return the plant of the loop with other sensors beside its own.
+        """Return the plant of the loop with other sensors beside its own, of their common period.
 
-        Parameters
-        ----------
-        suite : SensorSuite
-            The other sensors.
-        motions : tuple of mapping, optional
-            For each vibration of the plant, in order, the :class:`Motion` of each channel that it
-            moves; by default no channel moves.
-
-        Returns
-        -------
-        TipTiltPlant
-            The plant, of the common period of all sensors.
-
-        Raises
-        ------
-        ProblemError
-            If a rate is not a fraction of the frame rate, a delay is too short, or names or sizes
-            clash.
+        ``motions`` hold, for each vibration of the plant in order, the :class:`Motion` of each
+        channel that it moves; by default no channel moves. A rate that is no fraction of the frame
+        rate, a delay that is too short, and names or sizes that clash raise a ProblemError.
 
         Examples
         --------

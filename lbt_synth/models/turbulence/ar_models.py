@@ -37,48 +37,11 @@ from lbt_synth.validation import (
 _PANELS = 100  # of the contrast
 _FREQUENCIES, _DAMPINGS = (0.25, 0.5, 1.0), (0.01, 0.05, 0.2, 0.6)  # starts; the first in V / D
 _LEAST_DAMPING = 1e-6  # less is no turbulence
-
-
 _FURTHEST = 30  # the tail of the integral begins at this multiple of the order plus 2
 
 
-def le_roux_pole(
-    *, wind_speed_m_s: float, diameter_m: float, frame_rate_hz: float, radial_order: int = 1
-) -> float:
-    """Pole of the AR1 model, ``exp(-2 pi f_c / f_s)`` with ``f_c = 0.3 (n + 1) V / D``.
-
-    Parameters
-    ----------
-    wind_speed_m_s, diameter_m, frame_rate_hz : float
-        Wind speed V [m/s]; telescope diameter D [m]; sampling frequency f_s [Hz].
-    radial_order : int, optional
-        Radial order n of the Zernike mode; 1 for tip and tilt.
-
-    Returns
-    -------
-    float
-        The pole, in (0, 1).
-
-    Raises
-    ------
-    ProblemError
-        If a value is out of its range.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> round(lbt.models.le_roux_pole(wind_speed_m_s=20, diameter_m=8.22, frame_rate_hz=800), 5)
-    0.9886
-    """
-    order = integer(radial_order, "radial_order", at_least=1)
-    speed = number(wind_speed_m_s, "wind_speed_m_s", above=0)
-    diameter = number(diameter_m, "diameter_m", above=0)
-    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
-    return float(pole(speed, diameter, rate, order))
-
-
 def pole(speed: Any, diameter: float, rate: float, order: Any = 1) -> Any:
-    """Pole for one or many wind speeds [m/s] or radial orders."""
+    """Pole of AR1 models, with the cut-off at 0.3 (n + 1) V / D, for wind speeds V or orders n."""
     return np.exp(-2 * np.pi * 0.3 * (order + 1) * speed / diameter / rate)
 
 

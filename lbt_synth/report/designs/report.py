@@ -14,7 +14,7 @@ from scipy.ndimage import label
 from lbt_synth.config import Config
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import LbtSynthError, ProblemError
-from lbt_synth.interop import frame_cost
+from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.linear import Controller
 from lbt_synth.loop import (
     ClosedLoop,

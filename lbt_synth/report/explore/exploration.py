@@ -17,7 +17,7 @@ from lbt_synth.config import Config
 from lbt_synth.config.load import build_config, validate_sections
 from lbt_synth.config.schema import FileSection
 from lbt_synth.design import Design
-from lbt_synth.linear import hinf_norm, largest_singular_values
+from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.method import Method
@@ -365,7 +365,7 @@ def show_design(design: Design, config: Config, start: Config, shift_hz: float) 
         "explore-poles": (poles.real, poles.imag),
     }
     if design.is_estimator:
-        error = largest_singular_values(design.error_system(), grid)
+        error = spectral_norms(design.error_system().frequency_response(grid))
         curves["explore-sigma"] = grid, shown_unit("nm")[1] * error
     now = int(np.searchsorted(shifts, shift_hz))
     return Shown(

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import largest_singular_values
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins
 from lbt_synth.loop.margins import BrokenLoop, broken_loops
@@ -174,7 +173,7 @@ def sigma_curves(
         if design.is_estimator:
             problem = design.problem
             system = design.error_system(problem.with_unit_weights() if unit_weights else problem)
-            error = largest_singular_values(system, grid)
+            error = spectral_norms(system.frequency_response(grid))
         if name in loops and loops[name].is_stable:
             S, N = (
                 loops[name].sensitivity(grid),

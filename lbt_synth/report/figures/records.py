@@ -11,7 +11,8 @@ from scipy.stats import kstwobign
 
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification import IdentifiedAxis, IdentifiedLine, IdentifiedModel
+from lbt_synth.identification import IdentifiedModel
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import ClosedLoop, Simulation, close_loop

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.interop import EndToEndRun
+from lbt_synth.interop.specula.simulation import EndToEndRun
 from lbt_synth.methods.registry import design_label
 from lbt_synth.models import LoopHardware
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, count_columns, drawing
@@ -367,19 +367,19 @@ def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
     size = run.psf.shape[0]
     position_mas = (np.arange(size) - size // 2) * run.psf_pixel_mas
     reach_mas = min(_SHOWN_MAS, size / 2 * run.psf_pixel_mas)
-    seconds = np.arange(run.frames) / run.system.frame_rate_hz
+    seconds = np.arange(run.frames) / run.setup.hardware.frame_rate_hz
     x_axis, y_axis = (
         {"label": name, "unit": "mas", "low": -reach_mas, "high": reach_mas} for name in "xy"
     )
     with drawing([2.4, 2.4, PANEL_IN], columns=2, axes=axes) as (image, modes, series):
-        title = f"{run.system.imaging_wavelength_um:g} µm, Strehl ratio {100 * run.strehl:.1f} %"
+        title = f"{run.setup.imaging_wavelength_um:g} µm, Strehl ratio {100 * run.strehl:.1f} %"
         image.set_axes(x_axis, y_axis, title=title, equal=True)
         values = np.maximum(run.psf / run.psf.max(), _FAINTEST)
         image.map(position_mas, position_mas, values, "intensity / peak", log=True)
         x_axis = {"label": "mode (1 tip, 2 tilt)", "log": True}
         y_axis = {"label": "residual", "unit": "nm rms", "log": True}
         modes.set_axes(x_axis, y_axis, title="all modes")
-        numbers = np.arange(1.0, run.system.modes + 1)
+        numbers = np.arange(1.0, run.setup.modes + 1)
         modes.curve("residual", numbers, run.rms_nm, width=0.8, quiet=True)
         y_axis = {"label": "residual", "unit": "nm rms wavefront"}
         series.set_axes({"label": "time", "unit": "s"}, y_axis, title="tip and tilt")

@@ -12,8 +12,11 @@ from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification import accelerometer_transfers, loop_record
-from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
+from lbt_synth.identification import loop_record
+from lbt_synth.identification.accelerometers.transfers import (
+    AccelerometerTransfers,
+    accelerometer_transfers,
+)
 from lbt_synth.loop.disturbances import draw_others, draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
 
@@ -239,7 +242,8 @@ def test_a_record_of_39_s_and_5_channels_takes_little_memory():
 from pathlib import Path
 import numpy as np
 import lbt_synth as lbt
-from lbt_synth.identification import accelerometer_transfers, loop_record
+from lbt_synth.identification import loop_record
+from lbt_synth.identification.accelerometers.transfers import accelerometer_transfers
 rng = np.random.default_rng(0)
 line = lbt.Vibration(frequency_hz=90, damping=0.02, rms_nm=60).ar_model(1000)
 v = np.zeros(39_002)
@@ -247,8 +251,8 @@ for k in range(2, v.size):
     v[k] = line.coefficients @ v[[k - 1, k - 2]] + line.driving_rms_nm * rng.standard_normal()
 z = v[1:-1] + 5 * rng.standard_normal(39_000)
 a = -1e-9 * (2 * np.pi * 90) ** 2 * v[1:-1, None] + 1e-3 * rng.standard_normal((39_000, 5))
-model = lbt.identify(record := lbt.identification.loop_record(z, frame_rate_hz=1000, unit="nm"))
-used = lbt.identification.accelerometer_transfers(model, record, a).used
+model = lbt.identify(record := loop_record(z, frame_rate_hz=1000, unit="nm"))
+used = accelerometer_transfers(model, record, a).used
 status = Path("/proc/self/status").read_text()  # the peak that getrusage gives is the parent's
 print(len(used), int(status.split("VmHWM:")[1].split()[0]) / 1024)
 """

@@ -21,7 +21,6 @@ from lbt_synth.identification.commands.verdict import (
     judge_fitted_gains,
     likely_factors,
     list_repairs,
-    wrong_scale,
 )
 
 # coefficients and drive of the turbulence [nm]; lines (Hz, damping, nm, direction); noise [nm],
@@ -98,7 +97,7 @@ def hidden_gain_loop(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_a_good_record_is_accepted() -> None:
     verdict = explain_commands(record(*ordinary_loop(1)))
-    assert (verdict.explanation, verdict.accepted, verdict.options) == (AS_GIVEN, True, "")
+    assert (verdict.explanation, verdict.accepted, verdict.repair.options) == (AS_GIVEN, True, "")
     assert verdict.overruled == ()
     np.testing.assert_allclose(verdict.gain, 0.7, rtol=0.25)
     verdict.require_accepted()
@@ -117,7 +116,7 @@ def test_a_filter_is_known_although_its_measurements_were_rounded() -> None:
         rate = config.hardware.frame_rate_hz
         return explain_commands(
             loop_record(seen[5:-5], moved[5:-5], frame_rate_hz=rate, delay_frames=2, unit="nm")
-        ).options
+        ).repair.options
 
     assert options(4.0) == ""
     assert options(4.0, shift=1) == "--command-shift-frames -1"
@@ -128,10 +127,10 @@ def test_a_filter_is_known_although_its_measurements_were_rounded() -> None:
 def test_a_fault_is_named_and_repaired(fault) -> None:
     wrong = wrong_record(fault)
     verdict = explain_commands(wrong)
-    assert verdict.options == FAULTS[fault][1]
+    assert verdict.repair.options == FAULTS[fault][1]
     with pytest.raises(lbt.errors.RecordError, match=verdict.explanation[:20]) as caught:
         verdict.require_accepted()
-    assert caught.value.options == verdict.options
+    assert caught.value.options == verdict.repair.options
     assert verdict.explanation in verdict.overruled[0]
     if fault == "turned":
         assert explain_commands(repair_commands(wrong, verdict.repair)).accepted
@@ -144,8 +143,8 @@ def test_a_wrong_delay(delay) -> None:
     if delay == 2.5:  # 20 s of one axis hardly tell half a frame
         assert verdict.accepted
     else:
-        assert verdict.options == "--delay-frames 2"
-        assert verdict.delay_frames == 2
+        assert verdict.repair.options == "--delay-frames 2"
+        assert verdict.repair.delay_frames == 2
 
 
 def test_commands_that_are_shaken_need_no_law() -> None:
@@ -190,14 +189,16 @@ def test_the_law_decides_where_crowded_lines_mislead_a_coarse_spectrum(seed, fau
     spoil, options = FAULTS[fault]
     y, u = spoil(*hidden_gain_loop(seed))
     verdict = explain_commands(loop_record(y, u, frame_rate_hz=1000, delay_frames=2, unit="nm"))
-    assert verdict.options == options
+    assert verdict.repair.options == options
 
 
 def test_a_known_gain_decides_on_the_scale() -> None:
     y, u = ordinary_loop()
     assert explain_commands(record(y, u / 2), sensor_gain=1.4).accepted
     assert explain_commands(record(y, u), sensor_gain=[0.6, 0.8]).accepted
-    assert explain_commands(record(y, u), sensor_gain=[0.1]).options.startswith("--command-scale")
+    assert explain_commands(record(y, u), sensor_gain=[0.1]).repair.options.startswith(
+        "--command-scale"
+    )
     seen = loop_record(y, frame_rate_hz=RATE, delay_frames=2, unit="nm")
     with pytest.raises(lbt.errors.ProblemError, match="no commands to explain"):
         explain_commands(seen)
@@ -237,7 +238,7 @@ def test_what_cannot_be_is_named(spoil, words: str) -> None:
     verdict = explain_commands(record(*spoil(*ordinary_loop())))
     assert words in verdict.explanation
     assert not verdict.accepted
-    assert verdict.options == ""
+    assert verdict.repair.options == ""
 
 
 def test_an_axis_whose_commands_stand_still_is_an_open_loop() -> None:
@@ -250,14 +251,14 @@ def test_an_axis_whose_commands_stand_still_is_an_open_loop() -> None:
         assert explain_commands(record(y, still), sensor_gain=gain).notes == verdict.notes
     assert np.isnan(verdict.gain[1])
     assert verdict.gain[0] == pytest.approx(0.7, rel=0.3)
-    assert explain_commands(record(y, -still)).options == "--command-sign -1"
+    assert explain_commands(record(y, -still)).repair.options == "--command-sign -1"
 
 
 @pytest.mark.parametrize("late", [4, 8])
 def test_a_long_shift_is_that_of_the_law(late: int) -> None:
     y, u = ordinary_loop()
     verdict = explain_commands(record(y[late:], u[:-late]))
-    assert verdict.options == f"--command-shift-frames -{late}"
+    assert verdict.repair.options == f"--command-shift-frames -{late}"
 
 
 @pytest.mark.parametrize("step_nm", [6.0, 30.0])
@@ -267,7 +268,7 @@ def test_what_a_law_leaves_unexplained_is_said(step_nm: float) -> None:
     seen = record(y, step_nm * np.round(u / step_nm))
     verdict = explain_commands(seen)
     assert verdict.accepted is (step_nm < 30)
-    assert verdict.options == ""
+    assert verdict.repair.options == ""
     words = (*verdict.notes, verdict.explanation)
     assert any("of their changes unexplained" in each for each in words) is (step_nm > 1)
     assert explain_commands(seen, sensor_gain=0.7).accepted is (step_nm < 30)
@@ -286,7 +287,7 @@ def test_what_a_law_leaves_unexplained_is_said(step_nm: float) -> None:
 )
 def test_gains_far_above_plausible_ones_are_another_unit(gains, errors, options):
     verdict = judge_fitted_gains(np.array(gains), np.array(errors))
-    assert (verdict.options, verdict.accepted) == (options, not options)
+    assert (verdict.repair.options, verdict.accepted) == (options, not options)
     if options:
         assert "times too small" in verdict.overruled[0]
         with pytest.raises(lbt.errors.RecordError, match=options):
@@ -325,15 +326,6 @@ def test_one_factor_stands_for_the_axes_whose_gains_are_not_plausible() -> None:
         assert likely_factors(np.array(gains), within).tolist() == factors
 
 
-def test_words_for_a_scale() -> None:
-    gain = np.array([0.0007])
-    assert wrong_scale(np.array([0.001]), gain).startswith("they are 1000 times too large")
-    assert wrong_scale(np.array([2.0]), gain).startswith("they are 2 times too small")
-    assert wrong_scale(np.array([1.0, 2.0]), np.array([0.8, 1.6])) == (
-        "those of axis 1 are 2 times too small (with them the sensor has a gain of 0.8, 1.6)"
-    )
-
-
 @pytest.mark.parametrize(
     ("factor", "options"), [(1.0, ""), (0.1, "--command-scale 10"), (1e3, "--command-scale 0.001")]
 )
@@ -342,7 +334,7 @@ def test_wide_resonances_hide_no_other_unit(factor: float, options: str) -> None
     record = resonant_record()
     assert record.commands is not None
     record = replace(record, commands=factor * record.commands)
-    assert explain_commands(record).options == options
+    assert explain_commands(record).repair.options == options
 
 
 def test_a_known_gain_holds_after_a_repair() -> None:

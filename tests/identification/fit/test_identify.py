@@ -10,7 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from support.eris import ERIS_FILE, eris_example, eris_model, eris_record
+from support.eris import eris_example, eris_model, eris_record
 from support.plants import ROOT
 from support.recorded_loops import (
     LINE,
@@ -171,20 +171,6 @@ def test_what_the_loop_does_not_show_is_said() -> None:
     assert given_gain.sensor_gain_note == "given"
 
 
-def test_an_announced_line_is_found_where_a_search_would_not_dare() -> None:
-    rng = np.random.default_rng(5)
-    n = 16_384
-    y = rng.standard_normal(n) + 0.05 * np.sin(2 * np.pi * 90.0 * np.arange(n) / RATE)
-    plain = identify_series(10 * y, frame_rate_hz=RATE)
-    known = identify_series(10 * y, frame_rate_hz=RATE, announced=[(90.0, 0.05)])
-    wrong = identify_series(10 * y, frame_rate_hz=RATE, announced=[(140.0, 0.05)])
-    assert not plain.lines
-    assert not wrong.lines
-    (line,) = known.lines
-    assert line.announced
-    assert line.frequency_hz == pytest.approx(90, abs=0.1)
-
-
 def test_neither_units_nor_a_start_move_the_fit() -> None:
     loop = {"lines": ((40, 0.01, 30),), "frames": 8192}
     once = identify_loop(**loop)
@@ -315,7 +301,7 @@ def find_axes(y: np.ndarray, u: np.ndarray | None = None, **options: object) -> 
 
 
 def find_eris(**options: object) -> object:
-    plain = lbt.load_record(ERIS_FILE, kind="spectrum", unit="nm^2/Hz")
+    plain = eris_example().record(averages=None)
     return lbt.identify(plain, frame_rate_hz=1000, **options)
 
 
@@ -325,8 +311,6 @@ REFUSALS = [
     (lambda: find_series(stretches=[(0, 300)]), ProblemError, "at least 512 frames"),
     (lambda: find_series(stretches=[]), ProblemError, "at least one stretch"),
     (lambda: find_series(sensor_gain=-1.0), ProblemError, "sensor_gain"),
-    (lambda: find_series(announced=[(600.0, 0.1)]), ProblemError, "announced frequency"),
-    (lambda: find_series(announced=[(60.0, -0.1)]), ProblemError, "error of an announced"),
     (lambda: find_series(lowest_line_hz=501), ProblemError, "lowest_line_hz"),
     (lambda: find_series(most_lines=-1), ProblemError, "most_lines"),
     (lambda: find_series(measurement=1e200 * WHITE[:2000, 0]), ProblemError, "units"),
@@ -336,7 +320,6 @@ REFUSALS = [
     (lambda: find_record(sensor_gain=1e300), ProblemError, "sensor_gain must be"),
     (lambda: find_record(sensor_gain="x"), ProblemError, "sensor_gain must be an array of numbers"),
     (lambda: find_record(sensor_gain=[1.0, 2.0]), ProblemError, r"or one per measurement \(1\)"),
-    (lambda: find_record(announced=[[31.0, 0.1, 0.0]]), ProblemError, "announced must be"),
     (lambda: find_record(noise_nm=5.0), ProblemError, "noise_nm is for spectra"),
     (lambda: find_record(start=3), ProblemError, "IdentifiedModel"),
     (lambda: find_record(stretches=[(2, 4000), (3000, 5000)]), ProblemError, "in order, apart"),
@@ -415,7 +398,7 @@ def model() -> IdentifiedModel:
 
 
 def test_spectrum_without_scatter_is_taken_for_one_periodogram(example):
-    plain = lbt.load_record(ERIS_FILE, kind="spectrum", unit="nm^2/Hz")
+    plain = eris_example().record(averages=None)
     found = lbt.identify(plain, frame_rate_hz=1000)
     assert len(found.notes) == 2
     assert all("does not scatter" in note for note in found.notes)

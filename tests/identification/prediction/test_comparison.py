@@ -12,15 +12,16 @@ from support.predictions import (
     PATH,
     RATE,
     SLOW,
-    SPOILT,
     a_plant,
     a_series,
     pseudo_open_loop,
+    record_of,
+    replayed_residual,
 )
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification import prediction_against_data, replayed_residual
+from lbt_synth.identification import loop_record, prediction_against_data
 from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.models import ARModel
 from lbt_synth.models.plant.tip_tilt import retuned_plant
@@ -52,15 +53,15 @@ def two_different_axes():
     loop = lbt.close_loop(plant.hardware, ran.controller)
     series = filter_series(loop.system, np.column_stack([*total, noise]))
     y, u = series[:, 4:], series[:, 2:4]
-    return plant, ran, y, pseudo_open_loop(y, u, plant.hardware)
+    record = loop_record(y, u, frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    return plant, ran, record, pseudo_open_loop(y, u, plant.hardware)
 
 
 def test_the_table():
-    plant, ran, y, z = two_different_axes()
+    plant, ran, record, z = two_different_axes()
     kalman, hinf = lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.2, route="riccati")
     designs = {"Kalman": kalman, "H-infinity": hinf.controller}
-    known = {"measurements": y, "running": ran, "imaging": CAMERA}
-    table = prediction_against_data(plant, z, designs, **known)
+    table = prediction_against_data(record, plant, designs, running=ran, imaging=CAMERA)
     names = "what ran, best integrator, Kalman, H-infinity"
     assert [entry.name for entry in table.entries] == [*names.split(", "), "limit of performance"]
     assert table.notes == ()
@@ -80,8 +81,8 @@ def test_the_table():
     assert row.total_nm2 > limit.model_nm**2 - 4 * row.total_error_nm2
     # what ran: its own measurements on the same frames, and its replay is what it measured
     begin, end = table.test[0]
-    assert (begin, end) == (10_000, 20_000)  # the first half is enough to warm up
-    part = y[begin:end] / 0.6
+    assert (begin, end) == (10_001, 20_000)  # the first half is enough to warm up
+    part = record.measurements[begin:end] / 0.6
     variance = np.mean(part**2, axis=0) - np.array([15.0, 10.0]) ** 2 / 0.36
     np.testing.assert_allclose(table["what ran"].replayed.variance_nm2, variance, rtol=1e-9)
     known = {"noise_nm": [15.0, 10.0], "test": [(begin, end)]}
@@ -94,7 +95,7 @@ def test_the_table():
     loop = lbt.close_loop(plant.hardware, best.controller)
     exact = lbt.residual_budget(loop, plant, frame_means=True)
     assert table["best integrator"].model_nm == exact.rms_nm
-    unknown = prediction_against_data(plant, z, {}, measurements=y)["what ran"]
+    unknown = prediction_against_data(record, plant, {})["what ran"]
     assert unknown.model_axis_nm is None
     assert np.isnan([unknown.model_nm, unknown.ratio, unknown.deviations]).all()
 
@@ -107,8 +108,9 @@ def test_a_table_of_one_axis():
     rng = np.random.default_rng(8)
     z = a_series(SLOW, 9000, rng) + a_series(line.ar_model(RATE), 9000, rng)
     z = (z + 15.5 * rng.standard_normal(z.size))[:, None]
-    known = {"imaging": CAMERA, "stretches": [(0, 5000), (5100, 9000)]}
-    table = prediction_against_data(plant, z, {"Kalman": lbt.kalman(plant)}, **known)
+    gap = np.arange(9000) // 100 != 50
+    record = record_of(z, plant.hardware, measured=gap)
+    table = prediction_against_data(record, plant, {"Kalman": lbt.kalman(plant)}, imaging=CAMERA)
     assert table.fit == ((0, 4450),)
     assert table.test == ((4450, 5000), (5500, 9000))
     row = table["Kalman"]
@@ -119,9 +121,9 @@ def test_a_table_of_one_axis():
 
 def test_a_wrong_model_is_found_out():
     """The model of a filter for another frequency promises what the data does not show."""
-    plant, _, _, z = two_different_axes()
+    plant, _, record, _ = two_different_axes()
     wrong = retuned_plant(plant, 6.0)
-    table = prediction_against_data(wrong, z, {"Kalman": lbt.kalman(wrong)})
+    table = prediction_against_data(record, wrong, {"Kalman": lbt.kalman(wrong)})
     row, right = table["Kalman"], lbt.kalman(plant).rms
     assert row.deviations > 5
     assert row.model_nm < 1.05 * right < row.replayed_nm / 1.1
@@ -143,7 +145,8 @@ def test_a_limit_that_is_not_known_is_a_note():
     known = {"turbulence": SLOW, "vibrations": [LINES[0], crossed], "noise_nm": 15.5}
     plant = lbt.tip_tilt_plant(frame_rate_hz=RATE, delay_frames=2.4, **known)
     z = np.random.default_rng(0).standard_normal((4000, 2)).cumsum(axis=0)
-    table = prediction_against_data(plant, z, {})
+    record = record_of(z, plant.hardware)
+    table = prediction_against_data(record, plant, {})
     assert [entry.name for entry in table.entries] == ["best integrator"]
     assert "no limit of performance: a limit needs modes that decouple" in table.notes[-1]
 
@@ -154,7 +157,8 @@ def test_the_noise_of_the_table_has_its_correlations():
     plant = lbt.tip_tilt_plant(frame_rate_hz=RATE, turbulence=air, noise_nm=R, sensor_matrix=S)
     total = np.column_stack([a_series(air, 20_000, rng) for _ in range(2)])
     z = total + rng.multivariate_normal([0, 0], R, 20_000) @ back.T
-    table = prediction_against_data(plant, z, {"Kalman": lbt.kalman(plant)})
+    record = record_of(z, plant.hardware)
+    table = prediction_against_data(record, plant, {"Kalman": lbt.kalman(plant)})
     row = table["Kalman"]
     assert abs(row.deviations) < 4
     assert 0.95 < row.ratio < 1.05
@@ -168,8 +172,9 @@ def test_more_noise_than_the_data_has_is_a_note():
     path = {"frame_rate_hz": RATE, "turbulence": air, "modes": 1}
     right, wrong = (lbt.tip_tilt_plant(**path, noise_nm=s) for s in (10.0, 60.0))
     mine = {"mine": lbt.kalman(right)}
-    assert prediction_against_data(right, z, mine).notes == ()
-    table = prediction_against_data(wrong, z, mine, measurements=z)
+    idle = loop_record(z, 0 * z, frame_rate_hz=RATE, delay_frames=2, unit="nm")
+    assert prediction_against_data(idle, right, mine).notes == ()
+    table = prediction_against_data(idle, wrong, mine)
     (note,) = table.notes
     assert "of what ran, best integrator, mine: its variance is" in note
     assert "4 standard errors below zero" in note
@@ -178,9 +183,10 @@ def test_more_noise_than_the_data_has_is_a_note():
         assert np.isnan(entry.replayed.upper_nm)
 
 
-def make_table(plant=None, controllers=None, **options):
+def make_table(record=None, plant=None, controllers=None, **options):
     """Compare what is predicted with data, with changed arguments."""
-    return prediction_against_data(plant or a_plant(), GOOD, controllers or {}, **options)
+    seen = record_of(GOOD, PATH) if record is None else record
+    return prediction_against_data(seen, plant or a_plant(), controllers or {}, **options)
 
 
 INTEGRATOR = lbt.integrator(PATH, gain=0.3)
@@ -190,13 +196,13 @@ INTEGRATOR = lbt.integrator(PATH, gain=0.3)
     ("call", "message"),
     [
         (lambda: make_table(controllers={"best integrator": INTEGRATOR}), "may be called"),
-        (lambda: make_table(measurements=GOOD[:1999]), "within 1999 frames"),
-        (lambda: make_table(measurements=GOOD[:, :1]), r"measurements must be \(frames, 2\)"),
-        (lambda: make_table(measurements=np.vstack([GOOD, GOOD])), "have the 2000 frames of open"),
-        (lambda: make_table(measurements=SPOILT[::-1]), "measurements, frames 1000 to 2000, must"),
-        (lambda: make_table(running=INTEGRATOR), "needs its measurements"),
+        (lambda: make_table(record_of(GOOD[:, :1], ONE_MODE)), "2 modes at 800 Hz and 1 axes"),
+        (lambda: make_table(record_of(GOOD[:1], PATH)), "frames to fit and to test on; got 1"),
+        (lambda: make_table(GOOD), "expected a LoopRecord"),
+        (lambda: make_table(running=INTEGRATOR), "what ran needs commands"),
         (lambda: make_table(imaging=2.2), "expected an Imaging"),
         (lambda: make_table(plant=PATH), "expected a TipTiltPlant"),
+        (lambda: make_table(plant=a_plant(sensor=[[1, 0], [1, 0]])), "inverted; .* of rank 1"),
         (lambda: make_table()["mine"], "the table has the rows best integrator, .*'mine'"),
     ],
 )

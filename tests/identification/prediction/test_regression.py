@@ -12,7 +12,7 @@ from support.structures import structure
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.accelerometers.readings import channels_beside
-from lbt_synth.identification.prediction.comparison import unseen_claims
+from lbt_synth.identification.prediction.comparison import WITHOUT, compare_designs
 from lbt_synth.identification.prediction.regression import (
     TAPS,
     channel_values,
@@ -80,25 +80,23 @@ def test_channels_that_see_a_structure_are_worth_what_is_claimed() -> None:
     assert left_nm2(alone) < 1.02 * base
     assert left_nm2(fused) < 0.6 * base
     assert fused.other_sensors == ("channel1", "channel2", "channel3")
-    first, _ = split_halves(record.stretches(), record.frames)
+    first, _ = split_halves(record.stretches())
     half = lbt.identify(record, stretches=first, sensor_gain=1.0)
     beside = channels_beside(record, seen.readings[: record.frames])
-    past = regress(record, half, stretches=first, channels=beside)
-    claims = unseen_claims(record, half, past.design(), beside)
-    assert claims["residual_nm"] ** 2 == pytest.approx(left_nm2(fused), rel=0.2)
-    assert claims["alone_nm"] ** 2 == pytest.approx(left_nm2(alone), rel=0.2)
+    table, _ = compare_designs(record, half, {"predictor": {}}, channels=beside)
+    title = "least-squares predictor"
+    claimed_nm = table[title].replayed_nm
+    assert claimed_nm**2 == pytest.approx(left_nm2(fused), rel=0.2)
+    assert table[f"{title}{WITHOUT}"].replayed_nm ** 2 == pytest.approx(left_nm2(alone), rel=0.2)
     # each channel that fails: the poles stay, the fall-back leaves what the own sensor does
     (fallback,) = (k for missing, k in fused.controllers.items() if missing)
     assert left_nm2(fused, fallback, silent=(0, 1, 2)) == pytest.approx(left_nm2(alone), rel=0.05)
     loops = [close_loop(fused.hardware, k) for k in (fused.controller, fallback)]
     assert loops[0].spectral_radius == pytest.approx(loops[1].spectral_radius, rel=1e-9)
     # and what each is worth, by the moments of the unseen half alone
-    _, later = split_halves(record.stretches(), record.frames)
-    unseen = regress(record, half, stretches=later, channels=beside)
-    rows = channel_values(past, unseen, 2 * half.axes[0].noise_nm ** 2)
-    for place, row in enumerate(rows):
+    for place, row in enumerate(channel_values(record, half, beside)):
         assert row.channel == f"channel{place + 1}"
-        assert row.without_nm > 0.98 * claims["residual_nm"]
+        assert row.without_nm > 0.98 * claimed_nm
         dead = np.sqrt(left_nm2(fused, silent=(place,)))
         assert row.dead_nm == pytest.approx(dead, rel=0.25)
 

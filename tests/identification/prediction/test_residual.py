@@ -12,21 +12,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.predictions import (
     CAMERA,
-    FLAT,
     GOOD,
     PATH,
     RATE,
     SHELL,
-    SPOILT,
     TILTED,
     a_plant,
     a_series,
     a_truth,
     pseudo_open_loop,
+    replayed_residual,
 )
 
 import lbt_synth as lbt
-from lbt_synth.identification import LoopRecord, loop_record, replayed_residual
+from lbt_synth.identification import LoopRecord, loop_record
 from lbt_synth.identification.prediction.residual import estimate_residual, replay, settled_test
 from lbt_synth.models import ARModel
 
@@ -290,9 +289,6 @@ def short_record() -> LoopRecord:
     return loop_record(run.measurements[0], run.commands[0], **known)
 
 
-STRONG = replace(PATH, sensor_matrix=4 * np.eye(2))
-
-
 def replayed(series=GOOD, path=PATH, **options):
     return replayed_residual(series, INTEGRATOR, path, **({"noise_nm": 1.0} | options))
 
@@ -300,30 +296,18 @@ def replayed(series=GOOD, path=PATH, **options):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: replayed(GOOD[:, :1]), r"open_loop must be \(frames, 2\)"),
-        (lambda: replayed(GOOD[0]), r"open_loop must be \(frames, 2\)"),
-        (lambda: replayed(GOOD[:0]), r"open_loop must be \(frames, 2\)"),
-        (lambda: replayed(GOOD + 0j), "open_loop must be real"),
-        (lambda: replayed(SPOILT), r"frames 0 to 2000, must be finite; .* index \(77, 0\)"),
-        (lambda: replayed(SPOILT, stretches=[(50, 900)]), r"frames 50 to 900, .* index \(27, 0\)"),
-        (lambda: replayed(noise_nm=-1.0), "noise_nm must be at least 0"),
-        (lambda: replayed(noise_nm=[1.0, 2.0, 3.0]), r"or one per measurement \(2\); got 3"),
-        (lambda: replayed(noise_nm=np.nan), "noise_nm must be finite"),
         (lambda: replayed(noise_error_nm=-0.1), "noise_error_nm must be at least 0"),
+        (lambda: replayed(noise_error_nm=[1.0, 2.0, 3.0]), r"or one per measurement \(2\); got 3"),
         (lambda: replayed(test=[(1950, 2000)]), "at least 400 frames beyond the first 400 .* 50"),
         (
             lambda: replayed(test=[(800, 2000)], stretches=[(0, 900), (900, 2000)]),
             r"within the usable stretches; got \(800, 2000\) in \(0, 900\), \(900, 2000\)",
         ),
-        (lambda: replayed(stretches=[(0, 2001)]), "within 2000 frames"),
-        (lambda: replayed(path=FLAT), r"can be inverted; got \(2, 2\) of rank 1"),
-        (lambda: replayed(path=STRONG), "must be stable"),
-        (lambda: replayed(path=a_plant()), "expected a LoopHardware"),
         (lambda: replayed().above(replayed(test=[(500, 2000)])), "on the same frames only"),
     ],
 )
 def test_what_cannot_be_replayed_is_refused(call, message):
-    with pytest.raises((lbt.errors.ProblemError, lbt.errors.UnstableLoopError), match=message):
+    with pytest.raises(lbt.errors.ProblemError, match=message):
         call()
 
 

@@ -10,7 +10,6 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import loop_record
 
 RATE = 1000.0
-NOT_USED = "the times do not tell frames apart and were not used"
 
 
 @pytest.mark.parametrize("by", ["times", "numbers", "both"])
@@ -31,7 +30,7 @@ def test_missing_frames_become_holes(by):
     assert np.array_equal(seen.measurements[seen.usable], y[kept])
     assert findings(seen) == [("missing", "frames", None, 3, 100, True)]
     words = "the times lie 0.057 frames rms beside a regular grid"
-    assert (words in seen.health.notes) is (by != "numbers")
+    assert (words in seen.notes) is (by != "numbers")
 
 
 def test_rows_that_come_twice():
@@ -41,7 +40,7 @@ def test_rows_that_come_twice():
     same = loop_record(rows, frame_rate_hz=RATE, frame_numbers=order, unit="nm")
     assert same.usable.all()
     assert np.array_equal(same.measurements, y)
-    assert same.health.notes == ("3 rows of a time that had been recorded already were left out",)
+    assert same.notes == ("3 rows of a time that had been recorded already were left out",)
     rows[np.flatnonzero(order == 50)[1]] += 1  # two stories of one frame
     torn = loop_record(rows, frame_rate_hz=RATE, times_s=order / RATE, unit="nm")
     assert np.flatnonzero(~torn.usable).tolist() == [50]
@@ -55,14 +54,12 @@ def test_rows_that_come_twice():
         ({"times_s": [0, 1, 2]}, r"times_s must have shape \(6,\)"),
         ({"times_s": [0, 1, 2, 1.5, 3, 4]}, "must not run backwards; got 2 and then 1.5 at row 3"),
         ({"times_s": [0, 1, 2, np.nan, 3, 4]}, "times_s must be finite"),
-        ({"times_s": [1, 1, 1, 1, 1, 1]}, "times_s must rise"),
+        ({"times_s": [1, 1, 1, 1, 1, 1], "frame_rate_hz": 2}, "times_s must rise"),
         ({"times_s": [0, 1, 2, 3.5, 5.3, 6.3]}, "lie on no regular grid of 1 Hz"),
         ({"times_s": np.arange(6), "frame_rate_hz": 2}, "must be that of the times, 1 Hz; got 2"),
         ({"times_s": [0, 1, 2, 3, 4, 500]}, "495 of 501 frames would be missing"),
-        (
-            {"times_s": [0, 1, 2, 3, 4, 500], "frame_rate_hz": 1},
-            "495 of 501 frames would be missing",
-        ),
+        ({"times_s": [0, 1, 2, 3, 4, 1e19], "frame_rate_hz": 1}, "frames would be missing .* cut"),
+        ({"frame_numbers": [0, 1, 2, 3, 4, 1e19], "frame_rate_hz": 1}, "frames would be missing"),
         ({"frame_numbers": [0, 2, 4, 6, 8, 10], "frame_rate_hz": 2}, "median step of 2"),
         ({"frame_numbers": [0, 1, 2, 0, 1, 2], "frame_rate_hz": 2}, "frame_numbers must not run b"),
         ({"frame_numbers": [0, 1, 2, 2.5, 3, 4], "frame_rate_hz": 2}, "must be whole numbers"),
@@ -82,7 +79,7 @@ def test_a_stated_rate_is_held_against_the_times():
             loop_record(noise(20_000), frame_rate_hz=rate, times_s=times, unit="nm")
     near = loop_record(noise(20_000), frame_rate_hz=1000.05, times_s=times, unit="nm")
     assert near.frame_rate_hz == 1000.05
-    assert near.health.notes == (
+    assert near.notes == (
         "frame rate 1000.05 Hz, as stated; by the times 1000 Hz, 1 frames apart over the record",
     )
     # with a counter beside the times, too
@@ -95,20 +92,10 @@ def test_a_stated_rate_is_held_against_the_times():
             unit="nm",
         )
     same = loop_record(noise(20_000), frame_rate_hz=1000, times_s=times, unit="nm")
-    assert same.health.notes == ()
+    assert same.notes == ()
 
 
-def test_jumps_beyond_all_integers():
-    late = np.arange(50.0)
-    late[30:] += 1e19
-    for clock in ({"frame_numbers": late}, {"times_s": late}):
-        with pytest.raises(ProblemError, match=r"frames would be missing .* cut the record"):
-            loop_record(noise(50), frame_rate_hz=500, unit="nm", **clock)
-    with pytest.raises(ProblemError, match="frames would be missing"):
-        loop_record(noise(50), times_s=late, unit="nm")
-
-
-@pytest.mark.parametrize("rate", [800, 998.5, 999.9, 1000, 1001, 1050, 2000])
+@pytest.mark.parametrize("rate", [800, 998.5, 999.9, 1000])
 @pytest.mark.parametrize("rounding", [np.round, np.floor])
 def test_rounded_times_lose_no_frame_at_a_known_rate(rate, rounding):
     y, ms = noise(20_000), np.arange(20_000) / rate * 1e3
@@ -141,9 +128,6 @@ def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, q
         # never without a reason: times as coarse as frames
         assert quantum * rate > 0.4
         return
-    if NOT_USED in seen.health.notes:
-        assert quantum * rate > 1
-        return
     ends = [k for k in lost if not frames // 8 < k < frames - frames // 8 and k < frames]
     if quantum * rate > 0.9 and ends:
         return  # rounding may hide a frame at the ends
@@ -154,50 +138,33 @@ def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, q
     assert np.array_equal(seen.measurements[there, 0], y[there])
 
 
-def test_a_lost_frame_that_rounding_hides_is_refused():
-    for rate, lost in ((800, 2), (1003, 3), (2000, 4)):  # more than a step of the times hides
-        kept = np.delete(np.arange(40_000), 17_000 + np.arange(lost))
-        times = np.floor(kept / rate * 1e3 + 1e-6) / 1e3
-        with pytest.raises(ProblemError, match="cannot tell which frames are missing"):
-            loop_record(noise(len(kept)), frame_rate_hz=rate, times_s=times, unit="nm")
-    # and so it is where the rate is not quite that of the times
-    kept = np.delete(np.arange(4000), [1700])
+@pytest.mark.parametrize(
+    ("rate", "lost", "step_s"),
+    [
+        *((800, 2, 1e-3), (1003, 3, 1e-3), (1000, 0, 1.0), (1300, 0, 1.0)),
+        (2000, 0, 1e-3),  # a step of two frames hides one
+        (1000.1, 1, 1e-3),  # and so does one where the rate is not quite that of the times
+    ],
+)
+def test_stamps_that_may_hide_a_lost_frame_are_refused(rate, lost, step_s):
+    kept = np.delete(np.arange(40_000), 17_000 + np.arange(lost))
+    times = np.floor(kept / round(rate) / step_s + 1e-6) * step_s
     with pytest.raises(ProblemError, match="cannot tell which frames are missing"):
-        loop_record(noise(3999), frame_rate_hz=1000.1, times_s=kept / 1000, unit="nm")
-    # 300 frames of 999 Hz in ms: one step of 2 ms, by rounding or by a frame that is lost
+        loop_record(noise(len(kept)), frame_rate_hz=rate, times_s=times, unit="nm")
+    seen = loop_record(
+        noise(len(kept)), frame_rate_hz=rate, times_s=times, frame_numbers=kept, unit="nm"
+    )
+    assert seen.frames == 40_000
+
+
+def test_one_step_of_two_may_be_rounding_or_a_frame_that_is_lost():
     times = np.floor(np.arange(300) / 999 * 1e3 + 0.9) / 1e3
     with pytest.raises(ProblemError, match="cannot tell which frames are missing"):
         loop_record(noise(300), frame_rate_hz=999, times_s=times, unit="nm")
 
 
-@pytest.mark.parametrize(
-    "times",
-    [
-        np.zeros(3000),
-        np.floor(np.arange(3000) / RATE),
-        np.floor(np.arange(3000) / RATE * 50 / 3) / 50 * 3,
-    ],
-)
-def test_stamps_that_tell_no_frame_apart_are_not_used_beside_a_rate(times):
-    kept = np.delete(np.arange(3001), [1700])
-    for counter in (None, kept):
-        seen = loop_record(
-            noise(3000), frame_rate_hz=RATE, times_s=times, frame_numbers=counter, unit="nm"
-        )
-        assert seen.frames == 3000 + (counter is not None)
-        assert NOT_USED in seen.health.notes
-    with pytest.raises(ProblemError, match="must rise"):
-        loop_record(noise(3000), times_s=np.zeros(3000), unit="nm")
-
-
-def test_whole_seconds_of_another_rate_are_refused():
-    times = np.floor(np.arange(30_000) / RATE)
-    with pytest.raises(ProblemError, match="may be rounded"):
-        loop_record(noise(30_000), frame_rate_hz=1300, times_s=times, unit="nm")
-
-
 def test_one_row_has_no_rate_of_its_own():
     seen = loop_record([[1.0]], frame_rate_hz=RATE, times_s=[5.0], unit="nm")
-    assert (seen.frame_rate_hz, seen.health.notes) == (RATE, ())
+    assert (seen.frame_rate_hz, seen.notes) == (RATE, ())
     with pytest.raises(ProblemError, match="frame rate is not known"):
         loop_record([[1.0]], times_s=[5.0], unit="nm")

@@ -27,9 +27,9 @@ def turbulence(frames, *, rate=RATE, noise=15.5, seed=0, line=None):
 def test_a_million_clean_frames_show_nothing():
     y = np.random.default_rng(11).standard_normal((1_000_000, 1))
     seen = lbt.identification.loop_record(y, frame_rate_hz=RATE, unit="nm")
-    assert seen.health.findings == ()
+    assert seen.findings == ()
     assert seen.usable.all()
-    assert seen.health.notes == ()
+    assert seen.notes == ()
 
 
 def sinusoid(t):

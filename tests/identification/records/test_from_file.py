@@ -62,7 +62,7 @@ def test_every_format_gives_the_same_record(tmp_path, series, kind):
     assert np.array_equal(seen.commands, u)
     assert (seen.frame_rate_hz, seen.delay_frames, seen.source) == (RATE, 2.0, str(path))
     assert np.flatnonzero(~seen.usable).tolist() == [0, 1]
-    text = " | ".join(seen.health.notes)
+    text = " | ".join(seen.notes)
     assert "measurements: " in text
     assert "commands: " in text
 
@@ -84,7 +84,6 @@ def test_telemetry_of_ours(tmp_path):
         assert lbt.load_record(file, axes=[1]).axes == 1
         for options, words in (
             ({"frame_rate_hz": 801}, f"{name}: frame_rate_hz must be that of the telemetry, 800"),
-            ({"kind": "open_loop"}, "is of kind closed_loop; got open_loop"),
             ({"columns": {"measurements": 0}}, "neither columns nor commands"),
         ):
             with pytest.raises(ProblemError, match=words):
@@ -113,13 +112,13 @@ def test_gaps_times_and_counters(tmp_path):
     for k in np.delete(np.arange(50), [7, 8]):
         value = "" if k == 20 else "NaN" if k == 30 else f"{rng.standard_normal():.6f}"
         rows.append(f"{100 + k},{2.0 * k},{value}")
-    path.write_text("\n".join(rows))
-    seen = lbt.load_record(path, kind="open_loop")
+    path.write_text("\n".join(rows).replace("y_nm", "pol_nm"))
+    seen = lbt.load_record(path)
     assert seen.frame_rate_hz == 500
     assert np.flatnonzero(~seen.usable).tolist() == [7, 8, 20, 30]
-    assert [each.kind for each in seen.health.findings] == ["missing", "not finite"]
+    assert [each.kind for each in seen.findings] == ["missing", "not finite"]
     with pytest.raises(ProblemError, match=r"a\.csv: frame_rate_hz must be that of the times"):
-        lbt.load_record(path, kind="open_loop", frame_rate_hz=800)
+        lbt.load_record(path, frame_rate_hz=800)
 
 
 def test_delays_and_diameters_in_headers(tmp_path, series):
@@ -135,7 +134,7 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     )
     seen = lbt.load_record(path)
     assert (seen.delay_frames, seen.diameter_m, seen.obstruction) == (2.5, 8.0, 0.11)
-    assert "frame_rate_hz 500, by FRAMRATE of HDU 0" in seen.health.notes
+    assert "frame_rate_hz 500, by FRAMRATE of HDU 0" in seen.notes
     with pytest.raises(ProblemError, match="frame_rate_hz must be that of FRAMRATE of .*; got 100"):
         lbt.load_record(path, frame_rate_hz=1000)
     with pytest.raises(ProblemError, match="averages are only for a spectrum"):
@@ -144,7 +143,7 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     other = lbt.load_record(path, delay_frames=3, diameter_m=8.4)
     assert (other.delay_frames, other.diameter_m) == (3.0, 8.4)
     assert any(
-        "delay_frames 3 was given; DELAYFRM of HDU 0 has 2.5" in note for note in other.health.notes
+        "delay_frames 3 was given; DELAYFRM of HDU 0 has 2.5" in note for note in other.notes
     )
     # a delay of unknown unit is not taken
     unsure = hdus(tmp_path / "b.fits", image("Y", y, "nm"), image("U", u, "nm"), DELAY=0.002)
@@ -176,7 +175,9 @@ def test_units_must_be_given(tmp_path, series):
     with pytest.raises(ProblemError, match="unit must be one of nm.*got 'pixel'"):
         lbt.load_record(pixels)
     angle = hdus(tmp_path / "e.fits", image("POL", y, "arcsec"), FPS=RATE)
-    with pytest.raises(ProblemError, match=r"e\.fits: angles of tilt.*give diameter_m"):
+    with pytest.raises(
+        ProblemError, match=r"e\.fits: nothing tells the telescope.*give diameter_m"
+    ):
         lbt.load_record(angle)
 
 
@@ -194,7 +195,7 @@ def test_spectra(tmp_path, form):
     else:  # rows frequency, axis, axis: of no names at all
         path = tmp_path / "a.fits"
         fits.PrimaryHDU(np.vstack([f, s.T])).writeto(path)
-        options = {"kind": "spectrum", "unit": "nm**2/Hz"}
+        options = {"unit": "nm**2/Hz", "columns": {"frequency": 0, "density": (1, 2)}}
     seen = lbt.load_record(path, averages=12, frame_rate_hz=RATE, **options)
     assert isinstance(seen, lbt.identification.SpectrumRecord)
     assert np.array_equal(seen.frequency_hz, f)
@@ -214,16 +215,12 @@ def test_amplitude_spectra_and_angles(tmp_path):
     power = write_csv(tmp_path / "b.csv", ["f_hz", "psd"], [f, 0 * f + 3])
     seen = lbt.load_record(power, unit="mas^2/Hz", diameter_m=8.0)
     assert np.allclose(seen.density_nm2_hz, 3 * lbt.models.nm_per_mas(8.0) ** 2)
-    with pytest.raises(ProblemError, match="unit of a density is a square over Hz.*got 'nm'"):
+    with pytest.raises(ProblemError, match="unit must be one of nm\\^2/Hz, .*; got 'nm'"):
         lbt.load_record(power, unit="nm")
     assert any(note.startswith("2 rows with gaps") for note in gapped(tmp_path).notes)
     back = write_csv(tmp_path / "d.csv", ["f_hz", "psd_nm2_hz"], [f[::-1], f])
     with pytest.raises(ProblemError, match="must increase"):
         lbt.load_record(back)
-    with pytest.raises(ProblemError, match="below half the frame rate, 30 Hz; got 50"):
-        lbt.load_record(
-            write_csv(tmp_path / "e.csv", ["f_hz", "psd_nm2_hz"], [f, f]), frame_rate_hz=60
-        )
 
 
 def gapped(folder):
@@ -235,18 +232,13 @@ def gapped(folder):
 @pytest.mark.parametrize(
     ("names", "options", "words"),
     [
-        ([], {}, "names do not tell what the columns are.*Choose by columns="),
-        (["a", "b", "c", "d"], {}, "names do not tell what the columns are; got a, b, c, d"),
-        (
-            ["y_nm", "a", "b", "c"],
-            {"kind": "closed_loop"},
-            "needs columns of measurements and commands; got y",
-        ),
+        ([], {}, "got a column without a name; .*Choose by columns="),
+        (["y_nm", "a", "b", "c"], {}, r"got measurements \(y_nm\); a; b; c\. Choose by columns="),
         (["y_nm", "meas_nm", "u_nm", "u_nm"], {}, "not each of an axis of its own"),
         (["y0_nm", "y1_nm", "u0_nm", "t"], {}, r"commands must match measurements \(60, 2\)"),
         (["y_nm", "u_nm", "t", "time"], {}, "t, time are all named as times; choose by columns="),
         (["y_nm", "u_nm", "time_h", "b"], {"columns": {"times": 9}}, "no column 9; the file has 4"),
-        (["y_nm", "u_nm", "a", "b"], {"columns": {"times": "q"}}, "no column 'q'; got y_nm, u_nm"),
+        (["y_nm", "u_nm", "a", "b"], {"columns": {"times": "q"}}, "no column 'q'; .*: y_nm, u_nm"),
         (["y_nm", "u_nm", "a", "b"], {"columns": {"clock": 2}}, "a key of columns must be one of"),
         (["y_nm", "u_nm", "a", "b"], {"columns": ["a"]}, "columns must be a mapping"),
         (
@@ -254,18 +246,13 @@ def gapped(folder):
             {"columns": {"measurements": "a", "commands": "a"}},
             "a column was chosen twice",
         ),
-        (["y_nm", "u_nm", "a", "b"], {"kind": "video"}, "kind must be one of closed_loop"),
-        (
-            ["y_nm", "u_nm", "a", "b"],
-            {"kind": "spectrum"},
-            "needs columns of density and frequency; got y_nm",
-        ),
         (
             ["y_nm", "u_nm", "a", "b"],
             {"frame_rate_hz": None},
             "nothing tells the frame rate: give fra",
         ),
-        (["y_nm", "u_nm", "t [h]", "b"], {}, "times must be in one of s, ms, us, ns; got 'h'"),
+        (["y_nm", "u_nm", "time", "b"], {"frame_rate_hz": None}, "or times whose name has a unit"),
+        (["y_nm", "u_nm", "t [Hz]", "b"], {}, "times must be in one of s, ms, us, ns; got 'Hz'"),
     ],
 )
 def test_what_is_refused(tmp_path, series, names, options, words):
@@ -273,34 +260,7 @@ def test_what_is_refused(tmp_path, series, names, options, words):
     path = write_csv(tmp_path / "night.csv", names, [*y.T, *u.T])
     with pytest.raises(ProblemError, match=words) as caught:
         lbt.load_record(path, **{"frame_rate_hz": RATE, **options})
-    if "kind must" not in words and "columns must" not in words:
-        assert "night.csv" in str(caught.value)
-
-
-def test_files_without_series(tmp_path):
-    np.savez(tmp_path / "b.npz", cube=np.ones((3, 4, 5)), text=np.array(["a", "b"]))
-    with pytest.raises(ProblemError, match="holds no series of numbers"):
-        lbt.load_record(tmp_path / "b.npz")
-
-
-FRAMES = 60
-
-
-def test_capitals_of_frequencies(tmp_path):
-    f = np.linspace(1, 50, 40)
-    for unit, factor in (("mHz", 1e-3), ("MHz", 1e6), ("kHz", 1e3), ("HZ", 1.0)):
-        path = csv(tmp_path / "a.csv", **{f"f [{unit}]": f, "psd_nm2_hz": f})
-        assert np.allclose(lbt.load_record(path).frequency_hz, factor * f)
-    path = csv(tmp_path / "a.csv", f_mhz=f, psd_nm2_hz=f)
-    with pytest.raises(ProblemError, match="must be in one of Hz, kHz, mHz, MHz; got 'mhz'"):
-        lbt.load_record(path)
-
-
-@pytest.mark.parametrize("step", [1.0, 2.0, 1 / 86.4e6])
-def test_times_that_are_no_seconds(tmp_path, series, step):
-    path = csv(tmp_path / "a.csv", time=10 + step * np.arange(FRAMES), pol_nm=series[0][:, 0])
-    with pytest.raises(ProblemError, match="Hz with time in seconds, and their unit is not gi"):
-        lbt.load_record(path)
+    assert "night.csv" in str(caught.value)
 
 
 def test_data_come_unchanged_with_their_licence():
@@ -312,17 +272,12 @@ def test_data_come_unchanged_with_their_licence():
 
 
 def test_file_without_names_is_read_as_a_spectrum():
-    found = lbt.load_record(ERIS_FILE, kind="spectrum", unit="nm^2/Hz")
+    choice = {"frequency": 0, "density": (1, 2)}
+    found = lbt.load_record(ERIS_FILE, columns=choice, unit="nm^2/Hz")
     assert (found.axes, found.frequency_hz.size, found.averages) == (2, 3393, None)
     assert found.rms_nm == pytest.approx([94.6, 101.5], abs=0.05)
-    by_number = lbt.load_record(
-        ERIS_FILE, unit="nm^2/Hz", columns={"frequency": 0, "density": (1, 2)}
-    )
-    assert np.array_equal(by_number.density_nm2_hz, found.density_nm2_hz)
     with pytest.raises(ProblemError, match=r"the unit of \[1\], \[2\]: give unit \(nm\^2/Hz"):
-        lbt.load_record(ERIS_FILE, kind="spectrum")
-    with pytest.raises(ProblemError, match="say what kind"):
-        lbt.load_record(ERIS_FILE)
+        lbt.load_record(ERIS_FILE, columns=choice)
 
 
 def test_commands_from_another_file(tmp_path, series):
@@ -334,7 +289,7 @@ def test_commands_from_another_file(tmp_path, series):
     )
     assert np.array_equal(seen.measurements, y)
     assert np.array_equal(seen.commands, u)
-    assert f"commands are from {tmp_path / 'u.npy'}" in seen.health.notes
+    assert f"commands are from {tmp_path / 'u.npy'}" in seen.notes
     np.save(tmp_path / "v.npy", u[:-1])
     with pytest.raises(TelemetryError, match="as many frames as the measurements; got 59, 60"):
         lbt.load_record(tmp_path / "y.npy", commands=tmp_path / "v.npy", unit="nm")
@@ -351,26 +306,25 @@ def test_two_files_are_laid_beside_each_other_by_their_counters(tmp_path, series
     assert np.array_equal(seen.commands[:50, 0], u[10:])
     # commands 60 ... 69 are not there: y(k) holds u(k-2)
     assert np.flatnonzero(~seen.usable).tolist() == [0, 1, *range(52, 60)]
-    assert any("by frame: 50 of 60 rows have one" in note for note in seen.health.notes)
+    assert any("by frame: 50 of 60 rows have one" in note for note in seen.notes)
     far = csv(tmp_path / "f.csv", frame=np.arange(500, 560), u_nm=u)
-    with pytest.raises(TelemetryError, match="only 0 of 60 measurements have a command") as caught:
+    with pytest.raises(TelemetryError, match="got 500 to 559, and 10 to 69"):
         lbt.load_record(mine, commands=far, frame_rate_hz=RATE)
-    assert "they go from 10 to 69 and from 500 to 559" in str(caught.value)
     twice = csv(tmp_path / "t.csv", frame=np.arange(60) // 2 * 2, u_nm=u)
-    with pytest.raises(
-        TelemetryError, match="of both files must rise from row to row to be matched"
-    ):
+    with pytest.raises(TelemetryError, match=r"must have frame numbers that rise"):
         lbt.load_record(mine, commands=twice, frame_rate_hz=RATE)
 
 
-def test_two_files_without_counters_are_taken_row_by_row_if_their_times_agree(tmp_path, series):
+def test_two_files_without_counters_are_laid_by_their_times_or_row_by_row(tmp_path, series):
     y, u = series[0][:, 0], series[1][:, 0]
     mine = csv(tmp_path / "y.csv", time_s=np.arange(60) / RATE + 0.02, y_nm=y)
     theirs = csv(tmp_path / "u.csv", time_ms=np.arange(60) * 1e3 / RATE + 20.1, u_nm=u)
     for other in (theirs, csv(tmp_path / "n.csv", u_nm=u)):
         assert np.array_equal(lbt.load_record(mine, commands=other).commands[:, 0], u)
+    later = csv(tmp_path / "l.csv", time_s=np.arange(5, 65) / RATE + 0.02, u_nm=u)
+    assert np.array_equal(lbt.load_record(mine, commands=later).commands[5:, 0], u[:55])
     between = csv(tmp_path / "b.csv", time_ms=np.arange(60) * 1e3 / RATE + 21.0, u_nm=u)
-    with pytest.raises(TelemetryError, match="must be those of the measurements, row by row"):
+    with pytest.raises(TelemetryError, match="must have times that rise, and are those"):
         lbt.load_record(mine, commands=between)
 
 
@@ -387,7 +341,7 @@ def test_both_files_tell_facts_and_each_its_own_unit(tmp_path, series):
     silent = csv(tmp_path / "v.csv", u=u)
     with pytest.raises(ProblemError, match="nothing tells the unit of u: give command_unit"):
         lbt.load_record(mine, commands=silent, frame_rate_hz=RATE)
-    with pytest.raises(ProblemError, match="command_unit must be one of nm, .*'V'.*volts .* scale"):
+    with pytest.raises(ProblemError, match="command_unit must be one of nm, .*'V'.*volts"):
         lbt.load_record(mine, commands=silent, frame_rate_hz=RATE, command_unit="V")
     seen = lbt.load_record(mine, commands=silent, frame_rate_hz=RATE, command_unit="um")
     assert np.allclose(seen.commands[:, 0], 1e3 * u)
@@ -426,7 +380,7 @@ def test_telemetry_of_a_simulation_with_matrices():
     z = seen.pseudo_open_loop(0.7)[first:]
     assert np.allclose(z, run.total_nm[0, first - 1 : -1], rtol=1e-9, atol=1e-8)
     assert "measurements: the inverse of the interaction matrix times what was recorded" in (
-        seen.health.notes
+        seen.notes
     )
 
 
@@ -495,4 +449,4 @@ def test_what_telemetry_does_not_tell_is_given():
     assert np.array_equal(seen.commands, half.commands)
     other = lbt.load_record(telemetry(diameter_m=8.0), delay_frames=3, diameter_m=6.5)
     assert (other.delay_frames, other.diameter_m) == (3.0, 6.5)
-    assert "delay_frames 3 was given; the telemetry has 2" in other.health.notes
+    assert "delay_frames 3 was given; the telemetry has 2" in other.notes

@@ -19,6 +19,7 @@ from lbt_synth.design.predictor import predictor_design, regression_filter
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop import pipeline
 from lbt_synth.interop.c import export as c_export
+from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.interop.c.terms import RunningSource, source_terms
 from lbt_synth.interop.pipeline import target_named, target_names
 from lbt_synth.interop.proof import rehearsal_error
@@ -144,7 +145,7 @@ def test_coefficients_are_exact_and_explained(exported, designs):
     controller = designs["kalman"].controller
     text = exported("kalman").files[0].read_text()
     found = re.findall(r"(-?0x\S+p[+-]\d+), /\* ([ABCD])\[(\d+)\]\[(\d+)\] = (\S+) \*/", text)
-    assert len(found) == lbt.interop.frame_cost(controller).coefficients
+    assert len(found) == frame_cost(controller).coefficients
     for code, name, i, j, decimal in found:
         value = getattr(controller, name)[int(i), int(j)]
         assert float.fromhex(code) == value == float(decimal)
@@ -434,7 +435,7 @@ def test_the_certificate_beside_the_source(sensor_files):
 def test_the_cost_is_that_of_the_source(sensor_files, sensors_design):
     """Products of a frame in which all is read, and numbers, counted in the text."""
     text = sensor_files["double"].files[0].read_text()
-    cost = lbt.interop.frame_cost(source_terms(sensors_design))
+    cost = frame_cost(source_terms(sensors_design))
     sizes = header_numbers(sensor_files["double"].files[0], "double")
     constants, gains = (int(re.search(rf"real {a}\[(\d+)\]", text)[1]) for a in ("c", "gains"))
     varying = int(re.search(r"real varying\[DOUBLE_PERIOD\]\[(\d+)\]", text)[1])

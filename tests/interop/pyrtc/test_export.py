@@ -31,7 +31,6 @@ def test_the_folder_holds_all_that_it_refers_to(tmp_path):
     assert {"wfs", "slopes", "wfc", "loop"} <= set(conf)
     predictor = conf["loop"]["predictor"]
     assert (predictor["gain_file"], predictor["delay_frames"]) == ("gain.fits", 2)
-    assert predictor["fit_frames"] == 16_000
     assert conf["loop"]["gain"] == 1.0
     assert conf["wfc"]["num_modes"] == conf["slopes"]["signal_size"] == 2
     again = lbt.load_gain(tmp_path / "k" / "gain.fits")

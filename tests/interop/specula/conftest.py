@@ -1,20 +1,15 @@
-"""The set-up of the LBT, and the cache and calibration of the small telescope."""
+"""The set-up of the LBT, and the calibration of the small telescope."""
 
 import pytest
 from support.end_to_end import load_setup
-from support.small_telescope import BRIGHT
+from support.small_telescope import SETUP
 
-import lbt_synth as lbt
-
-
-@pytest.fixture(scope="session")
-def cache(tmp_path_factory):
-    return tmp_path_factory.mktemp("cache")
+from lbt_synth.interop.specula.optics import calibrate
 
 
 @pytest.fixture(scope="session")
-def calibration(cache):
-    return lbt.interop.calibrate(BRIGHT, cache=cache)
+def calibration():
+    return calibrate(SETUP)
 
 
 @pytest.fixture(scope="module")

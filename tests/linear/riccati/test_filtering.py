@@ -14,8 +14,8 @@ from support.plants import random_problem
 import lbt_synth as lbt
 from lbt_synth.design.certificate import certify_filter
 from lbt_synth.errors import DetectabilityError, InfeasibleError, NumericalError
-from lbt_synth.linear import EstimationProblem, infeasible_level
-from lbt_synth.linear.infeasibility_proof import worst_invisible_disturbance
+from lbt_synth.linear import EstimationProblem
+from lbt_synth.linear.infeasibility_proof import infeasible_level, worst_invisible_disturbance
 from lbt_synth.linear.riccati import filtering
 from lbt_synth.linear.riccati.filtering import gamma_riccati, kalman_riccati, least_gamma
 
@@ -189,7 +189,7 @@ def doubled(plant):
 def test_a_slow_line_of_little_damping_is_no_line_without_any(numbers):
     """Its pole is at 1e-8 to 1e-4 inside the circle, further than rounding can move it."""
     plant = slow_line(*numbers)
-    found = lbt.linear.kalman_riccati(plant)
+    found = kalman_riccati(plant)
     assert found.P == pytest.approx(doubled(plant), rel=5e-6)  # scipy's is off by up to 4e-5
     certificate = certify_filter(plant, found.gain_predictor, least_variance=True)
     assert certificate.passed

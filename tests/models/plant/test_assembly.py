@@ -9,6 +9,7 @@ from support.sensor_loops import AIR, FAST, MOTIONS, SLOW, example_plant, held_m
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
 from lbt_synth.models.plant.assembly import Exposure, memory
 from lbt_synth.models.plant.tip_tilt import retuned_plant
@@ -47,7 +48,7 @@ def test_channels_that_see_nothing_leave_the_filter_of_the_wavefront(delay):
     plant = example_plant((fast,), motions=({}, {}), delay_frames=delay)
     own = plant.own_sensor_alone()
     alone, n = lbt.kalman(own), own.n_states
-    solution = lbt.linear.kalman_riccati(plant)
+    solution = kalman_riccati(plant)
     assert plant.period == 2
     for P, gains in zip(solution.P, solution.gain_predictor, strict=True):
         assert relative_distance(gains[:n, :2], alone.gain_predictor) < 1e-9
