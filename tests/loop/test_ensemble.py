@@ -18,7 +18,6 @@ from lbt_synth.models import (
     PositionLoop,
     SinusoidalVibration,
     SumSpectrum,
-    TabulatedSpectrum,
 )
 
 WRONG = [
@@ -163,20 +162,6 @@ def test_a_bump_shakes_each_loop_as_it_shakes_one(kalman):
         assert rms_nm == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=1e-8)
 
 
-def test_three_coupled_modes():
-    rng = np.random.default_rng(3)
-    sensor = np.eye(3) + 0.2 * rng.standard_normal((3, 3))
-    gain = 0.3 * np.linalg.inv(sensor) + 0.02 * rng.standard_normal((3, 3))
-    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=3, sensor_matrix=sensor)
-    lazy = lbt.Controller(A=np.eye(3), B=gain, C=np.eye(3), D=np.zeros((3, 3)), dt_s=1 / RATE)
-    found = ensemble_residuals(lazy, path, LoopEnsemble(turbulence=AIR, noise_nm=[[4, 9, 15]]))
-    truth = lbt.Truth(turbulence=AIR, noise_nm=(4, 9, 15))
-    budget = lbt.residual_budget(lbt.close_loop(path, lazy), truth)
-    for name in ("turbulence_nm2", "noise_nm2"):
-        off = np.max(np.abs(getattr(found, name)[0] - getattr(budget, name)))
-        assert off < 5e-7 * np.trace(getattr(budget, name))
-
-
 def test_a_mirror_with_dynamics(kalman):
     shell = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
     design = lbt.kalman(plant(mirror=shell))
@@ -186,39 +171,11 @@ def test_a_mirror_with_dynamics(kalman):
     agree(found, design, w, lambda i: AIR)
 
 
-class Peak:
-    """A spectrum that says nothing of its shape."""
-
-    def psd(self, frequency_hz):
-        return 1e3 / (1 + ((np.asarray(frequency_hz) - 111.3) / 0.3) ** 2)
-
-
-@pytest.mark.parametrize(
-    "parts",
-    [
-        [AIR, lbt.Vibration(frequency_hz=133.3, damping=1e-5, rms_nm=500).ar_model(RATE)],
-        [AIR, TabulatedSpectrum(frequency_hz=[49, 50, 51], density_nm2_hz=[0, 100, 0])],
-        [Peak(), AIR, SLOW],
-    ],
-)
-def test_sums_of_spectra(kalman, parts):
-    """A peak that no pole of the loop is near."""
-    spectrum = SumSpectrum(parts=parts)
-    found = ensemble_residuals(
-        kalman.controller, kalman.hardware, LoopEnsemble(turbulence=spectrum)
-    )
-    loop = lbt.close_loop(kalman.hardware, kalman.controller)
-    single = lbt.residual_budget(loop, lbt.Truth(turbulence=spectrum))
-    assert found.turbulence_nm[0] == pytest.approx(single.turbulence_nm, rel=5e-7)
-
-
 @pytest.mark.parametrize(
     ("wind", "leak", "outer"),
     [
         ([0.01, 0.3, 3.4, 22.0, 95.0], 0.95, None),
-        ([0.01, 0.3, 3.4, 22.0, 95.0], 1.0, 7.0),
-        ([9.4, 12.0, 21.9, 32.2], 0.95, 200.0),
-        ([5.4], 1.0, None),
+        ([9.4, 12.0, 21.9, 32.2], 1.0, 200.0),
     ],
 )
 def test_slow_and_fast_winds_together(wind, leak, outer):
