@@ -27,7 +27,7 @@ from lbt_synth.storage.words import count_text
 from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
 if TYPE_CHECKING:
-    from lbt_synth.design.shaping import Specification, VibrationBand
+    from lbt_synth.design.shaping import Specification
 
 LIMIT_HEADING = "least residual of any linear controller in it"  # below the residual
 _WHAT = (
@@ -192,11 +192,6 @@ class Design(Summarised, ABC):
     def integrator_gain(self) -> float | None:
         """Gain of a pure integrator; None for any other design."""
         return None
-
-    @property
-    def vibration_bands(self) -> tuple[VibrationBand, ...]:
-        """Bands in which the design expects a vibration anywhere."""
-        return ()
 
     @property
     def mode_specifications(self) -> tuple[Specification, ...]:

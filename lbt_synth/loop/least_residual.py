@@ -272,14 +272,14 @@ def truth_modes(
             share = float(np.sinc(vibration.frequency_hz / rate))  # frames have its mean
             means = replace(vibration, rms_nm=share * vibration.rms_nm)
         lines.append((along, means))
-    matrices = [("the noise of the sensor", noise)]
-    matrices += [("the turbulence", np.diag(np.isin(range(n), some) * 1.0)) for _, some in air]
-    for along, line in lines:
-        if isinstance(line, Vibration):
-            name = f"the vibration at {line.frequency_hz:.6g} Hz"
-            matrices.append((name, np.outer(along, along)))
-    matrices += [("the given direction", np.outer(along, along)) for along in directions]
-    axes = _common_axes(matrices)
+    axes = _common_axes(
+        [
+            noise,
+            *(np.diag(np.isin(range(n), some) * 1.0) for _, some in air),
+            *(np.outer(along, along) for along, line in lines if isinstance(line, Vibration)),
+            *(np.outer(along, along) for along in directions),
+        ]
+    )
     frames, modes = _whole_frames(hardware, in_image=in_image), []
     for axis in axes:
         parts = [next(spectrum for spectrum, some in air if np.sum(axis[some] ** 2) > 0.5)]
@@ -358,34 +358,28 @@ def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray
     return np.asarray(size * np.linalg.inv(white.T @ white))
 
 
-def _common_axes(matrices: Sequence[tuple[str, FloatArray]]) -> FloatArray:
+def _common_axes(matrices: Sequence[FloatArray]) -> FloatArray:
     """Orthonormal rows that make all symmetric matrices diagonal."""
-    n = len(matrices[0][1])
-    unit = [(name, m / max(float(np.linalg.norm(m, 2)), 1e-300)) for name, m in matrices]
+    unit = np.array([m / max(float(np.linalg.norm(m, 2)), 1e-300) for m in matrices])
 
-    def coupled(axes: FloatArray) -> str | None:
-        for name, m in unit:
-            turned = axes @ m @ axes.T
-            if np.max(np.abs(turned - np.diag(np.diag(turned)))) > _COUPLING:
-                return name
-        return None
+    def couple(axes: FloatArray) -> bool:
+        turned = axes @ unit @ axes.T
+        return bool(np.max(np.abs(turned * (1 - np.eye(len(axes))))) > _COUPLING)
 
-    plain = np.eye(n)
-    if coupled(plain) is None:
+    plain = np.eye(len(matrices[0]))
+    if not couple(plain):
         return plain
     # matrices that commute share the eigenvectors of almost every sum of them
     shares = np.random.default_rng(0).uniform(1, 2, len(unit))
-    axes = np.linalg.eigh(sum(s * m for s, (_, m) in zip(shares, unit, strict=True)))[1].T
+    axes = np.linalg.eigh(np.tensordot(shares, unit, 1))[1].T
     largest = np.argmax(np.abs(axes), axis=1)
-    axes = axes * np.sign(axes[np.arange(n), largest])[:, None]
+    axes = axes * np.sign(axes[np.arange(len(axes)), largest])[:, None]
     axes = axes[np.argsort(largest, kind="stable")]
-    name = coupled(axes)
-    if name is not None:
+    if couple(axes):
         raise CoupledModesError(
             "a limit needs modes that decouple: vibrations parallel or at right angles to each "
-            "other, along principal axes of the sensor's noise and within modes of one turbulence; "
-            f"got {name} across them. Turn the directions, take equal noise on all modes, or treat "
-            "each mode by itself."
+            "other, along principal axes of the sensor's noise and within modes of one turbulence. "
+            "Turn the directions, take equal noise on all modes, or treat each mode by itself."
         )
     return np.asarray(axes)
 

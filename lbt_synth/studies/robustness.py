@@ -177,9 +177,6 @@ class RobustnessMap:
     strehl: FloatArray
     residual_nm: FloatArray  # (d, g, e): of the modes [nm rms]; nan where the loop is unstable
     stable: BoolArray  # (d, g): whether the loop is, which a frequency error does not change
-    # errors at which the vibration that moves most is within a band of the design [Hz]; None for a
-    # design without a band around it
-    band_hz: tuple[float, float] | None = None
 
 
 def robustness_map(
@@ -286,7 +283,6 @@ def robustness_map(
         strehl=strehl,
         residual_nm=residual_nm,
         stable=read_only(stable[..., 0] == 1),
-        band_hz=_errors_in_band(design, truth),
     )
 
 
@@ -306,16 +302,6 @@ def _moved_lines(truth: Truth, errors_hz: FloatArray, hardware: LoopHardware) ->
             )
         moved.append((line, frequencies))
     return moved
-
-
-def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
-    """Return the errors at which the vibration that moves most is within a band of the design."""
-    lines = truth.lines_hz
-    if not lines:
-        return None
-    most_hz = max(lines, key=lambda f: truth.frequency_shift_hz(f, 1.0))
-    held = (band for band in design.vibration_bands if band.low_hz <= most_hz <= band.high_hz)
-    return next(((band.low_hz - most_hz, band.high_hz - most_hz) for band in held), None)
 
 
 def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:

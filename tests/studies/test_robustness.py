@@ -10,7 +10,6 @@ from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
 from lbt_synth.loop.simulation import Drop
-from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.report.figures.studies import tradeoff_figure
@@ -137,23 +136,6 @@ def test_each_line_moves_by_its_share(kalman, settings):
     assert residual(stated, -2.0) == pytest.approx(at(0.2, 18.0), rel=1e-12)
     fixed = replace(truth, frequency_errors_hz=(0.0, 2.0))
     assert residual(fixed, -3.5) == pytest.approx(at(0.3, 16.5), rel=1e-12)
-
-
-def test_a_map_knows_the_band_of_its_design(kalman, settings):
-    inputs = PlantInputs(plant=settings.plant)
-    robust = design_request("robust", {}).build(inputs)
-
-    def band(design, truth):
-        return robustness_map(
-            design, truth, settings.imaging, errors_hz=[0], sensor_gains=[1]
-        ).band_hz
-
-    assert band(kalman, settings.truth) is None
-    low, high = band(robust, settings.truth)
-    (edges,) = {(part.low_hz, part.high_hz) for part in robust.vibration_bands}
-    assert (20.0 + low, 20.0 + high) == pytest.approx(edges)
-    assert band(robust, replace(settings.truth, vibrations=(sinusoid(70.0),))) is None
-    assert band(robust, replace(settings.truth, vibrations=())) is None
 
 
 def test_the_lines_of_the_model_move_as_the_true_ones_near_them(settings):

@@ -157,9 +157,6 @@ def robustness_map_figure(
             panel.map(errors_hz, gains, values, "Strehl ratio", "%", **scale)
             if real_gain is not None and gains[0] <= real_gain <= gains[-1]:
                 panel.rule("real sensor gain", real_gain, "y", dash=1)
-            for edge in grid.band_hz or ():
-                if errors_hz[0] < edge < errors_hz[-1]:
-                    panel.rule("edge of the design's band", edge, dash=2)
     return panels[0].figure
 
 

@@ -74,7 +74,6 @@ class ParameterSection(Section):
     uniform: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
     normal: NormalSection | None = None
     list_: Annotated[list[float], Field(min_length=1)] | None = Field(default=None, alias="list")
-    weights: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1)] | None = None
     also: list[str] = Field(default_factory=list)
 
     @model_validator(mode="before")
@@ -90,8 +89,6 @@ class ParameterSection(Section):
         if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
             low, high = self.uniform
             raise ValueError(f"uniform: must be [low, high]; got [{low:g}, {high:g}]")
-        if self.weights is not None and len(self.weights) != len(self.list_ or ()):
-            raise ValueError("weights goes with list, one for each of its values")
         return self
 
     @property
@@ -116,8 +113,6 @@ class ParameterSection(Section):
             ends = {"from": self.normal.low, "to": self.normal.high}
             return out + "".join(f", {k} {v:g}" for k, v in ends.items() if v is not None)
         shown = [f"{value:g}" for value in self.values]
-        if len(set(self.weights or ())) > 1:
-            shown = [f"{v} ({w:g})" for v, w in zip(shown, self.weights or (), strict=True)]
         if len(shown) > 8:
             shown[4:-3] = ["..."]
         return f"one of {', '.join(shown)}"
@@ -135,8 +130,7 @@ class ParameterSection(Section):
         if self.uniform is not None:
             low, high = self.uniform
             return np.clip(low + level * (high - low), low, high)
-        bounds = np.cumsum(self.weights or [1.0] * len(self.values))
-        return np.array(self.values)[np.searchsorted(bounds[:-1] / bounds[-1], level, side="right")]
+        return np.array(self.values)[(level * len(self.values)).astype(np.int64)]
 
     def extremes(self, samples: int) -> tuple[float, float]:
         """Return the ends, or values beyond which half a sample is expected."""

@@ -67,7 +67,7 @@ def test_distributions(tmp_path):
         parameters=f"{{'{ONE}': {{uniform: [100, 300]}}, "
         "'model.vibrations[0].rms_nm': {normal: {mean: 400, deviation: 50}}, "
         "'truth.vibrations[0].frequency_hz': {normal: {mean: 20, deviation: 1, low: 19.5, high: 23}},"
-        "sensor.noise_nm: {list: [10, 20, 30], weights: [1, 1, 2]}, "
+        "sensor.noise_nm: {list: [10, 20, 30, 30]}, "
         "truth.sensor_gain: {normal: {mean: 0.1, deviation: 0.01, low: 0.2}}}",
     )
     values = study.values()
@@ -148,8 +148,6 @@ ONE: {unifrom: [1, 2]} => unknown key parameters\.truth\.vibrations\[0\]\.rms_nm
 ONE: {uniform: [2, 1]} => must be \[low, high\]; got \[2, 1\]
 ONE: {uniform: [1, .inf]} => finite
 ONE: {fixed: 1, list: [2]} => expected a number or exactly one
-ONE: {list: [1, 2], weights: [1]} => weights goes with list
-ONE: {list: [1, 2], weights: [1, 0]} => greater than 0
 ONE: {normal: {mean: 1, deviation: 0}} => deviation: input should be gr
 ONE: {normal: {mean: 1, deviation: 1, low: 3, high: 2}} => low must be below high
 parameters: {'truth.vibration[0].rms_nm': 5} => truth has no vibration; did you mean vibrations
