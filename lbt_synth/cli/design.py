@@ -18,7 +18,8 @@ from lbt_synth.design import Design
 from lbt_synth.design.result import without_units
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest, read_design, require_gain_name
-from lbt_synth.loop import LoopMargins, close_loop, loop_margins
+from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.registry import design_title, option_names
 from lbt_synth.methods.request import Wording, design_request
 from lbt_synth.storage.atomic_files import require_writable

@@ -21,7 +21,8 @@ from lbt_synth.cli.loop_inputs import (
 from lbt_synth.cli.output import Report
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError, UnstableLoopError
-from lbt_synth.loop import LoopMargins, close_loop, loop_margins
+from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.loop.simulation import SHOWN_FRAMES, LoopStep
 from lbt_synth.report import design_page, design_report, write_page
 from lbt_synth.report.designs.report import WORDS, design_facts, good_range, verdict

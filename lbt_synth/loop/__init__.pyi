@@ -1,12 +1,9 @@
-from .budget import ResidualBudget as ResidualBudget
 from .budget import residual_budget as residual_budget
 from .closed_loop import ClosedLoop as ClosedLoop
 from .closed_loop import close_loop as close_loop
 from .disturbances import Disturbance as Disturbance
 from .least_residual import least_residual as least_residual
-from .margins import LoopMargins as LoopMargins
 from .margins import loop_margins as loop_margins
-from .simulation import Simulation as Simulation
 from .simulation import simulate as simulate
 from .stable_range import stable_sensor_gains as stable_sensor_gains
 from .strehl import Imaging as Imaging

@@ -64,24 +64,16 @@ _ORIGINS = {
 class ResidualBudget(Summarised):
     """Stationary residual of a loop, by origin; of p loops, all have a first axis (p,).
 
-    Attributes
-    ----------
-    turbulence_nm2, noise_nm2, random_vibration_nm2 : (n, n) ndarray
-        Covariances over the modes [nm^2], of means over the hold of a command.
-    within_nm2 : (n, n) ndarray
-        Covariance of what moves within the hold of a command [nm^2]; zero in means over frames.
-    line_amplitudes_nm : (s, n) complex ndarray
-        Complex amplitude that each sinusoid leaves on each mode [nm], of such means.
-    stable : bool
-        Whether the loop is stable; what an unstable one leaves is nan.
+    Covariances are over the modes [nm^2], and of means over the hold of a command but for
+    ``within_nm2``, of what moves within it.
     """
 
-    turbulence_nm2: FloatArray
+    turbulence_nm2: FloatArray  # (n, n)
     noise_nm2: FloatArray
     random_vibration_nm2: FloatArray
-    within_nm2: FloatArray
-    line_amplitudes_nm: ComplexArray
-    stable: Any = True
+    within_nm2: FloatArray  # zero in means over frames
+    line_amplitudes_nm: ComplexArray  # that each sinusoid leaves on each mode, (s, n)
+    stable: Any = True  # what an unstable loop leaves is nan
 
     def _brief(self) -> str:
         modes, loops = self.noise_nm2.shape[-1], self.noise_nm2.shape[:-2]

@@ -72,32 +72,18 @@ class SteppedController(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Simulation(Summarised):
-    """Series of a closed loop, after it has settled.
+    """Series of a closed loop, after it has settled."""
 
-    Attributes
-    ----------
-    total_nm, residual_nm : (cases, frames, n) ndarray
-        Mean phase over each frame before and after the correction [nm].
-    image_nm2 : (cases, frames, n) ndarray
-        Mean square of the residual, as the camera sees it, while the command holds that arrives in
-        a frame [nm^2].
-    commands : (cases, frames, m) ndarray
-        Commands u(k), as the mirror applied them.
-    measurements : (cases, frames, q) ndarray
-        Measurements y(k); of several sensors all of them, held from one reading to the next.
-    frame_rate_hz : float
-        Frame rate [Hz].
-    seed : int
-        Seed of the random series; 0 where they were recorded.
-    """
-
-    total_nm: FloatArray
-    residual_nm: FloatArray
+    total_nm: FloatArray  # mean phase over each frame, (cases, frames, n)
+    residual_nm: FloatArray  # the same after the correction
+    # mean square of the residual, as the camera sees it, while the command holds that arrives in a
+    # frame, (cases, frames, n)
     image_nm2: FloatArray
-    commands: FloatArray
+    commands: FloatArray  # u(k), as the mirror applied them, (cases, frames, m)
+    # y(k); of several sensors all, held from one reading to the next, (cases, frames, q)
     measurements: FloatArray
     frame_rate_hz: float
-    seed: int
+    seed: int  # of the random series; 0 where they were recorded
 
     def _brief(self) -> str:
         cases, frames, modes = self.residual_nm.shape

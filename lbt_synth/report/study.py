@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.loop import LoopMargins, close_loop, loop_margins
+from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.request import fixed_design
 from lbt_synth.report.draw import PANEL_IN, draw_bars, drawing
 from lbt_synth.report.page.html import (

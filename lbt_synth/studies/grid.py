@@ -22,7 +22,8 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from lbt_synth.errors import LbtSynthError, NumericalError, OutputError
-from lbt_synth.loop import ClosedLoop, Imaging, ResidualBudget, residual_budget, strehl
+from lbt_synth.loop import ClosedLoop, Imaging, residual_budget, strehl
+from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.models import Truth
 from lbt_synth.storage import array_file
 from lbt_synth.storage.atomic_files import (

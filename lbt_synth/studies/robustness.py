@@ -29,7 +29,6 @@ from lbt_synth.linear.controller import as_controller
 from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.loop import (
     Imaging,
-    Simulation,
     close_loop,
     loop_margins,
     residual_budget,
@@ -39,7 +38,7 @@ from lbt_synth.loop.budget import ensemble_residuals
 from lbt_synth.loop.closed_loop import require_matching_controller
 from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
 from lbt_synth.loop.evaluator import textbook_matrices
-from lbt_synth.loop.simulation import Drop, Segment, run_segments
+from lbt_synth.loop.simulation import Drop, Segment, Simulation, run_segments
 from lbt_synth.methods.registry import MIXED, record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import LoopHardware, SinusoidalVibration, TipTiltPlant, Truth, Vibration

@@ -18,17 +18,16 @@ from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.linear import Controller
 from lbt_synth.loop import (
     ClosedLoop,
-    LoopMargins,
-    ResidualBudget,
-    Simulation,
     loop_margins,
     residual_budget,
     simulate,
     stable_sensor_gains,
 )
 from lbt_synth.loop.band_limit import BandLimit
+from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.loop.least_residual import ResidualLimit
-from lbt_synth.loop.simulation import settling_frames
+from lbt_synth.loop.margins import LoopMargins
+from lbt_synth.loop.simulation import Simulation, settling_frames
 from lbt_synth.loop.stable_range import MovingGain, moving_gain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences

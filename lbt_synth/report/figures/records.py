@@ -15,8 +15,8 @@ from lbt_synth.identification import IdentifiedModel
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
-from lbt_synth.loop import ClosedLoop, Simulation, close_loop
-from lbt_synth.loop.simulation import Segment
+from lbt_synth.loop import ClosedLoop, close_loop
+from lbt_synth.loop.simulation import Segment, Simulation
 from lbt_synth.models import ARModel, Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing
