@@ -19,7 +19,7 @@ from numpy.polynomial.polynomial import polyval
 from scipy.linalg import block_diag, toeplitz
 
 from lbt_synth.errors import CoupledModesError, LbtSynthError, ProblemError
-from lbt_synth.linear.quadrature import RefinedPanels, refine_panels
+from lbt_synth.linear.quadrature import RefinedPanels, graded_edges, refine_panels
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.models import (
@@ -185,16 +185,12 @@ class ModeSpectrum:
         return still + float(sum(shares))
 
     def edges(self, extra: Sequence[float] = ()) -> FloatArray:
-        """First panels of (0, 1): geometric, and more of them at lines and kinks."""
-        grid = [np.geomspace(1e-6, 1, 40), np.linspace(0, 1, 17), np.array(extra, dtype=float)]
-        offsets = np.array([0.0, 1.0, 4.0, 16.0])
-        for part in self.parts:
-            grid.append(breakpoints_below(part, self.rate_hz / 2) / (self.rate_hz / 2))
-            if isinstance(part, ARModel):
-                for pole in np.linalg.eigvals(part.companion):
-                    centre, width = abs(np.angle(pole)) / np.pi, (1 - abs(pole)) / np.pi
-                    grid += [centre + offsets * width, centre - offsets * width]
-        points = np.unique(np.clip(np.concatenate(grid), 0, 1))
+        """First panels of (0, 1), short at lines and kinks."""
+        models = [part for part in self.parts if isinstance(part, ARModel)]
+        poles = [np.linalg.eigvals(model.companion).astype(np.complex128) for model in models]
+        kinks = [breakpoints_below(part, self.rate_hz / 2) for part in self.parts]
+        grid = graded_edges(np.concatenate([np.zeros(0, np.complex128), *poles]))
+        points = np.unique(np.concatenate([grid, *(2 / self.rate_hz * kink for kink in kinks)]))
         keep = np.concatenate([[True], np.diff(points) > 1e-12])
         return np.unique(np.concatenate([points[keep], [1.0], np.array(extra, dtype=float)]))
 
