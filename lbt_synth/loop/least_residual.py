@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
-from scipy.linalg import block_diag, toeplitz
+from scipy.linalg import toeplitz
 
 from lbt_synth.errors import CoupledModesError, LbtSynthError, ProblemError
 from lbt_synth.linear.quadrature import RefinedPanels, graded_edges, refine_panels
@@ -30,7 +30,6 @@ from lbt_synth.models import (
     Truth,
     Vibration,
 )
-from lbt_synth.models.plant.assembly import other_exposures
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density, spectrum_key
 from lbt_synth.models.vibration import checked_direction
 from lbt_synth.validation import FloatArray, frozen_copy, read_only, require_instance
@@ -242,10 +241,11 @@ def truth_modes(
     gain = truth.sensor_gain if isinstance(truth, Truth) else 1.0
     groups, vibrations, factor = truth.entering(hardware, sensor_gain=gain)
     noise_nm2 = factor @ factor.T / gain**2
-    if hardware.suite.accelerometers:
-        vibrations = ()
     if hardware.suite.sensors:
-        hardware, noise_nm2 = _quick_sensors(hardware, noise_nm2)
+        raise ProblemError(
+            "the limit is that of the loop's own sensor; got others beside it. Take "
+            "hardware.own_sensor_alone()."
+        )
     n, rate = hardware.modes, hardware.frame_rate_hz
     noise = _noise_on_modes(hardware, noise_nm2)
     rank = np.linalg.matrix_rank(hardware.influence)
@@ -296,27 +296,6 @@ def truth_modes(
         late = in_image and hardware.delay_frames > frames
         modes.append(mode.interpolated(hardware.delay_frames) if late else mode)
     return axes, modes
-
-
-def _quick_sensors(
-    hardware: LoopHardware, noise_nm2: FloatArray
-) -> tuple[LoopHardware, FloatArray]:
-    """Return a loop whose other sensors read every frame at once, and the noise of all (q, q)."""
-    sensor, blocks = [hardware.sensor], [noise_nm2]
-    suite = hardware.suite
-    for other, seen in zip(suite.wavefront, other_exposures(hardware), strict=True):
-        if seen.age_frames % 1:
-            raise ProblemError(
-                f"no limit is known where an exposure of sensor {other.name} ends within a frame "
-                f"of the loop; it ends {seen.age_frames % 1:.3g} frames after one begins."
-            )
-        factor = other.noise_factor(hardware.modes)
-        sensor.append(seen.response)
-        blocks.append(seen.period * factor @ factor.T)
-    if not noise_nm2.any():  # nothing adds to a sensor without noise
-        sensor, blocks = sensor[:1], blocks[:1]
-    every = replace(hardware.own_sensor_alone(), sensor_matrix=np.vstack(sensor))
-    return every, block_diag(*blocks)
 
 
 def _whole_frames(hardware: LoopHardware, *, in_image: bool) -> int:
@@ -406,11 +385,6 @@ def least_residual(
     can be rejected entirely at a price as small as one likes. Random vibrations count with their
     spectra.
 
-    With other sensors beside the loop's own it is the least residual of a loop that knows more:
-    each wavefront sensor reads each frame of its exposures at once, with as much noise as gives the
-    mean its own; accelerometers know all vibrations in advance. A sensor that reads each frame at
-    the loop's own delay loses nothing by that, a slow or late one a little.
-
     Parameters
     ----------
     hardware : LoopHardware
@@ -430,8 +404,8 @@ def least_residual(
     ------
     ProblemError
         If a mode is not seen or not reached, the modes do not decouple, or a disturbance does
-        not fit the loop; also for a mirror with dynamics, where an exposure of another sensor ends
-        within a frame, and in means over frames where a delay ends in the second half of a frame.
+        not fit the loop; also for other sensors, for a mirror with dynamics, and in means over
+        frames where a delay ends in the second half of a frame.
     NumericalError
         If an integral over a spectrum does not settle.
 
@@ -452,7 +426,7 @@ def least_residual(
     try:
         axes, modes = truth_modes(hardware, truth, in_image=not frame_means)
     except CoupledModesError:
-        late = hardware.mirror is not None or hardware.delay_frames % 1 or hardware.suite.sensors
+        late = hardware.mirror is not None or hardware.delay_frames % 1
         if isinstance(truth, Truth) or late:
             raise
         return _coupled_limit(truth, in_image=not frame_means)

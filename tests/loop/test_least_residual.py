@@ -13,7 +13,6 @@ import lbt_synth as lbt
 from lbt_synth.design.result import model_limits
 from lbt_synth.errors import CoupledModesError, DimensionError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.least_residual import least_residual
 
 
@@ -173,65 +172,6 @@ def test_coupled_modes_have_the_limit_of_the_best_filter(delay):
     assert nearly.rms_nm > alone.rms_nm
 
 
-def variances_of_sensors(sensors, *, delay=2.0, lines=(), sensor_gain=1.0, own_noise=20.0):
-    """Return what the Kalman filter of several sensors leaves, and the bound [nm^2]."""
-    slow = ar(0.995, driving=8.0)
-    own = lbt.tip_tilt_plant(
-        frame_rate_hz=RATE,
-        turbulence=slow,
-        vibrations=[line for line, _ in lines] or None,
-        noise_nm=own_noise,
-        delay_frames=delay,
-        sensor_matrix=[[sensor_gain]],
-        modes=1,
-    )
-    motions = tuple(moves for _, moves in lines)
-    plant = own.with_sensors(lbt.models.SensorSuite(sensors=tuple(sensors)), motions)
-    controller = plant.controller(kalman_riccati(plant).gain_predictor)
-    loop = lbt.close_loop(plant.hardware, controller)
-    truth = lbt.Truth(
-        turbulence=slow,
-        vibrations=tuple(line for line, _ in lines),
-        motions=motions,
-        noise_nm=own_noise,
-    )
-    limit = lbt.loop.least_residual(plant.hardware, truth)
-    left = float(np.trace(lbt.residual_budget(loop, truth).total_nm2))
-    return left, float(limit.variance_nm2.sum())
-
-
-def second(rate_hz, delay_frames, noise_nm):
-    return lbt.models.WavefrontSensor(
-        name="second", rate_hz=rate_hz, delay_frames=delay_frames, noise_nm=noise_nm
-    )
-
-
-def test_the_bound_of_two_sensors_is_met_by_quick_ones_and_passed_by_none():
-    calm, suite = {"turbulence": ar(0.99)}, lbt.models.SensorSuite(sensors=(second(RATE, 2, 3.0),))
-    assert variance(path(suite=suite), **calm) == variance(path(), **calm)  # its own has no noise
-    left, least = variances_of_sensors([second(RATE, 2, 9.0)], sensor_gain=0.6)
-    assert least == pytest.approx(left, rel=1e-7)
-    for divisor, delay_frames in ((2, 2), (5, 3.2)):
-        left, least = variances_of_sensors([second(RATE / divisor, delay_frames, 3.0)])
-        alone = variances_of_sensors([second(RATE / divisor, delay_frames, 1e4)])[0]
-        assert 0.3 * left < least < left < alone
-
-
-def test_accelerometers_cannot_do_more_than_know_the_vibrations():
-    line = lbt.Vibration(frequency_hz=25, damping=0.02, rms_nm=100, direction=(1,))
-    moves = {"m1": lbt.models.Motion(size=1.0)}
-    seen = [
-        lbt.models.Accelerometer(
-            name="a", rate_hz=RATE, delay_frames=1, channels=("m1",), noise_m_s2=noise
-        )
-        for noise in (1e-6, 1e-2)
-    ]
-    known, hidden = (variances_of_sensors([each], lines=[(line, moves)]) for each in seen)
-    assert known[1] == hidden[1]
-    assert known[1] < known[0] < hidden[0]
-    assert known[0] < 1.6 * known[1]
-
-
 def test_more_measurements_than_modes():
     """Two equal sensors of one mode halve the noise; a mixed sensor can be undone."""
     model = {"turbulence": ar(0.99)}
@@ -297,7 +237,10 @@ def shaken(hardware, *lines):
     return variance(hardware, **CALM, vibrations=lines)
 
 
-LATE, MOVING = second(RATE / 5, 2.1, 3.0), path(mirror=shell(100))
+MOVING = path(mirror=shell(100))
+SUITE = lbt.models.SensorSuite(
+    sensors=(lbt.models.WavefrontSensor(name="second", rate_hz=RATE, delay_frames=2, noise_nm=3.0),)
+)
 
 
 def test_refusals():
@@ -328,7 +271,11 @@ def test_refusals():
             CoupledModesError,
             "modes that decouple",
         ),
-        (lambda: variances_of_sensors([LATE]), ProblemError, "ends within a frame of the loop"),
+        (
+            lambda: variance(path(suite=SUITE), **CALM),
+            ProblemError,
+            "loop's own sensor; got others",
+        ),
         (lambda: variance(MOVING, **CALM), ProblemError, "got dynamics"),
         (lambda: variance(path(2.6), **CALM), ProblemError, "at most a half beyond whole frames"),
     ]
