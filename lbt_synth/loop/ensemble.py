@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.loop.evaluator import Turbulence
 from lbt_synth.models import (
     ARModel,
     FrozenFlows,
     LoopHardware,
     SinusoidalVibration,
-    Spectrum,
     Vibration,
 )
-from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.spectra import spectrum_key
+from lbt_synth.models.vibration import require_below_nyquist
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -27,8 +26,6 @@ from lbt_synth.validation import (
     frozen_copy,
     positive,
     real_array,
-    require_instance,
-    sequence,
     set_fields,
 )
 
@@ -48,11 +45,8 @@ class EnsembleVibration:
         for name in ("frequency_hz", "rms_nm", "damping"):
             if getattr(self, name) is not None:
                 set_fields(self, **{name: positive(getattr(self, name), name)})
-        direction = real_array(self.direction, "direction")
-        length = np.linalg.norm(np.atleast_1d(direction), axis=-1, keepdims=True)
-        if direction.ndim not in (1, 2) or not np.all(length > 0):
-            wanted = "a vector over the modes, or one per loop, and not zero"
-            raise ProblemError(f"direction must be {wanted}; got shape {direction.shape}.")
+        direction = np.asarray(self.direction, dtype=np.float64)
+        length = np.linalg.norm(direction, axis=-1, keepdims=True)
         set_fields(self, direction=frozen_copy(direction / length))
 
     @property
@@ -110,28 +104,15 @@ class LoopEnsemble:
     loops: int = 0  # how many loops; by default as many as there are numbers
 
     def __post_init__(self) -> None:
-        set_fields(self, vibrations=sequence(self.vibrations, "vibrations"))
-        for line in self.vibrations:
-            require_instance(line, EnsembleVibration)
         noise = real_array(self.noise_nm, "noise_nm")
         if np.any(noise < 0):
             raise ProblemError(f"noise_nm must be at least 0; got {noise.min():.6g}.")
         set_fields(self, sensor_gain=positive(self.sensor_gain, "sensor_gain"), noise_nm=noise)
-        if self.delay_frames is not None:
-            delay = real_array(self.delay_frames, "delay_frames")
-            if np.any((delay < 1) | (delay > LONGEST_DELAY)):
-                bounds, got = f"at least 1 and at most {LONGEST_DELAY}", delay.ravel().tolist()
-                raise ProblemError(f"delay_frames must be {bounds}; got {got}.")
-            set_fields(self, delay_frames=delay)
         values = [self.sensor_gain, self.noise_nm, self.delay_frames]
         values += [value for line in self.vibrations for value in line.per_loop]
         values += [v for air in self._turbulence_of(1) for v in _turbulence_numbers(air)]
-        lengths = {len(value) for value in values if np.ndim(value)} | ({self.loops} - {0})
-        if len(lengths - {1}) > 1 or 0 in lengths:
-            raise DimensionError(
-                f"all must have one entry per loop, and at least one; got {sorted(lengths)}."
-            )
-        set_fields(self, loops=max(lengths, default=1))
+        lengths = [len(value) for value in values if np.ndim(value)]
+        set_fields(self, loops=max([self.loops, *lengths], default=1) or 1)
 
     def _turbulence_of(self, modes: int) -> tuple[Any, ...]:
         """Return the turbulence as it is per mode, or for each of some modes."""
@@ -153,16 +134,11 @@ class LoopEnsemble:
         if self.noise_factor is not None:
             return np.broadcast_to(self.noise_factor, (self.loops, *self.noise_factor.shape))
         noise = noise[:, None] if noise.ndim == 1 else noise
-        if noise.ndim == 2 and noise.shape[1] not in (1, q):
-            got = noise.shape[1]
-            raise DimensionError(f"noise_nm must have one column per measurement ({q}); got {got}.")
         return np.broadcast_to(noise, (self.loops, q))[..., None] * np.eye(q)
 
     def groups(self, hardware: LoopHardware) -> list[tuple[Turbulence, IntArray]]:
         """Return the turbulence with the modes that have it."""
-        n, airs = hardware.modes, self._turbulence_of(hardware.modes)
-        if len(airs) != n:
-            raise DimensionError(f"turbulence must have one entry per mode ({n}); got {len(airs)}.")
+        airs = self._turbulence_of(hardware.modes)
         keys = [spectrum_key(air) for air in airs]
         kinds = {key: air for key, air in zip(keys, airs, strict=True) if air is not None}
         return [
@@ -171,17 +147,8 @@ class LoopEnsemble:
 
     def lines(self, hardware: LoopHardware) -> list[EnsembleVibration]:
         """Return the vibrations with all their numbers (p,), and directions (p, n)."""
-        n, nyquist = hardware.modes, hardware.frame_rate_hz / 2
         for line in self.vibrations:
-            got = line.direction.shape[-1]
-            if got != n:
-                raise DimensionError(
-                    f"the direction of a vibration must have {n} components, one per mode; got "
-                    f"{got}."
-                )
-            if not np.max(line.frequency_hz) < nyquist:
-                limit, got = f"the Nyquist frequency {nyquist:.6g} Hz", np.max(line.frequency_hz)
-                raise ProblemError(f"a vibration must lie below {limit}; got {got:.6g} Hz.")
+            require_below_nyquist(float(np.max(line.frequency_hz)), hardware.frame_rate_hz)
         return [line.of_loops(self.loops) for line in self.vibrations]
 
 
@@ -192,11 +159,6 @@ def _turbulence_numbers(turbulence: Turbulence | None) -> list[FloatArray]:
         return [value for value in values if value is not None]
     if isinstance(turbulence, ARModel) and turbulence.coefficients.ndim > 1:
         return [*turbulence.coefficients.T, turbulence.driving_rms_nm]
-    if turbulence is not None and not isinstance(turbulence, Spectrum):
-        raise ProblemError(
-            "turbulence must be a spectrum, FrozenFlows or None, or a sequence of these; got "
-            f"{type(turbulence).__name__}."
-        )
     return []
 
 

@@ -215,9 +215,10 @@ class LoopMargins(Summarised):
         unit="deg",
         help="Least phase lag that destabilises; inf without a crossover",
     )
-    delay_s: float = column(unit="s", help="Least further delay of the loop that destabilises")
     delay_frames: float = column(
-        "delay margin", unit="frames", help="The same; inf if the longest delay is stable"
+        "delay margin",
+        unit="frames",
+        help="Least further delay that destabilises; inf if the longest delay is stable",
     )
     early_frames: float = column(
         "early delay margin",
@@ -337,7 +338,6 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
         gain_low=low / loop.sensor_gain,
         gain_high=high / loop.sensor_gain,
         phase_deg=min((point.phase_deg for point in crossings), default=np.inf),
-        delay_s=delay / loop.hardware.frame_rate_hz,
         delay_frames=delay,
         early_frames=early,
         together=errors_together(loop),

@@ -100,7 +100,6 @@ def robustness(
     errors_hz: Sequence[float],
     methods: Sequence[str] | None = None,
     gamma_ratio: float = 1.2,
-    hold: str = "driving",
 ) -> Iterator[RobustnessRow]:
     """Design at each frequency error and evaluate exactly against the same truth.
 
@@ -120,8 +119,6 @@ def robustness(
         filter.
     gamma_ratio : float, optional
         H-infinity bound as a multiple of each row's least gamma.
-    hold : {"driving", "rms"}, optional
-        What the model keeps of a vibration when its frequency moves.
 
     Yields
     ------
@@ -156,7 +153,7 @@ def robustness(
         shifts = [
             -truth.frequency_shift_hz(line.frequency_hz, error_hz) for line in plant.vibrations
         ]
-        moved = retuned_plant(plant, shifts, hold=hold)
+        moved = retuned_plant(plant, shifts, hold="driving")
         for name in names:
             design = reference_design(name, moved, {"gamma_ratio": gamma_ratio})
             closed = design.close(plant.hardware, sensor_gain=truth.sensor_gain)
