@@ -21,21 +21,21 @@ LINES = {
     "identification": 9563,
     "interop": 3862,
     "linear": 5763,
-    "loop": 4088,
+    "loop": 4016,
     "methods": 920,
     "models": 4400,
     "report": 4312,
     "storage": 1049,
-    "studies": 2792,
+    "studies": 2760,
     "errors, validation": 642,
 }
 COUNTS = {
-    "files of the package": 211,
+    "files of the package": 210,
     "public names": 171,
     "tuned constants": 515,
-    "lines of tests": 32003,
+    "lines of tests": 31917,
     "lines of benchmarks": 4035,
-    "words of docs": 60091,
+    "words of docs": 60067,
 }
 
 

@@ -65,7 +65,6 @@ _LONGEST = 100  # delay up to which it is sought [frames]
 # loop with a pole nearer to the unit circle does not count as stable.
 CIRCLE_LIMIT = 1 - 1e-7
 _WIDEST_MOVING = 100.0  # factor on the loop's gain beyond which no pyramid's optical gain lies
-_NONE = np.zeros(0)
 # a loop of another gain, over the one assumed, and delay [frames], and taps of
 # ``z^-1 (M_d - g M_d')``, (t,)
 LoopChange: TypeAlias = tuple[float, float, FloatArray]
@@ -242,20 +241,17 @@ def _last_stable(
     steps: Iterable[FloatArray],
     *,
     rounds: int,
-    further: FloatArray = _NONE,
 ) -> float | None:
     """Return the last stable number before the first that is not, None if all are stable.
 
-    Each of the steps begins with a stable number. The step in which one is unstable is divided
-    again and again; ``further`` numbers are tried wherever they lie within.
+    Each of the steps begins with a stable number. The one in which one is unstable is divided again
+    and again.
     """
     for numbers in steps:
         unstable = np.flatnonzero(~are_stable(numbers[1:]))
         for _ in range(rounds if unstable.size else 0):
             first, last = numbers[unstable[0]], numbers[unstable[0] + 1]
-            within = further[(further - first) * (further - last) < 0]
-            numbers = np.concatenate([np.linspace(first, last, _FINER + 1), within])
-            numbers = np.sort(numbers)[:: 1 if first < last else -1]
+            numbers = np.linspace(first, last, _FINER + 1)
             unstable = np.append(np.flatnonzero(~are_stable(numbers[1:])), numbers.size - 2)
         if unstable.size:
             return float(numbers[unstable[0]])
@@ -287,7 +283,7 @@ def delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
         np.union1d(np.linspace(low, high, _DIVISION + 1), peaks[(peaks > low) & (peaks < high)])
         for low, high in pairwise(ends)
     )
-    last = _last_stable(are_stable, steps, rounds=_DELAY_ROUNDS, further=peaks)
+    last = _last_stable(are_stable, steps, rounds=_DELAY_ROUNDS)
     return np.inf if last is None else last
 
 

@@ -16,7 +16,7 @@ from lbt_synth.report.study import (
     short_names,
 )
 from lbt_synth.storage.tables import Cell, Table
-from lbt_synth.studies.study.sample import evaluate_samples
+from lbt_synth.studies.study.run import evaluate_samples
 from lbt_synth.studies.study.statistics import study_statistics
 
 
