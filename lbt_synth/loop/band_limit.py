@@ -60,7 +60,7 @@ def least_worst_residual(
 ) -> BandLimit:
     """Least worst residual [nm rms] of any linear controller with a sinusoid anywhere in a band.
 
-    The controller knows the truth, which must have noise, the band, and the size and direction of
+    The controller knows the truth, the band, and the size and direction of
     the sinusoid, but not its frequency; what counts is the frequency that is worst for it. In the
     image the limit is the larger of two: with the least mean over a frame and the least motion
     within one, over the band; and with all of the mean rejected, and the motion within a frame at
@@ -122,9 +122,7 @@ class _Band:
     def of(mode: ModeSpectrum, ends: tuple[float, float]) -> _Band:
         """Prepare a mode with a band."""
         width, noise = ends[1] - ends[0], mode.noise_nm2
-        panels = mode.log_moments(noise, ends) if noise > 0 else None
-        if panels is None:
-            raise ProblemError("the limit over a band needs noise; got none. Give noise_nm.")
+        panels = mode.log_moments(ends)
         middle = (panels.low + panels.high) / 2
         inside = (middle > ends[0]) & (middle < ends[1])
         cuts = [np.linspace(*ends, _PANELS + 1), panels.low[inside], panels.high[inside]]
@@ -160,7 +158,7 @@ class _Band:
         rejection = prediction.error_power(self.x) / (self.base + added)
         mean = float(self.quadrature @ (added * rejection))
         gap = noise * float(np.exp(prediction.mean_log)) * (total * worst - mean)
-        return prediction.variance(noise, noise), max(gap, 0.0)
+        return prediction.variance(noise), max(gap, 0.0)
 
 
 def _find_saddle(

@@ -93,7 +93,7 @@ class Interpolation:
 class Prediction:
     """Best prediction of a process whose spectrum has given integrals of its logarithm."""
 
-    mean_log: float  # mean of ``log(Phi / reference)``
+    mean_log: float  # mean of ``log(Phi / R)``
     coefficients: FloatArray  # ``1, f_1, ...`` of ``F = sigma (1 + f_1 z^-1 + ...)``
     target: Interpolation | None  # what is predicted, where it is not one sample
 
@@ -102,15 +102,14 @@ class Prediction:
         """Predict from the integrals of the logarithm times cosines."""
         return Prediction(float(moments[0]), _exponential(moments), target)
 
-    def variance(self, reference: float, noise: float) -> float:
-        """Least variance of the residual; the reference is the noise unless that is zero."""
+    def variance(self, noise: float) -> float:
+        """Least variance of the residual, for a noise of variance R."""
         sigma2 = np.exp(self.mean_log)
         if self.target is not None:
-            return self.target.variance(self.coefficients, reference * sigma2, noise)
+            return self.target.variance(self.coefficients, noise * sigma2, noise)
         later = float(np.sum(self.coefficients[1:] ** 2))
-        if noise > 0:  # sums of positive numbers: no digits are lost however large the noise
-            return float(reference * (np.expm1(self.mean_log) + sigma2 * later))
-        return float(reference * sigma2 * (1 + later))
+        # sums of positive numbers: no digits are lost however large the noise
+        return float(noise * (np.expm1(self.mean_log) + sigma2 * later))
 
     def error_power(self, x: FloatArray) -> FloatArray:
         """``|P|^2 / sigma^2`` at frequencies x: the rejection is ``|P / F|^2``."""
@@ -193,37 +192,20 @@ class ModeSpectrum:
         keep = np.concatenate([[True], np.diff(points) > 1e-12])
         return np.unique(np.concatenate([points[keep], [1.0], np.array(extra, dtype=float)]))
 
-    def reference(self) -> float:
-        """Return the unit of the logarithm [nm^2]: the noise, else the largest of the spectrum."""
-        if self.noise_nm2 > 0:
-            return self.noise_nm2
-        edges = self.edges()
-        return float(np.max(self.power((edges[1:] + edges[:-1]) / 2), initial=0.0))
-
-    def log_moments(self, reference: float, ends: Sequence[float] = ()) -> RefinedPanels | None:
-        """Integrals of ``log(Phi / reference)`` times the cosines; None where Phi vanishes.
-
-        The two ``ends`` are edges of panels.
-        """
-        noiseless = self.noise_nm2 == 0
+    def log_moments(self, ends: Sequence[float] = ()) -> RefinedPanels:
+        """Integrals of ``log(Phi / R)`` times the cosines; the two ``ends`` are edges of panels."""
 
         def integrand(x: FloatArray) -> FloatArray:
             with np.errstate(over="ignore"):
-                ratio = self.power(x) / reference
+                ratio = self.power(x) / self.noise_nm2
             if not np.all(np.isfinite(ratio)):
                 raise ProblemError(
                     f"the noise variance {self.noise_nm2:.3g} nm^2 is too small beside the "
-                    "disturbance to differ from zero; set noise_nm to 0."
+                    "disturbance to differ from zero. Give noise_nm a size that sensors have."
                 )
-            if noiseless and np.any(ratio == 0):
-                raise ZeroDivisionError  # the process can be predicted exactly
-            values = np.log(ratio) if noiseless else np.log1p(ratio)
-            return np.asarray(values[:, None] * self.cosines(x))
+            return np.asarray(np.log1p(ratio)[:, None] * self.cosines(x))
 
-        try:
-            return refine_panels(integrand, self.edges(ends), floor=1e-14 if noiseless else 0.0)
-        except ZeroDivisionError:
-            return None
+        return refine_panels(integrand, self.edges(ends))
 
 
 def truth_modes(
@@ -319,15 +301,13 @@ def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray
             "the sensor must see every mode: a sensor matrix with full column rank; got rank "
             f"{rank} for {n} modes. Leave out the modes that it does not see."
         )
-    if not np.any(noise_nm2):
-        return np.zeros((n, n))
     try:
-        size = float(np.max(np.abs(noise_nm2)))
+        size = float(np.max(np.abs(noise_nm2))) or 1.0
         factor = np.linalg.cholesky(noise_nm2 / size)
     except np.linalg.LinAlgError as error:
         raise ProblemError(
-            "the noise must be zero, or have a positive definite covariance; got a singular one. "
-            "Add a little noise to each measurement."
+            "the noise must have a positive definite covariance; got a singular one. Add a little "
+            "noise to each measurement."
         ) from error
     white = np.linalg.solve(factor, sensor)
     return np.asarray(size * np.linalg.inv(white.T @ white))
@@ -411,12 +391,14 @@ def least_residual(
 
     Examples
     --------
-    An AR1 process without noise, predicted over two frames:
+    An AR1 process with hardly any noise, predicted over two frames:
 
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2, modes=1)
     >>> slow = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=2.0, frame_rate_hz=800)
-    >>> limit = lbt.loop.least_residual(path, lbt.Truth(turbulence=slow), frame_means=True)
+    >>> limit = lbt.loop.least_residual(
+    ...     path, lbt.Truth(turbulence=slow, noise_nm=1e-6), frame_means=True
+    ... )
     >>> round(float(limit.variance_nm2[0]), 8)  # 2^2 (1 + 0.5^2)
     5.0
     """
@@ -458,12 +440,10 @@ def _coupled_limit(plant: TipTiltPlant, *, in_image: bool) -> ResidualLimit:
 
 def mode_limit(mode: ModeSpectrum) -> float:
     """Least variance of the means of one mode."""
-    reference = mode.reference()
-    panels = mode.log_moments(reference) if mode.parts and reference > 0 else None
-    if panels is None:  # nothing to correct, or all of it can be predicted
+    if not mode.parts:
         return 0.0
-    prediction = Prediction.of(panels.integrals.sum(axis=0), mode.target)
-    return prediction.variance(reference, mode.noise_nm2)
+    moments = mode.log_moments().integrals.sum(axis=0)
+    return Prediction.of(moments, mode.target).variance(mode.noise_nm2)
 
 
 def above_percent(rms_nm: float, limit_nm: float) -> float:

@@ -102,7 +102,7 @@ def test_a_narrow_band_tends_to_the_known_frequency():
         ({"band_hz": (0, 20)}, "above 0"),
         ({"direction": (1, 0)}, "must have 1 components"),
         ({"direction": (0,)}, "not zero"),
-        ({"truth": lbt.Truth(turbulence=ar(0.9))}, "needs noise"),
+        ({"truth": lbt.Truth(turbulence=ar(0.9))}, "a positive definite covariance"),
     ],
 )
 def test_bad_bands(arguments, text):
