@@ -23,6 +23,7 @@ from harness import log_uniform, record_options, run_all, second_order
 from scipy.signal import lfilter
 
 import lbt_synth as lbt
+from lbt_synth.config.write import config_text, identified_config
 from lbt_synth.identification.accelerometers.transfers import accelerometer_transfers
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.disturbances import run_oscillator
@@ -171,9 +172,10 @@ def loss(seed: int, frames: int) -> float:
     it = case(seed, frames)
     model = lbt.identify(it.record)
     found = accelerometer_transfers(model, it.record, it.accelerations)
-    settings, comments = lbt.config.identified_config(model, accelerometers=found)
+    settings, comments = identified_config(model, accelerometers=found)
     with tempfile.TemporaryDirectory() as folder:
-        path = lbt.config.save_config(Path(folder) / "model.yaml", settings, comments=comments)
+        path = Path(folder) / "model.yaml"
+        path.write_text(config_text(settings, comments), encoding="utf-8")
         config = lbt.load_config(path)
     best = true_plant(it, *(row.channel for row in found.channels[:2]))
     read = true_plant(it, *config.hardware.suite.channels)

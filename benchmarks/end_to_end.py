@@ -29,10 +29,9 @@ def run(
     setup: optics.EndToEndSetup,
     controller: Any = None,
     config: str = "examples/lbt.yaml",
-    **options: float,
 ) -> EndToEndRun:
     known = calibration(config)
-    return lbt.interop.run_end_to_end(setup, controller, calibration=known, **options)
+    return lbt.interop.run_end_to_end(setup, controller, calibration=known)
 
 
 def mean(runs: list[EndToEndRun]) -> str:
@@ -53,7 +52,7 @@ def leaks() -> None:
 
 def gains() -> None:
     for gain in (0.5, 0.56, 0.7, 0.9, 1.1):
-        runs = [run(replace(SETUP, seed=1), tip_tilt_gain=gain)]
+        runs = [run(replace(SETUP, seed=1), lbt.integrator(SETUP.hardware, gain=gain))]
         rms = np.hypot(*runs[0].rms_nm[:2])
         print(f"classical, gain {gain} with the vibration: {mean(runs)}, {rms:.0f} nm", flush=True)
 

@@ -20,7 +20,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 import lbt_synth as lbt
 from lbt_synth.models.loop_hardware import past_corrections
-from lbt_synth.models.resonance_spectrum import coefficients
+from lbt_synth.models.resonance_spectrum import coefficient_rows, drive_ratio
 
 FIGURES = Path(__file__).with_name("identification_figures.json")
 Row = dict[str, Any]
@@ -183,7 +183,8 @@ def frozen_flow(rng: np.random.Generator) -> lbt.Atmosphere:
 
 def second_order(hz: float, damping: float, rms_nm: float, rate: float) -> lbt.models.ARModel:
     """Return turbulence of second order."""
-    a1, a2, drive = coefficients(2 * np.pi * hz / rate, damping)
+    place = 2 * np.pi * hz / rate, damping
+    (a1, a2), drive = coefficient_rows(*map(np.array, place)), drive_ratio(*place)
     return lbt.models.ARModel(
         coefficients=[a1, a2], driving_rms_nm=rms_nm * np.sqrt(drive), frame_rate_hz=rate
     )

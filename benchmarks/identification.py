@@ -302,14 +302,14 @@ def studied(seed: int, frames: int) -> dict:
     axis = model.axes[0]
     best = left(it, lbt.kalman(exact_plant(it)).controller)
     limit = lbt.loop.least_residual(it.path, it.truth, frame_means=True).rms_nm ** 2
-    half, _ = split_halves(it.record.stretches())
-    halved = lbt.identify(it.record, stretches=half)
+    first, _ = split_halves(it.record)
+    halved = lbt.identify(first)
     table = lbt.identification.prediction_against_data(
         it.record, exact_plant(it), {"Kalman": lbt.kalman(halved.plant()).controller}
     )
     filtered, ((start, stop),) = table["Kalman"].replayed, table.test
     true_open = it.record.pseudo_open_loop(it.truth.sensor_gain)
-    predicted = least_squares(true_open, it.path.mirror_taps, 32, half)[start:stop]
+    predicted = least_squares(true_open, it.path.mirror_taps, 32, table.fit)[start:stop]
     noise_nm2 = (it.truth.noise_nm / it.truth.sensor_gain) ** 2
     error = axis.sensor_gain_error
     return {

@@ -31,7 +31,8 @@ from lbt_synth.identification.prediction.residual import (
     replay,
     settled_test,
 )
-from lbt_synth.identification.stretches import Stretches, cut_stretches
+from lbt_synth.identification.records.faults import mark
+from lbt_synth.identification.stretches import Stretches, cut_stretches, keep_frames
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray
@@ -236,7 +237,8 @@ def residuals_of(
         end = int((1 + k / splits) / 2 * usable)
         training = cut_stretches(stretches, 0, end)
         test = cut_stretches(stretches, end, end + usable // (2 * splits))
-        model = lbt.identify(record, stretches=training, start=model)
+        kept = mark(np.array(training), record.frames)
+        model = lbt.identify(keep_frames(record, kept), start=model)
         split = Split(record, training, test, model)
         for name in [name for name in ENTRIES if name not in failed]:
             try:

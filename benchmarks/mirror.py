@@ -135,7 +135,8 @@ def main() -> None:
     errors()
     if len(sys.argv) > 1:
         for name, file in (("500 Hz", "mirror_quick.png"), ("100 Hz", "mirror_slow.png")):
-            figure = mirror_figure(replace(CONFIG.hardware, mirror=MIRRORS[name]))
+            shell = MIRRORS[name]
+            figure = mirror_figure(shell, replace(CONFIG.hardware, mirror=shell))
             print(save_figure(figure, f"{sys.argv[1]}/{file}"))
 
 

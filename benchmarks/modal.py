@@ -14,6 +14,7 @@ from scipy.optimize import minimize_scalar
 import lbt_synth as lbt
 from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.draw import save_figure
+from lbt_synth.report.figures.studies import modal_figure
 
 MODES, RATE_HZ = 672, 800.0
 
@@ -85,9 +86,7 @@ def main() -> None:
     times = f"filters {1e3 * design:.0f} ms, optimised gains {1e3 * search:.0f} ms"
     print(f"design of {MODES} modes: {times}")
     if output:
-        figure = lbt.report.figures.modal_figure(
-            rows, gains=optimised.gains, turbulence_nm=modes.rms_nm
-        )
+        figure = modal_figure(rows, gains=optimised.gains, turbulence_nm=modes.rms_nm)
         print(f"written: {save_figure(figure, output)}")
 
 

@@ -16,8 +16,8 @@ if __name__ == "__main__":
         plant = lbt.tip_tilt_plant(
             frame_rate_hz=RATE_HZ, turbulence=air, vibrations=[line], noise_nm=noise_nm, modes=1
         )
-        shake = lbt.models.DriftingVibration(
-            start_hz=17, end_hz=23, duration_s=DRIFT_S, rms_nm=RMS_NM, direction=(1,)
+        shake = lbt.models.SinusoidalVibration(
+            frequency_hz=17, end_hz=23, duration_s=DRIFT_S, rms_nm=RMS_NM, direction=(1,)
         )
         truth = lbt.Truth(turbulence=air, vibrations=(shake,), noise_nm=noise_nm)
         controllers = {"fixed at 20 Hz": lbt.kalman(plant).controller} | {

@@ -16,7 +16,7 @@ from support.browser import chromium
 from support.configs import write_config
 from support.explore import await_verdict, choose, five_lines, move, press, served
 
-SIZE = {"width": 1400, "height": 1500, "deviceScaleFactor": 1, "mobile": False}
+SIZE = {"width": 1400, "height": 1060, "deviceScaleFactor": 1, "mobile": False}
 COLOURS = 64
 
 if __name__ == "__main__":

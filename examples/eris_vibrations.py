@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.report.draw import drawing, save_figure
+from lbt_synth.report.draw import GUIDE, drawing, line_style, name_axes, save_figure
 
 FILE = Path(__file__).parent / "data" / "eris_vibrations_psd.fits"
 COLUMNS = {"frequency": 0, "density": (1, 2)}
@@ -126,7 +126,7 @@ def composed(model: lbt.identification.IdentifiedModel) -> lbt.models.TipTiltPla
     air = lbt.models.ar2_turbulence(AIR, frame_rate_hz=FRAME_RATE_HZ, noise_nm=NOISE_NM)
     pole = np.log(np.roots([1.0, *-air.coefficients])[0].astype(complex)) * FRAME_RATE_HZ
     vibrations = []
-    for i, axis in enumerate(model.axes):
+    for i in range(len(model.axes)):
         along = tuple(float(i == j) for j in range(len(model.axes)))
         vibrations.append(
             lbt.Vibration(
@@ -136,12 +136,11 @@ def composed(model: lbt.identification.IdentifiedModel) -> lbt.models.TipTiltPla
                 direction=along,
             )
         )
-        vibrations += [part.vibration(along) for part in axis.parts]
     return lbt.tip_tilt_plant(
         frame_rate_hz=FRAME_RATE_HZ,
         delay_frames=DELAY_FRAMES,
         turbulence=[axis.turbulence for axis in model.axes],
-        vibrations=vibrations,
+        vibrations=[*vibrations, *(part.vibration() for part in model.parts)],
         noise_nm=NOISE_NM,
     )
 
@@ -245,28 +244,31 @@ def figure(
     f = np.union1d(np.geomspace(0.5, 499.0, 1500), seen.frequency_hz)
     whole = met.whole.turbulence_per_mode(seen.axes)
     noise = 2 * NOISE_NM**2 / FRAME_RATE_HZ
-    frequency = {"label": "frequency", "unit": "Hz", "log": True, "low": 0.5, "high": 499.0}
     axes = (
-        {"label": "density", "unit": "nm²/Hz", "log": True, "low": 0.1, "high": 1e6},
-        {"label": "rejection", "unit": "-", "log": True, "low": 5e-3, "high": 5.0},
-        {"label": "residual up to the frequency", "unit": "nm rms", "low": 0.0},
+        (("density", "nm²/Hz"), {"yscale": "log", "ylim": (0.1, 1e6)}),
+        (("rejection", "-"), {"yscale": "log", "ylim": (5e-3, 5.0)}),
+        (("residual up to the frequency", "nm rms"), {}),
     )
     heights = [height for height in (2.1, 2.1, 2.6) for _ in range(seen.axes)]
     with drawing(heights, columns=seen.axes) as panels:
         for i in range(seen.axes):
             density, column = whole[i].psd(f), panels[i :: seen.axes]
-            for panel, axis, title in zip(column, axes, (("tip", "tilt")[i], "", ""), strict=True):
-                panel.set_axes(frequency, axis, title=title)
+            for panel, (y, scale), title in zip(
+                column, axes, (("tip", "tilt")[i], "", ""), strict=True
+            ):
+                name_axes(panel, ("frequency", "Hz"), y, title, xscale="log", **scale)
+                panel.set_xlim(0.5, 499.0)
             spectrum, rejection, total = column
-            spectrum.curve("disturbance", f, density, look=None, width=0.7)
-            spectrum.rule("noise", noise, "y", dash=3)
-            rejection.rule("", 1.0, "y")
+            spectrum.plot(f, density, label="disturbance", **line_style(None, linewidth=0.7))
+            spectrum.axhline(noise, label="noise", linestyle=":", **GUIDE)
+            rejection.axhline(1.0, **GUIDE)
             for look, (name, loop) in enumerate(loops.items()):
                 rejected = np.abs(loop.sensitivity(f)[:, i, i]) ** 2
                 passed = np.abs(loop.path("noise", "residual").frequency_response(f)[:, i, i]) ** 2
                 left = accumulated(f, rejected * density + passed * noise)
-                rejection.curve(name, f, np.sqrt(rejected), look=look, width=0.9)
-                total.curve(name, f, np.sqrt(left), look=look)
+                rejection.plot(f, np.sqrt(rejected), label=name, **line_style(look, linewidth=0.9))
+                total.plot(f, np.sqrt(left), label=name, **line_style(look))
+            total.set_ylim(bottom=0)
     return panels[0].figure
 
 

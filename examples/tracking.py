@@ -18,8 +18,8 @@ plant = lbt.tip_tilt_plant(
 )
 
 # what is there
-shake = lbt.models.DriftingVibration(
-    start_hz=17, end_hz=23, duration_s=DRIFT_S, rms_nm=797, direction=(1,)
+shake = lbt.models.SinusoidalVibration(
+    frequency_hz=17, end_hz=23, duration_s=DRIFT_S, rms_nm=797, direction=(1,)
 )
 truth = lbt.Truth(turbulence=turbulence, vibrations=(shake,), noise_nm=15.5)
 

@@ -12,16 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-_LONGEST_MESSAGE = 2_000  # characters; values from a file may have millions
-
-
-def shorten_middle(message: str) -> str:
-    """Return a message, a very long one without its middle."""
-    if len(message) <= _LONGEST_MESSAGE:
-        return message
-    start, end = message[: _LONGEST_MESSAGE // 2], message[-_LONGEST_MESSAGE // 4 :]
-    return f"{start} [... {len(message) - len(start) - len(end)} characters ...] {end}"
-
 
 def suggest_word(word: str, known: Iterable[str]) -> str:
     """Return which of the known words was meant, or all of them."""
@@ -48,7 +38,7 @@ class LbtSynthError(Exception):
 
     def __init__(self, message: str = "", **data: Any) -> None:
         advice = data.get("in_python", "")
-        super().__init__(shorten_middle(f"{message} {advice}" if advice else message))
+        super().__init__(f"{message} {advice}" if advice else message)
         for name, value in data.items():
             if not hasattr(type(self), name):
                 raise TypeError(f"{type(self).__name__} has no attribute {name!r}.")
@@ -79,45 +69,23 @@ class CoupledModesError(ProblemError):
 
 
 class DetectabilityError(ProblemError):
-    """A mode that does not decay cannot be seen, or is not driven, as it must be.
+    """A mode that does not decay cannot be seen, or is not driven, as it must be."""
 
-    Attributes
-    ----------
-    eigenvalue : complex or None
-        The offending eigenvalue of the state matrix.
-    eigenvector : (n,) ndarray or None
-        Moduli of its eigenvector's entries, one per state, where it was computed.
-    """
-
-    eigenvalue: complex | None = None
-    eigenvector: Any = None
+    eigenvalue: complex | None = None  #: the offending one of the state matrix
+    eigenvector: Any = None  #: (n,): moduli of its entries, one per state, where it was computed
 
 
 class RecordError(ProblemError):
-    """A record contradicts itself: no model is fitted to it.
+    """A record contradicts itself: no model is fitted to it."""
 
-    Attributes
-    ----------
-    explanation : str
-        What explains the record better than what was given.
-    options : str
-        Options of the command line that repair it; empty if nothing does.
-    """
-
-    explanation: str = ""
-    options: str = ""
+    explanation: str = ""  #: what explains the record better than what was given
+    options: str = ""  #: options of the command line that repair it; empty if nothing does
 
 
 class ConfigError(ProblemError):
-    """A configuration file is refused.
+    """A configuration file is refused."""
 
-    Attributes
-    ----------
-    path : str
-        Path of the offending key, for example ``model.vibrations[0].damping``.
-    """
-
-    path: str = ""
+    path: str = ""  #: of the offending key, for example ``model.vibrations[0].damping``
 
 
 # --------------------------------------------------------------------------
@@ -128,87 +96,46 @@ class SynthesisError(LbtSynthError):
 
 
 class InfeasibleError(SynthesisError):
-    """No design meets the demand.
+    """No design meets the demand."""
 
-    Attributes
-    ----------
-    gamma : float or None
-        The requested level.
-    gamma_least : float or None
-        The least level that can be met.
-    conflict : tuple of str
-        Demands that cannot hold together; without any one of them the rest can.
-    """
-
-    gamma: float | None = None
-    gamma_least: float | None = None
+    gamma: float | None = None  #: the requested level
+    gamma_least: float | None = None  #: the least level that can be met
+    #: demands that cannot hold together; without any one of them the rest can
     conflict: tuple[str, ...] = ()
 
 
 class NumericalError(SynthesisError):
-    """A numerical method did not reach its accuracy.
+    """A numerical method did not reach its accuracy."""
 
-    Attributes
-    ----------
-    status : str
-        Status that the method reported.
-    residual : float or None
-        The residual reached.
-    """
-
-    status: str = ""
-    residual: float | None = None
+    status: str = ""  #: that the method reported
+    residual: float | None = None  #: that was reached
 
 
 class CertificateError(SynthesisError):
-    """A design failed a check of its certificate, so it is not returned.
+    """A design failed a check of its certificate, so it is not returned."""
 
-    Attributes
-    ----------
-    failed : tuple of str
-        Names of the checks that failed.
-    """
-
-    failed: tuple[str, ...] = ()
+    failed: tuple[str, ...] = ()  #: names of the checks
 
 
 class UnstableLoopError(SynthesisError):
-    """A closed loop is unstable or marginally stable, so it has no residual.
+    """A closed loop is unstable or marginally stable, so it has no residual."""
 
-    Attributes
-    ----------
-    spectral_radius : float
-        Largest modulus of the closed loop's poles.
-    """
-
-    spectral_radius: float = math.nan
+    spectral_radius: float = math.nan  #: largest modulus of the closed loop's poles
 
 
 class MissingExtraError(LbtSynthError, ImportError):
-    """An optional package is not installed, or not in a version that works here.
+    """An optional package is not installed, or not in a version that works here."""
 
-    Attributes
-    ----------
-    extra : str
-        The extra that brings it: ``pip install "lbt-synth[extra]"``.
-    """
-
-    extra: str = ""
+    extra: str = ""  #: that brings it: ``pip install "lbt-synth[extra]"``
 
 
 # --------------------------------------------------------------------------
 # Files.
 # --------------------------------------------------------------------------
 class FileError(LbtSynthError):
-    """A file cannot be read or written.
+    """A file cannot be read or written."""
 
-    Attributes
-    ----------
-    path : pathlib.Path or None
-        The file.
-    """
-
-    path: Path | None = None
+    path: Path | None = None  #: the file
 
 
 class GainFileError(FileError):

@@ -21,7 +21,6 @@ FORBIDDEN = {
     "report/new_page.py": ("jinja2", "Only report.page.html imports jinja2"),
     "loop/new_figure.py": ("matplotlib", "Only report imports matplotlib"),
     "linear/new_system.py": ("control", "Only linear.state_space imports control"),
-    "cli/new_shell.py": ("shtab", "Only cli.init imports shtab"),
     "interop/new_rtc.py": ("pyrtc", "Only interop.pyrtc imports pyrtc"),
     "linear/new_oracle.py": ("slycot", "Nothing else imports a GPL package"),
     "linear/new_plant.py": ("lbt_synth.models", "Rooms import only downwards"),

@@ -66,14 +66,6 @@ def test_help_is_a_page_with_every_name():
     assert [name for name in FACE if name not in words and name != "LbtSynthError"] == []
 
 
-@pytest.mark.parametrize("path", ROOMS)
-def test_a_name_that_is_in_a_room_is_pointed_to(path):
-    for name in public_names(path):
-        if name not in FACE:
-            with pytest.raises(AttributeError, match=rf"try lbt_synth\.{path}\.{name}\."):
-                getattr(lbt, name)
-
-
 def test_a_name_that_is_nowhere_is_refused():
     with pytest.raises(AttributeError, match="no_such_name"):
         _ = lbt.no_such_name

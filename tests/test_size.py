@@ -14,28 +14,28 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3825,
-    "config": 1846,
+    "cli": 3590,
+    "config": 1661,
     "design": 7690,
-    "files": 1283,
-    "identification": 9563,
-    "interop": 3862,
+    "files": 1243,
+    "identification": 9045,
+    "interop": 3756,
     "linear": 5763,
-    "loop": 3994,
+    "loop": 3988,
     "methods": 920,
     "models": 4400,
-    "report": 4312,
-    "storage": 1049,
-    "studies": 2760,
-    "errors, validation": 642,
+    "report": 3275,
+    "storage": 1027,
+    "studies": 2761,
+    "errors, validation": 554,
 }
 COUNTS = {
-    "files of the package": 210,
-    "public names": 171,
-    "tuned constants": 515,
-    "lines of tests": 31916,
-    "lines of benchmarks": 4035,
-    "words of docs": 60046,
+    "files of the package": 204,
+    "public names": 163,
+    "tuned constants": 498,
+    "lines of tests": 31029,
+    "lines of benchmarks": 4039,
+    "words of docs": 59818,
 }
 
 

@@ -7,6 +7,7 @@ that knows a 20 Hz vibration, and what it loses when it knows the wrong frequenc
 """
 
 import numpy as np
+from matplotlib.figure import Figure
 
 import lbt_synth as lbt
 
@@ -58,4 +59,10 @@ print(designs["H-infinity"])
 # H-infinity filter is the more tolerant one.
 
 rows = list(lbt.studies.robustness(plant, truth, camera, errors_hz=np.linspace(-3.5, 3.5, 15)))
-figure = lbt.report.figures.robustness_figure(rows)
+figure = Figure(layout="constrained")
+axes = figure.subplots()
+axes.set(xlabel="true frequency less that of the model [Hz]", ylabel="Strehl ratio")
+for method in ("kalman", "hinf"):
+    points = [(row.error_hz, row.strehl) for row in rows if row.method == method]
+    axes.plot(*np.transpose(points), "o-", label=method)
+axes.legend()

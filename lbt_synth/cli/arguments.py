@@ -71,8 +71,7 @@ _SHARED = """
   record
     series
     --accept-record | switch | go on although the commands do not reach the measurements as given
-    --figure | | figure to write (default: the output's name, .png)
-    --no-figure | switch | write no figure
+    --no-figure | switch | write no figure beside the output (.png)
   accelerometers
     > accelerometers
     --accelerometers | | NPY or CSV with one column per channel and one row per frame of the record
@@ -81,11 +80,9 @@ _SHARED = """
         the headings, else m/s2)
 """
 _TABLE = """
-  init | init | Write a commented configuration to begin with, a schema or a script for the shell.
+  init | init | Write a commented configuration to begin with, and its schema.
     --telescope | @telescopes | published numbers and their sources (default generic: assumed ones)
     --examples | switch | write the examples of the documentation instead (folder)
-    --schema | switch | print the JSON schema for editors instead (.json)
-    --completion | bash/zsh/fish | print the script with which a shell completes commands instead
     --force | switch | replace files that are there
     -o --output | | file to write (default: the telescope, .yaml)
   design | design | Design a controller and write its gain file.
@@ -161,7 +158,6 @@ _TABLE = """
     outputs
   show | design | Show a gain file: design, loop, margins, certificate.
     unit gain
-    --matrices | switch | print the gains and the controller, too
   verify | design | Recompute the certificate of a gain file.
     gain
   telemetry | telemetry | Show what telemetry or a record holds, and write it as telemetry.
@@ -169,8 +165,6 @@ _TABLE = """
     reading
     >
     -o --output | | file to write (.fits, .npz or .aot.fits)
-    --format | fits/npz/aot | of the file to write (default: its ending)
-    --precision | float64/float32 | of the series written (default float64)
   identify | records | Identify turbulence, vibrations, noise and sensor gain from a record.
     record accelerometers
     >
@@ -180,8 +174,7 @@ _TABLE = """
     >
     --method | @record_methods | default: kalman, unless another quick one leaves less
     --gamma-ratio | float | bound of the norm as a multiple of the least (default 1.2)
-    --model | | configuration to write (default: the output's name, .yaml)
-    -o --output | required | gain file (.fits or .npz)
+    -o --output | required | gain file (.fits or .npz); the configuration goes beside it (.yaml)
   diagnose | records | Say what ran in a record, what is wrong, what it costs, and what to change.
     series
     gain | nargs:? | gain file (.fits or .npz) to try on the record
@@ -255,6 +248,8 @@ _CHOICES = {  # what an argument may be: a tuple, or the function that returns i
     "record_methods": "lbt_synth.methods.registry:record_methods",
 }
 _TYPES: Mapping[str, type[Any]] = {"int": int, "float": float}
+# how scripts of shtab complete names of files
+_FILES = {"bash": "_shtab_compgen_files", "zsh": "_files", "fish": "(__fish_complete_path)"}
 
 
 def _add_arguments(parser: ArgumentParser, rows: Sequence[str]) -> None:
@@ -269,7 +264,9 @@ def _add_arguments(parser: ArgumentParser, rows: Sequence[str]) -> None:
                 place = parser.add_argument_group(title, text or None) if title else parser
         elif "|" in row:
             flags, how, text = (cell.strip() for cell in f"{row} | ".split("|", 2))
-            place.add_argument(*flags.split(), **_keywords(how, text.rstrip(" |")))
+            action = place.add_argument(*flags.split(), **_keywords(how, text.rstrip(" |")))
+            if action.choices is None and action.nargs != 0 and action.type is None:
+                action.complete = _FILES
         else:
             for name in row.split():
                 if name == "method":
@@ -381,6 +378,11 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
         if name in named:
             _add_arguments(added, command.arguments)
     return parser
+
+
+def full_parser() -> argparse.ArgumentParser:
+    """Build the parser of all commands with their arguments, of which shtab makes completions."""
+    return build_parser(*COMMANDS)
 
 
 def refuse_options(arguments: Namespace, names: Iterable[str], why: str) -> None:

@@ -17,7 +17,6 @@ from lbt_synth.cli.loop_inputs import (
     named_difference_notes,
     own_sensor_notes,
     say_limit,
-    say_residual,
 )
 from lbt_synth.cli.output import PERCENT, RMS, Report
 from lbt_synth.cli.streams import track_progress
@@ -30,13 +29,22 @@ from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residual import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models.turbulence.ar_models import noll_orders
-from lbt_synth.report.designs.report import refine_values, require_compatible, stable_interval
-from lbt_synth.report.figures import modal_figure, robustness_map_figure
-from lbt_synth.report.figures.studies import limits_figure, mirror_figure, tradeoff_figure
+from lbt_synth.report.designs import (
+    refine_values,
+    require_compatible,
+    stable_interval,
+)
+from lbt_synth.report.figures import robustness_map_figure
+from lbt_synth.report.figures.studies import (
+    limits_figure,
+    mirror_figure,
+    modal_figure,
+    tradeoff_figure,
+)
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.limits import LimitRow, LimitStudy, limits
+from lbt_synth.studies.limits import LimitRow, LimitStudy, limits, say_residual
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, mirror_rows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
@@ -129,11 +137,6 @@ def run_limits(arguments: Namespace) -> Report:
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
             "vibrations along principal axes of the sensor's noise."
         )
-    if config.truth.vibrations and not config.plant.vibrations:
-        report.notes.append(
-            "note: kalman and hinf are designed without a vibration, as model.vibrations is "
-            "missing; the truth has one."
-        )
     report.notes += named_difference_notes(config, designs)
     return report
 
@@ -196,17 +199,15 @@ def run_mirror(arguments: Namespace) -> Report:
         "rows",
         f"Designs on this mirror; {config.imaging.label}",
         rows,
-        figure=lambda: mirror_figure(hardware, tolerance=arguments.tolerance),
+        figure=lambda: mirror_figure(shell, hardware, tolerance=arguments.tolerance),
     )
     report.add_facts(
         "The mirror after a step of its command",
         facts(
-            rise_s=fact(step.rise_s, "rise, 10 % to 90 %", **ms),
             overshoot=fact(step.overshoot, "overshoot", unit="%", scale=100),
             tolerance=fact(step.tolerance, "tolerance of the settling time", unit="%", scale=100),
             settling_s=fact(step.settling_s, "settling time", **ms),
             settling_frames=fact(frames, "  in frames", unit="frames"),
-            bandwidth_hz=fact(shell.bandwidth_hz, "bandwidth, -3 dB", unit="Hz"),
             frame_s=fact(hardware.dt_s, "one frame", **ms),
             limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
         ),
@@ -301,17 +302,17 @@ def _stable_gains(design: Design, grid: RobustnessMap, config: Config) -> list[F
 
 def _map_points(name: str, grid: RobustnessMap) -> list[Facts]:
     """Return a row for each point of the map of a gain file."""
+    axes = grid.delay_errors_frames, grid.sensor_gains, grid.errors_hz
+    names = ("delay_error_frames", "sensor_gain", "error_hz")
     return [
         facts(
             file=fact(name),
-            delay_error_frames=fact(float(grid.delay_errors_frames[i])),
-            sensor_gain=fact(float(grid.sensor_gains[j])),
-            error_hz=fact(float(grid.errors_hz[k])),
+            **{key: fact(float(axis[i])) for key, axis, i in zip(names, axes, place, strict=True)},
             strehl=fact(float(strehl)),
-            residual_nm=fact(float(grid.residual_nm[i, j, k])),
-            stable=fact(bool(grid.stable[i, j])),
+            residual_nm=fact(float(grid.residual_nm[place])),
+            stable=fact(bool(grid.stable[place[:2]])),
         )
-        for (i, j, k), strehl in np.ndenumerate(grid.strehl)
+        for place, strehl in np.ndenumerate(grid.strehl)
     ]
 
 

@@ -24,7 +24,7 @@ from lbt_synth.models import nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.display_unit import LENGTHS, UNITS, nm_text, show_in
 from lbt_synth.storage.rows import Column, fact
-from lbt_synth.studies.limits import LimitRow, compare_in_truth
+from lbt_synth.studies.limits import compare_in_truth, say_residual
 
 _MAS_PER_URAD = np.degrees(1e-6) * 3.6e6
 _WITHOUT = ("worst_nm", "above_band_limit_percent", "method")  # columns
@@ -105,25 +105,14 @@ def load_design(path: str, config: Config | None = None) -> Design:
 
 
 def load_designs(paths: list[str], config: Config | None = None) -> dict[str, Design]:
-    """Load designs, named by the stems of their files or, where these repeat, by longer tails.
+    """Load designs, named by the stems of their files.
 
     With a configuration, they may read other sensors, too.
     """
-    if len({Path(path).resolve() for path in paths}) != len(paths):
-        raise ProblemError(f"each gain file must be given once; got {', '.join(paths)}.")
-    stems = [printable(Path(path).stem) for path in paths]
-    names = stems if len(set(stems)) == len(stems) else _distinct_tails(paths)
+    names = [printable(Path(path).stem) for path in paths]
+    if len(set(names)) != len(names):
+        raise ProblemError(f"each gain file must have a name of its own; got {', '.join(paths)}.")
     return {name: load_design(path, config) for name, path in zip(names, paths, strict=True)}
-
-
-def _distinct_tails(paths: list[str]) -> list[str]:
-    """Return the last parts of different paths, as few as distinguish all of them."""
-    tails = [Path(path).resolve().parts for path in paths]
-    for count in range(1, max(map(len, tails))):
-        names = [printable("/".join(parts[-count:])) for parts in tails]
-        if len(set(names)) == len(names):
-            return names
-    return paths
 
 
 def say_accelerometers(design: Design) -> str:
@@ -149,11 +138,8 @@ def loop_difference_notes(config: Config, design: Design) -> list[str]:
 
 def named_difference_notes(config: Config, designs: Mapping[str, Design]) -> list[str]:
     """Say so of designs by their names."""
-    return [
-        f"{note[:-1]} ({name})."
-        for name, design in designs.items()
-        for note in loop_difference_notes(config, design)
-    ]
+    notes = {name: loop_difference_notes(config, design) for name, design in designs.items()}
+    return [f"{note[:-1]} ({name})." for name, those in notes.items() for note in those]
 
 
 def own_sensor_notes(config: Config) -> list[str]:
@@ -163,12 +149,10 @@ def own_sensor_notes(config: Config) -> list[str]:
 
 
 def say_limit(limit: ResidualLimit, config: Config) -> str:
-    """Return the sentence on the limit of a truth, and on what other sensors can add to it."""
+    """Return the sentence on the limit of a truth."""
     least = nm_text(limit.rms_nm, ".6g", unit="nm rms")
-    if not config.hardware.suite.sensors:
-        return f"least residual of any linear controller in the truth: {least}"
-    said = f"least residual of any linear controller of the loop's own sensor in the truth: {least}"
-    return f"{said}; with the other sensors it is less"
+    own = " of the loop's own sensor" * bool(config.hardware.suite.sensors)
+    return f"least residual of any linear controller{own} in the truth: {least}"
 
 
 def add_truth(
@@ -208,16 +192,6 @@ def add_truth(
         report.notes.append(say_limit(comparison.limit, config))
     report.notes += [f"warning: {text}." for text in warnings]
     report.notes += [f"note: {text}" for text in comparison.notes]
-
-
-def say_residual(name: str, row: LimitRow, limit: ResidualLimit | None) -> str:
-    """Return the sentence on what a stable design leaves in the truth."""
-    said = f"{name} leaves {nm_text(row.residual_nm, '.1f')} rms in the truth (Strehl ratio "
-    said += f"{100 * row.strehl:.1f} %)"
-    if limit is None or np.isnan(row.above_limit_percent):
-        return f"{said}."
-    least = nm_text(limit.rms_nm, ".1f")
-    return f"{said}, {row.above_limit_percent:.0f} % above the {least} of the best linear one."
 
 
 def margin_columns(margins: LoopMargins | None) -> dict[str, tuple[Any, Column]]:

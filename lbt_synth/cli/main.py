@@ -9,10 +9,8 @@ Errors name the arguments of functions in three forms: ``name=value``, a name be
 
 from __future__ import annotations
 
-import gc
 import importlib
 import json
-import os
 import re
 import signal
 import sys
@@ -50,13 +48,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status."""
     words = (sys.argv[1:] if argv is None else list(argv)) or ["--help"]
     named = next((word for word in words if not word.startswith("-")), "")
-    if any(word.endswith(".fits") for word in words):
-        importlib.import_module("astropy.io.fits")  # which looks through all modules: few as yet
     arguments = build_parser(named).parse_args(words)
     try:
         quiet = arguments.json or arguments.command == "explore"  # which prints while it runs
         with _terminable(), own_display_unit(), show_progress(arguments.command, quiet=quiet):
-            report = _run_command(arguments)
+            from lbt_synth.cli.output import run_with_outputs  # slow to import for --help
+
+            report = run_with_outputs(_find_command(arguments.command), arguments)
     except LbtSynthError as error:
         return _fail(error, _say_error(error, arguments), arguments)
     except MemoryError:
@@ -70,12 +68,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return INTERRUPTED
     report.print(as_json=arguments.json, verbose=arguments.verbose)
     return DONE if report.passed else FAILED
-
-
-def _run_command(arguments: Namespace) -> Report:
-    from lbt_synth.cli.output import run_with_outputs  # slow to import for --help
-
-    return run_with_outputs(_find_command(arguments.command), arguments)
 
 
 def _find_command(command: str) -> Callable[[Namespace], Report]:
@@ -144,8 +136,6 @@ def _terminate(*_: object) -> None:
 
 def entry_point() -> None:
     """Run a command for a shell, and survive closed pipes and full disks."""
-    gc.set_threshold(1_000_000, 50, 50)  # what imports and charts make stays until the end
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # reads all packages for them
     for stream in (sys.stdout, sys.stderr):  # no character that an encoding lacks ends a command
         stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
@@ -166,7 +156,6 @@ def entry_point() -> None:
         sys.stderr.flush()
     except OSError:
         discard(2)
-    gc.freeze()  # Python's exit would look through all of it once more
     sys.exit(status)
 
 

@@ -36,7 +36,7 @@ _WIDTH = 200  # columns of --verbose where the output is no terminal
 _BRIEF_WIDTH, _BRIEF_LINES, BRIEF_ROWS = 100, 25, 12  # without --verbose: a screen
 _WRITTEN = "written: "
 # what of the notes is printed without --verbose, in this order: the first two whole, if they fit
-# into some lines, else without the ends of the longest
+# into some lines, else two lines of each
 _URGENT = ("assumes", "warning", "note")
 _URGENT_LINES = 8
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
@@ -147,7 +147,10 @@ class Report:
             written = [f"{_WRITTEN}{len(files)} files, {files[0]} to {files[-1]}"]
         verdict = _wrapped(" ".join(self.verdict), room)
         *urgent, notes = ([n for n in self.notes if n.startswith(mark)] for mark in _URGENT)
-        kept = _cut([note for marked in urgent for note in marked], room)
+        kept = [line for marks in urgent for note in marks for line in _wrapped(note, room)]
+        if len(kept) > _URGENT_LINES:  # the ends of sentences are left out, no sentence
+            cut: dict[str, Any] = {"max_lines": 2, "placeholder": " ... (--verbose)"}
+            kept = [x for marks in urgent for note in marks for x in _wrapped(note, room, **cut)]
         space = _BRIEF_LINES - len(written)
         most = max(space - 1 - len([*verdict, *kept]), 0)
         table: list[str] = []
@@ -161,18 +164,6 @@ class Report:
         if len(lines) > space or len(table) > most:
             lines = [*lines[: space - 1], "... more with --verbose"]
         return lines + written
-
-
-def _cut(notes: Sequence[str], room: int) -> list[str]:
-    """Return notes in lines, the longest of them without their ends where they are too many."""
-    counts = [len(_wrapped(note, room)) for note in notes]
-    while sum(counts) > _URGENT_LINES and max(counts) > 1:
-        counts[counts.index(max(counts))] -= 1
-    return [
-        line
-        for note, count in zip(notes, counts, strict=True)
-        for line in _wrapped(note, room, max_lines=count, placeholder=" ... (--verbose)")
-    ]
 
 
 def _wrapped(text: str, room: int, **cut: Any) -> list[str]:
@@ -251,17 +242,14 @@ def write_telemetry(
     telemetry: Telemetry,
     *,
     key: str,
-    kind: str | None = None,
-    precision: str = "float64",
 ) -> None:
     """Write telemetry, and note in the report the file and what its format leaves out."""
     from lbt_synth.files import save_telemetry  # which few commands need
     from lbt_synth.files.telemetry.aot import lost_fields
     from lbt_synth.files.telemetry.store import require_telemetry_name
 
-    kind = require_telemetry_name(output, kind)
-    path = save_telemetry(output, telemetry, format=kind, precision=precision)
-    lost = lost_fields(telemetry) if kind == "aot" else ()
+    path = save_telemetry(output, telemetry)
+    lost = lost_fields(telemetry) if require_telemetry_name(output) == "aot" else ()
     report.note_written(path, key)
     report.data["lost"] = list(lost)
     if lost:

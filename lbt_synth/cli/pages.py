@@ -5,11 +5,9 @@ from __future__ import annotations
 import re
 import sys
 from argparse import Namespace
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import TypeAlias
-
-import numpy as np
 
 from lbt_synth.cli.loop_inputs import (
     choose_design_unit,
@@ -23,38 +21,24 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.loop.margins import LoopMargins
-from lbt_synth.loop.simulation import SHOWN_FRAMES, LoopStep
-from lbt_synth.report import design_page, design_report, write_page
-from lbt_synth.report.designs.report import WORDS, design_facts, good_range, verdict
-from lbt_synth.report.explore.exploration import explore, new_view
+from lbt_synth.report.designs import WORDS, design_facts, design_report, report_page, verdict
+from lbt_synth.report.draw import figure_series
 from lbt_synth.report.figures import loop_figure
-from lbt_synth.report.figures.loops import (
-    axes_name,
-    closed_loops,
-    design_steps,
-    loop_points,
-    open_loops,
-    sigma_curves,
-)
-from lbt_synth.report.page.html import require_page_names
+from lbt_synth.report.figures.loops import axes_name, closed_loops, design_steps
+from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.atomic_files import require_writable
-from lbt_synth.storage.rows import Column, Facts, fact, facts, json_record, json_units, row_table
-from lbt_synth.validation import FloatArray, integer
+from lbt_synth.storage.display_unit import own_display_unit
+from lbt_synth.storage.rows import fact, facts, json_record, json_units, row_table
+from lbt_synth.validation import integer
 
 # what JSON has as a key, among the margins, or as numbers in place of words
-_WITHOUT = ("design", "modulus", "phase_deg", "delay_frames", "crossover_hz", "scatter", *WORDS)
+_WITHOUT = ("design", "modulus", "phase_deg", "delay_frames", "crossover_hz", *WORDS)
 _LOCAL = ("localhost", "127.0.0.1", "::1")
 _SETTLING_FRAMES = 8000  # within which loops settle, beyond what is drawn
 
-_UNITS = {"frequency_hz": "Hz", "gain_db": "dB", "phase_deg": "deg", "time_s": "s"}
-_LOOP = ("frequency_hz", "gain_db", "phase_deg", "real", "imaginary")  # phases without jumps
-_SIGMA = ("frequency_hz", "error", "rejection", "noise_transfer")  # of phase and noise to residual
-# series of numbers of a design, or of its loop broken at one measurement, by their names
-_Curves: TypeAlias = dict[str, dict[str, FloatArray]]
-
 
 def run_plot(arguments: Namespace) -> Report:
-    """Print the margins of designs, and write their figure and their points."""
+    """Print the margins of designs, and write their figure and its points."""
     view, gain = arguments.kind, arguments.gain_factor
     designs = load_designs(arguments.gains)
     choose_design_unit(arguments, dict(zip(arguments.gains, designs.values(), strict=True)))
@@ -62,51 +46,26 @@ def run_plot(arguments: Namespace) -> Report:
     if view == "step":
         _add_step_facts(report, designs, gain)
     _add_margins(report, designs, gain)
-    curves = _draw(view, designs, gain)
-    if not curves:
+    with own_display_unit():  # JSON and CSV stay in nm
+        curves = list(figure_series(loop_figure(designs, view, sensor_gain=gain)))
+    if all(record["stable"] is False for record in report.data["designs"].values()):
         raise UnstableLoopError(
             f"no loop is stable at {gain:g} times the sensor gain that its design assumes, and "
             "there is nothing to draw; lbt-synth show prints the factors that are stable."
         )
-    report.rows = list(_points(curves))
-    report.data["curves"] = {
-        name: {key: values for key, values in series.items() if not np.isnan(values).all()}
-        for name, series in curves.items()
-    }
-    report.data["units"] |= {name: _UNITS[name] for name in report.rows[0].values if name in _UNITS}
+    report.rows = [
+        facts(
+            panel=fact(curve.panel),
+            curve=fact(curve.name),
+            heading=fact(curve.heading),
+            x=fact(x),
+            y=fact(y),
+        )
+        for curve in curves
+        for x, y in zip(curve.x, curve.y.tolist(), strict=True)
+    ]
+    report.data["curves"] = [asdict(curve) for curve in curves]
     return report
-
-
-def _draw(view: str, designs: Mapping[str, Design], gain_factor: float) -> _Curves:
-    """Return the curves of designs in a view; nan stands for what a design does not have."""
-    if view == "step":
-        return {
-            name: {"time_s": step.time_s, "residual": step.residual, "command": step.command}
-            for name, step in _named_steps(designs, gain_factor)
-        }
-    if view == "sigma":
-        loops = closed_loops(designs, gain_factor, needed=False)
-        return {
-            name: {
-                key: np.full(f.size, np.nan) if values is None else values
-                for key, values in zip(_SIGMA, (f, *parts), strict=True)
-            }
-            for name, (f, *parts) in sigma_curves(designs, loops).items()
-        }
-    curves: _Curves = {}
-    for name, _, _, broken in open_loops(closed_loops(designs, gain_factor)):
-        if broken is not None:
-            *series, response = loop_points(broken)
-            curves[name] = dict(zip(_LOOP, (*series, response.real, response.imag), strict=True))
-    return curves
-
-
-def _points(curves: _Curves) -> Iterator[Facts]:
-    """Yield a row for each point of the curves."""
-    columns = tuple(Column(name=name) for name in ("design", *next(iter(curves.values()))))
-    for name, series in curves.items():
-        for numbers in zip(*(values.tolist() for values in series.values()), strict=True):
-            yield Facts(columns, {"design": name, **dict(zip(series, numbers, strict=True))})
 
 
 def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: float) -> None:
@@ -139,28 +98,19 @@ def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: flo
     report.tables.append(row_table(caption, lines))
 
 
-def _named_steps(
-    designs: Mapping[str, Design], gain_factor: float, frames: int = SHOWN_FRAMES
-) -> list[tuple[str, LoopStep]]:
-    """Return the step responses of designs, named with their axes where these differ."""
-    return [
-        (axes_name(name, [step.axis], alone=len(steps) == 1), step)
-        for name, steps in design_steps(closed_loops(designs, gain_factor), frames=frames).items()
-        for step in steps
-    ]
-
-
 def _add_step_facts(report: Report, designs: Mapping[str, Design], gain_factor: float) -> None:
     """Add how the loops follow a step."""
+    steps = design_steps(closed_loops(designs, gain_factor), frames=_SETTLING_FRAMES)
     percent = {"unit": "%", "format": ".1f"}
     ms = {"unit": "ms", "scale": 1e3, "format": ".2f"}
     rows = [
         facts(
-            design=fact(name, "design"),
+            design=fact(axes_name(name, [step.axis], alone=len(responses) == 1), "design"),
             overshoot_percent=fact(step.overshoot_percent, "overshoot", **percent),
             settling_s=fact(step.settling_s, "settling time, to 5 %", **ms),
         )
-        for name, step in _named_steps(designs, gain_factor, frames=_SETTLING_FRAMES)
+        for name, responses in steps.items()
+        for step in responses
     ]
     report.add_rows("steps", "After a step of the wavefront", rows)
 
@@ -174,8 +124,8 @@ def run_report(arguments: Namespace) -> Report:
     config = load_shown(arguments)
     designs = load_designs(arguments.gains, config)
     files = dict(zip(designs, arguments.gains, strict=True))
-    assessed = design_report(config, designs, gain_files=files)
-    page = design_page(assessed, title=arguments.title)
+    assessed = design_report(config, designs)
+    page = report_page(assessed, files, arguments.title)
     written = write_page(page, arguments.output, pdf=arguments.pdf)
     rows = [design_facts(assessed, one) for one in assessed.assessments]
     limit = assessed.limits.limit
@@ -185,7 +135,6 @@ def run_report(arguments: Namespace) -> Report:
                 row.design: json_record(row, without=_WITHOUT)
                 | {
                     "checks": [json_record(check) for check in one.checks],
-                    "good_errors_hz": good_range(assessed, one),
                     "margins": None if one.margins is None else json_record(one.margins),
                     "stable_sensor_gains": one.sensor_gains,
                 }
@@ -214,34 +163,19 @@ def run_explore(arguments: Namespace) -> Report:
     folder = Path(arguments.output)
     require_writable(folder / "explored-1.yaml")
     config = load_shown(arguments)
-    exploration = explore(config, load_designs(arguments.gains))
-    first = new_view(exploration)
+    designs = load_designs(arguments.gains)
 
-    from lbt_synth.report.explore.server import serve  # bokeh's server, slow to import
+    from lbt_synth.report.explore import serve  # bokeh's server, slow to import
 
-    served = []
+    report = Report()
+    said = [f"note: whoever reaches this address can use the page and write into {folder}."]
+    said = said * (arguments.host not in _LOCAL)
 
     def announce(url: str) -> None:
+        report.data["url"] = url
         stream = sys.stderr if arguments.json else sys.stdout
-        print(f"Open {url} in a browser. Ctrl-C ends.", file=stream, flush=True)
-        if arguments.host not in _LOCAL:
-            print(
-                "note: whoever reaches this address can use the page and write new files into "
-                f"{folder}.",
-                file=stream,
-                flush=True,
-            )
-        served.append(url)
+        print(f"Open {url} in a browser. Ctrl-C ends.", *said, sep="\n", file=stream, flush=True)
 
-    saved = serve(
-        exploration,
-        first,
-        folder,
-        host=arguments.host,
-        port=arguments.port,
-        origins=arguments.origin,
-        announce=announce,
-    )
-    report = Report(data={"url": served[0]})
-    report.note_files(saved)
+    place = {"host": arguments.host, "port": arguments.port, "origins": arguments.origin}
+    report.note_files(serve(config, designs, folder, **place, announce=announce))
     return report

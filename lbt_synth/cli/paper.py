@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from argparse import Namespace
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,7 +10,7 @@ from typing import Any
 
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs, load_shown
-from lbt_synth.cli.output import PERCENT, Report, json_value
+from lbt_synth.cli.output import PERCENT, Report
 from lbt_synth.cli.streams import count_progress, track_progress
 from lbt_synth.cli.study import run_in_parts
 from lbt_synth.design import Design, FilterDesign
@@ -27,8 +26,12 @@ from lbt_synth.interop.specula.optics import (
 from lbt_synth.interop.specula.simulation import EndToEndRun, mix_controller, unread_sensors
 from lbt_synth.methods.registry import design_label, design_title
 from lbt_synth.report.draw import save_figure
-from lbt_synth.report.figures import loop_figure, robustness_figure
-from lbt_synth.report.figures.studies import end_to_end_figure, end_to_end_table_figure
+from lbt_synth.report.figures import loop_figure
+from lbt_synth.report.figures.studies import (
+    end_to_end_figure,
+    end_to_end_table_figure,
+    robustness_figure,
+)
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
 from lbt_synth.storage.display_unit import nm_text, own_display_unit
 from lbt_synth.storage.input_files import file_sha256
@@ -150,7 +153,7 @@ def _write_paper(
 
 _LEAST_GAIN = 0.01  # optical gain of tip and tilt; less is what a saturated pyramid shows
 _SETTINGS = ("frames", "settle_frames", "seed", "pixels")
-_FILES = ("run.png", "telemetry.fits", "summary.json")
+_FILES = ("run.png", "telemetry.fits")
 
 
 def run_end_to_end(arguments: Namespace) -> Report:
@@ -170,7 +173,7 @@ def run_end_to_end(arguments: Namespace) -> Report:
     mix_controller(setup, design)  # refuses a filter of another loop before any work
     specula_version()  # refuses where it is missing
     make_directory(arguments.output)
-    figure_file, telemetry_file, summary_file = outputs
+    figure_file, telemetry_file = outputs
     with count_progress(total=setup.modes, what="calibration") as count:
         calibration = calibrate(setup, progress=count)
     total = setup.frames + setup.settle_frames
@@ -193,13 +196,11 @@ def run_end_to_end(arguments: Namespace) -> Report:
             "note: the pyramid is the only wavefront sensor of the simulation: the fall-back "
             f"filter of the gain file runs, without {listing_text(unread)}."
         )
-    summary = json.dumps(json_value(report.data), indent=1).encode() + b"\n"
     recorded = _telemetry(loop_run, design, gain)
     report.note_files(
         [
             save_figure(end_to_end_figure(loop_run), figure_file),
-            save_telemetry(telemetry_file, recorded, precision="float32"),
-            write_atomically(summary_file, summary),
+            save_telemetry(telemetry_file, recorded),
         ]
     )
     return report

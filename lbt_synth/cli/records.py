@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from lbt_synth import identification
 from lbt_synth.cli.arguments import given_options, refuse_options
@@ -18,9 +19,8 @@ from lbt_synth.cli.telemetry import (
     record_telescope,
     require_series,
 )
-from lbt_synth.config import identified_config
-from lbt_synth.config.write import RAISED, config_text, require_writable_facts
-from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.config.write import RAISED, config_text, identified_config, require_writable_facts
+from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import IdentifiedModel, LoopRecord, SpectrumRecord
@@ -31,14 +31,23 @@ from lbt_synth.identification.accelerometers.transfers import (
 )
 from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, model_tables
-from lbt_synth.identification.records.record import LEAST_SECONDS, require_length
+from lbt_synth.identification.records.record import LEAST_SECONDS, NOT_KNOWN, require_length
 from lbt_synth.loop import Imaging, loop_margins
-from lbt_synth.report.draw import require_figure_name, save_figure
+from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import identification_figure
-from lbt_synth.report.page.html import require_page_names, write_page
+from lbt_synth.report.page.html import (
+    Block,
+    Notice,
+    Page,
+    chart,
+    new_page,
+    paragraph,
+    require_page_names,
+    write_page,
+)
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import json_record, row_table
+from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.words import count_text
 
 if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not need
@@ -51,7 +60,7 @@ _STEPS = 3  # that diagnose and auto count
 
 def run_identify(arguments: Namespace) -> Report:
     """Identify a loop from its record; write a configuration and, by default, a figure."""
-    places = find_places(arguments, arguments.output)
+    places = find_places(arguments)
     record = read_record(arguments)
     choose_unit(arguments, record.diameter_m)
     readings = read_accelerations(arguments, record)
@@ -70,12 +79,8 @@ def run_identify(arguments: Namespace) -> Report:
     if readings is not None and isinstance(record, LoopRecord):
         channels, values, notes = readings
         report.notes += [f"note: {note}." for note in notes]
-        try:
-            transfers = accelerometer_transfers(model, record, values, channels=channels)
-        except LbtSynthError as error:  # the model is not lost
-            report.notes.append(f"warning: the accelerometers were not compared: {error}")
-        else:
-            add_accelerometers(report, transfers)
+        transfers = accelerometer_transfers(model, record, values, channels=channels)
+        add_accelerometers(report, transfers)
     report.notes += [marked_note(doubt) for doubt in doubts]
     write_files(report, places, arguments, record, model, accelerometers=transfers)
     return report
@@ -107,7 +112,7 @@ def run_auto(arguments: Namespace) -> Report:
     from lbt_synth.identification.auto import LEAST_SECONDS  # with it come the methods
 
     gain = require_gain_name(arguments.output)
-    places = find_places(arguments, arguments.model, gain=gain)
+    places = find_places(arguments, gain=gain)
     record = require_series(read_record(arguments, LEAST_SECONDS), "auto tests its design on")
     choose_unit(arguments, record.diameter_m)
     channels, values, notes = read_accelerations(arguments, record) or (None, None, ())
@@ -186,8 +191,11 @@ def _say_held_out(
 
 def run_diagnose(arguments: Namespace) -> Report:
     """Diagnose a record, with a design to try on it if one is given, and write the page."""
-    from lbt_synth.identification.diagnosis import live_axes  # with it come the methods
-    from lbt_synth.report.diagnosis import diagnosis_page, diagnosis_tables
+    from lbt_synth.identification.diagnosis import (  # with it come the methods
+        disturbance_lines,
+        judge_channels,
+        live_axes,
+    )
 
     if arguments.output is not None:
         paths = given_options(arguments, "file", "gain", "commands")
@@ -203,18 +211,30 @@ def run_diagnose(arguments: Namespace) -> Report:
         diagnosis = identification.diagnose(
             record.bridged(),
             given=designs,
-            whole=both,
             imaging=record_imaging(arguments, record),
             progress=count,
             **identification_options(arguments, record),
         )
-    sections = diagnosis_tables(diagnosis)
+    if record.axes < both.axes:
+        said = "the rest is of the axis that lives: the other one is dead"
+        notes = (said, *diagnosis.notes)
+        diagnosis = replace(diagnosis, channels=judge_channels(both), notes=notes)
+    model = diagnosis.model
     report = Report(
-        data={"source": str(arguments.file), **_diagnosis_data(diagnosis)},
+        data={
+            "source": str(arguments.file),
+            "doubt": diagnosis.doubt or None,
+            "record": record_data(record),
+            "lines": [] if model is None else [asdict(x) for x in disturbance_lines(model)],
+            "best": diagnosis.best or None,
+            "notes": diagnosis.notes,
+        },
         verdict=list(diagnosis.verdict),
-        tables=[*sections.pop("verdict")[::-1], *(t for one in sections.values() for t in one)],
         notes=[marked_note(note) for note in diagnosis.notes],
     )
+    for _, key, caption, rows in diagnosis_rows(diagnosis):
+        report.add_rows(key, caption, rows)
+    report.tables += [] if model is None else model_tables(model)[1:]
     if arguments.output is not None:
         files = (arguments.file, *([arguments.gain] if arguments.gain else []))
         page = diagnosis_page(diagnosis, files)
@@ -228,25 +248,66 @@ def _series(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
     return require_series(series, "diagnose examines")
 
 
-def _diagnosis_data(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return a diagnosis for JSON; what could not be said is null or empty."""
-    from lbt_synth.identification.diagnosis import disturbance_lines, law_facts
+_DiagnosisRows: TypeAlias = list[tuple[str, str, str, Sequence[Any]]]
 
-    model, law, loop = diagnosis.model, diagnosis.law, diagnosis.loop
-    commands = diagnosis.commands
-    return {
-        "doubt": diagnosis.doubt or None,
-        "record": record_data(diagnosis.record),
-        "channels": [json_record(row) for row in diagnosis.channels],
-        "commands": None if commands is None else json_record(commands.facts()),
-        "control_law": None if law is None else asdict(law) | json_record(law_facts(law)),
-        "loop": None if loop is None else json_record(loop),
-        "lines": [] if model is None else [asdict(line) for line in disturbance_lines(model)],
-        "costs": [json_record(row) for row in diagnosis.costs],
-        "residuals": [json_record(row) for row in diagnosis.residuals],
-        "best": diagnosis.best or None,
-        "notes": diagnosis.notes,
-    }
+
+def diagnosis_rows(diagnosis: Diagnosis) -> _DiagnosisRows:
+    """Return section, key, caption and rows of each table of a diagnosis, none of the unknown."""
+    from lbt_synth.identification.diagnosis import law_facts  # with it come the methods
+
+    record, commands, law = diagnosis.record, diagnosis.commands, diagnosis.law
+    size = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
+    # what a correction lacks is a consequence of other faults, and of the beginning
+    faults = [finding for finding in record.findings if finding.kind != NOT_KNOWN]
+    best = f" (best design: {diagnosis.best})" if diagnosis.best else ""
+    costs = f"What each part leaves by the model of the first half{best}"
+    unseen = "Residual on the second half of the record, by models of the first"
+    reach = "How the commands reach the measurements"
+    tables: _DiagnosisRows = [
+        ("Verdict", "residuals", f"{unseen}; {diagnosis.imaging.label}", diagnosis.residuals),
+        ("Verdict", "costs", costs, diagnosis.costs),
+        ("Record", "channels", f"Record: {size}. {record.summary()}", diagnosis.channels),
+        ("Record", "faults", "Faults", faults),
+        ("Loop", "commands", reach, [] if commands is None else [commands.facts()]),
+        (
+            "Loop",
+            "law",
+            "Control law, from y to u",
+            [] if law is None else [law_facts(law)],
+        ),
+        ("Loop", "loop", "Loop", [] if diagnosis.loop is None else [diagnosis.loop]),
+    ]
+    return [table for table in tables if table[-1]]
+
+
+def diagnosis_page(diagnosis: Diagnosis, files: Sequence[str] = ()) -> Page:
+    """Return the page of a diagnosis, with the digests of the record and of the given design."""
+    record, model, (state, *rest) = diagnosis.record, diagnosis.model, diagnosis.verdict
+    name = Path(files[0]).name if files else record.source or "a record"
+    tables: dict[str, list[Block]] = {}
+    for section, _, caption, rows in diagnosis_rows(diagnosis):
+        tables.setdefault(section, []).append(row_table(caption, rows))
+    disturbance: list[Block] = [] if model is None else [*model_tables(model)[1:]]
+    if model is not None:
+        best = diagnosis.best_design
+        designs = {} if best is None else {diagnosis.best: best}
+        figure = identification_figure(model, designs=designs)
+        disturbance.append(chart("identification", figure))
+    verdict: list[Block] = [Notice(text=state, tone=diagnosis.findings[0].tone), " ".join(rest)]
+    verdict += tables.pop("Verdict", [])
+    verdict += [Notice(text=f"{note[0].upper()}{note[1:]}") for note in diagnosis.notes]
+    duration = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
+    return new_page(
+        f"Diagnosis of {name}",
+        f"{duration}, {count_text(record.axes, 'axis', 'axes')}",
+        {
+            "Verdict": verdict,
+            "Record": tables["Record"],
+            "Loop that ran": [paragraph("law"), *tables.get("Loop", ())],
+            "Disturbance": disturbance or ["No model was identified."],
+        },
+        sources=list(zip(files, ("record", "gain file"), strict=False)),
+    )
 
 
 def read_record(
@@ -323,21 +384,14 @@ def add_accelerometers(report: Report, transfers: AccelerometerTransfers) -> Non
     report.notes.append(f"note: {transfers.shift_text}")
 
 
-def find_places(arguments: Namespace, model: str | Path | None, **others: Path) -> dict[str, Path]:
-    """Return where model, figure and others go, by default beside each other.
-
-    Refuse bad places.
-    """
+def find_places(arguments: Namespace, **gain: Path) -> dict[str, Path]:
+    """Return where model, figure and gain file go, beside each other; refuse bad places."""
     output = Path(arguments.output)
-    model = require_ending(model or output.with_suffix(".yaml"), "a model", (".yaml", ".yml"))
-    places = {**others, "model": model}
+    model = output.with_suffix(".yaml") if gain else output
+    places = {**gain, "model": require_ending(model, "a model", (".yaml", ".yml"))}
     if not arguments.no_figure:
-        figure = arguments.figure or output.with_suffix(".png")
-        places["figure"] = require_figure_name(figure)
-    elif arguments.figure is not None:
-        raise ProblemError("give one of --figure and --no-figure, not both.")
-    read = ("file", "commands", "accelerometers")
-    inputs = given_options(arguments, *(name for name in read if name in arguments))
+        places["figure"] = output.with_suffix(".png")
+    inputs = given_options(arguments, "file", "commands", "accelerometers")
     require_writable(*places.values(), inputs=inputs.values())
     return places
 
@@ -356,27 +410,6 @@ def write_files(
     if made is not None:
         designs = {made.name: made.design}
         report.note_written(save_gain(places["gain"], made.design))
-    try:
-        text, comments = _model_text(model, arguments, record, accelerometers)
-    except ProblemError as error:
-        if accelerometers is None:
-            raise
-        report.notes.append(f"warning: the model is written without accelerometers: {error}")
-        text, comments = _model_text(model, arguments, record, None)
-    report.note_written(write_atomically(places["model"], text), "model")
-    report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
-    if "figure" in places:
-        figure = identification_figure(model, designs=designs)
-        report.note_written(save_figure(figure, places["figure"]), "figure")
-
-
-def _model_text(
-    model: IdentifiedModel,
-    arguments: Namespace,
-    record: LoopRecord | SpectrumRecord,
-    accelerometers: AccelerometerTransfers | None,
-) -> tuple[bytes, dict[str, str]]:
-    """Return the text of a configuration for an identified model, and its comments."""
     source = ascii(Path(arguments.file).name)[1:-1]
     settings, comments = identified_config(
         model,
@@ -384,7 +417,12 @@ def _model_text(
         title=f"Identified from {source} by lbt-synth {arguments.command}.",
         accelerometers=accelerometers,
     )
-    return config_text(settings, comments).encode(), comments
+    text = config_text(settings, comments).encode()
+    report.note_written(write_atomically(places["model"], text), "model")
+    report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
+    if "figure" in places:
+        figure = identification_figure(model, designs=designs)
+        report.note_written(save_figure(figure, places["figure"]), "figure")
 
 
 def add_record(report: Report, record: LoopRecord | SpectrumRecord) -> None:

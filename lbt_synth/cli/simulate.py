@@ -25,13 +25,11 @@ from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.linear import estimator_form
 from lbt_synth.loop import (
     Imaging,
-    least_residual,
     residual_budget,
     simulate,
     strehl,
 )
 from lbt_synth.loop.budget import ResidualBudget
-from lbt_synth.loop.least_residual import above_percent, limit_or_nan
 from lbt_synth.loop.simulation import READINGS, Drop, Segment, Simulation, settling_frames
 from lbt_synth.models import Truth
 from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
@@ -45,8 +43,6 @@ from lbt_synth.studies.robustness import run_failures
 _TIME = r"(\d+\.?\d*)s?"
 _DROP = re.compile(rf"([^@]+)@{_TIME}(?:\.\.{_TIME})?(?::({'|'.join(READINGS)}))?")
 _AFTER_S = 5.0  # that a run lasts beyond the last event, if --frames is not given
-_PARTS = {"turbulence": "turbulence", "vibration": "vibration", "noise": "noise"}  # of a residual
-_PARTS |= {"within": "within frames"}
 # a line of the table, the runs, the parts between failures of sensors, and what to say
 _Run: TypeAlias = tuple[Facts, Simulation, list[tuple[Segment, Facts]], list[str]]
 
@@ -128,9 +124,7 @@ def _run(arguments: Namespace, name: str, design: Design, truth: Truth, config: 
                 f"note: this loop settles for {settle} frames, not {usual}; its random series are "
                 "not those of a faster loop with the same seed. Raise simulation.settle_frames."
             )
-    limit_nm, clipped = np.nan, None
-    if not loop.reads_others and not truth.drifts:
-        limit_nm = limit_or_nan(lambda: least_residual(config.hardware.own_sensor_alone(), truth))
+    clipped = None
     if arguments.stroke is not None:
         reached = np.any(np.abs(simulation.commands) >= arguments.stroke, axis=2)
         clipped = float(np.mean(reached))
@@ -139,7 +133,7 @@ def _run(arguments: Namespace, name: str, design: Design, truth: Truth, config: 
             "answer has no limit of the stroke."
         )
     exact = None if truth.drifts else residual_budget(loop, truth)
-    row = _describe(name, simulation, exact, limit_nm, clipped, config.imaging)
+    row = _describe(name, simulation, exact, clipped, config.imaging)
     return row, simulation, segments, notes + differences
 
 
@@ -147,37 +141,30 @@ def _describe(
     name: str,
     simulation: Simulation,
     exact: ResidualBudget | None,
-    limit_nm: float,
     clipped: float | None,
     imaging: Imaging,
 ) -> Facts:
     """Return the line of a gain file, with the exact answer unless a vibration drifts."""
-    simulated_nm = float(np.sqrt(np.mean(simulation.rms_nm**2)))
-    ratio = float(np.mean(simulation.strehl(imaging)))
-    residual_nm = above = exact_ratio = None
+    strehls, rms_nm = simulation.strehl(imaging), simulation.rms_nm
+    residual_nm = exact_ratio = None
     if exact is not None:
         residual_nm, exact_ratio = exact.rms_nm, strehl(exact, imaging)
-        above = round(above_percent(residual_nm, limit_nm), 6) + 0.0
     command_rms = float(np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1)))))
     return facts(
         design=fact(name, "design"),
-        residual_simulated_nm=fact(simulated_nm, "residual", **RMS),
+        residual_simulated_nm=fact(float(np.sqrt(np.mean(rms_nm**2))), "residual", **RMS),
         residual_exact_nm=fact(residual_nm, "exact", **RMS),
-        strehl_simulated=fact(ratio, "Strehl", **PERCENT),
+        strehl_simulated=fact(float(np.mean(strehls)), "Strehl", **PERCENT),
         strehl_exact=fact(exact_ratio, "exact", **PERCENT),
-        **{
-            f"{part}_nm": fact(getattr(exact, f"{part}_nm", None), word, **RMS)
-            for part, word in _PARTS.items()
-        },
-        limit_nm=fact(limit_nm, unit="nm"),
-        above_limit_percent=fact(above, unit="%"),
-        command_rms=fact(command_rms, unit="nm"),
+        command_rms=fact(command_rms, "commands", unit="nm", format=".1f"),
         clipped=fact(clipped),
+        cases_residual_nm=fact(rms_nm.tolist(), unit="nm"),
+        cases_strehl=fact(strehls.tolist()),
     )
 
 
 def _describe_runs(runs: Sequence[_Run], truth: Truth, config: Config) -> Report:
-    """Return a line for each gain file, and all that is known of a single one."""
+    """Return a line for each gain file, and the parts between failures of a single one."""
     rows, (_, first, segments, _) = [row for row, *_ in runs], runs[0]
     cases, frames = first.residual_nm.shape[:2]
     report = Report(data={"frames": frames, "cases": cases, "seed": first.seed})
@@ -190,23 +177,13 @@ def _describe_runs(runs: Sequence[_Run], truth: Truth, config: Config) -> Report
         if row.residual_exact_nm is not None:
             said += f", and {nm_text(row.residual_exact_nm, '.1f')} without chance"
         report.verdict.append(f"{said}.")
-    limits_nm = [row.limit_nm for row in rows if not np.isnan(row.limit_nm)]
-    if limits_nm:
-        least = nm_text(limits_nm[0], ".1f")
-        report.verdict.append(
-            f"No linear controller of the loop's own sensor leaves less than {least}."
-        )
     caption = f"{count_text(cases, 'run')} of {frames} frames; {config.imaging.label}"
     report.add_rows("designs", caption, rows)
-    report.rows = rows
-    if len(rows) == 1:
-        report.add_records(*rows)
-        report.data |= {"strehl": first.strehl(config.imaging), "residual_nm": first.rms_nm}
-        report.data["units"]["residual_nm"] = "nm"
-        if segments:
-            caption = "Simulated between failures and returns of sensors"
-            report.add_rows("segments", caption, [row for _, row in segments])
-            report.tables.reverse()
+    report.rows, report.without = rows, ("cases_residual_nm", "cases_strehl")
+    if segments:
+        caption = "Simulated between failures and returns of sensors"
+        report.add_rows("segments", caption, [row for _, row in segments])
+        report.tables.reverse()
     report.notes += dict.fromkeys(note for *_, notes in runs for note in notes)
     if truth.drifts:
         report.notes.append(

@@ -15,35 +15,26 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import lbt_synth
 from lbt_synth import studies
 from lbt_synth.cli.loop_inputs import load_shown
-from lbt_synth.cli.output import PERCENT, Report
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import count_progress, print_error
 from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
+from lbt_synth.report.study import study_verdict
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
-from lbt_synth.storage.rows import fact, facts, row_table
-from lbt_synth.storage.tables import Table
 from lbt_synth.storage.thread_limits import WorkerPool, limit_threads
-from lbt_synth.storage.words import count_text, duration_text
+from lbt_synth.storage.words import duration_text
 from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, replay_row
-from lbt_synth.studies.study.statistics import (
-    StudyStatistics,
-    study_statistics,
-    summary_tables,
-    worst_table,
-)
+from lbt_synth.studies.study.statistics import study_statistics, summary_tables, worst_table
 from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import integer
 
 _TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
 _FAILURE = ("row", "controller", "error")
 _WORST = 3  # rows of each controller that are printed; the page has more
-_LOW = 5.0  # percentile of the Strehl ratio that a bad night has
 
 
 def run(arguments: Namespace) -> Report:
@@ -97,67 +88,17 @@ def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
             "files": [str(path) for path in files],
             "statistics": asdict(statistics),
         },
-        verdict=_say_study(statistics),
+        verdict=study_verdict(statistics),
         tables=[
-            _controller_table(statistics),
             *summary_tables(statistics),
             *(replace(table, rows=table.rows[:_WORST]) for table in worst),
         ],
         notes=[
             f"note: {done}",
-            *_sampling_notes(loaded),
             *([f"note: {count} results failed, see {run.failed}."] if count else []),
             *(f"{'written' if now else 'unchanged'}: {path}" for path, now in files.items()),
         ],
     )
-
-
-def _say_study(statistics: StudyStatistics) -> list[str]:
-    """Return which controllers are unstable, which is best, and what it depends on."""
-    controllers = statistics.controllers
-    verdict = [
-        f"{one.controller} is unstable in {100 * one.unstable_share.value:.2g} % of the samples."
-        for one in sorted(controllers, key=lambda one: -one.unstable)
-        if one.unstable
-    ]
-    best = max(controllers, key=lambda one: np.nan_to_num(one.mean))
-    verdict.append(
-        f"{best.controller} has the highest mean Strehl ratio, {100 * best.mean:.1f} %, and keeps "
-        f"{100 * best.strehl[_LOW].value:.1f} % in {100 - _LOW:g} % of the samples."
-    )
-    if ranked := best.ranked:
-        verdict.append(
-            f"It depends most on {ranked[0]} ({100 * best.index(ranked[0])[0]:.0f} % of its "
-            "variance)."
-        )
-    return verdict
-
-
-def _controller_table(statistics: StudyStatistics) -> Table:
-    """Return a line for each controller."""
-    rms = {"unit": "nm rms", "format": ".1f"}
-    rows = [
-        facts(
-            controller=fact(one.controller, "controller"),
-            unstable=fact(one.unstable_share.value, "unstable", **PERCENT),
-            mean=fact(one.mean, "mean Strehl", **PERCENT),
-            low=fact(one.strehl[_LOW].value, f"{_LOW:g} % below", **PERCENT),
-            median=fact(one.strehl[50.0].value, "median", **PERCENT),
-            residual=fact(one.residual_nm[50.0].value, "median residual", **rms),
-            failed=fact(one.failed, "failed"),
-        )
-        for one in statistics.controllers
-    ]
-    return row_table(f"Strehl ratio over {count_text(statistics.samples, 'sample')}", rows)
-
-
-def _sampling_notes(loaded: Study) -> list[str]:
-    if loaded.samples & (loaded.samples - 1) == 0:
-        return []
-    return [
-        "note: Sobol's points are balanced best when their number is a power of two; "
-        f"{loaded.samples} is none."
-    ]
 
 
 def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.arguments import given_options, refuse_options
+from lbt_synth.cli.arguments import given_options
 from lbt_synth.cli.loop_inputs import choose_unit
 from lbt_synth.cli.output import Report, write_telemetry
 from lbt_synth.errors import ProblemError
@@ -70,18 +70,15 @@ def load_series(
         swap_axes=arguments.swap_axes,
         sign=tuple(arguments.command_sign or ()),
         matrix=tuple(arguments.command_matrix or ()),
-        scale=arguments.command_scale or 1.0,
+        scale=tuple(arguments.command_scale or ()),
     )
     if isinstance(record, SpectrumRecord):
         if repair.options:
             raise ProblemError(f"a spectrum has no commands; leave {repair.options} out.")
         return record
-    options = repair.options
-    if arguments.command_scale is not None and not repair.scales:
-        options = f"{options} --command-scale 1".strip()
     return replace(
         repair_commands(record, repair) if repair.options else record,
-        read_with=" ".join(filter(None, (record.read_with, options))),
+        read_with=" ".join(filter(None, (record.read_with, repair.options))),
         stated_gain=tuple(arguments.sensor_gain or record.stated_gain),
     )
 
@@ -138,10 +135,8 @@ _LOOP = {  # what telemetry says of the loop that it is from: headings and units
 def run(arguments: Namespace) -> Report:
     """Show telemetry, or a record as telemetry, and write it."""
     output = arguments.output
-    if output is None:
-        refuse_options(arguments, ("format", "precision"), "is of what -o writes; give -o FILE")
-    else:
-        require_telemetry_name(output, arguments.format)
+    if output is not None:
+        require_telemetry_name(output)
         named = given_options(arguments, "file", "commands")
         require_writable(output, inputs=list(named.values()))
     notes: list[str] = []
@@ -161,10 +156,7 @@ def run(arguments: Namespace) -> Report:
     if "timing" not in telemetry.metadata:  # of another program
         report.notes.append(telemetry.convention)
     if output is not None:
-        precision = arguments.precision or "float64"
-        write_telemetry(
-            report, output, telemetry, key="output", kind=arguments.format, precision=precision
-        )
+        write_telemetry(report, output, telemetry, key="output")
     return report
 
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import numpy as np
 
 from lbt_synth import models
 from lbt_synth.config.schema import (
-    AtmosphereSection,
     FileSection,
     LocalLoopSection,
     OtherSensorSection,
-    TelescopeSection,
     TrueVibrationSection,
     TurbulenceSection,
     VibrationSection,
@@ -23,7 +21,7 @@ from lbt_synth.errors import ConfigError, name_key
 from lbt_synth.models.sensor import illuminated_subapertures
 from lbt_synth.models.sensor_suite import Motions, Sensor, checked_motions
 from lbt_synth.models.vibration import TrueVibration, spread_lines
-from lbt_synth.validation import FloatArray, agree, frozen_copy
+from lbt_synth.validation import FloatArray, frozen_copy
 
 if TYPE_CHECKING:
     from lbt_synth.interop.specula.optics import EndToEndSetup
@@ -33,18 +31,12 @@ _AXES = {"tip": [(1.0, 0.0)], "tilt": [(0.0, 1.0)], "both": [(1.0, 0.0), (0.0, 1
 _USUAL_LINES = 5  # of a spread vibration, unless the file says
 
 
-def require_telescope(settings: FileSection, reason: str) -> TelescopeSection:
-    """Return the section ``telescope``; raise ConfigError with the reason if it is missing."""
-    if settings.telescope is None:
-        raise ConfigError(f"the key telescope is missing: {reason}.", path="telescope")
-    return settings.telescope
-
-
-def require_atmosphere(settings: FileSection, reason: str) -> AtmosphereSection:
-    """Return the section ``atmosphere``; raise ConfigError with the reason if it is missing."""
-    if settings.atmosphere is None:
-        raise ConfigError(f"the key atmosphere is missing: {reason}.", path="atmosphere")
-    return settings.atmosphere
+def require_section(settings: FileSection, name: str, reason: str) -> Any:
+    """Return a section that may be left out; raise ConfigError with the reason where it is."""
+    section = getattr(settings, name)
+    if section is None:
+        raise ConfigError(f"the key {name} is missing: {reason}.", path=name)
+    return section
 
 
 def count_axes(settings: FileSection) -> int:
@@ -89,14 +81,14 @@ def build_atmosphere(settings: FileSection) -> models.Atmosphere | None:
         return None
     reason = "the turbulence of atmosphere is that over its diameter"
     return models.Atmosphere(
-        diameter_m=require_telescope(settings, reason).diameter_m, **air.model_dump()
+        diameter_m=require_section(settings, "telescope", reason).diameter_m, **air.model_dump()
     )
 
 
 def _convert_mas_to_nm(settings: FileSection, mas: float, key: str) -> float:
     """Convert an angle of the file [mas] to a wavefront [nm rms]."""
     reason = f"{key} is in mas, and a wavefront in nm needs telescope.diameter_m"
-    telescope = require_telescope(settings, f"{reason}. Give it, or the value in nm")
+    telescope = require_section(settings, "telescope", f"{reason}. Give it, or the value in nm")
     return mas * models.nm_per_mas(telescope.diameter_m)
 
 
@@ -112,8 +104,10 @@ def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
         return _convert_mas_to_nm(settings, sensor.noise_mas, "sensor.noise_mas")
     if (pyramid := sensor.pyramid) is None:
         return sensor.noise_nm  # type: ignore[return-value]  # the schema wants one of the three
-    telescope = require_telescope(
-        settings, "the noise of sensor.pyramid depends on it. Give it, or sensor.noise_nm"
+    telescope = require_section(
+        settings,
+        "telescope",
+        "the noise of sensor.pyramid depends on it. Give it, or sensor.noise_nm",
     )
     numbers = dict(pyramid)
     across = numbers.pop("subapertures_across")
@@ -134,31 +128,7 @@ def _gains_per_measurement(settings: FileSection) -> FloatArray:
 
 def reference_gain(settings: FileSection) -> float:
     """Return the assumed gain with which a single number is compared: the mean of the gains."""
-    assumed = settings.model.sensor_gain
-    return (
-        float(np.mean(_gains_per_measurement(settings))) if isinstance(assumed, list) else assumed
-    )
-
-
-def relative_gain(settings: FileSection, reference: float) -> Any:
-    """Return the real sensor gain divided by that in the plant's sensor matrix; (b,) of samples.
-
-    ``reference`` is the :func:`reference_gain` of that matrix.
-    """
-    real, key = settings.truth.sensor_gain, "truth.sensor_gain"
-    if not isinstance(real, list):
-        return real / reference
-    assumed = _gains_per_measurement(settings)
-    ratios = np.array(_require_length(real, assumed.size, key, "measurement")) / assumed
-    if not agree(ratios, np.full_like(ratios, ratios[0])):
-        text = ", ".join(f"{ratio:.4g}" for ratio in ratios)
-        raise ConfigError(
-            f"{key}: must be model.sensor_gain times one factor, for the loop has one optical gain "
-            f"that may differ from the model's; got the factors {text}. Give one number: their "
-            "mean, in the proportion of model.sensor_gain.",
-            path=key,
-        )
-    return float(ratios[0])
+    return float(np.mean(settings.model.sensor_gain))
 
 
 def true_vibrations_owner(settings: FileSection) -> Literal["model", "truth"]:
@@ -238,20 +208,14 @@ def _build_true_vibrations(
         return plant.vibrations
     rate, lines = settings.loop.frame_rate_hz, list[TrueVibration]()
     for section, key, numbers in vibration_numbers(settings, "truth"):
-        if section.kind != "resonance":
-            del numbers["damping"]
-        if section.kind == "drift":
-            start_hz = numbers.pop("frequency_hz")
-            _require_below_nyquist(section.end_hz, rate, f"{key}.end_hz")
-            with name_key(key):
-                ends = {"start_hz": start_hz, "end_hz": section.end_hz}
-                lines.append(
-                    models.DriftingVibration(**numbers, **ends, duration_s=section.duration_s)
-                )
-        elif section.kind == "resonance":
+        if section.kind == "resonance":
             lines.append(models.Vibration(**numbers))
-        else:
-            lines.append(models.SinusoidalVibration(**numbers))
+            continue
+        del numbers["damping"]
+        if section.kind == "drift":
+            _require_below_nyquist(section.end_hz, rate, f"{key}.end_hz")
+        drift = {"end_hz": section.end_hz, "duration_s": section.duration_s}
+        lines.append(models.SinusoidalVibration(**numbers, **drift))
     return tuple(lines)
 
 
@@ -260,15 +224,11 @@ def _frequency_errors(
 ) -> tuple[float, ...] | None:
     """Return the error that is stated of each vibration [Hz], 0 beside others; None if none is."""
     sections = getattr(settings, true_vibrations_owner(settings)).vibrations or []
-    if all(section.largest_error_hz is None for section in sections):
+    if all(section.frequency_error_hz is None for section in sections):
         return None
     places = np.array([section.frequency_hz for section in sections])
-    starts = [
-        line.start_hz if isinstance(line, models.DriftingVibration) else line.frequency_hz
-        for line in vibrations
-    ]
-    nearest = [sections[int(np.argmin(np.abs(places - start)))] for start in starts]
-    return tuple(section.largest_error_hz or 0.0 for section in nearest)
+    nearest = [sections[int(np.argmin(np.abs(places - line.frequency_hz)))] for line in vibrations]
+    return tuple(section.frequency_error_hz or 0.0 for section in nearest)
 
 
 def build_plant(
@@ -341,12 +301,12 @@ def _build_turbulence_model(
         with name_key(f"{key}.coefficients"):
             numbers = section.model_dump(exclude={"kind"})
             return models.ARModel(**numbers, frame_rate_hz=rate)
-    if atmosphere is None:
-        reason = f"{key} of kind {section.kind} is computed from it. Give it, or kind ar"
-        raise ConfigError(f"the key atmosphere is missing: {reason}.", path="atmosphere")
+    reason = f"{key} of kind {section.kind} is computed from it. Give it, or kind ar"
+    require_section(settings, "atmosphere", reason)
+    air = cast(models.Atmosphere, atmosphere)
     if section.kind == "ar1":
-        return models.ar1_turbulence(atmosphere, frame_rate_hz=rate)
-    return models.ar2_turbulence(atmosphere, frame_rate_hz=rate, noise_nm=noise_nm)
+        return models.ar1_turbulence(air, frame_rate_hz=rate)
+    return models.ar2_turbulence(air, frame_rate_hz=rate, noise_nm=noise_nm)
 
 
 def _build_mirror(section: LocalLoopSection | None) -> models.PositionLoop | None:
@@ -402,8 +362,9 @@ def build_truth(
     """Build the truth: turbulence, vibrations, noise and gain of the real loop."""
     kind, suite, motions = settings.true_turbulence, plant.hardware.suite, plant.motions
     if kind == "frozen_flow":
-        require_atmosphere(
+        require_section(
             settings,
+            "atmosphere",
             "truth.turbulence: frozen_flow is its spectrum. Give it, or truth.turbulence: model",
         )
     one = plant.turbulence[0]
@@ -422,7 +383,7 @@ def build_truth(
         vibrations=vibrations,
         motions=motions if suite.sensors else (),
         noise_nm=noise_nm,
-        sensor_gain=relative_gain(settings, reference_gain(settings)),
+        sensor_gain=settings.truth.sensor_gain / reference_gain(settings),
         frequency_errors_hz=_frequency_errors(settings, vibrations),
     )
 
@@ -434,7 +395,10 @@ def build_end_to_end_setup(
     from lbt_synth.interop.specula.optics import EndToEndSetup  # half of the time of a design
 
     hint = "an end-to-end simulation needs it"
-    telescope, air = require_telescope(settings, hint), require_atmosphere(settings, hint)
+    telescope, air = (
+        require_section(settings, "telescope", hint),
+        require_section(settings, "atmosphere", hint),
+    )
     pyramid, modes = settings.sensor.pyramid, settings.mirror.modes
     calibrated = "must be left out for an end-to-end simulation, which calibrates it in nanometres"
     turbulence, screens = settings.true_turbulence, "must be a length: phase screens have an end"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -214,25 +215,19 @@ def load_config(path: str | os.PathLike[str]) -> Config:
 
 def config_from_text(text: str, source: Path) -> Config:
     """Build the configuration of ``Config.text``, which came from a file."""
-    try:
-        settings = FileSection.model_validate_json(text)
-    except ValidationError as error:
-        raise _config_error(error, FileSection, f"the configuration in {source}") from error
-    return build_config(settings, source)
+    raw = json.loads(text)
+    return build_config(
+        validate_sections(FileSection, raw, f"the configuration in {source}"), source
+    )
 
 
-def validate_sections(schema: type[Checked], raw: Mapping[str, Any], source: Path) -> Checked:
+def validate_sections(schema: type[Checked], raw: Mapping[str, Any], source: Path | str) -> Checked:
     """Check the mapping of a file against its schema, and return its sections."""
     try:
         return schema.model_validate(raw)
     except ValidationError as error:
-        raise _config_error(error, schema, str(source)) from error
-
-
-def _config_error(error: ValidationError, schema: type[BaseModel], where: str) -> ConfigError:
-    """Return the first mistake of a configuration as an error that names its key."""
-    message, key = describe_error(error, schema)
-    return ConfigError(f"{where}: {message}", path=key)
+        message, key = describe_error(error)
+        raise ConfigError(f"{source}: {message}", path=key) from error
 
 
 def read_mapping(source: Path) -> dict[str, Any]:

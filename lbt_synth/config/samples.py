@@ -14,7 +14,6 @@ import numpy as np
 from lbt_synth.config.build import (
     measurement_noise_nm,
     model_lines,
-    relative_gain,
     true_vibrations_owner,
     turbulence_sections,
     vibration_numbers,
@@ -23,13 +22,17 @@ from lbt_synth.config.load import Config
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ConfigError, suggest_word
 from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble, ensemble_vibration
-from lbt_synth.models import Atmosphere, FrozenFlows
+from lbt_synth.models import Atmosphere
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
 Keys = tuple[str | int, ...]  # the path of a number, such as ("truth", "vibrations", 0, "rms_nm")
 _KEY = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
-_WEATHER = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")  # keys of FrozenFlows
+_WEATHER = (
+    "seeing_arcsec",
+    "wind_speed_m_s",
+    "outer_scale_m",
+)  # that loops may differ in
 _LINE = ("frequency_hz", "damping", "rms_nm", "rms_mas")
 _PYRAMID = ("photons", "read_noise_electrons", "modulation_lambda_over_d")
 
@@ -52,32 +55,21 @@ def parse_path(path: str) -> Keys:
 def find_number(content: Mapping[str, Any], path: str) -> float:
     """Return the number to which a path leads; refuse a path that leads to none."""
     value: Any = content
-    place = "the configuration"
     for key in parse_path(path):
-        if not isinstance(value, list if isinstance(key, int) else dict):
-            says = "is no list" if isinstance(key, int) else "has no keys"
-            raise ConfigError(f"{path}: {place} {says}; {_describe(value)}.")
-        if isinstance(key, int) and key >= len(value):
-            entries = count_text(len(value), "entry", "entries")
-            raise ConfigError(f"{path}: {place} has {entries}, counted from 0; got [{key}].")
-        if isinstance(key, str) and key not in value:
-            raise ConfigError(f"{path}: {place} has no {key}; {suggest_word(key, sorted(value))}")
-        step = f"[{key}]" if isinstance(key, int) else f".{key}"
-        place = step.removeprefix(".") if value is content else place + step
+        names = range(len(value)) if isinstance(value, list) else value
+        if not isinstance(value, list | dict) or key not in names:
+            held = f"it is {value!r}"
+            if isinstance(value, dict):
+                held = suggest_word(str(key), sorted(value))
+            elif isinstance(value, list):
+                held = f"it is a list of {count_text(len(value), 'entry', 'entries')}, from [0]"
+            raise ConfigError(f"{path} is not in the configuration: no {key} there; {held}")
         value = cast(Any, value)[key]
     if value is None:
         raise ConfigError(f"{path} is not set in the configuration, so it cannot be varied.")
     if type(value) not in (int, float):
-        raise ConfigError(f"{path} must lead to a number of the configuration; {_describe(value)}.")
+        raise ConfigError(f"{path} must lead to a number; got a {type(value).__name__}.")
     return cast(float, value)
-
-
-def _describe(value: Any) -> str:
-    if isinstance(value, dict):
-        return f"it is a section with {', '.join(sorted(value))}"
-    if isinstance(value, list):
-        return f"it is a list of {len(value)}"
-    return "it is not set" if value is None else f"it is {value!r}"
 
 
 def set_number(
@@ -125,11 +117,9 @@ def array_keys(settings: FileSection) -> set[Keys]:
     kinds = {section.kind for section in turbulence_sections(settings)}
     if settings.true_turbulence != "model":
         kinds = set()
-    keys: set[Keys] = {("loop", "delay_frames")}
-    if not isinstance(truth.sensor_gain, list):
-        keys.add(("truth", "sensor_gain"))
-        if not isinstance(model.sensor_gain, list):
-            keys.add(("model", "sensor_gain"))
+    keys: set[Keys] = {("loop", "delay_frames"), ("truth", "sensor_gain")}
+    if not isinstance(model.sensor_gain, list):
+        keys.add(("model", "sensor_gain"))
     if "ar2" not in kinds:  # which is fitted above the noise
         if not isinstance(sensor.noise_nm, list):
             keys |= {("sensor", "noise_nm"), ("sensor", "noise_mas")}
@@ -166,7 +156,7 @@ def build_ensemble(
     if not isinstance(settings.sensor.noise_nm, list):
         noise = noise[..., None]
     return LoopEnsemble(
-        sensor_gain=relative_gain(settings, config.sensor_gain),
+        sensor_gain=settings.truth.sensor_gain / config.sensor_gain,
         delay_frames=delay,
         noise_nm=noise * noise_factor[:, None],
         turbulence=config.truth.turbulence if flows is None else flows,
@@ -190,11 +180,11 @@ def _ensemble_vibrations(config: Config, settings: FileSection) -> list[Ensemble
     return vibrations
 
 
-def _frozen_flows(settings: FileSection, atmosphere: Atmosphere | None) -> FrozenFlows | None:
+def _frozen_flows(settings: FileSection, atmosphere: Atmosphere | None) -> Atmosphere | None:
     """Return the frozen flows of the samples, None if the weather does not differ."""
     air = settings.atmosphere
     if air is None or atmosphere is None:
         return None
     weather = {name: getattr(air, name) for name in _WEATHER}
     differing = {name: values for name, values in weather.items() if np.ndim(values)}
-    return FrozenFlows(atmosphere=atmosphere, **differing) if differing else None
+    return replace(atmosphere, **differing) if differing else None

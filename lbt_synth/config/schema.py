@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 from pydantic import (
-    BaseModel,
     Discriminator,
     Field,
     Tag,
@@ -15,7 +14,6 @@ from pydantic import (
     model_validator,
 )
 
-from lbt_synth.errors import suggest_word
 from lbt_synth.methods import quantities as q
 from lbt_synth.methods.method import Section
 from lbt_synth.methods.registry import METHODS
@@ -202,22 +200,11 @@ class _LineSection(Section):
     frequency_error_hz: q.HertzFromZero | None = key(
         "how far the true frequency may be off [Hz]; 0 where it is known", None
     )
-    frequency_error_percent: q.RatioFromZero | None = key(
-        "the same in percent of the frequency", None
-    )
     accelerometers: dict[str, MotionSection] | None = key(
         "accelerometer channels that move with it", None
     )
     _one_size = exactly_one("rms_nm", "rms_mas")
     _one_direction = at_most_one("axis", "direction_deg")
-    _one_error = at_most_one("frequency_error_hz", "frequency_error_percent")
-
-    @property
-    def largest_error_hz(self) -> float | None:
-        """How far the true frequency may be off [Hz], None where it is not stated."""
-        if self.frequency_error_percent is None:
-            return self.frequency_error_hz
-        return self.frequency_hz * self.frequency_error_percent / 100
 
 
 class VibrationSection(_LineSection):
@@ -283,7 +270,7 @@ class TruthSection(Section):
         | Annotated[list[TrueVibrationSection], Tag(q.EACH)],
         Discriminator(q.tag_one_or_each),
     ] = key("the vibrations, or model: those of the model", [])
-    sensor_gain: q.GainOrEach = key("real sensor gain, or one per measurement", 1.0)
+    sensor_gain: q.Gain = key("real sensor gain; the mean, where the model has several", 1.0)
 
 
 class ImagingSection(Section):
@@ -377,50 +364,30 @@ class FileSection(Section):
     end_to_end: EndToEndSection = key("the end-to-end simulation", EndToEndSection())
 
     @property
-    def usual_turbulence(self) -> str:
-        """Turbulence of a truth that names none: frozen_flow if there is an atmosphere."""
-        return "model" if self.atmosphere is None else "frozen_flow"
-
-    @property
     def true_turbulence(self) -> str:
         """Turbulence that the real loop meets: frozen_flow, model or none."""
-        return self.truth.turbulence or self.usual_turbulence
+        return self.truth.turbulence or ("frozen_flow" if self.atmosphere else "model")
 
 
 def config_schema() -> dict[str, Any]:
-    """Return the JSON schema of a configuration file.
+    """Return the JSON schema of a configuration file, of draft 2020-12, for editors.
 
-    Every key has its description, with its unit. Rules over several keys, such as one of
-    ``rms_nm`` and ``rms_mas``, are known to :func:`load_config` alone.
-
-    Returns
-    -------
-    dict
-        Schema of draft 2020-12, ready for :func:`json.dumps`.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> schema = lbt.config.config_schema()
-    >>> schema["$defs"]["LoopSection"]["properties"]["frame_rate_hz"]["description"]
-    'frame rate [Hz]'
+    Rules over several keys, such as one of ``rms_nm`` and ``rms_mas``, are not in it.
     """
     dialect = "https://json-schema.org/draft/2020-12/schema"
     return {"$schema": dialect, **FileSection.model_json_schema(), "title": "lbt-synth"}
 
 
-def describe_error(
-    error: ValidationError, schema: type[BaseModel] = FileSection
-) -> tuple[str, str]:
+def describe_error(error: ValidationError) -> tuple[str, str]:
     """Return one sentence on the first mistake, and the path of its key."""
     details = error.errors()
     missing = [_key_path(d["loc"]) for d in details if d["type"] == "missing"]
     # an unknown key says more than the missing one that it was meant to be
-    first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
+    first = next((d for d in details if d["type"] == "unknown_key"), details[0])
     kind, key, got, mentioned = first["type"], _key_path(first["loc"]), first["input"], 1
-    if kind == "extra_forbidden":
-        *sections, word = first["loc"]
-        text = f"unknown key {key}; {suggest_word(str(word), _list_keys(schema, sections))}"
+    if kind == "unknown_key":
+        key = _key_path((*first["loc"], first["ctx"]["word"]))
+        text = f"unknown key {key}; {first['ctx']['advice']}"
     elif kind == "missing":
         mentioned = len(missing)
         one = mentioned == 1
@@ -442,28 +409,3 @@ def _key_path(location: Iterable[int | str]) -> str:
     """Return the path of a key, without the tags of what may stand there."""
     words = [f"[{p}]" if isinstance(p, int) else f".{p}" for p in location if p not in _TAGS]
     return "".join(words).removeprefix(".")
-
-
-def _list_keys(model: type[BaseModel], location: Iterable[int | str]) -> list[str]:
-    """Return the keys that the schema knows at a location."""
-    sections: list[type[BaseModel]] = [model]
-    named_by_file = False  # the next word is a name that the file chooses, a key of a mapping
-    for word in location:
-        if isinstance(word, int) or word in _TAGS or named_by_file:
-            named_by_file = False
-            continue
-        fields = [
-            field
-            for section in sections
-            for name, field in section.model_fields.items()
-            if word == (field.alias or name)
-        ]
-        named_by_file = any(get_origin(field.annotation) is dict for field in fields)
-        sections = [inner for field in fields for inner in _list_sections(field.annotation)]
-    return sorted({f.alias or name for s in sections for name, f in s.model_fields.items()})
-
-
-def _list_sections(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [m for arg in getattr(annotation, "__args__", ()) for m in _list_sections(arg)]

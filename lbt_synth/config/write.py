@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import io
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
@@ -20,7 +19,6 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedModel
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.models import ARModel
-from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.validation import number, require_instance
 
 _AXES = ("tip", "tilt")
@@ -34,7 +32,11 @@ _LONGEST_LINE = 10**9  # a list stays on its line
 
 
 def config_text(settings: FileSection, comments: Mapping[str, str] | None = None) -> str:
-    """Return the YAML of a configuration; see :func:`save_config`."""
+    """Return the YAML of a configuration: what was set, with all digits, read again as it is.
+
+    Comments are by the paths of keys, such as ``model.vibrations[0].rms_nm``, and stand at the ends
+    of their lines; that of ``""`` heads the file, and may have several lines.
+    """
     require_instance(settings, FileSection)
     content = settings.model_dump(exclude_unset=True)
     unused = dict(comments or {})
@@ -58,58 +60,6 @@ def config_text(settings: FileSection, comments: Mapping[str, str] | None = None
     if again.model_dump(exclude_unset=True) != content:
         raise ProblemError("the configuration would not be read again as it is; it was changed.")
     return text
-
-
-def save_config(
-    path: str | os.PathLike[str],
-    settings: FileSection,
-    *,
-    comments: Mapping[str, str] | None = None,
-) -> Path:
-    """Write a configuration file that loads with the same values, whole or not at all.
-
-    Only what was set is written; defaults stay out. Numbers keep all their digits. The text is
-    read again before it is written.
-
-    Parameters
-    ----------
-    path : path-like
-        The file.
-    settings : FileSection
-        The settings, for example of :func:`load_config` or :func:`identified_config`.
-    comments : mapping of str to str, optional
-        Comment at the end of a key's line, by the path of the key, such as
-        ``model.vibrations[0].rms_nm``. That of ``""`` heads the file, and may have several lines.
-
-    Returns
-    -------
-    pathlib.Path
-        The file.
-
-    Raises
-    ------
-    ProblemError
-        If ``settings`` is no FileSection, or a comment has no key or more than one line.
-    OutputError
-        If the file cannot be written.
-
-    Examples
-    --------
-    >>> import tempfile, pathlib
-    >>> import lbt_synth as lbt
-    >>> settings = lbt.load_config("examples/lbt.yaml").settings
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     path = lbt.config.save_config(
-    ...         pathlib.Path(folder) / "again.yaml",
-    ...         settings,
-    ...         comments={"telescope.diameter_m": "Table I"},
-    ...     )
-    ...     print(path.read_text().splitlines()[3])
-    ...     lbt.load_config(path).settings == settings
-      diameter_m: 8.22                      # Table I
-    True
-    """
-    return write_atomically(path, config_text(settings, comments).encode())
 
 
 def turbulence_content(model: ARModel) -> dict[str, Any]:
@@ -165,46 +115,9 @@ def identified_config(
     title: str = "An identified system.",
     accelerometers: AccelerometerTransfers | None = None,
 ) -> tuple[FileSection, dict[str, str]]:
-    """Return the configuration of an identified system, the truth being the model.
+    """Return the configuration of an identified system, and standard errors by paths of keys.
 
-    Parameters
-    ----------
-    model : IdentifiedModel
-        What was identified, of one or two axes.
-    diameter_m : float, optional
-        Telescope diameter [m]; the identified values, in nm, do not depend on it.
-    obstruction : float, optional
-        Diameter of the central obstruction as a fraction of ``diameter_m``.
-    wavelength_um : float, optional
-        Imaging wavelength [um] of Strehl ratios.
-    other_modes_strehl : float, optional
-        Strehl ratio that all other modes leave.
-    title : str, optional
-        Comment at the top of the file.
-    accelerometers : AccelerometerTransfers, optional
-        How accelerometers move with the lines of the model; channels that show none are left out.
-
-    Returns
-    -------
-    settings : FileSection
-        The configuration, for :func:`save_config`.
-    comments : dict of str to str
-        Standard errors by the paths of the keys, for :func:`save_config`.
-
-    Raises
-    ------
-    ProblemError
-        If the model has another number of axes, or a value that no configuration accepts.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> noise = 3 * np.random.default_rng(0).standard_normal((8192, 1))
-    >>> record = lbt.identification.loop_record(noise, frame_rate_hz=800, unit="nm")
-    >>> settings, comments = lbt.config.identified_config(lbt.identify(record))
-    >>> [round(value) for value in settings.sensor.noise_nm], comments["sensor.noise_nm"]
-    ([3], 'standard error 0.024 nm')
+    The truth is the model. Channels of accelerometers that show no line are left out.
     """
     axes = tuple(model.axes)
     if len(axes) not in (1, 2):
@@ -236,7 +149,8 @@ def identified_config(
         content["truth"]["vibrations"] = "model"
     gains = [float(axis.sensor_gain) for axis in axes]
     if any(gain != 1 for gain in gains):
-        content["model"]["sensor_gain"] = content["truth"]["sensor_gain"] = gains
+        content["model"]["sensor_gain"] = gains
+        content["truth"]["sensor_gain"] = float(np.mean(gains))
         comments["model.sensor_gain"] = _error_comment(
             "", [axis.sensor_gain_error or 0.0 for axis in axes]
         )

@@ -289,11 +289,6 @@ class FilterDesign(Design):
         return (RowTable(key="failures", title="When sensors fail", rows=rows, notes=notes),)
 
     @property
-    def estimator(self) -> Controller:
-        """Estimator of z whatever the commands are, from [y(k), u(k-1)] for a plant."""
-        return self.problem.estimator(self.gain_predictor)
-
-    @property
     def poles(self) -> ComplexArray:
         """Poles of the estimation error, (n,)."""
         return self.error_system().poles

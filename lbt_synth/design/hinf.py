@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from lbt_synth.design.filter_design import FilterDesign, filter_design
@@ -11,7 +9,6 @@ from lbt_synth.design.kalman import error_scale
 from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import CertificateError, InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear import EstimationProblem, hinf_norm
-from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.infeasibility_proof import (
     Witness,
     infeasible_level,
@@ -23,7 +20,7 @@ from lbt_synth.linear.riccati.filtering import (
     kalman_riccati,
     least_gamma,
 )
-from lbt_synth.validation import choice, number
+from lbt_synth.validation import choice, number, require_instance
 
 AT_LEAST = 1e-9  # a level this close to the least one counts as the least one itself
 LARGEST_LMI = 20  # states; the inequality takes minutes beyond
@@ -55,9 +52,9 @@ def hinf(
         Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
         filter (a-posteriori), 2 and more predict further, as ``problem.ahead``.
     route : {"lmi", "riccati"}, optional
-        Linear matrix inequality, or the gamma-Riccati equation. For a given
-        bound both give the central filter. By default the inequality up to 20 states, and
-        the equation beyond, where the inequality takes minutes, or where the inequality fails.
+        How the least gamma is found: linear matrix inequality, or gamma-Riccati equation, of which
+        the filter of a larger bound is the central one. By default the inequality up to 20 states,
+        and the equation beyond, where the inequality takes minutes, or where the inequality fails.
 
     Returns
     -------
@@ -84,7 +81,7 @@ def hinf(
     >>> design.gamma <= design.gamma_requested
     True
     """
-    require_problem(problem)
+    require_instance(problem, EstimationProblem)
     if route is not None:
         choice(route, "route", ("lmi", "riccati"))
     gamma, gamma_ratio = checked_bounds(
@@ -132,28 +129,20 @@ def _design(
     gamma_ratio: float | None,
 ) -> FilterDesign:
     """Find the least gamma by one route, and the filter of the level asked for."""
-    gains: FilterRiccati
     lower, upper = _kalman_bracket(problem, start)
     if route == "lmi":
-        from lbt_synth.linear.lmi.filters import hinf_lmi, least_gamma_lmi
+        from lbt_synth.linear.lmi.filters import least_gamma_lmi
 
-        scales: dict[str, Any] = {"coordinates": start.P, "scale": upper}
-        gains, witness = least_gamma_lmi(problem, **scales)
-
-        def central(gamma: float) -> FilterRiccati:
-            return hinf_lmi(problem, gamma, **scales)
+        gains, witness = least_gamma_lmi(problem, coordinates=start.P, scale=upper)
     else:
-        _, level, best = least_gamma(problem, lower=lower, upper=upper, start=start)
-        gains, witness = best, worst_invisible_disturbance(problem, best.P, level, start.P)
-
-        def central(gamma: float) -> FilterRiccati:
-            return _central(problem, start, gamma)
+        _, level, gains = least_gamma(problem, lower=lower, upper=upper, start=start)
+        witness = worst_invisible_disturbance(problem, gains.P, level, start.P)
 
     least, infeasible = _verified_bracket(problem, start, gains, witness)
     requested = gamma if gamma is not None else least * (gamma_ratio or 1)
     require_reachable(requested, least)
     if requested > least * (1 + AT_LEAST):
-        gains = central(requested)
+        gains = _central(problem, start, requested)
     design = filter_design(
         problem,
         gains.gain_predictor,

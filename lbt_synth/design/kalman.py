@@ -7,12 +7,11 @@ import numpy as np
 from lbt_synth.design.filter_design import FilterDesign, filter_design
 from lbt_synth.design.result import SolverReport
 from lbt_synth.linear import EstimationProblem
-from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.validation import FloatArray, choice
+from lbt_synth.validation import FloatArray, require_instance
 
 
-def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccati") -> FilterDesign:
+def kalman(problem: EstimationProblem, *, horizon: int = 1) -> FilterDesign:
     """Design the steady-state Kalman filter of an estimation problem.
 
     Parameters
@@ -22,9 +21,6 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccat
     horizon : int, optional
         Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
         filter, 2 and more predict further, as ``problem.ahead``.
-    route : {"riccati", "sdp"}, optional
-        The Riccati equation, or a semidefinite programme, which takes from the Riccati
-        solution only the coordinates and the scale of its variables.
 
     Returns
     -------
@@ -48,23 +44,16 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1, route: str = "riccat
     >>> round(float(design.gain_predictor[0, 0]), 9), design.certificate.passed
     (0.618033989, True)
     """
-    require_problem(problem)
-    choice(route, "route", ("riccati", "sdp"))
-    problem = problem.ahead(horizon)
+    problem = require_instance(problem, EstimationProblem).ahead(horizon)
     solution = kalman_riccati(problem)
-    gains = solution
-    if route == "sdp":
-        problem.require_one_phase("the semidefinite programme", "route='riccati'")
-        from lbt_synth.linear.lmi.filters import kalman_sdp
-
-        scale = error_scale(problem, solution.P)
-        gains = kalman_sdp(problem, coordinates=solution.P, scale=scale)
     return filter_design(
         problem,
-        gains.gain_predictor,
-        gains.gain_filter,
+        solution.gain_predictor,
+        solution.gain_filter,
         method="kalman",
-        solver=SolverReport(route=route, status=gains.status, iterations=gains.iterations),
+        solver=SolverReport(
+            route="riccati", status=solution.status, iterations=solution.iterations
+        ),
     )
 
 

@@ -22,11 +22,10 @@ from lbt_synth.linear import (
     StateSpace,
     hinf_norm,
 )
-from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.linear.infeasibility_proof import infeasible_level
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.linear.riccati.filtering import FilterRiccati, gamma_riccati, kalman_riccati
-from lbt_synth.validation import FloatArray, frozen_copy, integer, number
+from lbt_synth.validation import FloatArray, frozen_copy, integer, number, require_instance
 
 if TYPE_CHECKING:
     from lbt_synth.linear.lmi.mixed import InnovationProgramme
@@ -108,7 +107,7 @@ def mixed(
     >>> best.gamma <= central.gamma * (1 + 1e-6) and best.rms < central.rms
     True
     """
-    require_problem(problem)
+    require_instance(problem, EstimationProblem)
     if sum(bound is not None for bound in (gamma, gamma_ratio, rms)) != 1:
         raise ProblemError(
             "give one of gamma, gamma_ratio and rms; "
@@ -132,7 +131,7 @@ def mixed(
             return bound - deviation
 
         def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
-            return programme.minimize_level((bound * (1 - _EXCESS / 2)) ** 2, grid)
+            return programme.minimize(grid, variance=(bound * (1 - _EXCESS / 2)) ** 2)
     else:
         if gamma_ratio is not None:
             gamma = least.gamma_least * number(gamma_ratio, "gamma_ratio", at_least=1)
@@ -147,7 +146,7 @@ def mixed(
             return norm - bound
 
         def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
-            return programme.minimize_variance(bound * (1 - _EXCESS / 2), grid)
+            return programme.minimize(grid, gamma=bound * (1 - _EXCESS / 2))
 
     base = _central_member(problem, least, measure)
     if not problem.reads_all:  # no impulse response: the least variance among central filters
@@ -273,7 +272,7 @@ def central_filter(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
     >>> round(lbt.design.central_filter(walk, gamma=1.5).gamma, 6)
     1.5
     """
-    require_problem(problem)
+    require_instance(problem, EstimationProblem)
     bound = number(gamma, "gamma", above=0)
     least = hinf(problem, route="riccati")
     require_reachable(bound, least.gamma_least)

@@ -53,8 +53,8 @@ class PredictorDesign(Design):
     """A controller that predicts the disturbance by a filter of least squares.
 
     It claims what it leaves on frames of its record that it was not fitted to, as does its
-    fall-back without the other sensors [nm rms], and the command that a reading of unit white noise
-    makes, for each reading of both filters.
+    fall-back without the other sensors [nm rms], by which share the fit itself adds to that, and
+    the command that a reading of unit white noise makes, for each reading of both filters.
 
     Attributes
     ----------
@@ -68,6 +68,7 @@ class PredictorDesign(Design):
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
         Claim(name="residual_nm", heading="residual on unseen frames of its record", unit="nm"),
         Claim(name="residual_error_nm", heading="standard error of that", unit="nm"),
+        Claim(name="fit_share", heading="of their variance, which the fit of all frames adds"),
         Claim(name="alone_nm", heading="residual of the fall-back on these frames", unit="nm"),
         Claim(name="command_rms", checks=_check_noise),
     )

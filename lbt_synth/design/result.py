@@ -54,7 +54,7 @@ class SolverReport:
     Attributes
     ----------
     route : str
-        "riccati", "sdp", "lmi" or "closed form".
+        "riccati", "lmi" or "closed form".
     status : str
         What the solver said of itself.
     iterations : int

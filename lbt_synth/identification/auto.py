@@ -22,12 +22,12 @@ from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import CertificateError, NumericalError, SynthesisError
 from lbt_synth.identification.accelerometers.readings import channels_beside
+from lbt_synth.identification.commands.control_law import fit_control_law
 from lbt_synth.identification.commands.repair import CommandRepair
 from lbt_synth.identification.commands.verdict import (
     could_have_run,
     explain_commands,
     judge_fitted_gains,
-    record_law,
 )
 from lbt_synth.identification.fit.fitting import GAIN_STEP, PLAUSIBLE_GAINS, POSSIBLE_GAINS
 from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedModel
@@ -47,9 +47,9 @@ from lbt_synth.identification.prediction.regression import (
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
-from lbt_synth.identification.stretches import split_halves
+from lbt_synth.identification.stretches import keep_frames, split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.loop import Imaging, close_loop, residual_budget, stable_sensor_gains
+from lbt_synth.loop import ClosedLoop, Imaging, close_loop, residual_budget, stable_sensor_gains
 from lbt_synth.methods.registry import (
     default_method,
     method_named,
@@ -63,7 +63,6 @@ from lbt_synth.validation import FloatArray, choice, require_instance
 
 _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
-_SHORT_SECONDS = 15.0  # below, a note says what the record leaves open
 DELAY_ERROR = 0.1  # frames, by which every design of a record may be off
 _MOST_NOISE = 10  # octaves of noise, by which a filter trusts its sensor no more
 _MISFIT = 1.5  # factor by which a gain may be off where the model leaves something out
@@ -186,13 +185,12 @@ def design_from_record(
     if accelerations is not None:
         require_instance(record, LoopRecord)
         beside = channels_beside(record, accelerations, channels)
-        record = beside.within(record)
-    seconds = _require_able(record, method, defaults)
+        record = keep_frames(record, beside.good)
+    _require_able(record, method, defaults)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     options |= {"sensor_gain": sensor_gain}
-    first, _ = split_halves(record.stretches())
-    half = identify(record, stretches=first, **options)
+    half = identify(split_halves(record)[0], **options)
     finds_gain = record.commands is not None and sensor_gain is None
     assumptions += _judge_gains(half, accept_record) if finds_gain else ()
     step(1)
@@ -222,10 +220,12 @@ def design_from_record(
     title, tested = request.method.title, held_out
     if noise > 1:
         one = {method: requests[method]}
-        tested, _ = compare_designs(record, half, one, noise=noise, **inputs)
+        tested, designs = compare_designs(record, half, one, noise=noise, **inputs)
         notes.append(_say_price(price, tested.row(title), held_out.row(title)))
     if of_record := request.method.of_record:
-        made = replace(made, claims={**made.claims, **_claims(tested, title)})
+        past = designs.get(title, made)
+        saved = past.claims["fit_share"] - made.claims["fit_share"]
+        made = replace(made, claims={**made.claims, **_claims(tested, title, saved)})
     step(1)
     return RecordedDesign(
         model=model,
@@ -237,8 +237,7 @@ def design_from_record(
         notes=(
             *notes,
             *_compare_gains(model, half),
-            *note_drift(record, model.plant(), made),
-            *_note_short(seconds, model),
+            *note_drift(record, model.plant(), made.close(model.hardware)),
         ),
     )
 
@@ -249,25 +248,32 @@ def _say_price(price: str, now: PredictionRow | None, before: PredictionRow | No
     return f"{price}. It leaves {leaves[0]} on unseen data, and without that {leaves[1]}"
 
 
-def _claims(table: PredictionTable, title: str) -> dict[str, float]:
-    """Return what a predictor claims: what that of the first half leaves, where it is above 0."""
+def _claims(table: PredictionTable, title: str, saved: float) -> dict[str, float]:
+    """Return what a predictor claims: what that of the first half leaves, where it is above 0.
+
+    Of its measured variance, a share is saved: a fit of all frames has smaller errors.
+    """
     claims, alone = dict[str, float](), table.row(f"{title}{WITHOUT}")
-    if row := table.row(title):
-        claims = {"residual_nm": row.replayed_nm, "residual_error_nm": row.replayed_error_nm}
-    if alone:
+    if (row := table.row(title)) and row.replayed:
+        left_nm2 = row.replayed.total_nm2 - saved * row.replayed.measured_nm2
+        error_nm2 = row.replayed.total_error_nm2
+        if left_nm2 > 0:
+            left_nm = float(np.sqrt(left_nm2))
+            claims = {"residual_nm": left_nm, "residual_error_nm": error_nm2 / (2 * left_nm)}
+    if alone and alone.replayed_nm > 0:
         claims["alone_nm"] = alone.replayed_nm
-    return {name: value for name, value in claims.items() if value > 0}
+    return claims
 
 
-def _require_able(record: LoopRecord, method: str | None, defaults: Mapping[str, Any]) -> float:
-    """Return the usable seconds of a record; refuse it, or a method and options that cannot be."""
+def _require_able(record: LoopRecord, method: str | None, defaults: Mapping[str, Any]) -> None:
+    """Refuse a record that is too short, or a method and options that cannot be."""
     require_instance(record, LoopRecord)
     if method is not None:
         choice(method, "method", record_methods())
     if defaults:  # refuses what the method does not take
         design_request(method or option_owners("gamma_ratio")[0], defaults)
     _ = record.hardware  # refuses a record without a delay
-    return require_length(record, seconds=LEAST_SECONDS) / record.frame_rate_hz
+    require_length(record, seconds=LEAST_SECONDS)
 
 
 def _judge_commands(
@@ -306,17 +312,14 @@ def _compare_gains(model: IdentifiedModel, half: IdentifiedModel) -> Iterator[st
             )
 
 
-def note_drift(
-    record: LoopRecord, plant: TipTiltPlant, controller: Controller | Design
-) -> Iterator[str]:
+def note_drift(record: LoopRecord, plant: TipTiltPlant, loop: ClosedLoop) -> Iterator[str]:
     """Yield a note on each axis whose offset and drift leave much beside its residual.
 
     The fit sees a drift in its lowest frequencies only, and an offset not at all. The filter sees
     both, and what it does not reject at zero frequency stays in the residual for ever.
     """
-    if isinstance(controller, Design) and controller.other_sensors:
+    if loop.reads_others:
         return
-    loop = close_loop(plant.hardware, controller)
     budget = residual_budget(loop, plant, frame_means=True)
     residual_nm = np.sqrt(np.diag(budget.total_nm2))
     series = record.pseudo_open_loop(np.diag(loop.hardware.sensor))[record.usable]
@@ -331,16 +334,6 @@ def note_drift(
                 f"{nm_text(speed[i])}/s. The filter sees that, and leaves up to "
                 f"{nm_text(rest_nm, '.2g')} of it. Offload it to the telescope"
             )
-
-
-def _note_short(seconds: float, model: IdentifiedModel) -> Iterator[str]:
-    """Yield what a short record leaves open."""
-    if seconds < _SHORT_SECONDS:
-        resolution_hz = max(axis.data.step_hz for axis in model.axes)
-        yield (
-            f"the record is short ({seconds:.3g} s): it does not tell lines less than "
-            f"{resolution_hz:.2g} Hz apart from one. Half a minute shows more"
-        )
 
 
 def quick_methods() -> list[str]:
@@ -390,7 +383,7 @@ def allowed_gains(record: LoopRecord, model: IdentifiedModel) -> FloatArray:
 
 def _running_gains(record: LoopRecord) -> tuple[float, float]:
     """Return the ends of the possible gains beyond which the law that ran was unstable."""
-    law = record_law(record)
+    law = fit_control_law(record)
     if law is None or law.kind == "none" or law.lag_frames < 0:
         return POSSIBLE_GAINS
     gains = _gains_between(*POSSIBLE_GAINS)
@@ -465,35 +458,30 @@ def design_for_gains(
             if np.ptp(allowed, axis=0).any():
                 text += ", and each axis at those of both, because they differ"
         assumed.append(text)
-    bad, noise, note = unstable_gains(usual, intervals), 1.0, ""
-    if bad is not None:
-        stable = _assume_noise(design, intervals)
-        if stable is None:
-            advice = (
-                "" if command_scale_known else ", or say --command-scale 1 (recorded as applied)"
-            )
-            gain = ", ".join(f"{value:.3g}" for value in bad)
-            raise CertificateError(
-                f"the loop of the design is unstable at the sensor gain {gain}, or there with a "
-                f"delay {DELAY_ERROR:g} frames off, and the record allows {_in_words(intervals)}. "
-                "Record with a higher loop gain, look for jumps in it, give the sensor "
-                f"gain{advice}."
-            )
-        usual, noise = stable
-        note = (
-            f"to be stable at sensor gains of {_in_words(intervals)}, and with a delay up to "
-            f"{DELAY_ERROR:g} frames off, the design assumes {noise:.3g} times the noise"
+    bad = unstable_gains(usual, intervals)
+    if bad is None:
+        return replace(usual, assumptions=(*assumed, *usual.assumptions)), 1.0, ""
+    wanted = list[str]()
+    if allowed is not None and not command_scale_known:
+        wanted.append("--command-scale 1 if the commands were recorded at the size applied")
+    if allowed is not None and np.any(allowed[:, 1] > (1 + DIFFERENT * OPEN_GAIN) * allowed[:, 0]):
+        wanted.append("--sensor-gain, which the record leaves open")
+    advice = f". Give {' or '.join(wanted)}" if wanted else ""
+    stable = _assume_noise(design, intervals)
+    if stable is None:
+        gain = ", ".join(f"{value:.3g}" for value in bad)
+        raise CertificateError(
+            f"the loop of the design is unstable at the sensor gain {gain}, or there with a delay "
+            f"{DELAY_ERROR:g} frames off, and the record allows {_in_words(intervals)}. Record "
+            f"with a higher loop gain, or look for jumps in it{advice}."
         )
-        wanted = list[str]()
-        if allowed is not None and not command_scale_known:
-            wanted.append("--command-scale 1 if the commands were recorded at the size applied")
-        if allowed is not None and np.any(
-            allowed[:, 1] > (1 + DIFFERENT * OPEN_GAIN) * allowed[:, 0]
-        ):
-            wanted.append("--sensor-gain, which the record leaves open")
-        if wanted:
-            note = f"warning: {note}. Give {' or '.join(wanted)}"
-    return replace(usual, assumptions=(*assumed, *usual.assumptions)), noise, note
+    safe, noise = stable
+    note = (
+        f"{'warning: ' * bool(wanted)}to be stable at sensor gains of {_in_words(intervals)}, and "
+        f"with a delay up to {DELAY_ERROR:g} frames off, the design assumes {noise:.3g} times the "
+        f"noise{advice}"
+    )
+    return replace(safe, assumptions=(*assumed, *safe.assumptions)), noise, note
 
 
 def _assume_noise(

@@ -48,7 +48,7 @@ AXES = ("tip", "tilt")
 DEAD = "dead"
 _NOISIER = 3.0  # times the other axis, from frame to frame: turbulence and lines are more alike
 _WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel
-_WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers", "held": "held"}
+_WORDS = {"saturated": "clipped", "stuck": "stuck", "outlier": "outliers"}
 _NARROW = 0.3  # modulus margin: less is a gain margin below 1.4
 _LEAST_SHARE = 0.05  # of the residual variance, of a part that is named
 
@@ -57,17 +57,13 @@ _LEAST_SHARE = 0.05  # of the residual variance, of a part that is named
 class ChannelRow:
     """One channel of a record."""
 
-    channel: str = column("channel", help="What it is")
-    rms_nm: float = nm_column("rms", help="Deviation from its mean")
-    step_nm: float = column(
-        "frame to frame", unit="nm", format=".3g", help="Rms difference of two frames"
-    )
-    drift_nm: float = nm_column("drift", help="Mean of the last quarter less that of the first")
-    change: float = column(
-        "scatter, end/start", format=".2f", help="Rms difference, last quarter over first"
-    )
-    faulty: float = column(help="Part of the frames with a fault of this channel")
-    state: str = column("state", help="What is wrong with it, or good")
+    channel: str = column("channel")
+    rms_nm: float = nm_column("rms")
+    step_nm: float = column("frame to frame", unit="nm", format=".3g")  # rms difference
+    drift_nm: float = nm_column("drift")  # mean of the last quarter less that of the first
+    change: float = column("scatter, end/start", format=".2f")  # of rms differences, by quarters
+    faulty: float = column()  # part of the frames with a fault of this channel
+    state: str = column("state")  # what is wrong with it, or good
 
     @property
     def serious(self) -> bool:
@@ -111,8 +107,7 @@ def _judge_channel(
     change, quarter = last / first if first > 0 else np.nan, len(channel) // 4
     drift_nm = np.mean(channel[-quarter:]) - np.mean(channel[:quarter]) if quarter else np.nan
     words = [f"{_WORDS[kind]} ({100 * share:.2g} %)" for kind, share in faults.items()]
-    held = faults.get("stuck", 0.0) + faults.get("held", 0.0)
-    if np.ptp(channel) == 0 or held > 1 / 2:
+    if np.ptp(channel) == 0 or faults.get("stuck", 0.0) > 1 / 2:
         words = [DEAD]
     elif series == "measurements":
         is_so = (
@@ -232,11 +227,11 @@ def line_name(line: IdentifiedLine) -> str:
 
 @table_row
 class CostRow:
-    """One part of the disturbance, and what it costs two loops by the model."""
+    """One part of the disturbance, and the residual that it leaves in two loops by the model."""
 
-    part: str = column("part", help="Part of the disturbance")
-    running_nm: float = nm_column("running", help="Residual that it leaves in the loop that ran")
-    best_nm: float = nm_column("best design", help="Residual that it leaves in the best design")
+    part: str = column("part")
+    running_nm: float = nm_column("running")
+    best_nm: float = nm_column("best design")
 
 
 def disturbance_costs(
@@ -340,7 +335,6 @@ def diagnose(
     record: LoopRecord,
     *,
     given: Mapping[str, Design] | None = None,
-    whole: LoopRecord | None = None,
     imaging: Imaging | None = None,
     progress: Callable[[int], object] | None = None,
     **options: Any,
@@ -353,8 +347,6 @@ def diagnose(
         What the loop recorded; the delay of a closed loop must be known.
     given : mapping of str to Design, optional
         Designs to try on the record, by their names.
-    whole : LoopRecord, optional
-        The record with those axes, too, that are left out of ``record`` because they are dead.
     imaging : Imaging, optional
         The camera, for Strehl ratios; 2.2 um by default.
     progress : callable, optional
@@ -396,13 +388,11 @@ def diagnose(
     if record.commands is not None:
         commands = explain_commands(record, sensor_gain=options.get("sensor_gain"))
         notes += commands.notes
-    if whole is not None and whole.axes > record.axes:
-        notes.append("the rest is of the axis that lives: the other one is dead")
     diagnosis = Diagnosis(
         record=record,
         imaging=imaging or Imaging(),
         commands=commands,
-        channels=judge_channels(record if whole is None else whole),
+        channels=judge_channels(record),
     )
     step(1)
     if diagnosis.doubt:
@@ -443,9 +433,8 @@ def _compare(
     Its sensor gain is that of the whole record, because a half shows it less well.
     """
     record, imaging = diagnosis.record, diagnosis.imaging
-    first, _ = split_halves(record.stretches())
-    fixed = {"stretches": first, "start": model, "sensor_gain": list(model.sensor_gains)}
-    half = identify(record, **{**options, **fixed})
+    fixed = {"start": model, "sensor_gain": list(model.sensor_gains)}
+    half = identify(split_halves(record)[0], **{**options, **fixed})
     more = [m for m in METHODS.values() if m.plant_section is not None or m.of_record]
     names = [m.name for m in (*reference_methods(estimators_only=True), *more)]
     table, designs = compare_designs(

@@ -1,47 +1,37 @@
-"""Stretches of a record: frames that are usable, to fit on, and to test on."""
+"""Frames of a record: all that are usable, or a part of them, to fit on or to test on."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeAlias
 
+import numpy as np
+
 from lbt_synth.errors import ProblemError
-from lbt_synth.validation import integer
+from lbt_synth.identification.records.faults import mark
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.validation import BoolArray
 
-Stretches: TypeAlias = tuple[tuple[int, int], ...]
-StretchesLike: TypeAlias = Sequence[tuple[int, int]]
-
-
-def checked_stretches(stretches: StretchesLike | None, frames: int) -> Stretches:
-    """Return stretches as pairs of integers; the whole record for None."""
-    if stretches is None:
-        return ((0, frames),)
-    out: list[tuple[int, int]] = []
-    for pair in stretches:
-        if not isinstance(pair, Sequence) or isinstance(pair, str) or len(pair) != 2:
-            raise ProblemError(f"a stretch must be a pair (start, stop) of frames; got {pair!r}.")
-        start, stop = (integer(end, "the end of a stretch", at_least=0) for end in pair)
-        after = out[-1][1] if out else 0
-        if not after <= start < stop <= frames:
-            raise ProblemError(
-                f"stretches must be in order, apart, not empty and within {frames} frames; got "
-                f"({start}, {stop}) after frame {after}."
-            )
-        out.append((start, stop))
-    if not out:
-        raise ProblemError("there must be at least one stretch of usable frames; got none.")
-    return tuple(out)
+Stretches: TypeAlias = tuple[tuple[int, int], ...]  # (start, stop) of contiguous usable frames
 
 
-def split_halves(stretches: Stretches) -> tuple[Stretches, Stretches]:
-    """Split the usable frames of a record into those to fit and later ones to test on."""
-    count = sum(stop - start for start, stop in stretches)
+def keep_frames(record: LoopRecord, kept: BoolArray) -> LoopRecord:
+    """Return a record of which no other frames (frames,) are usable."""
+    bridges = None if record.bridges is None else record.bridges & kept
+    return replace(record, measured=record.measured & kept, bridges=bridges)
+
+
+def split_halves(record: LoopRecord) -> tuple[LoopRecord, LoopRecord]:
+    """Return a record with the first half of its usable frames, to fit, and the rest, to test."""
+    runs = record.stretches()
+    count = int(np.sum(record.usable))
     if count < 2:
         raise ProblemError(
             f"a record must leave frames to fit and to test on; got {count} usable frames. Record "
             "more."
         )
-    return cut_stretches(stretches, 0, count // 2), cut_stretches(stretches, count // 2, count)
+    first = mark(np.array(cut_stretches(runs, 0, count // 2)), record.frames)
+    return keep_frames(record, first), keep_frames(record, ~first)
 
 
 def cut_stretches(stretches: Stretches, first: int, last: int) -> Stretches:

@@ -1,9 +1,8 @@
 """Tracking: identify the last seconds of a running loop again, design again, and change over.
 
-The error of an estimator does not depend on the commands (:attr:`FilterDesign.estimator`): its
-input is the pseudo-open-loop series ``ybar(k) = y(k) + sensor_matrix c(k)``, whose correction c(k)
-follows from the commands that were given and the states of the mirror. A new filter that runs over
-the recorded ``ybar`` has the state that it would have if it had always run: no bump.
+The error of an estimator (:func:`~lbt_synth.linear.estimator_form`) does not depend on the
+commands. A new filter that runs over the recorded measurements and commands has the state that it
+would have if it had always run: no bump.
 """
 
 from __future__ import annotations
@@ -17,11 +16,10 @@ from numpy.typing import ArrayLike
 
 from lbt_synth.design import FilterDesign, kalman
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
-from lbt_synth.identification.fit.fitting import Search
-from lbt_synth.identification.fit.identified_model import IdentifiedModel
-from lbt_synth.identification.fit.identify import axis_periodogram, find_axis
+from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
-from lbt_synth.identification.records.record import FEW
+from lbt_synth.identification.records.record import FEW, LoopRecord
+from lbt_synth.linear import estimator_form
 from lbt_synth.linear.block_filtering import series_states
 from lbt_synth.loop import close_loop
 from lbt_synth.models import TipTiltPlant
@@ -103,7 +101,7 @@ class TrackingController:
             )
         self._window = round(number(window_s, "window_s", at_least=_LEAST_FRAMES / rate) * rate)
         self._every = round(number(update_s, "update_s", at_least=1 / rate) * rate)
-        self._hardware, self._gains = hardware, gains.tolist()
+        self._hardware = hardware
         self._most_lines = 1 + len(plant.vibrations)  # a new one may appear
         self._design_filter, self._first = design, design(plant)
         self.reset()
@@ -120,39 +118,29 @@ class TrackingController:
 
     def reset(self) -> None:
         """Return to the first filter, with zero states, and forget everything."""
-        hw, self._mirror = self._hardware, self._hardware.mirror_system.whole
-        # measurements, corrections, and whether they are spoilt, of the last frames
+        # measurements, the commands before them, and whether they are spoilt, of the last frames
         self._past: deque[FloatArray] = deque(maxlen=self._window)
         self._frames = 0
-        self._position = np.zeros((self._mirror.n_states, hw.n_commands))
-        self._command = np.zeros(hw.n_commands)
+        self._command = np.zeros(self._hardware.n_commands)
         self._history: list[TrackingUpdate] = []
         self._take(self._first)
-        self._state = np.zeros(len(self._filter[0]))
 
     def step(self, y: ArrayLike) -> FloatArray:
         """Take the measurements y(k), (q,), return the command u(k), (m,); update if it is time.
 
         Where a measurement is not finite the command is held.
         """
-        F, K, C, to_command = self._filter
-        S, mirror = self._hardware.sensor, self._mirror
-        measured = float_array(y, "y")
-        if measured.shape != (len(S),):
-            raise DimensionError(
-                f"y must have shape ({len(S)},) to match the sensor matrix {S.shape}; got "
-                f"{measured.shape}."
-            )
-        seen = mirror.C @ self._position + mirror.D * self._command
-        correction = self._hardware.influence @ seen
-        self._position = mirror.A @ self._position + np.outer(mirror.B, self._command)
+        measured, q = float_array(y, "y"), self._hardware.n_measurements
+        if measured.shape != (q,):
+            raise DimensionError(f"y must have shape ({q},), one per axis; got {measured.shape}.")
         spoilt = not np.all(np.isfinite(measured))
         if spoilt:  # what the filter expects leaves it without an innovation
-            measured = C @ self._state - S @ correction
-        self._state = F @ self._state + K @ (measured + S @ correction)
+            full = _plant_of(self._design).full()
+            measured = full.C @ self._filter.state + full.D_known @ self._command
+        self._past.append(np.concatenate([measured, self._command, [spoilt]]))
+        command = self._filter.step(measured, self._command)
         if not spoilt:
-            self._command = to_command @ self._state
-        self._past.append(np.concatenate([measured, correction, [spoilt]]))
+            self._command = command
         self._frames += 1
         since_full = self._frames - self._window
         if since_full >= 0 and since_full % self._every == 0:
@@ -178,24 +166,25 @@ class TrackingController:
 
     def _identify(self) -> TipTiltPlant:
         """Return the plant of the last window."""
-        hw, window = self._hardware, np.array(self._past)
-        share = float(np.mean(window[:, -1]))
-        if share > FEW:
+        hw, q = self._hardware, self._hardware.n_measurements
+        y, before, spoilt = np.split(np.array(self._past), [q, -1], axis=1)
+        if (share := float(np.mean(spoilt))) > FEW:
             raise ProblemError(
                 f"at most {100 * FEW:g} % of a window's measurements may be missing; got "
                 f"{100 * share:.3g} %. The next window may have fewer."
             )
-        axes = []
-        for i, gain in enumerate(self._gains):
-            y, c = window[:, i], window[:, hw.n_measurements + i]
-            data = axis_periodogram(y, c, hw.frame_rate_hz, None)
-            axes.append(find_axis(Search(data=data, gain=gain, most_lines=self._most_lines)))
-        model = IdentifiedModel(
-            axes=tuple(axes),
+        every = np.ones(len(y), dtype=np.bool_)
+        record = LoopRecord(
             frame_rate_hz=hw.frame_rate_hz,
+            measurements=y,
+            commands=np.vstack([before[1:], self._command]) @ hw.influence.T,
             delay_frames=hw.delay_frames,
             mirror=hw.mirror,
+            measured=every,
+            commanded=every,
         )
+        gains = np.diag(hw.sensor).tolist()
+        model = identify(record, sensor_gain=gains, most_lines=self._most_lines)
         return replace(model.plant(), hardware=hw)
 
     def _change_over(self, design: FilterDesign) -> None:
@@ -203,25 +192,25 @@ class TrackingController:
         if not close_loop(self._hardware, design.controller).is_stable:
             raise ProblemError("the loop must be stable with the new filter; it is not.")
         self._take(design)
-        F, K, *_ = self._filter
-        measured, corrections, _ = np.split(np.array(self._past), [len(K.T), -1], axis=1)
-        drive = (measured + corrections @ self._hardware.sensor.T) @ K.T
-        self._state = series_states(F, drive)[-1]
+        measured, commands, _ = np.split(
+            np.array(self._past), [self._hardware.n_measurements, -1], 1
+        )
+        form = self._filter.controller
+        driven = measured @ form.B.T + commands @ form.applied.T
+        self._filter.state = series_states(form.A, driven)[-1]
 
     def _take(self, design: FilterDesign) -> None:
-        """Set the filter: its matrices F, K and C, and from state to command."""
-        plant, K = _plant_of(design), design.gain_predictor
-        self._design = design
-        self._filter = plant.A - K @ plant.C, K, plant.C, self._hardware.projector @ plant.L
+        """Set the filter, with a zero state."""
+        _plant_of(design)
+        self._design, self._filter = design, estimator_form(design).start()
 
 
 def _plant_of(design: object) -> TipTiltPlant:
     """Return the plant of a filter; refuse a design that is none, or of another problem."""
-    plant: TipTiltPlant | None = getattr(design, "plant", None)
-    if plant is None or not hasattr(design, "gain_filter"):
-        kind = getattr(design, "method", type(design).__name__)
-        raise ProblemError(
-            "only filters of a TipTiltPlant can take over in a running loop (kalman, hinf, mixed, "
-            f"central); got {kind!r}. Their estimate does not depend on the commands."
-        )
-    return plant
+    if isinstance(design, FilterDesign) and isinstance(design.problem, TipTiltPlant):
+        return design.problem
+    raise ProblemError(
+        "only filters of a TipTiltPlant can take over in a running loop (kalman, hinf, mixed, "
+        f"central); got {getattr(design, 'method', type(design).__name__)!r}. Their estimate does "
+        "not depend on the commands."
+    )

@@ -15,16 +15,16 @@ from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
 import lbt_synth
-from lbt_synth.design import Check, Design
+from lbt_synth.design import Check, Design, IntegratorLaw, integrator
+from lbt_synth.design.modal import MixedController, ModalFilters
 from lbt_synth.design.modal.stack import name_modes
 from lbt_synth.design.result import require_hardware
-from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.interop.modes import ModalDesign, ModeDesign, mode_designs
+from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.interop.proof import FRAMES, LOSS, Written, prove_written, rehearsal_error
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import close_loop
@@ -38,15 +38,29 @@ from lbt_synth.loop.simulation import (
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
 from lbt_synth.storage.rows import json_record
-from lbt_synth.validation import FloatArray, choice, number, require_instance
+from lbt_synth.validation import FloatArray, choice, integer, number, require_instance
 
 CERTIFICATE = ".certificate.json"  # added to the name of what is written: its certificate
 # without *, \ and ? no text ends a comment, splices lines or makes a trigraph
 _UNSAFE = re.compile(r"[^A-Za-z0-9 ._,:;+\-=()<>%'/\[\]|]")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
-
-
 _MOST_SETTLING = 0.25  # part of the frames that the loops may settle in
+
+
+ModalDesign: TypeAlias = Design | MixedController | ModalFilters
+
+
+class ModeDesign(NamedTuple):
+    """A design, and the modes that it controls; one of a single mode controls each of them."""
+
+    design: Design
+    modes: tuple[int, ...]
+
+    @property
+    def copies(self) -> list[tuple[int, ...]]:
+        """The modes of each copy of the controller."""
+        single = len(self.design.controller.C) == 1
+        return [(mode,) for mode in self.modes] if single else [self.modes]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -206,15 +220,7 @@ def export(
     place = Path(path)
     if program.endings:
         place = require_ending(path, f"a file for {target}", program.endings)
-    parts, count = mode_designs(
-        design,
-        target,
-        modes=modes,
-        other_gain=other_gain,
-        modal=program.modal or modes is not None,
-        mixed=program.join is not None,
-        reads_others=program.reads_others,
-    )
+    parts, count = _designs_of_modes(design, program, target, modes, other_gain)
     first = parts[0].design
     origin = _provenance_lines(first, gain_digest)
     numbers = program.round([part.design for part in parts], **settings)
@@ -246,6 +252,108 @@ def export(
         checks=checks,
         notes=tuple(notes),
     )
+
+
+def require_exportable(design: Design, *, reads_others: bool = False) -> None:
+    """Refuse a design that is not certified, or that reads sensors which a target does not know."""
+    require_instance(design, Design)
+    if not design.certificate.passed:
+        failed = tuple(check.name for check in design.certificate.checks if not check.passed)
+        raise CertificateError(
+            f"only a certified design is exported; this one failed: {'; '.join(failed)}.",
+            failed=failed,
+        )
+    if design.other_sensors and not reads_others:
+        raise ProblemError(
+            f"this design reads {', '.join(design.other_sensors)} beside the loop's own sensor, "
+            "each when it is due; what this target loads has one matrix, for a loop of one sensor. "
+            "Export it to C."
+        )
+
+
+def require_modal(design: Design) -> int:
+    """Return the number of modes of a design that measures, with a gain each, and moves modes."""
+    hardware = require_hardware(design, "an export of modes")
+    sensor, identity = hardware.sensor, np.eye(hardware.modes)
+    own = "the RTC reconstructs modes and projects them on actuators itself. Design for the modes."
+    if sensor.shape != identity.shape or np.any(sensor != np.diag(np.diag(sensor))):
+        raise ProblemError(f"sensor_matrix must be diagonal, a gain for each mode: {own}")
+    if not np.array_equal(hardware.influence, identity):
+        raise ProblemError(f"influence_matrix must be the identity: {own}")
+    return hardware.modes
+
+
+def _designs_of_modes(
+    design: ModalDesign, program: Target, target: str, modes: int | None, other_gain: float | None
+) -> tuple[list[ModeDesign], int]:
+    """Return the designs of a file, each certified, and the number of its modes."""
+    mixed, modal = program.join is not None, program.modal or modes is not None
+    start = getattr(design, "start", None)  # of a stack of designs
+    design = cast("Design | MixedController", design if start is None else start())
+    if isinstance(design, MixedController):
+        if not mixed:
+            raise ProblemError(
+                f"target {target} holds one design, for the first modes, and at most one gain for "
+                f"all others; got {type(design).__name__}. Give a design."
+            )
+        if other_gain is not None:
+            raise ProblemError("other_gain goes with a design; here each mode has its own gain.")
+        parts, controlled = _designs_of_mixture(design), design.n_modes
+        for part in parts:
+            require_exportable(part.design)
+    else:
+        require_exportable(design, reads_others=program.reads_others)
+        if design.other_sensors and (modes is not None or other_gain is not None):
+            raise ProblemError(
+                "modes and other_gain go with a design of one sensor; got one of several. Leave "
+                "them out."
+            )
+        several = other_gain is not None or (mixed and modal)
+        controlled = require_modal(design) if several else len(design.controller.C)
+        parts = [ModeDesign(design, tuple(range(controlled)))]
+    count = controlled if modes is None else integer(modes, "modes", at_least=1)
+    if count < controlled:
+        raise ProblemError(
+            f"modes must be at least {controlled}, those of the design; got {count}."
+        )
+    if other_gain is not None:
+        if count == controlled:
+            raise ProblemError(
+                f"other_gain needs modes, the number of those of the RTC, above the {controlled} "
+                "of the design. Give modes, or leave other_gain out."
+            )
+        single = require_hardware(parts[0].design, "an export of modes").single_mode()
+        others = integrator(single, gain=number(other_gain, "other_gain", above=0))
+        parts.append(ModeDesign(others, tuple(range(controlled, count))))
+    return parts, count
+
+
+def _designs_of_mixture(control: MixedController) -> list[ModeDesign]:
+    """Return the design of each mode; modes that get no command have none."""
+    if control.reconstructor is not None:
+        raise ProblemError("the RTC reconstructs modes itself; got a reconstructor.")
+    loop, kind = control.hardware, type(control.filter).__name__
+    if loop is None:
+        raise ProblemError(f"the filter must be a certified design or ModalFilters; got {kind}.")
+    designs: list[ModeDesign] = []
+    if hasattr(control.filter, "designs"):
+        filtered, which = np.array(control.filtered), control.filter.which
+        designs += [
+            ModeDesign(design, tuple(filtered[which == i].tolist()))
+            for i, design in enumerate(control.filter.designs)
+        ]
+    else:
+        require_modal(control.filter)
+        designs.append(ModeDesign(control.filter, tuple(control.filtered)))
+    laws: dict[tuple[float, float], list[int]] = {}
+    for mode in np.setdiff1d(np.arange(control.n_modes), control.filtered).tolist():
+        laws.setdefault((float(control.gains[mode]), float(control.leak[mode])), []).append(mode)
+    single = loop.single_mode()
+    for (gain, leak), modes in laws.items():
+        if gain > 0:
+            law = integrator(single, gain=gain, law=IntegratorLaw(leak=leak))
+            designs.append(ModeDesign(law, tuple(modes)))
+    return designs
 
 
 def _require_proved(
@@ -382,30 +490,22 @@ def rehearse(
     target: str,
     disturbance: Disturbance,
     *,
-    hardware: LoopHardware | None = None,
+    hardware: LoopHardware,
     stroke: float | None = None,
 ) -> Rehearsal:
     """Run what is exported to a target in its arithmetic, and the design in double precision.
 
-    Both loops, of the design's hardware or another, run frame by frame on the phase and noise of
-    one case, with a mirror that clips at the stroke.
+    Both loops run frame by frame on the phase and noise of one case, with a mirror that clips at
+    the stroke.
     """
     controller = as_controller(design)
-    path = require_hardware(design, "a rehearsal") if hardware is None else hardware
-    require_instance(disturbance, Disturbance, "disturbance")
-    cases, frames, n = disturbance.phase_nm.shape
-    if (cases, n) != (1, path.modes):
-        raise DimensionError(
-            f"phase_nm must be (frames, {path.modes}), of one case; got "
-            f"{disturbance.phase_nm.shape}."
-        )
     limit = np.inf if stroke is None else number(stroke, "stroke", above=0, at_most=1e30)
-    loop = close_loop(path, controller, sensor_gain=disturbance.sensor_gain)
+    loop = close_loop(hardware, controller, sensor_gain=disturbance.sensor_gain)
     loop.require_stable()
-    settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * frames))
+    settle = min(settling_frames(loop.spectral_radius), int(_MOST_SETTLING * disturbance.frames))
     with TemporaryDirectory() as folder:
         exported = export(target_named(target).path_in(Path(folder)), design, target)
-    run = partial(simulate, hardware=path, settle_frames=settle, stroke=stroke)
+    run = partial(simulate, hardware=hardware, settle_frames=settle, stroke=stroke)
     try:
         with np.errstate(all="ignore"):  # what overflows is found to be infinite
             runs = [run(c, disturbance) for c in (exported.start(limit), controller.start())]

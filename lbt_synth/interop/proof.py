@@ -48,33 +48,18 @@ EIGENVALUES = "eigenvalues of the monodromy, per frame"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Written:
-    """A controller as a target computes it: its numbers, the rounding of its sums, what it lacks.
+    """A controller as a target computes it: numbers, the rounding of its sums, what it lacks."""
 
-    Attributes
-    ----------
-    controllers : mapping of frozenset to Controller
-        With the numbers of the file, for each set of sensors that are not read.
-    entry : Controller, optional
-        From the noise (r,) of the sums to the command; A and C are those of the controller.
-    variance : callable, optional
-        From the sensor gain and the rms of measurements (q,) and commands (m,) to that of the
-        noise in the sums.
-    signals : int, optional
-        First states of the controller whose rms follow the measurements'.
-    residual_change_nm, response_change : callable, optional
-        Bounds on what is left out: from the sensor gain to the change of the residual's rms [nm],
-        and to that of the sensitivities.
-    checks : tuple of Check
-        What has to hold besides, such as stability without the loop.
-    """
-
-    controllers: Mapping[frozenset[str], Controller]
-    entry: Controller | None = None
+    controllers: Mapping[frozenset[str], Controller]  # for each set of sensors that are not read
+    entry: Controller | None = None  # from the noise (r,) of the sums to the command
+    # from the sensor gain and the rms of measurements (q,) and commands (m,) to that noise's
     variance: Callable[[float, FloatArray, FloatArray], FloatArray] | None = None
-    signals: int = 0
+    signals: int = 0  # first states of the controller whose rms follow the measurements'
+    # bounds on what is left out: from the sensor gain to the change of the residual's rms [nm], and
+    # to that of the sensitivities
     residual_change_nm: Callable[[float], float] | None = None
     response_change: Callable[[float], float] | None = None
-    checks: tuple[Check, ...] = ()
+    checks: tuple[Check, ...] = ()  # of what has to hold besides, as stability without the loop
 
 
 def sums_variance(

@@ -20,21 +20,10 @@ from lbt_synth.validation import (
     matrix,
     read_only,
     set_fields,
-    suggest_part,
 )
 
 LONGEST_HORIZON = 100  # samples
 _NOISE_FREE = 1e-9  # singular value of readings whose noise is of size one that counts as zero
-
-
-def require_problem(problem: object) -> None:
-    """Refuse anything but an estimation problem."""
-    if not isinstance(problem, EstimationProblem):
-        hint = suggest_part(problem, EstimationProblem)
-        hint = hint or " Try EstimationProblem(A=..., B=..., C=..., D=..., L=...)."
-        raise ProblemError(
-            f"expected an EstimationProblem, such as a plant; got {type(problem).__name__}.{hint}"
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,12 +72,6 @@ class EstimationProblem(LinearSystem):
     ... )
     >>> round(lbt.kalman(walk).rms ** 2, 6)  # the golden ratio
     1.618034
-
-    The same walk, which its sensor sees in every second sample:
-
-    >>> from dataclasses import replace
-    >>> replace(walk, read=[[True], [False]]).period
-    2
     """
 
     L: FloatArray
@@ -275,10 +258,6 @@ class EstimationProblem(LinearSystem):
             L=np.hstack([self.L, weights]),
         )
 
-    def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Estimator of z from all known signals: here from y(k), as :meth:`controller`."""
-        return self.controller(gain_predictor)
-
     def controller(self, gain_predictor: FloatArray) -> Controller:
         """Filter from y(k) to ``L x_hat(k+1 | k)``, the prediction of the next z.
 
@@ -318,19 +297,6 @@ def decorrelate(
     A, B, C, D = problem.read_parts(t)
     injection = np.linalg.solve(D @ D.T, (B @ D.T).T).T
     return frozen_copy(A - injection @ C), frozen_copy(B - injection @ D), frozen_copy(injection)
-
-
-def filter_gains(
-    problem: EstimationProblem, information: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Predictor and filter gain of the information matrix ``M = Pt^-1``, which may be singular.
-
-    ``gain_filter = (M + C'R^-1 C)^-1 C'R^-1`` stays finite.
-    """
-    A_s, _, injection = decorrelate(problem)
-    weighted = np.linalg.solve(problem.R, problem.C).T  # C' R^-1
-    gain_filter = np.linalg.solve(information + weighted @ problem.C, weighted)
-    return frozen_copy(A_s @ gain_filter + injection), frozen_copy(gain_filter)
 
 
 def error_units(covariance: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import matrix_balance
 
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
-from lbt_synth.linear.state_space import SAMPLE_FIRST, StateSpace
+from lbt_synth.linear.state_space import StateSpace
 from lbt_synth.storage.summaries import Summarised
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
@@ -94,10 +94,6 @@ class GeneralizedPlant(Summarised):
         for word, value in (("B1", B1.T), ("B2", B2.T), ("C1", C1), ("C2", C2)):
             if not len(value):
                 raise DimensionError(f"{word} must have at least one signal; got {value.shape}.")
-        if self.dt_s is None or self.dt_s == 0:
-            raise ProblemError(
-                f"the plant must be in discrete time; got dt_s={self.dt_s}. {SAMPLE_FIRST}"
-            )
         set_fields(self, dt_s=number(self.dt_s, "dt_s", above=0))
 
     def _brief(self) -> str:
@@ -129,6 +125,13 @@ class GeneralizedPlant(Summarised):
         B, C = np.hstack([self.B1, self.B2]), np.vstack([self.C1, self.C2])
         D = np.block([[self.D11, self.D12], [self.D21, self.D22]])
         return StateSpace(A=self.A, B=B, C=C, D=D, dt_s=self.dt_s)
+
+    def transposed(self) -> GeneralizedPlant:
+        """Return the plant whose control is the estimation of this one, in costates."""
+        turned = {"A": "A", "B1": "C1", "B2": "C2", "C1": "B1", "C2": "B2"}
+        turned |= {"D11": "D11", "D12": "D21", "D21": "D12", "D22": "D22"}
+        parts = {name: getattr(self, other).T for name, other in turned.items()}
+        return GeneralizedPlant(**parts, dt_s=self.dt_s)
 
     def with_whole(self, system: StateSpace) -> GeneralizedPlant:
         """Return the plant of another system with the same partition."""

@@ -48,15 +48,14 @@ def stationary_covariances(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, Fl
     with several poles next to each other and to the unit circle.
     """
     with np.errstate(all="ignore"):  # the caller judges the residuals
-        X = smith_sum(A, Q)
-        X, step = _refine(A, Q, X, np.float64)
-        poor = np.flatnonzero(step > _SETTLED)
-        last = np.full(len(A), np.inf)
+        X, step = smith_sum(A, Q), np.full(len(A), np.inf)
+        poor = np.arange(len(A))
+        precision: type[np.floating[Any]] = np.float64
         while poor.size:
-            X[poor], step[poor] = _refine(A[poor], Q[poor], X[poor], np.longdouble)
-            improved = (step[poor] > _SETTLED) & (step[poor] < last[poor] / 2)
-            last[poor] = step[poor]
-            poor = poor[improved]
+            last = step[poor]
+            X[poor], step[poor] = _refine(A[poor], Q[poor], X[poor], precision)
+            poor = poor[(step[poor] > _SETTLED) & (step[poor] < last / 2)]
+            precision = np.longdouble
         residuals = _relative_residuals(A, Q, X)
         for i in np.flatnonzero(~(step <= _SETTLED)):
             if np.max(np.abs(np.linalg.eigvals(A[i]))) < 1:

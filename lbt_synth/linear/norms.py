@@ -131,20 +131,19 @@ def _peak(G: StateSpace, low: float, high: float) -> HinfNorm:
     """Largest singular value of a balanced system between two angles, by level sets."""
     largest = partial(_largest, G, schur_form(G), spectral_norms)
     seeds = _seeds(G, low, high)
-    peak, angle = _climb(G, seeds, largest, lambda level: level_angles(G, level))
+
+    def pencil(level: float) -> FloatArray:
+        # one scaling of states serves both x and p; levels are scaled to one
+        B, C, D = G.B / np.sqrt(level), G.C / np.sqrt(level), G.D / level
+        return popov_angles(G.A, B, C.T @ C, D.T @ C, D.T @ D - np.eye(D.shape[1]))
+
+    peak, angle = _climb(G, seeds, largest, pencil)
     return HinfNorm(
         value=peak,
         lower=peak,
         upper=peak * (1 + 2 * _TOLERANCE),
         peak_frequency_hz=angle / (2 * np.pi * G.dt_s),
     )
-
-
-def level_angles(G: StateSpace, level: float) -> FloatArray:
-    """Angles of a balanced system at which a singular value may be at a level."""
-    # one scaling of states serves both x and p; levels are scaled to one
-    B, C, D = G.B / np.sqrt(level), G.C / np.sqrt(level), G.D / level
-    return popov_angles(G.A, B, C.T @ C, D.T @ C, D.T @ D - np.eye(D.shape[1]))
 
 
 def largest_real_part(system: StateSpace, *, least: float = -np.inf) -> float:

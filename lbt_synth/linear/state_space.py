@@ -158,12 +158,6 @@ class StateSpace(LinearSystem):
         """Take a discrete system of python-control or scipy, or a tuple (A, B, C, D).
 
         Anything else, and a system in continuous time, raises a ProblemError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> lbt.linear.StateSpace.of(([[0.5]], [[1.0]], [[1.0]], [[0.0]])).spectral_radius
-        0.5
         """
         if isinstance(system, StateSpace):
             return system
@@ -221,15 +215,7 @@ class StateSpace(LinearSystem):
         return StateSpace(A=A, B=B, C=C, D=D, dt_s=self.dt_s)
 
     def lifted(self) -> StateSpace:
-        """Return the system over a period: inputs and outputs of all phases side by side.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> turns = lbt.linear.StateSpace(A=[[[0.5]], [[1.5]]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
-        >>> turns.lifted().A.tolist(), turns.lifted().D.tolist()
-        ([[0.75]], [[0.0, 0.0], [1.0, 0.0]])
-        """
+        """Return the system over a period: inputs and outputs of all phases side by side."""
         if self.period == 1:
             return self
         (N, p, m), n = self.D.shape, self.n_states

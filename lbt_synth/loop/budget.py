@@ -22,7 +22,6 @@ from lbt_synth.loop.evaluator import (
     STILL,
     Evaluator,
     Matrices,
-    Turbulence,
     close_loops,
     loop_evaluator,
     period_roots,
@@ -31,6 +30,7 @@ from lbt_synth.models import (
     ARModel,
     LoopHardware,
     SinusoidalVibration,
+    Spectrum,
     TipTiltPlant,
     Truth,
     Vibration,
@@ -224,7 +224,7 @@ def residual_budget(
 
 def residual_of_parts(
     parts: Sequence[Evaluator],
-    turbulence: Sequence[tuple[Turbulence, IntArray]],
+    turbulence: Sequence[tuple[Spectrum, IntArray]],
     lines: Sequence[EnsembleVibration],
     noise: FloatArray,
     *,

@@ -14,7 +14,6 @@ from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models import (
     ARModel,
-    DriftingVibration,
     LoopHardware,
     SinusoidalVibration,
     Spectrum,
@@ -206,7 +205,7 @@ def draw_phase(
 
 
 def _draw_line(
-    vibration: Vibration | SinusoidalVibration | DriftingVibration,
+    vibration: Vibration | SinusoidalVibration,
     hardware: LoopHardware,
     time_s: FloatArray,
     cases: int,
@@ -214,15 +213,15 @@ def _draw_line(
 ) -> tuple[FloatArray, FloatArray]:
     """Return a line of its rms, (cases, frames), and its frequencies of the moment [Hz]."""
     rate, frames = hardware.frame_rate_hz, len(time_s)
-    if isinstance(vibration, DriftingVibration):
-        phase = 2 * np.pi * vibration.turns_at(time_s) + rng.uniform(0, 2 * np.pi, (cases, 1))
-        return vibration.amplitude_nm * np.cos(phase), vibration.frequency_hz_at(time_s)
-    constant_hz = np.full(frames, vibration.frequency_hz)
     if isinstance(vibration, Vibration):
+        constant_hz = np.full(frames, vibration.frequency_hz)
         return _draw_ar(vibration.ar_model(rate), frames, cases, rng), constant_hz
     turns = vibration.frequency_hz / rate * np.arange(frames)
+    if vibration.drifts:
+        turns = vibration.turns_at(time_s)
     phase = rng.uniform(0, 2 * np.pi, (cases, 1))
-    return vibration.amplitude_nm * np.cos(2 * np.pi * turns + phase), constant_hz
+    series = vibration.amplitude_nm * np.cos(2 * np.pi * turns + phase)
+    return series, vibration.frequency_hz_at(time_s)
 
 
 def run_oscillator(seen: SeenVibration, line: Vibration, drive: FloatArray) -> FloatArray:
@@ -281,16 +280,13 @@ def draw_others(
 def _acceleration(
     sensor: Accelerometer,
     hardware: LoopHardware,
-    line: SinusoidalVibration | DriftingVibration,
+    line: SinusoidalVibration,
     motion: FloatArray,
     moved: Motion,
     time_s: FloatArray,
 ) -> FloatArray:
     """Return what a channel reads of a sinusoid, (cases, frames) [m/s^2]."""
-    if isinstance(line, DriftingVibration):
-        frequency_hz = line.frequency_hz_at(time_s)
-    else:
-        frequency_hz = np.full(len(time_s), line.frequency_hz)
+    frequency_hz = line.frequency_hz_at(time_s)
     turn = 2 * np.pi * frequency_hz * hardware.dt_s
     # whole frames of the age are a delay; what is left of it turns the phase, by two frames
     newest = int(sensor.age_frames(hardware) - period_frames(sensor, hardware) + 1)

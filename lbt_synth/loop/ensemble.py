@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.loop.evaluator import Turbulence
 from lbt_synth.models import (
     ARModel,
-    FrozenFlows,
+    Atmosphere,
     LoopHardware,
     SinusoidalVibration,
+    Spectrum,
     Vibration,
 )
 from lbt_synth.models.spectra import spectrum_key
@@ -90,8 +90,8 @@ def ensemble_vibration(vibration: Vibration | SinusoidalVibration) -> EnsembleVi
 class LoopEnsemble:
     """Conditions of p loops with the same sensor and mirror: one number for all, or one for each.
 
-    The turbulence is one for all modes, or one for each: a spectrum for all loops, or FrozenFlows
-    or a stack of AR models with one for each.
+    The turbulence is one for all modes, or one for each: a spectrum for all loops, or an
+    atmosphere or an AR model that is a stack with one for each.
     """
 
     sensor_gain: Any = 1.0  # real sensor gain relative to the sensor matrix
@@ -136,7 +136,7 @@ class LoopEnsemble:
         noise = noise[:, None] if noise.ndim == 1 else noise
         return np.broadcast_to(noise, (self.loops, q))[..., None] * np.eye(q)
 
-    def groups(self, hardware: LoopHardware) -> list[tuple[Turbulence, IntArray]]:
+    def groups(self, hardware: LoopHardware) -> list[tuple[Spectrum, IntArray]]:
         """Return the turbulence with the modes that have it."""
         airs = self._turbulence_of(hardware.modes)
         keys = [spectrum_key(air) for air in airs]
@@ -152,9 +152,9 @@ class LoopEnsemble:
         return [line.of_loops(self.loops) for line in self.vibrations]
 
 
-def _turbulence_numbers(turbulence: Turbulence | None) -> list[FloatArray]:
+def _turbulence_numbers(turbulence: Spectrum | None) -> list[FloatArray]:
     """Return the arrays of a turbulence that have one entry per loop."""
-    if isinstance(turbulence, FrozenFlows):
+    if isinstance(turbulence, Atmosphere):
         values = turbulence.seeing_arcsec, turbulence.wind_speed_m_s, turbulence.outer_scale_m
         return [value for value in values if value is not None]
     if isinstance(turbulence, ARModel) and turbulence.coefficients.ndim > 1:
@@ -162,9 +162,9 @@ def _turbulence_numbers(turbulence: Turbulence | None) -> list[FloatArray]:
     return []
 
 
-def turbulence_rows(turbulence: Turbulence, rows: IntArray) -> Turbulence:
+def turbulence_rows(turbulence: Spectrum, rows: IntArray) -> Spectrum:
     """Return the turbulence of some loops."""
-    if isinstance(turbulence, FrozenFlows) and len(turbulence) > 1:
+    if isinstance(turbulence, Atmosphere) and np.size(turbulence.wind_speed_m_s) > 1:
         return turbulence.take(rows)
     if isinstance(turbulence, ARModel) and turbulence.count > 1:
         return turbulence.take(rows)

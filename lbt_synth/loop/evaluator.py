@@ -32,7 +32,7 @@ from lbt_synth.linear.matrix_functions import component_labels, transpose
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_rule
 from lbt_synth.linear.state_space import stacked_response
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, ClosedLoop, last_frame, loop_matrices
-from lbt_synth.models import ARModel, FrozenFlows, LoopHardware, Spectrum
+from lbt_synth.models import ARModel, Atmosphere, LoopHardware, Spectrum
 from lbt_synth.models.mirror.frame_rate_system import (
     Hold,
     Response,
@@ -42,8 +42,6 @@ from lbt_synth.models.mirror.frame_rate_system import (
 from lbt_synth.models.spectra import breakpoints_below, companions, densities, spectrum_density
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
-# one for all modes and loops, or one for each loop
-Turbulence: TypeAlias = Spectrum | FrozenFlows
 Matrices: TypeAlias = tuple[FloatArray, ...]  # A, B, C, D in textbook form, (1 or p, ., .) each
 # the modes and measurements of each of c equal parts, (c, n) and (c, q), the matrices of their
 # controllers, the sensor (q, n) and the influence (n, m)
@@ -147,14 +145,14 @@ class Evaluator:
             out[:, 1] = power[:, None, None] * (entry @ transpose(entry))
         return out
 
-    def of_turbulence(self, spectrum: Turbulence, entry: FloatArray) -> FloatArray:
+    def of_turbulence(self, spectrum: Spectrum, entry: FloatArray) -> FloatArray:
         """Return what phases of a spectrum leave, or of sampled processes."""
         if isinstance(spectrum, ARModel):
             coefficients = np.atleast_2d(spectrum.coefficients)
             return self.of_process(coefficients, np.atleast_1d(spectrum.driving_rms_nm), entry)
 
         def density(f_hz: FloatArray) -> FloatArray:
-            if isinstance(spectrum, FrozenFlows):
+            if isinstance(spectrum, Atmosphere) and spectrum.is_stack:
                 shapes, which, factor = spectrum.factored_psd(f_hz)
                 return np.asarray(shapes.T[:, which] * factor)
             return spectrum_density(spectrum, f_hz)[:, None]

@@ -7,7 +7,10 @@ from dataclasses import dataclass, field
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Protocol
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic_core import PydanticCustomError
+
+from lbt_synth.errors import suggest_word
 
 if TYPE_CHECKING:
     from lbt_synth.design.result import Design
@@ -20,6 +23,18 @@ class Section(BaseModel):
     model_config = ConfigDict(
         extra="forbid", strict=True, allow_inf_nan=False, frozen=True, defer_build=True
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _know_keys(cls, content: Any) -> Any:
+        """Refuse a key that the section does not have, and name the one that was meant."""
+        names = sorted(field.alias or name for name, field in cls.model_fields.items())
+        closed = isinstance(content, dict) and cls.model_config["extra"] == "forbid"
+        for word in content if closed else ():
+            if word not in names:
+                advice = {"word": word, "advice": suggest_word(str(word), names)}
+                raise PydanticCustomError("unknown_key", "unknown key", advice)
+        return content
 
     def arguments(self) -> dict[str, Any]:
         """Return the options as arguments of the function that designs."""

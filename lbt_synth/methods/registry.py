@@ -33,9 +33,6 @@ _SIZES = {"gain", "phase_margin_deg", "modulus_margin"}  # what decides the gain
 class KalmanOptions(Section):
     """Options of the Kalman filter."""
 
-    route: Literal["riccati", "sdp"] = Field(
-        default="riccati", description="solver, riccati or sdp"
-    )
     horizon: Horizon = 1
 
 

@@ -19,7 +19,5 @@ from .turbulence.ar_models import ar1_turbulence as ar1_turbulence
 from .turbulence.ar_models import ar2_turbulence as ar2_turbulence
 from .turbulence.ar_models import modal_turbulence as modal_turbulence
 from .turbulence.atmosphere import Atmosphere as Atmosphere
-from .turbulence.atmosphere import FrozenFlows as FrozenFlows
-from .vibration import DriftingVibration as DriftingVibration
 from .vibration import SinusoidalVibration as SinusoidalVibration
 from .vibration import Vibration as Vibration

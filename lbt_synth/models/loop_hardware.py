@@ -11,8 +11,8 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.models.mirror.frame_rate_system import MirrorSystem, mirror_system
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.models.sensor_suite import OWN_SENSOR_ALONE, SensorSuite
-from lbt_synth.storage.rows import column, fact_table, fill_row, table_row
-from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.storage.rows import column, fill_row, table_row
+from lbt_synth.storage.summaries import Summarised
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, Positive, check_fields, frozen_copy, integer, matrix
 
@@ -173,9 +173,6 @@ class LoopHardware(Summarised):
         moving = "" if self.mirror is None else ", a mirror with dynamics"
         return f"{axes} at {self.frame_rate_hz:g} Hz, delay {self.delay_frames:g} frames{moving}"
 
-    def _summarise(self) -> Summary:
-        return Summary(tables=[fact_table("Loop", self.facts())])
-
     @property
     def dt_s(self) -> float:
         """Frame period [s]."""
@@ -226,9 +223,6 @@ def past_corrections(taps: FloatArray, commands: FloatArray) -> FloatArray:
     Commands (frames, m) before the first row count as zero, so the first ``len(taps)`` rows of
     the answer (frames, m) are not known.
     """
-    frames = len(commands)
-    out = np.zeros(commands.shape)
-    for i in np.flatnonzero(taps):
-        if i + 1 < frames:
-            out[i + 1 :] += taps[i] * commands[: frames - 1 - i]
-    return out
+    from scipy.signal import lfilter  # slow to import
+
+    return np.asarray(lfilter([0.0, *taps], [1.0], commands, axis=0))

@@ -59,15 +59,9 @@ def recursion(frequency: float, damping: float) -> tuple[float, float, Jacobian]
     return b, p, ((by_frequency, by_damping), (p_by_log, p_by_log))
 
 
-def coefficients(frequency: float, damping: float) -> tuple[float, float, float]:
-    """Return a1, a2 and var v / P of a sampled resonance."""
-    b, p, _ = recursion(frequency, damping)
-    q, drive = 1 - p, _drive(b, p)
-    if damping >= 1:
-        return 1 - b + q, -q, drive
-    decay = np.exp(-damping * frequency)
-    turn = frequency * np.sqrt((1 - damping) * (1 + damping))
-    return float(2 * decay * np.cos(turn)), -float(decay**2), drive
+def drive_ratio(frequency: float, damping: float) -> float:
+    """Return var v / P of a sampled resonance."""
+    return _drive(*recursion(frequency, damping)[:2])
 
 
 def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
@@ -126,7 +120,7 @@ def _gauss_rule() -> tuple[FloatArray, FloatArray]:
 
 def section_drives(frequency: float, damping: float, sections: int) -> FloatArray:
     """Return the driving deviations of processes of 1, 2, ... sections of unit variance, (m,)."""
-    drive = coefficients(frequency, damping)[2]
+    drive = drive_ratio(frequency, damping)
     variances = [series_variance(frequency, damping, m)[0] for m in range(1, sections + 1)]
     return np.asarray(np.sqrt(drive ** np.arange(1, sections + 1) / np.array(variances)))
 
@@ -177,14 +171,6 @@ def resonance_densities(
 def _drive(b: Number, p: Number) -> Number:
     """Variance of the driving noise of a resonance of unit variance."""
     return p * b * (2 * (2 - p) - b) / (2 - p)
-
-
-def log_density(
-    frequency: float, damping: float, s: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Logarithm of the spectrum of unit variance, and its derivatives; all are (f,) as s is."""
-    value, slopes = resonance_densities(np.array([frequency]), np.array([damping]), np.ones(1), s)
-    return np.log(value[0]), slopes[0, 0], slopes[0, 1]
 
 
 def log_roll_off(corner: float, order: float, s: FloatArray) -> tuple[FloatArray, FloatArray]:

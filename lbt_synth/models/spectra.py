@@ -89,13 +89,6 @@ class ARModel:
         """Return models of any orders as one stack, in which shorter ones have zeros.
 
         Anything but ARModels, and different frame rates, raise a ProblemError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
-        >>> lbt.models.ARModel.stack([slow, slow]).count
-        2
         """
         members = (models,) if isinstance(models, ARModel) else sequence(models, "models")
         if not members or not all(isinstance(model, ARModel) for model in members):
@@ -150,17 +143,10 @@ class ARModel:
 
         It is ``2 s^2 / (f_s |1 - a1 z^-1 - a2 z^-2 - ...|^2)``; that of a stack is (k, f). A
         frequency that is not finite raises a ProblemError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> white = lbt.models.ARModel(coefficients=[0.0], driving_rms_nm=3.0, frame_rate_hz=900)
-        >>> float(white.psd(100.0) * 450)
-        9.0
         """
         frequency = real_array(frequency_hz, "frequency_hz")
         density = densities(self.coefficients, self.driving_rms_nm, self.frame_rate_hz, frequency)
-        return density.reshape(*self.coefficients.shape[:-1], *frequency.shape)
+        return density.reshape((*self.coefficients.shape[:-1], *frequency.shape))
 
 
 def companions(coefficients: FloatArray) -> FloatArray:

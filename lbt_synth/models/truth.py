@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, TypeAlias
 
@@ -13,15 +13,12 @@ from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.sensor_suite import Motions
 from lbt_synth.models.spectra import ARModel, Spectrum, spectrum_key
 from lbt_synth.models.vibration import (
-    DriftingVibration,
     SinusoidalVibration,
     TrueVibration,
     Vibration,
     stationary_vibrations,
 )
-from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import column, fact_table, table_row
-from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.storage.summaries import Summarised
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     FloatArray,
@@ -31,64 +28,6 @@ from lbt_synth.validation import (
     number,
     one_or_each,
 )
-
-_DIGITS = ".4g"
-_MOST_LINES = 6  # vibrations that are listed, the strongest
-
-
-@table_row
-class DisturbanceFacts:
-    """Turbulence, vibrations and noise, in words."""
-
-    turbulence: str = column("turbulence")
-    vibrations: str = column("vibrations")
-    noise_nm: str = column("noise per frame")
-    sensor_gain: float | None = column("sensor gain over the assumed one")
-
-
-def disturbance_facts(
-    turbulence: Iterable[Spectrum | None],
-    vibrations: Sequence[TrueVibration],
-    noise_nm: FloatArray,
-    sensor_gain: float | None = None,
-) -> DisturbanceFacts:
-    """Return the facts of disturbances; what axes have in common is said once."""
-    return DisturbanceFacts(
-        turbulence=_join(_spectrum_text(spectrum) for spectrum in turbulence),
-        vibrations=_vibrations_text(vibrations),
-        noise_nm=_join(nm_text(noise, _DIGITS) for noise in np.ravel(noise_nm)),
-        sensor_gain=sensor_gain,
-    )
-
-
-def _join(texts: Iterable[str]) -> str:
-    return ", ".join(dict.fromkeys(texts))
-
-
-def _spectrum_text(spectrum: Spectrum | None) -> str:
-    if spectrum is None:
-        return "none"
-    if isinstance(spectrum, ARModel):
-        return f"AR{spectrum.order} {nm_text(spectrum.rms_nm, _DIGITS)}"
-    rms_nm = getattr(spectrum, "tilt_rms_nm", None)
-    size = f" {nm_text(rms_nm, _DIGITS)}" if isinstance(rms_nm, float) else ""
-    return f"{type(spectrum).__name__}{size}"
-
-
-def _vibrations_text(vibrations: Sequence[TrueVibration]) -> str:
-    """Return size and frequency of the strongest vibrations, by frequency."""
-    strongest = sorted(vibrations, key=lambda line: -line.rms_nm)[:_MOST_LINES]
-    texts = sorted((_frequency(line), line.rms_nm) for line in strongest)
-    more = len(vibrations) - len(strongest)
-    listed = [
-        f"{nm_text(rms_nm, _DIGITS)} at {frequency_hz:.4g} Hz" for frequency_hz, rms_nm in texts
-    ]
-    return ", ".join(listed + ([f"{more} more"] if more else []))
-
-
-def _frequency(line: TrueVibration) -> float:
-    return line.start_hz if isinstance(line, DriftingVibration) else line.frequency_hz
-
 
 # spectra with the modes that have them, vibrations, and a root of the covariance of the noise
 Entering: TypeAlias = tuple[
@@ -107,7 +46,7 @@ class Truth(Summarised):
     turbulence : Spectrum, sequence of (Spectrum or None), or None
         Spectrum of each mode, the modes independent: one for all of them, or one per mode; None
         for no turbulence.
-    vibrations : tuple of Vibration, SinusoidalVibration or DriftingVibration, optional
+    vibrations : tuple of Vibration or SinusoidalVibration, optional
         The vibrations that are really there. One that drifts can only be simulated.
     noise_nm : float or (q,) array_like, optional
         Standard deviation of the noise on each measurement, per frame [nm]: one for all of
@@ -137,15 +76,6 @@ class Truth(Summarised):
     >>> calm = lbt.Truth(turbulence=None, noise_nm=15.5)
     >>> calm.sensor_gain
     1.0
-
-    Tip and tilt that differ:
-
-    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40, frame_rate_hz=800)
-    >>> uneven = lbt.Truth(turbulence=[slow, None], noise_nm=[15.5, 12.0])
-    >>> [modes for _, modes in uneven.turbulence_groups(2)]
-    [(0,)]
-    >>> uneven.noise_per_measurement(2).tolist()
-    [15.5, 12.0]
     """
 
     turbulence: Spectrum | Sequence[Spectrum | None] | None
@@ -174,7 +104,7 @@ class Truth(Summarised):
         for each in self.vibrations:
             if not isinstance(each, TrueVibration):
                 raise ProblemError(
-                    "vibrations must be Vibration, SinusoidalVibration or DriftingVibration; got "
+                    "vibrations must be Vibration or SinusoidalVibration; got "
                     f"{type(each).__name__}."
                 )
         noise = one_or_each(self.noise_nm, "noise_nm", at_least=0)
@@ -190,12 +120,6 @@ class Truth(Summarised):
     def _brief(self) -> str:
         lines = count_text(len(self.vibrations), "vibration")
         return f"{lines}, sensor gain {self.sensor_gain:.4g}"
-
-    def _summarise(self) -> Summary:
-        parts = self.turbulence if isinstance(self.turbulence, tuple) else (self.turbulence,)
-        noise = np.asarray(self.noise_nm)
-        facts = disturbance_facts(parts, self.vibrations, noise, self.sensor_gain)
-        return Summary(tables=[fact_table("Truth", facts)])
 
     def _checked_errors(self) -> tuple[float, ...] | None:
         """Return the frequency errors, of which each vibration must have one."""
@@ -256,7 +180,7 @@ class Truth(Summarised):
     @property
     def drifts(self) -> bool:
         """Whether a vibration drifts, so that the truth can only be simulated."""
-        return any(isinstance(line, DriftingVibration) for line in self.vibrations)
+        return any(getattr(line, "drifts", False) for line in self.vibrations)
 
     @property
     def is_uniform(self) -> bool:

@@ -1,4 +1,4 @@
-"""Vibrations: damped resonances, sinusoids, what drifts, and whether they fit a loop.
+"""Vibrations: damped resonances, sinusoids, and whether they fit a loop.
 
 G. Agapito et al., 2008, equation 4, with the errata 1 and 7.
 """
@@ -186,116 +186,80 @@ def spread_lines(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SinusoidalVibration:
-    """A vibration that is a pure sinusoid.
+    """A vibration that is a pure sinusoid; its frequency may drift linearly in time.
+
+    The phase of one that drifts is the integral of its frequency. Only simulations accept it;
+    whatever needs a stationary truth refuses it.
 
     Parameters
     ----------
     frequency_hz : float
-        Frequency [Hz].
+        Frequency [Hz]; of one that drifts that up to time 0.
     rms_nm : float
         Standard deviation, amplitude / sqrt(2), along its direction [nm rms wavefront].
     direction : tuple of float, optional
-        Direction over the modes, made a unit vector.
+        Direction over the modes, made a unit vector; ``(1, 0)`` shakes tip.
+    end_hz, duration_s : float, optional
+        Frequency at which a drift arrives, and where it stays [Hz]; duration of the drift [s].
 
     Raises
     ------
     ProblemError
-        If a value is not finite or out of its range.
+        If a value is not finite or out of its range, or a drift has no end or no duration.
 
     Examples
     --------
     >>> import lbt_synth as lbt
     >>> round(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=797).amplitude_nm, 1)
     1127.1
+    >>> line = lbt.models.SinusoidalVibration(frequency_hz=17, end_hz=23, duration_s=60, rms_nm=797)
+    >>> line.frequency_hz_at([-5, 0, 30, 60, 100]).tolist()
+    [17.0, 17.0, 20.0, 23.0, 23.0]
     """
 
     frequency_hz: Positive
     rms_nm: Positive
     direction: tuple[float, ...] = (1.0, 0.0)
+    end_hz: Positive | None = None
+    duration_s: Positive | None = None
 
     def __post_init__(self) -> None:
         check_fields(self, direction=unit_direction(self.direction))
+        if (self.end_hz is None) != (self.duration_s is None):
+            raise ProblemError("a drift needs end_hz and duration_s; got one of them.")
+
+    @property
+    def drifts(self) -> bool:
+        """Whether its frequency moves."""
+        return self.end_hz is not None
 
     @property
     def amplitude_nm(self) -> float:
         """Peak displacement [nm rms wavefront]."""
         return float(np.sqrt(2) * self.rms_nm)
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DriftingVibration:
-    """A sinusoid whose frequency moves linearly in time, and stays where it arrived.
-
-    Its phase is the integral of its frequency. Only simulations accept it; whatever needs a
-    stationary truth refuses it.
-
-    Parameters
-    ----------
-    start_hz, end_hz : float
-        Frequency up to time 0, and from ``duration_s`` on [Hz].
-    duration_s : float
-        Duration of the drift [s].
-    rms_nm : float
-        Standard deviation of the displacement along its direction [nm rms wavefront].
-    direction : tuple of float, optional
-        Direction over the modes, made a unit vector; ``(1, 0)`` shakes tip.
-
-    Raises
-    ------
-    ProblemError
-        If a value is not finite or out of its range.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> line = lbt.models.DriftingVibration(start_hz=17, end_hz=23, duration_s=60, rms_nm=797)
-    >>> line.frequency_hz_at([-5, 0, 30, 60, 100]).tolist()
-    [17.0, 17.0, 20.0, 23.0, 23.0]
-    """
-
-    start_hz: Positive
-    end_hz: Positive
-    duration_s: Positive
-    rms_nm: Positive
-    direction: tuple[float, ...] = (1.0, 0.0)
-
-    def __post_init__(self) -> None:
-        check_fields(self, direction=unit_direction(self.direction))
-
-    @property
-    def highest_hz(self) -> float:
-        """The highest frequency that it passes [Hz]."""
-        return max(self.start_hz, self.end_hz)
-
-    @property
-    def amplitude_nm(self) -> float:
-        """Peak displacement of the sinusoid [nm rms wavefront]."""
-        return float(np.sqrt(2) * self.rms_nm)
-
     def frequency_hz_at(self, time_s: ArrayLike) -> FloatArray:
-        """Return the frequency [Hz] at finite times [s]; the drift begins at time 0."""
-        moved = np.clip(real_array(time_s, "time_s") / self.duration_s, 0.0, 1.0)
-        return np.asarray(self.start_hz + (self.end_hz - self.start_hz) * moved)
+        """Return the frequency [Hz] at finite times [s]; a drift begins at time 0."""
+        t, end_hz = real_array(time_s, "time_s"), self.end_hz or self.frequency_hz
+        moved = np.clip(t / (self.duration_s or 1.0), 0.0, 1.0)
+        return np.asarray(self.frequency_hz + (end_hz - self.frequency_hz) * moved)
 
     def turns_at(self, time_s: ArrayLike) -> FloatArray:
         """Return the phase over 2 pi at finite times [s]: the frequency's integral from time 0."""
-        t = real_array(time_s, "time_s")
-        inside = np.clip(t, 0.0, self.duration_s)
-        rise = (self.end_hz - self.start_hz) / self.duration_s
-        arrived = np.maximum(t - self.duration_s, 0.0)
-        before = self.start_hz * (t - arrived)
-        return np.asarray(before + rise * inside**2 / 2 + self.end_hz * arrived)
+        t, duration_s = real_array(time_s, "time_s"), self.duration_s or 1.0
+        end_hz = self.end_hz or self.frequency_hz
+        inside, arrived = np.clip(t, 0.0, duration_s), np.maximum(t - duration_s, 0.0)
+        rise = (end_hz - self.frequency_hz) / duration_s
+        before = self.frequency_hz * (t - arrived)
+        return np.asarray(before + rise * inside**2 / 2 + end_hz * arrived)
 
 
-TrueVibration: TypeAlias = Vibration | SinusoidalVibration | DriftingVibration
+TrueVibration: TypeAlias = Vibration | SinusoidalVibration
 
 
 def checked_direction(vibration: TrueVibration, hardware: LoopHardware) -> FloatArray:
     """Return the direction (n,) of a vibration, which must fit the loop."""
-    if isinstance(vibration, DriftingVibration):
-        frequency_hz = vibration.highest_hz
-    else:
-        frequency_hz = vibration.frequency_hz
+    frequency_hz = max(vibration.frequency_hz, getattr(vibration, "end_hz", None) or 0.0)
     if len(vibration.direction) != hardware.modes:
         raise DimensionError(
             f"the direction of a vibration must have {hardware.modes} components, one per mode; "
@@ -305,17 +269,14 @@ def checked_direction(vibration: TrueVibration, hardware: LoopHardware) -> Float
     return np.array(vibration.direction)
 
 
-def stationary_vibrations(
-    vibrations: Iterable[TrueVibration],
-) -> tuple[Vibration | SinusoidalVibration, ...]:
+def stationary_vibrations(vibrations: Iterable[TrueVibration]) -> tuple[TrueVibration, ...]:
     """Return the vibrations; refuse one that drifts."""
-    still = []
-    for vibration in vibrations:
-        if isinstance(vibration, DriftingVibration):
+    lines = tuple(vibrations)
+    for line in lines:
+        if isinstance(line, SinusoidalVibration) and line.drifts:
             raise ProblemError(
                 "this needs a truth that is stationary; got a vibration that drifts from "
-                f"{vibration.start_hz:.6g} to {vibration.end_hz:.6g} Hz. Simulate it, or take "
+                f"{line.frequency_hz:.6g} to {line.end_hz:.6g} Hz. Simulate it, or take "
                 "vibrations that stay, at the frequencies in question."
             )
-        still.append(vibration)
-    return tuple(still)
+    return lines

@@ -9,7 +9,6 @@ import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from itertools import zip_longest
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,7 +16,15 @@ from numpy.typing import ArrayLike
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.request import fixed_design
-from lbt_synth.report.draw import PANEL_IN, draw_bars, drawing
+from lbt_synth.report.draw import (
+    GUIDE,
+    PANEL_IN,
+    draw_map,
+    drawing,
+    line_style,
+    name_axes,
+)
+from lbt_synth.report.figures.studies import STREHL
 from lbt_synth.report.page.html import (
     Block,
     Chart,
@@ -36,7 +43,6 @@ from lbt_synth.studies.study.statistics import (
     Samples,
     StudyStatistics,
     controller_samples,
-    is_list,
     percent,
     residual_table,
     sensitivity_table,
@@ -51,7 +57,6 @@ _BINS = 30  # along either axis of a map, at most
 _PER_CELL = 8  # samples in a cell of a map on average, at least
 _MOST_FAILURES = 10  # that are listed
 _PARAMETERS = 5  # of a worst sample: with row and Strehl ratio, they fill a sheet
-Names = Mapping[str, str]  # what each parameter is called
 
 
 def study_page(
@@ -107,7 +112,6 @@ def study_page(
         for controller in statistics.controllers
     }
     values = {name: np.asarray(columns[name], float) for name in statistics.parameters}
-    names = short_names(statistics.parameters)
     varying = sum(np.ptp(column) > 0 for column in values.values())
     return new_page(
         f"Robustness study {study.source.name}",
@@ -115,12 +119,10 @@ def study_page(
         f"{count_text(len(statistics.controllers), 'controller')}",
         {
             "Summary": _summary_blocks(study, statistics, samples),
-            "What was sampled": _samples_blocks(study, values, names),
+            "What was sampled": _samples_blocks(study, values),
             "Controllers": _controllers_blocks(study, statistics, failures),
-            "What the Strehl ratio depends on": _dependence_blocks(
-                statistics, samples, values, names
-            ),
-            "Worst samples": _worst_blocks(study, statistics, columns, names, os.fspath(folder)),
+            "What the Strehl ratio depends on": _dependence_blocks(statistics, samples, values),
+            "Worst samples": _worst_blocks(study, statistics, columns, os.fspath(folder)),
             "How to read the figures": [paragraph(name) for name in ("intervals", "indices")],
         },
         sources=list(zip_longest(study.inputs, ("study", "configuration"), fillvalue="gain file")),
@@ -128,47 +130,19 @@ def study_page(
     )
 
 
-def short_names(names: Sequence[str]) -> dict[str, str]:
-    """Return for each path its last keys, as many as distinguish it from the others."""
-    out = {}
-    for name in names:
-        keys = name.split(".")
-        for count in range(1, len(keys) + 1):
-            out[name] = ".".join(keys[-count:])
-            if sum(f".{other}".endswith(f".{out[name]}") for other in names) == 1:
-                break
-    return out
-
-
 def _summary_blocks(
     study: Study, statistics: StudyStatistics, samples: Mapping[str, Samples]
 ) -> list[Block]:
     """Open with what is wrong, the verdict, and the Strehl ratios."""
-    unstable = ", ".join(
-        f"{one.controller} in {one.unstable} of {one.samples} "
-        f"({percent(one.unstable_share.value, 2)} %)"
-        for one in statistics.controllers
-        if one.unstable
-    )
     failed = ", ".join(f"{c.controller} {c.failed}" for c in statistics.controllers if c.failed)
     done, total = statistics.samples, study.samples
-    blocks: list[Block] = [
-        Notice(text=text, tone=tone)
-        for text, tone, is_so in (
-            (paragraph("incomplete", done=done, samples=total), "bad", done < total),
-            (f"Unstable loops: {unstable}.", "bad", unstable),
-            (f"Evaluations that failed, and are in none of the figures: {failed}.", "bad", failed),
-            (
-                "Every controller is stable in every sample, and none failed.",
-                "good",
-                done and not unstable and not failed,
-            ),
-        )
-        if is_so
-    ]
+    wrong = [paragraph("incomplete", done=done, samples=total)] if done < total else []
+    wrong += [f"Evaluations that failed, and are in none of the figures: {failed}."] * bool(failed)
+    verdict = study_verdict(statistics)
+    wrong += [sentence for sentence in verdict if " is unstable " in sentence]
     return [
-        *blocks,
-        _verdict_text(statistics.controllers),
+        *(Notice(text=sentence, tone="bad") for sentence in wrong),
+        " ".join(sentence for sentence in verdict if sentence not in wrong),
         *survival_blocks(_design_margins(study, statistics)),
         strehl_table(statistics),
         residual_table(statistics),
@@ -192,41 +166,55 @@ def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, Loop
     return {name: loop_margins(loop) for name, loop in loops.items() if loop.is_stable}
 
 
-def _verdict_text(controllers: Sequence[ControllerStatistics]) -> str:
-    """Say which controller leads by each measure; the reader decides which measure counts."""
-    with_data = [controller for controller in controllers if controller.samples]
+def study_verdict(statistics: StudyStatistics) -> list[str]:
+    """Say which controllers are unstable, which leads by each measure, and what it depends on.
+
+    The reader decides which measure counts.
+    """
+    with_data = [one for one in statistics.controllers if one.samples]
     if not with_data:
-        return "No controller was evaluated on any sample."
+        return ["No controller was evaluated on any sample."]
+    verdict = [
+        f"{one.controller} is unstable in {percent(one.unstable_share.value, 2)} % of the samples."
+        for one in sorted(with_data, key=lambda one: -one.unstable)
+        if one.unstable
+    ]
+    measures: dict[str, Callable[[ControllerStatistics], float]] = {
+        "mean": lambda one: one.mean,
+        "median": lambda one: one.strehl[50].value,
+        "5th percentile": lambda one: one.strehl[5].value,
+    }
+    leaders = []
+    for name, measure in measures.items():
+        best = max(with_data, key=measure)
+        leaders.append(f"highest {name}, {best.controller} {percent(measure(best))} %")
+    verdict.append(f"Strehl ratios: {'; '.join(leaders)}.")
+    best = max(with_data, key=measures["mean"])
+    if best.ranked:
+        share = 100 * best.index(best.ranked[0])[0]
+        verdict.append(
+            f"That of {best.controller} depends most on {best.ranked[0]} ({share:.0f} % of its "
+            "variance)."
+        )
+    return verdict
 
-    def leader(value: Callable[[ControllerStatistics], float]) -> str:
-        best = max(with_data, key=value)
-        return f"{best.controller}, {percent(value(best))} %"
 
-    return paragraph(
-        "leaders",
-        mean=leader(lambda controller: controller.mean),
-        median=leader(lambda controller: controller.strehl[50].value),
-        low=leader(lambda controller: controller.strehl[5].value),
-    )
-
-
-def _samples_blocks(study: Study, values: Mapping[str, FloatArray], names: Names) -> list[Block]:
+def _samples_blocks(study: Study, values: Mapping[str, FloatArray]) -> list[Block]:
     """List the parameters, and what was drawn of them."""
     settings = study.settings
     texts = {name: section.text for name, section in settings.parameters.items()}
     rows = [
         (
-            names[name],
             name,
             texts.get(name, ""),
             *(f"{q:.4g}" for q in np.quantile(c, (0, 0.5, 1))),
         )
         for name, c in values.items()
     ]
-    headings = ("parameter", "its place", "distribution", "least", "median", "greatest")
+    headings = ("parameter", "distribution", "least", "median", "greatest")
     return [
         f"{study.samples} samples of a Sobol sequence (seed: {settings.seed}).",
-        Table(caption="Parameters", headings=headings, rows=tuple(rows), words=(1, 2)),
+        Table(caption="Parameters", headings=headings, rows=tuple(rows), words=(1,)),
     ]
 
 
@@ -257,15 +245,13 @@ def _dependence_blocks(
     statistics: StudyStatistics,
     samples: Mapping[str, Samples],
     values: Mapping[str, FloatArray],
-    names: Names,
 ) -> list[Block]:
     """Show what the Strehl ratio depends on."""
     if not statistics.ranked:
         return [Notice(text=paragraph("no-index"))]
     return [
-        *_sensitivity_chart(statistics, names),
-        sensitivity_table(statistics, names),
-        *_map_charts(statistics, samples, values, names),
+        sensitivity_table(statistics),
+        *_map_charts(statistics, samples, values),
     ]
 
 
@@ -273,13 +259,12 @@ def _worst_blocks(
     study: Study,
     statistics: StudyStatistics,
     columns: Mapping[str, ArrayLike],
-    names: Names,
     folder: str,
 ) -> list[Block]:
     """List the worst samples, and the commands that replay them."""
     words = ["lbt-synth", "study", os.fspath(study.source), "-o", folder, "--row"]
     tables = [
-        worst_table(one, columns, (one.ranked or statistics.parameters)[:_PARAMETERS], names)
+        worst_table(one, columns, (one.ranked or statistics.parameters)[:_PARAMETERS])
         for one in statistics.controllers
         if one.worst
     ]
@@ -308,43 +293,28 @@ def _distribution_chart(samples: Mapping[str, Samples]) -> list[Chart]:
     top = 100 * max(float(np.max(values, initial=0.0)) for values in strehls.values())
     least = 100 / max(values.size for values in strehls.values())
     low = min(10.0, 10.0 ** np.floor(np.log10(least)))
-    x_axis = {"label": "Strehl ratio", "unit": "%", "low": 0}
-    x_axis["high"] = min(100.0, max(1.02 * top, 1.0))
-    y_axis = {"label": "samples at or below", "unit": "%", "high": 100}
+    share = ("samples at or below", "%")
     with drawing([PANEL_IN] * 2, columns=2) as (plain, tail):
-        plain.set_axes(x_axis, y_axis | {"low": 0}, title="all samples")
-        tail.set_axes(x_axis, y_axis | {"low": low, "log": True}, title="lower tail")
-        plain.rule("half of the samples", 50, "y")
+        name_axes(plain, STREHL, share, "all samples", ylim=(0, 100))
+        name_axes(tail, STREHL, share, "lower tail", ylim=(low, 100), yscale="log")
+        plain.axhline(50, label="half of the samples", **GUIDE)
         for look, (name, values) in enumerate(strehls.items()):
             if values.size:
-                level, share = cumulative_points(values)
+                level, part = cumulative_points(values)
                 # from nothing just below the first value
-                x, y = 100 * np.append(level[:1], level), 100 * np.append(0.0, share)
-                style: dict[str, Any] = {"look": look, "step": "steps-post", "width": 1.8}
-                plain.curve(name, x, y, **style)
-                tail.curve(name, x[1:], y[1:], **style)
+                x, y = 100 * np.append(level[:1], level), 100 * np.append(0.0, part)
+                style = line_style(look, drawstyle="steps-post", label=name)
+                plain.plot(x, y, **style)
+                tail.plot(x[1:], y[1:], **style)
+        for panel in (plain, tail):
+            panel.set_xlim(0, min(100.0, max(1.02 * top, 1.0)))
     return [chart("distribution", plain.figure)]
-
-
-def _sensitivity_chart(statistics: StudyStatistics, names: Names) -> list[Chart]:
-    """First-order indices as bars, one series per controller."""
-    bars: dict[str, FloatArray] = {}
-    intervals: dict[str, tuple[FloatArray, FloatArray]] = {}
-    for one in statistics.controllers:
-        value, error = 100 * np.transpose([one.index(name) for name in statistics.ranked])
-        bars[one.controller] = np.maximum(value, 0)
-        low, high = np.maximum((value - 2 * error, value + 2 * error), 0)
-        intervals[one.controller] = low, high
-    listed = [names[name] for name in statistics.ranked]
-    axis = {"label": "variance explained by itself", "unit": "%", "low": 0}
-    return [chart("sensitivity", draw_bars(axis, listed, bars, intervals))]
 
 
 def _map_charts(
     statistics: StudyStatistics,
     samples: Mapping[str, Samples],
     parameters: Mapping[str, FloatArray],
-    names: Names,
 ) -> list[Chart]:
     """Mean Strehl ratio over the two most influential parameters, one chart per controller."""
     charts = []
@@ -356,10 +326,9 @@ def _map_charts(
         places = parameters[first][kept], parameters[second][kept]
         x, y, mean = binned_map(*places, strehl[kept])
         with drawing([2.6]) as (panel,):
-            panel.set_axes({"label": names[first]}, {"label": names[second]})
-            label: dict[str, Any] = {"label": "mean Strehl ratio", "unit": "%"}
-            panel.map(x, y, 100 * mean, blank="no sample", **label)
-        facts = {"x": names[first], "y": names[second], "x_path": first, "y_path": second}
+            name_axes(panel, (first, ""), (second, ""))
+            draw_map([panel], [(x, y, 100 * mean)], "mean Strehl ratio [%]", blank="no sample")
+        facts = {"x": first, "y": second}
         facts["controller"] = one.controller
         charts.append(chart(f"map-{place + 1}", panel.figure, group="study-map", **facts))
     return charts
@@ -377,27 +346,9 @@ def cumulative_points(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 def binned_map(
     x: FloatArray, y: FloatArray, result: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the mean of a result (n,) over a grid of two varying parameters (n,).
-
-    It is (ny, nx), nan in a cell without samples, and comes after the centres of the cells, or
-    the values of a list, x (nx,) and y (ny,).
-    """
+    """Return centres of cells (nx,), (ny,), and the mean (ny, nx) of a result in each, or nan."""
     from scipy.stats import binned_statistic_2d
 
     cells = int(np.clip(np.sqrt(len(x) / _PER_CELL), 3, _BINS))
-    (columns, x_edges), (rows, y_edges) = (_cells(values, cells) for values in (x, y))
-    mean = binned_statistic_2d(y, x, result, bins=(y_edges, x_edges)).statistic
-    return columns, rows, np.asarray(mean)
-
-
-def _cells(values: FloatArray, cells: int) -> tuple[FloatArray, FloatArray]:
-    """Return the centres of the cells along one axis, and their edges.
-
-    A list has a cell for each value, other values have cells of equal width.
-    """
-    if is_list(values):
-        centres = np.unique(values)
-        inner = (centres[:-1] + centres[1:]) / 2
-        return centres, np.concatenate(([centres[0] - 1], inner, [centres[-1] + 1]))
-    edges = np.linspace(values.min(), values.max(), cells + 1)
-    return (edges[:-1] + edges[1:]) / 2, edges
+    mean, rows, columns, _ = binned_statistic_2d(y, x, result, bins=cells)
+    return (columns[:-1] + columns[1:]) / 2, (rows[:-1] + rows[1:]) / 2, np.asarray(mean)

@@ -96,12 +96,6 @@ def _is_whole(unit: Any, content: bytes) -> bool:
     return "DATASUM" not in unit.header or bool(unit.verify_datasum() and unit.verify_checksum())
 
 
-def check_fits(content: bytes) -> None:
-    """Refuse FITS content as :func:`open_fits` does."""
-    with open_fits(content):
-        pass
-
-
 def read_fits(content: bytes) -> tuple[dict[str, FloatArray], str]:
     """Read the arrays and the text of :func:`fits_bytes`."""
     with open_fits(content) as units:

@@ -26,7 +26,6 @@ from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.controller import as_controller
-from lbt_synth.linear.estimation_problem import require_problem
 from lbt_synth.loop import (
     Imaging,
     close_loop,
@@ -463,7 +462,7 @@ def tradeoff(
     >>> points[0].rms > points[1].rms > points[2].rms
     True
     """
-    require_problem(problem)
+    require_instance(problem, EstimationProblem)
     count = integer(points, "points", at_least=2)
     length = require_taps(taps)
     least, best = hinf(problem, route="riccati"), kalman(problem)

@@ -162,7 +162,7 @@ def test_a_map_is_of_the_loop_of_the_configuration(tmp_path, capsys, gains):
     [
         (("GAIN", "--errors-hz", -1, 1, 2.5), "COUNT of at least 2; got -1 1 2.5"),
         (("GAIN", "--sensor-gains", 0, 1, 3), "--sensor-gains must be above 0"),
-        (("GAIN", "GAIN"), "each gain file must be given once"),
+        (("GAIN", "GAIN"), "each gain file must have a name"),
     ],
 )
 def test_options_that_do_not_go_together(capsys, gains, words, message):

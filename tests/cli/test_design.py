@@ -25,7 +25,7 @@ CONFIG = str(LBT_YAML)
 @pytest.mark.parametrize(
     ("options", "method"),
     [
-        (("--method", "kalman", "--route", "sdp"), "kalman"),
+        (("--method", "kalman"), "kalman"),
         (("--method", "hinf", "--gamma", 200, "--route", "riccati"), "hinf"),
         (("--method", "integrator"), "integrator"),
     ],
@@ -99,14 +99,11 @@ def test_the_time_of_a_fragile_delay_needs_no_margin_on_the_other_side(monkeypat
 
 @pytest.mark.parametrize("name", ["kalman", "integrator"])
 def test_show_and_verify(capsys, gains, name):
-    status, text, _ = run(capsys, "show", gains[name], "--matrices", "--verbose")
+    status, text, _ = run(capsys, "show", gains[name], "--verbose")
     assert status == 0
     assert "stable gain factors, from" in text
     assert "proved while it moves at any speed, from" in text
-    lines = text.splitlines()
-    assert lines[lines.index("A =") + 1].startswith("[[")
-    assert lines[lines.index("D =") + 2].startswith(" [0.")
-    status, text, _ = run(capsys, "show", gains[name], "--json", "--matrices")
+    status, text, _ = run(capsys, "show", gains[name], "--json")
     data = json.loads(text)
     assert status == 0
     assert data["margins"]["modulus"] > 0
@@ -132,7 +129,6 @@ def test_show_prints_the_cost(tmp_path, capsys, monkeypatch, name):
     status, text, _ = run(capsys, "show", gain, "--verbose")
     assert status == 0
     assert re.search(rf"multiplications per frame +{cost.multiplications}\b", text)
-    assert re.search(rf"coefficients +{cost.coefficients}\b", text)
     data = json.loads(run(capsys, "show", gain, "--json")[1])["frame_cost"]
     assert data["additions"] == cost.additions
 

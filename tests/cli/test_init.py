@@ -7,6 +7,7 @@ from support.commands import run
 
 import lbt_synth as lbt
 from lbt_synth.config.load import example_files, telescope_names
+from lbt_synth.config.schema import config_schema
 
 
 @pytest.fixture
@@ -22,7 +23,7 @@ def test_a_telescope_is_written_with_its_schema(here, capsys, telescope):
     assert f"Next, put in your own numbers; then lbt-synth design {telescope}.yaml" in out
     text = (here / f"{telescope}.yaml").read_text()
     assert text.startswith("# yaml-language-server: $schema=lbt-synth.schema.json\n")
-    assert json.loads((here / "lbt-synth.schema.json").read_text()) == lbt.config.config_schema()
+    assert json.loads((here / "lbt-synth.schema.json").read_text()) == config_schema()
     lbt.load_config(f"{telescope}.yaml")
 
 
@@ -43,17 +44,3 @@ def test_the_examples_are_written_under_their_names(here, capsys):
     assert run(capsys, "init", "--examples")[0] == 0
     assert {file.name for file in (here / "examples").iterdir()} == set(example_files())
     lbt.studies.load_study("examples/study.yaml")
-
-
-def test_the_schema_is_printed_and_written(tmp_path, capsys):
-    schema = lbt.config.config_schema()
-    for words in ((), ("--json",)):
-        status, out, error = run(capsys, "init", "--schema", *words)
-        assert (status, error) == (0, "")
-        assert json.loads(out) == schema
-    file = tmp_path / "s.json"
-    assert run(capsys, "init", "--schema", "-o", file)[0] == 0
-    assert json.loads(file.read_text()) == schema
-    assert run(capsys, "init", "--schema", "-o", tmp_path / "s.yaml")[0] == 2
-    status, _, error = run(capsys, "init", "--schema", "--telescope", "vlt")
-    assert (status, "--telescope does not go with --schema; leave it out." in error) == (2, True)

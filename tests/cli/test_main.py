@@ -98,7 +98,10 @@ def test_shells_complete_every_option():
 
 @pytest.mark.parametrize(
     ("command", "text"),
-    [("tradeoff", "the Kalman filter's (default 9)"), ("identify", "[Hz] (default 0.1)")],
+    [
+        ("tradeoff", "the Kalman filter's (default 9)"),
+        ("identify", "counts as turbulence [Hz] (default 3)"),
+    ],
 )
 def test_help_says_the_defaults(capsys, command, text):
     status, out, _ = run(capsys, command, "--help")
@@ -205,9 +208,9 @@ SAID = {
     "design CONFIG --method kalman --horizon 200 -o OUT.fits": "--horizon must .* makes 201.",
     "simulate CONFIG GAIN --sensor-gain 0": "--sensor-gain must be above 0",
     "end-to-end CONFIG GAIN -o OUT --pixels 11": "--pixels must be even, at least subapertures_",
-    "identify BARE.csv -o OUT.yaml": "Choose by --columns measurements=... commands=..., names",
+    "identify BARE.csv -o OUT.yaml": "measurements=... commands=..., by names or numbers from 0",
     "identify NAMED.csv -o OUT.yaml": "unit of tip, tilt, command_tip, command_tilt: give --unit "
-    ".*; the frame rate: give --frame-rate-hz, or the times; the total delay: give --delay-frames.",
+    ".*; the frame rate: give --frame-rate-hz, or times .*; the total delay: give --delay-frames.",
     "identify NIGHT --unit mas -o OUT.yaml": "--unit must be that of the data, 'nm'; got 'mas'. "
     "Leave it out; --show-unit is the unit",
 }

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.commands import run
-from support.diagnoses import given_design, line_record
+from support.diagnoses import given_design, line_diagnosis, line_record, short_record
 from support.night import GAIN, LINE_HZ, NOISE
+from support.pages import Reader
 from support.recorded_loops import RATE, spliced_record
 
 import lbt_synth as lbt
-from lbt_synth.cli import records
+from lbt_synth.cli.records import diagnosis_page
 from lbt_synth.identification.fit import whittle
+from lbt_synth.report.page.html import write_page
 
 FACTS = ("--frame-rate-hz", 1000, "--delay-frames", 2, "--unit", "nm")
 
@@ -109,36 +111,6 @@ def test_accelerometers_are_compared_with_the_lines_of_the_model(
     assert "at least once a frame, 1000 Hz, and last a frame; got 24000 readings at 500 Hz" in error
 
 
-def test_a_model_is_written_whatever_becomes_of_its_accelerometers(
-    tmp_path, capsys, monkeypatch, recorded_loop, tip_night
-):
-    run_, _, _ = recorded_loop
-    np.save(tmp_path / "a.npy", 1e-3 * np.diff(run_.total_nm[0][:, 0], n=2, prepend=[0, 0]))
-    real = records.accelerometer_transfers
-
-    def fails(*_, **__):
-        raise lbt.errors.NumericalError("gone.")
-
-    def is_noiseless(*given, **options):
-        found = real(*given, **options)
-        rows = tuple(replace(row, noise_m_s2=0.0) for row in found.channels)
-        return replace(found, channels=rows)
-
-    for wrong, words in (
-        (fails, "warning: the accelerometers were not compared: gone."),
-        (is_noiseless, "warning: the model is written without accelerometers: "),
-    ):
-        monkeypatch.setattr(records, "accelerometer_transfers", wrong)
-        out = tmp_path / f"{wrong.__name__}.yaml"
-        base = ("identify", tip_night, *FACTS, "-o", out, "--no-figure")
-        status, text, _ = run(capsys, *base, "--accelerometers", tmp_path / "a.npy")
-        assert status == 0
-        assert words in text
-        settings = lbt.load_config(out).settings
-        assert settings.sensors is None
-        assert settings.model.vibrations
-
-
 def test_faults_are_in_the_report(tmp_path, capsys, recorded_loop):
     run_, _, _ = recorded_loop
     y, u = run_.measurements[0].copy(), run_.commands[0]
@@ -216,7 +188,7 @@ def test_auto_tests_its_design_on_unseen_data(made, recorded_loop):
 
 def test_auto_says_what_it_found(capsys, recorded_night, tmp_path):
     options = ("--method", "hinf", "--gamma-ratio", 1.3, "--sensor-gain", GAIN, "--no-figure")
-    files = ("-o", tmp_path / "h.npz", "--model", tmp_path / "m.yml")
+    files = ("-o", tmp_path / "h.npz")
     status, text, error = run(capsys, "auto", recorded_night, *options, *files)
     assert (status, error) == (0, "")
     said = " ".join(text.split())
@@ -226,7 +198,7 @@ def test_auto_says_what_it_found(capsys, recorded_night, tmp_path):
     )
     assert "Kalman filter" not in text
     assert not (tmp_path / "h.png").exists()
-    assert (tmp_path / "m.yml").is_file()
+    assert (tmp_path / "h.yaml").is_file()
 
 
 def test_an_open_loop_series_and_one_axis(tmp_path, capsys, recorded_loop):
@@ -246,11 +218,9 @@ def test_names_that_no_text_can_hold(tmp_path, capsys) -> None:
     file = tmp_path / "a\x01.npz"
     np.savez(file, measurements=record.measurements, commands=record.commands)
     words = ("auto", file, "-o", tmp_path / "q.fits", *FACTS, "--no-figure")
-    status, text, error = run(capsys, *words)
+    status, _, error = run(capsys, *words)
     assert (status, error) == (0, "")
     assert "a\\x01.npz" in (tmp_path / "q.yaml").read_text()
-    said = " ".join(text.split())
-    assert "note: the record is short (9 s): it does not tell lines less than 0.11 Hz apart" in said
 
 
 def write(path, change=1.0, frames=None, **more):
@@ -272,7 +242,7 @@ def test_a_gain_file_the_page_and_json(capsys, night, tmp_path):
     assert (status, error) == (0, "")
     data = json.loads(text)
     assert data["doubt"] is None
-    assert data["control_law"]["law"] == "integrator"
+    assert data["law"][0]["law"] == "integrator"
     assert any(note.startswith("mine assumes") for note in data["notes"])
     assert {row["name"] for row in data["residuals"]} > {"mine", data["best"], "what ran"}
     assert data["costs"][-1]["part"] == "all"
@@ -300,7 +270,6 @@ def test_a_dead_axis_leaves_the_other(capsys, tmp_path):
         ("identify NIGHT -o m.yaml --columns a", "--columns takes ROLE=NAME or ROLE=NAME,NAME"),
         ("identify NIGHT -o m.yaml --acceleration-unit g", "goes with --accelerometers."),
         ("identify NIGHT -o m.yaml --obstruction 0.1", "give --diameter-m."),
-        ("identify NIGHT -o m.yaml --figure a.png --no-figure", "give one of --figure and --no-"),
         ("auto SHORT -o t.fits --delay-frames 2", "4 s at 1000 Hz) in stretches of at least 256"),
         ("diagnose NIGHT --pdf a.pdf", "--pdf is the page of -o on paper; give -o, too."),
         ("diagnose PSD.csv --unit nm^2/Hz", "diagnose examines recorded series; "),
@@ -336,3 +305,51 @@ def test_auto_says_what_accelerometers_buy(tmp_path, capsys, recorded_loop, tip_
     assert "\nassumes: the sensor gain lies within" in text
     (channel,) = json.loads(run(capsys, *words, "--json")[1])["accelerometers"]
     assert channel["without_nm"] > claims["residual_nm"]
+
+
+@pytest.fixture(scope="module")
+def diagnosed():
+    return diagnosis_page(line_diagnosis())
+
+
+def test_sections_and_charts(diagnosed):
+    page = diagnosed
+    assert list(page.sections) == [
+        "Verdict",
+        "Record",
+        "Loop that ran",
+        "Disturbance",
+        "Files and versions",
+    ]
+    (spectra,) = page.charts
+    assert (spectra.key, len(spectra.figure.axes)) == ("identification", 3)
+    (table,) = (t for t in page.blocks if getattr(t, "caption", "").startswith("Residual on"))
+    names = [row.name for row in line_diagnosis().residuals]
+    assert [row[0] for row in table.rows] == names
+
+
+def test_files(tmp_path):
+    source = tmp_path / "night.npz"
+    source.write_bytes(b"what was recorded")
+    (path,) = write_page(diagnosis_page(line_diagnosis(), [source]), tmp_path / "page.html")
+    headings = re.findall(r"<th scope=.col.[^>]*>([^<]*)<", path.read_text())
+    assert "± [nm]" in headings
+    assert not [heading for heading in headings if "+-" in heading]
+    text = path.read_text(encoding="utf-8")
+    reader = Reader(text)
+    assert reader.texts["h1"] == ["Diagnosis of night.npz"]
+    assert hashlib.sha256(b"what was recorded").hexdigest() in text
+    (notice,) = (a for a in reader.named("p") if "good" in (a.get("class") or ""))
+    assert notice["class"] == "notice good"
+
+
+def test_what_is_wrong_comes_first_and_loudly(tmp_path):
+    found = lbt.identification.diagnose(short_record(-1.0))
+    page = diagnosis_page(found)
+    first = page.blocks[0]
+    assert (first.tone, first.text) == (
+        "bad",
+        "The commands are not those that the mirror followed: they have the opposite sign.",
+    )
+    assert page.charts == []
+    assert list(page.sections)[:3] == ["Verdict", "Record", "Loop that ran"]

@@ -78,17 +78,6 @@ def test_headings_of_records_cannot_command_the_terminal(tmp_path, capsys):
     assert printable(error) == error.replace("\n", "\\n")
 
 
-def test_long_values_are_shortened(tmp_path, capsys):
-    path = tmp_path / "a.yaml"
-    path.write_text(f"version: {'x' * 100_000}\n")
-    status, _, error = run(
-        capsys, "design", path, "--method", "integrator", "-o", tmp_path / "a.fits"
-    )
-    assert status == 2
-    assert len(error) < 3_000
-    assert "characters ...]" in error
-
-
 def test_an_interruption_is_one_line(monkeypatch, capsys):
     monkeypatch.setattr(
         "lbt_synth.cli.design.run_show", lambda _: signal.raise_signal(signal.SIGINT)

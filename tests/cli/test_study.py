@@ -75,7 +75,6 @@ def test_the_command(tmp_path, capsys):
     for text in ("50th percentile", "unstable", "failed", "Worst samples of b", "sensor_gain"):
         assert text in out
     assert "200 of 200 samples computed in" in out
-    assert "when their number is a power of two; 200 is none" in out
     study = lbt.studies.load_study(path)
     assert_whole(tmp_path / "out", study, evaluate_samples)
     assert b"<svg" in (tmp_path / "out" / "summary.html").read_bytes()

@@ -132,8 +132,7 @@ MISFITS = [
     ({"model": {"turbulence": [AR, UNSTABLE]}}, f"{SECOND}s", "must be stationary"),
     ({"model": {"turbulence": [AR, {**AR, "coefficient": 1}]}}, SECOND, "mean coefficients"),
     ({"model": {"sensor_gain": [1.0, 1.0, 1.0]}}, "model.sensor_gain", "got 3"),
-    ({"truth": {"sensor_gain": [1.0]}}, "truth.sensor_gain", "got 1"),
-    ({"truth": {"sensor_gain": [1.0, 0.9]}}, "truth.sensor_gain", "got the factors 1, 0.9"),
+    ({"truth": {"sensor_gain": [1.0, 0.9]}}, "truth.sensor_gain", "valid number"),
     ({"truth": {"vibrations": "same"}}, "truth.vibrations", "model"),
     (
         {

@@ -1,8 +1,8 @@
 """The JSON schema of a configuration: what editors read."""
 
-import lbt_synth as lbt
+from lbt_synth.config.schema import config_schema
 
-SCHEMA = lbt.config.config_schema()
+SCHEMA = config_schema()
 UNITS = {
     "_hz": "[Hz]",
     "_nm": "[nm",

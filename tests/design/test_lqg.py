@@ -18,7 +18,6 @@ from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.loop.least_residual import least_residual
 from lbt_synth.models import ARModel
 from lbt_synth.models.plant.tip_tilt import retuned_plant
-from lbt_synth.report.figures.studies import mirror_figure
 from lbt_synth.studies.robustness import mirror_rows
 
 
@@ -168,7 +167,6 @@ def test_refusals():
             (lambda: lbt.lqg(plant, command_weight=-1.0), ProblemError, weight),
             (lambda: lbt.lqg(flat), DimensionError, "must have rank 2"),
             (lambda: mirror_rows(path, *rows), ProblemError, need),
-            (lambda: mirror_figure(settled), ProblemError, "settles at once"),
             (lambda: design.error_system(bare), ProblemError, problem),
             (lambda: design.error_system(quiet), ProblemError, "must have 5 states"),
             (lambda: replace(design, controller=design.controller), ValueError, "controller"),

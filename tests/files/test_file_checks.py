@@ -1,6 +1,5 @@
-"""Files of gains and of telemetry: names, foreign content, damage, and what is half written."""
+"""Files of gains and of telemetry: names, foreign content, and damage."""
 
-import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -119,17 +118,3 @@ def test_names_that_cannot_be_read_or_written(tmp_path, kind):
         )
     ]
     require_refusals(rows)
-
-
-def test_nothing_half_written_stays(tmp_path, monkeypatch, kind):
-    path = kind.save(tmp_path / "g.fits", kind.make())
-    before = path.read_bytes()
-
-    def full_disk(_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full_disk)
-    with pytest.raises(OutputError, match="cannot write .*No space left on device"):
-        kind.save(path, kind.make())
-    assert path.read_bytes() == before
-    assert os.listdir(tmp_path) == ["g.fits"]

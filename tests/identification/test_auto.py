@@ -88,7 +88,7 @@ def test_what_a_filter_leaves_of_a_drift_is_noted():
         noise, commands = np.random.default_rng(0).standard_normal((5000, 2)), np.zeros((5000, 2))
         commands[:, 1] = offset_nm + speed_nm_s * (np.arange(5000) - 2500) / rate
         made = loop_record(noise, commands, **LOOP | {"frame_rate_hz": rate})
-        return list(note_drift(made, plant, controller))
+        return list(note_drift(made, plant, loop))
 
     assert notes(10.0, 1.0) == []
     (note,) = notes(3000.0, -200.0)
@@ -319,4 +319,4 @@ def test_gains_at_which_nothing_is_stable_are_refused(known: bool) -> None:
     stubborn = careless(model)(1.0)
     with pytest.raises(CertificateError, match=r"the record allows 0.0\d to 0.9") as caught:
         design_for_gains(model, lambda _: stubborn, wide, command_scale_known=known)
-    assert ("or say --command-scale 1" in str(caught.value)) is not known
+    assert ("Give --command-scale 1 if" in str(caught.value)) is not known

@@ -1,4 +1,4 @@
-"""Stretches of a record: halves and later parts, to fit and to test on."""
+"""Frames of a record: halves and later parts, to fit and to test on."""
 
 import numpy as np
 import pytest
@@ -6,26 +6,42 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.identification.stretches import checked_stretches, cut_stretches, split_halves
+from lbt_synth.identification import loop_record
+from lbt_synth.identification.records.record import LoopRecord
+from lbt_synth.identification.stretches import cut_stretches, split_halves
 
 
 def frames_in(stretches):
     return np.concatenate([np.arange(start, stop) for start, stop in stretches])
 
 
-@given(st.lists(st.integers(1, 50), min_size=4, max_size=12))
-def test_halves_are_apart_and_in_order(lengths):
-    ends = np.cumsum(lengths)
-    stretches = [(int(a), int(b)) for a, b in zip(ends[::2], ends[1::2], strict=False)]
-    usable = frames_in(stretches)
-    fit, test = split_halves(stretches)
-    assert len(frames_in(fit)) == len(usable) // 2
-    np.testing.assert_array_equal(np.concatenate([frames_in(fit), frames_in(test)]), usable)
+def record_with(good) -> LoopRecord:
+    good = np.array(good)
+    y = np.ones((len(good), 1))
+    return LoopRecord(frame_rate_hz=500, measurements=y, measured=good, commanded=good | True)
 
 
-def test_a_frame_alone_has_no_halves():
-    with pytest.raises(ProblemError, match="frames to fit and to test on; got 1 usable"):
-        split_halves(((0, 1),))
+@given(st.lists(st.booleans(), min_size=1, max_size=40))
+def test_halves_are_apart_and_in_order(good):
+    record = record_with(good)
+    if sum(good) < 2:
+        with pytest.raises(ProblemError, match=f"to fit and to test on; got {sum(good)} usable"):
+            split_halves(record)
+        return
+    fit, test = (frames_in(half.stretches()) for half in split_halves(record))
+    assert len(fit) == sum(good) // 2
+    np.testing.assert_array_equal(np.concatenate([fit, test]), np.flatnonzero(good))
+
+
+def test_a_half_keeps_what_was_bridged_and_its_commands():
+    y = np.random.default_rng(0).standard_normal((2000, 1))
+    y[[300, 1500]] = np.nan
+    record = loop_record(y, y, frame_rate_hz=500, delay_frames=2, unit="nm").bridged()
+    first, later = split_halves(record)
+    assert first.usable[300]
+    assert later.usable[1500]
+    np.testing.assert_array_equal(first.usable | later.usable, record.usable)
+    np.testing.assert_array_equal(later.corrections(), record.corrections())
 
 
 def test_cuts_are_those_of_the_usable_frames():
@@ -34,20 +50,3 @@ def test_cuts_are_those_of_the_usable_frames():
     for first, last in ((0, 390), (389, 401), (395, 901)):
         part = cut_stretches(usable, first, last)
         assert np.array_equal(frames_in(part), everything[first:last])
-
-
-@pytest.mark.parametrize(
-    ("stretches", "message"),
-    [
-        ([(0, 20), (10, 30)], "in order, apart"),
-        ([(0, 50)], "within 40 frames"),
-        ([(5, 5)], "not empty"),
-        ([(-1, 5)], "at least 0"),
-        ([(0.0, 5)], "must be an integer"),
-        ([7], "a pair \\(start, stop\\)"),
-        ([], "at least one stretch"),
-    ],
-)
-def test_stretches_that_are_refused(stretches, message):
-    with pytest.raises(ProblemError, match=message):
-        checked_stretches(stretches, 40)

@@ -98,13 +98,22 @@ def test_a_controller_without_such_a_form_is_refused():
 
 
 def test_inputs_that_are_not_finite_leave_the_state():
-    run = estimator_form(law()).start()
+    run, plain = estimator_form(law()).start(), law().controller.start()
     run.step([1.0, 2.0], [0.0, 0.0])
-    state = run.state.copy()
-    for y, applied in (([np.nan, 0], [0, 0]), ([0, 0], [np.inf, 0])):
-        with pytest.raises(lbt.errors.NonFiniteError, match="Hold the last command"):
-            run.step(y, applied)
-        assert np.array_equal(run.state, state)
+    plain.step([1.0, 2.0])
+    states = run.state.copy(), plain.state.copy()
+    for bad in (np.nan, np.inf, -np.inf):
+        for step in (
+            lambda b=bad: run.step([b, 0], [0, 0]),
+            lambda b=bad: run.step([0, 0], [b, 0]),
+            lambda b=bad: plain.step([0, b]),
+        ):
+            with pytest.raises(lbt.errors.NonFiniteError, match="Hold the last command"):
+                step()
+    assert np.array_equal(run.state, states[0])
+    assert np.array_equal(plain.state, states[1])
+    plain.reset()
+    assert not plain.state.any()
     with pytest.raises(lbt.errors.DimensionError, match="applied must have shape"):
         run.step([1.0, 2.0], [0.0])
 

@@ -40,15 +40,6 @@ def test_gains_of_what_is_not_read_do_nothing():
         problem.error_system(np.ones((3, 1, 2)))
 
 
-def test_the_controller_of_a_period_predicts():
-    problem = EstimationProblem(**WALK)
-    gains = kalman_riccati(problem).gain_predictor
-    run, estimate = problem.controller(gains).start(), 0.0
-    for k, y in enumerate(np.random.default_rng(0).standard_normal((7, 2))):
-        estimate += float(gains[k % 2, 0] @ (y - estimate))
-        assert run.step(y)[0] == pytest.approx(estimate, rel=1e-12)
-
-
 def test_a_problem_of_one_phase_in_which_all_is_read():
     one = EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     stack = EstimationProblem(A=[[[0.9]]], B=[[[1.0, 0.0]]], C=[[[1.0]]], D=[[[0.0, 1.0]]], L=1.0)
@@ -63,7 +54,6 @@ def test_a_problem_of_one_phase_in_which_all_is_read():
         (lambda p: p.ahead(0), "an estimate 0 samples ahead needs a period of 1; got one of 2"),
         (lambda p: p.with_memory([[1.0, 1.0]]), "a filter with a memory needs a period of 1"),
         (lambda p: p.with_unit_weights(), "a scaling of disturbances needs a period of 1"),
-        (lambda p: lbt.kalman(p, route="sdp"), "needs a period of 1"),
         (lambda p: lbt.hinf(p, route="lmi"), "needs a period of 1"),
     ],
 )

@@ -65,8 +65,7 @@ def test_refusals():
             ProblemError,
             "at most 1",
         ),
-        (lambda: GeneralizedPlant(**ONE, dt_s=None), ProblemError, SAMPLE_IT),
-        (lambda: GeneralizedPlant(**ONE, dt_s=0), ProblemError, SAMPLE_IT),
+        (lambda: GeneralizedPlant(**ONE, dt_s=0), ProblemError, "dt_s must be above 0"),
         (lambda: GeneralizedPlant.of(SLOW, measurements=1, controls=1), ProblemError, SAMPLE_IT),
         (
             lambda: LOOP.closed_loop(static([[0.0, 0.0]])),

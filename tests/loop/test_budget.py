@@ -450,7 +450,7 @@ LAZY = lbt.integrator(PATH, gain=0.3).controller
 LOOP = lbt.close_loop(PATH, LAZY)
 WILD = lbt.Controller(A=np.eye(2), B=3 * np.eye(2), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / 800)
 OTHER_RATE = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=1, frame_rate_hz=100)
-DRIFTING = lbt.models.DriftingVibration(start_hz=20, end_hz=30, duration_s=1, rms_nm=100)
+DRIFTING = lbt.models.SinusoidalVibration(frequency_hz=20, end_hz=30, duration_s=1, rms_nm=100)
 
 
 class Odd:

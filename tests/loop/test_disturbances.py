@@ -111,8 +111,8 @@ def test_readings_and_phase_of_a_run_are_those_of_one_oscillator(period, delay_f
 
 
 def test_a_line_that_drifts_is_read_at_its_frequency_of_the_moment():
-    line = lbt.models.DriftingVibration(
-        start_hz=40, end_hz=80, duration_s=10, rms_nm=100, direction=(1,)
+    line = lbt.models.SinusoidalVibration(
+        frequency_hz=40, end_hz=80, duration_s=10, rms_nm=100, direction=(1,)
     )
     channel = lbt.models.Accelerometer(
         name="mirror", rate_hz=800, delay_frames=2.5, channels=("m1",), noise_m_s2=1e-12

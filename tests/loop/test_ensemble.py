@@ -14,7 +14,6 @@ from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble
 from lbt_synth.loop.evaluator import split_into_parts, textbook_matrices
 from lbt_synth.models import (
     ARModel,
-    FrozenFlows,
     PositionLoop,
     SinusoidalVibration,
     SumSpectrum,
@@ -95,7 +94,7 @@ def agree(found, design, w, turbulence_of, *, rel=5e-7):
 def test_each_loop_on_its_own(which, request):
     """One process for all loops, one a loop, frozen flows, and different ones of the two axes."""
     design, w = request.getfixturevalue(which), weather(10, seed=1)
-    flows = FrozenFlows(atmosphere=AIR, seeing_arcsec=w["seeing"], wind_speed_m_s=w["wind"])
+    flows = replace(AIR, seeing_arcsec=w["seeing"], wind_speed_m_s=w["wind"])
 
     def flow(i):
         return replace(AIR, seeing_arcsec=w["seeing"][i], wind_speed_m_s=w["wind"][i])
@@ -155,7 +154,7 @@ def test_slow_and_fast_winds_together(wind, leak, outer):
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     controller = lbt.Controller(A=leak, B=0.3, C=1.0, D=0.0, dt_s=1 / RATE)
     air = replace(AIR, outer_scale_m=outer)
-    flows = FrozenFlows(atmosphere=air, wind_speed_m_s=wind)
+    flows = replace(air, wind_speed_m_s=wind)
     found = ensemble_residuals(controller, path, LoopEnsemble(turbulence=flows))
     loop = lbt.close_loop(path, controller)
     for speed, residual in zip(wind, found.turbulence_nm, strict=True):

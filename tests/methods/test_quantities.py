@@ -17,7 +17,7 @@ from lbt_synth.config.schema import FileSection
 EXAMPLE = YAML(typ="safe", pure=True).load(LBT_YAML.read_text())
 FROM_ZERO = """
     obstruction read_noise_electrons damping proportional_per_s2 derivative_per_s feed_forward
-    delay_samples frequency_error_hz frequency_error_percent phase_margin_deg modulus_margin leak
+    delay_samples frequency_error_hz phase_margin_deg modulus_margin leak
     command_weight low_hz delay_error_frames pole loss seed settle_frames gain
 """
 SIGNED = """

@@ -56,7 +56,7 @@ def test_every_command_takes_a_method_of_the_table(leaky, tmp_path, capsys, monk
     help_text = " ".join(text.split())
     assert "leaky: leaky integrator" in help_text
     assert "--leak-per-s LEAK_PER_S leaky: part of the command lost [1/s]" in help_text
-    assert "leaky: its gain, above 0 (default: the configuration's, else 0.3)" in help_text
+    assert "leaky: its gain (default the configuration's, else 0.3)" in help_text
     design = ("design", small, "--method", "leaky", "-o", gain)
     status, _, error = run(capsys, *design)
     assert (status, "--leak-per-s, the part of the command lost" in error) == (2, True)
@@ -67,7 +67,7 @@ def test_every_command_takes_a_method_of_the_table(leaky, tmp_path, capsys, monk
     assert (status, error) == (0, "")
     assert "leak, against the one claimed" in out
 
-    status, out, _ = run(capsys, "show", gain, "--json", "--matrices")
+    status, out, _ = run(capsys, "show", gain, "--json")
     shown = json.loads(out)
     assert (status, shown["leak_per_s"], shown["gain"]) == (0, 5.0, 0.3)
     assert shown["matrices"]["A"] == pytest.approx(np.exp(-5 / 800) * np.eye(2))

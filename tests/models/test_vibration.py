@@ -61,7 +61,7 @@ def test_the_sinusoid_has_the_frequency_at_each_time():
 
 
 def test_without_a_drift_it_is_the_sinusoid():
-    still = drifting(start_hz=20, end_hz=20)
+    still = drifting(frequency_hz=20, end_hz=20)
     (series,) = drawn(still, frames=4000, zero_frame=321)
     plain = lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100, direction=(1,))
     a, b = np.cos(2 * np.pi * 20 * np.arange(4000) / 800), np.sin(2 * np.pi * np.arange(4000) / 40)
@@ -91,7 +91,8 @@ def test_wrong_vibrations_are_refused():
         (lambda: line(frequency_hz=500).ar_model(800), beyond),
         (lambda: line(damping=0.5).at_frequency(8), "frequency above that"),
         (lambda: checked_direction(drifting(end_hz=500), PATH), beyond),
-        (lambda: drifting(start_hz=0), "start_hz must be above 0"),
+        (lambda: drifting(frequency_hz=0), "frequency_hz must be above 0"),
+        (lambda: drifting(end_hz=None), "needs end_hz and duration_s"),
         (lambda: drifting(direction=(0,)), "direction must be a vector"),
         (lambda: drifting().frequency_hz_at(np.nan), "time_s must be finite"),
     ):

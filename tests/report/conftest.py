@@ -19,7 +19,7 @@ def pages(tmp_path_factory):
         "kalman": lbt.kalman(config.plant),
         "integrator with a rather long name of its file": lbt.integrator(config.hardware, gain=0.4),
     }
-    page = lbt.report.design_page(lbt.report.design_report(config, designs))
+    page = lbt.report.design_page(config, designs)
     lbt.report.write_page(page, folder / "report.html")
     (folder / "study.html").write_bytes(page_html(page_of(results())))
     (folder / "marks.html").write_bytes(page_html(whole_page()))

@@ -229,8 +229,8 @@ def test_a_frozen_reading_and_a_drift_have_no_exact_answer(sensors_design, senso
     assert [np.isfinite(row.exact_nm) for _, row in segments] == [True, False]
     assert all(row.stable for _, row in segments)
     line, *others = sensors_config.truth.vibrations
-    moving = lbt.models.DriftingVibration(
-        start_hz=line.frequency_hz,
+    moving = lbt.models.SinusoidalVibration(
+        frequency_hz=line.frequency_hz,
         end_hz=line.frequency_hz + 0.1,
         duration_s=1,
         rms_nm=line.rms_nm,

@@ -6,7 +6,7 @@ from dataclasses import replace
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
-from lbt_synth.report.designs.page import design_page
+from lbt_synth.report.designs import report_page
 from lbt_synth.report.page.html import Notice
 from lbt_synth.storage.tables import Table
 
@@ -19,7 +19,7 @@ SMALL = re.sub(
 
 def words_of(report):
     """All texts of the page of a report but those of its charts."""
-    blocks = design_page(report).blocks
+    blocks = report_page(report, {}).blocks
     texts = [getattr(block, "text", block) for block in blocks if type(block) in (str, Notice)]
     tables = [block for block in blocks if isinstance(block, Table)]
     return " ".join(texts + [c.text for table in tables for row in table.cells() for c in row])

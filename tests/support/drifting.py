@@ -7,8 +7,8 @@ import lbt_synth as lbt
 
 
 def drifting(**changes):
-    given = {"start_hz": 17, "end_hz": 23, "duration_s": 10, "rms_nm": 100, "direction": (1,)}
-    return lbt.models.DriftingVibration(**(given | changes))
+    given = {"frequency_hz": 17, "end_hz": 23, "duration_s": 10, "rms_nm": 100, "direction": (1,)}
+    return lbt.models.SinusoidalVibration(**(given | changes))
 
 
 def drift_file(tmp_path, keys="kind: drift\n      end_hz: 23\n      duration_s: 60"):

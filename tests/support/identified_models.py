@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import lbt_synth as lbt
+from lbt_synth.config.write import config_text, identified_config
 from lbt_synth.identification.fit.identified_model import IdentifiedLine
 
 RATE = 1000.0
@@ -73,5 +74,6 @@ SHELL = lbt.models.PositionLoop.from_bandwidth(
 
 
 def save_identified(tmp_path, model, name="model.yaml", **options):
-    settings, comments = lbt.config.identified_config(model, **options)
-    return lbt.config.save_config(tmp_path / name, settings, comments=comments)
+    settings, comments = identified_config(model, **options)
+    (tmp_path / name).write_text(config_text(settings, comments))
+    return tmp_path / name

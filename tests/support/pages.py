@@ -6,7 +6,16 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from lbt_synth.report.draw import PANEL_IN, drawing, square_in
+from lbt_synth.report.draw import (
+    GUIDE,
+    PANEL_IN,
+    SHADE,
+    dot_style,
+    draw_map,
+    drawing,
+    line_style,
+    name_axes,
+)
 from lbt_synth.report.page.html import Chart, Notice, Page
 from lbt_synth.storage.tables import Cell, Table
 
@@ -50,24 +59,20 @@ class Reader(HTMLParser):
 
 def every_mark(name: str = "first") -> tuple[Chart, ...]:
     """Charts with every kind of mark."""
-    f = np.geomspace(0.1, 400, 50)
-    frequency = {"label": "frequency", "unit": "Hz", "log": True}
+    f, frequency = np.geomspace(0.1, 400, 50), ("frequency", "Hz")
     with drawing([PANEL_IN, PANEL_IN]) as (above, below):
-        above.set_axes(frequency, {"label": "size", "unit": "-", "log": True})
-        above.span("band", 10, 20)
-        above.area("spread", f, 0.5 / f, 2 / f, look=2)
-        above.area("", f[:9], 1e-4 / f[:9], 2e-4 / f[:9], look=2)
-        above.rule("line at 20 Hz", 20.0, dash=3)
-        above.curve(name, f, 1 / f)
-        above.curve("second", f, np.where(f < 5, np.nan, 1 / f**2), look=1)
-        dots = {"line": False, "marker": "own", "look": 3}
-        above.curve("dots", f[::5], 1 / f[::5], error=0.5 / f[::5], **dots)
-        above.flags([2.0, 3.0], [0.5, 0.3], (name, "flag"))
-        above.curve("only named", [], [], look=4)
-        below.set_axes(frequency, {"label": "steps", "unit": "nm"})
-        below.span("range", 0.1, 0.2, "y", look=5)
-        below.rule("level", 0.3, "y")
-        below.curve(name, f, 1 / f, step="steps-post")
+        name_axes(above, frequency, ("size", "-"), xscale="log", yscale="log")
+        above.axvspan(10, 20, label="band", color="0.3", **SHADE)
+        above.fill_between(f, 0.5 / f, 2 / f, label="spread", **SHADE)
+        above.axvline(20.0, label="line at 20 Hz", linestyle=":", **GUIDE)
+        above.plot(f, 1 / f, label=name, **line_style(0))
+        above.plot(f, np.where(f < 5, np.nan, 1 / f**2), label="second", **line_style(1))
+        above.vlines(f[::5], 0.5 / f[::5], 1.5 / f[::5])
+        above.plot(f[::5], 1 / f[::5], label="dots", **dot_style(3))
+        above.plot([], [], label="only named", **line_style(4))
+        _, factor = name_axes(below, frequency, ("steps", "nm"), xscale="log")
+        below.axhline(0.3, **GUIDE)
+        below.plot(f, factor / f, label=name, **line_style(0, drawstyle="steps-post"))
     words = {"caption": "Lines, areas, rules and spans.", "alt": "Two curves that fall."}
     lines = Chart(key="lines", title=f"Lines of {name}", figure=above.figure, **words)
     values = np.arange(30.0).reshape(5, 6)
@@ -75,24 +80,11 @@ def every_mark(name: str = "first") -> tuple[Chart, ...]:
     values[3, 2] = np.nan
     with drawing([PANEL_IN, PANEL_IN], columns=2) as panels:
         for panel, title in zip(panels, (name, "other"), strict=True):
-            panel.set_axes(
-                {"label": "error", "unit": "Hz"}, {"label": "gain", "unit": "-"}, title=title
-            )
-            gains = np.array([0.2, 0.4, 0.7, 1.0, 1.4])
-            more = {"log": title == "other", "contours": True, "blank": "unstable"}
-            panel.map(np.arange(6.0), gains, values, "ratio", "%", **more)
+            name_axes(panel, ("error", "Hz"), ("gain", "-"), title)
+        grid = np.arange(6.0), np.array([0.2, 0.4, 0.7, 1.0, 1.4]), values
+        draw_map(panels, [grid, grid], "ratio [%]", blank="unstable")
     words = {"caption": "Two maps.", "alt": "Values rise to the upper right."}
-    maps = Chart(key="maps", title="Maps", figure=panels[0].figure, **words)
-    turn = np.linspace(0, 2 * np.pi, 61)
-    with drawing([1.0, square_in(1)]) as (bars, plane):
-        bars.set_axes({"label": "share", "unit": "%", "low": 0}, {})
-        lengths = {"first order": [1, 2, 3], "total": [2, np.nan, 4]}
-        bars.bars(("a.b", name, "c"), lengths, {"first order": ([0.5, 1, 2], [2, 3, 4])})
-        plane.set_axes({"label": "real"}, {"label": "imaginary"}, equal=True)
-        plane.curve("", np.cos(turn), np.sin(turn), look=None)
-    words = {"caption": "Bars and a plane.", "alt": "Three bars, one circle."}
-    rest = Chart(key="rest", title="Bars and a plane", figure=bars.figure, **words)
-    return lines, maps, rest
+    return lines, Chart(key="maps", title="Maps", figure=panels[0].figure, **words)
 
 
 def whole_page(name: str = "first") -> Page:

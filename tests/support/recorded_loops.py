@@ -10,7 +10,7 @@ from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.identify import axis_periodogram, find_axis, refit_axis
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
-from lbt_synth.models.resonance_spectrum import coefficients
+from lbt_synth.models.resonance_spectrum import coefficient_rows, drive_ratio
 
 RATE = 1000.0
 FRAMES = 16_384
@@ -47,7 +47,8 @@ def integrator_loop(
 
 def slow() -> lbt.models.ARModel:
     """Turbulence of 300 nm around 1 Hz."""
-    a1, a2, drive = coefficients(2 * np.pi * 1.0 / RATE, 0.6)
+    place = 2 * np.pi * 1.0 / RATE, 0.6
+    (a1, a2), drive = coefficient_rows(*map(np.array, place)), drive_ratio(*place)
     return lbt.models.ARModel(
         coefficients=[a1, a2], driving_rms_nm=300 * np.sqrt(drive), frame_rate_hz=RATE
     )
@@ -65,7 +66,8 @@ def identify_series(
     **options: object,
 ) -> IdentifiedAxis:
     """Identify the series of one axis, at a sensor gain with an error if it is given."""
-    data = axis_periodogram(measurement, correction, frame_rate_hz, stretches)
+    pieces = stretches or ((0, len(measurement)),)
+    data = axis_periodogram(measurement, correction, frame_rate_hz, pieces)
     search = Search(data=data, gain=sensor_gain, **options)
     axis = find_axis(search, start=start)
     if not sensor_gain_error:

@@ -33,8 +33,8 @@ def record(run, path, **more):
     )
 
 
-def kinds(seen, *, spoils=True):
-    return {(f.kind, f.series, f.axis) for f in seen.findings if f.spoils == spoils}
+def kinds(seen):
+    return {(f.kind, f.series, f.axis) for f in seen.findings}
 
 
 def noise(frames, seed=0):
@@ -42,8 +42,8 @@ def noise(frames, seed=0):
 
 
 def findings(record):
-    """What was found in a record: kind, series, axis, frames, the first of them, whether spoilt."""
+    """What was found in a record: kind, series, axis, frames, the first of them."""
     return [
-        (each.kind, each.series, each.axis, each.count, each.first_frame, each.spoils)
+        (each.kind, each.series, each.axis, each.count, each.first_frame)
         for each in record.findings
     ]

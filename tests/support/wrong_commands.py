@@ -12,17 +12,19 @@ from lbt_synth.identification.commands.repair import CommandRepair
 TURN = np.deg2rad(30)
 ROTATION = np.array([[np.cos(TURN), -np.sin(TURN)], [np.sin(TURN), np.cos(TURN)]])
 
-# fault: (measurements and commands of the wrong record, the options that repair it)
-FAULTS = {
-    "turned": (lambda y, u: (y, -u), "--command-sign -1"),
-    "one turned": (lambda y, u: (y, u * [1, -1]), "--command-sign 1 -1"),
-    "exchanged": (lambda y, u: (y, u[:, ::-1]), "--swap-axes"),
-    "rotated": (lambda y, u: (y, u @ ROTATION), "--command-matrix 0.866025 -0.5 0.5 0.866025"),
-    "1000 times": (lambda y, u: (y, 1000 * u), "--command-scale 0.001"),
-    "a tenth": (lambda y, u: (y, 0.1 * u), "--command-scale 10"),
-    "late": (lambda y, u: (y[1:], u[:-1]), "--command-shift-frames -1"),
-    "early": (lambda y, u: (y[:-2], u[2:]), "--command-shift-frames 2"),
-    "increments": (lambda y, u: (y, np.diff(u, axis=0, prepend=0)), "--command-increments"),
+FAULTS = {  # measurements and commands of the wrong record, and its repair
+    "turned": (lambda y, u: (y, -u), CommandRepair(sign=(-1,))),
+    "one turned": (lambda y, u: (y, u * [1, -1]), CommandRepair(sign=(1, -1))),
+    "exchanged": (lambda y, u: (y, u[:, ::-1]), CommandRepair(swap_axes=True)),
+    "rotated": (lambda y, u: (y, u @ ROTATION), CommandRepair(matrix=tuple(ROTATION.ravel()))),
+    "1000 times": (lambda y, u: (y, 1000 * u), CommandRepair(scale=(0.001,))),
+    "a tenth": (lambda y, u: (y, 0.1 * u), CommandRepair(scale=(10.0,))),
+    "late": (lambda y, u: (y[1:], u[:-1]), CommandRepair(shift_frames=-1)),
+    "early": (lambda y, u: (y[:-2], u[2:]), CommandRepair(shift_frames=2)),
+    "increments": (
+        lambda y, u: (y, np.diff(u, axis=0, prepend=0)),
+        CommandRepair(increments=True),
+    ),
 }
 
 
@@ -37,18 +39,3 @@ def wrong_record(fault: str, seed: int = 1) -> lbt.identification.LoopRecord:
     """A record of an ordinary loop with one of the faults."""
     spoil, _ = FAULTS[fault]
     return record(*spoil(*ordinary_loop(seed)))
-
-
-def repair_of(fault: str) -> CommandRepair:
-    """The repair of a fault."""
-    return {
-        "turned": CommandRepair(sign=(-1,)),
-        "one turned": CommandRepair(sign=(1, -1)),
-        "exchanged": CommandRepair(swap_axes=True),
-        "rotated": CommandRepair(matrix=tuple(ROTATION.ravel())),
-        "1000 times": CommandRepair(scale=0.001),
-        "a tenth": CommandRepair(scale=10.0),
-        "late": CommandRepair(shift_frames=-1),
-        "early": CommandRepair(shift_frames=2),
-        "increments": CommandRepair(increments=True),
-    }[fault]

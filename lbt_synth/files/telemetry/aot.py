@@ -20,7 +20,7 @@ import numpy as np
 from lbt_synth.errors import FileError, OutputError, TelemetryError
 from lbt_synth.files.telemetry.telemetry import Telemetry
 from lbt_synth.models import PositionLoop
-from lbt_synth.storage.array_file import check_fits, error_reason, read_cards
+from lbt_synth.storage.array_file import error_reason, open_fits, read_cards
 from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import FloatArray
 
@@ -56,7 +56,7 @@ def require_aotpy(path: Path, error: type[FileError] = OutputError, verb: str = 
     return aotpy
 
 
-def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
+def to_bytes(telemetry: Telemetry, target: Path) -> bytes:
     """Return the content of an AOT file."""
     from astropy.io import fits
 
@@ -64,7 +64,7 @@ def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
     if telemetry.commands is None:
         raise OutputError("the AOT standard holds closed loops; got an open one.", path=target)
     plain, checked = io.BytesIO(), io.BytesIO()
-    aotpy.AOTFITSWriter(_to_system(aotpy, telemetry, precision)).get_hdulist().writeto(plain)
+    aotpy.AOTFITSWriter(_to_system(aotpy, telemetry)).get_hdulist().writeto(plain)
     # astropy's checksum of a table is right only once the table has been in a file
     with fits.open(io.BytesIO(plain.getvalue()), memmap=False) as units:
         for unit in units:
@@ -73,7 +73,7 @@ def to_bytes(telemetry: Telemetry, precision: str, target: Path) -> bytes:
     return checked.getvalue()
 
 
-def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
+def _to_system(aotpy: Any, seen: Telemetry) -> Any:
     """Describe telemetry as an ``AOSystem`` of aotpy."""
     diameter, ratio, m = seen.diameter_m, seen.obstruction, seen.n_commands
     telescope = aotpy.MainTelescope(
@@ -89,13 +89,9 @@ def _to_system(aotpy: Any, seen: Telemetry, precision: str) -> Any:
     unit = "m" if seen.command_unit == "nm" else seen.command_unit
     units, images = {"commands": unit, "measurements": seen.measurement_unit}, {}
     for name, data in _arrays(seen).items():
-        # series have a clock, and the precision that was chosen
-        digits, time = (precision, clock) if name in units else ("float64", None)
-        heading, of = (
-            name.upper().replace("_", " "),
-            {"unit": units.get(name) or None, "time": time},
-        )
-        images[name] = aotpy.Image(heading, data.astype(digits), **of)
+        time = clock if name in units else None
+        heading, unit = name.upper().replace("_", " "), units.get(name, "")
+        images[name] = aotpy.Image(heading, data, unit=unit or None, time=time)
     sensor = aotpy.Pyramid(
         "Pyramid",
         source=star,
@@ -164,7 +160,8 @@ def from_bytes(content: bytes, source: Path) -> Telemetry:
     aotpy = require_aotpy(source, TelemetryError, "read")
     with ignore_warnings():  # foreign files deviate in many small ways
         try:
-            check_fits(content)
+            with open_fits(content):  # refuses what is cut or belies a checksum
+                pass
             # other files and addresses that this one refers to are not opened
             reader = aotpy.AOTFITSReader(io.BytesIO(content), externals="disallow", memmap=False)
             system = reader.get_system()

@@ -23,11 +23,9 @@ from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.storage.array_file import Cards
 from lbt_synth.storage.atomic_files import write_atomically
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.validation import FloatArray, choice, integer, require_instance
+from lbt_synth.validation import FloatArray, integer, require_instance
 
-PRECISIONS = ("float64", "float32")
 Meta = dict[str, Any]
-FORMATS = ("fits", "npz", "aot")
 _ENDINGS = ".fits, .npz or .aot.fits"
 _KINDS = {".aot.fits": "aot", ".fits": "fits", ".npz": "npz"}  # the longer ending first
 _KIND = FileKind(
@@ -40,36 +38,18 @@ _KIND = FileKind(
 )
 
 
-def require_telemetry_name(path: str | os.PathLike[str], format: str | None = None) -> str:  # noqa: A002
+def require_telemetry_name(path: str | os.PathLike[str]) -> str:
     """Return the format of a file that is to be written."""
     target = Path(path)
-    by_name = next((_KINDS[end] for end in _KINDS if target.name.lower().endswith(end)), None)
-    if by_name is None:
+    kind = next((_KINDS[end] for end in _KINDS if target.name.lower().endswith(end)), None)
+    if kind is None:
         raise OutputError(f"telemetry must end in {_ENDINGS}; got {target.name!r}.", path=target)
-    kind = by_name if format is None else format
-    if kind not in FORMATS:
-        raise OutputError(
-            f"the format of telemetry must be one of {', '.join(FORMATS)}; got {format!r}.",
-            path=target,
-        )
-    if kind != by_name and (by_name, kind) != ("fits", "aot"):
-        raise OutputError(
-            f"the name {target.name!r} does not fit the format {format!r}: fits ends in .fits, "
-            "npz in .npz, aot in .aot.fits or .fits.",
-            path=target,
-        )
     if kind == "aot":
         aot.require_aotpy(target)
     return kind
 
 
-def save_telemetry(
-    path: str | os.PathLike[str],
-    telemetry: Telemetry,
-    *,
-    format: str | None = None,  # noqa: A002 - the word of the command line
-    precision: str = "float64",
-) -> Path:
+def save_telemetry(path: str | os.PathLike[str], telemetry: Telemetry) -> Path:
     """Write telemetry to a file, whole or not at all.
 
     Parameters
@@ -80,10 +60,6 @@ def save_telemetry(
         needs the extra ``aot`` and does not hold everything).
     telemetry : Telemetry
         The telemetry.
-    format : {"fits", "npz", "aot"}, optional
-        The format, where the ending does not give it.
-    precision : {"float64", "float32"}, optional
-        Of the series; matrices, images and times are float64.
 
     Returns
     -------
@@ -94,8 +70,6 @@ def save_telemetry(
     ------
     OutputError
         If the name is none of these, the file cannot be written, or the extra is missing.
-    ProblemError
-        If a value does not fit into the precision.
 
     Examples
     --------
@@ -109,15 +83,14 @@ def save_telemetry(
     [0.0, 1.5]
     """
     target = Path(path)
-    kind = require_telemetry_name(target, format)
+    kind = require_telemetry_name(target)
     if not isinstance(telemetry, Telemetry):
         raise OutputError(
             f"a telemetry file holds a Telemetry; got {type(telemetry).__name__}.", path=target
         )
-    choice(precision, "precision", PRECISIONS)
-    arrays, meta = pack(telemetry, precision)
     if kind == "aot":
-        return write_atomically(target, aot.to_bytes(telemetry, precision, target))
+        return write_atomically(target, aot.to_bytes(telemetry, target))
+    arrays, meta = pack(telemetry)
     cards = partial(primary_cards, telemetry)
     return _KIND.write(target, arrays, meta, cards, layer_cards(telemetry))
 
@@ -160,20 +133,10 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
         return unpack(*_KIND.decode(content, source))
 
 
-def pack(telemetry: Telemetry, precision: str) -> tuple[dict[str, npt.NDArray[Any]], Meta]:
-    """Return the arrays and the metadata; ``precision`` is that of the series."""
-    arrays: dict[str, npt.NDArray[Any]] = {}
-    for name, layer in LAYERS.items():
-        if (value := getattr(telemetry, layer.field)) is None:
-            continue
-        arrays[name] = value
-        if precision == "float32" and layer.is_series and layer.field != "times_s":
-            with np.errstate(over="ignore"):
-                arrays[name] = value.astype(np.float32)
-            if np.any(np.isinf(arrays[name])):
-                raise ProblemError(
-                    f"{layer.field} has values beyond the range of float32; write float64."
-                )
+def pack(telemetry: Telemetry) -> tuple[dict[str, npt.NDArray[Any]], Meta]:
+    """Return the arrays and the metadata."""
+    held = {name: getattr(telemetry, layer.field) for name, layer in LAYERS.items()}
+    arrays = {name: array for name, array in held.items() if array is not None}
     meta: Meta = {
         "schema": _KIND.schema,
         "schema_version": _KIND.version,

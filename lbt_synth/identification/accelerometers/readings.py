@@ -42,14 +42,10 @@ class Channels:
     be that of the measurement, a frame, whatever lies between the clocks.
     """
 
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the channels that live
+    dead: tuple[str, ...]  # names of the others
     values: FloatArray  # (frames, c): readings, zero where one is missing [m/s^2]
     good: BoolArray  # (frames,): whether all channels that live have a reading
-
-    def within(self, record: LoopRecord) -> LoopRecord:
-        """Return the record, in which frames without a reading are not usable."""
-        bridges = None if record.bridges is None else record.bridges & self.good
-        return replace(record, measured=record.measured & self.good, bridges=bridges)
 
     def hardware(self, path: LoopHardware) -> LoopHardware:
         """Return a loop that reads the channels, with the noise of each reading.
@@ -69,37 +65,56 @@ class Channels:
         return replace(path, suite=SensorSuite(sensors=(sensor,)))
 
 
-def channels_beside(
-    record: LoopRecord, accelerations: ArrayLike, names: Sequence[str] | None = None
-) -> Channels:
-    """Return the channels of a record: readings (frames, c) in its frames [m/s^2], and names.
+def read_channels(accelerations: ArrayLike, names: Sequence[str] | None = None) -> Channels:
+    """Return the channels of readings (frames, c) [m/s^2] that live, NaN where one is missing.
 
-    NaN is a missing reading; what comes after the last frame is not read. A channel without life is
-    left out.
+    Held values and spikes are missing, too; gaps of a few frames are bridged. A channel that misses
+    more than a tenth of the frames that any channel has, or does not move, is dead and spoils none.
     """
-    values, good = fill_missing(accelerations)
-    called = channel_names(names, values.shape[1])
-    live = np.std(values[good], axis=0) > LEAST_M_S2 if good.any() else np.zeros(len(called), bool)
-    if not live.any():
-        raise ProblemError(
-            f"accelerometers must move; got nothing but zeros or gaps in {', '.join(called)}. "
-            "Leave them out."
-        )
-    frames = min(record.frames, len(values))
-    laid, there = np.zeros((record.frames, int(live.sum()))), np.zeros(record.frames, bool)
-    laid[:frames], there[:frames] = values[:frames, live], good[:frames]
-    kept = tuple(name for name, lives in zip(called, live, strict=True) if lives)
-    return Channels(names=kept, values=laid, good=there)
-
-
-def channel_names(names: Sequence[str] | None, count: int) -> tuple[str, ...]:
-    """Return the names of channels; refuse two of one name, or too few."""
+    readings = float_array(accelerations, "accelerations")
+    readings = readings[:, None] if readings.ndim == 1 else readings
+    if readings.ndim != 2 or readings.size == 0:
+        raise DimensionError(f"accelerations must be (frames, channels); got {readings.shape}.")
+    count = readings.shape[1]
     called = tuple(names or (f"channel{c + 1}" for c in range(count)))
     if len(called) != count or len(set(called)) < count:
         raise ProblemError(
             f"channels must be {count} different names, one per column; got {', '.join(called)}."
         )
-    return called
+    good, filled = np.isfinite(readings), np.zeros(readings.shape)
+    recorded = np.sum(good.any(axis=1))
+    for c, series in enumerate(readings.T):
+        held = find_stuck(series, good[:, c])
+        good[:, c] &= ~held & ~find_outliers(series, good[:, c] & ~held)
+        filled[:, c] = fill(series, good[:, c])
+        gaps = runs(~good[:, c])
+        good[:, c] |= mark(gaps[gaps[:, 1] - gaps[:, 0] <= BRIDGED_FRAMES], len(series))
+    fine = np.sum(good, axis=0) >= (1 - _MISSING) * recorded
+    whole = np.asarray(good[:, fine].all(axis=1))
+    moves = np.std(filled[whole], axis=0) > LEAST_M_S2 if whole.any() else np.zeros(count, bool)
+    live = fine & moves
+    return Channels(
+        names=tuple(name for name, lives in zip(called, live, strict=True) if lives),
+        dead=tuple(name for name, lives in zip(called, live, strict=True) if not lives),
+        values=np.where(good, filled, 0.0)[:, live],
+        good=whole,
+    )
+
+
+def channels_beside(
+    record: LoopRecord, accelerations: ArrayLike, names: Sequence[str] | None = None
+) -> Channels:
+    """Return the channels that live in the frames of a record; what comes after is not read."""
+    read = read_channels(accelerations, names)
+    if not read.names:
+        raise ProblemError(
+            f"accelerometers must move; got nothing but zeros or gaps in {', '.join(read.dead)}. "
+            "Leave them out."
+        )
+    frames = min(record.frames, len(read.good))
+    values, good = np.zeros((record.frames, len(read.names))), np.zeros(record.frames, bool)
+    values[:frames], good[:frames] = read.values[:frames], read.good[:frames]
+    return replace(read, values=values, good=good)
 
 
 def load_readings(
@@ -216,25 +231,3 @@ def resample(values: FloatArray, rate_hz: float, frame_rate_hz: float) -> FloatA
             means = np.diff(CubicSpline(edges, total)(places)) / ratio + mean
             out[:, c] = np.where(gone[last] == gone[first], means, np.nan)
     return out
-
-
-def fill_missing(accelerations: ArrayLike) -> tuple[FloatArray, BoolArray]:
-    """Return readings (frames, channels) with zeros in gaps, and the frames without one.
-
-    Held values and spikes are missing, too; gaps of a few frames are bridged. A channel that misses
-    more than a tenth of the frames that any channel has becomes zeros, and spoils no frame.
-    """
-    readings = float_array(accelerations, "accelerations")
-    readings = readings[:, None] if readings.ndim == 1 else readings
-    if readings.ndim != 2 or readings.size == 0:
-        raise DimensionError(f"accelerations must be (frames, channels); got {readings.shape}.")
-    good, filled = np.isfinite(readings), np.zeros(readings.shape)
-    recorded = np.sum(good.any(axis=1))
-    for c, series in enumerate(readings.T):
-        held = find_stuck(series, good[:, c])
-        good[:, c] &= ~held & ~find_outliers(series, good[:, c] & ~held)
-        filled[:, c] = fill(series, good[:, c])
-        gaps = runs(~good[:, c])
-        good[:, c] |= mark(gaps[gaps[:, 1] - gaps[:, 0] <= BRIDGED_FRAMES], len(series))
-    fine = np.sum(good, axis=0) >= (1 - _MISSING) * recorded
-    return np.where(good & fine, filled, 0.0), np.asarray(good[:, fine].all(axis=1))

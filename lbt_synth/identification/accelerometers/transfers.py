@@ -23,7 +23,7 @@ from scipy.special import gammaincc
 
 from lbt_synth.design.filter_design import MOST_UNITS
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification.accelerometers.readings import LEAST_M_S2, channel_names, fill_missing
+from lbt_synth.identification.accelerometers.readings import read_channels
 from lbt_synth.identification.fit.identified_model import (
     DIFFERENT,
     IdentifiedLine,
@@ -47,49 +47,29 @@ _DOUBT = 0.01  # chance below which a channel moves at a line more than its nois
 
 @table_row
 class TransferRow:
-    """How one channel moves with one line."""
+    """How one channel moves with one line, with standard errors."""
 
-    channel: str = column("channel", help="Name of the channel")
-    line: int = column(help="Index of the line among the resonances of the model")
-    frequency_hz: float = column("f", unit="Hz", format=".3f", help="Frequency of the line")
-    motion_nm_per_nm: float = column(
-        "motion",
-        unit="nm/nm",
-        format=".4g",
-        help="Motion of the channel per motion of the wavefront",
-    )
-    motion_error_nm_per_nm: float = column(
-        "+-", unit="nm/nm", format=".2g", help="Standard error of the motion"
-    )
-    phase_deg: float = column(
-        "phase", unit="deg", format=".1f", help="Phase of the motion against that of the wavefront"
-    )
-    phase_error_deg: float = column(
-        "+-", unit="deg", format=".2g", help="Standard error of the phase"
-    )
-    coherence: float = column(
-        "coherence",
-        format=".3f",
-        help="Share of the power at the line that goes with the wavefront",
-    )
-    chance: float = column(
-        "chance", format=".1g", help="Probability that a channel without the line shows as much"
-    )
-    useful: bool = column("used", help="Whether the line shows in the channel beyond chance")
+    channel: str = column("channel")
+    line: int = column()  # its index among the resonances of the model
+    frequency_hz: float = column("f", unit="Hz", format=".3f")
+    # of the channel per motion of the wavefront, and its phase against that
+    motion_nm_per_nm: float = column("motion", unit="nm/nm", format=".4g")
+    motion_error_nm_per_nm: float = column("+-", unit="nm/nm", format=".2g")
+    phase_deg: float = column("phase", unit="deg", format=".1f")
+    phase_error_deg: float = column("+-", unit="deg", format=".2g")
+    # share of the power at the line that goes with the wavefront
+    coherence: float = column("coherence", format=".3f")
+    chance: float = column("chance", format=".1g")  # that a channel without it shows as much
+    useful: bool = column("used")  # whether the line shows in the channel beyond chance
 
 
 @table_row
 class ChannelRow:
-    """One channel of the accelerometers."""
+    """One channel of the accelerometers: its noise near the lines, and whether it is used."""
 
-    channel: str = column("channel", help="Name of the channel")
-    noise_m_s2: float = column(
-        "noise",
-        unit="m/s^2",
-        format=".3g",
-        help="Noise of a reading, near the lines it is used for",
-    )
-    verdict: str = column("verdict", help="Whether it is used, or why not")
+    channel: str = column("channel")
+    noise_m_s2: float = column("noise", unit="m/s^2", format=".3g")
+    verdict: str = column("verdict")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -152,28 +132,26 @@ def accelerometer_transfers(
     at most ``largest_shift_s``; NaN where one is missing. ``false_alarm`` is the probability that
     any line shows in any of these channels without being there.
     """
-    readings, good = fill_missing(accelerations)
-    names = channel_names(channels, readings.shape[1])
+    read = read_channels(accelerations, channels)
     if len(model.axes) != record.axes:
         raise DimensionError(
             f"model and record must have the same axes; got {len(model.axes)} and {record.axes}."
         )
     alarm = number(false_alarm, "false_alarm", above=0, below=1)
     largest_s = number(largest_shift_s, "largest_shift_s", at_least=0)
-    live = np.std(readings[good], axis=0) > LEAST_M_S2
     resonant = [part.kind != "turbulence" and part.sections == 1 for part in model.parts]
     places = np.flatnonzero(resonant).tolist()
     places.sort(key=lambda i: model.parts[i].frequency_hz)
     lines = [model.parts[i] for i in places]
     lag, shift, error, transfers = 0, 0.0, float("inf"), tuple[TransferRow, ...]()
-    noise, verdicts = np.full(len(names), np.nan), np.where(live, _NOTHING, "dead").astype(object)
-    if live.any() and lines:
+    rows = [(name, np.nan, _NOTHING) for name in read.names]
+    if read.names and lines:
         widest_hz = max(line.damping * line.frequency_hz for line in lines)
         shifts = 1 + np.ceil(4 * widest_hz * largest_s)  # that differ
-        limit = alarm / (np.sum(live) * len(lines) * shifts)
+        limit = alarm / (len(read.names) * len(lines) * shifts)
         largest = int(largest_s * model.frame_rate_hz)
         lag, fits, shift, error = _lay_and_fit(
-            model, record, lines, readings[:, live], good, largest, limit
+            model, record, lines, read.values, read.good, largest, limit
         )
         shown = fits.chances < limit
         # the channels that show most of the lines' power, as many as a design takes
@@ -181,15 +159,16 @@ def accelerometer_transfers(
         used = shown & (power >= np.sort(power)[-(MOST_UNITS - 1) :][0])[:, None]
         near = shown | ~shown.any(axis=1, keepdims=True)  # the lines it shows, or all
         level = np.sum(fits.noise * near, axis=1) / np.sum(near, axis=1)
-        noise[live] = np.sqrt(level * model.frame_rate_hz / 2)
-        verdicts[live] = np.select([used.any(1), shown.any(1)], ["used", _EXTRA], _NOTHING)
-        channels = [name for name, is_live in zip(names, live, strict=True) if is_live]
-        transfers = _transfer_rows(channels, places, lines, fits, used)
+        noise = np.sqrt(level * model.frame_rate_hz / 2).tolist()
+        verdicts = np.select([used.any(1), shown.any(1)], ["used", _EXTRA], _NOTHING).tolist()
+        rows = list(zip(read.names, noise, verdicts, strict=True))
+        transfers = _transfer_rows(read.names, places, lines, fits, used)
+    rows += [(name, np.nan, "dead") for name in read.dead]
     return AccelerometerTransfers(
         transfers=transfers,
         channels=tuple(
-            ChannelRow(channel=name, noise_m_s2=float(noise[c]), verdict=str(verdicts[c]))
-            for c, name in enumerate(names)
+            ChannelRow(channel=name, noise_m_s2=noise, verdict=verdict)
+            for name, noise, verdict in rows
         ),
         shift_frames=shift,
         shift_error_frames=error,

@@ -66,10 +66,7 @@ def repaired_corrections(record: LoopRecord, repair: CommandRepair) -> FloatArra
 
 
 def compare_repairs(record: LoopRecord, repairs: Sequence[CommandRepair]) -> CoarseFit:
-    """Return minus the log-likelihood and the best gain of n repairs, (axes, n + 1).
-
-    The last column is of commands that do not reach the measurements.
-    """
+    """Return minus log-likelihoods and gains of n repairs and of none at all, (axes, n + 1)."""
     rate = record.frame_rate_hz
     rows = _segments(coarse_stretches(record), rate)
     frequency_hz, measured, independent = segment_transforms(
@@ -161,10 +158,7 @@ def coarse_axis(
     independent: float,
     frame_rate_hz: float,
 ) -> CoarseAxis:
-    """Return an axis in bands, at peaks, and the shapes that a spectrum may have, (k, bands).
-
-    The transforms are (segments, f), of n guesses of the corrections (n, segments, f).
-    """
+    """Return an axis in bands, at peaks, and shapes (k, bands), with n guesses (n, segments, f)."""
     power = np.mean(abs(measured) ** 2, axis=0)
     is_peak, lines, width = find_spectral_peaks(frequency_hz, power)
     every = LoopPeriodogram(

@@ -10,6 +10,7 @@ laws apart is in their increments.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import NamedTuple, TypeAlias
@@ -17,8 +18,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.identification.records.faults import MAD, SURPRISING, find_saturated
+from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
@@ -26,8 +28,6 @@ from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
     IntArray,
-    matrix,
-    number,
     read_only,
     square,
 )
@@ -106,16 +106,13 @@ class ControlLaw:
 
     @property
     def coherence(self) -> float:
-        """Mean coherence of the axes: 0 of the commands of another night."""
+        """Return the part of what past commands leave that a law explains (axes,), unbiased."""
         return float(np.mean(self.axis_coherence))
 
     @property
     def leak(self) -> FloatArray:
-        """Pole nearest 1 of each axis, its size where it is complex, (axes,); nan of none."""
-        if not self.order:
-            return np.full(len(self.past), np.nan)
-        nearest = self.poles[:, 0]
-        return np.where(abs(nearest.imag) > 0, abs(nearest), nearest.real)
+        """Size of the pole nearest 1 of each axis, (axes,); (0,) of a law without memory."""
+        return np.asarray(np.abs(self.poles[:, :1]).ravel())
 
     @property
     def exact(self) -> bool:
@@ -163,32 +160,23 @@ class ControlLaw:
         return np.asarray(self.lag_frames + np.argmax(counts, axis=1))
 
 
-def fit_control_law(
-    measurements: ArrayLike, commands: ArrayLike, *, usable: ArrayLike | None = None
-) -> ControlLaw:
-    """Return the law of least order that explains commands by measurements, (frames, axes) each.
-
-    Frames that are not usable (frames,) or at which a command is at a limit do not count, nor those
-    few that do not follow the law of the others. ProblemError refuses too few frames.
-    """
-    y = matrix(measurements, "measurements")
-    why = f"to match measurements {y.shape}"
-    u = matrix(commands, "commands", rows=(len(y), why), cols=(y.shape[1], why))
-    good = np.ones(len(y), dtype=np.bool_) if usable is None else np.array(usable)
-    if good.dtype != np.bool_ or good.shape != (len(y),):
-        raise DimensionError(
-            f"usable must be {len(y)} truth values, one per frame; got {good.dtype} {good.shape}."
-        )
+def fit_control_law(record: LoopRecord) -> ControlLaw | None:
+    """Return the law of least order that explains commands; None of an open loop or few frames."""
+    if record.commands is None:
+        return None
+    y, u, good = record.measurements, record.commands, record.measured & record.commanded
     for column in u.T:
         good &= ~find_saturated(column, good)
     series = _Series(y, u, good, np.ones(len(y), dtype=np.bool_))
-    law = _search(series)
-    for _ in range(2):  # jumps hide the other frames that do not follow the law
-        odd = _odd_frames(series, law)
-        if odd.any():
-            series = series._replace(lawful=series.lawful & ~odd)
-            law = _search(series)
-    return law
+    with suppress(ProblemError):
+        law = _search(series)
+        for _ in range(2):  # jumps hide the other frames that do not follow the law
+            odd = _odd_frames(series, law)
+            if odd.any():
+                series = series._replace(lawful=series.lawful & ~odd)
+                law = _search(series)
+        return law
+    return None
 
 
 class _Series(NamedTuple):
@@ -264,10 +252,7 @@ class _Regression:
             if rows.size >= needed:
                 break
             if order <= 1:
-                raise ProblemError(
-                    f"the control law needs {needed} frames whose neighbours are good; got "
-                    f"{rows.size} of {len(u)}. Give a longer record, or one with fewer holes."
-                )
+                raise ProblemError(f"a law needs {needed} good frames; got {rows.size}.")
             order //= 2
         if rows.size > _MOST_ROWS:
             rows = rows[np.linspace(0, rows.size - 1, _MOST_ROWS).astype(np.int64)]
@@ -305,10 +290,7 @@ class _Regression:
         return float(np.mean([self.solve(axis, shape)[1] for axis in self.moving] or [1.0]))
 
     def coherence(self, shape: _Shape) -> FloatArray:
-        """Return the part of what past commands leave that a law explains, of each axis (axes,).
-
-        Corrected for the number of coefficients; zero where commands do not move.
-        """
+        """Return the part of what past commands leave that a law explains (axes,), unbiased."""
         out, used = np.zeros(self.axes), shape[0] + self.axes * len(shape[1])
         for axis in self.moving:
             (_, before), (_, after) = (
@@ -320,11 +302,7 @@ class _Regression:
         return out
 
     def simplest_shape(self, lags: range) -> _Shape:
-        """Return the shortest law that explains as much as the richest one.
-
-        Of up to three states each order and number of taps is tried, beyond them orders that
-        double. First and last taps that explain nothing are left out.
-        """
+        """Return the shortest law that explains as much as the richest one, without idle taps."""
         most = _enough(self.residual((self.order, range(lags[0], self.lags.stop)))) + _EXACT**2
         tried = [(p, taps) for p in range(SHORT_ORDER + 1) for taps in range(max(p - 1, 0), p + 1)]
         while tried[-1][0] < self.order:
@@ -366,11 +344,7 @@ class _Regression:
 
 
 def classify_matrix(values: ArrayLike) -> tuple[str, tuple[int, ...]]:
-    """Return what a matrix (n, n) of one or two axes does, the first kind that fits, and signs.
-
-    Elements below 5 % of the largest one count as zero. Signs are those on the diagonal, of a
-    swapped matrix on the other one, of each row; 0 of any other.
-    """
+    """Return what a matrix (n, n) of one or two axes does, and the sign of each row, or 0."""
     g = square(values, "values")
     g = np.where(np.abs(g) <= _SMALL * np.max(np.abs(g), initial=0.0), 0.0, g)
     on, off = np.diag(g), (g - np.diag(np.diag(g))).sum(axis=1)
@@ -382,11 +356,7 @@ def classify_matrix(values: ArrayLike) -> tuple[str, tuple[int, ...]]:
 
 
 def law_controller(law: ControlLaw, frame_rate_hz: float) -> Controller:
-    """Return a control law as a controller, whose state holds past commands and measurements.
-
-    ProblemError refuses the absence of a law, and one that knows measurements of the future.
-    """
-    rate = number(frame_rate_hz, "frame_rate_hz", above=0)
+    """Return a law as a controller, whose state holds past commands and measurements."""
     if law.kind == "none" or law.lag_frames < 0:
         raise ProblemError(f"a controller needs a law that can run; got {law.name}{law.lag_text}.")
     axes, last = len(law.gain), law.lag_frames + law.taps.shape[1] - 1
@@ -402,4 +372,6 @@ def law_controller(law: ControlLaw, frame_rate_hz: float) -> Controller:
     B[:axes] = taps[:, 0]
     if last:
         B[axes * slots : axes * (slots + 1)] = np.eye(axes)
-    return Controller(A=A, B=B, C=np.eye(axes, len(A)), D=np.zeros((axes, axes)), dt_s=1 / rate)
+    return Controller(
+        A=A, B=B, C=np.eye(axes, len(A)), D=np.zeros((axes, axes)), dt_s=1 / frame_rate_hz
+    )

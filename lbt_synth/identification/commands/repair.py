@@ -10,7 +10,7 @@ import numpy as np
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import FloatArray, integer, number, read_only, real_array, set_fields
+from lbt_synth.validation import FloatArray, integer, number, read_only, real_array
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,14 +22,12 @@ class CommandRepair:
     swap_axes: bool = False
     sign: tuple[int, ...] = ()  # 1 or -1 for each axis, or for both
     matrix: tuple[float, ...] = ()  # to the axes of the measurements, in rows
-    scale: float | Sequence[float] = ()  # of both axes, or of each
+    scale: tuple[float, ...] = ()  # of both axes, or of each
     delay_frames: float | None = None  # total delay of the loop
 
     def __post_init__(self) -> None:
-        factors = self.scale if isinstance(self.scale, Sequence) else (self.scale,)
-        scales = tuple(number(factor, "command_scale", above=0) for factor in factors)
-        scales = scales[:1] if len(set(scales)) == 1 else scales
-        set_fields(self, scale=() if scales == (1.0,) else scales)
+        for factor in self.scale:
+            number(factor, "command_scale", above=0)
         integer(self.shift_frames, "command_shift_frames")
         if any(sign not in (-1, 1) for sign in self.sign):
             raise ProblemError(f"command_sign must be 1 or -1, per axis; got {list(self.sign)}.")
@@ -48,7 +46,7 @@ class CommandRepair:
             "--swap-axes" if self.swap_axes else "",
             f"--command-sign {values(self.sign)}" if self.sign else "",
             f"--command-matrix {values(self.matrix)}" if self.matrix else "",
-            f"--command-scale {values(self.scales)}" if self.scales else "",
+            f"--command-scale {values(self.scale)}" if self.scale else "",
             "" if self.delay_frames is None else f"--delay-frames {self.delay_frames:g}",
         ]
         return " ".join(filter(None, words))
@@ -73,17 +71,12 @@ class CommandRepair:
             out.append(f"{'they have' if one else f'axis {turned} has'} the opposite sign")
         if self.delay_frames is not None:
             out.append(f"the total delay is {self.delay_frames:g} frames")
-        for axis, factor in enumerate(self.scales):
+        for axis, factor in enumerate(self.scale):
             if factor != 1:
-                whose = "they" if len(self.scales) == 1 else f"those of axis {axis}"
+                whose = "they" if len(self.scale) == 1 else f"those of axis {axis}"
                 size = f"{max(factor, 1 / factor):g} times too {'large' if factor < 1 else 'small'}"
                 out.append(f"{whose} are {size}")
         return out
-
-    @property
-    def scales(self) -> tuple[float, ...]:
-        """The factors, one or one for each axis; empty where nothing is scaled."""
-        return tuple(self.scale) if isinstance(self.scale, Sequence) else (self.scale,)
 
     def turn(self, axes: int) -> FloatArray:
         """Return the matrix that swap, sign, matrix and scale are together."""
@@ -101,7 +94,7 @@ class CommandRepair:
         out = _per_axis(self.sign, "command_sign", axes) * out
         if self.matrix:
             out = np.reshape(self.matrix, (axes, axes)) @ out
-        return _per_axis(self.scales, "command_scale", axes) * out
+        return _per_axis(self.scale, "command_scale", axes) * out
 
 
 def _per_axis(values: Sequence[float], name: str, axes: int) -> FloatArray:
@@ -112,11 +105,7 @@ def _per_axis(values: Sequence[float], name: str, axes: int) -> FloatArray:
 
 
 def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
-    """Return a closed-loop record with the commands that the mirror followed.
-
-    The usable frames are those of the new commands. ProblemError refuses a record
-    without commands, and a repair that does not fit its axes.
-    """
+    """Return a closed-loop record with the commands that the mirror followed."""
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to repair.")
     commands, good = np.array(record.commands), np.array(record.commanded)
@@ -130,11 +119,5 @@ def repair_commands(record: LoopRecord, repair: CommandRepair) -> LoopRecord:
         unknown = slice(0, repair.shift_frames) if late else slice(repair.shift_frames, None)
         commands[unknown], good[unknown] = 0.0, False
     commands = commands @ repair.turn(record.axes).T
-    delay_frames = record.delay_frames if repair.delay_frames is None else repair.delay_frames
-    return replace(
-        record,
-        commands=read_only(commands),
-        commanded=read_only(good),
-        delay_frames=delay_frames,
-        bridges=None,
-    )
+    repaired = replace(record, commands=read_only(commands), commanded=read_only(good))
+    return repaired.with_delay(repair.delay_frames or record.delay_frames)

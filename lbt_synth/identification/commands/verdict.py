@@ -8,7 +8,6 @@ ask for the repair. A factor of two in the size of commands is left to the gains
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -104,22 +103,17 @@ class CommandVerdict:
         )
 
     def require_accepted(self) -> None:
-        """Refuse a record that something else explains better.
-
-        The message says which law fits, and names all options that repair the record.
-        """
+        """Refuse a record that something explains better: name the law, and all that repairs it."""
         if self.accepted:
             return
         law = "" if self.law is None else f" ({self.law.name} fits them{self.law.lag_text})"
-        tried = f"{self.repair.options}, or " if self.repair.options else ""
+        options = self.repair.options
         raise RecordError(
             f"the commands do not reach the measurements as given: {self.explanation}{law}.",
             explanation=self.explanation,
-            options=self.repair.options,
-            in_python=f"Repair them as the options {self.repair.options} do."
-            if self.repair.options
-            else "",
-            at_terminal=f"Try {tried}--accept-record to go on as it is.",
+            options=options,
+            in_python=f"Repair them as the options {options} do." if options else "",
+            at_terminal=f"Try {options}{', or ' * bool(options)}--accept-record to go on as it is.",
         )
 
 
@@ -140,14 +134,14 @@ def explain_commands(
     if record.commands is None:
         raise ProblemError("the record is of an open loop: it has no commands to explain.")
     known = None if sensor_gain is None else record.known_gains(sensor_gain)
-    law, commands = record_law(record), record.commands[record.usable]
+    law, commands = fit_control_law(record), record.commands[record.usable]
     still = np.all(commands == commands[:1], axis=0)
     if still.all() or not still.any():
         return _explain(record, law, known)
     # the loop of the other axis was open
     y, u = record.measurements[:, ~still], record.commands[:, ~still]
     moving = replace(record, measurements=y, commands=u)
-    verdict = _explain(moving, record_law(moving), None if known is None else known[~still])
+    verdict = _explain(moving, fit_control_law(moving), None if known is None else known[~still])
     gain = np.where(still, np.nan, verdict.gain)
     note = f"the commands of axis {int(np.argmax(still))} stand still: its loop was open"
     return replace(verdict, gain=frozen_copy(gain), law=law, notes=(*verdict.notes, note))
@@ -188,7 +182,7 @@ def _explain(
         repair,
         shift_frames=-lag if repair.shift_frames else 0,
         delay_frames=delay_frames + off if off else None,
-        scale=tuple(scale),
+        scale=_factors(scale),
     )
     hidden = (gain / scale <= limits[0]) | (gain / scale >= limits[1])
     return refuse(
@@ -204,7 +198,7 @@ def _name_repair(repair: CommandRepair, gain: FloatArray) -> str:
     if not repair.options:
         return AS_GIVEN
     gains = ", ".join(f"{value:.3g}" for value in gain)
-    shown = f" (with them the sensor has a gain of {gains})" if repair.scales else ""
+    shown = f" (with them the sensor has a gain of {gains})" if repair.scale else ""
     return " and ".join(repair.words()) + shown
 
 
@@ -247,28 +241,13 @@ def _unexplained(law: ControlLaw | None) -> str:
 
 def _note_law(delay_frames: float, lag: int, hiding: str) -> tuple[str, ...]:
     """Return what to look at in an accepted record whose law has a lag, or explains too little."""
-    notes = []
-    if lag:
-        notes.append(
-            f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
-            "real-time computer takes that long, the total delay of a new design is "
-            f"{delay_frames + lag:g} frames"
-        )
-    if hiding:
-        notes.append(
-            f"warning: of the commands, {hiding}. The sensor gain may be larger than it looks"
-        )
-    return tuple(notes)
-
-
-def record_law(record: LoopRecord) -> ControlLaw | None:
-    """Return the control law of a closed-loop record; None where the frames are too few."""
-    if record.commands is None:
-        return None
-    with suppress(ProblemError):
-        good = record.measured & record.commanded
-        return fit_control_law(record.measurements, record.commands, usable=good)
-    return None
+    late = (
+        f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
+        "real-time computer takes that long, the total delay of a new design is "
+        f"{delay_frames + lag:g} frames"
+    )
+    few = f"warning: of the commands, {hiding}. The sensor gain may be larger than it looks"
+    return (late,) * bool(lag) + (few,) * bool(hiding)
 
 
 def _doubt_law(law: ControlLaw) -> str:
@@ -292,11 +271,7 @@ def _doubt_law(law: ControlLaw) -> str:
 def list_repairs(
     axes: int, delay_frames: float, law: ControlLaw | None = None, lag: int = 0
 ) -> list[CommandRepair]:
-    """Return what the commands of a record may need, the first nothing.
-
-    The law may ask for a matrix, and for a long shift. A shift moves corrections to frames that
-    still follow from the past of the measurements; it stands for another delay, too.
-    """
+    """Return what commands may need, first nothing; corrections follow from the past after all."""
     signs = [(), (-1,), *((1, -1), (-1, 1))[: 2 * axes - 2]]
     out = [CommandRepair(swap_axes=bool(k), sign=sign) for k in range(axes) for sign in signs]
     short_shifts = range(-MOST_SHIFT_FRAMES, MOST_SHIFT_FRAMES + 1)
@@ -305,23 +280,15 @@ def list_repairs(
     out += [CommandRepair(shift_frames=k) for k in shifts]
     out.append(CommandRepair(increments=True))
     if law is not None and law.is_sure and law.axes_kind == "general":
-        # what undoes the gain of the law: a turn, and all of it
-        U, s, Vh = np.linalg.svd(law.gain)
-        if s[-1] > _LITTLE * s[0]:
-            for undone in (np.ones(2), np.sqrt(s[0] * s[1]) / s):
-                matrix = (Vh.T * undone) @ U.T
-                out.append(CommandRepair(matrix=tuple(matrix.ravel().tolist())))
+        U, _, Vh = np.linalg.svd(law.gain)  # what undoes the turn in the gain of the law
+        out.append(CommandRepair(matrix=tuple((U @ Vh).T.ravel().tolist())))
     return out
 
 
 def _choose(
     record: LoopRecord, law: ControlLaw | None, lag: int, known: tuple[float, float] | None
 ) -> tuple[CommandRepair, FloatArray, BoolArray]:
-    """Return the repair that law and likelihood ask for, and the sensor gain (axes,) with it.
-
-    And which axes (axes,) have commands that follow no law and do not reach their measurements.
-    Where limits of a known gain hold as given, they have to hold after a repair.
-    """
+    """Return the repair that law and likelihood ask for, its gain, and which axes are unrelated."""
     repairs = list_repairs(record.axes, record.hardware.delay_frames, law, lag)
     contrasts, gains = compare_repairs(record, repairs)
     contrasts, unrelated = contrasts[:, :-1], contrasts[:, -1]
@@ -352,11 +319,7 @@ def _penalties(
     law: ControlLaw | None,
     lag: int,
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the nats that repairs (n,) cost because of the laws they make, and which the law asks.
-
-    A loop that would have been unstable has not run. A law that is not exact overrules no clear
-    likelihood.
-    """
+    """Return the nats that repairs (n,) cost by the laws they make, and which the law asks for."""
     odd = np.array([_is_unusual(repair, law, lag) for repair in repairs])
     impossible = np.zeros(len(repairs), dtype=np.bool_)
     if law is not None and law.is_sure:
@@ -413,11 +376,8 @@ def could_have_run(
 
 
 def _moving_radius(path: LoopHardware, controller: Controller) -> float:
-    """Return the largest modulus of the poles of a loop that depend on its sensor gain.
-
-    A law that was found from series has poles and zeros that cancel, outside of the circle too.
-    Infinite where the gain is so small that nothing depends on it: that loop was open.
-    """
+    """Return the largest modulus of the poles that depend on the sensor gain, infinite of none."""
+    # a law that was found from series has poles and zeros that cancel, outside of the circle too
     weaker = replace(path, sensor_matrix=0.8 * path.sensor)
     poles, others = (
         np.linalg.eigvals(close_loop(loop, controller).system.A) for loop in (path, weaker)
@@ -472,23 +432,22 @@ def _scale(
 
 
 def likely_factors(gains: FloatArray, within: BoolArray) -> FloatArray:
-    """Return the likeliest factors of commands whose sensor gains (axes,) are not within limits.
-
-    They are those between units, or the 2 of a reflection, and one for all where no gain is within.
-    """
+    """Return the factors between units or of a reflection, one for all where no gain is within."""
     means = gains if within.any() else np.exp(np.mean(np.log(gains))) * np.ones(gains.size)
     away = np.abs(np.log(means[:, None] / np.array(_FACTORS) / TYPICAL_GAIN))
     return np.where(within, 1.0, np.array(_FACTORS)[np.argmin(away, axis=1)])
 
 
-def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
-    """Judge the commands by the sensor gains (axes,) of a fit, with their standard errors.
+def _factors(scale: FloatArray) -> tuple[float, ...]:
+    """Return the factors of a repair: none, one for all axes, or one for each."""
+    return () if np.all(scale == 1) else tuple(scale[: 1 if np.ptp(scale) == 0 else None].tolist())
 
-    The fit shows gains beyond the plausible ones where the coarse model leaves them open.
-    """
+
+def judge_fitted_gains(gains: FloatArray, errors: FloatArray) -> CommandVerdict:
+    """Judge the commands by the sensor gains (axes,) of a fit, with their standard errors."""
     accepted = not np.all(gains - SURPRISING * errors > PLAUSIBLE_GAINS[1])
     scale = likely_factors(gains, np.full(gains.size, accepted))
-    repair = CommandRepair(scale=tuple(scale))
+    repair = CommandRepair(scale=_factors(scale))
     return CommandVerdict(
         explanation=_name_repair(repair, gains),
         repair=repair,

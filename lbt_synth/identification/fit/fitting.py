@@ -31,12 +31,12 @@ from lbt_synth.identification.fit.whittle import (
     SKIRT,
     FittedModel,
     Priors,
-    component_density,
     contrast,
     contrasts,
     density,
     minimise,
     observe_information,
+    part_density,
 )
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import integer, number
@@ -324,8 +324,7 @@ def _drop(
         power = float(np.logaddexp(line.log_power, spectrum.components[i].log_power))
         return spectrum.exchange(neighbour, replace(line, log_power=power)).exchange(i)
     less, noise = spectrum.exchange(i), float(np.exp(spectrum.background.log_noise))
-    lost = density(data, spectrum) - density(data, less)
-    white = float(np.min(lost)) * data.frame_rate_hz / 2
+    white = float(np.min(part_density(data, spectrum, i))) * data.frame_rate_hz / 2
     return less.with_background(log_noise=float(np.log(noise + white))) if white > noise else less
 
 
@@ -357,7 +356,7 @@ def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumMode
         moves = product(np.log1p(shifts * step / centre), _POWERS)
         # the width stays
         trials = [line, *(line.shift(move, -move, power) for move, power in moves)]
-        lines = [component_density.__wrapped__(data, trial) for trial in trials]  # none comes again
+        lines = [part_density(data, spectrum.exchange(i, trial), i) for trial in trials]
         best = int(np.argmin(contrasts(data, spectrum.background.gain, rest + np.array(lines))))
         line = trials[best]
     return spectrum.exchange(i, line)

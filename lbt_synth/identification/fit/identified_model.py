@@ -29,7 +29,7 @@ from lbt_synth.models import (
     Vibration,
     tip_tilt_plant,
 )
-from lbt_synth.models.resonance_spectrum import WIDE_DAMPING, coefficients
+from lbt_synth.models.resonance_spectrum import WIDE_DAMPING, coefficient_rows, drive_ratio
 from lbt_synth.storage.display_unit import nm_text, shown_format, shown_unit
 from lbt_synth.storage.rows import cell_text, column, fill_row, nm_column, row_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -248,10 +248,10 @@ def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> Spectrum
     return spectrum.unpack(np.sqrt(np.maximum(np.diag(covariance), 0)))
 
 
-def gain_covariance(
+def hold_gain(
     search: Search, model: FittedModel, errors: Sequence[tuple[Sequence[int], float]]
-) -> FloatArray:
-    """Return the covariance of a fit whose gains have errors, and all that these move, (p, p).
+) -> FittedModel:
+    """Return a fit whose gains have errors, and all that these move.
 
     The errors are relative ones, each common to the gains of some axes.
     """
@@ -267,12 +267,6 @@ def gain_covariance(
         moved = derivatives(data, model.spectrum.unpack(theta + step))[1]
         moves = (step - held @ (moved - gradient)) / DIFFERENCE
         covariance = covariance + error**2 * np.outer(moves, moves)
-    return covariance
-
-
-def hold_gain(search: Search, model: FittedModel, error: float) -> FittedModel:
-    """Return a model of one axis with a relative error of its gain, and all that this moves."""
-    covariance = gain_covariance(search, model, [([0], error)])
     return replace(model, information=invert_information(covariance))
 
 
@@ -436,7 +430,8 @@ def _nearest_process(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
 def _turbulence_process(spectrum: SpectrumModel, rate: float) -> ARModel:
     """Return the turbulence as a process of the phase, of order 2, or 3 with a roll-off."""
     slow, background = spectrum.components[0], spectrum.background
-    a1, a2, drive = coefficients(*_without_fast_pole(slow.frequency, slow.damping_ratio))
+    place = _without_fast_pole(slow.frequency, slow.damping_ratio)
+    (a1, a2), drive = coefficient_rows(*map(np.array, place)), drive_ratio(*place)
     polynomial = np.array([1.0, -a1, -a2])
     size = np.exp(slow.log_power / 2) / background.gain * np.sqrt(drive)
     if background.rolls_off:

@@ -35,11 +35,11 @@ from lbt_synth.identification.fit.periodogram import (
 from lbt_synth.identification.fit.shared_lines import couple_axes
 from lbt_synth.identification.records.faults import MAD, RARE
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
-from lbt_synth.identification.stretches import Stretches, StretchesLike, checked_stretches
+from lbt_synth.identification.stretches import Stretches
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, each_of, require_instance
 
-_DELAY = 2.0  # frames, if neither the record nor the call has a delay
+_DELAY = 2.0  # frames, of a spectrum or an open loop without a delay
 _CALIBRATED = 1.03  # largest gain of a sensor that was calibrated, to some percent
 _UNSEEN = 0.5  # relative error of a noise that the rest of the spectrum hides
 _UNSEEN_COLOUR = 0.045  # error of the correlation of a noise that may be coloured
@@ -60,7 +60,6 @@ def identify(
     noise_nm: float | Sequence[float] | None = None,
     lowest_line_hz: float = LOWEST_LINE_HZ,
     most_lines: int = MOST_LINES,
-    stretches: StretchesLike | None = None,
     start: IdentifiedModel | None = None,
 ) -> IdentifiedModel:
     """Identify turbulence, vibrations, noise and sensor gain of a loop from its record.
@@ -78,21 +77,18 @@ def identify(
     ----------
     record : LoopRecord or SpectrumRecord
         What the loop recorded, or spectra; in closed loop the delay must be known.
-    frame_rate_hz : float, optional
-        Frame rate of the loop to design for [Hz], for spectra without one.
-    delay_frames : float, optional
-        Total delay of that loop [frames], if the record does not have it; 2 by default.
+    frame_rate_hz, delay_frames : float, optional
+        Frame rate [Hz] and total delay [frames], 2 by default, of the loop to design for; for
+        spectra alone.
     sensor_gain : float or one per axis, optional
-        Known sensor gain; like ``stretches`` and ``start`` for series alone.
+        Known sensor gain; like ``start`` for series alone.
     noise_nm : float or one per axis, optional
-        Noise per frame of the sensor of the loop to design for [nm], for spectra alone: those of
-        wind shake or of a simulation have none.
+        Noise per frame of the sensor of that loop [nm], for spectra alone: those of wind shake or
+        of a simulation have none.
     lowest_line_hz : float, optional
         A resonance below is a part of the turbulence [Hz].
     most_lines : int, optional
         Most resonances above it on each axis.
-    stretches : sequence of (start, stop), optional
-        Frames to use; all that are usable by default.
     start : IdentifiedModel, optional
         A model to start from.
 
@@ -126,23 +122,28 @@ def identify(
     >>> lbt.kalman(found.plant()).certificate.passed
     True
     """
-    if start is not None:
-        require_instance(start, IdentifiedModel)
     options: dict[str, Any] = {"lowest_line_hz": lowest_line_hz, "most_lines": most_lines}
+    of_series = {"sensor_gain": sensor_gain, "start": start}
+    of_spectra = {
+        "noise_nm": noise_nm,
+        "frame_rate_hz": frame_rate_hz,
+        "delay_frames": delay_frames,
+    }
     if isinstance(record, SpectrumRecord):
-        of_series = {"sensor_gain": sensor_gain, "stretches": stretches, "start": start}
         if names := [name for name, value in of_series.items() if value is not None]:
             raise ProblemError(f"{names[0]} is for series of a loop; a spectrum is of the phase.")
         return _identify_spectra(record, frame_rate_hz, delay_frames, noise_nm, options)
     require_instance(record, LoopRecord)
-    if noise_nm is not None:
-        raise ProblemError("noise_nm is for spectra; the noise of a series is found in it.")
-    _check_record(record, frame_rate_hz, delay_frames, start)
+    if names := [name for name, value in of_spectra.items() if value is not None]:
+        raise ProblemError(f"{names[0]} is for spectra; a series has its own.")
+    if start is not None:
+        require_instance(start, IdentifiedModel)
+        if len(start.axes) != record.axes:
+            raise ProblemError(f"start must have {record.axes} axes; got {len(start.axes)}.")
     gains: list[float | None] = [None] * record.axes
     if sensor_gain is not None:
         gains = record.known_gains(sensor_gain).tolist()
-    pieces = record.stretches() if stretches is None else _usable_stretches(stretches, record)
-    pieces, notes = _cut_at_jumps(record.corrections(), pieces)
+    pieces, notes = _cut_at_jumps(record.corrections(), record.stretches())
     starts: Sequence[IdentifiedAxis | None] = start.axes if start else [None] * record.axes
     series = zip(record.measurements.T, record.corrections().T, gains, starts, strict=True)
     axes = list[IdentifiedAxis]()
@@ -159,7 +160,7 @@ def identify(
         axes=tuple(axes),
         shared=shared,
         frame_rate_hz=record.frame_rate_hz,
-        delay_frames=next(d for d in (record.delay_frames, delay_frames, _DELAY) if d is not None),
+        delay_frames=record.delay_frames or _DELAY,
         mirror=record.mirror,
         notes=tuple(dict.fromkeys([*notes, *_find_doubts(axes, most_lines)])),
     )
@@ -191,38 +192,6 @@ def _cut_at_jumps(corrections: FloatArray, stretches: Stretches) -> tuple[Stretc
         pieces = chain(*(((a, min(b, low)), (max(a, high), b)) for a, b in stretches))
         stretches = tuple((a, b) for a, b in pieces if b > a)
     return stretches, [f"{note}; the record was cut there"]
-
-
-def _check_record(
-    record: LoopRecord,
-    frame_rate_hz: float | None,
-    delay_frames: float | None,
-    start: IdentifiedModel | None,
-) -> None:
-    """Refuse what contradicts a record, and a record that cannot be identified."""
-    if frame_rate_hz is not None and frame_rate_hz != record.frame_rate_hz:
-        raise ProblemError(
-            f"the record has {record.frame_rate_hz:.9g} frames a second; got frame_rate_hz="
-            f"{frame_rate_hz!r}. It is for spectra only."
-        )
-    delay = record.delay_frames
-    if None not in (delay_frames, delay) and delay_frames != delay:
-        raise ProblemError(
-            f"the record has a delay of {delay:g} frames; got {delay_frames!r}. Try "
-            "record.with_delay(...)."
-        )
-    record.corrections()  # refuses a closed loop without a delay
-    if start is not None and len(start.axes) != record.axes:
-        raise ProblemError(f"start must have {record.axes} axes; got {len(start.axes)}.")
-
-
-def _usable_stretches(stretches: StretchesLike, record: LoopRecord) -> Stretches:
-    """Return given stretches in order; refuse those with frames that are not usable."""
-    out = checked_stretches(sorted(stretches), record.frames)
-    for a, b in out:
-        if not np.all(record.usable[a:b]):
-            raise ProblemError(f"stretches must lie within the usable frames; got ({a}, {b}).")
-    return out
 
 
 def _pool_gains(
@@ -396,7 +365,7 @@ def find_axis(search: Search, *, start: IdentifiedAxis | None = None) -> Identif
     fit_error = model.gain_error
     error = max(fit_error, *(abs(rival.log_gain - background.log_gain) for rival in rivals))
     if error > fit_error:  # what the gain moves is as ambiguous
-        model = hold_gain(search, model, error)
+        model = hold_gain(search, model, [([0], error)])
     colours = np.tanh([background.colour, *(rival.colour for rival in rivals)])
     note = _gain_note(error, "found in the closed loop's data")
     return describe_axis(search, model, error, note, colour_error=float(np.ptp(colours)))
@@ -417,15 +386,14 @@ def _gain_note(error: float, origin: str) -> str:
 def refit_axis(axis: IdentifiedAxis, search: Search, error: float, note: str) -> IdentifiedAxis:
     """Fit an axis again at the gain of a search, with its error."""
     model = add_evidence(search, find_components(search, axis.fitted_model.spectrum))
-    return describe_axis(search, hold_gain(search, model, error), error, note)
+    return describe_axis(search, hold_gain(search, model, [([0], error)]), error, note)
 
 
 def axis_periodogram(
-    y: FloatArray, c: FloatArray | None, frame_rate_hz: float, stretches: StretchesLike | None
+    y: FloatArray, c: FloatArray | None, frame_rate_hz: float, pieces: Stretches
 ) -> LoopPeriodogram:
     """Return the periodogram of measurements and corrections (frames,) of one axis."""
-    pieces = checked_stretches(stretches, y.size)
-    longest = max(stop - begin for begin, stop in pieces)
+    longest = max((stop - begin for begin, stop in pieces), default=0)
     if longest < 2 * SHORTEST_SEGMENT:
         raise ProblemError(
             f"a stretch of at least {2 * SHORTEST_SEGMENT} frames without a gap is needed; the "

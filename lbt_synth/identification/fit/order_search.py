@@ -67,7 +67,9 @@ def find_models(
     """
     model = find_components(search, start)
     spectrum = model.spectrum
-    plain = spectrum.keep(lambda c: c.is_narrow or c.kind == "slow")
+    turbulence, *others = spectrum.components
+    narrow = (c for c in others if c.is_narrow or c.kind == "slow")
+    plain = replace(spectrum, components=(turbulence, *narrow))
     other = plain.with_background(colour=0.0 if spectrum.background.colour else _COLOUR)
     if start is not None or plain == spectrum:
         rival = fitting.fit(search, spectrum.with_background(colour=other.background.colour))
@@ -82,6 +84,10 @@ def find_models(
                     held = find_components(replace(search, gain=gain), rounds=FEW_ROUNDS)
                     rival = fitting.fit(search, held.spectrum)
                     rivals += [] if rival is None else [rival]
+        for i, component in enumerate(best.spectrum.components):
+            if i and component.damping_ratio > WIDE_DAMPING / 2:  # the gain may be that without it
+                rival = fitting.fit(search, best.spectrum.exchange(i))
+                rivals += [] if rival is None else [rival]
         best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
     near = [
         rival

@@ -22,11 +22,12 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedAxis,
     IdentifiedLine,
     describe_axis,
-    gain_covariance,
+    hold_gain,
     standard_errors,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import (
+    BACKGROUND,
     GAIN,
     Component,
     SpectrumModel,
@@ -45,7 +46,6 @@ from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches
 from lbt_synth.models.resonance_spectrum import PARAMETERS
-from lbt_synth.validation import FloatArray
 
 _MOST_SHARED = 0.9  # of the turbulence, where a fit begins
 
@@ -73,13 +73,9 @@ def couple_axes(
     errors = [(axis.sensor_gain_error or 0.0) / axis.sensor_gain for axis in axes]
     one_gain = axes[0].sensor_gain == axes[1].sensor_gain
     groups = [([0, 1], errors[0])] if one_gain else [([i], errors[i]) for i in range(2)]
-    covariance = gain_covariance(search, model, groups)
-    sizes = [
-        _describe_size(model.spectrum, covariance, j) for j in range(len(model.spectrum.shared))
-    ]
-    coupled = [
-        _describe_axis(search, model, covariance, i, axis, sizes) for i, axis in enumerate(axes)
-    ]
+    model = hold_gain(search, model, groups)
+    sizes = [_describe_size(model, k) for k in model.spectrum.shared]
+    coupled = [_describe_axis(search, model, i, axis, sizes) for i, axis in enumerate(axes)]
     lines = []
     for size in sizes:
         shares = [p for axis in coupled for p in axis.parts if p.direction == size["direction"]]
@@ -239,35 +235,29 @@ def _share(search: Search, spectrum: SpectrumModel, pair: Pair) -> Component | N
     return shared if lost < HOPE * evidence else None
 
 
-def _axis_map(spectrum: SpectrumModel, i: int) -> FloatArray:
-    """Return the derivatives of the parameters (a,) of what axis i shows by all, (a, p).
-
-    They are linear.
-    """
-    theta, shown = spectrum.pack(), spectrum.on(i).pack()
-    rows = [spectrum.unpack(theta + step).on(i).pack() - shown for step in np.eye(theta.size)]
-    return np.transpose(rows)
-
-
 def _describe_axis(
     search: Search,
     model: FittedModel,
-    covariance: FloatArray,
     i: int,
     alone: IdentifiedAxis,
     sizes: Sequence[dict[str, Any]],
 ) -> IdentifiedAxis:
     """Return axis i of a joint fit in the units of the phase."""
-    spectrum, rows = model.spectrum.on(i), _axis_map(model.spectrum, i)
-    order = [k for k, c in enumerate(model.spectrum.components) if c.axis == i][1:]
-    order += model.spectrum.shared
-    data = search.merge(model.spectrum)
-    joint = contrast(data, model.spectrum)
-    evidence = [contrast(data, model.spectrum.exchange(k)) - joint for k in order]
+    spectrum, data = model.spectrum, search.merge(model.spectrum)
+    theta, seen = spectrum.pack(), spectrum.on(i)
+    # the derivatives of the parameters of what the axis shows by all, which are constant
+    moved = [spectrum.unpack(theta + step).on(i).pack() for step in np.eye(theta.size)]
+    rows = np.transpose(moved - seen.pack())
+    order = [k for k, c in enumerate(spectrum.components) if c.axis == i][1:]
+    order += spectrum.shared
+    joint = contrast(data, spectrum)
+    evidence = [contrast(data, spectrum.exchange(k)) - joint for k in order]
     shown = FittedModel(
-        spectrum=spectrum,
-        contrast=contrast(alone.data, spectrum),
-        information=invert_information(rows @ covariance @ rows.T),  # the other axis left open
+        spectrum=seen,
+        contrast=contrast(alone.data, seen),
+        information=invert_information(
+            rows @ model.covariance @ rows.T
+        ),  # the other axis left open
         evidence=(float("inf"), *evidence),
     )
     error = alone.sensor_gain_error
@@ -280,22 +270,22 @@ def _describe_axis(
     )
 
 
-def _describe_size(spectrum: SpectrumModel, covariance: FloatArray, j: int) -> dict[str, Any]:
-    """Return the size and the direction of the shared resonance j, with their errors."""
-    component, sizes, rows = spectrum.components[spectrum.shared[j]], [], []
-    for i in range(2):
-        shown, derivatives = spectrum.on(i), _axis_map(spectrum, i)
-        place = len(shown.components) - len(spectrum.shared) + j
-        sizes.append(np.exp(shown.components[place].log_power / 2) / shown.background.gain)
-        rows.append(derivatives[shown.place(place) + PARAMETERS - 1] / 2 - derivatives[GAIN])
+def _describe_size(model: FittedModel, k: int) -> dict[str, Any]:
+    """Return the size and the direction of the shared resonance k, with their errors."""
+    spectrum, c = model.spectrum, model.spectrum.components[k]
+    sizes = np.exp(0.5 * (c.log_power + np.array([0.0, c.log_ratio]))) / spectrum.gains
+    rows = np.zeros((2, len(model.information)))  # of the logarithms of both sizes
+    power = spectrum.place(k) + PARAMETERS - 1
+    rows[:, power], rows[1, power + 1] = 0.5, 0.5
+    rows[[0, 1], [GAIN, BACKGROUND + GAIN]] = -1.0
     rms = float(np.hypot(*sizes))
-    along = np.array([1.0, component.sign]) * sizes / rms
-    logs = np.array(rows) @ covariance @ np.transpose(rows)  # of the logarithms of both rms
+    along = np.array([1.0, c.sign]) * sizes / rms
+    logs = rows @ model.covariance @ rows.T
     square, turn = along**2, along[0] * along[1] * np.array([-1.0, 1.0])
     error = float(np.degrees(np.sqrt(max(turn @ logs @ turn, 0.0))))
     return {
         "rms_nm": rms,
         "rms_error_nm": rms * float(np.sqrt(square @ logs @ square)),
         "direction": (float(along[0]), float(along[1])),
-        "direction_error_deg": error if component.kind == "line" else None,
+        "direction_error_deg": error if c.kind == "line" else None,
     }

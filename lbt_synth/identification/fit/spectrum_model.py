@@ -12,7 +12,6 @@ their amplitudes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -201,11 +200,6 @@ class SpectrumModel:
     def alone(self, *wanted: Component) -> SpectrumModel:
         """Return components of one axis without the others and without noise."""
         return replace(self.with_background(log_noise=_NOTHING, colour=0.0), components=wanted)
-
-    def keep(self, wanted: Callable[[Component], bool]) -> SpectrumModel:
-        """Return the model with the turbulence and those of the other components."""
-        first, *others = self.components
-        return replace(self, components=(first, *filter(wanted, others)))
 
     def add(self, *new: Component) -> SpectrumModel:
         """Return the model with more components."""

@@ -37,7 +37,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 from scipy.linalg.lapack import dposv
@@ -174,26 +173,15 @@ def _log_fall(
     return fall if order == 1 else fall + data.log_frame_mean, slope
 
 
-@lru_cache(maxsize=64)
-def component_density(
-    data: LoopPeriodogram, component: Component, roll_off: tuple[float, float] | None = None
-) -> FloatArray:
-    """Return the density of a component, behind a roll-off of a corner and an order, (f,)."""
-    s, c = data.half_angle_square, component
-    density = unit_density(c.frequency, c.damping_ratio, s, c.sections)
-    if roll_off is not None:
-        density *= np.exp(_log_fall(data, *roll_off)[0])
-    _smear(data, [c], density[None])
-    return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * density)
-
-
 def part_density(data: LoopPeriodogram, spectrum: SpectrumModel, i: int) -> FloatArray:
     """Return the density of component i of a spectrum along its direction, (f,)."""
-    component = spectrum.components[i]
-    if component.kind != "turbulence":
-        return component_density(data, component)
-    log_corner = spectrum.axes[component.axis or 0].log_corner
-    return component_density(data, component, (log_corner, spectrum.roll_off_order))
+    c = spectrum.components[i]
+    density = unit_density(c.frequency, c.damping_ratio, data.half_angle_square, c.sections)
+    if c.kind == "turbulence":
+        log_corner = spectrum.axes[c.axis or 0].log_corner
+        density *= np.exp(_log_fall(data, log_corner, spectrum.roll_off_order)[0])
+    _smear(data, [c], density[None])
+    return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * density)
 
 
 def density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:

@@ -52,17 +52,14 @@ WITHOUT = ", wavefront alone"  # of the fall-back of a design that reads acceler
 class PredictionRow:
     """One controller on frames that nothing was fitted to, beside what the model promises."""
 
-    name: str = column("controller", help="What it is")
-    replayed_nm: float = nm_column(
-        "data", format=".2f", key="data_nm", help="Residual on the data, all axes"
-    )
-    replayed_error_nm: float = nm_column(
-        "+-", format=".2f", key="data_error_nm", help="Its standard error"
-    )
-    model_nm: float = nm_column("model", format=".2f", help="Residual that the model promises")
-    ratio: float = column("data/model", format=".3f", help="Residual on the data over that")
-    strehl: float = column("Strehl, data", format=".3f", help="Strehl ratio on the data")
-    model_strehl: float = column("Strehl, model", format=".3f", help="Strehl ratio by the model")
+    name: str = column("controller")
+    # residual over all axes on the data, its standard error, and what the model promises
+    replayed_nm: float = nm_column("data", format=".2f", key="data_nm")
+    replayed_error_nm: float = nm_column("+-", format=".2f", key="data_error_nm")
+    model_nm: float = nm_column("model", format=".2f")
+    ratio: float = column("data/model", format=".3f")
+    strehl: float = column("Strehl, data", format=".3f")
+    model_strehl: float = column("Strehl, model", format=".3f")
     replayed: ResidualEstimate | None  # on the test data; None for the limit, no controller
     model_axis_nm: FloatArray | None  # (n,): promised for each axis; None if unknown
 
@@ -187,7 +184,7 @@ def prediction_against_data(
             f"no controller may be called {RAN}, {INTEGRATOR} or {LIMIT}, as other rows are; got "
             f"{', '.join(controllers)}. Give other names."
         )
-    fit, later = split_halves(runs)
+    fit, later = (frames.stretches() for frames in split_halves(record))
     test = settled_test(runs, later, hardware)
     noise = mode_noise(hardware, plant.R, noise_error_nm)
     designs = {INTEGRATOR: model_integrator(plant), **controllers}
@@ -239,7 +236,6 @@ def design_inputs(
     record: LoopRecord,
     model: IdentifiedModel,
     *,
-    stretches: Stretches | None = None,
     channels: Channels | None = None,
     noise: float = 1.0,
     penalty: float | None = None,
@@ -248,7 +244,7 @@ def design_inputs(
     """Return what a method makes a design of: a model with more noise, its record and channels."""
 
     def predict() -> Design:
-        past = regress(record, model, stretches=stretches, channels=channels, noise=noise)
+        past = regress(record, model, channels=channels, noise=noise)
         return past.design(penalty)
 
     plant = noisier(model, noise).plant()
@@ -271,8 +267,7 @@ def compare_designs(
     ``inputs`` those of :func:`design_inputs`. The designs with a row are returned by their titles;
     the others have a note. One that reads channels has a row for its fall-back, too.
     """
-    first, _ = split_halves(record.stretches())
-    made_of = design_inputs(record, half, stretches=first, **inputs)
+    made_of = design_inputs(split_halves(record)[0], half, **inputs)
     designs, notes = dict[str, Design](), list[str]()
     controllers = dict[str, Controller | Design](others or {})
     for method, options in methods.items():

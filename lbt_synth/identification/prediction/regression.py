@@ -155,17 +155,30 @@ class Regression:
                 weights[np.ix_(rows, rows)] += (_OFFSET * scale[place]) ** 2
         return weights
 
-    def solve(self, signals: Sequence[int], penalty: float, moments: Moments) -> FloatArray:
-        """Return the coefficients of some signals, (taps m, n), for moments of these."""
-        weights = penalty * moments.frames * self._weights(signals)
+    def _factor(self, weights: FloatArray, moments: Moments) -> tuple[FloatArray, bool]:
+        """Return the factor of the squares of signals with a penalty, for :func:`cho_solve`."""
         try:
-            factor = cho_factor(moments.squares + weights)
+            return cho_factor(moments.squares + weights)
         except np.linalg.LinAlgError:
             raise NumericalError(
                 "the past readings of a record depend on each other; expected some noise in them.",
                 status="regression",
             ) from None
-        return np.asarray(cho_solve(factor, moments.products))
+
+    def solve(self, signals: Sequence[int], penalty: float, moments: Moments) -> FloatArray:
+        """Return the coefficients of some signals, (taps m, n), for moments of these."""
+        weights = penalty * moments.frames * self._weights(signals)
+        return np.asarray(cho_solve(self._factor(weights, moments), moments.products))
+
+    def fit_share(self, penalty: float) -> float:
+        """Return by which share of what it leaves the filter of all signals is worse unseen.
+
+        Its effective number of coefficients over the frames: what their errors add (H. Akaike, Ann.
+        Inst. Statist. Math. 21, 243 (1969), doi:10.1007/BF02532251).
+        """
+        weights = penalty * self.whole.frames * self._weights(range(len(self.scales)))
+        inverse = cho_solve(self._factor(weights, self.whole), np.eye(len(weights)))
+        return float(len(weights) - np.sum(inverse * weights)) / self.whole.frames
 
     @cached_property
     def whole(self) -> Moments:
@@ -207,6 +220,7 @@ class Regression:
             self.readings,
             left[0],
             what=f"penalty {penalty:.0e}",
+            fit_share=self.fit_share(penalty),
         )
 
 
@@ -214,37 +228,18 @@ def regress(
     record: LoopRecord,
     model: IdentifiedModel,
     *,
-    stretches: Stretches | None = None,
     channels: Channels | None = None,
     noise: float = 1.0,
 ) -> Regression:
-    """Collect what a record tells of its future, beside its model.
+    """Collect what a record tells of its future, beside its model, of which the base is the filter.
 
     More noise than the model's is added as that of a run without any disturbance, of which nothing
     is to be corrected.
-
-    Parameters
-    ----------
-    record : LoopRecord
-        The record, which the model was identified in.
-    model : IdentifiedModel
-        The model, of which the base is the Kalman filter.
-    stretches : sequence of (start, stop), optional
-        Frames to use; by default all usable ones.
-    channels : Channels, optional
-        Accelerometers beside the record.
-    noise : float, optional
-        Multiple of the model's noise that is assumed, at least 1.
-
-    Raises
-    ------
-    ProblemError
-        If the stretches are too short, or the loop has no command for some mode.
     """
     path = model.hardware
     if len(path.influence) != path.n_commands:
         raise ProblemError("a predictor needs a command for every mode; got fewer.")
-    runs = record.stretches() if stretches is None else stretches
+    runs = record.stretches()
     base = kalman(noisier(model, noise).plant()).controller
     series = record.pseudo_open_loop(model.sensor_gains)
     steering = close_loop(path, base).path("phase", "command")
@@ -300,11 +295,11 @@ def regress(
 
 @table_row
 class ChannelValue:
-    """What one channel of accelerometers is worth to a predictor, on unseen frames."""
+    """What a predictor leaves of unseen frames without a channel, and if it reads zeros."""
 
-    channel: str = column("channel", help="Name of the channel")
-    without_nm: float = nm_column("without it", unit="nm rms", help="Residual of all other sensors")
-    dead_nm: float = nm_column("zeros, unseen", unit="nm rms", help="Residual if it reads zeros")
+    channel: str = column("channel")
+    without_nm: float = nm_column("without it", unit="nm rms")
+    dead_nm: float = nm_column("zeros, unseen", unit="nm rms")
 
 
 def channel_values(
@@ -314,10 +309,7 @@ def channel_values(
 
     The noise of the measurements is subtracted; nan where it hides the residual.
     """
-    past, unseen = (
-        regress(record, half, stretches=frames, channels=channels)
-        for frames in split_halves(record.stretches())
-    )
+    past, unseen = (regress(frames, half, channels=channels) for frames in split_halves(record))
     noise_nm2 = sum((axis.noise_nm / axis.sensor_gain) ** 2 for axis in half.axes)
     everything = list(range(len(past.scales)))
     coefficients = past.solve(everything, past.penalty, past.whole)

@@ -201,11 +201,7 @@ def _add_comment(out: Contents, comment: str) -> None:
 def choose_columns(
     contents: Contents, *, axes: Sequence[int] | None, columns: Mapping[str, Any] | None
 ) -> Roles:
-    """Return the columns of a record by their roles, as they are chosen or named, and note them.
-
-    Those of a role with axes are in the order of the axes, of another role there is one; the first
-    role is that of the measurements or densities.
-    """
+    """Return the columns of a record by their roles in the order of axes, its series first."""
     chosen = {} if columns is None else columns
     if not isinstance(chosen, Mapping):
         raise ProblemError(

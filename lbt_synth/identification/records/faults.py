@@ -7,8 +7,6 @@ a clean record, with or without strong narrow lines, quantised or not, shows non
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 from scipy.special import ndtri
@@ -66,11 +64,8 @@ def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
 
 
 def find_saturated(series: FloatArray, good: BoolArray) -> BoolArray:
-    """Find frames at an end of the range that is reached far more often than values beside it.
-
-    The end of a sinusoid's range is reached often, too, but not by a factor of 4 more often
-    than the next values; an end that is cut off is. Zeros are those of an open loop.
-    """
+    """Find frames at an end of the range that is reached far more often than values beside it."""
+    # zeros are those of an open loop
     good, out = good & (series != 0), np.zeros(len(series), dtype=np.bool_)
     values = series[good]
     span = float(np.ptp(values)) if values.size else 0.0
@@ -165,28 +160,21 @@ class Finding:
     count: int = column("frames", help="How many")
     fraction: float = percent_column("share", format=".4g", help="Their part of all frames")
     first_frame: int = column("first frame", help="The first of them")
-    spoils: bool = column("spoilt", help="Whether they are not usable, or only reported")
 
 
 def findings_in(
-    found: BoolArray, kind: str, series: str, axis: int | None = None, *, spoils: bool = True
+    faulty: BoolArray, kind: str, series: str, axis: int | None = None
 ) -> tuple[Finding, ...]:
     """Return the finding of a fault in some frames, (frames,); none where there are none."""
-    where = np.flatnonzero(found)
-    if not where.size:
-        return ()
-    only = Finding(
-        kind=kind,
-        series=series,
-        axis=axis,
-        count=where.size,
-        first_frame=int(where[0]),
-        fraction=where.size / len(found),
-        spoils=spoils,
+    where = np.flatnonzero(faulty)
+    return tuple(
+        Finding(
+            kind=kind,
+            series=series,
+            axis=axis,
+            count=where.size,
+            first_frame=first,
+            fraction=where.size / len(faulty),
+        )
+        for first in where[:1].tolist()
     )
-    return (only,)
-
-
-def merge_notes(*parts: Sequence[str]) -> tuple[str, ...]:
-    """Return the notes of all parts in their order, each once."""
-    return tuple(dict.fromkeys(note for part in parts for note in part))

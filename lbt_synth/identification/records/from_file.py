@@ -39,7 +39,6 @@ from lbt_synth.identification.records.contents import (
     number_axes,
     read_contents,
 )
-from lbt_synth.identification.records.faults import merge_notes
 from lbt_synth.identification.records.from_series import loop_record
 from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.models import PositionLoop
@@ -82,10 +81,10 @@ def load_record(
     source : path-like or Telemetry
         Telemetry, or a file that ends in .fits, .fit, .fts, .npy, .npz, .csv, .tsv, .txt or .dat.
     frame_rate_hz, unit, command_unit : optional
-        As for :func:`loop_record`, where the source does not tell them; a contradiction is refused.
-        The unit of a spectrum is nm^2/Hz or nm/sqrt(Hz) and so on.
+        As for :func:`loop_record`, where the source does not tell them; another unit is refused.
+        That of a spectrum is nm^2/Hz or nm/sqrt(Hz) and so on.
     delay_frames, diameter_m, obstruction, mirror : optional
-        As for :func:`loop_record`; the delay also in place of that of the source.
+        As for :func:`loop_record`, in place of those of the source as the frame rate is.
     averages : int, optional
         Periodograms that were averaged in a spectrum.
     axes : sequence of int, optional
@@ -121,6 +120,7 @@ def load_record(
     (1000.0, [False, True, False], [29.89])
     """
     telemetry = source if isinstance(source, Telemetry) else None
+    name = str(source if telemetry is None else telemetry.metadata.get("name", "telemetry"))
     stated: dict[str, Any] = {
         "frame_rate_hz": frame_rate_hz,
         "delay_frames": delay_frames,
@@ -129,9 +129,9 @@ def load_record(
         "diameter_m": diameter_m,
         "obstruction": obstruction,
         "averages": averages,
-        "source": str(source if telemetry is None else telemetry.metadata.get("name", "telemetry")),
+        "source": name,
     }
-    with name_in_errors(path := Path(stated["source"])):
+    with name_in_errors(path := Path(name)):
         if telemetry is None and is_telemetry(path):
             telemetry = load_telemetry(path)
         if telemetry is not None:
@@ -154,17 +154,14 @@ def is_telemetry(path: str | os.PathLike[str]) -> bool:
     """Whether a file is telemetry of this package or of the AOT standard."""
     path = Path(path)
     try:
-        if path.suffix.lower() in FITS:
-            with open_input(path, TelemetryError) as stream:
-                header = io.BytesIO(stream.read(LARGEST_TEXT_BYTES))
-            return bool(read_cards(header, _TELEMETRY_CARDS))
-        if path.suffix.lower() != ".npz":
-            return False
         with open_input(path, TelemetryError) as stream:
-            names = ZipFile(stream).namelist()
+            if path.suffix.lower() in FITS:
+                header = io.BytesIO(stream.read(LARGEST_TEXT_BYTES))
+                return bool(read_cards(header, _TELEMETRY_CARDS))
+            names = ZipFile(stream).namelist() if path.suffix.lower() == ".npz" else []
+            return {Path(name).stem for name in names} >= _TELEMETRY_ARRAYS
     except Exception:  # zipfile raises many kinds; read_contents reports the error
         return False
-    return {Path(name).stem for name in names} >= _TELEMETRY_ARRAYS
 
 
 def _telemetry_record(
@@ -185,14 +182,19 @@ def _telemetry_record(
     chosen = choose_axes(axes, n, "modes")
     facts = {name: value for name in _FACTS if (value := getattr(telemetry, name)) is not None}
     contents = Contents(facts={name: {"the telemetry": value} for name, value in facts.items()})
-    matrix, unit = _inverse_response(telemetry), telemetry.measurement_unit
-    words, series = "measurements: the inverse of the interaction matrix", telemetry.measurements
-    roles = {"measurements": _modal_columns(telemetry, series, matrix, unit, words, contents.notes)}
-    if telemetry.commands is not None:
-        matrix, unit = _influence(telemetry), telemetry.command_unit
-        words, series = "commands: the influence matrix", telemetry.commands
-        roles["commands"] = _modal_columns(telemetry, series, matrix, unit, words, contents.notes)
-    roles = {role: [columns[axis] for axis in chosen] for role, columns in roles.items()}
+    roles: Roles = {}
+    for role, (find, word) in _MATRICES.items():
+        recorded_unit = getattr(telemetry, f"{role.removesuffix('s')}_unit")
+        if (series := getattr(telemetry, role)) is None:
+            continue
+        unit, said = recorded_unit if parse_unit(recorded_unit) else None, f"in {recorded_unit!r}"
+        if (matrix := find(telemetry)) is not None:
+            series, said = series @ matrix.T, f"behind {word}"
+            # the modes of our own telemetry are in nm
+            unit = "nm" if unit or _FOREIGN not in telemetry.metadata else None
+            contents.notes.append(f"{role}: {word} times what was recorded")
+        columns = [Column(name=f"mode {k} {said}", values=series[:, k], unit=unit) for k in chosen]
+        roles[role] = columns
     if telemetry.times_s is not None:
         roles["times"] = [Column(name="times_s", values=telemetry.times_s, unit="s")]
     if max(n, telemetry.measurements.shape[1], telemetry.n_commands) > len(chosen):
@@ -230,27 +232,6 @@ def telemetry_of_record(record: LoopRecord) -> Telemetry:
     )
 
 
-def _modal_columns(
-    seen: Telemetry,
-    series: FloatArray,
-    matrix: FloatArray | None,
-    recorded_unit: str,
-    words: str,
-    notes: list[str],
-) -> list[Column]:
-    """Return the columns of all modes: a series, or a matrix times it, where there is one."""
-    unit, said = recorded_unit if parse_unit(recorded_unit) else None, f"in {recorded_unit!r}"
-    if matrix is not None:
-        series, said = series @ matrix.T, f"behind {words.partition(': ')[2]}"
-        # the modes of our own telemetry are in nm
-        unit = "nm" if unit or _FOREIGN not in seen.metadata else None
-        notes.append(f"{words} times what was recorded")
-    return [
-        Column(name=f"mode {k} {said}", values=column, unit=unit)
-        for k, column in enumerate(series.T)
-    ]
-
-
 def _inverse_response(seen: Telemetry) -> FloatArray | None:
     """Return the matrix from measurements to modes, None for the identity."""
     n, q, response = seen.modes, seen.measurements.shape[1], seen.interaction_matrix
@@ -272,12 +253,9 @@ def _inverse_response(seen: Telemetry) -> FloatArray | None:
 
 def _is_gains(response: FloatArray, seen: Telemetry) -> bool:
     """Whether a response is a gain for each mode; units of other programs are in their matrix."""
-    if response.shape != (seen.modes, seen.modes):
-        return False
-    gains = np.diag(response)
-    one = np.array_equal(response, np.eye(seen.modes))
-    plain = np.array_equal(response, np.diag(gains)) and bool(np.all(gains > 0))
-    return one or (plain and _FOREIGN not in seen.metadata)
+    gains = np.diag(response) if _FOREIGN not in seen.metadata else np.ones(seen.modes)
+    is_square = response.shape == (seen.modes, seen.modes)
+    return is_square and np.array_equal(response, np.diag(gains)) and bool(np.all(gains > 0))
 
 
 def _influence(seen: Telemetry) -> FloatArray | None:
@@ -289,8 +267,13 @@ def _influence(seen: Telemetry) -> FloatArray | None:
             "commands).",
             in_python="Give it to Telemetry(influence_matrix=...).",
         )
-    is_identity = influence is None or np.array_equal(influence, np.eye(n))
-    return None if is_identity else influence
+    return None if influence is None or np.array_equal(influence, np.eye(n)) else influence
+
+
+_MATRICES = {  # from what was recorded to modes
+    "measurements": (_inverse_response, "the inverse of the interaction matrix"),
+    "commands": (_influence, "the influence matrix"),
+}
 
 
 def _join_commands(contents: Contents, path: Path) -> None:
@@ -321,11 +304,7 @@ def _join_commands(contents: Contents, path: Path) -> None:
 def _lay_beside(
     contents: Contents, other: Contents, commands: list[Column], path: Path
 ) -> list[Column]:
-    """Return the commands in the rows of the measurements, NaN where there are none.
-
-    Rows are matched by the counters of both files, else by their times. Without these both files
-    must have equally many rows.
-    """
+    """Return the commands in the rows of the measurements, by counters, times or row by row."""
     for role in CLOCKS:
         clocks = [c for file in (contents, other) for c in file.columns if c.role == role]
         if len(clocks) != 2:
@@ -420,27 +399,20 @@ def _require_facts(
         raise ProblemError(f"nothing tells {'; '.join(missing)}.", **volts)
 
 
-def _find_fact(contents: Contents, name: str, given: Any) -> Any:
-    """Return what was given, or what the source has; refuse two values of a source."""
+def _find_fact(contents: Contents, name: str, stated: Any) -> Any:
+    """Return what the call states, else what the source has; refuse two values of a source."""
     places = contents.facts.get(name, {})
     values = {where: number(value, f"{where} ({name})") for where, value in places.items()}
-    if given is None:
-        if len(set(values.values())) > 1:
-            listing = ", ".join(f"{value:.9g} by {where}" for where, value in values.items())
-            raise ProblemError(f"the file gives {name} twice: {listing}. Choose one in the call.")
-        for where, value in values.items():
-            contents.notes.append(f"{name} {value:.9g}, by {where}")
-            return int(value) if name == "averages" else value
-        return None
-    wanted = number(given, name)
-    for where, value in values.items():
-        if abs(value - wanted) > 1e-6 * wanted:
-            if name == "frame_rate_hz":
-                raise ProblemError(
-                    f"{name} must be that of {where}, {value:.9g}; got {wanted:.9g}."
-                )
-            contents.notes.append(f"{name} {wanted:.9g} was given; {where} has {value:.9g}")
-    return given
+    listing = ", ".join(f"{value:.9g} by {where}" for where, value in values.items())
+    if stated is None and len(set(values.values())) > 1:
+        raise ProblemError(f"the file gives {name} twice: {listing}. Choose one in the call.")
+    if stated is None and values:
+        stated = next(iter(values.values()))
+        contents.notes.append(f"{name} {listing}")
+        return int(stated) if name == "averages" else stated
+    if values and not np.allclose([*values.values()], number(stated, name), rtol=1e-6, atol=0):
+        contents.notes.append(f"{name} {stated:.9g} was given, in place of {listing}")
+    return stated
 
 
 def _find_unit(
@@ -491,16 +463,14 @@ def _build_spectrum(
     if not complete.all():
         contents.notes.append(f"{int(np.sum(~complete))} rows with gaps were left out")
     table = table[complete]
-    scaled = factor * table[:, 1:]
+    density = factor * table[:, 1:]
     if power == 1:
-        if np.any(scaled < 0):
-            raise ProblemError("an amplitude density must be at least 0; got a negative one.")
         contents.notes.append("amplitude densities were squared")
-        scaled = scaled**2
+        density = density * np.abs(density)  # a negative one stays negative, and is refused
     return SpectrumRecord(
         frequency_hz=clock_factor(frequency.unit, "Hz") * table[:, 0],
-        density_nm2_hz=scaled,
-        notes=merge_notes(contents.notes),
+        density_nm2_hz=density,
+        notes=tuple(dict.fromkeys(contents.notes)),
         source=source,
         **facts,
     )

@@ -13,14 +13,13 @@ from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
 from lbt_synth.identification.records import faults
 from lbt_synth.identification.records.clock import build_clock
 from lbt_synth.identification.records.columns import nm_unit
-from lbt_synth.identification.records.faults import Finding, findings_in, merge_notes
+from lbt_synth.identification.records.faults import Finding, findings_in
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array
 
 _LARGEST_NM = 1e30  # a larger number is a filler
-_OPEN_FRAMES = 20  # of zero or equal commands
 TREND = 2.0  # ratio of scatters
 
 # what spoils a measurement; a command is spoilt by the first alone
@@ -93,8 +92,8 @@ def loop_record(
     -----
     A frame is spoilt where a measurement is missing, not finite, held, at an end of the range that
     is reached repeatedly, or outlying. A command that is missing, not finite or at a limit spoils
-    the frames whose correction it is part of. Commands that are zero or held, and a scatter that
-    changes, are reported only. The page on records has the thresholds.
+    the frames whose correction it is part of. A note says where the scatter changes. The page on
+    records has the thresholds.
 
     Examples
     --------
@@ -126,7 +125,6 @@ def loop_record(
     commanded = np.ones(frames, dtype=np.bool_)
     if u is not None:
         u, commanded = _judge_series(rows[:, axes:], there, "commands", findings)
-        findings += _held_commands(u, commanded)
     said += _note_trends(y, measured)
     return LoopRecord(
         frame_rate_hz=clock.frame_rate_hz,
@@ -137,7 +135,7 @@ def loop_record(
         measured=measured,
         commanded=commanded,
         faults=tuple(findings),
-        notes=merge_notes(said),
+        notes=tuple(dict.fromkeys(said)),
         diameter_m=diameter_m,
         obstruction=obstruction,
         source=source,
@@ -195,20 +193,6 @@ def _judge_series(
     return out, all_good
 
 
-def _held_commands(commands: FloatArray, good: BoolArray) -> Iterator[Finding]:
-    """Yield where the loop was open, and where its commands stood still."""
-    frames, is_zero = len(commands), np.all(commands == 0, axis=1)
-    is_open = faults.mark(_longest(faults.runs(is_zero & good)), frames)
-    yield from findings_in(is_open, "loop open", "commands", spoils=False)
-    for axis, column in enumerate(commands.T):
-        held = faults.mark(_longest(faults.equal_runs(column, good)), frames) & ~is_open
-        yield from findings_in(held, "held", "commands", axis, spoils=False)
-
-
-def _longest(stretches: IntArray) -> IntArray:
-    return stretches[stretches[:, 1] - stretches[:, 0] >= _OPEN_FRAMES]
-
-
 def _note_trends(series: FloatArray, good: BoolArray) -> Iterator[str]:
     """Note where the scatter from frame to frame changes between the ends of the record."""
     for axis, column in enumerate(series.T):
@@ -221,10 +205,7 @@ def _note_trends(series: FloatArray, good: BoolArray) -> Iterator[str]:
 
 
 def end_scatters(series: FloatArray, good: BoolArray) -> tuple[float, float]:
-    """Return the rms difference of two good frames in the first quarter, and in the last.
-
-    nan where these are few.
-    """
+    """Return the rms difference of two good frames in the first and last quarter, nan of few."""
     steps = np.diff(series)[good[1:] & good[:-1]]
     quarter = steps.size // 4
     if quarter < SHORTEST_SEGMENT:

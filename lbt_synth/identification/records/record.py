@@ -52,39 +52,25 @@ class LoopRecord:
 
         y(k) = gain (phi_tot(k-1) - c(k)) + w(k),   c(k) = taps[0] u(k-1) + taps[1] u(k-2) + ...
 
-    :func:`loop_record` and :func:`load_record` make records and find their faults; this class takes
-    its arguments unchanged. A frame is usable if its measurement is good, and every command in its
-    correction.
+    :func:`loop_record` and :func:`load_record` make records, find their faults and describe the
+    facts that are fields here. A frame is usable if its measurement is good, and every command in
+    its correction, or if it is a bridge.
 
-    Parameters
+    Attributes
     ----------
-    frame_rate_hz : float
-        Frame rate [Hz].
-    measurements : (frames, axes) array_like
-        Measurements y(k) [nm]; the pseudo-open-loop series itself, where there are no commands.
-    commands : (frames, axes) array_like, optional
-        Commands u(k) [nm]; None for an open loop.
-    delay_frames : float, optional
-        Total delay [frames].
-    mirror : PositionLoop, optional
-        Dynamics of the mirror; one that settles at once by default.
-    measured, commanded : (frames,) bool array_like
-        Frames whose measurement, and whose command, is good: the others hold finite fillers.
-    faults : tuple of Finding, optional
-        What was found in the series.
-    notes : tuple of str, optional
-        How they were read, and what changes with time.
-    diameter_m, obstruction, imaging_wavelength_um : float, optional
-        Telescope diameter [m], its central obstruction as a fraction of it, and the wavelength of
-        the image [um].
-    source : str, optional
-        Where it is from.
-    bridges : (frames,) bool array_like, optional
-        Frames whose pseudo-open loop was interpolated, which are usable.
-    stated_gain : tuple of float, optional
-        Sensor gain of all axes, or of each, as somebody knows it.
-    read_with : str, optional
-        Options by which its commands were made those that the mirror followed.
+    measurements, commands : (frames, axes) arrays, the second or None
+        Measurements y(k) and commands u(k) [nm]; the pseudo-open-loop series itself, without
+        commands.
+    measured, commanded, bridges, usable : (frames,) bool arrays
+        Frames whose measurement is good, whose command is, whose pseudo-open loop was interpolated,
+        and that count. The others hold finite fillers.
+    faults, notes : tuple of Finding, tuple of str
+        What was found in the series; how they were read, and what changes with time.
+    imaging_wavelength_um : float or None
+        Wavelength of the image [um].
+    stated_gain, read_with : tuple of float, str
+        Sensor gain of all axes, or of each, as somebody knows it; options by which the commands
+        were made those that the mirror followed.
 
     Raises
     ------
@@ -181,7 +167,7 @@ class LoopRecord:
     def summary(self) -> str:
         """Return one line: how many frames are usable, and why the others are not."""
         usable = f"{int(np.sum(self.usable))} of {self.frames} frames are usable"
-        spoilt = [f"{f.count} {f.kind} ({f.series})" for f in self.findings if f.spoils]
+        spoilt = [f"{f.count} {f.kind} ({f.series})" for f in self.findings]
         return f"{'; '.join(filter(None, (usable, ', '.join(spoilt))))}."
 
     @property
@@ -257,13 +243,9 @@ class LoopRecord:
         """Return (start, stop) of each stretch of contiguous usable frames."""
         return tuple((int(start), int(stop)) for start, stop in runs(self.usable))
 
-    def with_delay(self, delay_frames: float, *, mirror: PositionLoop | None = None) -> LoopRecord:
-        """Return the same record of a loop with another total delay [frames], at least 1.
-
-        The mirror is that of the record by default. Bridged frames are not usable any more.
-        """
-        mirror = self.mirror if mirror is None else mirror
-        return replace(self, delay_frames=delay_frames, mirror=mirror, bridges=None)
+    def with_delay(self, delay_frames: float | None) -> LoopRecord:
+        """Return the same record of a loop with another total delay [frames], without bridges."""
+        return replace(self, delay_frames=delay_frames, bridges=None)
 
     def bridged(self, *, sensor_gain: ArrayLike = 1.0) -> LoopRecord:
         """Return the record with short holes interpolated, and a note.
@@ -294,10 +276,7 @@ class LoopRecord:
 def require_length(
     record: LoopRecord, *, frames: int = _LEAST_FRAMES, seconds: float = LEAST_SECONDS
 ) -> int:
-    """Return the usable frames in stretches of at least 256; refuse a record with too few.
-
-    Frames at the start of a record, whose commands came before it, count.
-    """
+    """Return the usable frames in stretches of at least 256; refuse a record with too few."""
     rate = record.frame_rate_hz
     needed = integer(frames, "frames", at_least=1)
     needed = max(needed, int(np.ceil(rate * number(seconds, "seconds", at_least=0) * (1 - 1e-12))))
@@ -383,11 +362,3 @@ class SpectrumRecord:
         """Root of the integral over the frequencies of the record, (axes,) [nm]."""
         middles = (self.density_nm2_hz[1:] + self.density_nm2_hz[:-1]) / 2
         return frozen_copy(np.sqrt(np.diff(self.frequency_hz) @ middles))
-
-    @property
-    def spectra(self) -> tuple[TabulatedSpectrum, ...]:
-        """The spectra as disturbances of a :class:`Truth`, one per axis."""
-        return tuple(
-            TabulatedSpectrum(frequency_hz=self.frequency_hz, density_nm2_hz=column)
-            for column in self.density_nm2_hz.T
-        )

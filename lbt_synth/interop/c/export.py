@@ -31,7 +31,7 @@ from lbt_synth.storage.rows import column, table_row
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, choice
 
-MOST_TERMS = 100_000  # 10 MB of source
+MOST_TERMS = 100_000  # that are written out: 10 MB of source
 MOST_GAINS = 1_000_000  # in the table: 8 MB of memory, 25 MB of source
 _IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 _SOURCE = re.compile(r"[A-Za-z0-9._+-]*\.c")
@@ -41,31 +41,23 @@ _WIDTH = 96
 
 @table_row
 class FrameCost:
-    """Arithmetic and memory of one frame of a controller, as exported to C."""
+    """Arithmetic of one frame of a controller, as exported to C."""
 
     multiplications: int = column(
         "multiplications per frame",
         help="Of the exported source; factors of 1 and -1 are no multiplications",
     )
     additions: int = column("additions per frame", help="Of the exported source")
-    coefficients: int = column("coefficients", help="Numbers that the exported source stores")
-    states: int = column(
-        "numbers kept between frames", help="Numbers that it keeps: states and last commands"
-    )
 
 
 def frame_cost(design: Design | Controller | SourceTerms) -> FrameCost:
-    """Count the arithmetic and the memory of one frame of the C source."""
+    """Count the arithmetic of one frame of the C source, in which all is read."""
     terms = design if isinstance(design, SourceTerms) else controller_terms(as_controller(design))
-    (s, _, m), out = terms.sizes, _written_out(terms)
+    out, table = _written_out(terms), terms.gains[NONE][0].size if terms.tabled else 0
     sums = "".join([*out["errors"], *out["states"], *out["commands"]])
-    table = terms.gains[NONE][0].size if terms.tabled else 0  # of a frame in which all is read
-    varying = len(terms.read) * len(out["varying"])
     return FrameCost(
         multiplications=sums.count(" * ") + table,
         additions=sums.count(" + ") + sums.count(" - ") + table,
-        coefficients=len(out["constants"]) + varying + count_gains(terms),
-        states=s + m,
     )
 
 
@@ -83,17 +75,13 @@ def _round(designs: Sequence[Design], *, form: str, precision: str, **_: Any) ->
                 "the applied commands; got form=plain. Leave it out."
             )
         terms = source_terms(design, form=kind)
-        count = int(np.count_nonzero(terms.whole)) if not terms.tabled else 0
-        if count > MOST_TERMS:
+        count = count_gains(terms) if terms.tabled else int(np.count_nonzero(terms.whole))
+        most = MOST_GAINS if terms.tabled else MOST_TERMS
+        if count > most:
             raise ProblemError(
-                f"the terms of a controller must be at most {MOST_TERMS:,} in C, for each is "
-                f"written out; got {count:,}. Design with fewer states."
-            )
-        if count_gains(terms) > MOST_GAINS:
-            raise ProblemError(
-                f"the gains of all phases and fall-backs must be at most {MOST_GAINS:,} numbers in "
-                f"C; got {count_gains(terms):,}, in a period of {len(terms.read)} frames. Choose "
-                "rates with a shorter common period, or leave out channels."
+                f"a controller must have at most {most:,} numbers in C; got {count:,}, in "
+                f"a period of {len(terms.read)} frames. Design with fewer states, choose rates "
+                "with a shorter common period, or leave out channels."
             )
         numbers.append(terms.rounded() if precision == "single" else terms)
     return numbers

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from lbt_synth.design import Check, Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
-from lbt_synth.interop.modes import ModeDesign
+from lbt_synth.interop.pipeline import ModeDesign
 from lbt_synth.interop.proof import EIGENVALUES, ROUNDOFF, Written, sums_variance
 from lbt_synth.linear import Controller, StateSpace, estimator_form
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN

@@ -22,8 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.interop.modes import ModeDesign
-from lbt_synth.interop.pipeline import Target
+from lbt_synth.interop.pipeline import ModeDesign, Target
 from lbt_synth.interop.proof import (
     LOSS,
     ROUNDOFF,

@@ -28,8 +28,7 @@ from lbt_synth.design.shaping.channel import Channel, laguerre_basis
 from lbt_synth.design.shaping.objectives import ResidualVariance, leaves, spectrum_of
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.interop.modes import ModeDesign
-from lbt_synth.interop.pipeline import Target
+from lbt_synth.interop.pipeline import ModeDesign, Target
 from lbt_synth.interop.proof import (
     LOSS,
     ROUNDOFF,

@@ -42,11 +42,6 @@ class SimulatedTelescope:
 
     To the simulation it is a controller: each measurement goes out as the stream ``signal``, and
     the command comes from the stream ``wfc``, with the number of the same frame.
-
-    Parameters
-    ----------
-    conf : dict
-        Section of the configuration; ``signal_size`` is its number of measurements.
     """
 
     def __init__(self, conf: dict[str, Any]) -> None:
@@ -103,29 +98,16 @@ class GainFilePredictor:
 
     The first frames, which fill the loop's memory of commands, get the command 0. A residual that
     is not finite leaves the filter as it is, and repeats the last command.
-
-    Parameters
-    ----------
-    num_modes : int
-        Modes of the loop; those of the gain file come first.
-    horizon : int
-        Frames from a command to the residual that shows it: ``delay_frames`` of the configuration.
-    gain_file : path-like
-        Gain file of the controller.
-    other_gain : float, optional
-        Gain of the integrator of each further mode, ``u(k) = u(k-1) + gain residual(k)``.
-    command_limit : float, optional
-        Largest modulus of a command: the loop does not see what a corrector clips.
     """
 
     def __init__(
         self,
-        num_modes: int,
-        horizon: int = 2,
+        num_modes: int,  # of the loop; those of the gain file come first
+        horizon: int = 2,  # frames to the residual that shows a command: delay_frames of the loop
         *,
         gain_file: str,
-        other_gain: float = 0.0,
-        command_limit: float | None = None,
+        other_gain: float = 0.0,  # of the integrator of each further mode
+        command_limit: float | None = None,  # the loop does not see what a corrector clips
     ) -> None:
         self.num_modes = integer(num_modes, "num_modes", at_least=1)
         self.horizon = integer(horizon, "predictor.delay_frames", at_least=1)

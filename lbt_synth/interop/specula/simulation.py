@@ -25,7 +25,7 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop.disturbances import draw_others, draw_phase
 from lbt_synth.loop.simulation import SteppedController, run_frames
 from lbt_synth.models import LoopHardware
-from lbt_synth.validation import FloatArray, number, require_instance
+from lbt_synth.validation import FloatArray, require_instance
 
 _BATCHES = 8
 _TIP_TILT = slice(2)
@@ -172,12 +172,7 @@ def accompany_filter(design: Design, setup: EndToEndSetup) -> AccompaniedFilter:
     )
 
 
-def mix_controller(
-    setup: EndToEndSetup,
-    filter: Any,  # noqa: A002
-    *,
-    tip_tilt_gain: float | None = None,
-) -> MixedController:
+def mix_controller(setup: EndToEndSetup, filter: Any) -> MixedController:  # noqa: A002
     """Return the controller of all modes: a filter of tip and tilt, integrators for the others."""
     if getattr(filter, "other_sensors", ()):
         filter = accompany_filter(filter, setup)  # noqa: A001
@@ -193,8 +188,6 @@ def mix_controller(
             "Design it from this configuration."
         )
     gains = np.full(setup.modes, setup.gain)
-    if tip_tilt_gain is not None:
-        gains[:2] = number(tip_tilt_gain, "tip_tilt_gain", at_least=0)
     return MixedController(filter=filter, gains=gains, leak=setup.leaks)
 
 
@@ -202,7 +195,6 @@ def run_end_to_end(
     setup: EndToEndSetup,
     controller: Any,
     *,
-    tip_tilt_gain: float | None = None,
     calibration: Calibration | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> EndToEndRun:
@@ -227,8 +219,6 @@ def run_end_to_end(
         other modes; None for integrators alone; or a MixedController of all modes. One of another
         loop is refused. A design of several sensors has accelerometers that follow the vibrations;
         further wavefront sensors are not read.
-    tip_tilt_gain : float, optional
-        Integrator gain of tip and tilt where there is no filter.
     calibration : Calibration, optional
         Calibration of another run of this system; by default it is measured.
     progress : callable, optional
@@ -267,7 +257,7 @@ and 2 frames; got one for 1000 Hz and 2 frames. Design it from this configuratio
     """
     require_instance(setup, EndToEndSetup)
     if not isinstance(controller, MixedController):
-        controller = mix_controller(setup, controller, tip_tilt_gain=tip_tilt_gain)
+        controller = mix_controller(setup, controller)
     settle = setup.settle_frames
     phase, _ = draw_phase(
         setup.shaken,

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
 from typing import TypeAlias
 
 import clarabel
@@ -36,15 +35,13 @@ from lbt_synth.linear.convex_functions import (
     Discs,
     Fractions,
     Function,
-    FunctionBound,
     HalfPlanes,
 )
 from lbt_synth.linear.matrix_functions import semidefinite_root
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray
+from lbt_synth.validation import ComplexArray, FloatArray
 
 _LEAST_CURVATURE = 0.03  # of that of the slopes alone
 _FLAT = 1e-12  # part of the largest curvature below which a direction is flat
-_CLOSE = 0.8  # share of a bound: a programme starts with those that are used more, for speed
 # Tighter tolerances end as "optimal_inaccurate" on plants with two equal axes, and gain nothing.
 SETTINGS = {"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8, "max_iter": 200}
 # Near the edge of feasibility the solver loses its accuracy, sometimes with its own scaling of
@@ -95,15 +92,6 @@ def require_optimum(run: tuple[str, int], programme: str, advice: str) -> None:
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ConicSolution:
-    """What the solver found."""
-
-    x: FloatArray  # (n,)
-    status: str
-    iterations: int
-
-
 class ConicProgramme:
     """Minimise ``x'P x / 2 + q'x``, with ``offsets + rows x`` in cones."""
 
@@ -130,8 +118,10 @@ class ConicProgramme:
         self._offsets.append(offsets)
         self._cones += cones
 
-    def minimize(self, linear: FloatArray, quadratic: FloatArray | None = None) -> ConicSolution:
-        """Solve for q, (n,), and P, (n, n)."""
+    def minimize(
+        self, linear: FloatArray, quadratic: FloatArray | None = None
+    ) -> tuple[FloatArray, tuple[str, int]]:
+        """Solve for q, (n,), and P, (n, n); return x, and the status and count of iterations."""
         blocks = [sparse.csr_matrix((0, self.size)), *self._rows]
         A = -sparse.vstack(blocks, format="csc")
         b = np.concatenate([np.zeros(0), *self._offsets])
@@ -149,7 +139,7 @@ class ConicProgramme:
                 ).solve()
             status = _STATUS.get(str(answer.status))
             if status is not None:
-                return ConicSolution(np.array(answer.x), status, int(answer.iterations))
+                return np.array(answer.x), (status, int(answer.iterations))
         raise solver_error("the solver lost its accuracy on the way.")
 
 
@@ -166,35 +156,12 @@ def minimize(
     Return the coefficients, None if the constraints cannot hold together, and the solver's status.
     """
     origin = np.zeros(size) if start is None else start
-    chosen = [_use(constraint, origin) > _CLOSE for constraint in constraints]
-    while True:
-        programme = ConicProgramme(size + _count_levels(function))
-        for constraint, places in zip(constraints, chosen, strict=True):
-            _constrain(programme, _part(constraint, places), origin)
-        linear, roots = _Model(programme, origin, scale).expression(function)
-        solution = programme.minimize(linear, 2 * roots.T @ roots)
-        if solution.status not in USABLE:
-            return None, solution.status
-        c = origin + solution.x[:size]
-        exceeded = [
-            _use(constraint, c) > 1 + 10 * SETTINGS["tol_feas"] for constraint in constraints
-        ]
-        if not any(np.any(new & ~old) for new, old in zip(exceeded, chosen, strict=True)):
-            return c, solution.status
-        chosen = [new | old for new, old in zip(exceeded, chosen, strict=True)]
-
-
-def _use(constraint: Constraint, c: FloatArray) -> FloatArray:
-    """Share of each bound that is used; that of a function is always imposed."""
-    return np.ones(1) if isinstance(constraint, FunctionBound) else constraint.use(c)
-
-
-def _part(constraint: Constraint, chosen: BoolArray) -> Constraint:
-    """Return some of the bounds of a constraint."""
-    if isinstance(constraint, FunctionBound):
-        return constraint
-    values = {field.name: getattr(constraint, field.name)[chosen] for field in fields(constraint)}
-    return replace(constraint, **values)
+    programme = ConicProgramme(size + _count_levels(function))
+    for constraint in constraints:
+        _constrain(programme, constraint, origin)
+    linear, roots = _Model(programme, origin, scale).expression(function)
+    x, (status, _) = programme.minimize(linear, 2 * roots.T @ roots)
+    return origin + x[:size] if status in USABLE else None, status
 
 
 def minimize_relaxation(
@@ -211,16 +178,16 @@ def minimize_relaxation(
     for i, group in enumerate(groups):
         for constraint in group:
             _constrain(programme, constraint, origin, None if rigid[i] else size + i)
-    relaxed = programme.minimize(slack)
-    if "infeasible" in relaxed.status:
+    x, run = programme.minimize(slack)
+    if "infeasible" in run[0]:
         return np.full(count, np.inf)
     require_optimum(
-        (relaxed.status, relaxed.iterations),
+        run,
         "the search for constraints that clash",
         "They may be close to what can be met, or very far from it; relax them, or try another "
         "number of functions.",
     )
-    return np.where(rigid, 0.0, relaxed.x[size:])
+    return np.where(rigid, 0.0, x[size:])
 
 
 def _count_levels(function: Function) -> int:

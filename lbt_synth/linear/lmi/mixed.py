@@ -79,28 +79,17 @@ class InnovationProgramme:
             taps=taps,
         )
 
-    def minimize_variance(
-        self, gamma: float, frequency_hz: FloatArray
+    def minimize(
+        self, frequency_hz: FloatArray, *, gamma: float | None = None, variance: float | None = None
     ) -> tuple[FloatArray, float, str]:
-        """Minimise the variance with the error below gamma at the frequencies.
+        """Minimise the variance with the error below gamma at the frequencies, or the reverse.
 
         Returns the taps (l, T q), gamma and the status of the solver.
         """
-        taps, _, status = self._solve(frequency_hz, level=gamma / self.scale, distance=None)
-        return taps, gamma, status
-
-    def minimize_level(
-        self, variance: float, frequency_hz: FloatArray
-    ) -> tuple[FloatArray, float, str]:
-        """Minimise the level at the frequencies with a bound on the variance; likewise."""
-        slack = float(np.sqrt(max(variance - self.floor, 0.0))) / self.scale
-        taps, level, status = self._solve(frequency_hz, level=None, distance=slack)
-        return taps, level * self.scale, status
-
-    def _solve(
-        self, frequency_hz: FloatArray, *, level: float | None, distance: float | None
-    ) -> tuple[FloatArray, float, str]:
-        """Minimise the level or the distance, whichever is None."""
+        level = None if gamma is None else gamma / self.scale
+        distance = None
+        if variance is not None:
+            distance = float(np.sqrt(max(variance - self.floor, 0.0))) / self.scale
         N, E = (s.frequency_response(frequency_hz) for s in (self.innovation, self.error))
         outputs, q = len(self.target), N.shape[1]
         taps: Any = 0  # (l, T q), zero between groups
@@ -120,7 +109,8 @@ class InnovationProgramme:
         advice = "Try a larger bound, or another number of taps."
         require_optimum(run, "the programme of the mixed filter", advice)
         unscaled = self.scale * taps.value @ np.kron(np.eye(self.taps), self.whitening)
-        return np.asarray(unscaled, dtype=np.float64), float(bound.value), run[0]
+        reached = gamma if gamma is not None else float(bound.value) * self.scale
+        return np.asarray(unscaled, dtype=np.float64), reached, run[0]
 
 
 def _independent_groups(N: ComplexArray, E: ComplexArray) -> list[tuple[list[int], list[int]]]:

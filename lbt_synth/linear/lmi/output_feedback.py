@@ -21,9 +21,6 @@ from lbt_synth.linear.lmi.programmes import norm_below, solve, symmetrise
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.linear.output_feedback.lower_bound import (
     ControlWitness,
-    Side,
-    control_side,
-    estimation_side,
     storage_coordinates,
     storage_root,
 )
@@ -41,7 +38,7 @@ def least_level_lmi(plant: GeneralizedPlant, scale: float) -> tuple[float, Contr
     """
     scaled = replace(plant, C1=plant.C1 / scale, D11=plant.D11 / scale, D12=plant.D12 / scale)
     level = cp.Variable()
-    sides = [_Storage(estimation_side(scaled)), _Storage(control_side(scaled))]
+    sides = [_Storage(scaled.transposed()), _Storage(scaled)]
     constraints = [side.dissipation(level) << 0 for side in sides]
     shared = sides[0].basis.T @ sides[1].basis
     coupling = cp.bmat([[sides[0].storage, shared], [shared.T, sides[1].storage]])
@@ -58,7 +55,7 @@ def least_level_lmi(plant: GeneralizedPlant, scale: float) -> tuple[float, Contr
 class _Storage:
     """The storage matrix of one side, and the pairs that its constraint hides."""
 
-    def __init__(self, side: Side) -> None:
+    def __init__(self, side: GeneralizedPlant) -> None:
         self.side = side
         self.basis, self.inverse = storage_coordinates(storage_root(side))
         if not self.basis.size:  # old versions of cvxpy have no empty variables

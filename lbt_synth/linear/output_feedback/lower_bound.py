@@ -16,11 +16,9 @@ oscillation has no growth but for rounding, and no price.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -43,29 +41,6 @@ _RANK = 1e-8  # share of the largest root of a cost that counts as none
 _SINGULAR = 1e-15  # of what the largest control moves, that counts as none
 
 
-class Side(NamedTuple):
-    """The matrices of one side: of control, or transposed, of estimation."""
-
-    A: FloatArray
-    B1: FloatArray
-    B2: FloatArray
-    C1: FloatArray
-    D11: FloatArray
-    D12: FloatArray
-
-
-def control_side(plant: GeneralizedPlant) -> Side:
-    """Return the side of a controller that knows state and disturbance."""
-    P = plant
-    return Side(A=P.A, B1=P.B1, B2=P.B2, C1=P.C1, D11=P.D11, D12=P.D12)
-
-
-def estimation_side(plant: GeneralizedPlant) -> Side:
-    """Return the side of an estimator whose corrections reach state and error, transposed."""
-    P = plant
-    return Side(A=P.A.T, B1=P.C1.T, B2=P.C2.T, C1=P.B1.T, D11=P.D11.T, D12=P.D21.T)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WorstCase:
     """The loop of best control and worst disturbance at a level, as functions of the state."""
@@ -74,9 +49,6 @@ class WorstCase:
     C: FloatArray  # (p1, n), to the error
     entry: FloatArray  # (n, 1), state that the last, worst disturbance leaves
     error: FloatArray  # (p1, 1), and the error at that instant
-
-
-_SideOf: TypeAlias = Callable[[GeneralizedPlant], Side]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -107,8 +79,8 @@ def infeasible_control_level(plant: GeneralizedPlant, witness: ControlWitness) -
 
     What measurements would show or controls move is removed from the pairs first.
     """
-    pairs = (witness.unseen, estimation_side), (witness.unmoved, control_side)
-    sides = [_moments(plant, side_of, pair) for pair, side_of in pairs if pair is not None]
+    pairs = (witness.unseen, True), (witness.unmoved, False)
+    sides = [_moments(*_side(plant, turned), pair) for pair, turned in pairs if pair is not None]
     levels = [np.sqrt(side.gained / side.spent) for side in sides if side.spent > 0]
     if len(sides) == 2:
         levels.append(_coupled_level(*sides))
@@ -131,26 +103,26 @@ def _coupled_level(one: _Moments, two: _Moments) -> float:
     return float(np.sqrt((first + second + both + root) / 2))
 
 
-def _moments(plant: GeneralizedPlant, side_of: _SideOf, pairs: Witness) -> _Moments:
-    """Evaluate pairs against the side in whose equation they are the costates."""
-    side, states = side_of(plant), pairs.states
+def _moments(side: GeneralizedPlant, root: FloatArray, pairs: Witness) -> _Moments:
+    """Evaluate pairs against the side in whose equation they are the costates, and its root."""
+    states = pairs.states
     after, steady = _hide(side, states, pairs.disturbances)
     growth, size = after @ after.T - states @ states.T, float(np.sum(states**2))
     turning = states.shape[1] <= 2 and np.linalg.norm(growth) <= _STEADY * size
     if steady is not None and turning:
         return steady
-    basis, inverse = storage_coordinates(_storage_root_of(plant, side_of))
+    basis, inverse = storage_coordinates(root)
     states = basis @ (inverse @ states)
     after, within = _hide(side, states, pairs.disturbances)
     priced = priced_growth(after, states, basis, inverse)
     if within is None or priced is None:
         return _Moments(0.0, 1.0, np.zeros_like(states))
-    root, price = priced
-    return _Moments(within.gained, within.spent + price, root)
+    grown, price = priced
+    return _Moments(within.gained, within.spent + price, grown)
 
 
 def _hide(
-    side: Side, states: FloatArray, signals: FloatArray
+    side: GeneralizedPlant, states: FloatArray, signals: FloatArray
 ) -> tuple[FloatArray, _Moments | None]:
     """Change signals as little as hides them from what the constraint reads.
 
@@ -178,7 +150,7 @@ def storage_coordinates(root: FloatArray) -> tuple[FloatArray, FloatArray]:
     return scaled_basis(spread, directions[:, kept], sizes[kept])
 
 
-def storage_root(side: Side) -> FloatArray:
+def storage_root(side: GeneralizedPlant) -> FloatArray:
     """Return a root (n, r) of what any law leaves: the least cost, or some steps to it.
 
     A root has costs to the square of rounding, which still limit what a storage matrix may be. The
@@ -206,9 +178,10 @@ def storage_root(side: Side) -> FloatArray:
 
 
 @lru_cache(maxsize=4)
-def _storage_root_of(plant: GeneralizedPlant, side_of: _SideOf) -> FloatArray:
-    """Return the root of a side once for all that may prove something of it."""
-    return storage_root(side_of(plant))
+def _side(plant: GeneralizedPlant, turned: bool) -> tuple[GeneralizedPlant, FloatArray]:
+    """Return a side, estimation turned, and its root, once for all that may prove something."""
+    side = plant.transposed() if turned else plant
+    return side, storage_root(side)
 
 
 def last_step(worst: WorstCase, X: FloatArray) -> Witness:
@@ -237,7 +210,7 @@ def coupled_bursts(
     return _burst(estimation, Y, meeting), _burst(control, X, Y @ meeting)
 
 
-def steady_pairs(side: Side, angle: float) -> Witness:
+def steady_pairs(side: GeneralizedPlant, angle: float) -> Witness:
     """Return the pairs of one frequency that gain most: no law changes them."""
     S = side
     return steady_oscillation((S.A.T, S.C1.T, S.B2.T, S.D12.T), (S.B1.T, S.D11.T), angle)

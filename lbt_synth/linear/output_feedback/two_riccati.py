@@ -24,28 +24,25 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
-from lbt_synth.errors import DetectabilityError, NonFiniteError, NumericalError
+from lbt_synth.errors import NonFiniteError, NumericalError
 from lbt_synth.linear.generalized_plant import GeneralizedPlant, invert_well_posed
 from lbt_synth.linear.infeasibility_proof import slow_angles
 from lbt_synth.linear.matrix_functions import nearest_powers_of_two, semidefinite_root
 from lbt_synth.linear.norms import hinf_norm
 from lbt_synth.linear.output_feedback.lower_bound import (
     ControlWitness,
-    Side,
     WorstCase,
-    control_side,
     coupled_bursts,
-    estimation_side,
     last_step,
     steady_pairs,
 )
-from lbt_synth.linear.riccati.dare import solve_dare, unstable_hidden_mode
+from lbt_synth.linear.riccati.dare import require_seen, solve_dare
 from lbt_synth.linear.riccati.equations import Equations, solve_by_doubling, solve_by_schur
 from lbt_synth.linear.state_space import StateSpace
-from lbt_synth.validation import FloatArray, frozen_copy, require_instance
+from lbt_synth.validation import FloatArray, require_instance
 
 _TOLERANCE = 1e-11
-_NOTHING = 1e-6  # part of the largest, of levels or of states of a mode, that counts as none
+_NOTHING = 1e-6  # part of the largest of levels, that counts as none
 _PART = 1e-10  # of the largest singular value, below which a channel cancels nothing
 _ROUNDING = 1e-9  # share of a solution that its residual, or a negative part, may be
 
@@ -59,8 +56,8 @@ class FullInformation:
     the innovation and ``feedback`` its gain into the state.
     """
 
-    def __init__(self, side: Side) -> None:
-        A, B1, B2, C1, D11, D12 = side
+    def __init__(self, side: GeneralizedPlant) -> None:
+        A, B1, B2, C1, D11, D12 = _side_matrices(side)
         dare = solve_dare(A, B2, C1.T @ C1, D12.T @ D12, C1.T @ D12)
         self.side, self.least = side, dare.X
         self.weight = D12.T @ D12 + B2.T @ dare.X @ B2
@@ -126,7 +123,7 @@ class FullInformation:
 
     def refine(self, X: FloatArray, gamma: float) -> FloatArray:
         """Return X after Newton steps on a residual in extended precision."""
-        A, B1, B2, C1, D11, D12 = self.side
+        A, B1, B2, C1, D11, D12 = _side_matrices(self.side)
         D = np.hstack([D11, D12])
         R = D.T @ D - block_diag(gamma**2 * np.eye(B1.shape[1]), np.zeros((B2.shape[1],) * 2))
         parts = {"A": A, "B": np.hstack([B1, B2]), "Q": C1.T @ C1, "R": R, "S": C1.T @ D}
@@ -135,7 +132,7 @@ class FullInformation:
 
     def worst_case(self, X: FloatArray, gamma: float) -> WorstCase:
         """Return the worst case at a level, for its X."""
-        A, B1, B2, C1, D11, D12 = self.side
+        A, B1, B2, C1, D11, D12 = _side_matrices(self.side)
         B, D, m = np.hstack([B1, B2]), np.hstack([D11, D12]), B1.shape[1]
         R = D.T @ D + B.T @ X @ B
         R[:m, :m] -= gamma**2 * np.eye(m)
@@ -144,6 +141,11 @@ class FullInformation:
         last = np.linalg.eigh(R[:m, :m] - R[:m, m:] @ answer)[1][:, -1:]
         signals = np.vstack([last, -answer @ last])
         return WorstCase(A=A + B @ law, C=C1 + D @ law, entry=B @ signals, error=D @ signals)
+
+
+def _side_matrices(side: GeneralizedPlant) -> tuple[FloatArray, ...]:
+    """Return the matrices of control with known state and disturbance."""
+    return side.A, side.B1, side.B2, side.C1, side.D11, side.D12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -160,8 +162,8 @@ class TwoRiccati:
 
     def __init__(self, plant: GeneralizedPlant) -> None:
         self.plant = plant
-        self.control = FullInformation(control_side(plant))
-        self.estimation = FullInformation(estimation_side(plant))
+        self.control = FullInformation(plant)
+        self.estimation = FullInformation(plant.transposed())
 
     def least_variance(self) -> StateSpace:
         """Return the controller of least variance."""
@@ -230,8 +232,8 @@ class TwoRiccati:
             control = self.control.worst_case(solution.X, solution.gamma)
             estimation = self.estimation.worst_case(solution.Y, solution.gamma)
             cases = (
-                ("unmoved", control_side(plant), control, solution.X, _CONTROL),
-                ("unseen", estimation_side(plant), estimation, solution.Y, _ESTIMATION),
+                ("unmoved", plant, control, solution.X, _CONTROL),
+                ("unseen", plant.transposed(), estimation, solution.Y, _ESTIMATION),
             )
             for pairs, side, worst, cost, (reason, reason_at) in cases:
                 if plant is self.plant:
@@ -512,37 +514,12 @@ def _size(*parts: FloatArray) -> float:
 
 def require_stabilisable(plant: GeneralizedPlant) -> None:
     """Raise if a mode that does not decay is not reached by u, or not seen by y."""
-    reached = unstable_hidden_mode(plant.A.T, plant.B2.T, drive=plant.C1.T)
-    seen = unstable_hidden_mode(plant.A, plant.C2, drive=plant.B1)
-    for value, A, C, words in (
-        (reached, plant.A.T, plant.B2.T, "no control reaches it. Give it a control"),
-        (seen, plant.A, plant.C2, "no measurement sees it. Measure it"),
-    ):
-        if value is None:
-            continue
-        vector = _null_vector(A, C, value)
-        raise DetectabilityError(
-            f"no controller stabilises the plant: its mode at {_number(value)} does not decay, and "
-            f"{words}, or take it out of the plant (a weight with such a pole: let it decay a "
-            f"little). The mode is made of the states {_states(vector)}.",
-            eigenvalue=value,
-            eigenvector=frozen_copy(np.abs(vector)),
-        )
-
-
-def _null_vector(A: FloatArray, C: FloatArray, value: complex) -> FloatArray:
-    """Return the unit vector that C does not see and A multiplies by a value, (n,) complex."""
-    pencil = np.vstack([A - value * np.eye(len(A)), C])
-    return np.asarray(np.linalg.svd(pencil)[2][-1].conj())
-
-
-def _states(vector: FloatArray) -> str:
-    """Name the few states that have the largest part in a mode."""
-    size = np.abs(vector) / np.max(np.abs(vector))
-    order = [int(i) for i in np.argsort(-size) if size[i] > _NOTHING]
-    named = ", ".join(f"{i} ({size[i]:.3g})" for i in order[:4])
-    return named + (", ..." if len(order) > 4 else "")
-
-
-def _number(value: complex) -> str:
-    return f"{value.real + 0.0:.6g}" if abs(value.imag) <= 1e-9 * abs(value) else f"{value:.6g}"
+    words = (
+        "no controller stabilises the plant: its mode at {{mode}} does not decay, and {}, or take "
+        "it out of the plant (a weight with such a pole: let it decay a little). The mode is made "
+        "of the states {{states}}."
+    )
+    reached = words.format("no control reaches it. Give it a control")
+    require_seen(plant.A.T, plant.B2.T, reached, drive=plant.C1.T)
+    seen = words.format("no measurement sees it. Measure it")
+    require_seen(plant.A, plant.C2, seen, drive=plant.B1)

@@ -43,6 +43,7 @@ _RANK = 1e-10  # share of a matrix below which an input or an output does nothin
 # A multiple eigenvalue on the circle is computed up to this far from it. It is tested on the circle
 # as well, where a mode that decays passes.
 _CIRCLE = 1e-3
+_NOTHING = 1e-6  # part of the largest share of a state in a mode, that counts as none
 _ROUNDING = 1e-14  # share of a pencil that rounding of the data may be: its singular value is zero
 
 
@@ -247,14 +248,15 @@ def _refuse(index: int, lead: tuple[int, ...], best: Solutions) -> None:
     )
 
 
-def unstable_hidden_mode(
-    A: FloatArray, C: FloatArray, *, drive: FloatArray, only_unit_circle: bool = False
-) -> complex | None:
-    """Eigenvalue of A that does not decay and that C does not see, or None.
+def require_seen(
+    A: FloatArray, C: FloatArray, words: str, *, drive: FloatArray, only_unit_circle: bool = False
+) -> None:
+    """Raise with words for a mode of A that does not decay and that C does not see.
 
     The Popov-Belevitch-Hautus test on the eigenvalues with modulus 1 or more
     (or about 1, with ``only_unit_circle``). ``drive`` (n, p), which enters the states,
-    serves to scale them, because the answer must not depend on their units.
+    serves to scale them, because the answer must not depend on their units. The words have places
+    for the mode, and for the states that it is made of.
     """
     n = A.shape[0]
     entry, leaving = np.linalg.norm(drive, axis=1), np.linalg.norm(C, axis=0)
@@ -271,21 +273,34 @@ def unstable_hidden_mode(
             points.append((complex(value / size), _ROUNDING))
     for point, tolerance in points:
         pencil = np.vstack([(A - point * np.eye(n)) / scale_A, C / scale_C])
-        if np.linalg.svd(pencil, compute_uv=False)[-1] < tolerance:
-            return point
-    return None
+        _, sizes, directions = np.linalg.svd(pencil)
+        if sizes[-1] < tolerance:
+            is_real = abs(point.imag) <= 1e-9 * abs(point)
+            mode = f"{point.real + 0.0:.6g}" if is_real else f"{point:.6g}"
+            vector = np.abs(units * directions[-1])
+            raise DetectabilityError(
+                words.format(mode=mode, states=_largest_states(vector)),
+                eigenvalue=point,
+                eigenvector=frozen_copy(vector / np.linalg.norm(vector)),
+            )
+
+
+def _largest_states(vector: FloatArray) -> str:
+    """Name the few states that have the largest part in a mode."""
+    share = vector / np.max(vector)
+    order = [int(i) for i in np.argsort(-share) if share[i] > _NOTHING]
+    named = ", ".join(f"{i} ({share[i]:.3g})" for i in order[:4])
+    return named + (", ..." if len(order) > 4 else "")
 
 
 def require_stabilising(equations: Equations, index: int, name: str = "") -> None:
     """Raise if an equation has no stabilising solution for a reason that can be named."""
     A, B, Q, R, S = (getattr(equations, key)[index] for key in "ABQRS")
-    hidden = unstable_hidden_mode(A.T, B.T, drive=weight_root(Q))
-    if hidden is not None:
-        raise DetectabilityError(
-            f"{name}(A, B) must be stabilisable; the mode of A at {hidden:.6g} does not decay and "
-            "B does not reach it. Give it an input, or take it out of the model.",
-            eigenvalue=hidden,
-        )
+    words = (
+        f"{name}(A, B) must be stabilisable; the mode of A at {{mode}} does not decay and B does "
+        "not reach it. Give it an input, or take it out of the model."
+    )
+    require_seen(A.T, B.T, words, drive=weight_root(Q))
     inputs = np.vstack([part / max(np.abs(part).max(), 1e-300) for part in (B, R, S)])
     if np.linalg.svd(inputs, compute_uv=False)[-1] < _RANK:
         raise DefinitenessError(
@@ -295,15 +310,12 @@ def require_stabilising(equations: Equations, index: int, name: str = "") -> Non
     if np.linalg.eigvalsh(R)[0] > 0:
         feedback = np.linalg.solve(R, S.T)
         weight = Q - S @ feedback
-        hidden = unstable_hidden_mode(
-            A - B @ feedback, weight_root((weight + weight.T) / 2).T, drive=B, only_unit_circle=True
+        words = (
+            f"{name}Q must see every mode on the unit circle; the mode of A at {{mode}} has no "
+            "weight, so there is no stabilising solution. Add a small weight on it."
         )
-        if hidden is not None:
-            raise DetectabilityError(
-                f"{name}Q must see every mode on the unit circle; the mode of A at {hidden:.6g} "
-                "has no weight, so there is no stabilising solution. Add a small weight on it.",
-                eigenvalue=hidden,
-            )
+        root = weight_root((weight + weight.T) / 2).T
+        require_seen(A - B @ feedback, root, words, drive=B, only_unit_circle=True)
 
 
 def weight_root(weight: FloatArray) -> FloatArray:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
-from lbt_synth.errors import DetectabilityError, InfeasibleError, NumericalError
+from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear.estimation_problem import (
     EstimationProblem,
     decorrelate,
@@ -34,8 +34,8 @@ from lbt_synth.linear.matrix_functions import (
 )
 from lbt_synth.linear.riccati.dare import (
     ERROR_LIMIT,
+    require_seen,
     solve_dare,
-    unstable_hidden_mode,
     weight_root,
 )
 from lbt_synth.linear.riccati.equations import Equations, doubling
@@ -59,30 +59,23 @@ class FilterRiccati:
     # measurement update alone; zero for what is not read
     gain_predictor: FloatArray
     gain_filter: FloatArray
-    # relative residual of the equation; with a longer period, relative change of P in the last
-    # Newton step, or over a period; nan of an inequality
-    residual: float
     iterations: int  # number of doublings, or of steps of the solver
     status: str  # the route that gave P, or what the solver reports; no certificate uses it
 
 
 def require_detectable(problem: EstimationProblem) -> None:
     """Raise if no stable filter exists."""
-    hidden = unstable_hidden_mode(problem.A, problem.C, drive=problem.B)
-    if hidden is not None:
-        raise DetectabilityError(
-            f"(A, C) must be detectable; the mode of A at {hidden:.6g} does not decay and no "
-            "measurement sees it. Measure it, or take it out of the model.",
-            eigenvalue=hidden,
-        )
+    words = (
+        "(A, C) must be detectable; the mode of A at {mode} does not decay and no measurement sees "
+        "it. Measure it, or take it out of the model."
+    )
+    require_seen(problem.A, problem.C, words, drive=problem.B)
     A_s, B_s, _ = decorrelate(problem)
-    hidden = unstable_hidden_mode(A_s.T, B_s.T, drive=problem.C.T, only_unit_circle=True)
-    if hidden is not None:
-        raise DetectabilityError(
-            f"every mode on the unit circle must be driven by noise; the mode of A at "
-            f"{hidden:.6g} is not, so the filter would stop correcting it. Add a column to B.",
-            eigenvalue=hidden,
-        )
+    words = (
+        "every mode on the unit circle must be driven by noise; the mode of A at {mode} is not, so "
+        "the filter would stop correcting it. Add a column to B."
+    )
+    require_seen(A_s.T, B_s.T, words, drive=problem.C.T, only_unit_circle=True)
 
 
 def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
@@ -91,13 +84,11 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
     constant = _over_a_period(scaled)
     require_detectable(constant)
     dare = solve_dare(constant.A.T, constant.C.T, constant.Q, constant.R, constant.S)
-    covariances, residual = dare.X[None], dare.residual
-    if problem.period > 1:
-        covariances, residual = _settle_phases(scaled, dare.X)
+    covariances = dare.X[None] if problem.period == 1 else _settle_phases(scaled, dare.X)
     gains = np.stack([kalman_gains(scaled, t, P) for t, P in enumerate(covariances)], axis=1)
     if problem.period == 1:
         gains[0, 0][:, problem.read[0]] = dare.gain_feedback.T  # refined in extended precision
-    return _filter_of(covariances, gains / units, residual, dare.iterations, dare.route)
+    return _filter_of(covariances, gains / units, dare.iterations, dare.route)
 
 
 def _in_noise_units(problem: EstimationProblem) -> tuple[EstimationProblem, FloatArray]:
@@ -118,23 +109,20 @@ def _over_a_period(problem: EstimationProblem) -> EstimationProblem:
     return EstimationProblem(A=A, B=B, C=weight_root(G).T, D=D, L=identity)
 
 
-def _filter_of(
-    P: FloatArray, gains: FloatArray, residual: float, iterations: int, status: str
-) -> FilterRiccati:
+def _filter_of(P: FloatArray, gains: FloatArray, iterations: int, status: str) -> FilterRiccati:
     """Return the solution of P (N, n, n) and gains (2, N, n, q), whose only phase is squeezed."""
     phases = 0 if len(P) == 1 else slice(None)
     return FilterRiccati(
         P=frozen_copy(P[phases]),
         gain_predictor=frozen_copy(gains[0][phases]),
         gain_filter=frozen_copy(gains[1][phases]),
-        residual=residual,
         iterations=iterations,
         status=status,
     )
 
 
-def _settle_phases(problem: EstimationProblem, P: FloatArray) -> tuple[FloatArray, float]:
-    """Return the covariances of all phases, (N, n, n), and their last relative change.
+def _settle_phases(problem: EstimationProblem, P: FloatArray) -> FloatArray:
+    """Return the covariances of all phases, (N, n, n).
 
     After a sweep in Joseph's form, each Newton step takes the covariances that the gains leave.
     """
@@ -161,7 +149,7 @@ def _settle_phases(problem: EstimationProblem, P: FloatArray) -> tuple[FloatArra
             status="residual",
             residual=change,
         )
-    return covariances, change
+    return covariances
 
 
 def _join_triples(first: _Triple, then: _Triple) -> _Triple:
@@ -290,7 +278,7 @@ class GammaEquation:
             return None
         gains = self.units * gains / self.noise_units
         covariances = self.units * P * self.units.T
-        return _filter_of(covariances, gains, residual, trial.iterations, "doubling")
+        return _filter_of(covariances, gains, trial.iterations, "doubling")
 
     def _refined(self, gamma: float, P: FloatArray) -> tuple[FloatArray, float]:
         """Return the solution of one phase after Newton steps, (1, n, n), and its residual."""

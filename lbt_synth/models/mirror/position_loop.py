@@ -16,7 +16,6 @@ from typing import Annotated, Any
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.optimize import brentq
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
@@ -43,7 +42,6 @@ class StepResponse:
     time_s: FloatArray  # (t,): time since the command arrived [s]
     position: FloatArray  # (t,): position over its final value
     tolerance: float  # half width of the band around 1 in which the mirror counts as settled
-    rise_s: float  # time from 10 % to 90 % [s]
     overshoot: float  # largest position less 1; 0 if it stays below
     settling_s: float  # time after which the position stays within the band [s]
 
@@ -228,27 +226,9 @@ class PositionLoop:
             time_s=frozen_copy(time),
             position=frozen_copy(x),
             tolerance=band,
-            rise_s=_crossing(time, x, 0.9) - _crossing(time, x, 0.1),
             overshoot=max(float(np.max(x)) - 1, 0.0),
             settling_s=_last_outside(time, x, band),
         )
-
-    @property
-    def bandwidth_hz(self) -> float:
-        """Frequency at which the amplitude has fallen to 0.707 of its static value [Hz]."""
-        loop = self.closed_loop()
-
-        def amplitude(frequency_hz: FloatArray | float) -> FloatArray:
-            response = loop.frequency_response(frequency_hz)[:, 0, 0]
-            return np.asarray(np.abs(response) / self.static_gain)
-
-        grid = np.geomspace(1e-3 * self.natural_frequency_hz, self.sampling_hz / 2, 2000)
-        below = np.flatnonzero(amplitude(grid) < np.sqrt(0.5))
-        if below.size == 0 or below[0] == 0:
-            return float("nan") if below.size else float(grid[-1])
-        low, high = grid[below[0] - 1 : below[0] + 1].tolist()
-        level = np.sqrt(0.5)
-        return brentq(lambda f: float(amplitude(f)[0]) - level, low, high, xtol=1e-9 * low)
 
     def _law(self) -> FloatArray:
         """Acceleration [positions per sample^2] that the loop computes, over states and command."""
@@ -286,12 +266,6 @@ def _exponential(omega: float, damping: float, time: float) -> FloatArray:
     generator[1, 3] = 1.0
     generator[2, 0] = 1.0
     return frozen_copy(expm(generator * time))
-
-
-def _crossing(time: FloatArray, x: FloatArray, level: float) -> float:
-    """Time at which a series first crosses a level from below, between its points."""
-    i = max(int(np.argmax(x >= level)), 1)
-    return float(np.interp(level, x[i - 1 : i + 1], time[i - 1 : i + 1]))
 
 
 def _last_outside(time: FloatArray, x: FloatArray, band: float) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.plant.seen_vibration import seen_vibration
-from lbt_synth.models.resonance_spectrum import coefficients, section_drives
+from lbt_synth.models.resonance_spectrum import coefficient_rows, section_drives
 from lbt_synth.models.sensor_suite import WHOLE, Motions, checked_motions, period_frames
 from lbt_synth.models.spectra import ARModel
 from lbt_synth.models.vibration import Vibration, checked_direction
@@ -251,7 +251,7 @@ def _section_states(parts: PlantParts) -> tuple[FloatArray, FloatArray, FloatArr
         chain = [*range(place, place + line.sections - 1), j]
         place += line.sections - 1
         deviations = section_drives(angle, line.damping, line.sections)
-        lines[chain] = coefficients(angle, line.damping)[:2]
+        lines[chain] = coefficient_rows(np.array(angle), np.array(line.damping))
         feeds[chain[1:], chain[:-1]] = deviations[1:] / deviations[:-1]
         drives[chain[0], j] = line.rms_nm * deviations[0]
     return lines, feeds, drives

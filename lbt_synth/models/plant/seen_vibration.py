@@ -24,7 +24,7 @@ from lbt_synth.linear import StateSpace
 from lbt_synth.linear.matrix_functions import symmetrise
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.sensor_suite import Accelerometer, Motion, period_frames
-from lbt_synth.models.vibration import Vibration, require_below_nyquist
+from lbt_synth.models.vibration import Vibration
 from lbt_synth.validation import FloatArray, frozen_copy, set_fields
 
 _DIGITS = 9  # of a part of a frame
@@ -84,7 +84,6 @@ def seen_vibration(
     The newest frame of the state comes ``ahead`` frames after that of the readings; the period is
     the common one of the accelerometers that see the line.
     """
-    require_below_nyquist(line.frequency_hz, hardware.frame_rate_hz)
     if line.sections > 1:
         raise ProblemError(
             f"a bump of {line.sections} sections moves no channel of an accelerometer; got motions "

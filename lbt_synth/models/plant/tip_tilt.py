@@ -28,10 +28,8 @@ from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.models.plant.assembly import PlantParts, known_states, plant_matrices
 from lbt_synth.models.sensor_suite import Motions, SensorSuite, noise_factor
 from lbt_synth.models.spectra import ARModel
-from lbt_synth.models.truth import Entering, disturbance_facts
+from lbt_synth.models.truth import Entering
 from lbt_synth.models.vibration import Vibration, spread_lines
-from lbt_synth.storage.rows import fact_table
-from lbt_synth.storage.summaries import Summary
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import (
     FloatArray,
@@ -76,13 +74,6 @@ class FullForm:
         D = np.zeros((len(to_command), gain.shape[-1]))
         return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s, applied=applied)
 
-    def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Return the estimator of z from ``[y(k), u(k-1)]``, in new-state form."""
-        gain = self._padded(gain_predictor)
-        B = np.concatenate([gain, self.B_known - gain @ self.D_known], axis=-1)
-        D = np.zeros((len(self.L), B.shape[-1]))
-        return Controller(A=self.A - gain @ self.C, B=B, C=self.L, D=D, dt_s=self.dt_s)
-
     def _padded(self, gain: FloatArray) -> FloatArray:
         """Return a gain over the reduced state as one over all states."""
         shape = (*gain.shape[:-2], self.n_states - gain.shape[-2], gain.shape[-1])
@@ -123,25 +114,8 @@ class TipTiltPlant(EstimationProblem):
             counts.append((len(self.hardware.suite.units), "sensor"))
         return ", ".join([self.hardware._brief(), *(count_text(*count) for count in counts)])
 
-    def _summarise(self) -> Summary:
-        deviations = np.linalg.norm(self.own_noise_factor, axis=1)
-        facts = disturbance_facts(self.turbulence, self.vibrations, deviations)
-        return Summary(tables=[fact_table("Plant", self.hardware.facts(), facts)])
-
     def full(self) -> FullForm:
-        """Return the same plant with the mirror's states, which are past commands if it settles.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
-        >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-        >>> plant = lbt.tip_tilt_plant(
-        ...     frame_rate_hz=800, turbulence=slow, vibrations=[line], noise_nm=15.5
-        ... )
-        >>> plant.full().A.shape  # 2 p + 2 n + m = 2 + 4 + 2, the paper's case
-        (8, 8)
-        """
+        """Return the same plant with the mirror's states, which are past commands if it settles."""
         A_known, B_known, C_known, D_known = known_states(self.hardware)
         (A, B, C, _), n, past = self.stacks(), self.n_states, A_known.shape[-1]
         A_full = np.zeros((self.period, n + past, n + past))
@@ -169,14 +143,6 @@ class TipTiltPlant(EstimationProblem):
         """
         full = self.full()
         return full.controller(self.checked_gain(gain_predictor), self.hardware.projector @ full.L)
-
-    def estimator(self, gain_predictor: FloatArray) -> Controller:
-        """Estimator of z from ``[y(k), u(k-1)]``, whatever gave that command, in new-state form.
-
-        The known input is removed exactly, so the estimation error does not depend on it. The
-        predictor gain is over the reduced state, (n, q).
-        """
-        return self.full().estimator(self.checked_gain(gain_predictor))
 
     def ahead(self, frames: int) -> TipTiltPlant:
         """Plant of the estimate of ``z(k + frames)`` from y up to k: a loop of another delay.
@@ -259,24 +225,6 @@ class TipTiltPlant(EstimationProblem):
         ``motions`` hold, for each vibration of the plant in order, the :class:`Motion` of each
         channel that it moves; by default no channel moves. A rate that is no fraction of the frame
         rate, a delay that is too short, and names or sizes that clash raise a ProblemError.
-
-        Examples
-        --------
-        A 20 Hz line that shakes tip by 500 nm, and the mirror's accelerometer by 1000 nm:
-
-        >>> import lbt_synth as lbt
-        >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=80, frame_rate_hz=1000)
-        >>> line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=500, direction=(1,))
-        >>> plant = lbt.tip_tilt_plant(
-        ...     frame_rate_hz=1000, turbulence=slow, vibrations=[line], noise_nm=15, modes=1
-        ... )
-        >>> mirror = lbt.models.Accelerometer(
-        ...     name="mirror", rate_hz=1000, delay_frames=1, channels=("m1",), noise_m_s2=2e-4
-        ... )
-        >>> suite = lbt.models.SensorSuite(sensors=(mirror,))
-        >>> shaken = plant.with_sensors(suite, ({"m1": lbt.models.Motion(size=2)},))
-        >>> shaken.period, shaken.n_states, shaken.n_measurements
-        (1, 6, 2)
         """
         require_instance(suite, SensorSuite, "suite")
         hardware = replace(self.hardware, suite=suite)

@@ -17,7 +17,7 @@ from scipy.special import jv
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.models.resonance_spectrum import coefficients, log_density
+from lbt_synth.models.resonance_spectrum import coefficient_rows, drive_ratio, unit_density
 from lbt_synth.models.spectra import ARModel
 from lbt_synth.models.turbulence.atmosphere import (
     LOWEST,
@@ -130,8 +130,7 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     def contrast(p: FloatArray) -> float:
         """Take the mean of log(model / numerator), which has no narrow peaks, for log(model)."""
         angle, damping = _unpack(p, rate)
-        shape, _, _ = log_density(angle, damping, s)
-        numerator = coefficients(angle, damping)[2]
+        shape, numerator = np.log(unit_density(angle, damping, s)), drive_ratio(angle, damping)
         model = 1 + (rms / noise) ** 2 * np.exp(shape)
         return float(np.log(numerator) + weight @ (np.log(model) - shape + target / model))
 
@@ -151,9 +150,10 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
             "Try the AR1 model, or check that the noise is not above the turbulence.",
             status=str(fit.message),
         )
-    a1, a2, drive = coefficients(angle, damping)
     return ARModel(
-        coefficients=frozen_copy([a1, a2]), driving_rms_nm=rms * np.sqrt(drive), frame_rate_hz=rate
+        coefficients=coefficient_rows(np.array(angle), np.array(damping)),
+        driving_rms_nm=rms * np.sqrt(drive_ratio(angle, damping)),
+        frame_rate_hz=rate,
     )
 
 

@@ -38,22 +38,24 @@ _AT_ONCE = 10  # frequencies of a spectrum that are integrated together, in the 
 _VON_KARMAN = 0.0228956  # phase spectrum constant, Noll's 0.023 to more digits
 
 
-_PER_LOOP = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")
+_PER_LOOP = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")  # what a stack has for each loop
 _TERMS = 12  # of the polynomial over an octave of the outer scale
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Atmosphere:
-    """One frozen layer of von Karman turbulence in front of a telescope.
+    """One frozen layer of von Karman turbulence in front of a telescope, or one for each loop.
 
     Parameters
     ----------
-    seeing_arcsec : float
+    seeing_arcsec : float or (p,) array_like
         Seeing (full width at half maximum) at ``seeing_wavelength_um`` [arcsec].
-    outer_scale_m : float or None
+    outer_scale_m : float, (p,) array_like or None
         Outer scale L0 [m]; None for Kolmogorov turbulence, L0 infinite.
-    wind_speed_m_s, diameter_m : float
-        Speed of the layer [m/s]; telescope diameter D [m].
+    wind_speed_m_s : float or (p,) array_like
+        Speed of the layer [m/s].
+    diameter_m : float
+        Telescope diameter D [m].
     obstruction, seeing_wavelength_um : float, optional
         Diameter of the central obstruction as a fraction of D; wavelength of the seeing [um].
 
@@ -61,6 +63,8 @@ class Atmosphere:
     ------
     ProblemError
         If a value is not finite or out of its range.
+    DimensionError
+        If seeing, wind and outer scale are not single numbers or lists of the same length.
 
     Examples
     --------
@@ -72,20 +76,49 @@ class Atmosphere:
     ... )
     >>> round(air.tilt_rms_nm, 1)
     591.6
+
+    Two loops that differ in the seeing alone:
+
+    >>> from dataclasses import replace
+    >>> flows = replace(air, seeing_arcsec=[0.8, 1.6])
+    >>> (flows.psd([5.0]) / air.psd([5.0])).round(4).ravel().tolist()
+    [1.0, 3.1748]
     """
 
-    seeing_arcsec: Positive
-    outer_scale_m: Positive | None
-    wind_speed_m_s: Positive
+    seeing_arcsec: Any
+    outer_scale_m: Any
+    wind_speed_m_s: Any
     diameter_m: Positive
     obstruction: Obstruction = 0.0
     seeing_wavelength_um: Positive = 0.5
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        given = {name: getattr(self, name) for name in _PER_LOOP}
+        values = {name: positive(value, name) for name, value in given.items() if value is not None}
+        shapes = {value.shape for value in values.values() if value.ndim}
+        if len(shapes) > 1 or any(len(shape) != 1 for shape in shapes):
+            sizes = ", ".join(f"{name} {value.shape}" for name, value in values.items())
+            raise DimensionError(
+                "seeing, wind and outer scale must be single numbers or lists of the same length; "
+                f"got {sizes}."
+            )
+        if shapes:
+            (shape,) = shapes
+            values = {name: np.broadcast_to(value, shape) for name, value in values.items()}
+        check_fields(self, **{n: v if v.ndim else float(v) for n, v in values.items()})
 
     @property
-    def fried_parameter_m(self) -> float:
+    def is_stack(self) -> bool:
+        """Whether there is one layer for each loop."""
+        return np.ndim(self.wind_speed_m_s) > 0
+
+    def take(self, rows: IntArray) -> Atmosphere:
+        """Return the layers of some loops."""
+        arrays = {name: getattr(self, name) for name in _PER_LOOP}
+        return replace(self, **{n: value[rows] for n, value in arrays.items() if value is not None})
+
+    @property
+    def fried_parameter_m(self) -> Any:
         """Fried parameter r0 = 0.976 lambda / seeing at the seeing's wavelength [m]."""
         return 0.976 * self.seeing_wavelength_um * 1e-6 / (self.seeing_arcsec * ARCSEC_RAD)
 
@@ -96,7 +129,7 @@ class Atmosphere:
         return float(np.sqrt(tilt_strength_nm2(self) * variance))
 
     @property
-    def scale_ratio(self) -> float:
+    def scale_ratio(self) -> Any:
         """Telescope diameter over the outer scale; 0 for Kolmogorov turbulence."""
         return 0.0 if self.outer_scale_m is None else self.diameter_m / self.outer_scale_m
 
@@ -104,38 +137,44 @@ class Atmosphere:
         """One-sided temporal power spectrum of one axis [nm^2/Hz] at frequencies [Hz].
 
         The mean over wind directions: the two axes have the same spectrum and are taken as
-        independent. Its integral over frequency is ``tilt_rms_nm**2``. A frequency that is negative
-        or not finite raises a ProblemError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> air = lbt.Atmosphere(
-        ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
-        ... )
-        >>> slow, fast = air.psd([0.1, 100.0])
-        >>> bool(slow > 1e9 * fast)
-        True
+        independent. Its integral over frequency is ``tilt_rms_nm**2``. That of a stack is (p, f). A
+        frequency that is negative or not finite raises a ProblemError.
         """
         frequency = real_array(frequency_hz, "frequency_hz")
-        if np.any(frequency < 0):
-            raise ProblemError(f"frequency_hz must be at least 0; got {np.min(frequency)}.")
-        crossing_s = self.diameter_m / self.wind_speed_m_s
+        shapes, which, factors = self.factored_psd(frequency.ravel())
+        density = shapes[which] * factors[:, None]
+        return np.asarray(density.reshape((*np.shape(self.wind_speed_m_s), *frequency.shape)))
+
+    def factored_psd(self, frequency_hz: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
+        """Shapes (u, f) of the spectra, which of them each loop has, and its factor, (p,) each.
+
+        Spectra of the same wind and outer scale have one shape.
+        """
+        if np.any(frequency_hz < 0):
+            raise ProblemError(f"frequency_hz must be at least 0; got {np.min(frequency_hz)}.")
+        crossing_s = np.atleast_1d(self.diameter_m / self.wind_speed_m_s)
+        # pairs as complex numbers, which are sorted several times faster
+        unique, which = np.unique(crossing_s + 1j * self.scale_ratio, return_inverse=True)
         with np.errstate(divide="ignore"):
-            x = np.log(frequency * crossing_s)
-        density = _log_density(tilt_spline(self.scale_ratio, self.obstruction), x)
-        return np.asarray(tilt_strength_nm2(self) * crossing_s * np.exp(density))
+            x = np.log(frequency_hz) + np.log(unique.real[:, None])
+        values, ratios = np.empty(x.shape), np.unique(unique.imag)
+        # a polynomial over an octave needs as many tables
+        spline_of = tilt_spline if len(ratios) <= _TERMS else _interpolated_spline
+        for ratio in ratios:
+            rows = unique.imag == ratio
+            values[rows] = _log_density(spline_of(float(ratio), self.obstruction), x[rows])
+        return np.exp(values), which.reshape(-1), tilt_strength_nm2(self) * crossing_s
 
 
-def kolmogorov_constant_nm2(air: Atmosphere) -> float:
+def kolmogorov_constant_nm2(air: Atmosphere) -> Any:
     """Factor of ``(f^2 + L0^-2)^(-11/6)`` in the spatial phase spectrum [nm^2 m^(-5/3)]."""
     nm_per_radian = air.seeing_wavelength_um * 1e3 / (2 * np.pi)
-    return float(_VON_KARMAN * air.fried_parameter_m ** (-5 / 3) * nm_per_radian**2)
+    return _VON_KARMAN * air.fried_parameter_m ** (-5 / 3) * nm_per_radian**2
 
 
-def tilt_strength_nm2(air: Atmosphere) -> float:
+def tilt_strength_nm2(air: Atmosphere) -> Any:
     """Factor of tilt spectra in units of the telescope's diameter [nm^2]."""
-    return float(kolmogorov_constant_nm2(air) * air.diameter_m ** (5 / 3))
+    return kolmogorov_constant_nm2(air) * air.diameter_m ** (5 / 3)
 
 
 def _filtered_spectrum(scale_ratio: float, eps: float, f: FloatArray) -> FloatArray:
@@ -161,7 +200,7 @@ def _bessel_j2(x: FloatArray) -> FloatArray:
 @lru_cache(maxsize=2)
 def _spatial_panels(*, is_flat: bool = False) -> tuple[FloatArray, FloatArray]:
     """Nodes over spatial frequency [1/D]: octaves below 1/4 unless all is flat there."""
-    low = np.array([0.0, 0.25]) if is_flat else np.geomspace(1e-9, 0.25, 29)
+    low = np.array([0.0, 0.25]) if is_flat else np.geomspace(1e-18, 0.25, 59)
     return gauss_panels(np.concatenate([low, [0.5], np.arange(1.0, 41.0)]), 10)
 
 
@@ -197,104 +236,6 @@ def tilt_spline(scale_ratio: float, obstruction: float) -> PPoly:
             density.append(4 * spectrum @ wy)
     knots = np.log(np.concatenate([slow, fast]))
     return CubicSpline(knots, np.log(np.concatenate(density)))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrozenFlows:
-    """Frozen von Karman layers, one per loop, over the telescope of one atmosphere.
-
-    Parameters
-    ----------
-    atmosphere : Atmosphere
-        The telescope, and the default values.
-    seeing_arcsec, wind_speed_m_s, outer_scale_m : (p,) array_like, optional
-        Seeing [arcsec], wind speed [m/s] and outer scale [m] of each loop, or one number for
-        all; those of the atmosphere by default.
-
-    Raises
-    ------
-    ProblemError
-        If a value is not above 0.
-    DimensionError
-        If they are not lists of the same length.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> air = lbt.Atmosphere(
-    ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
-    ... )
-    >>> flows = lbt.models.FrozenFlows(atmosphere=air, seeing_arcsec=[0.8, 1.6])
-    >>> (flows.psd([5.0]) / air.psd([5.0])).round(4).ravel().tolist()
-    [1.0, 3.1748]
-    """
-
-    atmosphere: Atmosphere
-    seeing_arcsec: Any = None
-    wind_speed_m_s: Any = None
-    outer_scale_m: Any = None
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        given = {}
-        for name in _PER_LOOP:
-            value = getattr(self, name)
-            value = getattr(self.atmosphere, name) if value is None else value
-            if value is None:  # Kolmogorov
-                continue
-            given[name] = np.atleast_1d(positive(value, name))
-        try:
-            arrays = np.broadcast_arrays(*given.values())
-        except ValueError as error:
-            shapes = ", ".join(f"{name} {value.shape}" for name, value in given.items())
-            raise DimensionError(
-                f"seeing, wind and outer scale must be lists of the same length; got {shapes}."
-            ) from error
-        if arrays[0].ndim != 1:
-            raise DimensionError(f"they must be lists, one number per loop; got {arrays[0].shape}.")
-        check_fields(self, **dict(zip(given, arrays, strict=True)))
-
-    def __len__(self) -> int:
-        """Return the number of loops p."""
-        return int(self.seeing_arcsec.size)
-
-    def take(self, rows: IntArray) -> FrozenFlows:
-        """Return the flows of some loops."""
-        arrays = {name: getattr(self, name) for name in _PER_LOOP}
-        return replace(self, **{n: value[rows] for n, value in arrays.items() if value is not None})
-
-    def psd(self, frequency_hz: ArrayLike) -> FloatArray:
-        """One-sided temporal power spectra (p, f) of one axis [nm^2/Hz] at frequencies (f,) [Hz].
-
-        A frequency that is not a finite number above 0 raises a ProblemError.
-        """
-        shapes, which, factors = self.factored_psd(frequency_hz)
-        return np.asarray(shapes[which] * factors[:, None])
-
-    def factored_psd(self, frequency_hz: ArrayLike) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Shapes (u, f) of the spectra, which of them each loop has, and its factor, (p,) each.
-
-        Spectra of the same wind and outer scale have one shape. For the frequencies see
-        :meth:`psd`.
-        """
-        frequency = real_array(frequency_hz, "frequency_hz")
-        if frequency.ndim != 1 or np.any(frequency <= 0):
-            raise ProblemError("frequency_hz must be a list of frequencies above 0 Hz.")
-        air = self.atmosphere
-        crossing_s, scale_ratio = air.diameter_m / self.wind_speed_m_s, np.zeros(len(self))
-        if self.outer_scale_m is not None:
-            scale_ratio = air.diameter_m / self.outer_scale_m
-        # pairs as complex numbers, which are sorted several times faster
-        unique, which = np.unique(crossing_s + 1j * scale_ratio, return_inverse=True)
-        x = np.log(frequency) + np.log(unique.real[:, None])
-        values, ratios = np.empty(x.shape), np.unique(unique.imag)
-        # a polynomial over an octave needs as many tables
-        spline_of = tilt_spline if len(ratios) <= _TERMS else _interpolated_spline
-        for ratio in ratios:
-            rows = unique.imag == ratio
-            values[rows] = _log_density(spline_of(float(ratio), air.obstruction), x[rows])
-        strength = tilt_strength_nm2(air) * (self.seeing_arcsec / air.seeing_arcsec) ** (5 / 3)
-        return np.exp(values), which.reshape(-1), strength * crossing_s
 
 
 def _interpolated_spline(scale_ratio: float, obstruction: float) -> PPoly:

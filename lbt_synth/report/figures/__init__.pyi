@@ -1,5 +1,3 @@
 from .loops import loop_figure as loop_figure
 from .records import identification_figure as identification_figure
-from .studies import modal_figure as modal_figure
-from .studies import robustness_figure as robustness_figure
 from .studies import robustness_map_figure as robustness_map_figure

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,19 +14,31 @@ from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.loop import ClosedLoop, close_loop, loop_margins
 from lbt_synth.loop.margins import BrokenLoop, broken_loops
 from lbt_synth.loop.simulation import SHOWN_FRAMES, LoopStep, step_response
-from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing, shorten, square_in
+from lbt_synth.report.draw import (
+    GREY,
+    GUIDE,
+    PANEL_IN,
+    Figure,
+    OwnAxes,
+    drawing,
+    line_style,
+    name_axes,
+    shorten,
+)
 from lbt_synth.validation import ComplexArray, FloatArray, choice
 
-FREQUENCY = {"label": "frequency", "unit": "Hz", "log": True}
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FREQUENCY = ("frequency", "Hz")
 _DECADES = 3.6  # of frequency that are drawn, below half the frame rate
 _POINTS = 1200  # of a grid of frequencies
 _LOWEST_DB, _HIGHEST_DB = -40.0, 60.0
 _REACH = 2.5  # of a Nyquist plot from its centre
-FAR = 3 * _REACH  # loop gain that is outside of it
 _MODULI = (0.3, 0.5, 0.7)  # modulus margins whose contours a Nichols plot has
 _TURN = np.linspace(0, 2 * np.pi, 241)
 _APART = 1e-12  # of a response, that another axis has by rounding
-_THIN: dict[str, Any] = {"look": None, "width": 1.0, "numbers": False}
+_MARKS = {"phase margin": "o", "gain margin": "s", "critical point": "x"}
 Loops: TypeAlias = Mapping[str, ClosedLoop]  # by the names of designs
 # Frequencies [Hz] of a curve, (f,), and the largest singular values of error, rejection and noise,
 # (f,) each; None for what there is not
@@ -139,17 +151,17 @@ def frequency_grid(
 
 
 def draw_design(
-    panel: Panel, names: Sequence[str], name: str, x: ArrayLike, y: ArrayLike | None, **look: Any
+    axes: Axes, names: Sequence[str], name: str, x: ArrayLike, y: ArrayLike | None, **style: Any
 ) -> None:
     """Draw the curve of a design in the look of its place among the names.
 
     Without values it is in the legend as unstable.
     """
-    number = list(names).index(name)
+    look = line_style(list(names).index(name))
     if y is None:
-        panel.curve(f"{name}: unstable", [], [], look=number)
+        axes.plot([], [], label=f"{name}: unstable", **look)
     else:
-        panel.curve(name, x, y, look=number, **look)
+        axes.plot(x, y, label=name, **look, **style)
 
 
 def sigma_curves(
@@ -212,7 +224,6 @@ def draw_sigma(
     *,
     unit: str = "nm",
     title: str = "",
-    line: str = "vibration",
     axes: OwnAxes = None,
 ) -> Figure:
     """Draw estimation errors, and rejection and noise transfer of loops; a panel for what is there.
@@ -231,16 +242,17 @@ def draw_sigma(
     ]
     with drawing([PANEL_IN] * len(drawn), axes=axes) as panels:
         for panel, (number, label, of, norms) in zip(panels, drawn, strict=True):
-            y_axis = {"label": f"\u03c3\u0304, {label}", "unit": of, "log": True}
-            panel.set_axes(FREQUENCY, y_axis, title=title if number == 1 else "")
+            y_axis, above = (f"\u03c3\u0304, {label}", of), title if number == 1 else ""
+            _, factor = name_axes(panel, FREQUENCY, y_axis, above, xscale="log", yscale="log")
             for name, (f, norm) in norms.items():
                 is_unstable = number > 0 and name in loops and not loops[name].is_stable
                 if norm is not None or is_unstable:
-                    draw_design(panel, list(norms), name, f, norm)
+                    shown = None if norm is None else factor * norm
+                    draw_design(panel, list(norms), name, f, shown)
             for line_hz in lines_hz:
-                panel.rule(line, line_hz, dash=3)
+                panel.axvline(line_hz, label="vibration", linestyle=":", **GUIDE)
             if number == 1:
-                panel.rule("", 1.0, "y")
+                panel.axhline(1.0, **GUIDE)
     return panels[0].figure
 
 
@@ -281,42 +293,59 @@ def margins_text(broken: BrokenLoop | None) -> str:
     return ", ".join(texts + ([f"{' / '.join(gains)} dB"] if gains else []))
 
 
-def _draw_opened(panel: Panel, opened: OpenLoop, x: ArrayLike, y: ArrayLike) -> None:
+def _draw_opened(axes: Axes, opened: OpenLoop, x: ArrayLike, y: ArrayLike) -> None:
     """Draw a curve in the look of a loop, named with its margins."""
     name, look, dash, broken = opened
-    panel.curve(f"{shorten(name, 24)}: {margins_text(broken)}", x, y, look=look, dash=dash)
+    label = f"{shorten(name, 24)}: {margins_text(broken)}"
+    axes.plot(x, y, label=label, **line_style(look, dash=dash))
+
+
+def _margin_points(broken: BrokenLoop | None) -> Iterator[tuple[str, float, float, float]]:
+    """Yield name, frequency [Hz], gain [dB] and phase [deg] of the points that margins lie at."""
+    if broken is None:
+        return
+    if (point := broken.phase_margin) is not None:
+        yield "phase margin", point.frequency_hz, 0.0, _phase_at(broken, point.frequency_hz)
+    for point in broken.gain_margins:
+        # a margin at rest is drawn at the lowest frequency
+        frequency_hz = max(point.frequency_hz, broken.frequency_hz[-1] / 10**_DECADES)
+        gain_db = -20 * float(np.log10(point.gain))
+        yield "gain margin", frequency_hz, gain_db, _phase_at(broken, frequency_hz)
+
+
+def _phase_at(broken: BrokenLoop, frequency_hz: float) -> float:
+    return float(np.interp(frequency_hz, broken.frequency_hz, broken.phase_deg))
+
+
+def _mark(axes: Axes, name: str, x: float, y: float) -> None:
+    """Draw the mark of a margin or of the critical point."""
+    axes.plot(x, y, _MARKS[name], label=name, color=GREY, markersize=4.5)
 
 
 def draw_bode(loops: Loops, *, axes: OwnAxes = None) -> Figure:
     """Draw gain and phase of broken loops, with their margins."""
     opened = open_loops(loops)
-    points = [None if broken is None else loop_points(broken) for *_, broken in opened]
-    gains = np.concatenate([np.zeros(1), *(curve[1] for curve in points if curve)])
-    phases = np.concatenate([[-180.0, -90.0], *(curve[2] for curve in points if curve)])
-    y_axis = {
-        "label": "loop gain",
-        "unit": "dB",
-        "low": _LOWEST_DB if np.min(gains) < _LOWEST_DB else None,
-        "high": _HIGHEST_DB if np.max(gains) > _HIGHEST_DB else None,
-    }
     with drawing([PANEL_IN, PANEL_IN], axes=axes) as (above, below):
-        above.set_axes(FREQUENCY, y_axis)
-        below.set_axes(FREQUENCY, {"label": "phase", "unit": "deg"})
-        above.rule("", 0.0, "y", dash=1)
-        for drawn, curves in zip(opened, points, strict=True):
-            if curves is None:
-                _draw_opened(above, drawn, [], [])
+        name_axes(above, FREQUENCY, ("loop gain", "dB"), xscale="log")
+        name_axes(below, FREQUENCY, ("phase", "deg"), xscale="log")
+        above.axhline(0.0, linestyle="--", **GUIDE)
+        for loop in opened:
+            broken = loop[-1]
+            if broken is None:
+                _draw_opened(above, loop, [], [])
                 continue
-            f, gain, phase, _ = curves
-            _draw_opened(above, drawn, f, np.maximum(gain, 2 * _LOWEST_DB))  # a zero is far below
-            _draw_opened(below, drawn, f, phase)
-        for at in _critical_phases(float(np.nanmin(phases)), float(np.nanmax(phases))):
-            below.rule("", at, "y", dash=1)
-        for broken in (broken for *_, broken in opened if broken is not None):
-            for frequency_hz, ends in _gain_marks(broken):
-                _mark(above, "gain margin", [frequency_hz] * 2, ends, "s")
-            for frequency_hz, ends in _phase_marks(broken):
-                _mark(below, "phase margin", [frequency_hz] * 2, ends, "o")
+            f, gain, phase, _ = loop_points(broken)
+            _draw_opened(above, loop, f, np.maximum(gain, 2 * _LOWEST_DB))  # a zero is far below
+            _draw_opened(below, loop, f, phase)
+            for name, frequency_hz, gain_db, phase_deg in _margin_points(broken):
+                if name == "gain margin":
+                    _mark(above, name, frequency_hz, gain_db)
+                else:
+                    _mark(below, name, frequency_hz, phase_deg)
+        low, high = above.get_ylim()
+        above.set_ylim(max(low, _LOWEST_DB), min(high, _HIGHEST_DB))
+        for at in _critical_phases(*below.get_ylim()):
+            below.axhline(at, linestyle="--", **GUIDE)
     return above.figure
 
 
@@ -325,98 +354,60 @@ def _draw_nyquist(loops: Loops, *, axes: OwnAxes = None) -> Figure:
     columns = min(2, len(loops))
     with drawing([square_in(columns)] * len(loops), columns=columns, axes=axes) as panels:
         for panel, (name, loop) in zip(panels, loops.items(), strict=True):
-            _draw_plane(panel, name, loop)
+            margins = loop_margins(loop) if loop.is_stable else None
+            title = f"{name}: unstable"
+            if margins is not None:
+                title = f"{name}: disk {margins.disk:.2f}, modulus {margins.modulus:.2f}"
+            parts = ("real part", "-"), ("imaginary part", "-")
+            name_axes(panel, *parts, title, box_aspect=1)
+            panel.set(xlim=(-1.4 * _REACH, 0.6 * _REACH), ylim=(-_REACH, _REACH))
+            panel.plot(np.cos(_TURN), np.sin(_TURN), label="unit circle", linestyle=":", **GUIDE)
+            _mark(panel, "critical point", -1.0, 0.0)
+            if margins is None:
+                continue
+            groups = broken_loops(loop)
+            for number, broken in enumerate(groups):
+                far = np.abs(broken.response) > 3 * _REACH
+                shown = np.where(far, np.nan, broken.response)
+                label = axes_name("loop", broken.measurements, alone=len(groups) == 1)
+                panel.plot(shown.real, shown.imag, label=label, **line_style(0, dash=number))
+                if (point := broken.phase_margin) is not None:
+                    _mark(panel, "phase margin", point.response.real, point.response.imag)
+                for point in broken.gain_margins:
+                    _mark(panel, "gain margin", point.response.real, 0.0)
+            low, high = margins.disk_gain_low, min(margins.disk_gain_high, 1e3)
+            for label, centre, radius, look in (
+                ("modulus margin", -1.0, margins.modulus, 2),
+                ("disk margin", -(low + high) / 2, (high - low) / 2, 1),
+            ):
+                x, y = centre + radius * np.cos(_TURN), radius * np.sin(_TURN)
+                panel.plot(x, y, label=label, **GUIDE | line_style(look, dash=0))
     return panels[0].figure
-
-
-def _draw_plane(panel: Panel, name: str, loop: ClosedLoop) -> None:
-    """Draw the broken loops of a design in the complex plane."""
-    x, y = (
-        {"label": f"{part} part", "unit": "-", "low": low, "high": low + 2 * _REACH}
-        for part, low in (("real", -0.7 * 2 * _REACH), ("imaginary", -_REACH))
-    )
-    margins, title = None, f"{name}: unstable"
-    if loop.is_stable:
-        margins = loop_margins(loop)
-        title = f"{name}: disk {margins.disk:.2f}, modulus {margins.modulus:.2f}"
-    panel.set_axes(x, y, title=title, equal=True)
-    panel.curve("unit circle", np.cos(_TURN), np.sin(_TURN), dash=3, **_THIN)
-    _mark(panel, "critical point", [-1.0], [0.0], "x")
-    if margins is None:
-        return
-    groups = broken_loops(loop)
-    for number, broken in enumerate(groups):
-        shown = np.where(np.abs(broken.response) < FAR, broken.response, np.nan)
-        label = axes_name("loop", broken.measurements, alone=len(groups) == 1)
-        panel.curve(label, shown.real, shown.imag, dash=number)
-        pale: dict[str, Any] = {"dash": number, "opacity": 0.35, "numbers": False}
-        panel.curve("negative frequencies", shown.real, -shown.imag, **pale)
-        if (point := broken.phase_margin) is not None:
-            ends = [0.0, point.response.real], [0.0, point.response.imag]
-            _mark(panel, "phase margin", *ends, "o")
-        for point in broken.gain_margins:
-            _mark(panel, "gain margin", [point.response.real], [0.0], "s")
-    low, high = margins.disk_gain_low, min(margins.disk_gain_high, 1e3)
-    for label, centre, radius, look in (
-        ("modulus margin", -1.0, margins.modulus, 2),
-        ("disk margin", -(low + high) / 2, (high - low) / 2, 1),
-    ):
-        places = centre + radius * np.cos(_TURN), radius * np.sin(_TURN)
-        panel.curve(label, *places, look=look, width=1.2, numbers=False)
 
 
 def _draw_nichols(loops: Loops, *, axes: OwnAxes = None) -> Figure:
     """Draw gain over phase of loops, with their margins and contours of the modulus margin."""
     opened = open_loops(loops)
-    curves = []
-    for *_, broken in opened:
-        gain, phase = (np.zeros(0),) * 2 if broken is None else loop_points(broken)[1:3]
-        seen = (gain > _LOWEST_DB) & (gain < _HIGHEST_DB)
-        curves.append((np.where(seen, phase, np.nan), np.where(seen, gain, np.nan)))
-    reach = np.concatenate([[-360.0, 0.0], *(phase for phase, _ in curves)])
-    lowest, highest = float(np.nanmin(reach)), float(np.nanmax(reach))
-    x_axis = {"label": "phase", "unit": "deg", "low": lowest, "high": highest}
     with drawing([2 * PANEL_IN], axes=axes) as (panel,):
-        panel.set_axes(x_axis, {"label": "loop gain", "unit": "dB", "high": 40.0})
-        for drawn, curve in zip(opened, curves, strict=True):
-            _draw_opened(panel, drawn, *curve)
-        for broken in (broken for *_, broken in opened if broken is not None):
-            for _, ends in _phase_marks(broken):
-                _mark(panel, "phase margin", ends, [0.0, 0.0], "o")
-            for frequency_hz, ends in _gain_marks(broken):
-                phase_deg = float(np.interp(frequency_hz, broken.frequency_hz, broken.phase_deg))
-                _mark(panel, "gain margin", [phase_deg] * 2, ends, "s")
-        for at in _critical_phases(lowest, highest):
+        name_axes(panel, ("phase", "deg"), ("loop gain", "dB"))
+        for loop in opened:
+            broken = loop[-1]
+            gain, phase = (np.zeros(0),) * 2 if broken is None else loop_points(broken)[1:3]
+            seen = (gain > _LOWEST_DB) & (gain < _HIGHEST_DB)
+            _draw_opened(panel, loop, np.where(seen, phase, np.nan), np.where(seen, gain, np.nan))
+            for name, _, gain_db, phase_deg in _margin_points(broken):
+                _mark(panel, name, phase_deg, gain_db)
+        ends = panel.get_xlim()
+        ends = min(ends[0], -360.0), max(ends[1], 0.0)
+        for at in _critical_phases(*ends):
             for dash, modulus in enumerate(_MODULI, start=1):
                 point = 1 - modulus * np.exp(1j * _TURN)
                 degrees, decibels = at + np.degrees(np.angle(point)), 20 * np.log10(np.abs(point))
-                panel.curve(f"modulus {modulus:g}", degrees, decibels, dash=dash, **_THIN)
-            _mark(panel, "critical point", [at], [0.0], "x")
+                style = GUIDE | line_style(None, dash=dash)
+                panel.plot(degrees, decibels, label=f"modulus {modulus:g}", **style)
+            _mark(panel, "critical point", at, 0.0)
+        panel.set(xlim=ends, ylim=(_LOWEST_DB, 40.0))
     return panel.figure
-
-
-def _mark(panel: Panel, name: str, x: Sequence[float], y: Sequence[float], marker: str) -> None:
-    """Draw what marks a margin: its point, the last one, and a line to it."""
-    panel.curve("", x, y, dash=0, **_THIN)
-    panel.curve(name, x[-1:], y[-1:], line=False, marker=marker, look=None, size=4.5)
-
-
-def _phase_marks(broken: BrokenLoop) -> list[tuple[float, list[float]]]:
-    """Return frequency [Hz] of the phase margin, and the phases [deg] that it lies between."""
-    point = broken.phase_margin
-    if point is None:
-        return []
-    phase = float(np.interp(point.frequency_hz, broken.frequency_hz, broken.phase_deg))
-    return [(point.frequency_hz, [phase - point.phase_deg, phase])]
-
-
-def _gain_marks(broken: BrokenLoop) -> list[tuple[float, list[float]]]:
-    """Return frequencies [Hz] of gain margins, and the gains [dB] that each lies between."""
-    least = broken.frequency_hz[-1] / 10**_DECADES
-    return [
-        (max(point.frequency_hz, least), [0.0, -20 * float(np.log10(point.gain))])
-        for point in broken.gain_margins
-    ]
 
 
 def _critical_phases(lowest: float, highest: float) -> list[float]:
@@ -443,16 +434,15 @@ def draw_steps(loops: Loops, *, axes: OwnAxes = None) -> Figure:
     steps = design_steps(loops)
     with drawing([PANEL_IN, PANEL_IN], axes=axes) as panels:
         for panel, label in zip(panels, ("residual", "command"), strict=True):
-            y_axis = {"label": f"{label}, part of the step", "unit": "-"}
-            panel.set_axes({"label": "time after the step", "unit": "ms"}, y_axis)
+            time = ("time after the step", "ms")
+            name_axes(panel, time, (f"{label}, part of the step", "-"))
             for look, (design, responses) in enumerate(steps.items()):
                 if not responses:
                     draw_design(panel, list(steps), design, [], None)
                 for number, step in enumerate(responses):
                     name = axes_name(design, [step.axis], alone=len(responses) == 1)
-                    line: dict[str, Any] = {"look": look, "dash": look + number if number else None}
-                    y = getattr(step, label)
-                    panel.curve(name, 1e3 * step.time_s, y, step="steps-post", **line)
+                    style = line_style(look, dash=look + number, drawstyle="steps-post")
+                    panel.plot(1e3 * step.time_s, getattr(step, label), label=name, **style)
     return panels[0].figure
 
 
@@ -462,3 +452,8 @@ DRAWN: Mapping[str, Callable[..., Figure]] = {
     "nichols": _draw_nichols,
     "step": draw_steps,
 }
+
+
+def square_in(columns: int) -> float:
+    """Return the height of square axes, so many side by side [inch]."""
+    return min(7.0 / columns - 0.75, 5.0)

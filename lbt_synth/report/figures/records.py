@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.signal import freqz, get_window, welch
@@ -19,16 +19,28 @@ from lbt_synth.loop import ClosedLoop, close_loop
 from lbt_synth.loop.simulation import Segment, Simulation
 from lbt_synth.models import ARModel, Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
-from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, Panel, drawing
+from lbt_synth.report.draw import (
+    PANEL_IN,
+    SHADE,
+    Figure,
+    OwnAxes,
+    colour,
+    drawing,
+    line_style,
+    name_axes,
+)
 from lbt_synth.report.figures.loops import FREQUENCY
-from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.display_unit import nm_text, shown_unit
 from lbt_synth.validation import FloatArray, require_instance
 
-TIME = {"label": "time", "unit": "s"}
-SPECTRUM = {"label": "power spectrum", "unit": "nm²/Hz", "log": True}
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+TIME = ("time", "s")
 SERIES_S = 1.0  # of a series, in which single oscillations are seen
 _WINDOW_S = 0.1  # over which the size of the residual is averaged
 _BANDS = 240  # of equal ratio over which the periodogram is averaged
+_FLAG_IN = 0.15  # width of an upright text
 _NAMES = ("tip", "tilt")
 
 
@@ -38,7 +50,6 @@ def simulation_figure(
     loop: ClosedLoop | None = None,
     truth: Truth | None = None,
     title: str = "",
-    axes: OwnAxes = None,
 ) -> Figure:
     """Residual series of the first second of the first case, and spectra.
 
@@ -46,26 +57,30 @@ def simulation_figure(
     axes; that of the transfer functions is beside them for a loop and a truth.
     """
     frames = min(run.residual_nm.shape[1], int(np.ceil(SERIES_S * run.frame_rate_hz)))
-    with drawing([PANEL_IN, PANEL_IN], columns=2, axes=axes) as (series, spectra):
+    with drawing([PANEL_IN, PANEL_IN], columns=2) as (series, spectra):
         _draw_series(series, run, frames, title)
-        spectra.set_axes(FREQUENCY, SPECTRUM)
+        density = ("power spectrum", "nm²/Hz")
+        _, factor = name_axes(spectra, FREQUENCY, density, xscale="log", yscale="log")
         f, opened, residual = run_spectra(run)
-        spectra.curve("before the correction", f, opened, look=None, width=0.8)
-        spectra.curve("after it", f, residual, look=5, width=1.0, dash=0)
+        before = line_style(None, linewidth=0.8)
+        spectra.plot(f, factor * opened, label="before the correction", **before)
+        spectra.plot(f, factor * residual, label="after it", **line_style(5, dash=0, linewidth=1.0))
         if loop is not None and truth is not None:
             exact = exact_spectrum(loop, truth, f, _segment(run))
-            spectra.curve("after it, exact", f, exact, look=1, width=1.4)
+            spectra.plot(f, factor * exact, label="after it, exact", **line_style(1))
+        spectra.set_ylim(bottom=0.3 * factor * float(np.min(residual)))
     return series.figure
 
 
-def _draw_series(panel: Panel, run: Simulation, frames: int, title: str) -> None:
+def _draw_series(axes: Axes, run: Simulation, frames: int, title: str) -> None:
     """Draw the residual of each axis in the first frames of the first case."""
     n = run.residual_nm.shape[2]
     names = _NAMES if n <= 2 else [f"mode {i}" for i in range(1, n + 1)]
     time = np.arange(frames) / run.frame_rate_hz
-    panel.set_axes(TIME, {"label": "residual", "unit": "nm"}, title=title)
+    _, factor = name_axes(axes, TIME, ("residual", "nm"), title)
     for i, name in zip(range(n), names, strict=False):
-        panel.curve(name, time, run.residual_nm[0, :frames, i], look=i, width=0.7, dash=0)
+        values = factor * run.residual_nm[0, :frames, i]
+        axes.plot(time, values, label=name, **line_style(i, dash=0, linewidth=0.7))
 
 
 def sensor_failure_figure(
@@ -85,15 +100,19 @@ def sensor_failure_figure(
     looks = {text: 3 + i for i, text in enumerate(dict.fromkeys(s.text for s in failures))}
     with drawing([PANEL_IN, PANEL_IN]) as (series, size):
         _draw_series(series, run, frames, title)
-        size.set_axes(TIME, {"label": "residual, both axes", "unit": "nm rms", "log": True})
+        residual = ("residual, both axes", "nm rms")
+        _, factor = name_axes(size, TIME, residual, yscale="log")
+        last_s = frames / run.frame_rate_hz
         for panel in (series, size):
             for failure in failures:
-                ends = failure.start_s, failure.end_s
-                panel.span(failure.text, *ends, look=looks[failure.text])
-        size.curve(f"in the run, over {_WINDOW_S:g} s", centres, rms_nm, look=0)
+                ends, shade = (failure.start_s, min(failure.end_s, last_s)), looks[failure.text]
+                panel.axvspan(*ends, label=failure.text, color=colour(shade), **SHADE)
+        label = f"in the run, over {_WINDOW_S:g} s"
+        size.plot(centres, factor * rms_nm, label=label, **line_style(0))
         for segment, exact in zip(segments, exact_nm, strict=True):
             if np.isfinite(exact):
-                size.curve("exact", [segment.start_s, segment.end_s], [exact] * 2, look=2)
+                ends = segment.start_s, min(segment.end_s, last_s)
+                size.plot(ends, [factor * exact] * 2, label="exact", **line_style(2))
     return series.figure
 
 
@@ -141,26 +160,21 @@ def identification_figure(
     """
     require_instance(model, IdentifiedModel)
     residuals = _predicted_residuals(model, designs or {})
-    cumulative = [
-        _cumulative_curves(axis, {name: densities[i] for name, densities in residuals.items()})
-        for i, axis in enumerate(model.axes)
-    ]
-    last = [float(y[-1]) for curves in cumulative for y, _ in curves.values() if y[-1] > 0]
-    rms = {"label": "rms up to the frequency", "unit": "nm", "log": True}
-    rms |= {"low": 0.2 * min(last), "high": 1.5 * max(last)} if last else {}
-    density, n = _density_axis(model), len(model.axes)
+    n = len(model.axes)
     heights = [height_in for height_in in (3.0, 1.9, 1.3) for _ in model.axes]
     with drawing(heights, columns=n, axes=axes) as panels:
         for i, axis in enumerate(model.axes):
-            first, last_hz = float(axis.frequency_hz[0]), float(axis.frequency_hz[-1])
-            frequency = FREQUENCY | {"low": first, "high": last_hz}
             name = f"{_NAMES[i]}: " if n == len(_NAMES) else ""
-            panels[i].set_axes(frequency, density, title=name + _noise_text(axis))
-            _draw_spectrum(panels[i], axis)
-            panels[n + i].set_axes(frequency, rms)
-            for label, (y, look) in cumulative[i].items():
-                panels[n + i].curve(label, axis.frequency_hz, y, look=look, width=1.2)
-            _draw_innovations(panels[2 * n + i], axis, frequency)
+            _draw_spectrum(panels[i], axis, name + _noise_text(axis))
+            densities = {name: each[i] for name, each in residuals.items()}
+            _draw_cumulative(panels[n + i], axis, densities)
+            _draw_innovations(panels[2 * n + i], axis)
+        for row in (panels[:n], panels[n : 2 * n]):  # the same scale for all axes
+            lows, highs = zip(*(panel.get_ylim() for panel in row), strict=True)
+            for panel in row:
+                panel.set_ylim(min(lows), max(highs))
+        for panel, axis in zip(panels, model.axes, strict=False):
+            _draw_flags(panel, axis)
     return panels[0].figure
 
 
@@ -208,20 +222,64 @@ def _noise_text(axis: IdentifiedAxis) -> str:
     return f"noise {nm_text(axis.noise_nm)}, gain {gain}"
 
 
-def _density_axis(model: IdentifiedModel) -> dict[str, object]:
-    """Return the same scale for all axes, with room for the labels of lines."""
-    smooth = [_average_bands(axis.frequency_hz, axis.density_nm2_hz)[1] for axis in model.axes]
-    top = max(float(np.max(values)) for values in smooth)
-    top = max([top, *(height for axis in model.axes for height in _line_heights(axis))])
-    low = 0.2 * min(float(np.min(values)) for values in smooth)
-    labelled = any(axis.lines for axis in model.axes)
-    high = top * (top / low) ** (0.45 if labelled else 0.1)
-    return {"label": "density", "unit": "nm²/Hz", "log": True, "low": low, "high": high}
+def _draw_spectrum(axes: Axes, axis: IdentifiedAxis, title: str) -> None:
+    """Draw the periodogram with its fit, and leave room for the names of lines."""
+    f, density = axis.frequency_hz, ("density", "nm²/Hz")
+    _, factor = name_axes(axes, FREQUENCY, density, title, xscale="log", yscale="log")
+    centres, smooth, least, most = _average_bands(f, axis.density_nm2_hz)
+    band = {"label": "periodogram: range", "color": colour(None), **SHADE}
+    axes.fill_between(centres, factor * least, factor * most, **band)
+    mean = line_style(None, linewidth=0.8)
+    axes.plot(centres, factor * smooth, label="periodogram: mean", **mean)
+    axes.plot(f, factor * axis.fitted_nm2_hz, label="fit", **line_style(0))
+    background = line_style(1, linewidth=1.2)
+    axes.plot(f, factor * axis.background_nm2_hz, label="fit without lines", **background)
+    top = factor * max(float(np.max(smooth)), *_line_heights(axis), 0.0)
+    low = 0.2 * factor * float(np.min(smooth))
+    axes.set_ylim(low, top * (top / low) ** (0.45 if axis.lines else 0.1))
+    axes.set_xlim(f[0], f[-1])
 
 
 def _line_heights(axis: IdentifiedAxis) -> FloatArray:
     peaks = [line.frequency_hz for line in axis.lines]
     return np.asarray(np.interp(peaks, axis.frequency_hz, axis.fitted_nm2_hz))
+
+
+def _draw_flags(axes: Axes, axis: IdentifiedAxis) -> None:
+    """Write the lines upright along the upper edge without overlaps, each tied to its point."""
+    if not axis.lines:
+        return
+    factor = shown_unit("nm²/Hz")[1]
+    x = [line.frequency_hz for line in axis.lines]
+    y = factor * _line_heights(axis)
+    points = axes.transData.transform(np.column_stack((x, y)))
+    across = axes.transAxes.inverted().transform(points)[:, 0]
+    width_in = axes.get_window_extent().width / axes.figure.dpi
+    places = spread_labels(across, _FLAG_IN / width_in)
+    tie = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "relpos": (0.5, 0.0)}
+    for line, point, place in zip(axis.lines, zip(x, y, strict=True), places, strict=True):
+        axes.annotate(
+            _line_text(line),
+            xy=point,
+            xytext=(float(place), 0.985),
+            textcoords="axes fraction",
+            fontsize=6.5,
+            rotation=90,
+            ha="center",
+            va="top",
+            arrowprops={**tie, "shrinkA": 0, "shrinkB": 0},
+        )
+
+
+def spread_labels(places: FloatArray, width: float) -> FloatArray:
+    """Return places in (0, 1) for labels of that width near increasing ones; none overlap."""
+    gap = min(width, 1 / max(places.size, 1))
+    steps = gap * np.arange(places.size)
+    least = gap / 2 + steps
+    # pushed to the right where they are crowded, and back from the end
+    right = np.maximum.accumulate(np.maximum(places, least) - steps) + steps
+    ends = 1 - least[::-1]
+    return np.asarray(np.minimum.accumulate((np.minimum(right, ends) - steps)[::-1])[::-1] + steps)
 
 
 def _average_bands(
@@ -239,27 +297,14 @@ def _average_bands(
     )
 
 
-def _draw_spectrum(panel: Panel, axis: IdentifiedAxis) -> None:
-    f = axis.frequency_hz
-    centres, smooth, least, most = _average_bands(f, axis.density_nm2_hz)
-    panel.area("periodogram: range", centres, least, most, look=None)
-    panel.curve("periodogram: mean", centres, smooth, look=None, width=0.8)
-    panel.curve("fit", f, axis.fitted_nm2_hz, look=0, width=1.3)
-    panel.curve("fit without lines", f, axis.background_nm2_hz, look=1, width=1.2)
-    peaks = [line.frequency_hz for line in axis.lines]
-    panel.flags(peaks, _line_heights(axis), [_line_text(line) for line in axis.lines])
-
-
 def _line_text(line: IdentifiedLine) -> str:
     """Return frequency and rms of a line on its axis, and the direction if both axes share it."""
     along = "" if line.direction is None else f", {line.direction_deg:.0f}°"
     return f"{line.frequency_hz:.2f} Hz, {nm_text(line.rms_nm)}{along}"
 
 
-def _cumulative_curves(
-    axis: IdentifiedAxis, residuals: dict[str, FloatArray]
-) -> dict[str, tuple[FloatArray, int | None]]:
-    """Return the rms that adds up from low to high frequencies, and the look of its curve."""
+def _draw_cumulative(axes: Axes, axis: IdentifiedAxis, residuals: dict[str, FloatArray]) -> None:
+    """Draw the rms that adds up from low to high frequencies."""
     f, white = axis.frequency_hz, _noise_density(axis)
     densities: dict[str, tuple[FloatArray, int | None]] = {
         "disturbance, data": (axis.density_nm2_hz - white, None),
@@ -269,23 +314,30 @@ def _cumulative_curves(
         densities["measurement that ran"] = (axis.data.measured / axis.sensor_gain**2, 2)
     for look, (name, density) in enumerate(residuals.items(), start=3):
         densities[f"residual, {name}"] = (density, look)
-    step = np.gradient(f)
-    return {
-        name: (np.sqrt(np.maximum(np.cumsum(density * step), 0)), look)
-        for name, (density, look) in densities.items()
-    }
+    rms = ("rms up to the frequency", "nm")
+    _, factor = name_axes(axes, FREQUENCY, rms, xscale="log", yscale="log")
+    totals, step = [], np.gradient(f)
+    for name, (density, shade) in densities.items():
+        values = factor * np.sqrt(np.maximum(np.cumsum(density * step), 0))
+        axes.plot(f, values, label=name, **line_style(shade, linewidth=1.2))
+        totals += [values[-1]] if values[-1] > 0 else []
+    if totals:
+        axes.set_ylim(0.2 * min(totals), 1.5 * max(totals))
+    axes.set_xlim(f[0], f[-1])
 
 
-def _draw_innovations(panel: Panel, axis: IdentifiedAxis, frequency: dict[str, object]) -> None:
-    test = axis.whiteness
+def _draw_innovations(axes: Axes, axis: IdentifiedAxis) -> None:
+    """Draw the cumulative periodogram of the innovations less that of white noise."""
+    test, f = axis.whiteness, axis.frequency_hz
     even = np.arange(1, test.cumulative.size + 1) / test.cumulative.size
     bound = 100 * kstwobign.isf(0.01) / np.sqrt(test.effective)  # of Kolmogorov's statistic
     excess = 100 * (test.cumulative - even)
     reach = max(2 * bound, 1.2 * float(np.max(np.abs(excess))))
-    y_axis = {"label": "power up to f", "unit": "%", "low": -reach, "high": reach}
-    panel.set_axes(frequency, y_axis, title="innovations, less white noise")
-    panel.span("99 % of white noise", -bound, bound, "y")
-    panel.curve("excess", axis.frequency_hz, excess, width=1.0, quiet=True)
+    title = "innovations, less white noise"
+    name_axes(axes, FREQUENCY, ("power up to f", "%"), title, xscale="log")
+    axes.axhspan(-bound, bound, label="99 % of white noise", color=colour(None), **SHADE)
+    axes.plot(f, excess, label="_excess", **line_style(0, linewidth=1.0))
+    axes.set(xlim=(f[0], f[-1]), ylim=(-reach, reach))
 
 
 SEGMENT = 2048  # frames of a segment of the spectra, at most

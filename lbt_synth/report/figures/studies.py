@@ -7,93 +7,63 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from lbt_synth.errors import DimensionError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.interop.specula.simulation import EndToEndRun
 from lbt_synth.methods.registry import design_label
-from lbt_synth.models import LoopHardware
-from lbt_synth.report.draw import PANEL_IN, Figure, OwnAxes, count_columns, drawing
+from lbt_synth.models import LoopHardware, PositionLoop
+from lbt_synth.report.draw import (
+    GUIDE,
+    PANEL_IN,
+    SHADE,
+    Figure,
+    OwnAxes,
+    colour,
+    count_columns,
+    dot_style,
+    draw_map,
+    drawing,
+    line_style,
+    name_axes,
+)
 from lbt_synth.report.figures.loops import draw_design
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts
 from lbt_synth.studies.limits import LimitStudy
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, RobustnessRow
-from lbt_synth.validation import FloatArray, positive, require_instance
+from lbt_synth.validation import FloatArray
 
-FREQUENCY_ERROR = {"label": "frequency error, truth less design", "unit": "Hz"}
-SENSOR_GAIN = {"label": "sensor gain", "unit": "-"}
-SHORT_FREQUENCY_ERROR = {"label": "frequency error", "unit": "Hz"}  # of narrow panels
-_POINTS: dict[str, Any] = {"marker": "own", "size": 4.0}
-_RINGS: dict[str, Any] = {"line": False, "marker": "own", "filled": False, "size": 9.0}
+FREQUENCY_ERROR = ("frequency error, truth less design", "Hz")
+SENSOR_GAIN = ("sensor gain", "-")
+SHORT_FREQUENCY_ERROR = ("frequency error", "Hz")  # of narrow panels
+STREHL = ("Strehl ratio", "%")
+_RINGS: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "markersize": 8.0}
 
 
 def robustness_figure(
-    rows: Sequence[RobustnessRow],
-    published: Mapping[str, Sequence[tuple[float, float]]] | None = None,
-    *,
-    axes: OwnAxes = None,
+    rows: Sequence[RobustnessRow], published: Mapping[str, Sequence[tuple[float, float]]]
 ) -> Figure:
-    """Draw the Strehl ratio over the error of the model's vibration frequency.
+    """Draw the Strehl ratio over the frequency error, and the pairs that were published.
 
-    Parameters
-    ----------
-    rows : sequence of RobustnessRow
-        Rows of :func:`lbt_synth.studies.robustness`; unstable ones are marked at the bottom.
-    published : mapping, optional
-        For each method, pairs (error [Hz], Strehl ratio [%]) drawn as open markers.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes, one; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel.
-
-    Raises
-    ------
-    ProblemError
-        If there are no rows, or ``axes`` are not one.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> parts = config.plant, config.truth, config.imaging
-    >>> rows = list(lbt.studies.robustness(*parts, errors_hz=[0]))
-    >>> len(lbt.report.figures.robustness_figure(rows).axes)
-    1
+    Unstable loops are marked at the bottom, published pairs (error [Hz], Strehl ratio [%]) with
+    open markers.
     """
-    if not rows:
-        raise ProblemError("a robustness figure needs at least one row; got none.")
-    strehls = [100 * row.strehl if row.stable else 0.0 for row in rows]
-    papers = [strehl for points in (published or {}).values() for _, strehl in points]
-    with drawing([2.5], axes=axes) as (panel,):
-        panel.set_axes(FREQUENCY_ERROR, strehl_axis([*strehls, *papers]))
+    with drawing([2.5]) as (panel,):
+        name_axes(panel, FREQUENCY_ERROR, STREHL)
         for look, method in enumerate(dict.fromkeys(row.method for row in rows)):
             entries = sorted((r for r in rows if r.method == method), key=lambda r: r.error_hz)
             label, errors = design_label(method), np.array([r.error_hz for r in entries])
             stable = np.array([r.stable for r in entries])
             if stable.any():
                 y = np.where(stable, [100 * r.strehl for r in entries], np.nan)
-                panel.curve(label, errors, y, look=look, **_POINTS)
+                panel.plot(errors, y, label=label, **dot_style(look))
             if not stable.all():
-                lost, name = errors[~stable], f"{label}: unstable"
-                panel.curve(name, lost, 0 * lost, look=look, line=False, marker="x")
-            if published is not None and method in published:
+                lost = errors[~stable]
+                panel.plot(lost, 0 * lost, "x", label=f"{label}: unstable", color=colour(look))
+            if method in published:
                 x, y = np.array(published[method], dtype=float).T
-                panel.curve(f"{label}, paper", x, y, look=look, **_RINGS | {"size": 7.0})
+                panel.plot(x, y, label=f"{label}, paper", **dot_style(look) | _RINGS)
     return panel.figure
-
-
-def strehl_axis(percents: ArrayLike) -> dict[str, Any]:
-    """Return the axis of Strehl ratios, from a multiple of 10 % or 1 % below the least on."""
-    values = np.asarray(percents, dtype=np.float64)
-    values = values[np.isfinite(values)]
-    least, most = (values.min(), values.max()) if values.size else (0.0, 100.0)
-    step = 10.0 if most - least > 10 else 1.0  # of the lower end
-    low = max(0.0, step * np.floor(least / step - 0.5))
-    return {"label": "Strehl ratio", "unit": "%", "low": low}
 
 
 def robustness_map_figure(
@@ -146,25 +116,31 @@ def robustness_map_figure(
     x_axis = FREQUENCY_ERROR if columns < 3 else SHORT_FREQUENCY_ERROR
     heights = [2.3] * (len(delays) * len(maps))
     with drawing(heights, columns=columns, axes=axes) as panels:
-        drawn = [(row, *named) for row in range(len(delays)) for named in maps.items()]
+        drawn, grids = [(row, *named) for row in range(len(delays)) for named in maps.items()], []
         for panel, (row, name, grid) in zip(panels, drawn, strict=True):
             late = f", delay error {delays[row]:+g} frames" if np.any(delays) else ""
-            panel.set_axes(x_axis, SENSOR_GAIN, title=f"{name}{late}")
+            name_axes(panel, x_axis, SENSOR_GAIN, f"{name}{late}")
             across, up = np.argsort(grid.errors_hz), np.argsort(grid.sensor_gains)
-            errors_hz, gains = grid.errors_hz[across], grid.sensor_gains[up]
-            values = 100 * grid.strehl[row][np.ix_(up, across)]
-            scale: dict[str, Any] = {"contours": True, "blank": "unstable loop"}
-            panel.map(errors_hz, gains, values, "Strehl ratio", "%", **scale)
-            if real_gain is not None and gains[0] <= real_gain <= gains[-1]:
-                panel.rule("real sensor gain", real_gain, "y", dash=1)
+            x, y = grid.errors_hz[across], grid.sensor_gains[up]
+            grids.append((x, y, 100 * grid.strehl[row][np.ix_(up, across)]))
+        label = f"{STREHL[0]} [{STREHL[1]}]"
+        draw_map(panels, grids, label, blank="unstable loop")
+        for panel, (x, y, values) in zip(panels, grids, strict=True):
+            finite = values[np.isfinite(values)]
+            if min(values.shape) > 1 and finite.size and np.ptp(finite) > 0:
+                dark_on_light = {"cmap": "gray_r", "norm": panel.collections[0].norm}
+                style = {**dark_on_light, "linewidths": 0.8}
+                lines = panel.contour(x, y, np.ma.masked_invalid(values), 6, **style)
+                panel.clabel(lines, fmt="%g", fontsize=7)
+            if real_gain is not None and y[0] <= real_gain <= y[-1]:
+                panel.axhline(real_gain, label="real sensor gain", linestyle="--", **GUIDE)
     return panels[0].figure
 
 
-def limits_figure(study: LimitStudy, *, over_errors: bool = False, axes: OwnAxes = None) -> Figure:
+def limits_figure(study: LimitStudy, *, over_errors: bool = False) -> Figure:
     """Draw the residual of each design over the vibration's frequency or its error, and the limits.
 
-    Designs that leave the same are one curve with their names; unstable ones are named and not
-    drawn. A study in which no vibration moves raises a ProblemError.
+    Unstable designs are named and not drawn. ProblemError if no vibration moves.
     """
     if study.shift_hz.size < 2:
         raise ProblemError(
@@ -175,26 +151,20 @@ def limits_figure(study: LimitStudy, *, over_errors: bool = False, axes: OwnAxes
     if not over_errors:
         shift = "shift of the vibration that moves most, the others in proportion"
         label = shift if study.frequency_hz is None else "frequency of the true vibration"
-        start_hz, x_axis = study.frequency_hz or 0.0, {"label": label, "unit": "Hz"}
+        start_hz, x_axis = study.frequency_hz or 0.0, (label, "Hz")
     order, places = np.argsort(study.shift_hz), np.sort(study.shift_hz) + start_hz
-    curves: list[tuple[str, FloatArray | None]] = []
-    for row, residual_nm in zip(study.rows, study.residual_nm, strict=True):
-        name = row.design if over_errors else design_label(row.design)
-        values = residual_nm[order] if row.stable else None
-        for i, (twin, other) in enumerate(curves):
-            if values is not None and other is not None and np.allclose(values, other, rtol=1e-9):
-                curves[i] = f"{twin} and {name}", other
-                break
-        else:
-            curves.append((name, values))
-    with drawing([2.5], axes=axes) as (panel,):
-        panel.set_axes(x_axis, {"label": "residual", "unit": "nm rms", "log": True})
-        for name, values in curves:
-            draw_design(panel, [title for title, _ in curves], name, places, values)
-        if study.limit is not None and study.limit.rms_nm > 0:
-            panel.rule("limit, frequency known", study.limit.rms_nm, "y", dash=3)
-        if study.band is not None:
-            panel.rule("limit, frequency anywhere in this range", study.band.rms_nm, "y", dash=1)
+    names = [row.design if over_errors else design_label(row.design) for row in study.rows]
+    with drawing([2.5]) as (panel,):
+        _, factor = name_axes(panel, x_axis, ("residual", "nm rms"), yscale="log")
+        for name, row, residual_nm in zip(names, study.rows, study.residual_nm, strict=True):
+            shown = factor * residual_nm[order] if row.stable else None
+            draw_design(panel, names, name, places, shown)
+        for label, limit, style in (
+            ("limit, frequency known", study.limit, ":"),
+            ("limit, frequency anywhere in this range", study.band, "--"),
+        ):
+            if limit is not None and limit.rms_nm > 0:
+                panel.axhline(factor * limit.rms_nm, label=label, linestyle=style, **GUIDE)
     return panel.figure
 
 
@@ -203,130 +173,78 @@ _NAMES = dict(
 )
 
 
-def tradeoff_figure(points: Sequence[Facts], *, axes: OwnAxes = None) -> Figure:
+def tradeoff_figure(points: Sequence[Facts]) -> Figure:
     """Draw deviation and stable sensor gains over the norm of the estimation error.
 
     Above, the standard deviation; below, if there are loops, the interval of sensor gains for which
     each is stable. An end of it that is 0 has no line: the shaded area goes on to the edge. Norms
     that no filter reaches are shaded.
     """
-    if not points:
-        raise ProblemError("a trade-off figure needs at least one point; got none.")
     loops = any(point.design.hardware is not None for point in points)
     unit = "nm" if loops else "-"
     norms = [point.gamma for point in points]
     margin = 0.06 * (max(norms) - min(norms)) or 0.01 * max(norms)
-    low, high = min(norms) - margin, max(norms) + margin
-    x_axis = {"label": "H∞ norm of the estimation error", "unit": unit, "low": low, "high": high}
-    shown_gains = {"label": "sensor gains with a stable loop", "unit": "-", "log": True}
-    with drawing([2.3] * (1 + loops), axes=axes) as panels:
-        panels[0].set_axes(x_axis, {"label": "estimation error, rms", "unit": unit})
+    norm = ("H∞ norm of the estimation error", unit)
+    with drawing([2.3] * (1 + loops)) as panels:
+        _, factor = name_axes(panels[0], norm, ("estimation error, rms", unit))
         ends = [end for p in points for end in (p.gain_low, p.gain_high) if 0 < end < np.inf]
         edges = min([1.0, *ends]) / 2, 2 * max([1.0, *ends])
         if loops:
-            panels[1].set_axes(x_axis, shown_gains | {"low": edges[0], "high": edges[1]})
+            shown_gains = ("sensor gains with a stable loop", "-")
+            name_axes(panels[1], norm, shown_gains, yscale="log", ylim=edges)
         for look, family in enumerate(dict.fromkeys(point.family for point in points)):
             entries = sorted((p for p in points if p.family == family), key=lambda p: p.gamma)
-            gamma, name = np.array([p.gamma for p in entries]), _NAMES.get(family, family)
-            panels[0].curve(name, gamma, [p.rms for p in entries], look=look, **_POINTS)
+            gamma, name = factor * np.array([p.gamma for p in entries]), _NAMES.get(family, family)
+            rms = factor * np.array([p.rms for p in entries])
+            panels[0].plot(gamma, rms, label=name, **dot_style(look))
             if not loops:
                 continue
             interval = np.array([(p.gain_low, p.gain_high) for p in entries]).T
-            panels[1].area("", gamma, *np.clip(interval, *edges), look=look)
+            panels[1].fill_between(gamma, *np.clip(interval, *edges), color=colour(look), **SHADE)
             for gains in interval:
                 inside = np.where((gains > 0) & (gains < np.inf), gains, np.nan)
-                panels[1].curve(name, gamma, inside, look=look, **_POINTS)
-        least = min(point.rms for point in points)
-        panels[0].curve("Kalman", [max(norms)], [least], look=None, **_RINGS)
+                panels[1].plot(gamma, inside, label=name, **dot_style(look))
+        least = factor * min(point.rms for point in points)
+        panels[0].plot(factor * max(norms), least, "o", label="Kalman", color="black", **_RINGS)
         if loops:
-            panels[1].rule("nominal sensor gain", 1.0, "y", dash=1)
+            panels[1].axhline(1.0, label="nominal sensor gain", linestyle="--", **GUIDE)
+        low, high = factor * (min(norms) - margin), factor * (max(norms) + margin)
         for panel in panels:
-            panel.span("no filter", low, min(norms))
+            panel.axvspan(low, factor * min(norms), label="no filter", color="0.3", **SHADE)
+            panel.set_xlim(low, high)
     return panels[0].figure
 
 
 def modal_figure(
-    residuals_nm: Mapping[str, ArrayLike],
-    *,
-    gains: ArrayLike | None = None,
-    turbulence_nm: ArrayLike | None = None,
-    axes: OwnAxes = None,
+    residuals_nm: Mapping[str, FloatArray], *, gains: FloatArray, turbulence_nm: FloatArray
 ) -> Figure:
-    """Draw the residual of each mode under several controllers, and integrator gains.
-
-    Parameters
-    ----------
-    residuals_nm : mapping of str to (n,) array_like
-        Residual of each mode [nm rms] by the names of the controllers.
-    gains : (n,) array_like, optional
-        Integrator gain of each mode, for a panel of its own.
-    turbulence_nm : (n,) array_like, optional
-        Turbulence of each mode [nm rms], before any correction.
-    axes : Axes or sequence of Axes, optional
-        Your own matplotlib axes, one per panel; by default a new figure.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel over the other with a common axis of modes, counted from 1.
-
-    Raises
-    ------
-    ProblemError
-        If there is no controller, a value is not positive, or lengths or ``axes`` do not fit.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> len(lbt.report.figures.modal_figure({"integrator": [9.0, 5.0]}, gains=[0.5, 0.4]).axes)
-    2
-    """
-    if not residuals_nm:
-        raise ProblemError("a modal figure needs the residuals of a controller; got none.")
-    others = {"turbulence_nm": turbulence_nm, "gains": gains}
-    numbers = {**residuals_nm, **others}
-    curves = {n: positive(values, n) for n, values in numbers.items() if values is not None}
-    count = curves[next(iter(residuals_nm))].size
-    for name, curve in curves.items():
-        if curve.shape != (count,) or not count:
-            raise DimensionError(
-                f"{name} must have {count} modes, one number per mode; got shape {curve.shape}."
-            )
-    modes = np.arange(1.0, count + 1)
-    label = "mode, in Noll's order from tip on"
-    x_axis = {"label": label, "log": True, "low": 1, "high": max(count, 2)}
-    step = "steps-mid"  # modes are counted, there is nothing between them
-    with drawing([1.7] * (gains is not None) + [2.6], axes=axes) as panels:
-        if gains is not None:
-            look = len(residuals_nm)  # of none of the residuals, nor of the turbulence
-            panels[0].set_axes(x_axis, {"label": "integrator gain", "low": 0})
-            y = curves["gains"]
-            panels[0].curve("integrator gain", modes, y, look=look, dash=0, step=step, quiet=True)
-        panels[-1].set_axes(x_axis, {"label": "residual", "unit": "nm rms", "log": True})
-        if turbulence_nm is not None:
-            y = curves["turbulence_nm"]
-            panels[-1].curve("turbulence", modes, y, look=None, width=1.0, step=step)
-        for name in residuals_nm:
-            draw_design(panels[-1], list(residuals_nm), name, modes, curves[name], step=step)
-    return panels[0].figure
+    """Draw the integrator gain of each mode, and its residual under several controllers."""
+    count = gains.size
+    modes, mode = np.arange(1.0, count + 1), ("mode, in Noll's order from tip on", "")
+    # modes are counted, there is nothing between them
+    step: dict[str, Any] = {"drawstyle": "steps-mid"}
+    scale: dict[str, Any] = {"xscale": "log", "xlim": (1, max(count, 2))}
+    with drawing([1.7, 2.6]) as (above, below):
+        look = line_style(len(residuals_nm), dash=0, **step)  # of none of the residuals
+        name_axes(above, mode, ("integrator gain", ""), **scale)
+        above.plot(modes, gains, label="_integrator gain", **look)
+        above.set_ylim(bottom=0)
+        _, factor = name_axes(below, mode, ("residual", "nm rms"), yscale="log", **scale)
+        grey = line_style(None, linewidth=1.0, **step)
+        below.plot(modes, factor * turbulence_nm, label="turbulence", **grey)
+        for name, rms_nm in residuals_nm.items():
+            draw_design(below, list(residuals_nm), name, modes, factor * rms_nm, **step)
+    return above.figure
 
 
-def mirror_figure(
-    hardware: LoopHardware, *, tolerance: float = 0.1, axes: OwnAxes = None
-) -> Figure:
+def mirror_figure(shell: PositionLoop, hardware: LoopHardware, *, tolerance: float = 0.1) -> Figure:
     """Draw the mirror's step response, and its taps.
 
     The step response has the ends of the frames after the command's arrival, and the band in which
     the mirror counts as settled. The taps are the weights of the commands in the position averaged
     over an exposure, with those of a settled mirror beside them.
     """
-    require_instance(hardware, LoopHardware)
-    if hardware.mirror is None:
-        raise ProblemError(
-            "a figure of the mirror needs one with dynamics; got a mirror that settles at once. "
-            "Try LoopHardware(..., mirror=PositionLoop(...))."
-        )
-    step = hardware.mirror.step_response(tolerance)
+    step = shell.step_response(tolerance)
     settling_ms, frame_ms = 1e3 * step.settling_s, 1e3 * hardware.dt_s
     end_ms = max(1.5 * settling_ms, 2 * frame_ms)
     time_ms = 1e3 * step.time_s
@@ -337,21 +255,22 @@ def mirror_figure(
     taps = hardware.mirror_taps
     ideal = replace(hardware, mirror=None).mirror_taps
     count = max(np.trim_zeros(taps.round(2), "b").size, ideal.size)  # of half a percent and more
-    time = {"label": "time since the command arrived", "unit": "ms", "low": 0, "high": end_ms}
-    with drawing([2.4, 2.4], columns=2, axes=axes) as (response, weights):
-        response.set_axes(time, {"label": "position / final position"})
-        response.span("", 1 - tolerance, 1 + tolerance, "y")
-        response.curve("this mirror", time_ms[shown], position[shown])
+    with drawing([2.4, 2.4], columns=2) as (response, weights):
+        time = ("time since the command arrived", "ms")
+        name_axes(response, time, ("position / final position", ""), xlim=(0, end_ms))
+        response.axhspan(1 - tolerance, 1 + tolerance, color="0.3", **SHADE)
+        response.plot(time_ms[shown], position[shown], label="this mirror", **line_style(0))
         for k in range(1, int(end_ms / frame_ms) + 1):
-            response.rule("frames", k * frame_ms, dash=3)
+            response.axvline(k * frame_ms, label="frames", linestyle=":", **GUIDE)
         settled = f"settled to {100 * tolerance:g} %: {settling_ms:.2f} ms"
-        response.rule(settled, settling_ms, dash=1)
-        x_axis = {"label": "frames after the command", "low": -0.6, "high": count - 0.4}
-        weights.set_axes(x_axis, {"label": "weight in the exposure"})
+        response.axvline(settling_ms, label=settled, linestyle="--", **GUIDE)
+        name_axes(weights, ("frames after the command", ""), ("weight in the exposure", ""))
         for name, values, look in (("settled at once", ideal, None), ("this mirror", taps, 0)):
             heights = np.zeros(count)
             heights[: values.size] = values[:count]
-            weights.curve(name, np.arange(count), heights, look=look, step="steps-mid")
+            style = line_style(look, drawstyle="steps-mid")
+            weights.plot(np.arange(count), heights, label=name, **style)
+        weights.set_xlim(-0.6, count - 0.4)
     return response.figure
 
 
@@ -359,30 +278,28 @@ _SHOWN_MAS = 700.0  # from the centre of the image to its edges
 _FAINTEST = 1e-5  # of the peak
 
 
-def end_to_end_figure(run: EndToEndRun, *, axes: OwnAxes = None) -> Figure:
+def end_to_end_figure(run: EndToEndRun) -> Figure:
     """Image, tip and tilt over time, and residual of each mode of an end-to-end run."""
     size = run.psf.shape[0]
     position_mas = (np.arange(size) - size // 2) * run.psf_pixel_mas
     reach_mas = min(_SHOWN_MAS, size / 2 * run.psf_pixel_mas)
     seconds = np.arange(run.frames) / run.setup.hardware.frame_rate_hz
-    x_axis, y_axis = (
-        {"label": name, "unit": "mas", "low": -reach_mas, "high": reach_mas} for name in "xy"
-    )
-    with drawing([2.4, 2.4, PANEL_IN], columns=2, axes=axes) as (image, modes, series):
+    with drawing([2.4, 2.4, PANEL_IN], columns=2) as (image, modes, series):
         title = f"{run.setup.imaging_wavelength_um:g} µm, Strehl ratio {100 * run.strehl:.1f} %"
-        image.set_axes(x_axis, y_axis, title=title, equal=True)
+        name_axes(image, ("x", "mas"), ("y", "mas"), title, box_aspect=1)
         values = np.maximum(run.psf / run.psf.max(), _FAINTEST)
-        image.map(position_mas, position_mas, values, "intensity / peak", log=True)
-        x_axis = {"label": "mode (1 tip, 2 tilt)", "log": True}
-        y_axis = {"label": "residual", "unit": "nm rms", "log": True}
-        modes.set_axes(x_axis, y_axis, title="all modes")
+        draw_map([image], [(position_mas, position_mas, values)], "intensity / peak", log=True)
+        image.set(xlim=(-reach_mas, reach_mas), ylim=(-reach_mas, reach_mas))
+        mode, residual = ("mode (1 tip, 2 tilt)", ""), ("residual", "nm rms")
+        _, factor = name_axes(modes, mode, residual, "all modes", xscale="log", yscale="log")
         numbers = np.arange(1.0, run.setup.modes + 1)
-        modes.curve("residual", numbers, run.rms_nm, width=0.8, quiet=True)
-        y_axis = {"label": "residual", "unit": "nm rms wavefront"}
-        series.set_axes({"label": "time", "unit": "s"}, y_axis, title="tip and tilt")
+        thin = line_style(0, linewidth=0.8)
+        modes.plot(numbers, factor * run.rms_nm, label="_residual", **thin)
+        name_axes(series, ("time", "s"), ("residual", "nm rms wavefront"), "tip and tilt")
         for axis, name in enumerate(("tip", "tilt")):
             label = f"{name}, {nm_text(run.rms_nm[axis], '.0f', unit='nm rms')}"
-            series.curve(label, seconds, run.residual_nm[:, axis], look=axis, width=0.8, dash=0)
+            style = line_style(axis, dash=0, linewidth=0.8)
+            series.plot(seconds, factor * run.residual_nm[:, axis], label=label, **style)
     return image.figure
 
 
@@ -391,17 +308,18 @@ def end_to_end_table_figure(entries: Sequence[Facts]) -> Figure:
     rows = [e for e in entries if e.table == "III" and e.error_hz is not None]
     methods = list(dict.fromkeys(e.method for e in rows))
     x_axis = FREQUENCY_ERROR if len(methods) < 3 else SHORT_FREQUENCY_ERROR
-    y_axis = {"label": "Strehl ratio at 2.2 µm", "unit": "%", "low": 0, "high": 100}
+    y_axis = ("Strehl ratio at 2.2 µm", "%")
     with drawing([2.3] * len(methods), columns=len(methods)) as panels:
         for panel, method in zip(panels, methods, strict=True):
-            panel.set_axes(x_axis, y_axis, title=design_label(method))
+            name_axes(panel, x_axis, y_axis, design_label(method), ylim=(0, 100))
             names = ("error_hz", "paper", "modal", "strehl", "scatter")
             entries = [e for e in rows if e.method == method]
             error, paper, modal, strehl, scatter = (
                 np.array([getattr(e, name) for e in entries], dtype=float) for name in names
             )
             if not np.isnan(paper[0]):  # it published none of its own integrator
-                panel.curve("Agapito et al. 2008", error, paper, look=3, **_POINTS)
-            panel.curve("modal, measured optical gain", error, modal, look=1)
-            panel.curve("end to end", error, strehl, error=scatter, look=0, **_POINTS)
+                panel.plot(error, paper, label="Agapito et al. 2008", **dot_style(3))
+            panel.plot(error, modal, label="modal, measured optical gain", **line_style(1))
+            panel.vlines(error, strehl - scatter, strehl + scatter, color=colour(0))
+            panel.plot(error, strehl, label="end to end", **dot_style(0))
     return panels[0].figure

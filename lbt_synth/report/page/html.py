@@ -36,7 +36,6 @@ from lbt_synth.storage.tables import TONES, Table
 from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import choice
 
-_MOST_NAMED = 8  # curves of a panel whose ranges are told
 _PROGRAMS = ("numpy", "scipy", "matplotlib", "cvxpy", "clarabel")
 _LISTED = ("configuration", "study")  # what is a text for people
 
@@ -102,24 +101,9 @@ def words(group: str) -> dict[str, Any]:
 
 
 def chart(key: str, figure: Figure, *, group: str = "", **facts: object) -> Chart:
-    """Return a chart with the words of its key, or of another group, and facts filled in.
-
-    Its words for those who do not see it say from where to where its curves reach.
-    """
+    """Return a chart with the words of its key, or of another group, and facts filled in."""
     texts = {name: text.format(**facts) for name, text in words(group or key).items()}
-    texts["alt"] += "".join(f" {text}." for text in _ranges(figure))
     return Chart(key=key, figure=figure, **texts)
-
-
-def _ranges(figure: Figure) -> Iterator[str]:
-    """Yield from where to where the curves of each panel reach; many are one."""
-    for panel, series in groupby(figure_series(figure), lambda one: one.panel):
-        curves = {one.name: one.y[np.isfinite(one.y)] for one in series}
-        if len(curves) > _MOST_NAMED:
-            curves = {f"all {len(curves)}": np.concatenate(list(curves.values()))}
-        texts = [f"{name} {y.min():.3g} to {y.max():.3g}" for name, y in curves.items() if y.size]
-        if texts:
-            yield f"{panel}: {', '.join(texts)}".removeprefix(": ")
 
 
 def survival_blocks(margins: Mapping[str, LoopMargins]) -> list[Block]:
@@ -277,14 +261,14 @@ def number_tables(figure: Figure) -> Iterator[Table]:
     """
 
     def abscissae(one: Series) -> object:
-        return one.panel, one.heading, one.x if isinstance(one.x, tuple) else one.x.tobytes()
+        return one.panel, one.heading, one.x.tobytes()
 
     for _, curves in groupby(figure_series(figure), abscissae):
         group = list(curves)
         rows, x = _kept_rows(group), group[0].x
         cells = [
-            [x[i] if isinstance(x, tuple) else cell_text(float(x[i]), _FORMAT) for i in rows],
-            *([cell_text(float(one.y[i]), _FORMAT) for i in rows] for one in group),
+            [cell_text(float(numbers[i]), _FORMAT) for i in rows]
+            for numbers in (x, *(one.y for one in group))
         ]
         count = "" if len(rows) == len(x) else f" ({len(rows)} of {len(x)} rows)"
         yield Table(
@@ -354,7 +338,7 @@ def write_page(
     >>> import lbt_synth as lbt, pathlib, tempfile
     >>> config = lbt.load_config("examples/lbt.yaml")
     >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
-    >>> page = lbt.report.design_page(lbt.report.design_report(config, {"integrator": slow}))
+    >>> page = lbt.report.design_page(config, {"integrator": slow})
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     [file.name for file in lbt.report.write_page(page, pathlib.Path(folder) / "a.html")]
     ['a.html']

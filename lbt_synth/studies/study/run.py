@@ -13,12 +13,11 @@ from typing import cast
 
 import numpy as np
 
-from lbt_synth.config import save_config
 from lbt_synth.config.build import turbulence_sections
 from lbt_synth.config.load import validate_sections
 from lbt_synth.config.samples import Keys, array_keys, build_ensemble
 from lbt_synth.config.schema import FileSection
-from lbt_synth.config.write import turbulence_content
+from lbt_synth.config.write import config_text, turbulence_content
 from lbt_synth.design import Design
 from lbt_synth.errors import CertificateError, LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
@@ -399,7 +398,7 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
     files = []
     with note_failure(failures, row, ["configuration"]):
         settings, comments = _row_settings(study, row, sample)
-        files.append(save_config(path, settings, comments=comments))
+        files.append(write_atomically(path, config_text(settings, comments).encode()))
     for gain, controller in designs.items():
         with suppress(*EXPECTED_ERRORS):  # they are among the failures
             files.append(save_gain(gain, design_for_sample(controller, sample)))

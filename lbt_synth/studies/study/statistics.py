@@ -208,7 +208,7 @@ def first_order_index(parameter: FloatArray, result: FloatArray) -> tuple[float,
     spread = result - np.mean(result)
     total = float(spread @ spread)
     _, group, counts = np.unique(parameter, return_inverse=True, return_counts=True)
-    if is_list(parameter):
+    if len(counts) <= min(_MOST_VALUES, max(2, n // 5)):
         coefficients = len(counts)
         fit = (np.bincount(group, spread) / counts)[group]
     else:
@@ -226,11 +226,6 @@ def first_order_index(parameter: FloatArray, result: FloatArray) -> tuple[float,
     influence = (squares - unexplained * spread * spread) * (n / total)
     least = unexplained * (2 * (coefficients - 1)) ** 0.5 / n
     return 1 - unexplained - correction, max(float(np.std(influence)) / n**0.5, least)
-
-
-def is_list(parameter: FloatArray) -> bool:
-    """Whether a parameter takes few values, as from a list of a study."""
-    return len(np.unique(parameter)) <= min(_MOST_VALUES, max(2, len(parameter) // 5))
 
 
 def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
@@ -274,12 +269,11 @@ def residual_table(statistics: StudyStatistics) -> Table:
     return _table_by_controller(caption, f"residual [{unit}]", statistics, rows)
 
 
-def sensitivity_table(statistics: StudyStatistics, names: Mapping[str, str] | None = None) -> Table:
+def sensitivity_table(statistics: StudyStatistics) -> Table:
     """First-order indices of the parameters, one column per controller, and what they lack."""
     controllers = statistics.controllers
     rows: list[_Row] = [
-        ((names or {}).get(name, name), *(_with_error(*c.index(name)) for c in controllers))
-        for name in statistics.ranked
+        (name, *(_with_error(*c.index(name)) for c in controllers)) for name in statistics.ranked
     ]
     if rows:
         rest = []
@@ -296,10 +290,9 @@ def worst_table(
     controller: ControllerStatistics,
     columns: Mapping[str, ArrayLike],
     parameters: Sequence[str],
-    names: Mapping[str, str] | None = None,
 ) -> Table:
     """List the samples on which a controller does worst, from the columns of the results."""
-    places, name, words = list(controller.worst), controller.controller, names or {}
+    places, name = list(controller.worst), controller.controller
 
     def at(column: str) -> list[float]:
         return [float(value) for value in np.asarray(columns[column], dtype=np.float64)[places]]
@@ -312,7 +305,7 @@ def worst_table(
     values = [[f"{value:.5g}" for value in at(parameter)] for parameter in parameters]
     return Table(
         caption=f"Worst samples of {name}",
-        headings=("row", "Strehl [%]", *(words.get(name, name) for name in parameters)),
+        headings=("row", "Strehl [%]", *parameters),
         rows=tuple(zip(rows, strehls, *values, strict=True)),
     )
 

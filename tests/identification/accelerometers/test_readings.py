@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from lbt_synth.errors import ProblemError, TelemetryError
-from lbt_synth.identification.accelerometers.readings import fill_missing, load_readings, resample
+from lbt_synth.identification.accelerometers.readings import (
+    load_readings,
+    read_channels,
+    resample,
+)
 
 RATE = 1000.0
 FRAMES = 4000
@@ -101,7 +105,8 @@ def test_held_values_and_spikes_are_missing_and_short_gaps_bridged():
     given = truth.copy()
     given[1000:1300] = 0.0
     given[2000, 0], given[3000, 1] = np.nan, 50.0
-    values, good = fill_missing(given)
+    read = read_channels(given)
+    values, good = read.values, read.good
     assert not good[1000:1300].any()
     assert good[:1000].all()
     assert good[1300:].all()
@@ -111,7 +116,7 @@ def test_held_values_and_spikes_are_missing_and_short_gaps_bridged():
 def test_a_channel_that_stops_spoils_no_frame_of_the_others():
     given = np.random.default_rng(1).standard_normal((FRAMES, 2))
     given[1000:, 1] = given[1000, 1]
-    values, good = fill_missing(given)
-    assert good.all()
-    assert not values[:, 1].any()
-    np.testing.assert_array_equal(values[:, 0], given[:, 0])
+    read = read_channels(given)
+    assert (read.names, read.dead) == (("channel1",), ("channel2",))
+    assert read.good.all()
+    np.testing.assert_array_equal(read.values[:, 0], given[:, 0])

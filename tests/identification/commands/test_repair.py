@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.control_laws import ordinary_loop
-from support.wrong_commands import FAULTS, record, repair_of, wrong_record
+from support.wrong_commands import FAULTS, record, wrong_record
 
 import lbt_synth as lbt
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
@@ -14,8 +14,7 @@ from lbt_synth.identification.commands.repair import CommandRepair, repair_comma
 @pytest.mark.parametrize("fault", ["one turned", "rotated", "a tenth", "late", "increments"])
 def test_a_repair_undoes_its_fault(fault) -> None:
     y, u = ordinary_loop()
-    repaired = repair_commands(wrong_record(fault), repair_of(fault))
-    assert repair_of(fault).options == FAULTS[fault][1]
+    repaired = repair_commands(wrong_record(fault), FAULTS[fault][1])
     good = record(y, u)
     start = 1 if fault == "late" else 0  # the measurement of the first frame was lost with it
     usable = np.flatnonzero(repaired.usable)
@@ -41,11 +40,10 @@ def test_frames_whose_command_is_not_known_are_not_usable() -> None:
 
 
 def test_the_matrix_of_a_repair_is_applied_in_the_order_of_its_fields() -> None:
-    both = CommandRepair(swap_axes=True, sign=(1, -1), matrix=(1.0, 2.0, 3.0, 4.0), scale=2.0)
+    both = CommandRepair(swap_axes=True, sign=(1, -1), matrix=(1.0, 2.0, 3.0, 4.0), scale=(2.0,))
     swap, sign = np.array([[0, 1], [1, 0]]), np.diag([1, -1])
     np.testing.assert_allclose(both.turn(2), 2 * np.array([[1, 2], [3, 4]]) @ sign @ swap)
-    assert CommandRepair(scale=[500.0, 480.0]).turn(2).tolist() == [[500.0, 0.0], [0.0, 480.0]]
-    assert CommandRepair(scale=(2.0, 2.0)) == CommandRepair(scale=2.0)
+    assert CommandRepair(scale=(500.0, 480.0)).turn(2).tolist() == [[500.0, 0.0], [0.0, 480.0]]
     assert both.options == (
         "--swap-axes --command-sign 1 -1 --command-matrix 1 2 3 4 --command-scale 2"
     )
@@ -59,7 +57,7 @@ def test_words_name_what_is_wrong() -> None:
         "the total delay is 3 frames",
         "those of axis 1 are 2 times too small",
     ]
-    assert CommandRepair(scale=0.001).words() == ["they are 1000 times too large"]
+    assert CommandRepair(scale=(0.001,)).words() == ["they are 1000 times too large"]
 
 
 def test_repairs_that_are_refused() -> None:
@@ -72,7 +70,7 @@ def test_repairs_that_are_refused() -> None:
 
     for call, why in (
         (lambda: CommandRepair(sign=(2,)), "command_sign must be 1 or -1"),
-        (lambda: CommandRepair(scale=0.0), "command_scale must be above 0"),
+        (lambda: CommandRepair(scale=(0.0,)), "command_scale must be above 0"),
         (lambda: CommandRepair(scale=(1.0, -2.0)), "command_scale must be above 0"),
         (lambda: CommandRepair(matrix=(1.0, np.nan, 0.0, 1.0)), "command_matrix"),
         (lambda: CommandRepair(scale=(5.0, 4.0)).turn(1), "command_scale must be one number, or 1"),

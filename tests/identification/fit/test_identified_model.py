@@ -84,7 +84,7 @@ def test_an_ambiguous_gain_has_that_error_and_moves_the_rest() -> None:
     axis = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
     search, model = Search(data=axis.data), axis.fitted_model
     errors = standard_errors(model.spectrum, model.covariance)
-    more = hold_gain(search, model, 0.2)
+    more = hold_gain(search, model, [([0], 0.2)])
     wider = standard_errors(model.spectrum, more.covariance)
     assert wider.background.log_gain == pytest.approx(0.2, rel=1e-6)
     assert wider.components[1].log_power > errors.components[1].log_power

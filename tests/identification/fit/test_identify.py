@@ -24,7 +24,6 @@ from support.recorded_loops import (
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification import (
-    IdentifiedAxis,
     IdentifiedModel,
     LoopRecord,
     SpectrumRecord,
@@ -32,6 +31,7 @@ from lbt_synth.identification import (
 )
 from lbt_synth.identification.fit import identify, order_search
 from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.identification.fit.order_search import find_components
 from lbt_synth.models import ARModel, SumSpectrum
 
@@ -307,9 +307,7 @@ def find_eris(**options: object) -> object:
 
 REFUSALS = [
     (lambda: find_series(measurement=np.ones(2000)), ProblemError, "measurement is constant"),
-    (lambda: find_series(stretches=[(0, 5000)]), ProblemError, "stretches must be .* 2000 frames"),
     (lambda: find_series(stretches=[(0, 300)]), ProblemError, "at least 512 frames"),
-    (lambda: find_series(stretches=[]), ProblemError, "at least one stretch"),
     (lambda: find_series(sensor_gain=-1.0), ProblemError, "sensor_gain"),
     (lambda: find_series(lowest_line_hz=501), ProblemError, "lowest_line_hz"),
     (lambda: find_series(most_lines=-1), ProblemError, "most_lines"),
@@ -322,15 +320,11 @@ REFUSALS = [
     (lambda: find_record(sensor_gain=[1.0, 2.0]), ProblemError, r"or one per measurement \(1\)"),
     (lambda: find_record(noise_nm=5.0), ProblemError, "noise_nm is for spectra"),
     (lambda: find_record(start=3), ProblemError, "IdentifiedModel"),
-    (lambda: find_record(stretches=[(2, 4000), (3000, 5000)]), ProblemError, "in order, apart"),
-    (lambda: find_record(stretches=[(0, 4000)]), ProblemError, "usable"),
-    (lambda: find_record(frame_rate_hz=900.0), ProblemError, "for spectra only"),
-    (lambda: find_record(delay_frames=3.0), ProblemError, "with_delay"),
+    (lambda: find_record(frame_rate_hz=900.0), ProblemError, "frame_rate_hz is for spectra"),
     (lambda: find_axes(WHITE, WHITE), ProblemError, "give delay_frames"),
     (lambda: find_axes(WHITE * [1, 0]), ProblemError, "measurement is constant"),
     (lambda: find_eris(sensor_gain=0.5), ProblemError, "is for series of a loop"),
     (lambda: find_eris(noise_nm=0.0), ProblemError, "noise_nm must be above 0"),
-    (lambda: find_eris(stretches=[(0, 600)]), ProblemError, "is for series of a loop"),
     (lambda: find_eris(start=eris_model()), ProblemError, "is for series of a loop"),
 ]
 

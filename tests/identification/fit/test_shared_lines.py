@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.recorded_loops import RATE, identify_series, integrator_loop, open_record, slow
@@ -121,8 +123,8 @@ def test_the_plant_has_each_line_once(model):
 
 def test_the_filter_uses_both_axes(model):
     """It comes closer to the filter of the truth than one with a line on either axis."""
-    each = zip(model.axes, ((1, 0), (0, 1)), strict=True)
-    apart = [axis.lines[0].vibration(direction) for axis, direction in each]
+    axes = zip(model.axes, ((1.0, 0.0), (0.0, 1.0)), strict=True)
+    apart = [replace(axis.lines[0], direction=along).vibration() for axis, along in axes]
     path = lbt.LoopHardware(frame_rate_hz=RATE)
     truth = lbt.Truth(turbulence=slow(), vibrations=(DIAGONAL, TILT), noise_nm=6.0)
 

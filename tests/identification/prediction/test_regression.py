@@ -21,7 +21,7 @@ from lbt_synth.identification.prediction.regression import (
     regress,
 )
 from lbt_synth.identification.prediction.residual import replay
-from lbt_synth.identification.stretches import split_halves
+from lbt_synth.identification.stretches import keep_frames, split_halves
 from lbt_synth.loop import close_loop
 
 
@@ -80,8 +80,7 @@ def test_channels_that_see_a_structure_are_worth_what_is_claimed() -> None:
     assert left_nm2(alone) < 1.02 * base
     assert left_nm2(fused) < 0.6 * base
     assert fused.other_sensors == ("channel1", "channel2", "channel3")
-    first, _ = split_halves(record.stretches())
-    half = lbt.identify(record, stretches=first, sensor_gain=1.0)
+    half = lbt.identify(split_halves(record)[0], sensor_gain=1.0)
     beside = channels_beside(record, seen.readings[: record.frames])
     table, _ = compare_designs(record, half, {"predictor": {}}, channels=beside)
     title = "least-squares predictor"
@@ -116,6 +115,25 @@ def test_the_filter_gives_the_sum_of_squares_of_the_moments() -> None:
     first = start + round(record.frame_rate_hz / 2)
     measured = float(np.sum(np.mean(left[first:stop] ** 2, axis=0)))
     assert measured == pytest.approx(fit.whole.left(coefficients), rel=0.01)
+
+
+def test_a_fit_adds_its_coefficients_over_the_frames() -> None:
+    """None where a penalty holds them all; else what two halves of a record lose to each other."""
+    _, record, _ = vibrating()
+    fit = regression(channels=True)
+    assert fit.fit_share(1e30) == pytest.approx(0, abs=1e-9)
+    penalty, signals = 1e-6, range(len(fit.scales))
+    past, later = (sum(parts[1:], parts[0]) for parts in (fit.parts[:3], fit.parts[3:]))
+    apart = [
+        unseen.left(b) - seen.left(b)
+        for seen, unseen in ((past, later), (later, past))
+        for b in [fit.solve(signals, penalty, seen)]
+    ]
+    least = fit.whole.left(fit.solve(signals, penalty, fit.whole))
+    half = replace(fit, parts=fit.parts[:3])
+    assert np.mean(apart) == pytest.approx(2 * half.fit_share(penalty) * least, rel=0.3)
+    design = lbt.design_from_record(record, sensor_gain=1.0, method="predictor").design
+    assert 0 < design.claims["fit_share"] < 0.1
 
 
 def test_a_large_penalty_leaves_the_filter_of_the_model() -> None:
@@ -162,6 +180,6 @@ def test_gains_and_delays_that_are_not_whole() -> None:
 def test_what_is_too_short_or_dead_is_refused() -> None:
     _, record, model = vibrating()
     with pytest.raises(ProblemError, match=f"needs {12 * TAPS} frames beyond the first"):
-        regress(record, model, stretches=((0, 900),))
+        regress(keep_frames(record, np.arange(record.frames) < 900), model)
     with pytest.raises(ProblemError, match="nothing but zeros or gaps in a, b. Leave them out"):
         channels_beside(record, np.zeros((500, 2)), ("a", "b"))

@@ -9,7 +9,7 @@ import pytest
 from astropy.io import fits
 from support.eris import ERIS_FILE
 from support.record_files import csv, hdus, image, write_csv
-from support.records import SHELL
+from support.records import SHELL, ran
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError, TelemetryError
@@ -17,45 +17,30 @@ from lbt_synth.errors import ProblemError, TelemetryError
 RATE = 500.0
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["csv", "blanks", "turned", "fits table", "npz", "npy"],
-)
+@pytest.mark.parametrize("kind", ["csv", "blanks", "images", "table", "npz", "npy"])
 def test_every_format_gives_the_same_record(tmp_path, series, kind):
     y, u = series
-    options = {"delay_frames": 2}
-    names = ["time_s", "y0_nm", "y1_nm", "u0_nm", "u1_nm"]
-    columns = [np.arange(60) / RATE, *y.T, *u.T]
+    options, time_s = {"delay_frames": 2}, np.arange(60) / RATE
+    path = tmp_path / f"a.{'csv' if kind == 'blanks' else kind if kind[0] in 'cn' else 'fits'}"
     if kind in ("csv", "blanks"):
-        sign = {"csv": ",", "blanks": " "}[kind]
-        path = write_csv(tmp_path / "a.csv", names, columns, sign=sign)
-    elif kind == "turned":
-        path = hdus(
-            tmp_path / "a.fits",
-            image("RESIDUALS", y.T, "nm"),
-            image("COMMANDS", u.T.astype(">f8"), "nm"),
-            FRAMRATE=RATE,
-        )
-    elif kind == "fits table":
-        table = fits.BinTableHDU.from_columns(
-            [
-                fits.Column(name="TIME", format="D", array=columns[0], unit="s"),
-                fits.Column(name="Residuals", format="2D", array=y, unit="nm"),
-                fits.Column(name="Commands", format="2D", array=u, unit="nm"),
-            ]
-        )
-        path = hdus(tmp_path / "a.fits", table)
+        names = ["time_s", "y0_nm", "y1_nm", "u0_nm", "u1_nm"]
+        write_csv(path, names, [time_s, *y.T, *u.T], sign="," if kind == "csv" else " ")
+    elif kind == "images":  # turned
+        commands = image("COMMANDS", u.T.astype(">f8"), "nm")
+        hdus(path, image("RESIDUALS", y.T, "nm"), commands, FRAMRATE=RATE)
+    elif kind == "table":
+        columns = [
+            fits.Column(name="TIME", format="D", array=time_s, unit="s"),
+            fits.Column(name="Residuals", format="2D", array=y, unit="nm"),
+            fits.Column(name="Commands", format="2D", array=u, unit="nm"),
+        ]
+        hdus(path, fits.BinTableHDU.from_columns(columns))
     elif kind == "npz":
-        path = tmp_path / "a.npz"
         np.savez(path, measurements=y, commands=u.T, frame_rate_hz=RATE, unit="nm")
     else:
-        path = tmp_path / "a.npy"
         np.save(path, np.hstack([y, u]))
-        options |= {
-            "unit": "nm",
-            "frame_rate_hz": RATE,
-            "columns": {"measurements": (0, 1), "commands": (2, 3)},
-        }
+        chosen = {"measurements": (0, 1), "commands": (2, 3)}
+        options |= {"unit": "nm", "frame_rate_hz": RATE, "columns": chosen}
     seen = lbt.load_record(path, **options)
     assert isinstance(seen, lbt.identification.LoopRecord)
     assert np.array_equal(seen.measurements, y)
@@ -82,12 +67,8 @@ def test_telemetry_of_ours(tmp_path):
         assert np.array_equal(seen.mirror_taps, path.mirror_taps)
         assert seen.source == str(file)
         assert lbt.load_record(file, axes=[1]).axes == 1
-        for options, words in (
-            ({"frame_rate_hz": 801}, f"{name}: frame_rate_hz must be that of the telemetry, 800"),
-            ({"columns": {"measurements": 0}}, "neither columns nor commands"),
-        ):
-            with pytest.raises(ProblemError, match=words):
-                lbt.load_record(file, **options)
+        with pytest.raises(ProblemError, match=f"{name}: .*neither columns nor commands"):
+            lbt.load_record(file, columns={"measurements": 0})
 
 
 @pytest.mark.e2e
@@ -134,17 +115,13 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     )
     seen = lbt.load_record(path)
     assert (seen.delay_frames, seen.diameter_m, seen.obstruction) == (2.5, 8.0, 0.11)
-    assert "frame_rate_hz 500, by FRAMRATE of HDU 0" in seen.notes
-    with pytest.raises(ProblemError, match="frame_rate_hz must be that of FRAMRATE of .*; got 100"):
-        lbt.load_record(path, frame_rate_hz=1000)
+    assert "frame_rate_hz 500 by FRAMRATE of HDU 0" in seen.notes
     with pytest.raises(ProblemError, match="averages are only for a spectrum"):
         lbt.load_record(path, averages=3)
     assert np.allclose(seen.measurements, lbt.models.nm_per_mas(8.0) * y)
-    other = lbt.load_record(path, delay_frames=3, diameter_m=8.4)
-    assert (other.delay_frames, other.diameter_m) == (3.0, 8.4)
-    assert any(
-        "delay_frames 3 was given; DELAYFRM of HDU 0 has 2.5" in note for note in other.notes
-    )
+    other = lbt.load_record(path, frame_rate_hz=1000, delay_frames=3, diameter_m=8.4)
+    assert (other.frame_rate_hz, other.delay_frames, other.diameter_m) == (1000.0, 3.0, 8.4)
+    assert "delay_frames 3 was given, in place of 2.5 by DELAYFRM of HDU 0" in other.notes
     # a delay of unknown unit is not taken
     unsure = hdus(tmp_path / "b.fits", image("Y", y, "nm"), image("U", u, "nm"), DELAY=0.002)
     seen = lbt.load_record(unsure, frame_rate_hz=RATE)
@@ -167,36 +144,27 @@ def test_units_must_be_given(tmp_path, series):
         lbt.load_record(named, frame_rate_hz=RATE, unit="mas", diameter_m=8)
     assert lbt.load_record(named, frame_rate_hz=RATE, unit="nanometer").axes == 1
     mixed = write_csv(tmp_path / "c.csv", ["pol0_nm", "pol1_um"], y.T)
-    with pytest.raises(
-        ProblemError, match="pol0_nm, pol1_um must all have the same unit; got nm, um"
-    ):
-        lbt.load_record(mixed, frame_rate_hz=RATE)
     pixels = hdus(tmp_path / "d.fits", image("POL", y, "pixel"), FPS=RATE)
-    with pytest.raises(ProblemError, match="unit must be one of nm.*got 'pixel'"):
-        lbt.load_record(pixels)
     angle = hdus(tmp_path / "e.fits", image("POL", y, "arcsec"), FPS=RATE)
-    with pytest.raises(
-        ProblemError, match=r"e\.fits: nothing tells the telescope.*give diameter_m"
+    for file, words in (
+        (mixed, "pol0_nm, pol1_um must all have the same unit; got nm, um"),
+        (pixels, "unit must be one of nm.*got 'pixel'"),
+        (angle, r"e\.fits: nothing tells the telescope.*give diameter_m"),
     ):
-        lbt.load_record(angle)
+        with pytest.raises(ProblemError, match=words):
+            lbt.load_record(file, frame_rate_hz=RATE)
 
 
-@pytest.mark.parametrize("form", ["csv", "fits", "array"])
+@pytest.mark.parametrize("form", ["csv", "fits"])
 def test_spectra(tmp_path, form):
     f = np.linspace(5, 100, 300)
     s = 90 / (1 + ((f[:, None] - [20, 45]) / 2) ** 2)
-    options = {}
+    path = tmp_path / f"a.{form}"
     if form == "csv":
-        path = write_csv(
-            tmp_path / "a.csv", ["freq_hz", "psd_x [nm^2/Hz]", "psd_y [nm^2/Hz]"], [f, *s.T]
-        )
-    elif form == "fits":
-        path = hdus(tmp_path / "a.fits", image("FREQUENCY", f, "Hz"), image("PSD", s.T, "nm2/Hz"))
-    else:  # rows frequency, axis, axis: of no names at all
-        path = tmp_path / "a.fits"
-        fits.PrimaryHDU(np.vstack([f, s.T])).writeto(path)
-        options = {"unit": "nm**2/Hz", "columns": {"frequency": 0, "density": (1, 2)}}
-    seen = lbt.load_record(path, averages=12, frame_rate_hz=RATE, **options)
+        write_csv(path, ["freq_hz", "psd_x [nm^2/Hz]", "psd_y [nm^2/Hz]"], [f, *s.T])
+    else:
+        hdus(path, image("FREQUENCY", f, "Hz"), image("PSD", s.T, "nm2/Hz"))
+    seen = lbt.load_record(path, averages=12, frame_rate_hz=RATE)
     assert isinstance(seen, lbt.identification.SpectrumRecord)
     assert np.array_equal(seen.frequency_hz, f)
     assert np.allclose(seen.density_nm2_hz, s)
@@ -204,7 +172,6 @@ def test_spectra(tmp_path, form):
     # a Lorentzian's integral, arctan
     exact = [90 * 2 * (np.arctan((100 - c) / 2) - np.arctan((5 - c) / 2)) for c in (20, 45)]
     assert seen.rms_nm**2 == pytest.approx(exact, rel=1e-3)
-    assert seen.spectra[1].psd([45.0])[0] == pytest.approx(90, rel=0.02)
 
 
 def test_amplitude_spectra_and_angles(tmp_path):
@@ -217,16 +184,14 @@ def test_amplitude_spectra_and_angles(tmp_path):
     assert np.allclose(seen.density_nm2_hz, 3 * lbt.models.nm_per_mas(8.0) ** 2)
     with pytest.raises(ProblemError, match="unit must be one of nm\\^2/Hz, .*; got 'nm'"):
         lbt.load_record(power, unit="nm")
-    assert any(note.startswith("2 rows with gaps") for note in gapped(tmp_path).notes)
-    back = write_csv(tmp_path / "d.csv", ["f_hz", "psd_nm2_hz"], [f[::-1], f])
-    with pytest.raises(ProblemError, match="must increase"):
-        lbt.load_record(back)
-
-
-def gapped(folder):
-    path = folder / "gaps.csv"
-    path.write_text("f_hz,psd_nm2_hz\n1,2\n2,\n3,5\n4,-\n5,6\n")
-    return lbt.load_record(path)
+    (tmp_path / "gaps.csv").write_text("f_hz,psd_nm2_hz\n1,2\n2,\n3,5\n4,-\n5,6\n")
+    seen = lbt.load_record(tmp_path / "gaps.csv")
+    assert seen.frequency_hz.tolist() == [1, 3, 5]
+    assert seen.notes[-1].startswith("2 rows with gaps")
+    for column, words in ((f[::-1], "must increase"), (f, "at least 0")):
+        wrong = write_csv(tmp_path / "d.csv", ["f_hz", "asd_nm_rthz"], [column, 3 - f])
+        with pytest.raises(ProblemError, match=words):
+            lbt.load_record(wrong)
 
 
 @pytest.mark.parametrize(
@@ -241,16 +206,8 @@ def gapped(folder):
         (["y_nm", "u_nm", "a", "b"], {"columns": {"times": "q"}}, "no column 'q'; .*: y_nm, u_nm"),
         (["y_nm", "u_nm", "a", "b"], {"columns": {"clock": 2}}, "a key of columns must be one of"),
         (["y_nm", "u_nm", "a", "b"], {"columns": ["a"]}, "columns must be a mapping"),
-        (
-            ["a", "b", "c", "d"],
-            {"columns": {"measurements": "a", "commands": "a"}},
-            "a column was chosen twice",
-        ),
-        (
-            ["y_nm", "u_nm", "a", "b"],
-            {"frame_rate_hz": None},
-            "nothing tells the frame rate: give fra",
-        ),
+        (list("abcd"), {"columns": {"open_loop": ("a", 0)}}, "a column was chosen twice"),
+        (["y_nm", "u_nm", "a", "b"], {"frame_rate_hz": None}, "nothing tells the frame rate: give"),
         (["y_nm", "u_nm", "time", "b"], {"frame_rate_hz": None}, "or times whose name has a unit"),
         (["y_nm", "u_nm", "t [Hz]", "b"], {}, "times must be in one of s, ms, us, ns; got 'Hz'"),
     ],
@@ -280,60 +237,52 @@ def test_file_without_names_is_read_as_a_spectrum():
         lbt.load_record(ERIS_FILE, columns=choice)
 
 
-def test_commands_from_another_file(tmp_path, series):
-    y, u = series
-    np.save(tmp_path / "y.npy", y)
-    np.save(tmp_path / "u.npy", u)
-    seen = lbt.load_record(
-        tmp_path / "y.npy", commands=tmp_path / "u.npy", frame_rate_hz=RATE, unit="nm"
-    )
-    assert np.array_equal(seen.measurements, y)
-    assert np.array_equal(seen.commands, u)
-    assert f"commands are from {tmp_path / 'u.npy'}" in seen.notes
-    np.save(tmp_path / "v.npy", u[:-1])
-    with pytest.raises(TelemetryError, match="as many frames as the measurements; got 59, 60"):
-        lbt.load_record(tmp_path / "y.npy", commands=tmp_path / "v.npy", unit="nm")
-    with pytest.raises(TelemetryError, match="cannot read .*w.npy: No such file"):
-        lbt.load_record(tmp_path / "y.npy", commands=tmp_path / "w.npy", unit="nm")
+TIMES = np.arange(60) / RATE + 0.02
+LAID = {  # clocks of measurements and commands, and which command each row has
+    "row by row": ({}, {}, np.arange(60)),
+    "counters": ({"frame": np.arange(10, 70)}, {"frame": np.arange(60)}, np.arange(10, 70)),
+    "times": ({"time_s": TIMES}, {"time_ms": 1e3 * TIMES + 0.1}, np.arange(60)),
+    "later": ({"time_s": TIMES}, {"time_s": TIMES + 5 / RATE}, np.arange(-5, 55)),
+}
 
 
-def test_two_files_are_laid_beside_each_other_by_their_counters(tmp_path, series):
+@pytest.mark.parametrize("by", LAID)
+def test_commands_of_another_file_are_laid_beside_the_measurements(tmp_path, series, by):
     y, u = series[0][:, 0], series[1][:, 0]
-    mine = csv(tmp_path / "y.csv", frame=np.arange(10, 70), y_nm=y)
-    theirs = csv(tmp_path / "u.csv", frame=np.arange(60), u_nm=u)
-    seen = lbt.load_record(mine, commands=theirs, frame_rate_hz=RATE, delay_frames=2)
-    assert np.array_equal(seen.measurements[:50, 0], y[:50])
-    assert np.array_equal(seen.commands[:50, 0], u[10:])
-    # commands 60 ... 69 are not there: y(k) holds u(k-2)
-    assert np.flatnonzero(~seen.usable).tolist() == [0, 1, *range(52, 60)]
-    assert any("by frame: 50 of 60 rows have one" in note for note in seen.notes)
-    far = csv(tmp_path / "f.csv", frame=np.arange(500, 560), u_nm=u)
-    with pytest.raises(TelemetryError, match="got 500 to 559, and 10 to 69"):
-        lbt.load_record(mine, commands=far, frame_rate_hz=RATE)
-    twice = csv(tmp_path / "t.csv", frame=np.arange(60) // 2 * 2, u_nm=u)
-    with pytest.raises(TelemetryError, match=r"must have frame numbers that rise"):
-        lbt.load_record(mine, commands=twice, frame_rate_hz=RATE)
+    clock, other, row = LAID[by]
+    mine, theirs = csv(tmp_path / "y.csv", **clock, y=y), csv(tmp_path / "u.csv", **other, u=u)
+    seen = lbt.load_record(mine, commands=theirs, frame_rate_hz=RATE, unit="nm", delay_frames=2)
+    there = (row >= 0) & (row < 60)
+    assert np.array_equal(seen.measurements[:, 0], y)
+    assert np.array_equal(seen.commanded, there)
+    assert np.array_equal(seen.commands[there, 0], u[row[there]])
+    assert f"commands are from {theirs}" in seen.notes
+    words = f"commands were laid beside the measurements by {next(iter(other), '')}: "
+    assert any(f"{words}{there.sum()} of 60 rows" in note for note in seen.notes) is bool(other)
 
 
-def test_two_files_without_counters_are_laid_by_their_times_or_row_by_row(tmp_path, series):
+def test_files_that_do_not_belong_together(tmp_path, series):
     y, u = series[0][:, 0], series[1][:, 0]
-    mine = csv(tmp_path / "y.csv", time_s=np.arange(60) / RATE + 0.02, y_nm=y)
-    theirs = csv(tmp_path / "u.csv", time_ms=np.arange(60) * 1e3 / RATE + 20.1, u_nm=u)
-    for other in (theirs, csv(tmp_path / "n.csv", u_nm=u)):
-        assert np.array_equal(lbt.load_record(mine, commands=other).commands[:, 0], u)
-    later = csv(tmp_path / "l.csv", time_s=np.arange(5, 65) / RATE + 0.02, u_nm=u)
-    assert np.array_equal(lbt.load_record(mine, commands=later).commands[5:, 0], u[:55])
-    between = csv(tmp_path / "b.csv", time_ms=np.arange(60) * 1e3 / RATE + 21.0, u_nm=u)
-    with pytest.raises(TelemetryError, match="must have times that rise, and are those"):
-        lbt.load_record(mine, commands=between)
+    by_frame = csv(tmp_path / "y.csv", frame=np.arange(10, 70), y_nm=y)
+    by_time = csv(tmp_path / "t.csv", time_s=TIMES, y_nm=y)
+    for mine, clock, words in (
+        (by_frame, {"frame": np.arange(500, 560)}, "got 500 to 559, and 10 to 69"),
+        (by_frame, {"frame": np.arange(60) // 2 * 2}, "must have frame numbers that rise"),
+        (by_time, {"time_ms": 1e3 * TIMES + 1.0}, "must have times that rise, and are those"),
+    ):
+        theirs = csv(tmp_path / "u.csv", **clock, u_nm=u)
+        with pytest.raises(TelemetryError, match=words):
+            lbt.load_record(mine, commands=theirs, frame_rate_hz=RATE)
+    for name, words in (("v", "as many frames as the .* got 59, 60"), ("w", "No such file")):
+        np.save(tmp_path / "v.npy", u[:-1])
+        with pytest.raises(TelemetryError, match=words):
+            lbt.load_record(by_time, commands=tmp_path / f"{name}.npy", unit="nm")
 
 
 def test_both_files_tell_facts_and_each_its_own_unit(tmp_path, series):
     y, u = series[0][:, 0], series[1][:, 0]
     mine = csv(tmp_path / "y.csv", ("unit = mas", "diameter_m = 8.0"), y=y)
     slow = csv(tmp_path / "u.csv", ("frame_rate_hz = 250", "delay_frames = 2"), u_nm=u)
-    with pytest.raises(ProblemError, match=r"must be that of .* in u\.csv, 250; got 500"):
-        lbt.load_record(mine, commands=slow, frame_rate_hz=RATE)
     seen = lbt.load_record(mine, commands=slow)
     assert (seen.frame_rate_hz, seen.delay_frames) == (250.0, 2.0)
     assert np.allclose(seen.measurements[:, 0], lbt.models.nm_per_mas(8.0) * y)
@@ -347,75 +296,47 @@ def test_both_files_tell_facts_and_each_its_own_unit(tmp_path, series):
     assert np.allclose(seen.commands[:, 0], 1e3 * u)
 
 
-FAST = 1000.0
-SLOW = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=FAST)
-
-
-def telemetry(frames=60, **changes):
-    rng = np.random.default_rng(2)
-    fields = {
-        "frame_rate_hz": FAST,
-        "delay_frames": 2.0,
-        "commands": rng.standard_normal((frames, 2)),
-        "measurements": rng.standard_normal((frames, 2)),
-    }
+def telemetry(**changes):
+    y, u = np.random.default_rng(2).standard_normal((2, 60, 2))
+    fields = {"frame_rate_hz": 1000.0, "delay_frames": 2.0, "commands": u, "measurements": y}
     return lbt.files.Telemetry(**{**fields, **changes})
 
 
 def test_telemetry_of_a_simulation_with_matrices():
-    axes, rng = 2, np.random.default_rng(3)
+    rng = np.random.default_rng(3)
     path = lbt.LoopHardware(
-        frame_rate_hz=FAST,
+        frame_rate_hz=1000.0,
         delay_frames=2.25,
-        sensor_matrix=rng.standard_normal((3, axes)),
-        influence_matrix=np.eye(axes) + 0.1 * rng.standard_normal((axes, axes)),
+        sensor_matrix=rng.standard_normal((3, 2)),
+        influence_matrix=np.eye(2) + 0.1 * rng.standard_normal((2, 2)),
         mirror=SHELL,
     )
-    truth = lbt.Truth(turbulence=SLOW, sensor_gain=0.7)
-    design = lbt.integrator(path, gain=0.1)
-    run = lbt.simulate(design.controller, truth, hardware=path, frames=400, seed=5)
+    run = ran(path, sensor_gain=0.7)
     seen = lbt.load_record(lbt.files.telemetry_from_simulation(run, path))
-    assert seen.axes == axes
     first = len(path.mirror_taps)
     z = seen.pseudo_open_loop(0.7)[first:]
     assert np.allclose(z, run.total_nm[0, first - 1 : -1], rtol=1e-9, atol=1e-8)
-    assert "measurements: the inverse of the interaction matrix times what was recorded" in (
-        seen.notes
-    )
+    words = "measurements: the inverse of the interaction matrix times what was recorded"
+    assert words in seen.notes
 
 
 def test_slopes_with_their_modes_and_without():
     rng = np.random.default_rng(0)
-    S = rng.standard_normal((8, 3))
-    phase = rng.standard_normal((60, 3))
-    slopes = phase @ S.T
-    R = np.linalg.pinv(S)
-    seen = lbt.load_record(
-        telemetry(measurements=slopes @ R.T, interaction_matrix=R @ S, commands=phase),
-        axes=(0, 1),
-    )
-    assert np.allclose(seen.measurements, phase[:, :2])
-    with pytest.raises(
-        ProblemError,
-        match=r"has 8 measurements and 3 modes: slopes without modal .*slopes @ reconstructor.T",
-    ):
-        lbt.load_record(
-            telemetry(measurements=slopes, interaction_matrix=S, commands=phase), axes=(0, 1)
-        )
-    with pytest.raises(ProblemError, match="slopes without modal coefficients"):
-        lbt.load_record(telemetry(measurements=slopes, influence_matrix=np.eye(2)))
+    S, phase = rng.standard_normal((8, 3)), rng.standard_normal((60, 3))
+    slopes, R = phase @ S.T, np.linalg.pinv(S)
+    seen = telemetry(measurements=slopes @ R.T, interaction_matrix=R @ S, commands=phase)
+    assert np.allclose(lbt.load_record(seen, axes=(0, 1)).measurements, phase[:, :2])
+    words = "has 8 measurements and 3 modes: slopes without modal .*slopes @ reconstructor.T"
+    bare = telemetry(measurements=slopes, interaction_matrix=S, commands=phase)
+    with pytest.raises(ProblemError, match=words):
+        lbt.load_record(bare, axes=(0, 1))
 
 
 @pytest.mark.parametrize(
     ("telemetry_changes", "options", "words"),
     [
-        ({}, {"frame_rate_hz": 999}, "frame_rate_hz must be that of the telemetry, 1000; got 999"),
         ({}, {"unit": "mas"}, "unit must be that of the data, 'nm'; got 'mas'"),
-        (
-            {"measurement_unit": "pixel"},
-            {},
-            "the unit of mode 0 in 'pixel', mode 1 in 'pixel': give unit",
-        ),
+        ({"measurement_unit": "pixel"}, {}, "the unit of mode 0 in 'pixel', .*: give unit"),
         ({"command_unit": "V"}, {}, "the unit of mode 0 in 'V', mode 1 in 'V': give command_unit"),
         (
             {"commands": np.ones((60, 3)), "interaction_matrix": np.eye(2)},
@@ -432,21 +353,13 @@ def test_telemetry_that_is_refused(telemetry_changes, options, words):
 
 
 def test_what_telemetry_does_not_tell_is_given():
-    seen = lbt.load_record(
-        telemetry(measurement_unit="px", command_unit="V", delay_frames=None),
-        delay_frames=2.5,
-        diameter_m=8.0,
-        unit="mas",
-        command_unit="nm",
-    )
-    assert seen.delay_frames == 2.5
-    assert np.allclose(seen.measurements, lbt.models.nm_per_mas(8.0) * telemetry().measurements)
-    assert np.array_equal(seen.commands, telemetry().commands)
+    seen = telemetry(measurement_unit="px", command_unit="V", delay_frames=None)
+    known = {"delay_frames": 2.5, "diameter_m": 8.0, "unit": "mas", "command_unit": "nm"}
+    record = lbt.load_record(seen, **known)
+    assert record.delay_frames == 2.5
+    assert np.allclose(record.measurements, lbt.models.nm_per_mas(8.0) * seen.measurements)
+    assert np.array_equal(record.commands, seen.commands)
     # a unit of the measurements is none of commands that have their own
-    half = telemetry(measurement_unit="px", command_unit="nm")
-    seen = lbt.load_record(half, unit="m")
-    assert np.allclose(seen.measurements, 1e9 * half.measurements)
-    assert np.array_equal(seen.commands, half.commands)
-    other = lbt.load_record(telemetry(diameter_m=8.0), delay_frames=3, diameter_m=6.5)
-    assert (other.delay_frames, other.diameter_m) == (3.0, 6.5)
-    assert "delay_frames 3 was given; the telemetry has 2" in other.notes
+    half = lbt.load_record(telemetry(measurement_unit="px", command_unit="nm"), unit="m")
+    assert np.allclose(half.measurements, 1e9 * seen.measurements)
+    assert np.array_equal(half.commands, seen.commands)

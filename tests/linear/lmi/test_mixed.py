@@ -31,10 +31,10 @@ def test_turned_axes_have_the_same_optimum(of_level: bool) -> None:
         gain = kalman_riccati(problem).gain_predictor
         programme = InnovationProgramme.from_predictor(problem, gain, taps=3)
         if of_level:
-            taps, value, _ = programme.minimize_level(1.03 * programme.floor, GRID_HZ)
+            taps, value, _ = programme.minimize(GRID_HZ, variance=1.03 * programme.floor)
         else:
             norm = np.max(np.linalg.norm(programme.error.frequency_response(GRID_HZ), 2, (1, 2)))
-            taps, value, _ = programme.minimize_variance(0.97 * float(norm), GRID_HZ)
+            taps, value, _ = programme.minimize(GRID_HZ, gamma=0.97 * float(norm))
         scaled = taps @ np.kron(np.eye(3), np.linalg.inv(programme.whitening))
         distance = np.sum((scaled @ programme.root - programme.target) ** 2)
         assert np.sum(taps**2) > 0.001

@@ -2,14 +2,13 @@
 
 import runpy
 
-import control
 import numpy as np
 import pytest
 from support.generalized_plants import lightly_damped_plant, random_plant, sampled_plant, stacked
 from support.plants import ROOT
 
 import lbt_synth as lbt
-from lbt_synth.linear import GeneralizedPlant, mixed_sensitivity
+from lbt_synth.linear import GeneralizedPlant
 from lbt_synth.linear.lmi.output_feedback import least_level_lmi
 from lbt_synth.linear.output_feedback.lower_bound import infeasible_control_level
 from lbt_synth.linear.output_feedback.two_riccati import TwoRiccati
@@ -182,20 +181,6 @@ def test_a_large_direct_path_that_a_control_cancels(seed, copies):
     assert lbt.h2_controller(plant).rms <= cancelling_rms * (1 + 1e-6)
     least = lbt.hinf_controller(plant)
     assert least.gamma == pytest.approx(least.gamma_infeasible, rel=1e-6)
-
-
-def test_a_weight_as_a_transfer_function_is_that_in_state_space():
-    dt, pole = 1e-3, 0.999998
-    plant = control.tf([0.2], [1, -0.8, 0, 0], dt)
-    as_ratio = control.tf([0.5, -0.45], [1, -pole], dt)
-    as_states = control.ss([[pole]], [[1.0]], [[0.5 * (pole - 0.9)]], [[0.5]], dt)
-    levels = [
-        lbt.hinf_controller(mixed_sensitivity(plant, performance=weight, control=0.1))
-        for weight in (as_ratio, as_states)
-    ]
-    assert levels[0].gamma == pytest.approx(levels[1].gamma, rel=1e-5)
-    for level in levels:
-        assert level.gamma_infeasible == pytest.approx(level.gamma_least, rel=1e-3)
 
 
 def some_plant(seed, *, through):

@@ -123,8 +123,8 @@ def test_mirrors_that_do_not_fit_are_refused():
         (1e5, shell(), r"that fit are 72000 Hz"),
         (800, shell(ramp_samples=91), "ramp_samples must be at most 90"),
         (800, 0.7, "expected a PositionLoop"),
-        (799, quick, r"at most 100000 samples .* Lower sampling_hz to"),
-        (1e-308, quick, "= inf"),
+        (799, quick, r"at most 100000 samples .* Lower sampling_hz"),
+        (1e-308, quick, "got inf"),
         (800, ringing, "must settle within 4000 frames"),
     ):
         with pytest.raises(lbt.errors.ProblemError, match=words):

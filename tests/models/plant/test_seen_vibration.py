@@ -6,7 +6,6 @@ from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from support.oscillators import KickedOscillator
 
 import lbt_synth as lbt
-from lbt_synth.errors import ProblemError
 from lbt_synth.models import Accelerometer, LoopHardware, Motion
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 
@@ -100,12 +99,6 @@ def test_channels_that_move_alike_share_their_memory():
     apart = alike | {"v": Motion(size=0.3, phase_deg=90)}
     sizes = [seen_vibration(line, each, (mirror(),), PATH).n_states for each in (alike, apart)]
     assert sizes == [4, 5]
-
-
-def test_lines_above_the_nyquist_frequency_are_refused():
-    line = lbt.Vibration(frequency_hz=401, damping=0.05, rms_nm=500)
-    with pytest.raises(ProblemError, match="below the Nyquist frequency"):
-        seen_vibration(line, {}, (), PATH)
 
 
 def designed(frequency_hz, damping, noise, age):

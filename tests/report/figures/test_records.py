@@ -2,14 +2,18 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from support.eris import eris_model
 
 import lbt_synth as lbt
 from lbt_synth.loop.simulation import Drop, run_segments
 from lbt_synth.report.figures.records import (
     exact_spectrum,
+    run_spectra,
     sensor_failure_figure,
     simulation_figure,
+    spread_labels,
 )
 
 
@@ -49,13 +53,30 @@ def test_the_labels_of_axes_are_whole_and_beside_their_numbers(model):
         assert label.x1 <= min(text.get_window_extent().x0 for text in numbers)
 
 
-def test_simulation_figure(config):
+@given(st.lists(st.floats(0, 1), max_size=40))
+def test_labels_do_not_overlap(wanted):
+    wanted = sorted(wanted)
+    places = spread_labels(np.array(wanted), 0.045)
+    gap = min(0.045, 1 / max(len(wanted), 1))
+    assert places.size == len(wanted)
+    assert np.all(np.diff(places) > gap - 1e-9)
+    assert np.all((places > 0) & (places < 1))
+    if wanted and np.all(np.diff([-0.03, *wanted, 1.03]) > 0.06):
+        assert places == pytest.approx(wanted)
+
+
+def test_a_simulation_has_the_spectrum_of_the_transfer_functions(config):
+    design = lbt.kalman(config.plant)
     run = lbt.simulate(
-        lbt.kalman(config.plant).controller, config.truth, hardware=config.hardware, frames=600
+        design.controller, config.truth, hardware=config.hardware, frames=4000, cases=2
     )
     series, spectrum = simulation_figure(run, title="Kalman").axes
     assert series.get_xlabel() == "time [s]"
     assert "[nm²/Hz]" in spectrum.get_ylabel()
+    f, _, simulated = run_spectra(run)
+    loop = lbt.close_loop(config.hardware, design.controller)
+    ratio = (simulated / exact_spectrum(loop, config.truth, f, 2048))[f > 5]
+    assert np.mean(ratio) == pytest.approx(1, abs=0.06)
 
 
 def test_spans_and_levels(sensors_design, sensors_config):

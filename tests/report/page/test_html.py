@@ -12,7 +12,7 @@ from support.browser import DESK, PHONE, chain, opened
 from support.pages import HOSTILE, Reader, every_mark, whole_page
 
 import lbt_synth as lbt
-from lbt_synth.report.draw import drawing
+from lbt_synth.report.draw import drawing, name_axes
 from lbt_synth.report.page.html import (
     chart_svg,
     creation_time,
@@ -83,9 +83,9 @@ def test_numbers_of_long_curves_keep_their_peaks():
     x = np.linspace(0, 1, 5001)
     peak = 1 / (1e-6 + (x - 0.4321) ** 2)
     with drawing([2.0]) as (panel,):
-        panel.set_axes({"label": "x"}, {"label": "y", "unit": "nm"})
-        panel.curve("peak", x, peak)
-        panel.curve("hole", x, np.where(x > 0.5, np.nan, -peak))
+        name_axes(panel, ("x", ""), ("y", "nm"))
+        panel.plot(x, peak, label="peak")
+        panel.plot(x, np.where(x > 0.5, np.nan, -peak), label="hole")
     (table,) = number_tables(panel.figure)
     assert table.headings == ("x", "peak", "hole")
     assert 60 < len(table.rows) <= 120

@@ -1,15 +1,14 @@
-"""Designs side by side in the loop of a configuration: their numbers, verdict and tables."""
+"""Designs side by side in the loop of a configuration: their numbers, verdict, and page."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import label
 
 from lbt_synth.config import Config
 from lbt_synth.design import Check, Design
@@ -20,45 +19,47 @@ from lbt_synth.loop import (
     ClosedLoop,
     loop_margins,
     residual_budget,
-    simulate,
     stable_sensor_gains,
 )
 from lbt_synth.loop.band_limit import BandLimit
 from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.loop.least_residual import ResidualLimit
 from lbt_synth.loop.margins import LoopMargins
-from lbt_synth.loop.simulation import Simulation, settling_frames
-from lbt_synth.loop.stable_range import MovingGain, moving_gain
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
-from lbt_synth.report.page.html import words
+from lbt_synth.report.figures.loops import draw_bode, draw_sigma, draw_steps, sigma_curves
+from lbt_synth.report.figures.studies import limits_figure, robustness_map_figure
+from lbt_synth.report.page.html import (
+    Block,
+    Notice,
+    Page,
+    chart,
+    new_page,
+    paragraph,
+    survival_blocks,
+    words,
+)
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import Facts, columns, fact, facts
-from lbt_synth.storage.tables import Cell, Table
+from lbt_synth.storage.rows import Facts, columns, fact, facts, row_table
+from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import robustness_map
-from lbt_synth.studies.limits import LimitRow, LimitStudy, compare_in_truth
+from lbt_synth.studies.limits import LimitRow, LimitStudy, compare_in_truth, say_residual
 from lbt_synth.studies.robustness import RobustnessMap
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
-
-_MOST_FRAMES = 8192  # of a run: its series and spectra need no more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DesignAssessment:
     """What is known exactly of one design in the loop of a configuration."""
 
-    name: str  # its name in the report
     design: Design
     loop: ClosedLoop  # with the real sensor gain
-    notes: tuple[str, ...]  # how the loop that it was made for differs from this one
-    # None where the loop is unstable: the exact residual, and a run in time; and, None for several
-    # sensors, too, the margins at the real sensor gain, and the intervals around it of a gain that
-    # moves
+    limits: LimitRow  # name, residual, Strehl ratio, and how far they are from the limits
+    # None where the loop is unstable: the exact residual, and, None for several sensors, too, the
+    # margins at the real sensor gain
     budget: ResidualBudget | None
-    run: Simulation | None
     margins: LoopMargins | None
-    moving: MovingGain | None
     # interval of real sensor gains with a stable loop, relative to the sensor matrix of the
     # configuration, around the real one, the assumed one, or one of the map; nan for none
     sensor_gains: tuple[float, float]
@@ -66,9 +67,12 @@ class DesignAssessment:
     certificate_error: str  # why it could not be; empty if it could
     # Strehl ratio over the frequency error and the real sensor gain; None for several sensors
     map: RobustnessMap | None
-    # (e,): Strehl ratio over the frequency error at the real sensor gain; nan where it is unknown
-    strehls: FloatArray
-    limits: LimitRow  # residual, Strehl ratio, and how far they are from the limits
+    worst_strehl: float  # over the frequency errors at the real sensor gain; nan if unknown
+
+    @property
+    def name(self) -> str:
+        """Its name in the report."""
+        return self.limits.design
 
     @property
     def stable(self) -> bool:
@@ -87,59 +91,38 @@ class DesignAssessment:
 
 
 def assess_design(
-    design: Design,
-    loop: ClosedLoop,
-    limits: LimitRow,
-    config: Config,
-    errors_hz: FloatArray,
-    settle_frames: int,
+    design: Design, limits: LimitRow, config: Config, errors_hz: FloatArray
 ) -> DesignAssessment:
     """Assess a design in the loop of a configuration, over frequency errors (e,)."""
-    hardware, truth, settings = config.hardware, config.truth, config.settings.simulation
+    hardware, truth = config.hardware, config.truth
+    loop = design.close(hardware, sensor_gain=truth.sensor_gain)
     real_gain = config.sensor_gain * truth.sensor_gain
     gains = np.unique([*config.settings.robustness.sensor_gains, real_gain])
     checks: tuple[Check, ...] = ()
-    complaint, budget, margins, moving, run, image = "", None, None, None, None, None
+    complaint, image, worst_strehl = "", None, np.nan
     try:
         checks = design.recertify().checks
     except (LbtSynthError, ArithmeticError) as error:
         complaint = str(error)
-    starts, strehls = [loop.sensor_gain, 1.0], np.full(errors_hz.size, np.nan)
+    starts = [loop.sensor_gain, 1.0]
     if not loop.reads_others:
         over: dict[str, Any] = {"errors_hz": errors_hz, "sensor_gains": gains / config.sensor_gain}
         image = robustness_map(design, truth, config.imaging, hardware=hardware, **over)
         starts += image.sensor_gains[image.stable[0]].tolist()
         image = replace(image, sensor_gains=frozen_copy(gains))  # the real ones again
-        strehls = image.strehl[0, int(np.searchsorted(gains, real_gain))]
+        worst_strehl = float(image.strehl[0, int(np.searchsorted(gains, real_gain))].min())
     low, high = stable_interval(hardware, design.controller, starts)
-    if loop.is_stable:
-        budget = residual_budget(loop, truth)
-        if not loop.reads_others:
-            margins, moving = loop_margins(loop), moving_gain(loop)
-        run = simulate(
-            design.controller,
-            truth,
-            hardware=hardware,
-            frames=min(settings.frames, _MOST_FRAMES),
-            cases=settings.cases,
-            seed=settings.seed,
-            settle_frames=max(settings.settle_frames, settle_frames),
-        )
     return DesignAssessment(
-        name=limits.design,
         design=design,
         loop=loop,
-        notes=() if design.hardware is None else tuple(loop_differences(design.hardware, hardware)),
-        budget=budget,
-        margins=margins,
-        moving=moving,
-        run=run,
+        limits=limits,
+        budget=residual_budget(loop, truth) if loop.is_stable else None,
+        margins=loop_margins(loop) if loop.is_stable and not loop.reads_others else None,
         sensor_gains=(low * config.sensor_gain, high * config.sensor_gain),
         checks=checks,
         certificate_error=complaint,
         map=image,
-        strehls=strehls,
-        limits=limits,
+        worst_strehl=worst_strehl,
     )
 
 
@@ -181,7 +164,6 @@ class DesignReport:
     """Designs in the loop of a configuration: what is known of each, beside the limits."""
 
     config: Config  # the configuration
-    gain_files: Mapping[str, str | os.PathLike[str]]  # that designs came from, by their names
     assessments: tuple[DesignAssessment, ...]  # one per design, exact
     # the designs beside reference designs and limits, over the frequency error, and what they were
     # not made for
@@ -205,64 +187,21 @@ class DesignReport:
         return self.config.sensor_gain * self.config.truth.sensor_gain
 
 
-def design_report(
-    config: Config,
-    designs: Mapping[str, Design],
-    *,
-    gain_files: Mapping[str, str | os.PathLike[str]] | None = None,
-) -> DesignReport:
-    """Examine designs in the loop of a configuration.
-
-    Each controller is closed with the configuration's loop as it is, whatever it was designed
-    for. Certificates are recomputed.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-    designs : mapping of str to Design
-        Designs by name.
-    gain_files : mapping of str to path-like, optional
-        Files that designs came from, whose digests the page gives.
-
-    Returns
-    -------
-    DesignReport
-        The numbers; :func:`design_page` makes a page of them.
-
-    Raises
-    ------
-    ProblemError
-        If there is no design, one does not fit the loop, or a true vibration drifts.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
-    >>> report = lbt.report.design_report(config, {"integrator": slow})
-    >>> one = report.assessments[0]
-    >>> one.certified, f"{one.limits.residual_nm:.0f} nm, Strehl {one.limits.strehl:.2f}"
-    (True, '156 nm, Strehl 0.70')
-    """
+def design_report(config: Config, designs: Mapping[str, Design]) -> DesignReport:
+    """Examine designs in the loop of a configuration; ProblemError for one that does not fit."""
     require_instance(config, Config)
     if not designs:
         raise ProblemError("a report needs at least one design; got none.")
     for name, design in designs.items():
         require_instance(design, Design)
         require_compatible(name, design, config.hardware)
-    truth, hardware, errors = config.truth, config.hardware, frequency_errors(config)
+    errors = frequency_errors(config)
     study = compare_in_truth(designs, config, errors_hz=list(errors))
-    loops = [design.close(hardware, sensor_gain=truth.sensor_gain) for design in designs.values()]
-    # all settle as the slowest, so that one seed is the same weather for all
-    radii = [loop.radius_per_frame for loop in loops if loop.is_stable]
-    settle_frames = max(map(settling_frames, radii), default=0)
     return DesignReport(
         config=config,
-        gain_files=dict(gain_files or {}),
         assessments=tuple(
-            assess_design(design, loop, row, config, errors, settle_frames)
-            for design, loop, row in zip(designs.values(), loops, study.rows, strict=False)
+            assess_design(design, row, config, errors)
+            for design, row in zip(designs.values(), study.rows, strict=False)
         ),
         limits=study,
         errors_hz=errors,
@@ -292,16 +231,7 @@ def refine_values(values: Sequence[float]) -> FloatArray:
     return np.asarray(np.interp(places, np.arange(ordered.size), ordered))
 
 
-WORDS = (  # facts that are texts, made of several numbers
-    "origin",
-    "certificate",
-    "loop",
-    "good_errors",
-    "gain_margin",
-    "stable_gains",
-    "moving_gains",
-)
-_TONES = {"passed": "good", "stable": "good", "FAILED": "bad", "NOT": "bad", "UNSTABLE": "bad"}
+WORDS = ("origin", "certificate", "loop", "gain_margin", "stable_gains")  # facts that are texts
 
 
 def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
@@ -309,12 +239,9 @@ def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
 
     How each is called and printed is in the words of pages; the page prints what has a help.
     """
-    design, row, margins, moving = one.design, one.limits, one.margins, one.moving
-    limits, gain = report.limits, report.config.sensor_gain
-    strehls = np.zeros(0) if one.run is None else one.run.strehl(report.config.imaging)
+    design, row, margins = one.design, one.limits, one.margins
+    limits, budget = report.limits, one.budget
     factors = None if margins is None else (margins.gain_low, margins.gain_high)
-    moves = None if moving is None else (gain * moving.moving_low, gain * moving.moving_high)
-    budget = one.budget
     values = {
         "design": one.name,
         "method": design.method,
@@ -330,32 +257,25 @@ def design_facts(report: DesignReport, one: DesignAssessment) -> Facts:
         "loop": "stable" if one.stable else "UNSTABLE",
         "spectral_radius": one.loop.radius_per_frame,
         "residual_nm": row.residual_nm,
-        "turbulence_nm": budget and budget.turbulence_nm,
-        "vibration_nm": budget and budget.vibration_nm,
-        "noise_nm": budget and budget.noise_nm,
-        "within_nm": budget and budget.within_nm,
         "strehl": row.strehl,
-        "strehl_simulated": float(np.mean(strehls)) if strehls.size else None,
-        "scatter": 100 * float(np.std(strehls, ddof=1)) if strehls.size > 1 else None,
         "above_limit_percent": _known(limits.limit) and row.above_limit_percent,
         "worst_nm": row.worst_nm if report.errors_hz.size > 1 else None,
-        "worst_strehl": float(one.strehls.min()),
-        "good_errors": _interval(good_range(report, one), "+.4g"),
+        "worst_strehl": one.worst_strehl,
         "above_band_limit_percent": _known(limits.band) and row.above_band_limit_percent,
-        "modulus": margins and margins.modulus,
-        "phase_deg": margins and margins.phase_deg,
-        "delay_frames": margins and margins.delay_frames,
-        "crossover_hz": margins and margins.crossover_hz,
         "gain_margin": _interval(factors, ".3g"),
         "stable_gains": _interval(one.sensor_gains),
-        "moving_gains": _interval(moves),
     }
+    for name in ("turbulence_nm", "vibration_nm", "noise_nm", "within_nm"):
+        values[name] = getattr(budget, name, None)
+    for name in ("modulus", "phase_deg", "delay_frames", "crossover_hz"):
+        values[name] = getattr(margins, name, None)
     bounds = {"limit": _known(limits.limit), "band": _known(limits.band)}
-    entries = {}
-    for name, printing in words("facts").items():
-        text = printing.get("help", "").format(**bounds)
-        entries[name] = fact(values[name], **printing | {"help": text})
-    return facts(**entries)
+    return facts(
+        **{
+            name: fact(values[name], **{**how, "help": how.get("help", "").format(**bounds)})
+            for name, how in words("facts").items()
+        }
+    )
 
 
 def _known(limit: ResidualLimit | BandLimit | None) -> str | None:
@@ -376,55 +296,26 @@ def _certificate_word(one: DesignAssessment) -> str:
     return f"FAILED, {failed} of {count}" if failed else f"passed, {count}"
 
 
-_KEPT = 0.9  # of its best Strehl ratio, within which a design counts as good
-
-
-def good_range(report: DesignReport, one: DesignAssessment) -> tuple[float, float] | None:
-    """Return between which frequency errors [Hz] a design keeps 90 % of its best Strehl ratio.
-
-    None where it is unstable, reads several sensors, or where there is no range of errors.
-    """
-    if np.isnan(one.strehls).any() or report.errors_hz.size == 1:
-        return None
-    runs, _ = label(one.strehls >= _KEPT * np.max(one.strehls))
-    good = report.errors_hz[runs == runs[np.argmax(one.strehls)]]
-    return float(good[0]), float(good[-1])
-
-
 def verdict(report: DesignReport) -> str:
     """Return at most three sentences: which design leaves least, which is robust, what is proved.
 
-    Designs that show the same number as the best are as good. The table of the report has all.
+    The table of the report has all.
     """
     sentences = []
     if report.stable:
-        strehl = max(one.limits.strehl for one in report.stable)
-        where = ", if the vibrations are where the configuration has them"
-        least = _leaders(
-            {one.name: one.limits.residual_nm for one in report.stable},
-            lambda residual_nm: nm_text(residual_nm, ".1f", unit="nm rms"),
-        )
+        best = min((one.limits for one in report.stable), key=lambda row: row.residual_nm)
+        sentences.append(say_residual(best.design, best, report.limits.limit))
+    alone = [one for one in report.stable if one.alone]
+    if alone and report.errors_hz.size > 1:
+        tough = max(alone, key=lambda one: one.worst_strehl)
+        first, last = report.errors_hz[[0, -1]]
         sentences.append(
-            f"Least residual: {least} (Strehl ratio {100 * strehl:.1f} %)"
-            f"{where if report.config.truth.vibrations else ''}."
-        )
-    worst = {o.name: -100 * float(np.min(o.strehls)) for o in report.stable if o.alone}
-    if worst and report.errors_hz.size > 1:
-        first, last = (f"{report.errors_hz[i]:+.4g}" for i in (0, -1))
-        most = _leaders(worst, lambda percent: f"{-percent:.1f} %")
-        sentences.append(
-            f"Highest Strehl ratio at worst, if their frequencies are wrong by {first} to {last} "
-            f"Hz{'' if all(o.alone for o in report.stable) else ', of one sensor'}: {most}."
+            f"{tough.name} keeps the highest Strehl ratio at worst, {100 * tough.worst_strehl:.1f} "
+            f"%, if the vibrations are elsewhere by {first:+.4g} to {last:+.4g} Hz."
         )
     sentences.append(_certificate_sentence(report))
     # a number stays in one line with its unit
     return re.sub(r"(?<=\d) (?=%|nm|um|mas|urad|Hz)", "\u00a0", " ".join(sentences))
-
-
-def _leaders(values: Mapping[str, float], show: Callable[[float], str]) -> str:
-    """Name the designs that show the same as the one of the least value, and say that."""
-    least = show(min(values.values()))
-    return f"{listing_text([n for n, value in values.items() if show(value) == least])}, {least}"
 
 
 def _certificate_sentence(report: DesignReport) -> str:
@@ -448,25 +339,179 @@ def summary_table(report: DesignReport) -> Table:
     """All designs side by side, in groups; a line that no design has a value for is left out."""
     rows = [design_facts(report, one) for one in report.assessments]
     ends = f"{report.errors_hz[0]:.4g} to {report.errors_hz[-1]:.4g} Hz"
-    lines: list[tuple[str | Cell, ...]] = []
+    lines: list[tuple[str, ...]] = []
     group = ""
     for how in columns(rows[0]):
         group = words("groups").get(how.name, group).format(ends=ends)
-        texts = [how.text(row) for row in rows]
-        if not how.help or set(texts) == {"-"}:
-            continue
-        title = f"{how.help} [{how.shown_unit}]" if how.unit else how.help
-        lines += [] if (group,) in lines else [(group,)]
-        lines.append((title, *map(_toned, texts)))
+        cells = tuple(how.text(row) for row in rows)
+        if how.help and set(cells) != {"-"}:
+            title = f"{how.help} [{how.shown_unit}]" if how.unit else how.help
+            lines += [(group,)] * ((group,) not in lines) + [(title, *cells)]
+    caption = f"Summary at a real sensor gain of {report.real_gain:.4g}"
     return Table(
-        caption=f"Summary at a real sensor gain of {report.real_gain:.4g}; "
-        f"{report.config.imaging.label}",
+        caption=f"{caption}; {report.config.imaging.label}",
         headings=("quantity", *report.names),
         rows=tuple(lines),
     )
 
 
-def _toned(text: str) -> str | Cell:
-    """Return a cell in the tone of its first word."""
-    tone = _TONES.get(text.partition(",")[0].partition(" ")[0])
-    return text if tone is None else Cell(text=text, tone=tone)
+def design_page(
+    config: Config,
+    designs: Mapping[str, Design],
+    *,
+    gain_files: Mapping[str, str | os.PathLike[str]] | None = None,
+    title: str | None = None,
+) -> Page:
+    """Examine designs in the loop of a configuration, and return their page.
+
+    Each controller is closed with the configuration's loop as it is, whatever it was designed
+    for. Certificates are recomputed. :func:`write_page` writes the page.
+
+    Parameters
+    ----------
+    config : Config
+        The configuration.
+    designs : mapping of str to Design
+        Designs by name.
+    gain_files : mapping of str to path-like, optional
+        Files that designs came from, whose digests the page gives.
+    title : str, optional
+        Heading of the page; by default it names the configuration.
+
+    Returns
+    -------
+    Page
+        The page.
+
+    Raises
+    ------
+    ProblemError
+        If there is no design, one does not fit the loop, a true vibration drifts, or the title is
+        empty.
+    FileError
+        If the configuration or a gain file cannot be read again.
+
+    Examples
+    --------
+    >>> import lbt_synth as lbt
+    >>> config = lbt.load_config("examples/lbt.yaml")
+    >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
+    >>> lbt.report.design_page(config, {"slow": slow}, title="Tonight").title
+    'Tonight'
+    """
+    return report_page(design_report(config, designs), gain_files or {}, title)
+
+
+def report_page(
+    report: DesignReport,
+    gain_files: Mapping[str, str | os.PathLike[str]],
+    title: str | None = None,
+) -> Page:
+    """Return the page of a report; :func:`design_page` says more."""
+    source = report.config.source
+    heading = f"Controllers for {source.name}" if title is None else title.strip()
+    if not heading:
+        raise ProblemError("title must hold at least one letter; got an empty text.")
+    return new_page(
+        heading,
+        f"{count_text(len(report.assessments), 'design')}: {listing_text(report.names)}",
+        {
+            "Summary": _summary_blocks(report),
+            "When sensors fail": _failure_blocks(report),
+            "Transfer functions": _transfer_blocks(report),
+            "Robustness": _robustness_blocks(report),
+            "Certificates": _certificate_blocks(report),
+        },
+        sources=[
+            (source, "configuration"),
+            *((path, f"gain file of {name}") for name, path in gain_files.items()),
+        ],
+    )
+
+
+def _summary_blocks(report: DesignReport) -> list[Block]:
+    """Open with what is wrong, the verdict, and the tables of all designs and of the loop."""
+    config, limits = report.config, report.limits
+    blocks: list[Block] = []
+    for one in report.assessments:
+        if not one.stable:
+            radius, gain = f"{one.loop.spectral_radius:.6g}", f"{report.real_gain:.4g}"
+            text = paragraph("unstable", name=one.name, radius=radius, gain=gain)
+            blocks.append(Notice(text=text, tone="bad"))
+        if not one.certified:
+            why = one.certificate_error or "; ".join(
+                f"{check.name} {check.value:.6g}, limit {check.limit:.6g}"
+                for check in one.checks
+                if not check.passed
+            )
+            blocks.append(Notice(text=f"The certificate of {one.name} fails: {why}", tone="bad"))
+    hidden = ("worst_nm", "above_band_limit_percent", "method", "stable")
+    caption = f"In the truth of {config.source.name}; {config.imaging.label}"
+    blocks += [
+        verdict(report),
+        *survival_blocks({one.name: one.margins for one in report.assessments if one.margins}),
+        summary_table(report),
+        row_table(caption, limits.rows, without=hidden),
+    ]
+    if limits.limit is not None and any(not one.alone for one in report.assessments):
+        least = nm_text(limits.limit.rms_nm, ".1f", unit="nm rms")
+        blocks.append(f"No controller of the loop's own sensor alone leaves less than {least}.")
+    # an unstable loop is named above
+    notes = [f"{one.name}: {t}." for one in report.stable for t in limits.warnings[one.name]]
+    notes += limits.notes
+    for one in report.assessments:
+        if one.design.hardware is not None:
+            differences = loop_differences(one.design.hardware, config.hardware)
+            notes += [f"{one.name} was {text}" for text in differences]
+    return [*blocks, *config._summarise().tables, *(Notice(text=note) for note in notes)]
+
+
+def _failure_blocks(report: DesignReport) -> list[Block]:
+    """Return what designs of several sensors leave while some fail."""
+    tables = {one.name: one.design.tables()[0] for one in report.assessments if not one.alone}
+    return [row_table(f"{name}: {table.title}", table.rows) for name, table in tables.items()]
+
+
+def _transfer_blocks(report: DesignReport) -> list[Block]:
+    """Return singular values of the error and of the loops, their margins, and their steps."""
+    lines_hz, gain = report.config.truth.lines_hz, f"{report.real_gain:.4g}"
+    alone = [one for one in report.assessments if one.alone]
+    designs = {one.name: one.design for one in alone}
+    loops = {one.name: one.loop for one in alone}
+    curves = sigma_curves(designs, loops, lines_hz=lines_hz)
+    blocks: list[Block] = []
+    if alone and not any(one.stable for one in alone):
+        loops = {}
+        blocks.append("No loop is stable, so none has a rejection or a noise transfer.")
+    if loops or any(error is not None for _, error, *_ in curves.values()):
+        blocks.append(chart("sigma", draw_sigma(curves, loops, lines_hz), gain=gain))
+    if loops:
+        frame = f"{1e3 / report.config.hardware.frame_rate_hz:.4g}"
+        blocks.append(chart("bode", draw_bode(loops), gain=gain))
+        blocks.append(chart("step", draw_steps(loops), frame=frame))
+    return blocks
+
+
+def _robustness_blocks(report: DesignReport) -> list[Block]:
+    """Return the residual over the frequency error, and maps with the sensor gain."""
+    if report.errors_hz.size == 1:
+        return []
+    blocks: list[Block] = []
+    if report.stable:
+        blocks.append(chart("limits", limits_figure(report.limits, over_errors=True)))
+    if maps := {one.name: one.map for one in report.assessments if one.map is not None}:
+        figure = robustness_map_figure(maps, real_gain=report.real_gain)
+        blocks.append(chart("map", figure))
+    return blocks
+
+
+def _certificate_blocks(report: DesignReport) -> list[Block]:
+    blocks: list[Block] = [paragraph("certificates")]
+    for one in report.assessments:
+        missing = f"{one.name}: not computed: {one.certificate_error}"
+        blocks.append(
+            Notice(text=missing, tone="bad")
+            if one.certificate_error
+            else row_table(f"Certificate of {one.name}", one.checks)
+        )
+    return blocks

@@ -1,0 +1,556 @@
+"""The page of sliders: what moves, what is shown of it, and Bokeh's server and widgets.
+
+A knob edits numbers of the configuration, so that whatever is seen can be saved.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from bokeh.layouts import column, grid, row
+from bokeh.models import (
+    Button,
+    ColumnDataSource,
+    Div,
+    HoverTool,
+    Legend,
+    PlainText,
+    PreText,
+    Select,
+    Slider,
+)
+from bokeh.plotting import figure as new_figure
+from bokeh.server.server import Server
+
+from lbt_synth.config import Config
+from lbt_synth.config.load import build_config, validate_sections
+from lbt_synth.config.schema import FileSection
+from lbt_synth.config.write import config_text
+from lbt_synth.design import Design
+from lbt_synth.errors import LbtSynthError, ProblemError
+from lbt_synth.files import save_gain
+from lbt_synth.linear.norms import spectral_norms
+from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.methods.registry import METHODS, default_method, method_named
+from lbt_synth.methods.request import DesignRequest, design_request
+from lbt_synth.models import Vibration
+from lbt_synth.models.vibration import stationary_vibrations
+from lbt_synth.report.designs import frequency_errors, require_compatible
+from lbt_synth.report.draw import GREY, colour, dashes
+from lbt_synth.report.figures.loops import frequency_grid
+from lbt_synth.report.figures.records import SEGMENT, exact_spectrum
+from lbt_synth.report.page.html import creator_name
+from lbt_synth.storage.atomic_files import write_atomically
+from lbt_synth.storage.display_unit import shown_unit
+from lbt_synth.storage.rows import fact, facts, row_table
+from lbt_synth.storage.tables import Table, text_lines
+from lbt_synth.storage.words import count_text
+from lbt_synth.studies import robustness_map
+from lbt_synth.studies.limits import compare_in_truth, say_residual
+from lbt_synth.validation import FloatArray
+
+Content: TypeAlias = dict[str, Any]  # of a configuration file
+Curve: TypeAlias = tuple[FloatArray, FloatArray]  # abscissae and ordinates, in units that are shown
+Designs: TypeAlias = Mapping[str, Design]
+SHIFT = "shift"  # key of the knob that moves the true lines
+
+
+@dataclass(frozen=True, slots=True)
+class Knob:
+    """One number that can be moved."""
+
+    key: str
+    label: str
+    unit: str  # empty for a pure number
+    low: float
+    high: float
+    value: float  # where it stands before it is moved
+    edit: Callable[[Config, Content, float], None]  # puts a value into a configuration
+
+
+def list_knobs(config: Config) -> Iterator[Knob]:
+    """Yield what can be moved in a configuration: the loop and the sky, then the design."""
+    settings, gain = config.settings, config.truth.sensor_gain * config.sensor_gain
+    delay, air = settings.loop.delay_frames, settings.atmosphere
+    edit = partial(_scale, "loop", "delay_frames", delay)
+    yield Knob("delay", "total delay", "frames", 1.0, max(6.0, delay), delay, edit)
+    edit = partial(_scale, "truth", "sensor_gain", gain)
+    yield Knob("gain", "real sensor gain", "", gain / 5, 2.5 * gain, gain, edit)
+    if (noise_nm := _noise_nm(config)) > 0:
+        ends = noise_nm / 5, 5 * noise_nm
+        yield Knob("noise", "measurement noise", "nm", *ends, noise_nm, _set_noise)
+    low, high = frequency_errors(config)[[0, -1]].tolist()
+    if low < high:
+        label = "frequency error, true less assumed"
+        yield Knob(SHIFT, label, "Hz", low, high, 0.0, _set_shift)
+    for key, label, unit, name in (
+        ("seeing", "seeing", "arcsec", "seeing_arcsec"),
+        ("wind", "wind speed", "m/s", "wind_speed_m_s"),
+    ):
+        if air is not None:
+            value = float(getattr(air, name))
+            edit = partial(_scale, "atmosphere", name, value)
+            yield Knob(key, label, unit, value / 4, 4 * value, value, edit)
+    if lines := settings.model.vibrations:
+        damping = float(np.exp(np.mean(np.log([line.damping for line in lines]))))
+        ends, edit = (damping / 5, min(5 * damping, 0.9)), partial(_scale_damping, damping)
+        yield Knob("damping", "assumed damping", "", *ends, damping, edit)
+    ratio = float(settings.design.gamma_ratio)
+    methods = ", ".join(name for name, m in METHODS.items() if "gamma_ratio" in m.configurable)
+    edit = partial(_scale, "design", "gamma_ratio", ratio)
+    yield Knob("gamma_ratio", f"gamma ratio of {methods}", "", 1.0, 3.0, ratio, edit)
+
+
+def _noise_nm(config: Config) -> float:
+    return float(np.sqrt(np.mean(np.square(config.noise_nm))))
+
+
+def _scale(
+    section: str, name: str, start: float, config: Config, content: Content, value: float
+) -> None:
+    """Scale a number of a section from its start."""
+    usual = getattr(getattr(config.settings, section), name)
+    # the value of the slider, and not a neighbour by rounding
+    content.setdefault(section, {})[name] = float(f"{usual * value / start:.12g}")
+
+
+def _set_noise(config: Config, content: Content, value: float) -> None:
+    """Scale the noise of all measurements."""
+    sensor = content["sensor"]
+    for name in ("noise_mas", "pyramid"):
+        sensor.pop(name, None)
+    sensor["noise_nm"] = (value / _noise_nm(config) * np.asarray(config.noise_nm)).tolist()
+
+
+def _set_shift(config: Config, content: Content, value: float) -> None:
+    """Move the true lines, the one that moves most by a shift; those of the model stay."""
+    for line in _true_lines(config, content):
+        line["frequency_hz"] += config.truth.frequency_shift_hz(line["frequency_hz"], value)
+
+
+def _scale_damping(start: float, config: Config, content: Content, value: float) -> None:
+    """Scale the damping of the lines of the model; those of the truth stay."""
+    _true_lines(config, content)
+    for line in content["model"]["vibrations"]:
+        if line["damping"] < 0.99:  # from there on it is a drift
+            line["damping"] = min(line["damping"] * value / start, 0.99)
+
+
+def _true_lines(config: Config, content: Content) -> list[Content]:
+    """Return the lines of the truth; those that it takes from the model become its own."""
+    truth = content.setdefault("truth", {})
+    if not isinstance(truth.get("vibrations", []), list):
+        lines = stationary_vibrations(config.truth.vibrations)
+        errors = config.truth.frequency_errors_hz or (None,) * len(lines)
+        entries = truth["vibrations"] = []
+        for line, error in zip(lines, errors, strict=True):
+            if not isinstance(line, Vibration):
+                continue
+            names = ("frequency_hz", "damping", "rms_nm")
+            entry = {"kind": "resonance", **{n: float(getattr(line, n)) for n in names}}
+            if len(line.direction) == 2:
+                entry["direction_deg"] = float(np.degrees(np.arctan2(*line.direction[::-1])))
+            entries.append(entry if error is None else {**entry, "frequency_error_hz": error})
+    return truth.setdefault("vibrations", [])  # type: ignore[no-any-return]  # of a file
+
+
+def move(config: Config, values: Mapping[str, float]) -> Config:
+    """Return the configuration with knobs at other values; ConfigError where they do not fit."""
+    content = config.settings.model_dump(exclude_unset=True)
+    for knob in list_knobs(config):
+        if knob.key in values:
+            knob.edit(config, content, min(max(values[knob.key], knob.low), knob.high))
+    return build_config(validate_sections(FileSection, content, config.source), config.source)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Shown:
+    """What the page shows of a design; nan in an unstable loop."""
+
+    curves: Mapping[str, Curve]  # by the titles of figures; none of an error without an estimate
+    residual_nm: float  # this and what follows: where the true lines are now
+    strehl: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class View:
+    """What a method and sliders give; the first of the designs on show is its own."""
+
+    config: Config
+    request: DesignRequest
+    moves: str  # the sliders that were moved, as people read them
+    design: Design
+    shown: Mapping[str, Shown]
+
+    @property
+    def name(self) -> str:
+        """Name of the design."""
+        return next(iter(self.shown))
+
+
+def new_view(
+    start: Config, designs: Designs, method: str = "", values: Mapping[str, float] | None = None
+) -> View:
+    """Design, and return what the page shows of the design and of those to compare with."""
+    name, moved = method or default_method(), values or {}
+    config = move(start, moved)
+    request = design_request(name, method_named(name).reference_options)
+    design, label = config.design(request), request.method.label
+    if label in designs:
+        label += " by the sliders"
+    moves = (
+        f"{knob.label} {moved[knob.key] * factor:.4g} {unit}".rstrip()
+        for knob in list_knobs(start)
+        if knob.key in moved
+        for unit, factor in (shown_unit(knob.unit),)
+    )
+    return View(
+        config=config,
+        request=request,
+        moves=", ".join(moves),
+        design=design,
+        shown={
+            title: show_design(one, config, start, moved.get(SHIFT, 0.0))
+            for title, one in {label: design, **designs}.items()
+        },
+    )
+
+
+# The figures of the page: what is on their axes, with units of wavefronts in braces; scales over
+# frequency are logarithmic
+FIGURES = {
+    "Rejection": ("frequency [Hz]", "\u03c3\u0304, phase to residual [-]"),
+    "Noise": ("frequency [Hz]", "\u03c3\u0304, noise to residual [-]"),
+    "Residual spectrum": ("frequency [Hz]", "power spectrum [{nm²/Hz}]"),
+    "Strehl ratio": ("frequency error [Hz]", "Strehl ratio [%]"),
+    "Estimation error": ("frequency [Hz]", "\u03c3\u0304, disturbances to error [{nm}]"),
+}
+# Frequencies of a curve, in all and on each side of a line, and shifts of the true lines: as many
+# as a page draws in a tenth of a second
+_POINTS, _NEAR_A_LINE, _SHIFTS = 240, 28, 15
+
+
+def show_design(design: Design, config: Config, start: Config, shift_hz: float) -> Shown:
+    """Return what a design does in the loop of a configuration.
+
+    The true lines have moved there by a shift from where they are at the start, and move on for the
+    Strehl ratio over their shift.
+    """
+    hardware, truth, n = config.hardware, config.truth, config.hardware.modes
+    loop = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+    density = {"points": _POINTS, "near": _NEAR_A_LINE}
+    f = frequency_grid(hardware.frame_rate_hz, truth.lines_hz, **density)
+    lines = {name: getattr(start.truth, name) for name in ("vibrations", "frequency_errors_hz")}
+    low, high = frequency_errors(start)[[0, -1]]
+    shifts = np.unique([*np.linspace(low, high, _SHIFTS), shift_hz])
+    image = robustness_map(
+        design,
+        replace(truth, **lines),
+        config.imaging,
+        hardware=hardware,
+        errors_hz=shifts,
+        sensor_gains=[truth.sensor_gain],
+    )
+    rejection = noise = power = np.full(f.size, np.nan)
+    if loop.is_stable:
+        power = shown_unit("nm²/Hz")[1] * exact_spectrum(loop, truth, f, SEGMENT)
+        response = loop.system.frequency_response(f)[:, :n]
+        rejection, noise = (spectral_norms(response[..., s]) for s in (np.s_[:n], np.s_[n:]))
+    curves = {
+        "Rejection": (f, rejection),
+        "Noise": (f, noise),
+        "Residual spectrum": (f, power),
+        "Strehl ratio": (shifts, 100 * image.strehl[0, 0]),
+    }
+    if design.is_estimator:
+        error = spectral_norms(design.error_system().frequency_response(f))
+        curves["Estimation error"] = f, shown_unit("nm")[1] * error
+    now = int(np.searchsorted(shifts, shift_hz))
+    return Shown(
+        curves=curves,
+        residual_nm=float(image.residual_nm[0, 0, now]),
+        strehl=float(image.strehl[0, 0, now]),
+    )
+
+
+def explored_table(shown: Mapping[str, Shown]) -> Table:
+    """Return what designs leave; an unstable loop has no numbers."""
+    rows = [
+        facts(
+            design=fact(name, "design"),
+            residual=fact(one.residual_nm, "residual", unit="nm", format=".1f", missing="unstable"),
+            strehl=fact(one.strehl, "Strehl ratio", unit="%", scale=100, format=".2f"),
+        )
+        for name, one in shown.items()
+    ]
+    return row_table("", rows)
+
+
+def judge(view: View) -> str:
+    """Return the verdict on the design of a view, in sentences."""
+    config = view.config
+    compared = compare_in_truth({view.name: view.design}, config)
+    row, *others = compared.rows
+    checks = f"Certified: {count_text(len(view.design.certificate.checks), 'check')} passed."
+    if not row.stable:
+        return f"{view.name} is UNSTABLE in this loop. {checks}"
+    gain = config.truth.sensor_gain
+    loop = close_loop(config.hardware, view.design.controller, sensor_gain=gain)
+    margins = loop_margins(loop)
+    sentences = [*(f"WARNING: {text}" for text in margins.fragilities)]
+    sentences.append(say_residual(view.name, row, compared.limit))
+    best = min(others, key=lambda other: other.residual_nm, default=row)
+    if best.residual_nm < row.residual_nm:
+        sentences.append(say_residual(f"Here {best.design}", best, None))
+    warnings = (f"{text[0].upper()}{text[1:]}." for text in compared.warnings[view.name])
+    return " ".join([*sentences, f"It {margins.survival}", *warnings, checks])
+
+
+def save_view(start: Config, view: View, folder: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """Write a view into a folder under names that are free; return the files and their commands."""
+    stem = next(
+        stem
+        for stem in (f"explored-{number}" for number in count(1))
+        if not any((folder / (stem + ending)).exists() for ending in (".yaml", ".fits"))
+    )
+    config, gain = folder / f"{stem}.yaml", folder / f"{stem}.fits"
+    request = view.request
+    options = [f"--{name.replace('_', '-')} {value}" for name, value in request.given.items()]
+    design = ["lbt-synth design", config.name, "--method", request.method.name, *options]
+    commands = (
+        " ".join((*design, "-o", gain.name)),
+        f"lbt-synth report {config.name} {gain.name} -o {stem}.html",
+    )
+    moves = view.moves or "nothing moved"
+    head = f"{start.source.name!a} with {moves}; {creator_name()}"
+    text = config_text(view.config.settings, {"": "\n".join((head, *commands))})
+    write_atomically(config, text.encode())
+    save_gain(gain, view.design)
+    return [config, gain], commands
+
+
+_QUICK_S = 0.3  # a design that takes longer is made when a slider is released
+_TICK_MS = 20  # in which moves of a slider become one wish
+
+
+def new_panel(title: str) -> tuple[Any, ColumnDataSource, ColumnDataSource]:
+    """Return a figure with the data of its curves, and of the rules across them."""
+    scale = "log" if FIGURES[title][0] == "frequency [Hz]" else "linear"
+    curves = ColumnDataSource({name: [] for name in ("x", "y", "name", "colour", "dash")})
+    rules = ColumnDataSource({"at": []})
+    figure = new_figure(
+        name=title,
+        title=title,
+        height=300,
+        sizing_mode="stretch_width",
+        x_axis_type=scale,
+        y_axis_type=scale,
+        tools="box_zoom,pan,wheel_zoom,reset",
+    )
+    # a finger scrolls the page
+    figure.toolbar.update(logo=None, active_drag=None, active_scroll=None)
+    units = {unit: shown_unit(unit)[0] for unit in ("nm", "nm²/Hz")}
+    for axis, text in zip((figure.xaxis[0], figure.yaxis[0]), FIGURES[title], strict=True):
+        axis.axis_label = PlainText(text=text.format_map(units))
+    figure.vspan(x="at", source=rules, line_color=GREY, line_dash="dotted")
+    figure.add_layout(Legend(orientation="horizontal", padding=0, border_line_color=None), "below")
+    look: dict[str, Any] = {"line_color": "colour", "line_dash": "dash", "legend_field": "name"}
+    lines = figure.multi_line("x", "y", line_width=2, source=curves, **look)
+    tips = [("", "@name"), ("x", "$snap_x"), ("y", "$snap_y")]
+    figure.add_tools(HoverTool(renderers=[lines], tooltips=tips))
+    return figure, curves, rules
+
+
+class Session:
+    """One open page."""
+
+    def __init__(
+        self,
+        document: Any,
+        start: Config,
+        designs: Designs,
+        first: View,
+        folder: Path,
+        saved: list[Path],
+    ) -> None:
+        self._document, self._start, self._designs, self._view = document, start, designs, first
+        self._folder, self._saved = folder, saved  # the files that all pages wrote
+        self._seconds: dict[str, float] = {}  # of the last design of a method
+        self._waits = self._judges = False  # whether a wish waits, and for a verdict, too
+        self._kept: dict[str, Shown] = {}
+        self._sliders = {knob: _new_slider(knob) for knob in list_knobs(start)}
+        methods = [(m.name, m.title) for m in METHODS.values() if not m.of_record]
+        self._method = Select(
+            name="method", title="Method", value=default_method(), options=methods
+        )
+        self._verdict, self._files = (
+            Div(name=name, sizing_mode="stretch_width") for name in ("verdict", "saved")
+        )
+        self._table = PreText(name="table")
+        self._panels = {title: new_panel(title) for title in FIGURES}
+        buttons = [Button(name=label.lower(), label=label) for label in ("Keep", "Save", "Reset")]
+        for button, action in zip(buttons, (self._keep, self._save, self._reset), strict=True):
+            button.on_click(action)
+        self._method.on_change("value", self._released)
+        for slider in self._sliders.values():
+            slider.on_change("value", self._moved)
+            slider.on_change("value_throttled", self._released)
+        controls = column(
+            self._method, *self._sliders.values(), row(*buttons), self._files, width=320
+        )
+        figures = grid([figure for figure, *_ in self._panels.values()], ncols=2)
+        figures.sizing_mode = "stretch_width"
+        wide = {"sizing_mode": "stretch_width"}
+        results = column(self._verdict, self._table, figures, **wide)
+        document.add_root(row(controls, results, **wide))
+        document.title = f"Explore {start.source.name}"
+        self._show()
+        self._say(self._verdict, judge(first))
+
+    def _moved(self, attr: str, old: Any, new: Any) -> None:
+        """Design anew while a slider moves, unless the method is slow."""
+        if self._seconds.get(self._method.value, 0.0) < _QUICK_S:
+            self._ask(judges=False)
+
+    def _released(self, attr: str, old: Any, new: Any) -> None:
+        """Design anew, and say what to think of it."""
+        self._ask(judges=True)
+
+    def _ask(self, *, judges: bool) -> None:
+        """Design anew soon."""
+        self._judges |= judges
+        if not self._waits:
+            self._waits, self._verdict.text = True, "Designing …"
+            self._document.add_timeout_callback(self._design, _TICK_MS)
+
+    def _design(self) -> None:
+        """Design where the sliders stand; the curves stay those of the last design that worked."""
+        judges, self._judges, self._waits = self._judges, False, False
+        values = {
+            knob.key: slider.value / shown_unit(knob.unit)[1]
+            for knob, slider in self._sliders.items()
+            if slider.value != _new_slider(knob).value
+        }
+        begun = time.perf_counter()
+        try:
+            self._view = new_view(self._start, self._designs, self._method.value, values)
+            self._seconds[self._method.value] = time.perf_counter() - begun
+            self._show()
+            if judges:
+                self._say(self._verdict, judge(self._view))
+        except Exception as error:
+            self._say(self._verdict, str(error) or repr(error))
+
+    @staticmethod
+    def _say(place: Div, *lines: str) -> None:
+        """Write lines of plain text."""
+        place.update(text="\n".join(lines), disable_math=True, render_as_text=True)
+
+    def _show(self) -> None:
+        """Show the view and what was kept, each design in the look of its place."""
+        view, shown = self._view, {**self._view.shown, **self._kept}
+        for title, (_, curves, rules) in self._panels.items():
+            over_frequency = FIGURES[title][0] == "frequency [Hz]"
+            rules.data = {"at": np.array(view.config.truth.lines_hz if over_frequency else [])}
+            drawn = {
+                name: (look, *one.curves[title])
+                for look, (name, one) in enumerate(shown.items())
+                if title in one.curves
+            }
+            curves.data = {
+                "x": [x for _, x, _ in drawn.values()],
+                "y": [np.where(y > 0, y, np.nan) for *_, y in drawn.values()],
+                "name": list(drawn),
+                "colour": [colour(look) for look, *_ in drawn.values()],
+                "dash": [dashes(look) for look, *_ in drawn.values()],
+            }
+        self._table.text = "\n".join(text_lines(explored_table(shown), 100))
+
+    def _keep(self) -> None:
+        """Keep the curves of the design that is shown."""
+        view = self._view
+        self._kept[f"{view.name}, {view.moves or 'kept'}"] = view.shown[view.name]
+        self._show()
+
+    def _save(self) -> None:
+        """Write the view, and say how the files are made."""
+        try:
+            paths, commands = save_view(self._start, self._view, self._folder)
+        except LbtSynthError as error:
+            self._say(self._files, str(error))
+            return
+        self._saved.extend(paths)
+        names = ", ".join(map(str, paths))
+        self._say(self._files, f"Written: {names}. The commands that make them:", *commands)
+
+    def _reset(self) -> None:
+        """Put the sliders back, and drop the curves that were kept."""
+        self._kept.clear()
+        for knob, slider in self._sliders.items():
+            slider.value = _new_slider(knob).value
+        self._ask(judges=True)
+
+
+def _new_slider(knob: Knob) -> Slider:
+    """Return the slider of a knob, in the unit that is shown."""
+    unit, factor = shown_unit(knob.unit)
+    low, high, value = (factor * number for number in (knob.low, knob.high, knob.value))
+    title = f"{knob.label} [{unit}]" if unit else knob.label
+    words = {"name": knob.key, "title": title, "format": "0.[0000]"}
+    return Slider(start=low, end=high, value=value, step=(high - low) / 200, **words)
+
+
+def serve(
+    start: Config,
+    designs: Designs,
+    folder: Path,
+    *,
+    host: str,
+    port: int,
+    origins: Sequence[str],
+    announce: Callable[[str], None],
+) -> list[Path]:
+    """Serve the page until it is interrupted, and return the files that its users saved.
+
+    ``origins`` are further addresses, as host:port, under which browsers may reach the page.
+    ProblemError if a design does not fit the loop, or if there is no such place to serve.
+    """
+    for name, design in designs.items():
+        require_compatible(name, design, start.hardware)
+    first, saved = new_view(start, designs), list[Path]()
+    place = port
+    try:
+        for family, *_, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+            with socket.create_server((address[0], place), family=family) as probe:
+                place = probe.getsockname()[1]
+    except (OSError, UnicodeError) as error:  # a name of another alphabet, or too long
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ProblemError(
+            f"cannot serve at --host {host} --port {port}: {reason}. Try another one; --port 0 is "
+            "any that is free."
+        ) from error
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+    hosts = (f"{one}:{place}" for one in ("localhost", "127.0.0.1", name))
+    server = Server(
+        {"/": lambda document: Session(document, start, designs, first, folder, saved)},
+        address=host,
+        port=place,
+        allow_websocket_origin=[*hosts, *origins],
+    )
+    server.start()
+    try:
+        announce(f"http://{name}:{place}/")
+        server.io_loop.start()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.stop()
+    return saved
