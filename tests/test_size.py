@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3590,
+    "cli": 3483,
     "config": 1661,
     "design": 7690,
     "files": 1243,
@@ -24,7 +24,7 @@ LINES = {
     "loop": 3988,
     "methods": 920,
     "models": 4400,
-    "report": 3275,
+    "report": 3342,
     "storage": 1027,
     "studies": 2761,
     "errors, validation": 554,
@@ -32,10 +32,10 @@ LINES = {
 COUNTS = {
     "files of the package": 204,
     "public names": 163,
-    "tuned constants": 498,
+    "tuned constants": 496,
     "lines of tests": 31029,
     "lines of benchmarks": 4039,
-    "words of docs": 59818,
+    "words of docs": 59817,
 }
 
 

@@ -15,7 +15,6 @@ from lbt_synth.cli.loop_inputs import (
     load_shown,
     margin_columns,
     named_difference_notes,
-    own_sensor_notes,
     say_limit,
 )
 from lbt_synth.cli.output import PERCENT, RMS, Report
@@ -32,7 +31,6 @@ from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.designs import (
     refine_values,
     require_compatible,
-    stable_interval,
 )
 from lbt_synth.report.figures import robustness_map_figure
 from lbt_synth.report.figures.studies import (
@@ -168,7 +166,8 @@ def run_tradeoff(arguments: Namespace) -> Report:
         f"The least norm of any filter lies between {nm_text(least.gamma_infeasible, '.9g')} and "
         f"{nm_text(least.gamma_least, '.9g')}.",
     ]
-    report.notes += own_sensor_notes(config)
+    if others := config.other_sensors:
+        report.notes.append(f"note: the loop's own sensor is read alone, without {others}.")
     return report
 
 
@@ -204,8 +203,6 @@ def run_mirror(arguments: Namespace) -> Report:
     report.add_facts(
         "The mirror after a step of its command",
         facts(
-            overshoot=fact(step.overshoot, "overshoot", unit="%", scale=100),
-            tolerance=fact(step.tolerance, "tolerance of the settling time", unit="%", scale=100),
             settling_s=fact(step.settling_s, "settling time", **ms),
             settling_frames=fact(frames, "  in frames", unit="frames"),
             frame_s=fact(hardware.dt_s, "one frame", **ms),
@@ -225,7 +222,7 @@ def run_robustness(arguments: Namespace) -> Report:
     for gain in gains:
         number(gain, "--sensor-gains", above=0)
     designs = load_designs(arguments.gains)
-    maps, intervals = {}, {}
+    maps = {}
     for name, design in designs.items():
         require_compatible(name, design, hardware)
         grid = studies.robustness_map(
@@ -237,10 +234,9 @@ def run_robustness(arguments: Namespace) -> Report:
             delay_errors_frames=delays,
             hardware=hardware,
         )
-        intervals[name] = _stable_gains(design, grid, config)
         maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
     real = int(np.argmin(np.abs(gains - config.sensor_gain * config.truth.sensor_gain)))
-    lines = [line for name in maps for line in _map_lines(name, maps[name], real, intervals[name])]
+    lines = [line for name in maps for line in _map_lines(name, maps[name], real)]
     where = f"frequency errors of {np.min(errors):+g} to {np.max(errors):+g} Hz"
     caption = f"At a sensor gain of {gains[real]:.3g}: {config.imaging.label}, over {where}"
     report = Report(
@@ -250,9 +246,7 @@ def run_robustness(arguments: Namespace) -> Report:
         rows=[point for name, grid in maps.items() for point in _map_points(name, grid)],
         figure=lambda: robustness_map_figure(maps),
     )
-    report.data["maps"] = {
-        name: asdict(grid) | {"stable_sensor_gains": intervals[name]} for name, grid in maps.items()
-    }
+    report.data["maps"] = {name: asdict(grid) for name, grid in maps.items()}
     return report
 
 
@@ -290,16 +284,6 @@ def _parse_range(
     return np.linspace(low, high, int(count))
 
 
-def _stable_gains(design: Design, grid: RobustnessMap, config: Config) -> list[FloatArray]:
-    """Return the interval of stable real sensor gains at each delay error, or nan for none."""
-    hardware, intervals = config.hardware, []
-    for delay, stable in zip(grid.delay_errors_frames, grid.stable, strict=True):
-        real = replace(hardware, delay_frames=hardware.delay_frames + delay)
-        ends = stable_interval(real, design.controller, [1.0, *grid.sensor_gains[stable]])
-        intervals.append(config.sensor_gain * np.array(ends))
-    return intervals
-
-
 def _map_points(name: str, grid: RobustnessMap) -> list[Facts]:
     """Return a row for each point of the map of a gain file."""
     axes = grid.delay_errors_frames, grid.sensor_gains, grid.errors_hz
@@ -316,11 +300,9 @@ def _map_points(name: str, grid: RobustnessMap) -> list[Facts]:
     ]
 
 
-def _map_lines(
-    name: str, grid: RobustnessMap, real: int, intervals: Sequence[FloatArray]
-) -> Iterator[Facts]:
+def _map_lines(name: str, grid: RobustnessMap, real: int) -> Iterator[Facts]:
     """Yield a row for each delay error at the real sensor gain, with its worst frequency error."""
-    for i, (delay, (low, high)) in enumerate(zip(grid.delay_errors_frames, intervals, strict=True)):
+    for i, delay in enumerate(grid.delay_errors_frames):
         stable, strehls = bool(grid.stable[i, real]), grid.strehl[i, real]
         worst = int(np.argmin(strehls)) if stable else 0
         centre = strehls[grid.errors_hz == 0]
@@ -332,8 +314,6 @@ def _map_lines(
             centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **PERCENT),
             worst=fact(strehls[worst], "worst Strehl", **PERCENT),
             worst_hz=fact(at_hz, "at", unit="Hz", format="+.2f"),
-            low=fact(low, "stable gains, from", format=".4g"),
-            high=fact(high, "to", format=".4g"),
         )
 
 

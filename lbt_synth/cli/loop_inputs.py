@@ -142,12 +142,6 @@ def named_difference_notes(config: Config, designs: Mapping[str, Design]) -> lis
     return [f"{note[:-1]} ({name})." for name, those in notes.items() for note in those]
 
 
-def own_sensor_notes(config: Config) -> list[str]:
-    """Say that other sensors are not read, if the configuration has some."""
-    others = config.other_sensors
-    return [f"note: the loop's own sensor is read alone, without {others}."] if others else []
-
-
 def say_limit(limit: ResidualLimit, config: Config) -> str:
     """Return the sentence on the limit of a truth."""
     least = nm_text(limit.rms_nm, ".6g", unit="nm rms")

@@ -83,14 +83,11 @@ def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: flo
             report.verdict.insert(0, f"{name} is unstable at this sensor gain.")
         record = {} if margins is None else json_record(margins)
         report.data["designs"][name] = {"method": design.method, "stable": stable} | record
-        crossover = getattr(margins, "crossover_hz", None)
         lines.append(
             facts(
                 design=fact(name, "design"),
                 stable=fact(stable, "stable"),
                 **margin_columns(margins),
-                phase=fact(getattr(margins, "phase_deg", None), "phase", unit="deg", format=".1f"),
-                crossover=fact(crossover, "crossover", unit="Hz", format=".1f"),
             )
         )
     report.data["units"] = report.data.get("units", {}) | json_units(LoopMargins)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from lbt_synth import identification
 from lbt_synth.cli.arguments import given_options, refuse_options
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs, say_accelerometers
-from lbt_synth.cli.output import BRIEF_ROWS, Report, say_checks
+from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.cli.streams import count_progress
 from lbt_synth.cli.telemetry import (
     load_series,
@@ -31,20 +30,11 @@ from lbt_synth.identification.accelerometers.transfers import (
 )
 from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, model_tables
-from lbt_synth.identification.records.record import LEAST_SECONDS, NOT_KNOWN, require_length
+from lbt_synth.identification.records.record import LEAST_SECONDS, require_length
 from lbt_synth.loop import Imaging, loop_margins
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import identification_figure
-from lbt_synth.report.page.html import (
-    Block,
-    Notice,
-    Page,
-    chart,
-    new_page,
-    paragraph,
-    require_page_names,
-    write_page,
-)
+from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import row_table
@@ -52,7 +42,6 @@ from lbt_synth.storage.words import count_text
 
 if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not need
     from lbt_synth.identification.auto import RecordedDesign
-    from lbt_synth.identification.diagnosis import Diagnosis
 
 
 _STEPS = 3  # that diagnose and auto count
@@ -72,8 +61,8 @@ def run_identify(arguments: Namespace) -> Report:
         doubts = judge_record(arguments, record)
     model = identification.identify(record, **options)
     report = Report(data={"source": str(arguments.file)})
-    add_record(report, record)
     add_model(report, model)
+    add_record(report, record)
     _say_model(report, model, record)
     transfers: AccelerometerTransfers | None = None
     if readings is not None and isinstance(record, LoopRecord):
@@ -94,16 +83,11 @@ def _say_model(report: Report, model: IdentifiedModel, record: LoopRecord | Spec
     leaves = "is white: the model is enough" if white else "is not white: the model lacks something"
     said = "No vibration stands out of the turbulence and the noise."
     if lines := model.parts:
-        order = sorted(range(len(lines)), key=lambda place: -lines[place].rms_nm)
-        strongest = lines[order[0]]
+        strongest = max(lines, key=lambda line: line.rms_nm)
         said = (
             f"{count_text(len(lines), 'vibration')}, the strongest of "
             f"{nm_text(strongest.rms_nm, '.1f')} rms at {strongest.frequency_hz:.2f} Hz."
         )
-        table = model_tables(model)[-1]
-        rows = [table.rows[place] for place in order[:BRIEF_ROWS]]
-        caption = f"{table.caption}, the strongest first"
-        report.tables.insert(0, replace(table, caption=caption, rows=tuple(rows)))
     report.verdict += [said, f"What the model does not explain {leaves}."]
 
 
@@ -196,6 +180,7 @@ def run_diagnose(arguments: Namespace) -> Report:
         judge_channels,
         live_axes,
     )
+    from lbt_synth.report.pages import diagnosis_page, diagnosis_rows
 
     if arguments.output is not None:
         paths = given_options(arguments, "file", "gain", "commands")
@@ -246,68 +231,6 @@ def _series(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
     """Load the record, or some of its axes."""
     series = load_series(arguments, axes)
     return require_series(series, "diagnose examines")
-
-
-_DiagnosisRows: TypeAlias = list[tuple[str, str, str, Sequence[Any]]]
-
-
-def diagnosis_rows(diagnosis: Diagnosis) -> _DiagnosisRows:
-    """Return section, key, caption and rows of each table of a diagnosis, none of the unknown."""
-    from lbt_synth.identification.diagnosis import law_facts  # with it come the methods
-
-    record, commands, law = diagnosis.record, diagnosis.commands, diagnosis.law
-    size = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
-    # what a correction lacks is a consequence of other faults, and of the beginning
-    faults = [finding for finding in record.findings if finding.kind != NOT_KNOWN]
-    best = f" (best design: {diagnosis.best})" if diagnosis.best else ""
-    costs = f"What each part leaves by the model of the first half{best}"
-    unseen = "Residual on the second half of the record, by models of the first"
-    reach = "How the commands reach the measurements"
-    tables: _DiagnosisRows = [
-        ("Verdict", "residuals", f"{unseen}; {diagnosis.imaging.label}", diagnosis.residuals),
-        ("Verdict", "costs", costs, diagnosis.costs),
-        ("Record", "channels", f"Record: {size}. {record.summary()}", diagnosis.channels),
-        ("Record", "faults", "Faults", faults),
-        ("Loop", "commands", reach, [] if commands is None else [commands.facts()]),
-        (
-            "Loop",
-            "law",
-            "Control law, from y to u",
-            [] if law is None else [law_facts(law)],
-        ),
-        ("Loop", "loop", "Loop", [] if diagnosis.loop is None else [diagnosis.loop]),
-    ]
-    return [table for table in tables if table[-1]]
-
-
-def diagnosis_page(diagnosis: Diagnosis, files: Sequence[str] = ()) -> Page:
-    """Return the page of a diagnosis, with the digests of the record and of the given design."""
-    record, model, (state, *rest) = diagnosis.record, diagnosis.model, diagnosis.verdict
-    name = Path(files[0]).name if files else record.source or "a record"
-    tables: dict[str, list[Block]] = {}
-    for section, _, caption, rows in diagnosis_rows(diagnosis):
-        tables.setdefault(section, []).append(row_table(caption, rows))
-    disturbance: list[Block] = [] if model is None else [*model_tables(model)[1:]]
-    if model is not None:
-        best = diagnosis.best_design
-        designs = {} if best is None else {diagnosis.best: best}
-        figure = identification_figure(model, designs=designs)
-        disturbance.append(chart("identification", figure))
-    verdict: list[Block] = [Notice(text=state, tone=diagnosis.findings[0].tone), " ".join(rest)]
-    verdict += tables.pop("Verdict", [])
-    verdict += [Notice(text=f"{note[0].upper()}{note[1:]}") for note in diagnosis.notes]
-    duration = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
-    return new_page(
-        f"Diagnosis of {name}",
-        f"{duration}, {count_text(record.axes, 'axis', 'axes')}",
-        {
-            "Verdict": verdict,
-            "Record": tables["Record"],
-            "Loop that ran": [paragraph("law"), *tables.get("Loop", ())],
-            "Disturbance": disturbance or ["No model was identified."],
-        },
-        sources=list(zip(files, ("record", "gain file"), strict=False)),
-    )
 
 
 def read_record(
@@ -455,7 +378,7 @@ def record_data(record: LoopRecord | SpectrumRecord) -> dict[str, Any]:
 
 def add_model(report: Report, model: IdentifiedModel) -> None:
     """Add the tables of an identified model, its notes, and its numbers."""
-    report.tables += model_tables(model)
+    report.tables += model_tables(model)[::-1]
     report.notes += [marked_note(note) for note in model.notes]
     report.data["axes"] = [_axis_record(axis) for axis in model.axes]
     report.data["vibrations"] = [asdict(line) for line in model.parts]

@@ -23,7 +23,7 @@ from lbt_synth.cli.streams import count_progress, print_error
 from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
-from lbt_synth.report.study import study_verdict
+from lbt_synth.report.pages import study_verdict
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.thread_limits import WorkerPool, limit_threads
 from lbt_synth.storage.words import duration_text

@@ -352,7 +352,7 @@ def choose_method(residuals: Mapping[str, ResidualEstimate]) -> tuple[str, str]:
     usual = usual if usual in residuals else ordered[0]
     for title in ordered:
         thirds = zip(residuals[usual].parts(3), residuals[title].parts(3), strict=True)
-        if all(third.is_clearly_above(other) for third, other in thirds):
+        if all(third.is_clearly_above(rival) for third, rival in thirds):
             difference, error = residuals[usual].above(residuals[title])
             return title, (
                 f"the {title} is chosen: on each third of the test it leaves less than the "
@@ -446,18 +446,18 @@ def design_for_gains(
     intervals = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1)
     if allowed is not None:
         intervals = allowed
-        text = (
+        sentence = (
             f"the sensor gain lies within {_in_words(allowed)}, as the record and its model allow; "
             "the loop is stable at all of these"
         )
         if command_scale_known:
-            text += ". The commands were recorded at the size that was applied, as was stated"
+            sentence += ". The commands were recorded at the size that was applied, as was stated"
         else:
             intervals = np.tile([allowed.min() / 2, allowed.max()], (len(allowed), 1))
-            text += " and at half of them, should the commands be recorded at half their size"
+            sentence += " and at half of them, should the commands be recorded at half their size"
             if np.ptp(allowed, axis=0).any():
-                text += ", and each axis at those of both, because they differ"
-        assumed.append(text)
+                sentence += ", and each axis at those of both, because they differ"
+        assumed.append(sentence)
     bad = unstable_gains(usual, intervals)
     if bad is None:
         return replace(usual, assumptions=(*assumed, *usual.assumptions)), 1.0, ""

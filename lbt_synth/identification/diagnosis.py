@@ -214,8 +214,8 @@ def given_design_notes(name: str, design: Design, model: IdentifiedModel) -> lis
 
 def disturbance_lines(model: IdentifiedModel) -> tuple[IdentifiedLine, ...]:
     """Return the resonances of a model that are no turbulence, by frequency."""
-    parts = [part for part in model.parts if part.kind != "turbulence"]
-    return tuple(sorted(parts, key=lambda part: part.frequency_hz))
+    lines = [resonance for resonance in model.parts if resonance.kind != "turbulence"]
+    return tuple(sorted(lines, key=lambda line: line.frequency_hz))
 
 
 def line_name(line: IdentifiedLine) -> str:
@@ -525,10 +525,10 @@ def _advice_text(diagnosis: Diagnosis) -> str:
     if not ran.is_clearly_above(best):
         return f"Change nothing: of all that was tried the {name} leaves least, {best.text}."
     if ran.is_clearly_above(slow) and slow.total_nm2 < MUCH**2 * best.total_nm2:
-        other = "" if name == INTEGRATOR else f", the {name} {best.text}"
+        alternative = "" if name == INTEGRATOR else f", the {name} {best.text}"
         return (
             f"First change the gain{_gain_text(diagnosis)}: the {INTEGRATOR} leaves {slow.text} on "
-            f"unseen data{other}."
+            f"unseen data{alternative}."
         )
     return (
         f"First change the controller: the {name} leaves {best.text} on unseen data. The "

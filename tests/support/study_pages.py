@@ -8,7 +8,7 @@ import numpy as np
 from support.plants import ROOT
 
 import lbt_synth as lbt
-from lbt_synth.report.study import study_page
+from lbt_synth.report.pages import study_page
 from lbt_synth.studies.study.statistics import study_statistics
 
 PARAMETERS = ("truth.sensor_gain", "error.delay_frames", "atmosphere.wind_speed_m_s", "fixed")

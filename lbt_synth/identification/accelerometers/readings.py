@@ -90,14 +90,14 @@ def read_channels(accelerations: ArrayLike, names: Sequence[str] | None = None) 
         gaps = runs(~good[:, c])
         good[:, c] |= mark(gaps[gaps[:, 1] - gaps[:, 0] <= BRIDGED_FRAMES], len(series))
     fine = np.sum(good, axis=0) >= (1 - _MISSING) * recorded
-    whole = np.asarray(good[:, fine].all(axis=1))
-    moves = np.std(filled[whole], axis=0) > LEAST_M_S2 if whole.any() else np.zeros(count, bool)
+    usable = np.asarray(good[:, fine].all(axis=1))
+    moves = np.std(filled[usable], axis=0) > LEAST_M_S2 if usable.any() else np.zeros(count, bool)
     live = fine & moves
     return Channels(
         names=tuple(name for name, lives in zip(called, live, strict=True) if lives),
         dead=tuple(name for name, lives in zip(called, live, strict=True) if not lives),
         values=np.where(good, filled, 0.0)[:, live],
-        good=whole,
+        good=usable,
     )
 
 

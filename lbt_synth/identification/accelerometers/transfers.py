@@ -34,7 +34,7 @@ from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.models.sensor_suite import LONGEST_DELAY
 from lbt_synth.storage.rows import column, table_row
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, number
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _TINY = np.finfo(np.float64).tiny
 _NOTHING = "adds nothing"
@@ -119,7 +119,6 @@ def accelerometer_transfers(
     accelerations: ArrayLike,
     *,
     channels: Sequence[str] | None = None,
-    false_alarm: float = 1e-3,
     largest_shift_s: float = 10.0,
 ) -> AccelerometerTransfers:
     """Find how the channels of accelerometers move with the lines of an identified model.
@@ -129,17 +128,17 @@ def accelerometer_transfers(
     reading, and F_cj a complex factor, whose size is the motion and whose angle the phase. Standard
     errors count those of the model's sensor gains. The readings are (frames, channels) or (frames,)
     [m/s^2], the first that of the first frame of the record, but for a shift between the clocks of
-    at most ``largest_shift_s``; NaN where one is missing. ``false_alarm`` is the probability that
-    any line shows in any of these channels without being there.
+    at most ``largest_shift_s``; NaN where one is missing. The probability that any line shows in
+    any of these channels without being there is 0.001.
     """
     read = read_channels(accelerations, channels)
     if len(model.axes) != record.axes:
         raise DimensionError(
             f"model and record must have the same axes; got {len(model.axes)} and {record.axes}."
         )
-    alarm = number(false_alarm, "false_alarm", above=0, below=1)
-    largest_s = number(largest_shift_s, "largest_shift_s", at_least=0)
-    resonant = [part.kind != "turbulence" and part.sections == 1 for part in model.parts]
+    resonant = [
+        resonance.kind != "turbulence" and resonance.sections == 1 for resonance in model.parts
+    ]
     places = np.flatnonzero(resonant).tolist()
     places.sort(key=lambda i: model.parts[i].frequency_hz)
     lines = [model.parts[i] for i in places]
@@ -147,9 +146,9 @@ def accelerometer_transfers(
     rows = [(name, np.nan, _NOTHING) for name in read.names]
     if read.names and lines:
         widest_hz = max(line.damping * line.frequency_hz for line in lines)
-        shifts = 1 + np.ceil(4 * widest_hz * largest_s)  # that differ
-        limit = alarm / (len(read.names) * len(lines) * shifts)
-        largest = int(largest_s * model.frame_rate_hz)
+        shifts = 1 + np.ceil(4 * widest_hz * largest_shift_s)  # that differ
+        limit = 1e-3 / (len(read.names) * len(lines) * shifts)
+        largest = int(largest_shift_s * model.frame_rate_hz)
         lag, fits, shift, error = _lay_and_fit(
             model, record, lines, read.values, read.good, largest, limit
         )
@@ -157,8 +156,8 @@ def accelerometer_transfers(
         # the channels that show most of the lines' power, as many as a design takes
         power = (fits.coherences * shown) @ np.array([line.rms_nm**2 for line in lines])
         used = shown & (power >= np.sort(power)[-(MOST_UNITS - 1) :][0])[:, None]
-        near = shown | ~shown.any(axis=1, keepdims=True)  # the lines it shows, or all
-        level = np.sum(fits.noise * near, axis=1) / np.sum(near, axis=1)
+        counted = shown | ~shown.any(axis=1, keepdims=True)  # the lines it shows, or all
+        level = np.sum(fits.noise * counted, axis=1) / np.sum(counted, axis=1)
         noise = np.sqrt(level * model.frame_rate_hz / 2).tolist()
         verdicts = np.select([used.any(1), shown.any(1)], ["used", _EXTRA], _NOTHING).tolist()
         rows = list(zip(read.names, noise, verdicts, strict=True))
@@ -185,14 +184,14 @@ def _transfer_rows(
     used: BoolArray,
 ) -> tuple[TransferRow, ...]:
     """Return what the fits of channels say of lines."""
-    size = np.abs(fits.factors)
-    turned = np.minimum(np.degrees(fits.across / np.maximum(size, _TINY)), 180.0)
+    motions = np.abs(fits.factors)
+    turned = np.minimum(np.degrees(fits.across / np.maximum(motions, _TINY)), 180.0)
     return tuple(
         TransferRow(
             channel=name,
             line=places[j],
             frequency_hz=line.frequency_hz,
-            motion_nm_per_nm=float(size[c, j]),
+            motion_nm_per_nm=float(motions[c, j]),
             motion_error_nm_per_nm=float(fits.along[c, j]),
             phase_deg=float(np.angle(fits.factors[c, j], deg=True)),
             phase_error_deg=float(turned[c, j]),
@@ -335,13 +334,13 @@ def _likeliest_lag(bands: Sequence[_Bands], largest: int) -> int:
     lags = np.arange(-largest, largest + 1)
     total = np.zeros(lags.size)
     for band in bands:
-        near = np.abs(lags) <= band.frames // 2
+        covered = np.abs(lags) <= band.frames // 2
         for expected, reading in product(band.expected.T, band.readings.T):
             spectrum = np.zeros(band.frames, dtype=np.complex128)
             spectrum[band.bins] = expected.conj() * reading
             agreement = np.abs(band.frames * np.fft.ifft(spectrum)) ** 2
             power = max(float(np.sum(np.abs(spectrum) ** 2)), _TINY)
-            total[near] += agreement[lags[near] % band.frames] / power
+            total[covered] += agreement[lags[covered] % band.frames] / power
     return int(lags[np.argmax(total)])
 
 
@@ -383,21 +382,21 @@ def _fit_channel(bands: Sequence[_Bands], channel: int) -> _Fits:
         opened = np.concatenate([band.open_power(factors) for band in bands])
     error = a - x @ factors
     slopes = -bread @ (x.conj().T @ (weights[:, None] * np.einsum("fja,j->fa", moved, factors)))
-    size = np.abs(x) ** 2
-    shares = size * weights[:, None]
+    power_seen = np.abs(x) ** 2
+    shares = power_seen * weights[:, None]
     shares /= np.maximum(shares.sum(axis=0), _TINY)
     values = np.maximum(_INDEPENDENT / np.sum(shares**2, axis=0), 1.0)  # at each line
     degrees = np.maximum(values - 1, 0.5)
     excess = (np.abs(error) ** 2 * weights) @ shares
-    more = np.maximum(excess * values / degrees, 1.0)
+    inflation = np.maximum(excess * values / degrees, 1.0)
     # a channel with a motion of its own there
     doubtful = gammaincc(degrees, excess * values) < _DOUBT
-    raised, degrees = np.where(doubtful, more, 1.0), np.where(doubtful, degrees, len(a))
+    raised, degrees = np.where(doubtful, inflation, 1.0), np.where(doubtful, degrees, len(a))
     variances = np.diag(bread).real / _INDEPENDENT
     ratios = np.abs(factors) ** 2 / np.maximum(raised * variances, _TINY)
     rest = np.abs(error) ** 2 @ shares
-    shown = np.abs(factors) ** 2 * np.sum(size * shares, axis=0)
-    scatter = variances * more / 2
+    shown = np.abs(factors) ** 2 * np.sum(power_seen * shares, axis=0)
+    scatter = variances * inflation / 2
     moves = slopes * np.exp(-1j * np.angle(factors))[:, None]
     # a small shift turns the phase in proportion to the distance from the middle of the line
     turn = -1j * (angle[:, None] - angle @ shares) * factors * x
@@ -410,7 +409,7 @@ def _fit_channel(bands: Sequence[_Bands], channel: int) -> _Fits:
         coherences=shown / np.maximum(shown + rest, _TINY),
         noise=noise * raised,
         shifts=np.real((weights * error) @ turn.conj()) / turned,
-        shift_weights=2 * _INDEPENDENT * turned / more,
+        shift_weights=2 * _INDEPENDENT * turned / inflation,
     )
 
 

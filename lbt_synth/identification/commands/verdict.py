@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -169,7 +169,7 @@ def _explain(
         return refuse(notes=(note,))
     usual = PLAUSIBLE_GAINS if known is None else (float(np.min(known)), float(np.max(known)))
     limits = usual[0] / _WRONG_GAIN**2, usual[1] * _WRONG_GAIN**2
-    repair, gain, unrelated = _choose(record, law, lag, None if known is None else limits)
+    repair, gain, unrelated, delays = _choose(record, law, lag, None if known is None else limits)
     scale = np.ones(record.axes)
     if not unrelated.any():
         scale = _scale(record, law, repair, gain, limits)
@@ -189,7 +189,7 @@ def _explain(
         explanation=_name_repair(repair, gain),
         repair=repair,
         gain=frozen_copy(np.where(hidden, np.nan, gain / scale)),
-        notes=() if repair.options else _note_law(delay_frames, lag, _unexplained(law)),
+        notes=() if repair.options else _note_law(delay_frames, lag, delays, _unexplained(law)),
     )
 
 
@@ -239,15 +239,25 @@ def _unexplained(law: ControlLaw | None) -> str:
     )
 
 
-def _note_law(delay_frames: float, lag: int, hiding: str) -> tuple[str, ...]:
-    """Return what to look at in an accepted record whose law has a lag, or explains too little."""
+def _note_law(
+    delay_frames: float, lag: int, delays: Sequence[float], hiding: str
+) -> tuple[str, ...]:
+    """Return what to look at in an accepted record whose law has a lag, or explains too little.
+
+    And which other delays explain it as well.
+    """
     late = (
         f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
         "real-time computer takes that long, the total delay of a new design is "
         f"{delay_frames + lag:g} frames"
     )
     few = f"warning: of the commands, {hiding}. The sensor gain may be larger than it looks"
-    return (late,) * bool(lag) + (few,) * bool(hiding)
+    others = " or ".join(f"{delay:g}" for delay in delays)
+    several = (
+        f"warning: the record leaves the total delay open: {others} explain it as well as the "
+        f"{delay_frames:g} frames that are given and taken"
+    )
+    return (late,) * bool(lag) + (several,) * bool(delays) + (few,) * bool(hiding)
 
 
 def _doubt_law(law: ControlLaw) -> str:
@@ -287,9 +297,13 @@ def list_repairs(
 
 def _choose(
     record: LoopRecord, law: ControlLaw | None, lag: int, known: tuple[float, float] | None
-) -> tuple[CommandRepair, FloatArray, BoolArray]:
-    """Return the repair that law and likelihood ask for, its gain, and which axes are unrelated."""
-    repairs = list_repairs(record.axes, record.hardware.delay_frames, law, lag)
+) -> tuple[CommandRepair, FloatArray, BoolArray, list[float]]:
+    """Return the repair that law and likelihood ask for, its gain, and which axes are unrelated.
+
+    And the delays a frame from the given one that coarse spectrum and fit leave open beside it.
+    """
+    fit_cost, delay_frames = cache(partial(_fit_cost, record)), record.hardware.delay_frames
+    repairs = list_repairs(record.axes, delay_frames, law, lag)
     contrasts, gains = compare_repairs(record, repairs)
     contrasts, unrelated = contrasts[:, :-1], contrasts[:, -1]
     contrast = contrasts.sum(axis=0)
@@ -303,13 +317,18 @@ def _choose(
     if asked[best]:
         is_shown = penalty[0] >= _SURPRISING or nats >= _ODD
     else:
-        is_shown = nats >= CLEAR and (
-            _fit_cost(record, _GIVEN) - _fit_cost(record, repairs[best]) >= _ODD
-        )
+        is_shown = nats >= CLEAR and fit_cost(_GIVEN) - fit_cost(repairs[best]) >= _ODD
     best = best if is_shown else 0
+    delays = [
+        delay_frames + frames
+        for frames in (-1, 1)
+        for i, repair in enumerate(repairs)
+        if best == 0 and repair == CommandRepair(shift_frames=frames) and lag == 0
+        if contrast[i] - contrast[0] < CLEAR and fit_cost(repair) - fit_cost(_GIVEN) < _ODD
+    ]
     followed = np.zeros(record.axes) if law is None else law.axis_coherence
     reaches_not = (followed < FOLLOWED) & (unrelated - np.min(contrasts, axis=1) < CLEAR)
-    return repairs[best], gains[:, best], reaches_not
+    return repairs[best], gains[:, best], reaches_not, delays
 
 
 def _penalties(

@@ -184,16 +184,16 @@ class Search:
     def merge(self, spectrum: SpectrumModel) -> LoopPeriodogram:
         """Return means over groups of bins within which a model is nearly constant."""
         f, step = self.data.frequency_hz, self.data.step_hz
-        size = np.maximum(step, np.minimum(_FINE * f, _WIDEST_HZ))
+        widths_hz = np.maximum(step, np.minimum(_FINE * f, _WIDEST_HZ))
         for line in spectrum.lines:
             centre, half_width = self.place(line)
             fine = SKIRT if half_width < RESOLVED * step else _BINS
             reach = fine * step + _WIDEST_HZ / _SHARE / 2  # beyond, this limit is wider
-            near = slice(*np.searchsorted(f, [centre - reach, centre + reach]))
-            away = np.maximum(np.abs(f[near] - centre) - fine * step, 0)
+            band = slice(*np.searchsorted(f, [centre - reach, centre + reach]))
+            away = np.maximum(np.abs(f[band] - centre) - fine * step, 0)
             wide = _SHARE / line.sections * np.maximum(half_width, 2 * away)
-            size[near] = np.minimum(size[near], np.maximum(step, wide))
-        group = np.floor(np.cumsum(step / size) - 1e-9)
+            widths_hz[band] = np.minimum(widths_hz[band], np.maximum(step, wide))
+        group = np.floor(np.cumsum(step / widths_hz) - 1e-9)
         return self.data.merge(np.flatnonzero(np.diff(group, prepend=-np.inf) > 0))
 
 
@@ -283,15 +283,15 @@ def prune(search: Search, model: FittedModel, *, thorough: bool = False) -> Fitt
     least = contrast(data, spectrum)
     for i, component in enumerate(spectrum.components):
         neighbour = _overlapping(search, spectrum, i)
-        less = _drop(data, spectrum, i, neighbour)
-        if less is not None:
+        smaller = _drop(data, spectrum, i, neighbour)
+        if smaller is not None:
             required = required_evidence(search, spectrum, i)
-            spare = contrast(data, less) - least - HOPE * required
+            spare = contrast(data, smaller) - least - HOPE * required
             patient = thorough and (neighbour is not None or not component.is_narrow)
             if patient or spare <= 0:
-                trials.append((spare, required, less, None if patient else model))
-    for _, required, less, bound in sorted(trials, key=lambda trial: trial[0]):
-        plainer = fit(search, less, better_than=bound, margin=required)
+                trials.append((spare, required, smaller, None if patient else model))
+    for _, required, smaller, bound in sorted(trials, key=lambda trial: trial[0]):
+        plainer = fit(search, smaller, better_than=bound, margin=required)
         if plainer is not None and cost(search, plainer) < cost(search, model):
             return prune(search, plainer, thorough=thorough)
     return model
@@ -303,9 +303,9 @@ def _overlapping(search: Search, spectrum: SpectrumModel, i: int) -> int | None:
         return None
     centre, half = search.place(spectrum.components[i])
     apart = {}
-    for k, other in enumerate(spectrum.components):
-        its_centre, its_half = search.place(other)
-        if k != i and other.kind == "line" and abs(its_centre - centre) < 2 * min(half, its_half):
+    for k, rival in enumerate(spectrum.components):
+        its_centre, its_half = search.place(rival)
+        if k != i and rival.kind == "line" and abs(its_centre - centre) < 2 * min(half, its_half):
             apart[k] = abs(its_centre - centre)
     return min(apart, key=apart.__getitem__, default=None)
 
@@ -323,9 +323,11 @@ def _drop(
         line = spectrum.components[neighbour]
         power = float(np.logaddexp(line.log_power, spectrum.components[i].log_power))
         return spectrum.exchange(neighbour, replace(line, log_power=power)).exchange(i)
-    less, noise = spectrum.exchange(i), float(np.exp(spectrum.background.log_noise))
+    smaller, noise = spectrum.exchange(i), float(np.exp(spectrum.background.log_noise))
     white = float(np.min(part_density(data, spectrum, i))) * data.frame_rate_hz / 2
-    return less.with_background(log_noise=float(np.log(noise + white))) if white > noise else less
+    if white > noise:
+        return smaller.with_background(log_noise=float(np.log(noise + white)))
+    return smaller
 
 
 def add_evidence(search: Search, model: FittedModel) -> FittedModel:

@@ -176,14 +176,14 @@ def _cut_at_jumps(corrections: FloatArray, stretches: Stretches) -> tuple[Stretc
     for start, stop in stretches:
         inside[start : stop - 1] = True
     scale = MAD * np.median(change[inside], axis=0)
-    size = np.max(change[:, scale > 0] / scale[scale > 0], axis=1, initial=0.0) * inside
-    places = np.flatnonzero(size > _JUMP)
+    deviations = np.max(change[:, scale > 0] / scale[scale > 0], axis=1, initial=0.0) * inside
+    places = np.flatnonzero(deviations > _JUMP)
     if not places.size:
         return stretches, []
     jumps = np.split(places, 1 + np.flatnonzero(np.diff(places) > _AROUND_JUMP))
     note = (
         f"warning: {count_text(len(jumps), 'jump')} of the commands, the largest at frame "
-        f"{1 + int(np.argmax(size))} with {np.max(size):.0f} standard deviations"
+        f"{1 + int(np.argmax(deviations))} with {np.max(deviations):.0f} standard deviations"
     )
     if len(jumps) > _MOST_JUMPS:
         return stretches, [f"{note}; too many to cut the record there, and the model suffers"]
@@ -238,7 +238,7 @@ def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[st
             )
         if axis.noise_error_nm > _UNSEEN * axis.noise_nm:
             yield f"warning: the noise of axis {i} is not seen under the rest of its spectrum"
-        if sum(part.kind != "turbulence" for part in axis.parts) >= most_lines > 0:
+        if sum(resonance.kind != "turbulence" for resonance in axis.parts) >= most_lines > 0:
             yield (
                 f"the limit of {most_lines} lines was reached on axis {i}: there may be more, and "
                 "the rest of the model suffers"

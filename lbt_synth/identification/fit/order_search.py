@@ -70,11 +70,11 @@ def find_models(
     turbulence, *others = spectrum.components
     narrow = (c for c in others if c.is_narrow or c.kind == "slow")
     plain = replace(spectrum, components=(turbulence, *narrow))
-    other = plain.with_background(colour=0.0 if spectrum.background.colour else _COLOUR)
+    recoloured = plain.with_background(colour=0.0 if spectrum.background.colour else _COLOUR)
     if start is not None or plain == spectrum:
-        rival = fitting.fit(search, spectrum.with_background(colour=other.background.colour))
+        rival = fitting.fit(search, spectrum.with_background(colour=recoloured.background.colour))
     else:
-        rival = find_components(search, other)
+        rival = find_components(search, recoloured)
     rivals = [model] if rival is None else [model, rival]
     best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
     if search.finds_gain and start is None and not _is_clear(best):

@@ -185,7 +185,7 @@ def loop_periodogram(
 
 def _segment_length(lengths: list[int]) -> int:
     """Return the length of segments that uses most frames, the longest of equal ones."""
-    parts = {length // part for length in lengths for part in range(1, 9)}
+    parts = {length // pieces for length in lengths for pieces in range(1, 9)}
     c = np.array(sorted(p for p in parts | {_LONGEST_SEGMENT} if p >= SHORTEST_SEGMENT))
     c = c[c <= _LONGEST_SEGMENT]
     used = np.sum(np.array(lengths)[:, None] // c * c, axis=0)

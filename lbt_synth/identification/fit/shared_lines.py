@@ -119,7 +119,7 @@ def _share_lines(
             saved = search.price * (1 - pair.count(None)) - search.parameter_price
             if trial and trial.contrast < least + saved:
                 model, spectrum, least = trial, trial.spectrum, trial.contrast
-                pairs = [other for other in pairs if other is not pair]
+                pairs = [waiting for waiting in pairs if waiting is not pair]
     return model
 
 
@@ -158,9 +158,9 @@ def _share_turbulence(search: Search, apart: SpectrumModel) -> FittedModel | Non
         return None
     common = min(abs(coherence), _MOST_SHARED)
     first, second = (apart.components[i] for i in slow)
-    less = float(np.log1p(-common))
+    log_rest = float(np.log1p(-common))
     components = [
-        c.shift(0.0, 0.0, less) if c.kind == "turbulence" else c for c in apart.components
+        c.shift(0.0, 0.0, log_rest) if c.kind == "turbulence" else c for c in apart.components
     ]
     shared = replace(
         first.shift(0.0, 0.0, float(np.log(common))),
@@ -194,14 +194,14 @@ def _find_pairs(
     while rows:
         _, strong, error = rows.pop(0)
         centre, half = search.place(strong)
-        near = {}
-        for _, other, its_error in rows:
-            its_centre, its_half = search.place(other)
+        distances = {}
+        for _, rival, its_error in rows:
+            its_centre, its_half = search.place(rival)
             uncertain = SURPRISING * centre * float(np.hypot(error, its_error))
             apart = abs(its_centre - centre)
-            if other.axis != strong.axis and apart <= max(uncertain, 0.5 * (half + its_half)):
-                near[other] = apart
-        partner = min(near, key=near.__getitem__, default=None)
+            if rival.axis != strong.axis and apart <= max(uncertain, 0.5 * (half + its_half)):
+                distances[rival] = apart
+        partner = min(distances, key=distances.__getitem__, default=None)
         rows = [row for row in rows if row[1] is not partner]
         pairs.append((strong, partner) if strong.axis == 0 else (partner, strong))
     return pairs

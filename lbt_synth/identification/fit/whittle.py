@@ -154,12 +154,12 @@ def _smear(
         half_width = c.damping_ratio * place
         if c.kind != "line" or c.sections > 1 or half_width > WIDE:
             continue
-        near = slice(*np.searchsorted(periods, [place - SKIRT, place + SKIRT]))
-        more, by_width, by_distance = log_smearing(half_width, periods[near] - place)
-        density[i, near] *= np.exp(more)
+        band = slice(*np.searchsorted(periods, [place - SKIRT, place + SKIRT]))
+        log_ratio, by_width, by_distance = log_smearing(half_width, periods[band] - place)
+        density[i, band] *= np.exp(log_ratio)
         if slopes is not None:
-            slopes[i, 0, near] += by_width - by_distance * place
-            slopes[i, 1, near] += by_width
+            slopes[i, 0, band] += by_width - by_distance * place
+            slopes[i, 1, band] += by_width
 
 
 def _log_fall(
@@ -422,14 +422,14 @@ def _secant(missing: FloatArray, step: FloatArray) -> FloatArray:
 
 def _trust_step(slope: FloatArray, curvature: FloatArray, radius: float) -> FloatArray:
     """Return the step (p,) to the minimum of a quadratic form within a radius, in its axes."""
-    more = 0.0
+    shift = 0.0
     for _ in range(MOST_STEPS):
-        step = -slope / (curvature + more)
-        size = float(np.linalg.norm(step))
-        if size <= 1.001 * radius:
+        step = -slope / (curvature + shift)
+        length = float(np.linalg.norm(step))
+        if length <= 1.001 * radius:
             break
         # Newton's method for 1 / size = 1 / radius, from below
-        more += size**2 / float(np.sum(step**2 / (curvature + more))) * (size / radius - 1)
+        shift += length**2 / float(np.sum(step**2 / (curvature + shift))) * (length / radius - 1)
     return step
 
 

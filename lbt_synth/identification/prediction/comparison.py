@@ -27,9 +27,7 @@ from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.identification.stretches import Stretches, split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import (
-    ClosedLoop,
     Imaging,
     close_loop,
     residual_budget,
@@ -38,7 +36,7 @@ from lbt_synth.loop import (
 from lbt_synth.loop.least_residual import least_residual
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import PlantInputs, design_request
-from lbt_synth.models import LoopHardware, TipTiltPlant
+from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, matrix, require_instance
 
@@ -190,7 +188,10 @@ def prediction_against_data(
     designs = {INTEGRATOR: model_integrator(plant), **controllers}
     if running is not None:
         designs[RAN] = running
-    loops = {name: _close(hardware, design) for name, design in designs.items()}
+    loops = {
+        name: one.close(hardware) if isinstance(one, Design) else close_loop(hardware, one)
+        for name, one in designs.items()
+    }
     stable = {name: loop for name, loop in loops.items() if loop.is_stable}
     unstable = loops.keys() - stable.keys()
     notes = [f"{name} is unstable at the sensor gain of the model" for name in sorted(unstable)]
@@ -223,13 +224,6 @@ def prediction_against_data(
         along = limit.directions.T * limit.variance_nm2 @ limit.directions
         rows.append(_build_row(LIMIT, None, along, imaging))
     return PredictionTable(entries=tuple(rows), fit=fit, test=test, notes=tuple(notes))
-
-
-def _close(hardware: LoopHardware, design: Controller | Design) -> ClosedLoop:
-    """Close the loop of a model around a controller, or a design with the sensors it reads."""
-    if isinstance(design, Design):
-        return design.close(hardware)
-    return close_loop(hardware, as_controller(design))
 
 
 def design_inputs(

@@ -42,8 +42,6 @@ _PENALTIES = 10.0 ** np.arange(-9, 4)  # of a coefficient whose signal changes b
 _USUAL = 5  # place of the penalty where a search begins
 _PARTS = 6  # of a record, of which each is predicted by those before, from the third on
 _FIRST = 2
-_OFFSET = 1.0  # by which a channel's readings may stand off zero, in rms changes a frame
-_SEED = 1
 _REMOTE = 16.0  # frames, from which on a penalty grows with age: old readings tell least
 
 
@@ -152,7 +150,8 @@ class Regression:
         for place, signal in enumerate(signals):
             if signal >= self.own:
                 rows = place + len(signals) * np.arange(TAPS)
-                weights[np.ix_(rows, rows)] += (_OFFSET * scale[place]) ** 2
+                # readings may stand off zero by their rms change a frame
+                weights[np.ix_(rows, rows)] += scale[place] ** 2
         return weights
 
     def _factor(self, weights: FloatArray, moments: Moments) -> tuple[FloatArray, bool]:
@@ -277,7 +276,7 @@ def regress(
     moments = [lagged_moments(signals, left, part, TAPS) for part in parts]
     if noise > 1:
         deviation = np.array([axis.noise_nm for axis in model.axes]) / model.sensor_gains
-        drawn = np.random.default_rng(_SEED).standard_normal((count + first, path.modes))
+        drawn = np.random.default_rng(1).standard_normal((count + first, path.modes))
         drawn *= deviation * np.sqrt(noise**2 - 1)
         silence = np.zeros((len(drawn), beside.shape[1]))
         heard, left, _, target = lay(drawn, ((0, len(drawn)),), silence)

@@ -228,7 +228,6 @@ def test_motions_at_the_frequency_of_a_line_that_do_not_go_with_it_are_not_used(
     [
         (np.ones((100, 2, 2)), {}, r"must be \(frames, channels\)"),
         (np.ones((FRAMES, 2)), {"channels": ["a", "a"]}, "2 different names"),
-        (np.ones(FRAMES), {"false_alarm": 2}, "false_alarm"),
         (np.random.default_rng(0).standard_normal(100), {}, "usable frames in a row"),
     ],
 )

@@ -99,6 +99,16 @@ def test_a_fault_is_named_and_repaired(fault) -> None:
         assert explain_commands(repair_commands(wrong, verdict.repair)).accepted
 
 
+def test_a_delay_that_stays_open_is_said() -> None:
+    """Eight seconds of a weak loop tell no frame from the next; half a minute of two axes do."""
+    weak = spliced_record(lines=LINE, frames=8000, gain=0.03)
+    (note,) = explain_commands(weak).notes
+    assert note.endswith(
+        "delay open: 1 or 3 explain it as well as the 2 frames that are given and taken"
+    )
+    assert explain_commands(record(*ordinary_loop())).notes == ()
+
+
 @pytest.mark.parametrize("delay", [2.5, 3.0])
 def test_a_wrong_delay(delay) -> None:
     """The coarse spectrum alone finds a delay of 1.5 frames likelier than 2.5, by 121."""

@@ -1,4 +1,4 @@
-"""The page of a robustness study: verdict, samples, dependence, worst samples.
+"""The pages of a study and of a diagnosis: verdict, tables, figures.
 
 Charts are made of binned data, so that their size does not grow with the samples.
 """
@@ -9,10 +9,15 @@ import os
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from itertools import zip_longest
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lbt_synth.identification.diagnosis import Diagnosis, law_facts
+from lbt_synth.identification.fit.identified_model import model_tables
+from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.request import fixed_design
@@ -24,6 +29,7 @@ from lbt_synth.report.draw import (
     line_style,
     name_axes,
 )
+from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.studies import STREHL
 from lbt_synth.report.page.html import (
     Block,
@@ -35,6 +41,7 @@ from lbt_synth.report.page.html import (
     paragraph,
     survival_blocks,
 )
+from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, duration_text
 from lbt_synth.studies.grid import Failure
@@ -352,3 +359,63 @@ def binned_map(
     cells = int(np.clip(np.sqrt(len(x) / _PER_CELL), 3, _BINS))
     mean, rows, columns, _ = binned_statistic_2d(y, x, result, bins=cells)
     return (columns[:-1] + columns[1:]) / 2, (rows[:-1] + rows[1:]) / 2, np.asarray(mean)
+
+
+_DiagnosisRows: TypeAlias = list[tuple[str, str, str, Sequence[Any]]]
+
+
+def diagnosis_rows(diagnosis: Diagnosis) -> _DiagnosisRows:
+    """Return section, key, caption and rows of each table of a diagnosis, none of the unknown."""
+    record, commands, law = diagnosis.record, diagnosis.commands, diagnosis.law
+    size = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
+    # what a correction lacks is a consequence of other faults, and of the beginning
+    faults = [finding for finding in record.findings if finding.kind != NOT_KNOWN]
+    best = f" (best design: {diagnosis.best})" if diagnosis.best else ""
+    costs = f"What each part leaves by the model of the first half{best}"
+    unseen = "Residual on the second half of the record, by models of the first"
+    reach = "How the commands reach the measurements"
+    tables: _DiagnosisRows = [
+        ("Verdict", "residuals", f"{unseen}; {diagnosis.imaging.label}", diagnosis.residuals),
+        ("Verdict", "costs", costs, diagnosis.costs),
+        ("Record", "channels", f"Record: {size}. {record.summary()}", diagnosis.channels),
+        ("Record", "faults", "Faults", faults),
+        ("Loop", "commands", reach, [] if commands is None else [commands.facts()]),
+        (
+            "Loop",
+            "law",
+            "Control law, from y to u",
+            [] if law is None else [law_facts(law)],
+        ),
+        ("Loop", "loop", "Loop", [] if diagnosis.loop is None else [diagnosis.loop]),
+    ]
+    return [table for table in tables if table[-1]]
+
+
+def diagnosis_page(diagnosis: Diagnosis, files: Sequence[str] = ()) -> Page:
+    """Return the page of a diagnosis, with the digests of the record and of the given design."""
+    record, model, (state, *rest) = diagnosis.record, diagnosis.model, diagnosis.verdict
+    name = Path(files[0]).name if files else record.source or "a record"
+    tables: dict[str, list[Block]] = {}
+    for section, _, caption, rows in diagnosis_rows(diagnosis):
+        tables.setdefault(section, []).append(row_table(caption, rows))
+    disturbance: list[Block] = [] if model is None else [*model_tables(model)[1:]]
+    if model is not None:
+        best = diagnosis.best_design
+        designs = {} if best is None else {diagnosis.best: best}
+        figure = identification_figure(model, designs=designs)
+        disturbance.append(chart("identification", figure))
+    verdict: list[Block] = [Notice(text=state, tone=diagnosis.findings[0].tone), " ".join(rest)]
+    verdict += tables.pop("Verdict", [])
+    verdict += [Notice(text=f"{note[0].upper()}{note[1:]}") for note in diagnosis.notes]
+    duration = f"{record.duration_s:.4g} s at {record.frame_rate_hz:.6g} Hz"
+    return new_page(
+        f"Diagnosis of {name}",
+        f"{duration}, {count_text(record.axes, 'axis', 'axes')}",
+        {
+            "Verdict": verdict,
+            "Record": tables["Record"],
+            "Loop that ran": [paragraph("law"), *tables.get("Loop", ())],
+            "Disturbance": disturbance or ["No model was identified."],
+        },
+        sources=list(zip(files, ("record", "gain file"), strict=False)),
+    )

@@ -1,18 +1,23 @@
 """The page of a study: what it says, and what it must not depend on."""
 
+import hashlib
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.diagnoses import line_diagnosis, short_record
+from support.pages import Reader
 from support.plants import ROOT
 from support.study_pages import CONTROLLERS, night, page_of, results
 
 import lbt_synth as lbt
-from lbt_synth.report.page.html import Chart, Notice, page_html
-from lbt_synth.report.study import (
+from lbt_synth.report.page.html import Chart, Notice, page_html, write_page
+from lbt_synth.report.pages import (
     binned_map,
     cumulative_points,
+    diagnosis_page,
 )
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies.study.run import evaluate_samples
@@ -205,3 +210,51 @@ def test_a_map_has_the_mean_of_each_cell():
     np.testing.assert_allclose(mean, np.outer(rows, columns), atol=0.02)
     sparse = binned_map(np.arange(9.0), np.arange(9.0), np.arange(9.0))[2]
     assert np.isnan(sparse).any()  # a cell without samples
+
+
+@pytest.fixture(scope="module")
+def diagnosed():
+    return diagnosis_page(line_diagnosis())
+
+
+def test_sections_and_charts(diagnosed):
+    page = diagnosed
+    assert list(page.sections) == [
+        "Verdict",
+        "Record",
+        "Loop that ran",
+        "Disturbance",
+        "Files and versions",
+    ]
+    (spectra,) = page.charts
+    assert (spectra.key, len(spectra.figure.axes)) == ("identification", 3)
+    (table,) = (t for t in page.blocks if getattr(t, "caption", "").startswith("Residual on"))
+    names = [row.name for row in line_diagnosis().residuals]
+    assert [row[0] for row in table.rows] == names
+
+
+def test_files(tmp_path):
+    source = tmp_path / "night.npz"
+    source.write_bytes(b"what was recorded")
+    (path,) = write_page(diagnosis_page(line_diagnosis(), [source]), tmp_path / "page.html")
+    headings = re.findall(r"<th scope=.col.[^>]*>([^<]*)<", path.read_text())
+    assert "± [nm]" in headings
+    assert not [heading for heading in headings if "+-" in heading]
+    text = path.read_text(encoding="utf-8")
+    reader = Reader(text)
+    assert reader.texts["h1"] == ["Diagnosis of night.npz"]
+    assert hashlib.sha256(b"what was recorded").hexdigest() in text
+    (notice,) = (a for a in reader.named("p") if "good" in (a.get("class") or ""))
+    assert notice["class"] == "notice good"
+
+
+def test_what_is_wrong_comes_first_and_loudly(tmp_path):
+    found = lbt.identification.diagnose(short_record(-1.0))
+    page = diagnosis_page(found)
+    first = page.blocks[0]
+    assert (first.tone, first.text) == (
+        "bad",
+        "The commands are not those that the mirror followed: they have the opposite sign.",
+    )
+    assert page.charts == []
+    assert list(page.sections)[:3] == ["Verdict", "Record", "Loop that ran"]
