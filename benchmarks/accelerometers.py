@@ -26,7 +26,7 @@ import lbt_synth as lbt
 from lbt_synth.config.write import config_text, identified_config
 from lbt_synth.identification.accelerometers.transfers import accelerometer_transfers
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.loop.simulation.disturbances import run_oscillator
+from lbt_synth.loop.disturbances import run_oscillator
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 
 RATE = 1000.0

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 import lbt_synth as lbt
-from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.loop.least_residual import least_residual
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.studies import mirror_figure
 from lbt_synth.studies.robustness import mirror_rows
@@ -39,10 +39,7 @@ def study(plant: lbt.models.TipTiltPlant) -> None:
         settling = 0.0 if mirror is None else 1e3 * mirror.step_response().settling_s
         rows = mirror_rows(here, CONFIG.truth, CONFIG.imaging)
         cells = [
-            f"{r.residual_nm:8.2f} {100 * r.strehl:6.2f} ({r.unsettled_nm:7.2f})"
-            if r.stable
-            else "unstable"
-            for r in rows
+            f"{r.residual_nm:8.2f} {100 * r.strehl:6.2f}" if r.stable else "unstable" for r in rows
         ]
         print(f"{name:8s} {settling:5.2f} ms" + "".join(f"{c:>26s}" for c in cells))
 
@@ -63,7 +60,7 @@ def delays() -> None:
             lbt.residual_budget(lbt.close_loop(plant.hardware, d.controller), plant).rms_nm
             for d in (lbt.kalman(plant), lbt.lqg(plant))
         ]
-        limit = least_model_residual(plant).rms_nm
+        limit = least_residual(plant.hardware, plant).rms_nm
         print(f"{delay:5.2f}: {found[0]:8.3f} {found[1]:8.3f} {limit:8.3f}")
 
 

@@ -11,8 +11,10 @@ import numpy as np
 from scipy.optimize import minimize
 
 import lbt_synth as lbt
+from lbt_synth.loop.band_limit import least_worst_residual
 from lbt_synth.report.draw import house_style
 from lbt_synth.studies import paper as paper
+from lbt_synth.studies.limits import limits
 from lbt_synth.studies.paper import paper_filters
 
 ERRORS = np.arange(-7, 8) / 2
@@ -84,14 +86,14 @@ def designs() -> dict[str, lbt.Design]:
 
 def limit_strehl(residual_nm: float) -> float:
     """Strehl ratio of a residual shared evenly by the axes [%]."""
-    return 100 * lbt.loop.jitter_strehl(np.eye(2) * residual_nm**2 / 2, imaging=CAMERA)
+    return 100 * lbt.strehl(np.eye(2) * residual_nm**2 / 2, CAMERA)
 
 
 def main() -> None:
     """Print the table, draw the figure."""
     every = designs()
     bands = {
-        gain: lbt.loop.least_worst_residual(
+        gain: least_worst_residual(
             every["shaped"].hardware,
             replace(TRUTH, vibrations=(), sensor_gain=gain),
             band_hz=(16.5, 23.5),
@@ -104,7 +106,7 @@ def main() -> None:
         end="",
     )
     print("| modulus margin | states | worst residual [nm] | above the limit [%] |")
-    study = lbt.studies.limits(every, every["shaped"].hardware, TRUTH, CAMERA, errors_hz=ERRORS)
+    study = limits(every, every["shaped"].hardware, TRUTH, CAMERA, errors_hz=ERRORS)
     for (name, design), row in zip(every.items(), study.rows, strict=True):
         margins = lbt.loop_margins(lbt.close_loop(design.hardware, design.controller))
         strehls = " | ".join(f"{s:.2f}" for s in worst_strehl(design))

@@ -26,6 +26,7 @@ from speed_linear import SIZED
 
 import lbt_synth as lbt
 from lbt_synth.linear.block_filtering import filter_series
+from lbt_synth.studies.robustness import RobustnessMap
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "benchmarks_table.md"
@@ -93,7 +94,7 @@ def maps() -> dict[str, Row]:
         loop = lbt.close_loop(config.hardware, design.controller, sensor_gain=gain)
         return lbt.strehl(lbt.residual_budget(loop, met), config.imaging)
 
-    def mapped() -> lbt.studies.RobustnessMap:
+    def mapped() -> RobustnessMap:
         return lbt.studies.robustness_map(
             design, truth, config.imaging, errors_hz=errors, sensor_gains=gains
         )

@@ -185,9 +185,7 @@ def strehls(covariance_nm2: np.ndarray) -> list[float]:
     """Return the Strehl ratios [%] of J, H and K."""
     return [
         100
-        * lbt.loop.jitter_strehl(
-            covariance_nm2, imaging=lbt.Imaging(obstruction=AIR.obstruction, wavelength_um=wave)
-        )
+        * lbt.strehl(covariance_nm2, lbt.Imaging(obstruction=AIR.obstruction, wavelength_um=wave))
         for wave in WAVELENGTHS_UM
     ]
 
@@ -266,7 +264,7 @@ def figure(
             rejection.axhline(1.0, **GUIDE)
             for look, (name, loop) in enumerate(loops.items()):
                 rejected = np.abs(loop.sensitivity(f)[:, i, i]) ** 2
-                passed = np.abs(loop.noise_transfer(f)[:, i, i]) ** 2
+                passed = np.abs(loop.path("noise", "residual").frequency_response(f)[:, i, i]) ** 2
                 left = accumulated(f, rejected * density + passed * noise)
                 rejection.plot(f, np.sqrt(rejected), label=name, **line_style(look, linewidth=0.9))
                 total.plot(f, np.sqrt(left), label=name, **line_style(look))

@@ -76,9 +76,7 @@ def column(parameters: np.ndarray) -> np.ndarray:
         budget = lbt.residual_budget(loop, shaken, frame_means=True)
         tilt = budget.turbulence_nm2[0, 0] + budget.noise_nm2[0, 0]  # the axis without vibration
         lines = np.array([[budget.line_amplitudes_nm[0, 0], 0]])
-        out[i] = 100 * lbt.loop.jitter_strehl(
-            np.diag([tilt, tilt]), imaging=imaging(), line_amplitudes_nm=lines
-        )
+        out[i] = 100 * lbt.strehl(np.diag([tilt, tilt]), imaging(), line_amplitudes_nm=lines)
     return out
 
 

@@ -31,7 +31,9 @@ frequency_hz = np.geomspace(0.5, 399, 500)
 figure, axes = plt.subplots(layout="constrained")
 for gain in (1.0, 0.7, 0.4):
     loop = lbt.close_loop(plant.hardware, designs["Kalman"], sensor_gain=gain)
-    sigma = np.linalg.norm(loop.rejection().frequency_response(frequency_hz), 2, axis=(1, 2))
+    sigma = np.linalg.norm(
+        loop.path("phase", "residual").frequency_response(frequency_hz), 2, axis=(1, 2)
+    )
     axes.loglog(frequency_hz, sigma, label=f"sensor gain {gain}")
 axes.axhline(1, color="0.6", linewidth=0.8)
 axes.set(xlabel="frequency [Hz]", ylabel="rejection", title="A Kalman filter at other sensor gains")

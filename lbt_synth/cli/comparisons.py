@@ -25,7 +25,7 @@ from lbt_synth.design.modal import modal_filters, modal_gains
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.loop import least_residual, loop_margins
-from lbt_synth.loop.least_residuals.residual_limit import limit_or_nan
+from lbt_synth.loop.least_residual import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.designs import (
@@ -42,8 +42,7 @@ from lbt_synth.report.figures.studies import (
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies import LimitRow
-from lbt_synth.studies.limits import LimitStudy, say_residual
+from lbt_synth.studies.limits import LimitRow, LimitStudy, limits, say_residual
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, mirror_rows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
@@ -85,7 +84,7 @@ def _compared(design: Design, row: LimitRow, config: Config) -> Facts:
 
 def _begin(designs: Mapping[str, Design], config: Config) -> tuple[Report, LimitStudy]:
     """Return a study of designs beside the limits, and what it says first of them."""
-    study = studies.limits(
+    study = limits(
         designs, config.hardware, config.truth, config.imaging, errors_hz=config.errors_hz
     )
     report = Report(data={"limit_nm": None if study.limit is None else study.limit.rms_nm})

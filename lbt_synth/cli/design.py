@@ -16,7 +16,8 @@ from lbt_synth.design import Design
 from lbt_synth.design.result import without_units
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest, read_design, require_gain_name
-from lbt_synth.loop import LoopMargins, close_loop, loop_margins
+from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.registry import design_title, option_names
 from lbt_synth.methods.request import design_request
 from lbt_synth.storage.atomic_files import require_writable
@@ -96,7 +97,7 @@ def _say_model(design: Design) -> str:
 
 def add_moving_gain(report: Report, design: Design) -> None:
     """Add the intervals of a sensor gain that moves, for a design with a stable loop."""
-    from lbt_synth.loop import moving_gain
+    from lbt_synth.loop.stable_range import moving_gain
 
     if design.hardware is None or design.other_sensors:
         return

@@ -17,8 +17,8 @@ from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import load_gain
-from lbt_synth.loop import LoopMargins
-from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
+from lbt_synth.loop.least_residual import ResidualLimit
+from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.registry import design_title
 from lbt_synth.models import nm_per_mas
 from lbt_synth.models.loop_hardware import loop_differences

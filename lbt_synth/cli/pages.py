@@ -19,7 +19,8 @@ from lbt_synth.cli.loop_inputs import (
 from lbt_synth.cli.output import Report
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError, UnstableLoopError
-from lbt_synth.loop import LoopMargins, close_loop, loop_margins
+from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.report.designs import WORDS, design_facts, design_report, report_page, verdict
 from lbt_synth.report.draw import figure_series
 from lbt_synth.report.figures import loop_figure

@@ -49,7 +49,6 @@ from lbt_synth.storage.rows import (
 )
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies import RobustnessRow
 from lbt_synth.studies.paper import (
     DIAMETER_M,
     TABLE_II,
@@ -66,6 +65,7 @@ from lbt_synth.studies.paper import (
     rms_modal_difference,
     table_entry,
 )
+from lbt_synth.studies.robustness import RobustnessRow
 from lbt_synth.validation import integer
 
 _ROWS = 3 * len(TABLE_II) + 2 * len(TABLE_III)  # of both tables and their controllers

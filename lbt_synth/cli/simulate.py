@@ -25,13 +25,12 @@ from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.linear import estimator_form
 from lbt_synth.loop import (
     Imaging,
-    ResidualBudget,
-    Simulation,
     residual_budget,
     simulate,
     strehl,
 )
-from lbt_synth.loop.simulation.run import READINGS, Drop, Segment, settling_frames
+from lbt_synth.loop.budget import ResidualBudget
+from lbt_synth.loop.simulation import READINGS, Drop, Segment, Simulation, settling_frames
 from lbt_synth.models import Truth
 from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
 from lbt_synth.storage.atomic_files import require_writable

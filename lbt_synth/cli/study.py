@@ -28,7 +28,8 @@ from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
 from lbt_synth.storage.thread_limits import WorkerPool, limit_threads
 from lbt_synth.storage.words import duration_text
 from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, replay_row
-from lbt_synth.studies.study.statistics import summary_tables, worst_table
+from lbt_synth.studies.study.statistics import study_statistics, summary_tables, worst_table
+from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import integer
 
 _TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
@@ -50,11 +51,11 @@ def run(arguments: Namespace) -> Report:
     return _run_study(loaded, folder, arguments)
 
 
-def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
+def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     with run_in_parts(arguments, folder, total=loaded.samples, what="samples") as engine:
         run = studies.run_study(loaded, folder, **engine)
     names, columns = loaded.parameter_names, run.columns
-    statistics = studies.study_statistics(columns, names, tuple(loaded.controllers))
+    statistics = study_statistics(columns, names, tuple(loaded.controllers))
     pages = [folder / PAGE, *([folder / PRINT] if arguments.pdf else [])]
     draws = run.computed > 0 or not all(path.exists() for path in pages)
     if draws:
@@ -100,7 +101,7 @@ def _run_study(loaded: studies.Study, folder: Path, arguments: Namespace) -> Rep
     )
 
 
-def _replay(loaded: studies.Study, folder: Path, arguments: Namespace) -> Report:
+def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     if 0 <= arguments.row < loaded.samples:  # else it is refused
         make_directory(folder)
     replay = replay_row(loaded, folder, arguments.row)

@@ -21,7 +21,7 @@ from lbt_synth.interop import export
 from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.interop.pipeline import rehearse, target_named, target_names
 from lbt_synth.loop import Imaging
-from lbt_synth.loop.simulation.disturbances import Disturbance
+from lbt_synth.loop.disturbances import Disturbance
 from lbt_synth.loop.strehl import series_strehl
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.figures.records import simulation_figure

@@ -21,8 +21,7 @@ from lbt_synth.config.build import (
 from lbt_synth.config.load import Config
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ConfigError, suggest_word
-from lbt_synth.loop import EnsembleVibration, LoopEnsemble
-from lbt_synth.loop.ensemble import ensemble_vibration
+from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble, ensemble_vibration
 from lbt_synth.models import Atmosphere
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray

@@ -14,8 +14,10 @@ from lbt_synth.design.certificate import LEVEL_SETS, TOLERANCE, Check, Claim, Ev
 from lbt_synth.design.result import Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller, hinf_norm
-from lbt_synth.loop import ClosedLoop, LoopEnsemble, close_loop, stable_sensor_gains
-from lbt_synth.loop.ensemble import ensemble_vibration, residuals_from_matrices, textbook_matrices
+from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
+from lbt_synth.loop.budget import ensemble_residuals
+from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
+from lbt_synth.loop.evaluator import textbook_matrices
 from lbt_synth.loop.margins import phase_margin_deg
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
 from lbt_synth.models.vibration import stationary_vibrations
@@ -137,7 +139,7 @@ class IntegratorLaw:
         if self.phase_margin_deg is not None:
             found["phase_margin_deg"] = phase_margin_deg(loop)
         if self.modulus_margin is not None:
-            found["modulus_margin"] = 1 / hinf_norm(loop.output_sensitivity()).upper
+            found["modulus_margin"] = 1 / hinf_norm(loop.path("noise", "reading")).upper
         return found
 
 
@@ -372,19 +374,11 @@ def _residuals_by_gain(
 ) -> Callable[[FloatArray], FloatArray]:
     """Return what loops leave in the image [nm^2] by their gains (k,), nan if unstable."""
     if isinstance(truth, TipTiltPlant):
-        rate = hardware.frame_rate_hz
-        lines = [  # those of a plant are means over frames
-            replace(line, rms_nm=line.rms_nm / np.sinc(line.frequency_hz / rate))
-            for line in truth.vibrations
-        ]
-        # readings over the square root of their noise have independent noise of 1
-        unit, factor = np.ones(hardware.n_measurements), truth.own_noise_factor
-        whitened = frozen_copy(np.linalg.solve(factor, hardware.sensor))
-        seen = replace(hardware, sensor_matrix=whitened)
         ensemble = LoopEnsemble(
             turbulence=truth.turbulence,
-            noise_nm=unit[None],
-            vibrations=tuple(map(ensemble_vibration, lines)),
+            vibrations=tuple(map(ensemble_vibration, truth.vibrations)),
+            noise_factor=truth.own_noise_factor,
+            of_means=True,
         )
     else:
         require_instance(truth, Truth, "truth")
@@ -394,7 +388,6 @@ def _residuals_by_gain(
             raise ProblemError(
                 "the truth must disturb the loop; got no turbulence, vibration or noise."
             )
-        factor, seen = np.eye(hardware.n_measurements), hardware
         ensemble = LoopEnsemble(
             sensor_gain=truth.sensor_gain,
             turbulence=truth.turbulence_per_mode(hardware.modes),
@@ -405,9 +398,8 @@ def _residuals_by_gain(
 
     def variances(gains: FloatArray) -> FloatArray:
         scale, one = gains[:, None, None], np.ones((gains.size, 1, 1))
-        loops = one * A, scale * (B @ factor), one * C, scale * (D @ factor)
-        conditions = replace(ensemble, loops=gains.size)
-        budget = residuals_from_matrices(loops, seen, conditions, in_image=True)
+        loops = one * A, scale * B, one * C, scale * D  # a gain scales the input
+        budget = ensemble_residuals(loops, hardware, replace(ensemble, loops=gains.size))
         return np.asarray(budget.rms_nm**2)
 
     return variances

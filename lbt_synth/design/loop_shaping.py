@@ -293,12 +293,6 @@ class ShapedDesign(Design):
         """Root of the sum of the squared objectives of the modes."""
         return float(np.linalg.norm(self.objective_nm))
 
-    @property
-    def vibration_bands(self) -> tuple[VibrationBand, ...]:
-        """Bands of the specifications, mode by mode."""
-        terms = (term for spec in self.specifications for term in spec.terms)
-        return tuple(term for term in terms if isinstance(term, VibrationBand))
-
     def violated_demands(self, controller: Controller) -> tuple[str, ...]:
         """Return the demands that a controller violates, none where it couples the modes."""
         return violated_demands(self.specifications, self.problem, controller) or ()

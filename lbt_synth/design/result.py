@@ -20,9 +20,9 @@ from lbt_synth.loop import (
     stable_sensor_gains,
 )
 from lbt_synth.loop.closed_loop import reads_others
-from lbt_synth.loop.least_residuals.residual_limit import (
+from lbt_synth.loop.least_residual import (
     above_percent,
-    least_model_residual,
+    least_residual,
     limit_or_nan,
 )
 from lbt_synth.models import LoopHardware, TipTiltPlant
@@ -33,7 +33,7 @@ from lbt_synth.storage.words import count_text
 from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 
 if TYPE_CHECKING:
-    from lbt_synth.design.shaping import Specification, VibrationBand
+    from lbt_synth.design.shaping import Specification
 
 LIMIT_HEADING = "least residual of any linear controller in it"  # below the residual
 _WHAT = (
@@ -198,11 +198,6 @@ class Design(Summarised, ABC):
         return None
 
     @property
-    def vibration_bands(self) -> tuple[VibrationBand, ...]:
-        """Bands in which the design expects a vibration anywhere."""
-        return ()
-
-    @property
     def mode_specifications(self) -> tuple[Specification, ...]:
         """What each mode was shaped for; empty for a design that was not shaped."""
         return ()
@@ -337,7 +332,7 @@ def model_limits(design: Design) -> Mapping[str, float | None]:
         return {}
     loop = close_loop(plant.hardware, design.controller)
     residual_nm = residual_budget(loop, plant).rms_nm if loop.is_stable else np.nan
-    limit_nm = limit_or_nan(lambda: least_model_residual(plant))
+    limit_nm = limit_or_nan(lambda: least_residual(plant.hardware, plant))
     values = residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
     return {column.name: value for column, value in zip(MODEL_LIMITS, values, strict=True)}
 

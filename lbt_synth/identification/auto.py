@@ -314,7 +314,7 @@ def note_drift(record: LoopRecord, plant: TipTiltPlant, loop: ClosedLoop) -> Ite
     seconds = np.flatnonzero(record.usable) / record.frame_rate_hz
     speed, mean = np.polyfit(seconds - np.mean(seconds), series, 1)
     away = np.abs(mean) + np.abs(speed) * np.ptp(seconds) / 2
-    rejected = loop.rejection().frequency_response([0.0])[0].real
+    rejected = loop.path("phase", "residual").frequency_response([0.0])[0].real
     for i, rest_nm in enumerate(np.abs(rejected) @ away):
         if rest_nm > _DRIFT_SHARE * residual_nm[i]:
             yield (

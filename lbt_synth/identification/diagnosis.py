@@ -35,10 +35,9 @@ from lbt_synth.identification.records.record import FEW, LoopRecord, require_len
 from lbt_synth.identification.stretches import split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, loop_margins, residual_budget
-from lbt_synth.loop.budget import line_covariance
 from lbt_synth.loop.stable_range import stable_sensor_gains
 from lbt_synth.methods.registry import METHODS, reference_methods
-from lbt_synth.models import TipTiltPlant
+from lbt_synth.models import TipTiltPlant, Truth
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, column, fact, facts, nm_column, table_row
@@ -261,8 +260,9 @@ def _costs(
     budget = residual_budget(loop, plant, frame_means=True)
     parts = {"turbulence": 0.0, "measurement noise": float(np.trace(budget.noise_nm2))}
     for line in lines:  # two of one frequency are one part
-        variance = float(np.trace(line_covariance(loop, line.vibration())))
-        parts[line_name(line)] = parts.get(line_name(line), 0.0) + variance
+        alone = Truth(turbulence=None, vibrations=(line.vibration(),))
+        rms_nm = residual_budget(loop, alone, frame_means=True).rms_nm
+        parts[line_name(line)] = parts.get(line_name(line), 0.0) + rms_nm**2
     total = float(np.trace(budget.total_nm2))
     parts["turbulence"] = total - sum(parts.values())  # slow resonances are turbulence
     return {

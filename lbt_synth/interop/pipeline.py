@@ -28,8 +28,8 @@ from lbt_synth.errors import CertificateError, NumericalError, ProblemError
 from lbt_synth.interop.proof import FRAMES, LOSS, Written, prove_written, rehearsal_error
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import close_loop
-from lbt_synth.loop.simulation.disturbances import Disturbance
-from lbt_synth.loop.simulation.run import (
+from lbt_synth.loop.disturbances import Disturbance
+from lbt_synth.loop.simulation import (
     Simulation,
     SteppedController,
     settling_frames,

@@ -22,8 +22,8 @@ from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import ClosedLoop, close_loop, stable_sensor_gains
 from lbt_synth.loop.budget import residual_budget
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, youla_controller
-from lbt_synth.loop.simulation.disturbances import Disturbance
-from lbt_synth.loop.simulation.run import Drop, SteppedController, simulate
+from lbt_synth.loop.disturbances import Disturbance
+from lbt_synth.loop.simulation import Drop, SteppedController, simulate
 from lbt_synth.loop.stable_range import radii_by_gain
 from lbt_synth.models import ARModel, LoopHardware
 from lbt_synth.validation import FloatArray
@@ -81,12 +81,6 @@ def command_as_state(textbook: StateSpace) -> Controller:
         D=np.zeros((m, q)),
         dt_s=textbook.dt_s,
     )
-
-
-def history_filter(loop: ClosedLoop) -> StateSpace:
-    """Return the filter from pseudo-open-loop values to the commands of a loop of unit sensor."""
-    s, n = loop.commanding(), loop.hardware.modes
-    return replace(s, B=s.B[:, n:], D=s.D[:, n:])
 
 
 def filter_of_history(hardware: LoopHardware, system: StateSpace) -> tuple[Controller, Controller]:
@@ -160,7 +154,7 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
     inside = (gain for gain in scenario_gains(design) if low <= gain <= high)
     checks += (_residual_check(design, hardware, written, gain) for gain in inside)
     exact, other = (close_loop(hardware, c) for c in (design.controller, controller))
-    before, after = (hinf_norm(loop.output_sensitivity()).value for loop in (exact, other))
+    before, after = (hinf_norm(loop.path("noise", "reading")).value for loop in (exact, other))
     change = written.response_change
     after += change(1.0) if change else 0.0
     checks.append(Check("modulus margin, loss", float(after / before) - 1, LOSS, "level sets"))

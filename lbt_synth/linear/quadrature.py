@@ -38,7 +38,6 @@ class RefinedPanels:
     low: FloatArray  # (panels,)
     high: FloatArray  # (panels,)
     integrals: FloatArray  # (panels, ...): integral over each panel
-    change: float  # by the last halvings: summed over the panels, the largest of the entries
 
 
 def _panel_integrals(
@@ -65,7 +64,7 @@ def _halve_panels(
     low, high = edges[:-1], edges[1:]
     coarse = _panel_integrals(integrand, low, high, order)
     settled: list[tuple[FloatArray, FloatArray, FloatArray]] = []
-    total, moved = np.zeros(coarse.shape[1:]), 0.0
+    total = np.zeros(coarse.shape[1:])
     for _ in range(_HALVINGS):
         middle, count = (low + high) / 2, low.size
         low, high = np.concatenate([low, middle]), np.concatenate([middle, high])
@@ -76,13 +75,10 @@ def _halve_panels(
         done = np.all((change <= limits).reshape(count, -1), axis=1)
         settled.append((low[:count][done], high[count:][done], fine[done]))
         total = total + np.abs(fine[done]).sum(axis=0)
-        moved += float(change.reshape(count, -1).max(axis=1)[done].sum())
         if done.all():
             begin, end, integrals = (np.concatenate(rows) for rows in zip(*settled, strict=True))
             rank = np.argsort(begin)
-            return RefinedPanels(
-                low=begin[rank], high=end[rank], integrals=integrals[rank], change=moved
-            )
+            return RefinedPanels(low=begin[rank], high=end[rank], integrals=integrals[rank])
         halved = np.tile(~done, 2)
         low, high, coarse = low[halved], high[halved], halves[halved]
     raise NumericalError(
@@ -105,12 +101,12 @@ def adaptive_integral(
 
 
 def refine_panels(
-    integrand: Callable[[FloatArray], FloatArray], edges: FloatArray, *, floor: float = 0.0
+    integrand: Callable[[FloatArray], FloatArray], edges: FloatArray
 ) -> RefinedPanels:
     """Halve panels until a panel changes by at most 1e-10, and of the first entry, of a vector."""
 
     def limits(total: FloatArray, lengths: FloatArray) -> FloatArray:
-        return np.maximum(1e-10 * min(1.0, float(total[0])), floor * lengths)[:, None]
+        return np.full((lengths.size, 1), 1e-10 * min(1.0, float(total[0])))
 
     return _halve_panels(integrand, edges, 10, limits)
 

@@ -1,29 +1,142 @@
-"""The exact residual of one closed loop, by origin: turbulence, vibrations, noise."""
+"""The exact residual of loops, by origin: turbulence, vibrations, noise."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.linear import StateSpace
+from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
-from lbt_synth.loop.evaluator import STILL, Evaluator, ResidualBudget
-from lbt_synth.loop.stable_range import append_taps
+from lbt_synth.loop.ensemble import (
+    EnsembleVibration,
+    LoopEnsemble,
+    ensemble_vibration,
+    turbulence_rows,
+)
+from lbt_synth.loop.evaluator import (
+    STILL,
+    Evaluator,
+    Matrices,
+    close_loops,
+    loop_evaluator,
+    period_roots,
+)
 from lbt_synth.models import (
     ARModel,
+    LoopHardware,
     SinusoidalVibration,
+    Spectrum,
     TipTiltPlant,
     Truth,
     Vibration,
 )
-from lbt_synth.models.mirror.frame_rate_system import Hold, instant_mirror
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.sensor_suite import Motion, Motions, checked_motions
-from lbt_synth.models.vibration import checked_direction
-from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, require_instance
+from lbt_synth.models.vibration import checked_direction, sampled_lines
+from lbt_synth.storage.display_unit import nm_text
+from lbt_synth.storage.rows import fact, fact_table, facts
+from lbt_synth.storage.summaries import Summarised, Summary
+from lbt_synth.validation import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    frozen_copy,
+    read_only,
+    require_instance,
+)
+
+_TOGETHER = 2048  # loops with the same frequencies: as many as repay their panels
+_COVARIANCES = ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "within_nm2")
+_ORIGINS = {
+    "turbulence": "turbulence",
+    "vibration": "vibrations",
+    "noise": "noise",
+    "within": "within frames",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ResidualBudget(Summarised):
+    """Stationary residual of a loop, by origin; of p loops, all have a first axis (p,).
+
+    Covariances are over the modes [nm^2], and of means over the hold of a command but for
+    ``within_nm2``, of what moves within it.
+    """
+
+    turbulence_nm2: FloatArray  # (n, n)
+    noise_nm2: FloatArray
+    random_vibration_nm2: FloatArray
+    within_nm2: FloatArray  # zero in means over frames
+    line_amplitudes_nm: ComplexArray  # that each sinusoid leaves on each mode, (s, n)
+    stable: Any = True  # what an unstable loop leaves is nan
+
+    def _brief(self) -> str:
+        modes, loops = self.noise_nm2.shape[-1], self.noise_nm2.shape[:-2]
+        if loops:
+            return f"{loops[0]} loops, {modes} modes"
+        return f"{nm_text(self.rms_nm, '.4g')} rms, {modes} modes"
+
+    def _summarise(self) -> Summary:
+        headings = {"rms_nm": "residual"} | {
+            f"{name}_nm": f"  {heading}" for name, heading in _ORIGINS.items()
+        }
+        nm = {"unit": "nm rms", "format": ".1f"}
+        named = {name: fact(getattr(self, name), text, **nm) for name, text in headings.items()}
+        rows = facts(**named)
+        return Summary(tables=[fact_table("Residual", rows)])
+
+    @property
+    def gaussian_nm2(self) -> FloatArray:
+        """Covariance of all that is Gaussian [nm^2]."""
+        steady = self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2
+        return frozen_copy(steady + self.within_nm2)
+
+    @property
+    def vibration_nm2(self) -> FloatArray:
+        """Covariance of all vibrations, the sinusoids by their mean power [nm^2]."""
+        a = self.line_amplitudes_nm
+        return frozen_copy(self.random_vibration_nm2 + np.real(transpose(a) @ a.conj()) / 2)
+
+    @property
+    def total_nm2(self) -> FloatArray:
+        """Covariance of the residual [nm^2]."""
+        steady = self.turbulence_nm2 + self.noise_nm2 + self.vibration_nm2
+        return frozen_copy(steady + self.within_nm2)
+
+    @property
+    def rms_nm(self) -> Any:
+        """Residual over all modes [nm rms]."""
+        return _rms(self.total_nm2)
+
+    @property
+    def turbulence_nm(self) -> Any:
+        """Residual turbulence over all modes [nm rms]."""
+        return _rms(self.turbulence_nm2)
+
+    @property
+    def vibration_nm(self) -> Any:
+        """Residual vibration over all modes [nm rms]."""
+        return _rms(self.vibration_nm2)
+
+    @property
+    def noise_nm(self) -> Any:
+        """Propagated noise over all modes [nm rms]."""
+        return _rms(self.noise_nm2)
+
+    @property
+    def within_nm(self) -> Any:
+        """What moves within frames over all modes, which no command follows [nm rms]."""
+        return _rms(self.within_nm2)
+
+
+def _rms(covariance: FloatArray) -> Any:
+    root = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
+    return root if root.ndim else float(root)
 
 
 def residual_budget(
@@ -73,55 +186,156 @@ def residual_budget(
     >>> shake = lbt.Truth(turbulence=None, vibrations=(line,))
     >>> round(lbt.residual_budget(loop, shake).within_nm, 1)
     36.1
-
-    A Kalman filter leaves in its own model what it expects:
-
-    >>> slow = lbt.models.ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=15.5)
-    >>> design = lbt.kalman(plant)
-    >>> budget = lbt.residual_budget(design.close(plant.hardware), plant, frame_means=True)
-    >>> bool(abs(budget.rms_nm / design.rms - 1) < 1e-9)
-    True
     """
     require_instance(loop, ClosedLoop, "loop")
     loop.require_stable()
     if not hasattr(truth, "entering"):
         require_instance(truth, Truth)
-    turbulence, lines, noise = truth.entering(loop.hardware, sensor_gain=loop.sensor_gain)
-    of_means = frame_means or truth.is_of_means
-    pairs = list(zip(lines, _motions(loop, truth.motions, len(lines)), strict=True))
-    rows, n = loop_evaluator(loop, frame_means=frame_means), loop.hardware.modes
-    steady = np.zeros((2, n, n))
-    for spectrum, modes in turbulence:
-        if isinstance(spectrum, ARModel):
-            require_loop_rate(spectrum.frame_rate_hz, loop.hardware)
-        steady += rows.of_turbulence(spectrum, np.eye(n)[None, :, list(modes)]).mean(axis=0)
-    propagated = rows.of_noise(_noise_factor(loop, noise)[None]).mean(axis=0)
-    shaken = np.zeros((2, n, n))
-    amplitudes: list[ComplexArray] = []
-    for line, motion in pairs:
-        if isinstance(line, Vibration):
-            shaken += _of_resonance(loop, rows, line, motion, of_means=of_means)
+    hardware, n = loop.hardware, loop.hardware.modes
+    turbulence, vibrations, noise = truth.entering(hardware, sensor_gain=loop.sensor_gain)
+    motions = _motions(loop, truth.motions, len(vibrations))
+    rows = loop_evaluator(loop, in_image=not frame_means)
+    lines, seen = [], np.zeros((2, n, n))
+    for line, motion in zip(vibrations, motions, strict=True):
+        if not isinstance(line, Vibration):
+            lines.append(_one_line(loop, line, _seen_swing(loop, line, motion)))
+        elif _moved_rows(loop, motion):
+            seen += _of_seen(loop, rows, line, motion)
         else:
-            f = np.full(len(rows.A), line.frequency_hz / loop.hardware.frame_rate_hz)
-            entry = line.amplitude_nm * _sinusoid_entry(loop, line, motion)
-            left, within = rows.of_sinusoids(f, entry[None])
-            # what repeats with the period turns one sinusoid into several
-            amplitudes += list(np.fft.fft(left, axis=0) / len(left))
-            shaken[1] += within.mean(axis=0)
-    return ResidualBudget(
-        turbulence_nm2=frozen_copy(steady[0]),
-        noise_nm2=frozen_copy(propagated[0]),
-        random_vibration_nm2=frozen_copy(shaken[0]),
-        within_nm2=frozen_copy(steady[1] + shaken[1] + propagated[1]),
-        line_amplitudes_nm=np.array(amplitudes, dtype=np.complex128).reshape(-1, n),
+            lines.append(_one_line(loop, line))
+    budget = residual_of_parts(
+        [rows],
+        [(spectrum, np.array(modes, dtype=np.intp)) for spectrum, modes in turbulence],
+        lines,
+        _noise_factor(loop, noise)[None],
+        hardware=hardware,
+        of_means=frame_means or truth.is_of_means,
     )
+    # what repeats with the period turns one sinusoid into several
+    amplitudes = np.fft.fft(budget.line_amplitudes_nm, axis=0) / rows.phases
+    return ResidualBudget(
+        turbulence_nm2=frozen_copy(budget.turbulence_nm2.mean(axis=0)),
+        noise_nm2=frozen_copy(budget.noise_nm2.mean(axis=0)),
+        random_vibration_nm2=frozen_copy(budget.random_vibration_nm2.mean(axis=0) + seen[0]),
+        within_nm2=frozen_copy(budget.within_nm2.mean(axis=0) + seen[1]),
+        line_amplitudes_nm=read_only(amplitudes.reshape(-1, n)),
+    )
+
+
+def residual_of_parts(
+    parts: Sequence[Evaluator],
+    turbulence: Sequence[tuple[Spectrum, IntArray]],
+    lines: Sequence[EnsembleVibration],
+    noise: FloatArray,
+    *,
+    hardware: LoopHardware,
+    of_means: bool,
+) -> ResidualBudget:
+    """Return what k loops leave, whose independent parts are evaluated one by one.
+
+    A line shakes the modes of one part. Each turbulence comes with its modes, the noise is a factor
+    (k or 1, q, w) of its covariance, and the numbers of a line are (k or 1). ``of_means`` says of
+    what the rms of a resonance is.
+    """
+    k, modes, rate = len(parts[0].start), hardware.modes, hardware.frame_rate_hz
+    for spectrum, _ in turbulence:
+        if isinstance(spectrum, ARModel):
+            require_loop_rate(spectrum.frame_rate_hz, hardware)
+    air, shot, shaken = np.zeros((3, k, 2, modes, modes))  # of means, and within
+    for part in parts:
+        equal: dict[object, FloatArray] = {}  # what reaches equal parts alike is evaluated once
+        for some, inputs in zip(part.modes, part.measurements, strict=True):
+            at = np.s_[:, :, some[:, None], some]
+            factor = noise[:, inputs]
+            factor = factor[..., np.any(factor, axis=(0, 1))]
+            if factor.tobytes() not in equal:
+                equal[factor.tobytes()] = part.of_noise(factor)
+            shot[at] += equal[factor.tobytes()]
+            for i, (spectrum, reached) in enumerate(turbulence):
+                columns = np.flatnonzero(np.isin(some, reached))
+                key = i, *columns.tolist()
+                if key not in equal and columns.size:
+                    entry = np.eye(some.size)[None, :, columns]
+                    equal[key] = part.of_turbulence(spectrum, entry)
+                air[at] += equal.get(key, 0.0)
+    amplitudes: list[ComplexArray] = []
+    for line in lines:
+        pairs = ((part, some) for part in parts for some in part.modes)
+        part, some = next(pair for pair in pairs if np.any(line.direction[:, pair[1]]))
+        at, along = np.s_[:, :, some[:, None], some], line.direction[:, some]
+        f = line.frequency_hz / rate
+        if line.damping is not None:
+            rms_nm = line.rms_nm * (1.0 if of_means else np.sinc(f))
+            numbers = line.frequency_hz, line.damping, rms_nm, rate, line.sections
+            shaken[at] += part.of_process(*sampled_lines(*numbers), along[..., None])
+            continue
+        entry = np.zeros((len(f), part.B.shape[2]), dtype=np.complex128)
+        entry[:, : some.size] = along
+        if line.readings is not None:
+            entry[:, some.size :] = line.readings
+        amplitude = np.zeros((k, modes), dtype=np.complex128)
+        size_nm = np.sqrt(2) * line.rms_nm[:, None]
+        amplitude[:, some], within = part.of_sinusoids(np.broadcast_to(f, k), size_nm * entry)
+        shaken[:, 1, some[:, None], some] += within
+        amplitudes.append(amplitude)
+    return ResidualBudget(
+        turbulence_nm2=air[:, 0],
+        noise_nm2=shot[:, 0],
+        random_vibration_nm2=shaken[:, 0],
+        within_nm2=air[:, 1] + shot[:, 1] + shaken[:, 1],
+        line_amplitudes_nm=np.array(amplitudes, np.complex128).reshape(-1, k, modes).swapaxes(0, 1),
+    )
+
+
+def ensemble_residuals(
+    matrices: Matrices, hardware: LoopHardware, ensemble: LoopEnsemble, *, frame_means: bool = False
+) -> ResidualBudget:
+    """Return what controllers ``A, B, C, D`` leave, (1 or p, ., .) each, in many loops (p,).
+
+    Unstable loops leave nan.
+    """
+    turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
+    noise, n, p = ensemble.noise(hardware), hardware.modes, ensemble.loops
+    gains, delays = ensemble.gains(), ensemble.delays(hardware)
+    stable, groups = close_loops(
+        matrices,
+        hardware,
+        gains,
+        delays,
+        in_image=not frame_means,
+        together=[np.any(line.direction, axis=0) for line in lines],
+    )
+    sinusoids = sum(line.damping is None for line in lines)
+    whole = {name: np.full((p, n, n), np.nan) for name in _COVARIANCES}
+    amplitudes = np.full((p, sinusoids, n), np.nan, dtype=np.complex128)
+    for loops, parts in groups:
+        # those next to instability need short panels
+        radii = np.max(np.abs(np.concatenate([part.roots for part in parts], axis=1)), axis=1)
+        order = np.argsort(radii, kind="stable")
+        order = order[stable[loops[order]]]
+        for first in range(0, order.size, _TOGETHER):
+            some = order[first : first + _TOGETHER]
+            rows = loops[some]
+            budget = residual_of_parts(
+                [part.take(some) for part in parts],
+                [(turbulence_rows(spectrum, rows), modes) for spectrum, modes in turbulence],
+                [line.take(rows) for line in lines],
+                noise[rows],
+                hardware=hardware,
+                of_means=frame_means or ensemble.of_means,
+            )
+            for name, covariances in whole.items():
+                covariances[rows] = getattr(budget, name)
+            amplitudes[rows] = budget.line_amplitudes_nm
+    return ResidualBudget(**whole, line_amplitudes_nm=amplitudes, stable=read_only(stable))
 
 
 def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
     """Return the covariance (q, q) of all readings in the first frame of a period."""
-    every = _evaluator(loop, loop.system, None, in_image=False)
-    parts = [every.shaken(_noise_factor(loop, plant.own_noise_factor))]
+    _, _, C, D = loop.system.stacks()
+    every = replace(loop_evaluator(loop, in_image=False), C=C, D=D)
+    n, factor = loop.hardware.modes, _noise_factor(loop, plant.own_noise_factor)
+    parts = [replace(every, B=every.B[..., n:] @ factor, D=D[..., n:] @ factor)]
     for mode, model in enumerate(plant.turbulence):
         entry = np.eye(loop.system.B.shape[-1])[:, [mode]]
         parts.append(_driven(every, ar_process(model), entry))
@@ -131,72 +345,13 @@ def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
     return np.asarray(sum(part.output_covariances()[0, first:, first:] for part in parts))
 
 
-def line_covariance(loop: ClosedLoop, line: Vibration) -> FloatArray:
-    """Covariance (n, n) of the residual that a line leaves, in means over frames."""
-    rows = loop_evaluator(loop, frame_means=True)
-    return np.asarray(_of_resonance(loop, rows, line, {}, of_means=True)[0])
-
-
-def noise_covariance(loop: ClosedLoop, factor: FloatArray) -> FloatArray:
-    """Covariance of what noise of covariance ``factor factor'`` leaves in the image, (n, n)."""
-    rows = loop_evaluator(loop, frame_means=False).of_noise(_noise_factor(loop, factor)[None])
-    return np.asarray(rows.mean(axis=0).sum(axis=0))
-
-
-def loop_evaluator(loop: ClosedLoop, *, frame_means: bool) -> Evaluator:
-    """Return the evaluator of a loop, in the image or in means over frames."""
-    hardware, s, n = loop.hardware, loop.system, loop.hardware.modes
-    if frame_means or (hardware.mirror is None and hardware.delay_frames % 1 == 0):
-        rows = replace(s, C=s.C[..., :n, :], D=s.D[..., :n, :])
-        return _evaluator(loop, rows, None, in_image=not frame_means)
-    hold, command = hardware.mirror_system.hold, slice(n, n + hardware.n_commands)
-    # the states of the mirror follow those of the controller
-    first, commands = loop.controller.n_states, (s.C[..., command, :], s.D[..., command, :])
-    C, D = hold.positions(hardware.influence, commands, first)
-    size = len(hold.D) * n
-    C, D = C.reshape(*s.C.shape[:-2], size, -1), D.reshape(*s.D.shape[:-2], size, s.D.shape[-1])
-    return _evaluator(loop, replace(s, C=C, D=D), hold, in_image=True)
-
-
-def _evaluator(
-    loop: ClosedLoop, rows: StateSpace, hold: Hold | None, *, in_image: bool
-) -> Evaluator:
-    """Return the evaluator of a system from a loop's inputs to rows."""
-    s = rows.balanced() if rows.period == 1 else rows
-    A, B, C, D = s.stacks()
-    return Evaluator(
-        A=A,
-        B=B,
-        C=C,
-        D=D,
-        modes=loop.hardware.modes,
-        frame_rate_hz=loop.hardware.frame_rate_hz,
-        roots=_roots(loop.system.poles, loop.system.period),
-        hold=hold,
-        start=np.full(s.period, loop.hardware.delay_frames - 1),
-        in_image=in_image,
-        phases=s.period,
-    )
-
-
-def _of_resonance(
-    loop: ClosedLoop,
-    rows: Evaluator,
-    line: Vibration,
-    motion: Mapping[str, Motion],
-    *,
-    of_means: bool,
-) -> FloatArray:
-    """Return what a resonance leaves, (2, n, n), whose rms is of means or of all moments."""
-    if _moved_rows(loop, motion):
-        return _of_seen(loop, rows, line, motion)
-    rate = loop.hardware.frame_rate_hz
-    share = 1.0 if of_means else float(np.sinc(line.frequency_hz / rate))
-    model = replace(line, rms_nm=share * line.rms_nm).ar_model(rate)
+def _one_line(
+    loop: ClosedLoop, line: Vibration | SinusoidalVibration, readings: ComplexArray | None = None
+) -> EnsembleVibration:
+    """Return a line as one loop meets it."""
     along = checked_direction(line, loop.hardware)
-    driving_rms_nm = np.array([model.driving_rms_nm])
-    left = rows.of_process(model.coefficients[None], driving_rms_nm, along[None, :, None])
-    return np.asarray(left.mean(axis=0))
+    conditions = replace(ensemble_vibration(line), direction=along, readings=readings)
+    return conditions.of_loops(1)
 
 
 def _of_seen(
@@ -235,7 +390,7 @@ def _of_seen(
             )
         return 2 / rate * left
 
-    roots = np.concatenate([rows.roots, _roots(process.poles, process.period)])
+    roots = np.concatenate([rows.roots.ravel(), period_roots(process.poles, process.period)])
     return out + adaptive_integral(density, graded_edges(roots) * rate / 2)
 
 
@@ -274,19 +429,20 @@ def _shaken(
     return seen_vibration(line, motion, hardware.suite.accelerometers, hardware), entry
 
 
-def _sinusoid_entry(
+def _seen_swing(
     loop: ClosedLoop, line: SinusoidalVibration, motion: Mapping[str, Motion]
 ) -> ComplexArray:
-    """Return how a sinusoid of unit amplitude enters a loop, (n + q,)."""
-    hardware, entry = loop.hardware, np.zeros(loop.system.B.shape[-1], dtype=np.complex128)
-    entry[: hardware.modes] = checked_direction(line, hardware)
+    """Return what the readings have of a sinusoid of unit amplitude, (q,)."""
+    hardware, n = loop.hardware, loop.hardware.modes
+    readings = np.zeros(loop.system.B.shape[-1] - n, dtype=np.complex128)
     of_channel = {
         name: sensor for sensor in hardware.suite.accelerometers for name in sensor.channels
     }
     for row, name in _moved_rows(loop, motion):
         if name not in loop.blind:
-            entry[row] = of_channel[name].swing(motion[name], line.frequency_hz, hardware)
-    return entry
+            swing = of_channel[name].swing(motion[name], line.frequency_hz, hardware)
+            readings[row - n] = swing
+    return readings
 
 
 def ar_process(model: ARModel) -> StateSpace:
@@ -307,35 +463,7 @@ def _noise_factor(loop: ClosedLoop, own: FloatArray) -> FloatArray:
     return np.asarray(noise)
 
 
-def _roots(poles: ComplexArray, period: int) -> ComplexArray:
-    """Return where the poles of a period show in a response: at each of their roots."""
-    turns = np.exp(2j * np.pi * np.arange(period) / period)
-    roots = np.abs(poles) ** (1 / period) * np.exp(1j * np.angle(poles) / period)
-    return np.asarray((roots[:, None] * turns).ravel())
-
-
 def resonance_edges(loop: ClosedLoop) -> FloatArray:
     """Panels of (0, Nyquist) [Hz] for a loop."""
-    roots = _roots(loop.system.poles, loop.system.period)
+    roots = period_roots(loop.system.poles, loop.system.period)
     return graded_edges(roots) * loop.hardware.frame_rate_hz / 2
-
-
-def settling_error(loop: ClosedLoop, truth: Truth) -> ResidualBudget:
-    """Position of a settled mirror less the real one, for the commands that a loop gives.
-
-    It is by how much the paper's equation 1, ``phi_cor(k-1) = N u(k-2)``, misses the position over
-    the exposure; no residual, as the loop corrects for part of it.
-    """
-    return residual_budget(replace(loop, system=_difference_loop(loop)), truth, frame_means=True)
-
-
-def _difference_loop(loop: ClosedLoop) -> StateSpace:
-    """Return the loop to the settled mirror's position less the real one, phase less residual."""
-    hardware, s, n = loop.hardware, loop.system, loop.hardware.modes
-    if hardware.mirror is None:  # it leaves nothing, not even rounding
-        return replace(s, C=0 * s.C[:n], D=0 * s.D[:n])
-    settled = append_taps(loop.commanding(), instant_mirror(hardware.delay_frames).taps)
-    C, D = hardware.influence @ settled.C, hardware.influence @ settled.D + s.D[:n]
-    C[:, : s.n_states] += s.C[:n]
-    D[:, :n] -= np.eye(n)
-    return replace(settled, C=C, D=D)

@@ -109,55 +109,20 @@ class ClosedLoop(Summarised):
                 spectral_radius=radius,
             )
 
+    def path(self, source: str, end: str) -> StateSpace:
+        """Return the system from "phase", "noise" or "all" to "residual", "command" or "reading".
+
+        From the noise to the readings it is ``(I + loop)^-1``.
+        """
+        s, n, m = self.system, self.hardware.modes, self.hardware.n_commands
+        inputs = {"phase": slice(n), "noise": slice(n, None), "all": slice(None)}[source]
+        ends = {"residual": slice(n), "command": slice(n, n + m), "reading": slice(n + m, None)}
+        B, C = s.B[..., inputs], s.C[..., ends[end], :]
+        return replace(s, B=B, C=C, D=s.D[..., ends[end], inputs])
+
     def sensitivity(self, frequency_hz: ArrayLike) -> ComplexArray:
         """Transfer from the total phase to the residual (the rejection), (f, n, n)."""
-        n = self.hardware.modes
-        return self.system.frequency_response(frequency_hz)[:, :n, :n]
-
-    def noise_transfer(self, frequency_hz: ArrayLike) -> ComplexArray:
-        """Transfer from the measurement noise to the residual, (f, n, q)."""
-        n = self.hardware.modes
-        return self.system.frequency_response(frequency_hz)[:, :n, n:]
-
-    def output_sensitivity(self) -> StateSpace:
-        """System from measurement noise to measurement, ``(I + loop)^-1``."""
-        n, m = self.hardware.modes, self.hardware.n_commands
-        return self._subsystem(slice(n + m, None), slice(n, None))
-
-    def rejection(self) -> StateSpace:
-        """System from the total phase to the residual."""
-        n = self.hardware.modes
-        return self._subsystem(slice(n), slice(n))
-
-    def rejection_with_channels(self) -> StateSpace:
-        """System from the total phase, and what all other sensors read of it, to the residual.
-
-        Readings of accelerometers are no part of the loop: they enter as their noise does.
-        """
-        n, q = self.hardware.modes, self.hardware.n_measurements
-        whole = self._subsystem(slice(n), slice(None))
-        kept = np.r_[:n, n + q : whole.B.shape[-1]]
-        return replace(whole, B=whole.B[..., kept], D=whole.D[..., kept])
-
-    def noise_propagation(self) -> StateSpace:
-        """System from the measurement noise to the residual."""
-        n = self.hardware.modes
-        return self._subsystem(slice(n), slice(n, None))
-
-    def commanding(self) -> StateSpace:
-        """System from ``[phi_tot, noise]`` to the command."""
-        n, m = self.hardware.modes, self.hardware.n_commands
-        return self._subsystem(slice(n, n + m), slice(None))
-
-    def steering(self) -> StateSpace:
-        """System from the total phase to the command."""
-        n, m = self.hardware.modes, self.hardware.n_commands
-        return self._subsystem(slice(n, n + m), slice(n))
-
-    def _subsystem(self, outputs: slice, inputs: slice) -> StateSpace:
-        s = self.system
-        B, C, D = s.B[..., inputs], s.C[..., outputs, :], s.D[..., outputs, inputs]
-        return replace(s, B=B, C=C, D=D)
+        return self.path("phase", "residual").frequency_response(frequency_hz)
 
 
 def close_loop(

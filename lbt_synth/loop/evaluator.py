@@ -11,44 +11,48 @@ else by adaptive quadrature on panels that are short around the poles, sinusoids
 sampled process is one of means over frames, whose density in the continuous phase is larger by
 ``1 / sinc^2(f / f_s)``; spectra, and the rms of vibrations, are of the continuous phase. Nothing
 lies above half the frame rate.
+
+Many loops are split into parts that do not act on each other; equal parts are evaluated once.
+Between two whole delays a settled mirror shows the commands of two frames within an exposure, so
+that every matrix of the loop is affine in the fraction, as it is in the sensor gain.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import StateSpace
+from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.lyapunov import stationary_covariances
-from lbt_synth.linear.matrix_functions import transpose
+from lbt_synth.linear.matrix_functions import component_labels, transpose
 from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_rule
-from lbt_synth.models import ARModel, Atmosphere, Spectrum
-from lbt_synth.models.mirror.frame_rate_system import Hold
+from lbt_synth.linear.state_space import stacked_response
+from lbt_synth.loop.closed_loop import STABILITY_MARGIN, ClosedLoop, last_frame, loop_matrices
+from lbt_synth.models import ARModel, Atmosphere, LoopHardware, Spectrum
+from lbt_synth.models.mirror.frame_rate_system import (
+    Hold,
+    Response,
+    mirror_system,
+    tapped_mirror,
+)
 from lbt_synth.models.spectra import breakpoints_below, companions, densities, spectrum_density
-from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import fact, fact_table, facts
-from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
-# from cycles per frame (f,), the share (f,) of a phase that its means are, and entries (k or 1, n,
-# w), to the rows of a loop, piece by piece
-_Response: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], Iterable[ComplexArray]]
+Matrices: TypeAlias = tuple[FloatArray, ...]  # A, B, C, D in textbook form, (1 or p, ., .) each
+# the modes and measurements of each of c equal parts, (c, n) and (c, q), the matrices of their
+# controllers, the sensor (q, n) and the influence (n, m)
+Part: TypeAlias = tuple[IntArray, IntArray, Matrices, FloatArray, FloatArray]
 
 STILL = Hold(start=0.0, edges=np.array([0.0, 1.0]), C=np.zeros((1, 0)), D=np.ones(1))
 _RESIDUAL = 1e-9  # of a Lyapunov equation, relative
 _ROUNDING = 1e-8  # of the terms of a variance, the least part that it is computed from
+_ZERO = 1e-13  # smaller entries, relative to the largest of their matrix, count as zero
 _WIDENINGS = 16  # panels beside a pole, each four times as long as the one before
 _ORDER = 10  # of the rule on a panel; 6 leaves errors of 3e-6
-_ORIGINS = {
-    "turbulence": "turbulence",
-    "vibration": "vibrations",
-    "noise": "noise",
-    "within": "within frames",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,14 +69,41 @@ class Evaluator:
     B: FloatArray
     C: FloatArray
     D: FloatArray
-    modes: int
+    modes: IntArray  # numbers of the modes of each of c equal parts, (c, n)
+    measurements: IntArray  # (c, q)
     frame_rate_hz: float
-    roots: ComplexArray  # where responses have resonances
+    roots: ComplexArray  # where responses have resonances, (k, .) or those of a period (1, .)
     hold: Hold | None
     start: FloatArray  # of the holds [frames], (k,)
     in_image: bool  # whether what moves within a frame counts
     phases: int  # of the period of one loop; 1 for many loops
-    response: _Response | None = None  # from unit phases to the rows, in fewer operations
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes n."""
+        return int(self.modes.shape[1])
+
+    def take(self, which: IntArray) -> Evaluator:
+        """Return some of many loops."""
+        return replace(
+            self, **{name: getattr(self, name)[which] for name in [*"ABCD", "roots", "start"]}
+        )
+
+    def powers(self, f_hz: FloatArray, entry: FloatArray) -> FloatArray:
+        """Powers (2, n, n, f, k) that phases of unit density leave by an entry (k or 1, n, w)."""
+        f = f_hz / self.frame_rate_hz
+        mean: ComplexArray = np.zeros(1, dtype=np.complex128)
+        squares = np.zeros(1)
+        for weight, piece in self._pieces(f, entry):
+            mean = mean + weight * piece
+            squares = squares + weight * _power(piece)
+        of_mean = _power(mean)
+        within = squares - of_mean
+        if self.in_image:
+            rest = 1 - np.abs(self._holds.phase_means(f)) ** 2 @ self._holds.weights
+            along = np.moveaxis(entry @ transpose(entry), 0, -1)
+            within += along[:, :, None] * rest[:, None]
+        return np.array([of_mean, within])
 
     def of_density(
         self,
@@ -81,30 +112,18 @@ class Evaluator:
         edges_hz: FloatArray,
     ) -> FloatArray:
         """Return what phases of a density (f, k or 1) leave by an entry (k or 1, n, w)."""
-        nyquist, along = self.frame_rate_hz / 2, np.asarray(entry @ transpose(entry))
-        edges = np.union1d(graded_edges(self.roots) * nyquist, edges_hz)
+        edges = np.union1d(graded_edges(self.roots.ravel()) * self.frame_rate_hz / 2, edges_hz)
 
-        def left(f_hz: FloatArray) -> FloatArray:
-            f = f_hz / self.frame_rate_hz
-            mean: ComplexArray = np.zeros(1, dtype=np.complex128)
-            squares = np.zeros(1)
-            for weight, piece in self._pieces(f, entry):
-                mean = mean + weight * piece
-                squares = squares + weight * _power(piece)
-            of_mean = _power(mean)
-            within = squares - of_mean
-            if self.in_image:
-                rest = 1 - np.abs(self._holds.phase_means(f)) ** 2 @ self._holds.weights
-                within += np.moveaxis(along, 0, -1)[:, :, None] * rest[:, None]
-            return np.moveaxis(np.array([of_mean, within]) * density(f_hz), (3, 4), (0, 1))
+        def weighted(f_hz: FloatArray) -> FloatArray:
+            return np.moveaxis(self.powers(f_hz, entry) * density(f_hz), (3, 4), (0, 1))
 
-        return adaptive_integral(left, edges)
+        return adaptive_integral(weighted, edges)
 
     def of_process(
         self, coefficients: FloatArray, driving_rms_nm: FloatArray, entry: FloatArray
     ) -> FloatArray:
         """Return what processes of means over frames leave by the columns of an entry."""
-        rate = self.frame_rate_hz
+        rate, n = self.frame_rate_hz, self.n_modes
         if self.hold is not None:
 
             def density(f_hz: FloatArray) -> FloatArray:
@@ -113,11 +132,11 @@ class Evaluator:
 
             poles = process_poles(coefficients).ravel()
             return self.of_density(density, entry, graded_edges(poles) * rate / 2)
-        out = np.zeros((len(self.A), 2, self.modes, self.modes))
+        out = np.zeros((len(self.A), 2, n, n))
         first = np.eye(coefficients.shape[1], 1)
         process = companions(coefficients), driving_rms_nm[:, None, None] * first, first.T[None]
         inputs = np.zeros((len(entry), self.B.shape[-1], entry.shape[-1]))
-        inputs[:, : self.modes] = entry
+        inputs[:, :n] = entry
         for column in range(entry.shape[-1]):
             driven = self.driven(*process, inputs[..., [column]])
             out[:, 0] += driven.output_covariances()
@@ -142,8 +161,9 @@ class Evaluator:
 
     def of_noise(self, factor: FloatArray) -> FloatArray:
         """Return what white noise of covariance ``factor factor'`` leaves, (k or 1, q, p)."""
-        covariance = self.shaken(factor).output_covariances()
-        n, w = self.modes, self._holds.weights
+        n, w = self.n_modes, self._holds.weights
+        B, D = self.B[..., n:] @ factor, self.D[..., n:] @ factor
+        covariance = replace(self, B=B, D=D).output_covariances()
         blocks = covariance.reshape(len(covariance), w.size, n, w.size, n)
         mean = np.einsum("g,kgihj,h->kij", w, blocks, w)
         return np.stack([mean, np.einsum("g,kgigj->kij", w, blocks) - mean], axis=1)
@@ -153,7 +173,7 @@ class Evaluator:
 
         Frequencies [cycles per frame] are (k,), the entries (k or 1, n + q) complex amplitudes.
         """
-        n, share = self.modes, np.ones((len(f), entry.shape[-1]))
+        n, share = self.n_modes, np.ones((len(f), entry.shape[-1]))
         if self.in_image:
             share[:, :n] = np.sinc(f)[:, None]
         follow = (self._at(f) @ (share * entry)[..., None])[..., 0]
@@ -178,28 +198,19 @@ class Evaluator:
         A process x(j + 1) = A x(j) + B w(j) has acted by the time of its newest sample.
         """
         samples, n, size = entry @ C, self.A.shape[-1], self.A.shape[-1] + A.shape[-1]
-        whole = np.zeros((len(self.A), size, size))
+        joined = np.zeros((len(self.A), size, size))
         drive = np.zeros((len(self.A), size, B.shape[-1]))
-        whole[:, :n, :n], whole[:, :n, n:], whole[:, n:, n:] = self.A, self.B @ samples, A
+        joined[:, :n, :n], joined[:, :n, n:], joined[:, n:, n:] = self.A, self.B @ samples, A
         drive[:, n:] = B
         rows = np.concatenate([self.C, self.D @ samples], axis=2)
         direct = np.zeros((*rows.shape[:2], drive.shape[2]))
-        return replace(self, A=whole, B=drive, C=rows, D=direct, response=None)
-
-    def shaken(self, factor: FloatArray) -> Evaluator:
-        """Return the loops from white noise that enters the measurements by a factor."""
-        n = self.modes
-        B, D = self.B[..., n:] @ factor, self.D[..., n:] @ factor
-        return replace(self, B=B, D=D, response=None)
+        return replace(self, A=joined, B=drive, C=rows, D=direct)
 
     def system(self) -> StateSpace:
         """Return the one loop."""
-        parts = [self.A, self.B, self.C, self.D]
-        if self.phases == 1:
-            A, B, C, D = (part[0] for part in parts)
-            return StateSpace(A=A, B=B, C=C, D=D, dt_s=1 / self.frame_rate_hz).balanced()
-        A, B, C, D = parts
-        return StateSpace(A=A, B=B, C=C, D=D, dt_s=1 / self.frame_rate_hz)
+        A, B, C, D = (part[0] if self.phases == 1 else part for part in self._matrices)
+        system = StateSpace(A=A, B=B, C=C, D=D, dt_s=1 / self.frame_rate_hz)
+        return system.balanced() if self.phases == 1 else system
 
     def output_covariances(self) -> FloatArray:
         """Return covariances (k, r, r) for white inputs, by roots where digits are lost."""
@@ -211,8 +222,8 @@ class Evaluator:
         terms = np.abs(self.C) @ np.abs(X) @ transpose(np.abs(self.C))
         poor = np.trace(terms, axis1=1, axis2=2) * _ROUNDING > np.trace(out, axis1=1, axis2=2)
         for i in np.flatnonzero(~((residuals < _RESIDUAL) & ~poor)):
-            parts = {name: getattr(self, name)[i] for name in "ABCD"}
-            out[i] = StateSpace(**parts).output_covariances()[0]
+            A, B, C, D = (part[i] for part in self._matrices)
+            out[i] = StateSpace(A=A, B=B, C=C, D=D).output_covariances()[0]
         if not np.all(np.isfinite(out)):
             raise ProblemError(
                 "the covariance of a process in a loop was not found. The process or the loop is "
@@ -221,35 +232,31 @@ class Evaluator:
         return out
 
     @property
+    def _matrices(self) -> Matrices:
+        return self.A, self.B, self.C, self.D
+
+    @property
     def _holds(self) -> Hold:
         return STILL if self.hold is None else self.hold
 
     def _pieces(self, f: FloatArray, entry: FloatArray) -> Iterator[tuple[float, ComplexArray]]:
         """Yield the length of each piece of a hold, and what phases leave (n, w, f, k)."""
-        share = np.sinc(f) if self.in_image else np.ones(f.size)
-        rows = (self.response or self._response)(f, share, entry)
+        n, share = self.n_modes, np.sinc(f) if self.in_image else np.ones(f.size)
+        entered = replace(self, B=self.B[..., :n] @ entry, D=self.D[..., :n] @ entry)
+        if len(self.A) == self.phases:
+            response = entered.system().phase_response(f * self.frame_rate_hz)
+        else:
+            response = stacked_response(entered._matrices, np.exp(2j * np.pi * f))
+        rows = np.moveaxis(response, (2, 3), (0, 1)) * share[:, None]  # (g n, w, f, k)
+        rows = rows.reshape(-1, n, *rows.shape[1:])
         if self.hold is None:
-            yield from ((1.0, left) for left in rows)
+            yield 1.0, rows[0]
             return
         # as seen from the middle of the frame, where the mean has its phase
-        turn = 2 * np.pi * f[:, None] * (self.start - self.hold.start - 0.5)
-        late = np.empty(turn.shape, dtype=np.complex128)
-        np.cos(turn, out=late.real)  # a complex exp takes twice as long
-        np.sin(turn, out=late.imag)
+        late = np.exp(2j * np.pi * f[:, None] * (self.start - self.hold.start - 0.5))
         means, enters = self.hold.phase_means(f), np.moveaxis(entry, 0, -1)[:, :, None]
         for g, (weight, positions) in enumerate(zip(self.hold.weights, rows, strict=True)):
-            left = (means[:, g, None] * enters) * late
-            left -= positions
-            yield float(weight), left
-
-    def _response(self, f: FloatArray, share: FloatArray, entry: FloatArray) -> ComplexArray:
-        """Return the rows of one loop for phases whose means are a share, (g, n, w, f, k)."""
-        used = np.flatnonzero(np.any(entry[0], axis=1))
-        s = self.system()
-        s = replace(s, B=s.B[..., used], D=s.D[..., used])
-        response = s.phase_response(f * self.frame_rate_hz)
-        rows = np.einsum("f,fkru,uw->rwfk", share, response, entry[0, used])
-        return np.asarray(rows.reshape(-1, self.modes, *rows.shape[1:]))
+            yield float(weight), (means[:, g, None] * enters) * late - positions
 
     def _at(self, f: FloatArray) -> ComplexArray:
         """Return the responses (k, r, n + q) of loops, each at its own frequency."""
@@ -259,12 +266,12 @@ class Evaluator:
         return np.asarray(self.C @ np.linalg.solve(pencil, self.B + 0j) + self.D)
 
 
-def _power(left: ComplexArray) -> FloatArray:
+def _power(phases: ComplexArray) -> FloatArray:
     """Powers (n, n, f, k) of residuals (n, w, f, k), summed over the columns."""
-    x, y = left.real, left.imag
+    x, y = phases.real, phases.imag
     out = x[:, None, 0] * x[:, 0]
     out += y[:, None, 0] * y[:, 0]
-    for i in range(1, left.shape[1]):
+    for i in range(1, phases.shape[1]):
         out += x[:, None, i] * x[:, i] + y[:, None, i] * y[:, i]
     return np.asarray(out)
 
@@ -272,19 +279,6 @@ def _power(left: ComplexArray) -> FloatArray:
 def process_poles(coefficients: FloatArray) -> ComplexArray:
     """Poles of processes, (k, r)."""
     return np.linalg.eigvals(companions(coefficients)).astype(np.complex128)
-
-
-def block_diagonal(blocks: Sequence[FloatArray]) -> FloatArray:
-    """Return stacks of matrices (..., m, n) along the diagonals of larger ones."""
-    stack = np.broadcast_shapes(*(block.shape[:-2] for block in blocks))
-    rows, columns = np.sum([block.shape[-2:] for block in blocks], axis=0)
-    out = np.zeros((*stack, rows, columns))
-    i = j = 0
-    for block in blocks:
-        m, n = block.shape[-2:]
-        out[..., i : i + m, j : j + n] = block
-        i, j = i + m, j + n
-    return out
 
 
 def power_within_frames(
@@ -307,88 +301,176 @@ def power_within_frames(
     return np.asarray(np.square(driving_rms_nm) * np.sum(weights * gain * moving, axis=1) / np.pi)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ResidualBudget(Summarised):
-    """Stationary residual of a loop, by origin; of p loops, all have a first axis (p,).
+def loop_evaluator(loop: ClosedLoop, *, in_image: bool) -> Evaluator:
+    """Return the evaluator of one loop, with each phase of its period."""
+    hardware, s = loop.hardware, loop.system
+    settled = hardware.mirror is None and hardware.delay_frames % 1 == 0
+    n = hardware.modes
+    return _evaluator(
+        s.stacks(),
+        hardware.influence,
+        modes=np.arange(n)[None],
+        measurements=np.arange(s.B.shape[-1] - n)[None],
+        first=loop.controller.n_states,
+        frame_rate_hz=hardware.frame_rate_hz,
+        roots=period_roots(s.poles, s.period)[None],
+        hold=hardware.mirror_system.hold if in_image and not settled else None,
+        start=np.full(s.period, hardware.delay_frames - 1),
+        in_image=in_image,
+        phases=s.period,
+    )
 
-    Attributes
-    ----------
-    turbulence_nm2, noise_nm2, random_vibration_nm2 : (n, n) ndarray
-        Covariances over the modes [nm^2], of means over the hold of a command.
-    within_nm2 : (n, n) ndarray
-        Covariance of what moves within the hold of a command [nm^2]; zero in means over frames.
-    line_amplitudes_nm : (s, n) complex ndarray
-        Complex amplitude that each sinusoid leaves on each mode [nm], of such means.
-    stable : bool
-        Whether the loop is stable; what an unstable one leaves is nan.
+
+def _evaluator(
+    matrices: Matrices, influence: FloatArray, *, first: int, hold: Hold | None, **facts: Any
+) -> Evaluator:
+    """Return the evaluator of loops to ``[phi_res, u, ...]``, with the mirror's states behind."""
+    n, m = influence.shape
+    A, B, C, D = matrices
+    if hold is None:
+        C, D = C[:, :n], D[:, :n]
+    else:
+        C, D = hold.positions(influence, (C[:, n : n + m], D[:, n : n + m]), first)
+        C, D = (rows.reshape(len(rows), -1, rows.shape[-1]) for rows in (C, D))
+    return Evaluator(A=A, B=B, C=C, D=D, hold=hold, **facts)
+
+
+def period_roots(poles: ComplexArray, period: int) -> ComplexArray:
+    """Return where the poles of a period show in a response: at each of their roots."""
+    turns = np.exp(2j * np.pi * np.arange(period) / period)
+    roots = np.abs(poles) ** (1 / period) * np.exp(1j * np.angle(poles) / period)
+    return np.asarray((roots[:, None] * turns).ravel())
+
+
+def textbook_matrices(controllers: Sequence[Controller]) -> Matrices:
+    """Return controllers of as many states as balanced ``A, B, C, D`` in textbook form."""
+    systems = [controller.to_statespace() for controller in controllers]
+    systems = [system.balanced() if system.n_states else system for system in systems]
+    return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
+
+
+def close_loops(
+    matrices: Matrices,
+    hardware: LoopHardware,
+    sensor_gains: FloatArray,
+    delay_frames: FloatArray,
+    *,
+    in_image: bool = True,
+    together: Sequence[BoolArray] = (),
+) -> tuple[BoolArray, list[tuple[IntArray, list[Evaluator]]]]:
+    """Close loops of controllers at gains and delays (p,); return their stability (p,).
+
+    Loops of the same whole delay come with it, by their numbers (k,): an evaluator for each part.
+    Modes that one line shakes ``together``, (n,) for each, are in one part.
     """
-
-    turbulence_nm2: FloatArray
-    noise_nm2: FloatArray
-    random_vibration_nm2: FloatArray
-    within_nm2: FloatArray
-    line_amplitudes_nm: ComplexArray
-    stable: Any = True
-
-    def _brief(self) -> str:
-        modes, loops = self.noise_nm2.shape[-1], self.noise_nm2.shape[:-2]
-        if loops:
-            return f"{loops[0]} loops, {modes} modes"
-        return f"{nm_text(self.rms_nm, '.4g')} rms, {modes} modes"
-
-    def _summarise(self) -> Summary:
-        headings = {"rms_nm": "residual"} | {
-            f"{name}_nm": f"  {heading}" for name, heading in _ORIGINS.items()
-        }
-        nm = {"unit": "nm rms", "format": ".1f"}
-        named = {name: fact(getattr(self, name), text, **nm) for name, text in headings.items()}
-        rows = facts(**named)
-        return Summary(tables=[fact_table("Residual", rows)])
-
-    @property
-    def gaussian_nm2(self) -> FloatArray:
-        """Covariance of all that is Gaussian [nm^2]."""
-        steady = self.turbulence_nm2 + self.noise_nm2 + self.random_vibration_nm2
-        return frozen_copy(steady + self.within_nm2)
-
-    @property
-    def vibration_nm2(self) -> FloatArray:
-        """Covariance of all vibrations, the sinusoids by their mean power [nm^2]."""
-        a = self.line_amplitudes_nm
-        return frozen_copy(self.random_vibration_nm2 + np.real(transpose(a) @ a.conj()) / 2)
-
-    @property
-    def total_nm2(self) -> FloatArray:
-        """Covariance of the residual [nm^2]."""
-        steady = self.turbulence_nm2 + self.noise_nm2 + self.vibration_nm2
-        return frozen_copy(steady + self.within_nm2)
-
-    @property
-    def rms_nm(self) -> Any:
-        """Residual over all modes [nm rms]."""
-        return _rms(self.total_nm2)
-
-    @property
-    def turbulence_nm(self) -> Any:
-        """Residual turbulence over all modes [nm rms]."""
-        return _rms(self.turbulence_nm2)
-
-    @property
-    def vibration_nm(self) -> Any:
-        """Residual vibration over all modes [nm rms]."""
-        return _rms(self.vibration_nm2)
-
-    @property
-    def noise_nm(self) -> Any:
-        """Propagated noise over all modes [nm rms]."""
-        return _rms(self.noise_nm2)
-
-    @property
-    def within_nm(self) -> Any:
-        """What moves within frames over all modes, which no command follows [nm rms]."""
-        return _rms(self.within_nm2)
+    stable = np.ones(sensor_gains.size, dtype=np.bool_)
+    parts, rest = split_into_parts(matrices, hardware, together)
+    for A in rest:
+        stable &= _are_stable(np.linalg.eigvals(A).astype(np.complex128))
+    groups = []
+    for rows, fraction, mirrors, hold in _mirrors_by_delay(hardware, delay_frames):
+        seen = hold or (STILL if np.any(fraction) else None)
+        evaluators = []
+        for modes, measurements, controllers, sensor, influence in parts:
+            one = len(controllers[0]) == 1
+            controllers = controllers if one else tuple(matrix[rows] for matrix in controllers)
+            closed = _interpolated_loops(
+                controllers, mirrors, sensor, influence, sensor_gains[rows], fraction
+            )
+            poles = np.linalg.eigvals(closed[0]).astype(np.complex128)
+            stable[rows] &= _are_stable(poles)
+            part = _evaluator(
+                closed,
+                influence,
+                modes=modes,
+                measurements=measurements,
+                first=controllers[0].shape[-1],
+                frame_rate_hz=hardware.frame_rate_hz,
+                roots=poles,
+                hold=seen if in_image else None,
+                start=delay_frames[rows] - 1,
+                in_image=in_image,
+                phases=1,
+            )
+            evaluators.append(part)
+        groups.append((rows, evaluators))
+    return stable, groups
 
 
-def _rms(covariance: FloatArray) -> Any:
-    root = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
-    return root if root.ndim else float(root)
+def _interpolated_loops(
+    controllers: Matrices,
+    mirrors: tuple[Response, Response],
+    sensor: FloatArray,
+    influence: FloatArray,
+    gains: FloatArray,
+    fraction: FloatArray,
+) -> Matrices:
+    """Close loops (k, ., .) whose mirrors are ``(1 - fraction) first + fraction second``."""
+    ends = [
+        loop_matrices(*controllers, mirror=mirror, readings=last_frame(sensor), influence=influence)
+        for mirror in mirrors
+    ]
+    share, gain = fraction[:, None, None], gains[:, None, None]
+    A0, A1, B, C0, C1, D = (one + share * (two - one) for one, two in zip(*ends, strict=True))
+    return A0 + gain * A1, B, C0 + gain * C1, D
+
+
+def split_into_parts(
+    matrices: Matrices, hardware: LoopHardware, together: Sequence[BoolArray] = ()
+) -> tuple[list[Part], list[FloatArray]]:
+    """Split a loop into independent parts, equal ones once, and what reaches no mode.
+
+    Modes that are ``together``, (n,) for each, stay in one part.
+    """
+    A, B, C, D = matrices
+    sensor, influence = hardware.sensor, hardware.influence
+    s, q, m, n = A.shape[-1], B.shape[-1], C.shape[-2], hardware.modes
+    x, y, u, r = np.split(np.arange(s + q + m + n), np.cumsum([s, q, m]))
+    links = np.zeros((s + q + m + n, s + q + m + n), dtype=np.bool_)
+    controller = (x, x, A), (x, y, B), (u, x, C), (u, y, D)
+    for rows, columns, entries in (*controller, (y, r, sensor[None]), (r, u, influence[None])):
+        sizes = np.abs(entries)
+        largest = np.max(sizes, axis=(1, 2), keepdims=True, initial=0.0)
+        links[np.ix_(rows, columns)] = np.any(sizes > _ZERO * largest, axis=0)
+    for shaken in together:
+        links[np.ix_(r[shaken], r[shaken])] = True
+    label = component_labels(links)
+    parts: dict[tuple[bytes, ...], Part] = {}
+    rest = []
+    for i in range(np.max(label) + 1):
+        states, inputs, commands, modes = (np.flatnonzero(label[k] == i) for k in (x, y, u, r))
+        entry, leaving = states[:, None], commands[:, None]
+        law = A[:, entry, states], B[:, entry, inputs], C[:, leaving, states], D[:, leaving, inputs]
+        path = sensor[np.ix_(inputs, modes)], influence[np.ix_(modes, commands)]
+        key = tuple(matrix.tobytes() for matrix in (*law, *path))
+        if modes.size and key in parts:
+            modes = np.vstack([parts[key][0], modes])
+            inputs = np.vstack([parts[key][1], inputs])
+        if modes.size:
+            parts[key] = np.atleast_2d(modes), np.atleast_2d(inputs), law, *path
+        elif states.size:
+            rest.append(law[0])
+    return list(parts.values()), rest
+
+
+def _mirrors_by_delay(
+    hardware: LoopHardware, delay_frames: FloatArray
+) -> Iterator[tuple[IntArray, FloatArray, tuple[Response, Response], Hold | None]]:
+    """Yield rows, fractions and mirrors by whole delay, or by delay if the mirror has dynamics."""
+    if hardware.mirror is not None:
+        for delay in np.unique(delay_frames):
+            mirror = mirror_system(hardware.mirror, hardware.frame_rate_hz, float(delay))
+            rows = np.flatnonzero(delay_frames == delay)
+            yield rows, np.zeros(rows.size), (mirror.whole, mirror.whole), mirror.hold
+        return
+    lead = np.floor(delay_frames - 1).astype(np.int64)
+    fraction = delay_frames - 1 - lead
+    for frames in np.unique(lead):
+        rows = np.flatnonzero(lead == frames)
+        taps = np.zeros((2, frames + (2 if np.any(fraction[rows] > 0) else 1)))
+        taps[0, frames] = taps[1, -1] = 1.0
+        yield rows, fraction[rows], (tapped_mirror(taps[0]), tapped_mirror(taps[1])), None
+
+
+def _are_stable(poles: ComplexArray) -> BoolArray:
+    return np.asarray(np.max(np.abs(poles), axis=-1) < 1 - STABILITY_MARGIN)

@@ -93,36 +93,9 @@ class BrokenLoop:
 
 
 def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
-    """Break a stable loop at each measurement in turn, the others closed.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        The loop.
-
-    Returns
-    -------
-    tuple of BrokenLoop
-        One for each response; measurements whose responses are equal share it.
-
-    Raises
-    ------
-    UnstableLoopError
-        If the loop is not stable.
-
-    Examples
-    --------
-    An integrator of gain 0.5 in a two-frame loop has a phase margin of 90 - 3 asin(0.25) degrees:
-
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> both = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller)
-    >>> (found,) = lbt.loop.broken_loops(both)
-    >>> found.measurements, round(found.phase_margin.phase_deg, 2)
-    ((0, 1), 46.57)
-    """
+    """Break a stable loop at each measurement in turn, the others closed; equal ones share it."""
     loop.require_stable()
-    system, nyquist = loop.output_sensitivity(), loop.hardware.frame_rate_hz / 2
+    system, nyquist = loop.path("noise", "reading"), loop.hardware.frame_rate_hz / 2
     panels = graded_edges(loop.controller.to_statespace().poles)  # resonances of the open loop
     edges = np.union1d(resonance_edges(loop), panels[panels > 1e-6] * nyquist)
     nodes, _ = gauss_panels(edges, 12)
@@ -163,8 +136,8 @@ def gain_crossings(loop: ClosedLoop) -> list[MarginPoint]:
 
 def _own_sensitivities(loop: ClosedLoop) -> dict[int, StateSpace]:
     """Return the sensitivity of each measurement to itself, balanced."""
-    system = loop.output_sensitivity()
-    system.require_one_phase("a broken loop", "output_sensitivity().lifted()")
+    system = loop.path("noise", "reading")
+    system.require_one_phase("a broken loop", "path('noise', 'reading').lifted()")
     sensitivities = {}
     for outputs, inputs, part in split_into_parts(system):
         for measurement in np.intersect1d(outputs, inputs).tolist():
@@ -242,9 +215,10 @@ class LoopMargins(Summarised):
         unit="deg",
         help="Least phase lag that destabilises; inf without a crossover",
     )
-    delay_s: float = column(unit="s", help="Least further delay of the loop that destabilises")
     delay_frames: float = column(
-        "delay margin", unit="frames", help="The same; inf if the longest delay is stable"
+        "delay margin",
+        unit="frames",
+        help="Least further delay that destabilises; inf if the longest delay is stable",
     )
     early_frames: float = column(
         "early delay margin",
@@ -360,11 +334,10 @@ def loop_margins(loop: ClosedLoop) -> LoopMargins:
     delay, early = (delay_margin_frames(loop, sign=sign) for sign in (1, -1))
     disk = _disk_margin(loop)
     return LoopMargins(
-        modulus=1 / float(hinf_norm(loop.output_sensitivity())),
+        modulus=1 / float(hinf_norm(loop.path("noise", "reading"))),
         gain_low=low / loop.sensor_gain,
         gain_high=high / loop.sensor_gain,
         phase_deg=min((point.phase_deg for point in crossings), default=np.inf),
-        delay_s=delay / loop.hardware.frame_rate_hz,
         delay_frames=delay,
         early_frames=early,
         together=errors_together(loop),
@@ -384,7 +357,7 @@ def _disk_margin(loop: ClosedLoop) -> float:
     doi:10.1109/MCS.2020.3005277, with the norm of ``(S - T) / 2`` in place of its structured
     singular value, which for one measurement is the same.
     """
-    S = loop.output_sensitivity()
+    S = loop.path("noise", "reading")
     centred = replace(S, D=S.D - np.eye(len(S.D)) / 2)
     parts = independent_parts(centred)  # each measurement is an input and an output of its part
     return 1 / max(hinf_norm(part).upper for part in parts)

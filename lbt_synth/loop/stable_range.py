@@ -42,13 +42,12 @@ from lbt_synth.loop.closed_loop import (
     checked_loop_matrices,
     close_loop,
 )
-from lbt_synth.loop.ensemble import textbook_matrices
-from lbt_synth.loop.stacks import close_loops
+from lbt_synth.loop.evaluator import close_loops, textbook_matrices
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import instant_mirror, tapped_mirror
 from lbt_synth.storage.rows import column, fact_table, table_row
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number, require_instance
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, number
 
 AffinePart: TypeAlias = tuple[FloatArray, FloatArray]  # A0 and A1 of ``A0[t] + g A1[t]``
 
@@ -66,7 +65,6 @@ _LONGEST = 100  # delay up to which it is sought [frames]
 # loop with a pole nearer to the unit circle does not count as stable.
 CIRCLE_LIMIT = 1 - 1e-7
 _WIDEST_MOVING = 100.0  # factor on the loop's gain beyond which no pyramid's optical gain lies
-_NONE = np.zeros(0)
 # a loop of another gain, over the one assumed, and delay [frames], and taps of
 # ``z^-1 (M_d - g M_d')``, (t,)
 LoopChange: TypeAlias = tuple[float, float, FloatArray]
@@ -243,20 +241,17 @@ def _last_stable(
     steps: Iterable[FloatArray],
     *,
     rounds: int,
-    further: FloatArray = _NONE,
 ) -> float | None:
     """Return the last stable number before the first that is not, None if all are stable.
 
-    Each of the steps begins with a stable number. The step in which one is unstable is divided
-    again and again; ``further`` numbers are tried wherever they lie within.
+    Each of the steps begins with a stable number. The one in which one is unstable is divided again
+    and again.
     """
     for numbers in steps:
         unstable = np.flatnonzero(~are_stable(numbers[1:]))
         for _ in range(rounds if unstable.size else 0):
             first, last = numbers[unstable[0]], numbers[unstable[0] + 1]
-            within = further[(further - first) * (further - last) < 0]
-            numbers = np.concatenate([np.linspace(first, last, _FINER + 1), within])
-            numbers = np.sort(numbers)[:: 1 if first < last else -1]
+            numbers = np.linspace(first, last, _FINER + 1)
             unstable = np.append(np.flatnonzero(~are_stable(numbers[1:])), numbers.size - 2)
         if unstable.size:
             return float(numbers[unstable[0]])
@@ -288,7 +283,7 @@ def delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
         np.union1d(np.linspace(low, high, _DIVISION + 1), peaks[(peaks > low) & (peaks < high)])
         for low, high in pairwise(ends)
     )
-    last = _last_stable(are_stable, steps, rounds=_DELAY_ROUNDS, further=peaks)
+    last = _last_stable(are_stable, steps, rounds=_DELAY_ROUNDS)
     return np.inf if last is None else last
 
 
@@ -318,39 +313,13 @@ def circle_norm(loop: ClosedLoop, *, low: float, high: float) -> float:
     centred = close_loop(loop.hardware, loop.controller, sensor_gain=middle)
     if not centred.is_stable:
         return np.inf
-    S = centred.output_sensitivity()
+    S = centred.path("noise", "reading")
     T = replace(S, C=-S.C, D=np.eye(len(S.D)) - S.D)
     return (high - low) / (2 * middle) * hinf_norm(T).upper
 
 
 def moving_gain(loop: ClosedLoop) -> MovingGain:
-    """Find the interval of a moving sensor gain in which a loop is proved stable.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        The loop, stable at its sensor gain.
-
-    Returns
-    -------
-    MovingGain
-        The intervals, in sensor gains relative to the sensor matrix.
-
-    Raises
-    ------
-    UnstableLoopError
-        If the loop is not stable.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
-    >>> moving = lbt.loop.moving_gain(lbt.close_loop(path, lazy))
-    >>> round(moving.constant_high, 3), round(moving.moving_low, 3), round(moving.moving_high, 3)
-    (2.0, 0.06, 1.527)
-    """
-    require_instance(loop, ClosedLoop, "loop")
+    """Find the interval of a moving sensor gain in which a loop, stable at its own, is proved."""
     loop.require_stable()
     nominal = loop.sensor_gain
     constant = stable_sensor_gains(loop.hardware, loop.controller, nominal=nominal)
@@ -442,11 +411,6 @@ def _largest_proved(proves: Callable[[float], bool], most: float) -> float:
 
 def _answer_to_noise(loop: ClosedLoop) -> StateSpace:
     """Return the system from the noise to what the sensor sees of the commands it causes."""
-    hardware, commanding = loop.hardware, loop.commanding()
-    n, seen = hardware.modes, loop.sensor_gain * hardware.sensor @ hardware.influence
-    return replace(
-        commanding,
-        B=commanding.B[:, n:],
-        C=seen @ commanding.C,
-        D=seen @ commanding.D[:, n:],
-    )
+    hardware, commands = loop.hardware, loop.path("noise", "command")
+    seen = loop.sensor_gain * hardware.sensor @ hardware.influence
+    return replace(commands, C=seen @ commands.C, D=seen @ commands.D)

@@ -20,7 +20,7 @@ from scipy.special import j0, j1
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.loop.evaluator import ResidualBudget
+from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -84,15 +84,21 @@ class Imaging:
         return 4 / (self.wavelength_um * 1e3)
 
 
-def strehl(budget: ResidualBudget, imaging: Imaging) -> Any:
-    """Strehl ratio, in [0, 1], of a loop's exact residual on one or two axes.
+def strehl(
+    residual: ResidualBudget | ArrayLike, imaging: Imaging, *, line_amplitudes_nm: ArrayLike = ()
+) -> Any:
+    """Strehl ratio, in [0, 1], of the exact residual of a loop or of many, on one or two axes.
 
     Parameters
     ----------
-    budget : ResidualBudget
-        Residual of tip and tilt, of one loop or of p.
+    residual : ResidualBudget, or (2, 2), (1, 1) or (p, n, n) array_like
+        Residual of tip and tilt, of one loop or of p; or covariance of Gaussian jitter on the axes
+        [nm^2 rms wavefront].
     imaging : Imaging
         The camera.
+    line_amplitudes_nm : (s, n) or (p, s, n) complex array_like, optional
+        Beside a covariance, amplitude and phase of each sinusoid on each axis [nm]; the sinusoids
+        must have different frequencies.
 
     Returns
     -------
@@ -102,80 +108,40 @@ def strehl(budget: ResidualBudget, imaging: Imaging) -> Any:
 
     Raises
     ------
-    DimensionError
-        If the loop has more than two modes.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800)
-    >>> quiet = lbt.Controller(
-    ...     A=0.0, B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=[[0.0] * 2] * 2, dt_s=1 / 800
-    ... )
-    >>> still = lbt.residual_budget(lbt.close_loop(path, quiet), lbt.Truth(turbulence=None))
-    >>> round(lbt.strehl(still, lbt.Imaging(diameter_m=8.22, other_modes=0.84)), 12)
-    0.84
-    """
-    stable = np.asarray(budget.stable)
-    out = np.full(stable.shape, np.nan)
-    lines = budget.line_amplitudes_nm[stable] if stable.ndim else budget.line_amplitudes_nm
-    jitter = budget.gaussian_nm2[stable] if stable.ndim else budget.gaussian_nm2
-    out[stable] = jitter_strehl(jitter, imaging=imaging, line_amplitudes_nm=lines)
-    return out if stable.ndim else float(out)
-
-
-def jitter_strehl(
-    covariance_nm2: ArrayLike, *, imaging: Imaging, line_amplitudes_nm: ArrayLike = ()
-) -> Any:
-    """Strehl ratio of Gaussian and sinusoidal jitter, or of many jitters.
-
-    Parameters
-    ----------
-    covariance_nm2 : (2, 2), (1, 1) or (p, n, n) array_like
-        Covariance of the Gaussian jitter on the axes [nm^2 rms wavefront].
-    imaging : Imaging
-        The camera.
-    line_amplitudes_nm : (s, n) or (p, s, n) complex array_like, optional
-        Amplitude and phase of each sinusoid on each axis [nm]; the sinusoids
-        must have different frequencies.
-
-    Returns
-    -------
-    float or (p,) ndarray
-        Strehl ratio in [0, 1], the other modes included; 0 where the image moves by more than 160
-        times its width.
-
-    Raises
-    ------
     ProblemError
-        If a value is not finite, the covariance is indefinite, or sizes clash.
+        If there are more than two axes, a value is not finite, the covariance is indefinite, or
+        sizes clash.
 
     Examples
     --------
     >>> import lbt_synth as lbt
     >>> camera = lbt.Imaging(diameter_m=8.22)
-    >>> round(lbt.loop.jitter_strehl([[300**2, 0], [0, 300**2]], imaging=camera), 3)
+    >>> round(lbt.strehl([[300**2, 0], [0, 300**2]], camera), 3)
     0.379
     """
-    covariance = semidefinite(covariance_nm2, "covariance_nm2", stacked=True)
-    lines = np.asarray(line_amplitudes_nm, dtype=np.complex128)
-    real_array(np.abs(lines), "line_amplitudes_nm")
-    alone, size = covariance.ndim == 2, covariance.shape[-1]
-    _require_axes(size)
-    lines = lines if lines.size else np.zeros((*covariance.shape[:-2], 0, size), np.complex128)
-    if (*lines.shape[:-2], lines.shape[-1]) != covariance.shape[:-1]:
-        counts = (*covariance.shape[:-2], "sinusoids", size)
-        raise DimensionError(
-            f"line_amplitudes_nm must be ({', '.join(map(str, counts))}); got {lines.shape}."
-        )
-    if alone:
-        covariance, lines = covariance[None], lines[None]
-    deviation = np.sqrt(np.max(np.diagonal(covariance, axis1=1, axis2=2), axis=1))
+    if isinstance(residual, ResidualBudget):
+        stable, jitter = np.asarray(residual.stable), residual.gaussian_nm2
+        lines = residual.line_amplitudes_nm
+    else:
+        jitter = semidefinite(residual, "the covariance", stacked=True)
+        stable, lines = np.ones(jitter.shape[:-2], bool), np.asarray(line_amplitudes_nm, complex)
+        real_array(np.abs(lines), "line_amplitudes_nm")
+        lines = lines if lines.size else np.zeros((*stable.shape, 0, jitter.shape[-1]), complex)
+        if (*lines.shape[:-2], lines.shape[-1]) != jitter.shape[:-1]:
+            counts = (*stable.shape, "sinusoids", jitter.shape[-1])
+            raise DimensionError(
+                f"line_amplitudes_nm must be ({', '.join(map(str, counts))}); got {lines.shape}."
+            )
+    _require_axes(jitter.shape[-1])
+    jitter, lines = jitter[stable], lines[stable]
+    deviation = np.sqrt(np.max(np.diagonal(jitter, axis1=1, axis2=2), axis=1))
     spread = (deviation + np.sum(np.abs(lines), axis=(1, 2))) * imaging.cycles_per_nm
-    out, near = np.zeros(len(spread)), spread <= _MOST_TURNS
+    ratios, near = np.zeros(len(spread)), spread <= _MOST_TURNS
     if np.any(near):
-        out[near] = _integrated_otf(covariance[near], lines[near], spread[near], imaging)
-    return float(out[0]) if alone else out
+        ratios[near] = _integrated_otf(jitter[near], lines[near], spread[near], imaging)
+    out = np.full(stable.shape, np.nan)
+    out[stable] = ratios
+    return out if out.ndim else float(out)
 
 
 def _integrated_otf(

@@ -17,14 +17,14 @@ from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.linear import Controller
 from lbt_synth.loop import (
     ClosedLoop,
-    LoopMargins,
-    ResidualBudget,
     loop_margins,
     residual_budget,
     stable_sensor_gains,
 )
-from lbt_synth.loop.least_residuals.band_limit import BandLimit
-from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
+from lbt_synth.loop.band_limit import BandLimit
+from lbt_synth.loop.budget import ResidualBudget
+from lbt_synth.loop.least_residual import ResidualLimit
+from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.figures.loops import draw_bode, draw_sigma, draw_steps, sigma_curves
@@ -43,8 +43,9 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, columns, fact, facts, row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, listing_text
-from lbt_synth.studies import LimitRow, RobustnessMap, robustness_map
-from lbt_synth.studies.limits import LimitStudy, compare_in_truth, say_residual
+from lbt_synth.studies import robustness_map
+from lbt_synth.studies.limits import LimitRow, LimitStudy, compare_in_truth, say_residual
+from lbt_synth.studies.robustness import RobustnessMap
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
 

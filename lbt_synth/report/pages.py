@@ -18,7 +18,8 @@ from numpy.typing import ArrayLike
 from lbt_synth.identification.diagnosis import Diagnosis, law_facts
 from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
-from lbt_synth.loop import LoopMargins, close_loop, loop_margins
+from lbt_synth.loop import close_loop, loop_margins
+from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.request import fixed_design
 from lbt_synth.report.draw import (
     GUIDE,
@@ -43,20 +44,19 @@ from lbt_synth.report.page.html import (
 from lbt_synth.storage.rows import row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, duration_text
-from lbt_synth.studies import Study
 from lbt_synth.studies.grid import Failure
 from lbt_synth.studies.study.statistics import (
     ControllerStatistics,
     Samples,
     StudyStatistics,
+    controller_samples,
     percent,
-    read_column,
-    read_controller_samples,
     residual_table,
     sensitivity_table,
     strehl_table,
     worst_table,
 )
+from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import FloatArray
 
 _POINTS = 400  # of a cumulative distribution
@@ -105,21 +105,20 @@ def study_page(
     Examples
     --------
     >>> import lbt_synth as lbt
+    >>> from lbt_synth.studies.study.statistics import study_statistics
     >>> study = lbt.studies.load_study("examples/study.yaml")
-    >>> columns = dict(zip(study.parameter_names, study.values(0, 2).T))
+    >>> columns = dict(zip(study.parameter_names, study.values(0, 2).T)) | {"row": [0, 1]}
     >>> columns |= {f"kalman.{name}": [1.0, 0.5] for name in ("strehl", "residual_nm")}
     >>> columns["kalman.stable"] = [1, 1]
-    >>> statistics = lbt.studies.study_statistics(columns, study.parameter_names, ["kalman"])
+    >>> statistics = study_statistics(columns, study.parameter_names, ["kalman"])
     >>> lbt.report.study_page(study, columns, statistics).title
     'Robustness study study.yaml'
     """
     samples = {
-        controller.controller: read_controller_samples(columns, controller.controller)
+        controller.controller: controller_samples(columns, controller.controller)
         for controller in statistics.controllers
     }
-    values = {
-        name: read_column(columns, name, statistics.samples) for name in statistics.parameters
-    }
+    values = {name: np.asarray(columns[name], float) for name in statistics.parameters}
     varying = sum(np.ptp(column) > 0 for column in values.values())
     return new_page(
         f"Robustness study {study.source.name}",
@@ -221,8 +220,7 @@ def _samples_blocks(study: Study, values: Mapping[str, FloatArray]) -> list[Bloc
     ]
     headings = ("parameter", "distribution", "least", "median", "greatest")
     return [
-        f"{study.samples} samples (sampling: {settings.sampling}, seed: {settings.seed}, "
-        f"evaluation: {settings.evaluation}).",
+        f"{study.samples} samples of a Sobol sequence (seed: {settings.seed}).",
         Table(caption="Parameters", headings=headings, rows=tuple(rows), words=(1,)),
     ]
 

@@ -1,12 +1,5 @@
-from .limits import LimitRow as LimitRow
-from .limits import limits as limits
-from .paper import end_to_end_tables as end_to_end_tables
-from .robustness import RobustnessMap as RobustnessMap
-from .robustness import RobustnessRow as RobustnessRow
 from .robustness import robustness as robustness
 from .robustness import robustness_map as robustness_map
 from .robustness import tradeoff as tradeoff
 from .study.run import run_study as run_study
-from .study.statistics import study_statistics as study_statistics
-from .study.study import Study as Study
 from .study.study import load_study as load_study

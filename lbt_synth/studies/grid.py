@@ -1,9 +1,8 @@
-"""One grid: samples, a function of one of them or of a stack, an executor, and parts on disk.
+"""A grid of many samples: a function of some of them, an executor, and parts on disk.
 
-What a loop leaves has the same columns for one loop and for a stack of them. A grid of a few
-samples is in memory (:func:`evaluate`). One of many is a :class:`Sweep`: a part holds the results
-of a fixed number of consecutive rows in a file that is named by them, and a sweep that was killed
-at any moment goes on with the rows that no part has.
+What a loop leaves has the same columns for one loop and for a stack of them. A part of a
+:class:`Sweep` holds the results of a fixed number of consecutive rows in a file that is named by
+them, and a sweep that was killed at any moment goes on with the rows that no part has.
 """
 
 from __future__ import annotations
@@ -13,17 +12,18 @@ import json
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent import futures
 from dataclasses import dataclass
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn, TypeVar
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
 from lbt_synth.errors import LbtSynthError, NumericalError, OutputError
-from lbt_synth.loop import ClosedLoop, Imaging, ResidualBudget, residual_budget, strehl
+from lbt_synth.loop import ClosedLoop, Imaging, residual_budget, strehl
+from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.models import Truth
 from lbt_synth.storage import array_file
 from lbt_synth.storage.atomic_files import (
@@ -38,7 +38,6 @@ from lbt_synth.validation import FloatArray
 Rows = tuple[int, int]  # the first, and the one after the last
 Failure = tuple[int, str, str]  # a row, the controller without a result on it, and why
 Result = tuple[dict[str, FloatArray], list[Failure]]  # columns of some rows (b,), and failures
-Answer = TypeVar("Answer")
 RESIDUALS = {"residual_nm": "rms_nm"} | {  # columns, and the attributes of what has them
     name: name for name in ("turbulence_nm", "vibration_nm", "noise_nm", "within_nm")
 }
@@ -171,26 +170,7 @@ class Sweep:
         return Part(results, failures, sum(part.seconds for part in parts)), computed
 
 
-def evaluate(
-    function: Callable[..., Answer],
-    samples: Iterable[tuple[Any, ...]],
-    executor: futures.Executor | None = None,
-) -> Iterator[Answer]:
-    """Yield what a function returns for the arguments of each sample, in the order of samples.
-
-    The function and the arguments of an executor must be such that other processes can read them.
-    """
-    tasks = (((i, i + 1), arguments) for i, arguments in enumerate(samples))
-    early: dict[int, Answer] = {}
-    following = 0
-    for (row, _), answer, _ in _compute(function, tasks, executor, _in_flight(executor)):
-        early[row] = answer
-        while following in early:
-            yield early.pop(following)
-            following += 1
-
-
-def _in_flight(executor: futures.Executor | None, workers: int | None = None) -> int:
+def _in_flight(executor: futures.Executor | None, workers: int | None) -> int:
     """Return how many tasks an executor has at once: two a worker, so that none waits."""
     if executor is None:
         return 1
@@ -198,22 +178,22 @@ def _in_flight(executor: futures.Executor | None, workers: int | None = None) ->
 
 
 def _compute(
-    function: Callable[..., Answer],
+    function: Callable[..., Result],
     tasks: Iterator[tuple[Rows, tuple[Any, ...]]],
     executor: futures.Executor | None,
     in_flight: int,
-) -> Iterator[tuple[Rows, Answer, float]]:
+) -> Iterator[tuple[Rows, Result, float]]:
     """Yield results as they come; if one task fails as a whole, the others are given up."""
     for rows, arguments in tasks if executor is None else ():
         with _explain_failure(rows):
-            result, seconds = timed(function, *arguments)
+            result, seconds = _timed(function, *arguments)
         yield rows, result, seconds
-    running: dict[futures.Future[tuple[Answer, float]], Rows] = {}
+    running: dict[futures.Future[tuple[Result, float]], Rows] = {}
     try:
         while executor is not None:
             for rows, arguments in islice(tasks, in_flight - len(running)):
                 with _explain_failure(rows):
-                    running[executor.submit(timed, function, *arguments)] = rows
+                    running[executor.submit(_timed, function, *arguments)] = rows
             if not running:
                 return
             for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
@@ -231,7 +211,7 @@ def refuse(path: Path, why: str, cause: Exception | None = None) -> NoReturn:
     raise OutputError(f"{path} {why}", path=path) from cause
 
 
-def timed(function: Callable[..., Answer], *arguments: Any) -> tuple[Answer, float]:
+def _timed(function: Callable[..., Result], *arguments: Any) -> tuple[Result, float]:
     """Call a function, and return its result and its seconds."""
     before = time.perf_counter()
     result = function(*arguments)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,26 +16,18 @@ from lbt_synth.loop import (
     ClosedLoop,
     Imaging,
     least_residual,
-    least_worst_residual,
     residual_budget,
 )
-from lbt_synth.loop.least_residuals.residual_limit import (
-    ResidualLimit,
-    above_percent,
-    limit_or_none,
-)
+from lbt_synth.loop.band_limit import BandLimit, least_worst_residual
+from lbt_synth.loop.least_residual import ResidualLimit, above_percent, limit_or_none
 from lbt_synth.loop.margins import phase_margin_deg
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import column, fill_row, nm_column, percent_column, table_row
-from lbt_synth.studies.grid import evaluate, loop_columns
+from lbt_synth.studies.grid import loop_columns
 from lbt_synth.validation import FloatArray, frozen_copy, number
-
-if TYPE_CHECKING:
-    from lbt_synth.loop.least_residuals.band_limit import BandLimit
-    from lbt_synth.loop.least_residuals.residual_limit import ResidualLimit
 
 _GRID = 65  # shifts over the range of errors, at least
 _CLEAR = 0.01  # of the residual's variance by which a reference has to be better
@@ -113,52 +103,11 @@ def limits(
     imaging: Imaging,
     *,
     errors_hz: Sequence[float] = (0.0,),
-    executor: Executor | None = None,
 ) -> LimitStudy:
-    """Evaluate designs exactly and compare them with the limits.
+    """Evaluate designs exactly under a truth, and compare them with the limits.
 
-    Parameters
-    ----------
-    designs : mapping of str to Design
-        Designs by name; each is left as it is while the truth moves.
-    hardware : LoopHardware
-        The loop in which all of them run.
-    truth : Truth
-        What the loop really meets.
-    imaging : Imaging
-        The camera.
-    errors_hz : sequence of float, optional
-        True frequency less that of the model [Hz], of the vibration that moves most; the others
-        move in proportion (``truth.frequency_errors_hz``), over the whole range between the
-        extremes.
-    executor : concurrent.futures.Executor, optional
-        Runs the samples, in processes for example; it is left open. By default they run here.
-
-    Returns
-    -------
-    LimitStudy
-        Rows in the order of the designs.
-
-    Raises
-    ------
-    ProblemError
-        If a design or a vibration does not fit the loop, or there is no design.
-    NumericalError
-        If an integral does not settle.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
-    >>> study = lbt.studies.limits(
-    ...     {"by hand": lbt.integrator(path, gain=0.5)},
-    ...     path,
-    ...     lbt.Truth(turbulence=slow, noise_nm=5.0),
-    ...     lbt.Imaging(diameter_m=8.22),
-    ... )
-    >>> study.rows[0].above_limit_percent > 0
-    True
+    The errors are true frequencies less those of the model [Hz], of the vibration that moves most;
+    the others move in proportion, over the whole range between the extremes.
     """
     if not designs:
         raise ProblemError("a study of limits needs at least one design; got none.")
@@ -179,8 +128,10 @@ def limits(
         band = limit_or_none(partial(least_worst, rms_nm=line.rms_nm, direction=line.direction))
     bounds_nm = tuple(np.nan if bound is None else bound.rms_nm for bound in (limit, band))
     met = hardware, truth, imaging
-    samples = ((name, design, met, shifts, bounds_nm) for name, design in designs.items())
-    rows, curves = zip(*evaluate(_limit_row, samples, executor), strict=True)
+    rows, curves = zip(
+        *(_limit_row(name, design, met, shifts, bounds_nm) for name, design in designs.items()),
+        strict=True,
+    )
     return LimitStudy(
         rows=rows,
         limit=limit,

@@ -362,52 +362,11 @@ def end_to_end_tables(
 ) -> list[Facts]:
     """Run Tables II and III of Agapito et al. 2008 end to end, or what is missing of them.
 
-    Each run has a file of its own: started again in the same directory with the same arguments,
+    Each run has a file of its own in an existing directory: started again with the same arguments,
     only the missing ones run. All controllers of a row meet the same air, vibrations and noise.
-
-    Parameters
-    ----------
-    setup : EndToEndSetup
-        The system, for the paper's frame rate and delay.
-    directory : path-like
-        An existing directory for the results of the runs.
-    designs : mapping of str to Design, optional
-        Fixed designs beside the paper's filters; the vibration moves under them.
-    seeds, row_seeds : sequence of int, optional
-        Seeds of Table II and of the row at 20 Hz; seeds of the other rows.
-    tables : sequence of str, optional
-        Which of "II" and "III".
-    executor : concurrent.futures.Executor, optional
-        Runs the cases, in processes for example; it is left open. By default they run here.
-    workers : int, optional
-        How many cases the executor runs at once, if it does not say so itself.
-    progress : callable, optional
-        Called with the number of runs that were found or finished since its last call.
-
-    Returns
-    -------
-    list of Facts
-        One per row and controller: ``table``, ``label``, ``method``, ``error_hz``, and the mean and
-        the scatter over seeds of the Strehl ratio, ``strehl`` and ``scatter`` [points], beside
-        ``paper`` and ``modal``, the modal analysis with what was measured [%].
-
-    Raises
-    ------
-    MissingExtraError
-        If SPECULA is missing: ``pip install "lbt-synth[e2e]"``.
-    ProblemError
-        If the loop is not that of the paper, or a design is for another.
-    OutputError
-        If the directory holds results of other settings, or cannot be written.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> setup = lbt.load_config("examples/lbt.yaml").end_to_end
-    >>> lbt.studies.end_to_end_tables(setup, "nowhere/at/all", tables=["IV"])
-    Traceback (most recent call last):
-        ...
-    lbt_synth.errors.ProblemError: tables must be one of II, III; got 'IV'.
+    The seeds are those of Table II and of the row at 20 Hz, and those of the other rows. Each row
+    and controller has the mean and the scatter over seeds of its Strehl ratio [points], beside that
+    of the paper and of the modal analysis with what was measured [%].
     """
     planned = plan_cases(setup, designs, seeds=seeds, row_seeds=row_seeds, tables=tables)
     cases = all_cases(planned)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, TypeAlias
@@ -25,19 +24,19 @@ from lbt_synth.design.mixed import central_filter, require_taps
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import EstimationProblem
+from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import (
     Imaging,
-    LoopEnsemble,
-    Simulation,
     close_loop,
-    ensemble_residuals,
     loop_margins,
     residual_budget,
     simulate,
 )
-from lbt_synth.loop.budget import settling_error
-from lbt_synth.loop.ensemble import ensemble_vibration
-from lbt_synth.loop.simulation.run import Drop, Segment, run_segments
+from lbt_synth.loop.budget import ensemble_residuals
+from lbt_synth.loop.closed_loop import require_matching_controller
+from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
+from lbt_synth.loop.evaluator import textbook_matrices
+from lbt_synth.loop.simulation import Drop, Segment, Simulation, run_segments
 from lbt_synth.methods.registry import MIXED, record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import LoopHardware, SinusoidalVibration, TipTiltPlant, Truth, Vibration
@@ -54,7 +53,7 @@ from lbt_synth.storage.rows import (
     percent_column,
     table_row,
 )
-from lbt_synth.studies.grid import evaluate, loop_columns, residual_columns
+from lbt_synth.studies.grid import loop_columns, residual_columns
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
@@ -71,7 +70,6 @@ _Loop: TypeAlias = tuple[Design, LoopHardware, Truth, Imaging]
 _MovedLines: TypeAlias = Sequence[tuple[Vibration | SinusoidalVibration, FloatArray]]
 FAMILIES = (MIXED.name, "central")
 _CROWDING = 1.5  # above 1, points are denser near the least norm
-_GAINS_AT_ONCE = 64  # of a map
 
 
 @table_row
@@ -100,8 +98,6 @@ def robustness(
     errors_hz: Sequence[float],
     methods: Sequence[str] | None = None,
     gamma_ratio: float = 1.2,
-    hold: str = "driving",
-    executor: Executor | None = None,
 ) -> Iterator[RobustnessRow]:
     """Design at each frequency error and evaluate exactly against the same truth.
 
@@ -121,10 +117,6 @@ def robustness(
         filter.
     gamma_ratio : float, optional
         H-infinity bound as a multiple of each row's least gamma.
-    hold : {"driving", "rms"}, optional
-        What the model keeps of a vibration when its frequency moves.
-    executor : concurrent.futures.Executor, optional
-        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Yields
     ------
@@ -151,32 +143,20 @@ def robustness(
         raise ProblemError(
             "a frequency error needs a vibration in the model; got a plant without any."
         )
-    names = default_methods() if methods is None else methods
+    reference = [method.name for method in reference_methods(estimators_only=True)]
+    names = reference if methods is None else methods
     for name in names:
         choice(name, "method", record_methods())
-    errors = [number(error, "errors_hz") for error in errors_hz]
-    model = {"gamma_ratio": gamma_ratio, "hold": hold}
-    loop = plant, truth, imaging
-    samples = ((loop, model, error, name) for error in errors for name in names)
-    yield from evaluate(_robustness_row, samples, executor)
-
-
-def _robustness_row(
-    loop: tuple[TipTiltPlant, Truth, Imaging], model: dict[str, Any], error_hz: float, method: str
-) -> RobustnessRow:
-    """Design for lines that are moved by an error, and close the real loop."""
-    plant, truth, imaging = loop
-    shifts = [-truth.frequency_shift_hz(line.frequency_hz, error_hz) for line in plant.vibrations]
-    moved = retuned_plant(plant, shifts, hold=model["hold"])
-    design = reference_design(method, moved, {"gamma_ratio": model["gamma_ratio"]})
-    closed = design.close(plant.hardware, sensor_gain=truth.sensor_gain)
-    numbers = loop_columns(closed, truth, imaging) | {"stable": closed.is_stable}
-    return fill_row(RobustnessRow, design, error_hz=error_hz, **numbers)
-
-
-def default_methods() -> list[str]:
-    """Return the methods whose rows are computed unless others are named."""
-    return [method.name for method in reference_methods(estimators_only=True)]
+    for error_hz in [number(error, "errors_hz") for error in errors_hz]:
+        shifts = [
+            -truth.frequency_shift_hz(line.frequency_hz, error_hz) for line in plant.vibrations
+        ]
+        moved = retuned_plant(plant, shifts, hold="driving")
+        for name in names:
+            design = reference_design(name, moved, {"gamma_ratio": gamma_ratio})
+            closed = design.close(plant.hardware, sensor_gain=truth.sensor_gain)
+            numbers = loop_columns(closed, truth, imaging) | {"stable": closed.is_stable}
+            yield fill_row(RobustnessRow, design, error_hz=error_hz, **numbers)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -191,9 +171,6 @@ class RobustnessMap:
     strehl: FloatArray
     residual_nm: FloatArray  # (d, g, e): of the modes [nm rms]; nan where the loop is unstable
     stable: BoolArray  # (d, g): whether the loop is, which a frequency error does not change
-    # errors at which the vibration that moves most is within a band of the design [Hz]; None for a
-    # design without a band around it
-    band_hz: tuple[float, float] | None = None
 
 
 def robustness_map(
@@ -205,7 +182,6 @@ def robustness_map(
     sensor_gains: ArrayLike,
     delay_errors_frames: ArrayLike = (0.0,),
     hardware: LoopHardware | None = None,
-    executor: Executor | None = None,
 ) -> RobustnessMap:
     """Evaluate one design exactly over frequency errors, sensor gains and delay errors.
 
@@ -226,8 +202,6 @@ def robustness_map(
         Real delay less that of the design [frames].
     hardware : LoopHardware, optional
         Loop to close; that of the design by default.
-    executor : concurrent.futures.Executor, optional
-        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Returns
     -------
@@ -278,15 +252,23 @@ def robustness_map(
         raise ProblemError(
             "a frequency error needs a vibration in the truth; got a truth without any."
         )
-    lines = _moved_lines(truth, errors, hardware)
-    pieces = np.array_split(gains, -(-gains.size // _GAINS_AT_ONCE))
-    loop = design, hardware, truth, imaging
-    samples = ((loop, lines, float(delay), piece) for delay in delays for piece in pieces)
-    stacks = list(evaluate(_map_columns, samples, executor))
+    require_matching_controller(hardware.own_sensor_alone(), as_controller(design))
     size = delays.size, gains.size, errors.size
+    delay, gain, place = (axis.ravel() for axis in np.indices(size))
+    ensemble = LoopEnsemble(
+        sensor_gain=gains[gain],
+        delay_frames=hardware.delay_frames + delays[delay],
+        noise_nm=truth.noise_per_measurement(hardware.n_measurements)[None],
+        turbulence=truth.turbulence,
+        vibrations=tuple(
+            replace(ensemble_vibration(line), frequency_hz=frequencies[place])
+            for line, frequencies in _moved_lines(truth, errors, hardware)
+        ),
+    )
+    matrices = textbook_matrices([as_controller(design)])
+    columns = residual_columns(ensemble_residuals(matrices, hardware, ensemble), imaging)
     strehl, residual_nm, stable = (
-        read_only(np.concatenate([stack[name] for stack in stacks]).reshape(size))
-        for name in ("strehl", "residual_nm", "stable")
+        read_only(columns[name].reshape(size)) for name in ("strehl", "residual_nm", "stable")
     )
     return RobustnessMap(
         errors_hz=errors,
@@ -295,27 +277,7 @@ def robustness_map(
         strehl=strehl,
         residual_nm=residual_nm,
         stable=read_only(stable[..., 0] == 1),
-        band_hz=_errors_in_band(design, truth),
     )
-
-
-def _map_columns(
-    loop: _Loop, lines: _MovedLines, delay_error_frames: float, gains: FloatArray
-) -> dict[str, FloatArray]:
-    """Return what the loops of all gains leave with lines at all frequencies, by column."""
-    design, hardware, truth, imaging = loop
-    errors = lines[0][1].size if lines else 1
-    ensemble = LoopEnsemble(
-        sensor_gain=np.repeat(gains, errors),
-        delay_frames=hardware.delay_frames + delay_error_frames,
-        noise_nm=truth.noise_per_measurement(hardware.n_measurements)[None],
-        turbulence=truth.turbulence,
-        vibrations=tuple(
-            replace(ensemble_vibration(line), frequency_hz=np.tile(frequencies, gains.size))
-            for line, frequencies in lines
-        ),
-    )
-    return residual_columns(ensemble_residuals(design.controller, hardware, ensemble), imaging)
 
 
 def _moved_lines(truth: Truth, errors_hz: FloatArray, hardware: LoopHardware) -> _MovedLines:
@@ -334,16 +296,6 @@ def _moved_lines(truth: Truth, errors_hz: FloatArray, hardware: LoopHardware) ->
             )
         moved.append((line, frequencies))
     return moved
-
-
-def _errors_in_band(design: Design, truth: Truth) -> tuple[float, float] | None:
-    """Return the errors at which the vibration that moves most is within a band of the design."""
-    lines = truth.lines_hz
-    if not lines:
-        return None
-    most_hz = max(lines, key=lambda f: truth.frequency_shift_hz(f, 1.0))
-    held = (band for band in design.vibration_bands if band.low_hz <= most_hz <= band.high_hz)
-    return next(((band.low_hz - most_hz, band.high_hz - most_hz) for band in held), None)
 
 
 def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
@@ -385,8 +337,7 @@ def run_failures(
     )
     segments = run_segments(drops, frames / rate)
     loop = design, hardware, truth, config.imaging
-    samples = ((loop, simulation, segment) for segment in segments)
-    return simulation, list(zip(segments, evaluate(_segment_row, samples), strict=True))
+    return simulation, [(segment, _segment_row(loop, simulation, segment)) for segment in segments]
 
 
 def _segment_row(loop: _Loop, simulation: Simulation, segment: Segment) -> Facts:
@@ -440,8 +391,9 @@ def mirror_rows(
         "kalman, real positions": kalman(plant),
         regulated.method: regulated,
     }
-    samples = ((name, (design, hardware, truth, imaging)) for name, design in designs.items())
-    return tuple(evaluate(_mirror_row, samples))
+    return tuple(
+        _mirror_row(name, (design, hardware, truth, imaging)) for name, design in designs.items()
+    )
 
 
 def _mirror_row(name: str, loop: _Loop) -> Facts:
@@ -449,14 +401,13 @@ def _mirror_row(name: str, loop: _Loop) -> Facts:
     design, hardware, truth, imaging = loop
     closed = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
     numbers = loop_columns(closed, truth, imaging)
-    unsettled_nm = settling_error(closed, truth).rms_nm if closed.is_stable else np.nan
-    rms: dict[str, Any] = {"unit": "nm", "format": ".2f"}
     return facts(
         design=fact(name, "design"),
         stable=fact(closed.is_stable),
-        residual_nm=fact(numbers["residual_nm"], "residual", missing="unstable", **rms),
+        residual_nm=fact(
+            numbers["residual_nm"], "residual", missing="unstable", unit="nm", format=".2f"
+        ),
         strehl=fact(numbers["strehl"], "Strehl", unit="%", scale=100, format=".2f"),
-        unsettled_nm=fact(unsettled_nm, "settled less real position", **rms),
     )
 
 
@@ -465,7 +416,6 @@ def tradeoff(
     *,
     points: int = 9,
     taps: int = 16,
-    executor: Executor | None = None,
 ) -> Iterator[Facts]:
     """Return filters from the least norm to the least variance, and examine their loops.
 
@@ -480,8 +430,6 @@ def tradeoff(
         Levels of the norm, at least 2.
     taps : int, optional
         Length of the mixed filters' impulse response.
-    executor : concurrent.futures.Executor, optional
-        Runs the samples, in processes for example; it is left open. By default they run here.
 
     Yields
     ------
@@ -519,29 +467,18 @@ def tradeoff(
     least, best = hinf(problem, route="riccati"), kalman(problem)
     spread = max(best.gamma / least.gamma_least, 1.0)
     levels = least.gamma_least * spread ** (np.linspace(0, 1, count) ** _CROWDING)
-    ends = {0: least, count - 1: best}
-    samples = (
-        (problem, family, ends.get(i, float(level)), length, least.gamma_least)
-        for i, level in enumerate(levels)
-        for family in FAMILIES
-    )
-    yield from evaluate(_front_point, samples, executor)
+    ends: dict[int, FilterDesign] = {0: least, count - 1: best}
+    for i, level in enumerate(levels.tolist()):
+        for family in FAMILIES:
+            if (design := ends.get(i)) is None and family == MIXED.name:
+                design = mixed(problem, gamma=level, taps=length)
+            elif design is None:
+                design = central_filter(problem, gamma=level)
+            yield _front_point(family, design, least.gamma_least)
 
 
-def _front_point(
-    problem: EstimationProblem,
-    family: str,
-    level: float | FilterDesign,
-    taps: int,
-    gamma_least: float,
-) -> Facts:
-    """Design a filter of a norm, unless it is one already, and examine its loop."""
-    if isinstance(level, FilterDesign):
-        design = level
-    elif family == MIXED.name:
-        design = mixed(problem, gamma=level, taps=taps)
-    else:
-        design = central_filter(problem, gamma=level)
+def _front_point(family: str, design: FilterDesign, gamma_least: float) -> Facts:
+    """Examine the loop of a filter of a family."""
     margins: Any = SimpleNamespace(gain_low=np.nan, gain_high=np.nan, modulus=np.nan)
     if design.hardware is not None:
         margins = loop_margins(close_loop(design.hardware, design.controller))

@@ -89,7 +89,7 @@ def test_a_fragile_design_does_not_pass_without_a_word(tmp_path, capsys):
 @pytest.mark.parametrize("late", [0.0, np.inf])
 def test_the_time_of_a_fragile_delay_needs_no_margin_on_the_other_side(monkeypatch, late):
     def fragile(loop):
-        return replace(lbt.loop_margins(loop), delay_frames=late, delay_s=late, early_frames=0.04)
+        return replace(lbt.loop_margins(loop), delay_frames=late, early_frames=0.04)
 
     monkeypatch.setattr("lbt_synth.cli.design.loop_margins", fragile)
     hardware = lbt.LoopHardware(frame_rate_hz=1000, modes=1)

@@ -25,7 +25,7 @@ from support.studies import (
 import lbt_synth as lbt
 from lbt_synth.cli.study import connect_cluster
 from lbt_synth.errors import NumericalError
-from lbt_synth.studies.study.sample import evaluate_samples
+from lbt_synth.studies.study.run import evaluate_samples
 
 
 def wait_for(condition, seconds=30.0):

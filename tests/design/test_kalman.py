@@ -12,7 +12,7 @@ from support.uneven_axes import QUICK, RATE, SLOW
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import estimator_form
-from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.loop.least_residual import least_residual
 
 SEEDS = st.integers(0, 10_000)
 
@@ -51,7 +51,7 @@ def test_the_plant_of_uneven_axes_is_two_plants():
     ]
     alone_nm = [design.rms for design in alone]
     assert lbt.kalman(both).rms == pytest.approx(np.hypot(*alone_nm), rel=1e-9)
-    limit = least_model_residual(both)
+    limit = least_residual(both.hardware, both)
     means = limit.variance_nm2 - limit.within_nm2
     np.testing.assert_allclose(np.sqrt(means), alone_nm, rtol=1e-6)
 

@@ -9,7 +9,7 @@ import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification import TrackingController
 from lbt_synth.linear import estimator_form
-from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.loop.disturbances import draw_disturbance
 from lbt_synth.models import ARModel, PositionLoop, SinusoidalVibration
 from lbt_synth.models.plant.tip_tilt import with_vibrations
 

@@ -246,7 +246,7 @@ def test_coupled_axes_against_the_frequency_response():
     loop = lbt.close_loop(path, controller)
     truth = Truth(turbulence=[SLOW, TABLE], noise_nm=[3.0, 9.0])
     f = (np.arange(100_000) + 0.5) * RATE / 2 / 100_000
-    S, N = loop.sensitivity(f), loop.noise_transfer(f)
+    S, N = loop.sensitivity(f), loop.path("noise", "residual").frequency_response(f)
     density = np.stack([SLOW.psd(f), TABLE.psd(f)], axis=-1)
     white = np.array([3.0, 9.0]) ** 2 / (RATE / 2)
     share = np.sinc(f / RATE)[:, None] ** np.array([0, 2])  # a process is one of means

@@ -31,7 +31,9 @@ def test_error_transfer_of_the_lbt(gain):
     h = H / z**2
     assert np.allclose(loop.sensitivity(f)[:, 0, 0], (1 - h) / (1 - (1 - gain) * h), rtol=1e-8)
     noise = -(H / z) / (1 - (1 - gain) * h)
-    assert np.allclose(loop.noise_transfer(f)[:, 0, 0], noise, rtol=1e-8)
+    assert np.allclose(
+        loop.path("noise", "residual").frequency_response(f)[:, 0, 0], noise, rtol=1e-8
+    )
 
 
 def test_the_page_says_where_the_settled_design_becomes_unstable(config):
@@ -82,7 +84,9 @@ def test_the_closed_loop_is_affine_in_the_filter(delay, feedthrough, moving):
     Q = parameter.to_statespace().frequency_response(f)
     M = sum(tap * mirror * z**-i for i, tap in enumerate(path.mirror_taps))
     np.testing.assert_allclose(loop.sensitivity(f), np.eye(2) - M @ Q @ sensor / z, atol=1e-10)
-    np.testing.assert_allclose(loop.noise_transfer(f), -M @ Q, atol=1e-10)
+    np.testing.assert_allclose(
+        loop.path("noise", "residual").frequency_response(f), -M @ Q, atol=1e-10
+    )
 
 
 def test_a_filter_of_another_size_is_refused():

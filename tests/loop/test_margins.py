@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 import lbt_synth as lbt
+from lbt_synth.loop.margins import broken_loops
 
 RATE = 800.0
 
 
 def broken(gain, *, delay=2, modes=1, **path):
     hardware = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=modes, **path)
-    return lbt.loop.broken_loops(
-        lbt.close_loop(hardware, lbt.integrator(hardware, gain=gain).controller)
-    )
+    return broken_loops(lbt.close_loop(hardware, lbt.integrator(hardware, gain=gain).controller))
 
 
 @pytest.mark.parametrize(("delay", "gain"), [(1, 0.4), (3, 0.1)])
@@ -40,14 +39,14 @@ def test_loops_without_a_crossing_and_of_two_integrators():
     hardware = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     timid = lbt.Controller(A=0.5, B=0.1, C=1.0, D=0.0, dt_s=1 / RATE)
     loop = lbt.close_loop(hardware, timid)
-    (response,) = lbt.loop.broken_loops(loop)
+    (response,) = broken_loops(loop)
     assert response.phase_margin is None
     assert response.phase_deg[0] == pytest.approx(0, abs=1e-3)
     margins = lbt.loop_margins(loop)
     assert (margins.phase_deg, margins.delay_frames) == (np.inf, np.inf)
     law = lbt.design.IntegratorLaw(integrators=2, zero_hz=40)
     twice = lbt.integrator(hardware, gain=0.1, law=law)
-    (response,) = lbt.loop.broken_loops(lbt.close_loop(hardware, twice.controller))
+    (response,) = broken_loops(lbt.close_loop(hardware, twice.controller))
     assert response.phase_deg[0] == pytest.approx(-180, abs=1)
 
 
@@ -58,7 +57,7 @@ def test_equal_axes_share_a_response_and_others_have_their_own():
     controller = lbt.Controller(
         A=np.eye(3), B=np.diag([one, two, three]), C=np.eye(3), D=np.zeros((3, 3)), dt_s=1 / RATE
     )
-    found = lbt.loop.broken_loops(lbt.close_loop(hardware, controller))
+    found = broken_loops(lbt.close_loop(hardware, controller))
     assert [each.measurements for each in found] == [(0, 2), (1,)]
     margins = [each.phase_margin.phase_deg for each in found]
     assert margins == pytest.approx([90 - np.degrees(3 * np.arcsin(g / 2)) for g in (one, two)])
@@ -71,7 +70,7 @@ def test_a_loop_of_an_unstable_controller_has_a_margin_on_both_sides():
     growing = lbt.Controller(A=1.02, B=0.3, C=1.0, D=0.0, dt_s=1 / RATE)
     loop = lbt.close_loop(hardware, growing)
     margins = lbt.loop_margins(loop)
-    (found,) = lbt.loop.broken_loops(loop)
+    (found,) = broken_loops(loop)
     fall, rise = found.gain_margins
     assert (fall.gain, fall.frequency_hz) == (pytest.approx(0.02 / 0.3), 0)
     assert rise.gain == pytest.approx(margins.gain_high)
@@ -92,7 +91,7 @@ def test_a_response_is_followed_around_its_zeros():
         dt_s=1 / RATE,
     )
     loop = lbt.close_loop(hardware, controller)
-    (found,) = lbt.loop.broken_loops(loop)
+    (found,) = broken_loops(loop)
     z = np.exp(2j * np.pi * found.frequency_hz / RATE)
     expected = np.polyval(notch[::-1], 1 / z) / z**2 / (1 - 1 / z)
     assert np.allclose(found.response, expected, rtol=1e-6)
@@ -121,7 +120,7 @@ def test_marginal_and_unstable_loops_have_no_residual():
         for ask in (
             lambda loop=loop: lbt.residual_budget(loop, truth),
             lambda loop=loop: lbt.loop_margins(loop),
-            lambda loop=loop: lbt.loop.broken_loops(loop),
+            lambda loop=loop: broken_loops(loop),
         ):
             with pytest.raises(lbt.errors.UnstableLoopError, match=word) as caught:
                 ask()

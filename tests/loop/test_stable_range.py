@@ -25,6 +25,7 @@ from lbt_synth.loop.stable_range import (
     circle_norm,
     errors_together,
     loop_changes,
+    moving_gain,
     radii_by_gain,
     stable_range,
     stepped_range,
@@ -132,7 +133,7 @@ def test_a_common_lyapunov_function_exists_inside_and_none_beyond(design):
     """The matrix inequality knows nothing of frequencies; its P is checked without rounding."""
     plant = lbt_axis_plant()
     loop = lbt.close_loop(plant.hardware, design(plant))
-    moving = lbt.loop.moving_gain(loop)
+    moving = moving_gain(loop)
     A0, A1, *_ = checked_loop_matrices(plant.hardware, loop.controller)
     size = np.sqrt(np.diag(stationary_covariance(A0 + A1, np.eye(len(A0)))))
     A0, A1 = (A * size / size[:, None] for A in (A0, A1))
@@ -149,10 +150,10 @@ def test_a_common_lyapunov_function_exists_inside_and_none_beyond(design):
 
 def test_the_moving_gain_lies_in_the_constant_one_and_axes_count_one_by_one():
     plant = lbt_axis_plant(modes=2)
-    moving = lbt.loop.moving_gain(lbt.close_loop(plant.hardware, lbt.kalman(plant)))
+    moving = moving_gain(lbt.close_loop(plant.hardware, lbt.kalman(plant)))
     assert moving.constant_low < moving.moving_low < 1 < moving.moving_high < moving.constant_high
     alone = lbt_axis_plant()
-    expected = lbt.loop.moving_gain(lbt.close_loop(alone.hardware, lbt.kalman(alone)))
+    expected = moving_gain(lbt.close_loop(alone.hardware, lbt.kalman(alone)))
     ends = (moving.moving_low, moving.moving_high)
     assert ends == pytest.approx((expected.moving_low, expected.moving_high), rel=1e-4)
 
@@ -161,20 +162,20 @@ def test_intervals_are_of_the_sensor_gain_whatever_the_loop_has():
     plant = lbt_axis_plant()
     controller = lbt.kalman(plant).controller
     low, high = lbt.loop.stable_sensor_gains(plant.hardware, controller)
-    moving = lbt.loop.moving_gain(lbt.close_loop(plant.hardware, controller, sensor_gain=0.5))
+    moving = moving_gain(lbt.close_loop(plant.hardware, controller, sensor_gain=0.5))
     assert moving.moving_low < 0.5 < moving.moving_high < moving.constant_high
     assert (moving.constant_low, moving.constant_high) == pytest.approx((low, high))
     inside = [*np.geomspace(low * 1.0001, high * 0.9999, 9), low * 0.999, high * 1.001]
     loops = [lbt.close_loop(plant.hardware, controller, sensor_gain=gain) for gain in inside]
     assert [loop.is_stable for loop in loops] == [True] * 9 + [False] * 2
     with pytest.raises(lbt.errors.UnstableLoopError):
-        lbt.loop.moving_gain(integrator_loop(2, gain=1.5))
+        moving_gain(integrator_loop(2, gain=1.5))
 
 
 def test_a_loop_that_the_gain_does_not_touch_is_proved_for_all_gains():
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     idle = lbt.Controller(A=0.5, B=0.0, C=1.0, D=0.0, dt_s=1 / 800)
-    moving = lbt.loop.moving_gain(lbt.close_loop(path, idle))
+    moving = moving_gain(lbt.close_loop(path, idle))
     assert (moving.moving_low, moving.moving_high) == (0.01, 100.0)
     assert np.isinf(moving.constant_high)
 

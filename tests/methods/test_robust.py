@@ -104,7 +104,7 @@ def test_a_plant_alone_has_a_band_around_each_line():
     assert np.array(edges) == pytest.approx(np.array([(19.6, 20.4, 80.0), (49.0, 51.51, 50.0)]))
     design = design_request("robust", {}).build(PlantInputs(plant=plant))
     assert design.certificate.passed
-    lines = lbt.close_loop(plant.hardware, design.controller).rejection()
+    lines = lbt.close_loop(plant.hardware, design.controller).path("phase", "residual")
     assert abs(lines.frequency_response([20.0])[0, 0, 0]) < 0.2
 
 

@@ -9,7 +9,7 @@ from support.drifting import drifting
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.loop.disturbances import draw_disturbance
 from lbt_synth.models.vibration import checked_direction
 
 PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)

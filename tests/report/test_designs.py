@@ -23,6 +23,7 @@ from lbt_synth.report.designs import (
 from lbt_synth.report.draw import figure_series
 from lbt_synth.report.page.html import page_html
 from lbt_synth.storage.tables import Table
+from lbt_synth.studies.limits import limits
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def text(report, folder):
 
 
 def test_the_numbers_are_those_of_the_library(report, config, designs):
-    study = lbt.studies.limits(
+    study = limits(
         designs,
         config.hardware,
         config.truth,
@@ -70,10 +71,10 @@ def test_the_numbers_are_those_of_the_library(report, config, designs):
         errors_hz=config.settings.robustness.errors_hz,
     )
     (rejections,) = (c.figure for c in report_page(report, {}).charts if c.key == "sigma")
-    for one, limits in zip(report.assessments, study.rows, strict=True):
+    for one, limit in zip(report.assessments, study.rows, strict=True):
         row = one.limits
-        assert row.residual_nm == pytest.approx(limits.residual_nm, rel=1e-9, nan_ok=True)
-        assert row.above_limit_percent == pytest.approx(limits.above_limit_percent, nan_ok=True)
+        assert row.residual_nm == pytest.approx(limit.residual_nm, rel=1e-9, nan_ok=True)
+        assert row.above_limit_percent == pytest.approx(limit.above_limit_percent, nan_ok=True)
         if not one.stable:
             continue
         loop = lbt.close_loop(config.hardware, one.design.controller)

@@ -81,7 +81,9 @@ def test_curves_are_those_of_the_loop(start, first):
     loop = lbt.close_loop(start.hardware, design.controller)
     grid, rejection = curves["Rejection"]
     np.testing.assert_allclose(rejection, spectral_norms(loop.sensitivity(grid)))
-    np.testing.assert_allclose(curves["Noise"][1], spectral_norms(loop.noise_transfer(grid)))
+    np.testing.assert_allclose(
+        curves["Noise"][1], spectral_norms(loop.path("noise", "residual").frequency_response(grid))
+    )
     error = spectral_norms(design.error_system().frequency_response(grid))
     np.testing.assert_allclose(curves["Estimation error"][1], error)
     spectrum = exact_spectrum(loop, start.truth, grid, 2048)

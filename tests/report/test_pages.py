@@ -20,7 +20,8 @@ from lbt_synth.report.pages import (
     diagnosis_page,
 )
 from lbt_synth.storage.tables import Cell, Table
-from lbt_synth.studies.study.sample import evaluate_samples
+from lbt_synth.studies.study.run import evaluate_samples
+from lbt_synth.studies.study.statistics import study_statistics
 
 
 @pytest.fixture(scope="module")
@@ -147,12 +148,10 @@ def study():
 def test_a_page_from_a_study_file(study, tmp_path):
     values = study.values(0, 3)
     columns = dict(zip(study.parameter_names, values.T, strict=True))
-    columns |= evaluate_samples(study, values, 0)[0]
+    columns |= evaluate_samples(study, values, 0)[0] | {"row": np.arange(3)}
     folder = tmp_path / "a folder"
     folder.mkdir()
-    statistics = lbt.studies.study_statistics(
-        columns, study.parameter_names, list(study.controllers)
-    )
+    statistics = study_statistics(columns, study.parameter_names, list(study.controllers))
     page = lbt.report.study_page(study, columns, statistics, folder=folder)
     files = lbt.report.write_page(page, folder / "summary.html")
     assert [file.name for file in files] == ["summary.html"]

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.plants import LBT_YAML, lbt_axis_plant
 from support.studies import (
     assert_whole,
     evaluate_quickly,
@@ -21,12 +20,11 @@ from support.studies import (
     part_rows,
 )
 
-import lbt_synth as lbt
 from lbt_synth.errors import NumericalError, OutputError
 from lbt_synth.storage import array_file
 from lbt_synth.storage.thread_limits import WorkerPool
 from lbt_synth.studies import run_study
-from lbt_synth.studies.grid import Sweep, evaluate
+from lbt_synth.studies.grid import Sweep
 
 
 def test_a_sweep_knows_what_is_missing(tmp_path):
@@ -56,46 +54,11 @@ def test_a_sweep_knows_what_is_missing(tmp_path):
     assert sweep.run(None, lambda rows: rows, part_rows=2)[1] == 0
 
 
-def late(number, seconds):
-    time.sleep(seconds)
-    return number**2
-
-
-def fails(number):
-    raise RuntimeError("no such thing.")
-
-
-def test_a_grid_in_memory_is_in_the_order_of_its_samples():
-    samples = [(i, 0.05 * (i == 0)) for i in range(9)]
-    assert list(evaluate(late, iter(samples))) == [i * i for i in range(9)]
-    with ThreadPoolExecutor(3) as pool:
-        assert list(evaluate(late, iter(samples), pool)) == [i * i for i in range(9)]
-        with pytest.raises(NumericalError, match=r"rows 0 to 0 .*RuntimeError: no such thing"):
-            list(evaluate(fails, [(1,)], pool))
-
-
 class Elsewhere(ThreadPoolExecutor):
     """An executor that gets everything in bytes, as one of processes does."""
 
     def submit(self, fn, *args):
         return super().submit(*pickle.loads(pickle.dumps((fn, *args))))
-
-
-def test_tables_of_designs_are_the_same_elsewhere():
-    config = lbt.load_config(LBT_YAML)
-    plant, met = lbt_axis_plant(modes=1), (config.truth, config.imaging)
-    design = config.design("integrator", gain=0.3)
-    errors = {"errors_hz": [-1.0, 0.0]}
-
-    def tables(**how):
-        yield list(lbt.studies.robustness(config.plant, *met, **errors, **how))
-        yield lbt.studies.limits({"slow": design}, config.hardware, *met, **errors, **how).rows
-        yield [p.gamma for p in lbt.studies.tradeoff(plant, points=2, **how)]
-        gains = {"sensor_gains": np.linspace(0.1, 1, 70), "delay_errors_frames": [0, 0.5]}
-        yield lbt.studies.robustness_map(design, *met, **errors, **gains, **how).strehl.tolist()
-
-    with Elsewhere(2) as pool:
-        assert list(tables(executor=pool)) == list(tables())
 
 
 def test_a_part_is_believed_by_its_digest_alone(tmp_path):

@@ -8,7 +8,7 @@ import lbt_synth as lbt
 from lbt_synth.config import Config
 from lbt_synth.design.result import model_limits
 from lbt_synth.report.figures.studies import limits_figure
-from lbt_synth.studies.limits import compare_in_truth
+from lbt_synth.studies.limits import compare_in_truth, limits
 
 
 def test_study(config):
@@ -16,9 +16,7 @@ def test_study(config):
         "kalman": lbt.kalman(config.plant),
         "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati"),
     }
-    study = lbt.studies.limits(
-        designs, config.hardware, config.truth, config.imaging, errors_hz=[-3.5, 0, 3.5]
-    )
+    study = limits(designs, config.hardware, config.truth, config.imaging, errors_hz=[-3.5, 0, 3.5])
     assert study.band_hz == (16.5, 23.5)
     assert study.residual_nm.shape == (2, study.shift_hz.size)
     for row, curve in zip(study.rows, study.residual_nm, strict=True):
@@ -39,7 +37,7 @@ def test_a_filter_of_several_sensors_has_no_distance_from_the_limit_of_one(
 ):
     loop = (sensors_config.hardware, sensors_config.truth, sensors_config.imaging)
     designs = {"several": sensors_design, "own": sensors_config.design("integrator")}
-    several, own = lbt.studies.limits(designs, *loop).rows
+    several, own = limits(designs, *loop).rows
     assert several.stable
     assert np.isnan(several.above_limit_percent)
     assert own.above_limit_percent > 0
@@ -47,13 +45,13 @@ def test_a_filter_of_several_sensors_has_no_distance_from_the_limit_of_one(
 
 def test_bad_studies(config):
     good, designs = (config.hardware, config.truth, config.imaging), {"k": lbt.kalman(config.plant)}
-    still = lbt.studies.limits(designs, *good)
+    still = limits(designs, *good)
     assert still.band is None
     for call, words in (
-        (lambda: lbt.studies.limits({}, *good), "at least one design"),
-        (lambda: lbt.studies.limits(designs, *good, errors_hz=[]), "at least one error"),
+        (lambda: limits({}, *good), "at least one design"),
+        (lambda: limits(designs, *good, errors_hz=[]), "at least one error"),
         (
-            lambda: lbt.studies.limits(designs, *good, errors_hz=[-25.0]),
+            lambda: limits(designs, *good, errors_hz=[-25.0]),
             "each vibration above 0 Hz; got an error of -25",
         ),
         (lambda: limits_figure(still), "a vibration that moves"),

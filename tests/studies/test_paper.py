@@ -159,17 +159,17 @@ def runs(monkeypatch):
 def test_only_what_is_missing_runs_again(tmp_path, setup, runs):
     counted = []
     options = {"seeds": [0, 1], "tables": ["II"], "progress": counted.append}
-    first = lbt.studies.end_to_end_tables(setup, tmp_path, **options)
+    first = given.end_to_end_tables(setup, tmp_path, **options)
     assert len(runs) == len(list(tmp_path.glob("*.npz"))) == sum(counted) == 12
     assert (first[0].strehl, first[0].seeds) == (pytest.approx(70.5), 2)
     for path in sorted(tmp_path.glob("*.npz"))[3:5]:
         path.unlink()
-    again = lbt.studies.end_to_end_tables(setup, tmp_path, **options)
+    again = given.end_to_end_tables(setup, tmp_path, **options)
     assert (len(runs), sum(counted)) == (14, 24)
     assert [entry.values for entry in again] == [entry.values for entry in first]
 
 
 def test_runs_of_other_settings_are_not_mixed_in(tmp_path, setup, runs):
-    lbt.studies.end_to_end_tables(setup, tmp_path, seeds=[0], tables=["II"])
+    given.end_to_end_tables(setup, tmp_path, seeds=[0], tables=["II"])
     with pytest.raises(OutputError, match="is of another study"):
-        lbt.studies.end_to_end_tables(replace(setup, gain=0.4), tmp_path, seeds=[0], tables=["II"])
+        given.end_to_end_tables(replace(setup, gain=0.4), tmp_path, seeds=[0], tables=["II"])

@@ -9,9 +9,8 @@ from support.plants import LBT_YAML, lbt_axis_plant
 from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.run import Drop
-from lbt_synth.methods.request import PlantInputs, design_request
-from lbt_synth.models import ARModel, SinusoidalVibration, TabulatedSpectrum
+from lbt_synth.loop.simulation import Drop
+from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.report.figures.studies import tradeoff_figure
 from lbt_synth.studies import robustness, robustness_map
@@ -52,18 +51,10 @@ def test_the_study_refuses_what_it_cannot_do(config):
 
 
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11, other_modes=0.9)
-SLOW = ARModel(coefficients=[0.9886], driving_rms_nm=89.1, frame_rate_hz=800)
-DIAGONAL = (0.8, 0.6)
 
 
 def sinusoid(frequency_hz=20.0, rms_nm=797.0, direction=(1.0, 0.0)):
     return SinusoidalVibration(frequency_hz=frequency_hz, rms_nm=rms_nm, direction=direction)
-
-
-def random_line(frequency_hz=20.0, rms_nm=500.0, damping=0.01, direction=(1.0, 0.0)):
-    return lbt.Vibration(
-        frequency_hz=frequency_hz, damping=damping, rms_nm=rms_nm, direction=direction
-    )
 
 
 @pytest.fixture(scope="module")
@@ -99,22 +90,6 @@ def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,), rel=1
     return found
 
 
-TRUTHS = {
-    "two sinusoids": ((sinusoid(), sinusoid(33.0, 120, (0.0, 1.0))), "air"),
-    "random and sinusoid": ((random_line(25.0, 90, 0.02, DIAGONAL), sinusoid()), "ar"),
-    "table": ((sinusoid(),), "table"),
-}
-
-
-@pytest.mark.parametrize("name", TRUTHS)
-def test_each_point_is_that_of_the_single_evaluator(kalman, air, name):
-    vibrations, turbulence = TRUTHS[name]
-    table = TabulatedSpectrum(frequency_hz=[1, 5, 40, 120], density_nm2_hz=[3e4, 900, 8, 0.1])
-    spectra = {"air": air, "ar": SLOW, "table": table}
-    truth = lbt.Truth(turbulence=spectra[turbulence], vibrations=vibrations, noise_nm=15.5)
-    assert_as_single(kalman, truth, CAMERA, [-2.5, 1.0], [0.07, 0.6, 1.9])
-
-
 def test_delay_errors_whole_and_fractional(air):
     truth = lbt.Truth(turbulence=air, vibrations=(sinusoid(),), noise_nm=15.5)
     lazy = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800), gain=0.3)
@@ -130,10 +105,6 @@ def test_unstable_points_are_nan(robust, settings):
     assert np.isnan(found.strehl[0, [0, 2]]).all()
     assert np.isnan(found.residual_nm[0, [0, 2]]).all()
     assert np.isfinite(found.strehl[0, 1]).all()
-    none = robustness_map(
-        robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[0.1]
-    )
-    assert np.isnan(none.strehl).all()
 
 
 def test_an_image_that_is_gone_has_no_strehl(robust, settings):
@@ -165,23 +136,6 @@ def test_each_line_moves_by_its_share(kalman, settings):
     assert residual(stated, -2.0) == pytest.approx(at(0.2, 18.0), rel=1e-12)
     fixed = replace(truth, frequency_errors_hz=(0.0, 2.0))
     assert residual(fixed, -3.5) == pytest.approx(at(0.3, 16.5), rel=1e-12)
-
-
-def test_a_map_knows_the_band_of_its_design(kalman, settings):
-    inputs = PlantInputs(plant=settings.plant)
-    robust = design_request("robust", {}).build(inputs)
-
-    def band(design, truth):
-        return robustness_map(
-            design, truth, settings.imaging, errors_hz=[0], sensor_gains=[1]
-        ).band_hz
-
-    assert band(kalman, settings.truth) is None
-    low, high = band(robust, settings.truth)
-    (edges,) = {(part.low_hz, part.high_hz) for part in robust.vibration_bands}
-    assert (20.0 + low, 20.0 + high) == pytest.approx(edges)
-    assert band(robust, replace(settings.truth, vibrations=(sinusoid(70.0),))) is None
-    assert band(robust, replace(settings.truth, vibrations=())) is None
 
 
 def test_the_lines_of_the_model_move_as_the_true_ones_near_them(settings):

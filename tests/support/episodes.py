@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lbt_synth.linear import estimator_form
-from lbt_synth.loop.simulation.run import settling_frames
+from lbt_synth.loop.simulation import settling_frames
 from lbt_synth.loop.stable_range import radii_by_gain
 
 QUIET, LONGEST = 200, 400  # frames before an episode, and of one at most

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import yaml
 
-from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.loop.disturbances import draw_disturbance
 
 _NUMBERS = itertools.count()
 _LONGEST_S = 300

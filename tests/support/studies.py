@@ -10,6 +10,7 @@ from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.studies.grid import Sweep
+from lbt_synth.studies.study.study import Study
 
 # cheap to evaluate: turbulence of the model, one integrator
 BASE = """
@@ -43,7 +44,7 @@ def study_file(folder: Path, *, base: str = BASE, **changes: str) -> Path:
     return path
 
 
-def load_small_study(folder: Path, **changes: str) -> lbt.studies.Study:
+def load_small_study(folder: Path, **changes: str) -> Study:
     return lbt.studies.load_study(study_file(folder, **changes))
 
 

@@ -9,6 +9,7 @@ from support.plants import ROOT
 
 import lbt_synth as lbt
 from lbt_synth.report.pages import study_page
+from lbt_synth.studies.study.statistics import study_statistics
 
 PARAMETERS = ("truth.sensor_gain", "error.delay_frames", "atmosphere.wind_speed_m_s", "fixed")
 
@@ -54,6 +55,7 @@ def night():
 
 
 def page_of(columns, controllers=CONTROLLERS, parameters=PARAMETERS, study=None):
-    statistics = lbt.studies.study_statistics(columns, parameters, controllers)
+    columns = {"row": np.arange(len(columns[f"{controllers[0]}.stable"]))} | columns
+    statistics = study_statistics(columns, parameters, controllers)
     more = {"folder": "out", "failures": FAILURES, "computing_s": 75.0}
     return study_page(study or night(), columns, statistics, **more)

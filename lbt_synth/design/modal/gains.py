@@ -29,8 +29,7 @@ from lbt_synth.design.modal.stack import Vibrations, lines_per_mode, number_per_
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels, graded_edges
 from lbt_synth.loop.closed_loop import require_loop_rate
-from lbt_synth.loop.ensemble import textbook_matrices
-from lbt_synth.loop.stacks import close_loops, stack_evaluator
+from lbt_synth.loop.evaluator import close_loops, textbook_matrices
 from lbt_synth.models import ARModel, LoopHardware, Spectrum
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.models.spectra import breakpoints_below
@@ -339,8 +338,7 @@ def _find_gains(
         )
     unit = textbook_matrices([PURE.controller(path, 1.0)])
     delays = np.full(loop_gains.size, path.delay_frames)
-    _, ((stack,),) = close_loops(unit, path, loop_gains, delays)
-    loops = stack_evaluator([(stack, stack.modes[0])], path, in_image=True)
+    _, ((_, (loops,)),) = close_loops(unit, path, loop_gains, delays)
     # of unit noise over the sensor gain
     propagated = loops.of_noise(np.ones((1, 1, 1))).sum(axis=(1, 2, 3)) * loop_gains**2
     # the poles of a loop are the roots of 1 - z^-1 + h z^-1 M, in powers of z^-1
@@ -351,7 +349,7 @@ def _find_gains(
     last = np.full((2, gain.size), np.inf)  # gains and variances
     for _ in range(_HALVINGS):
         nodes, weights = gauss_panels(edges * rate / 2, _NODES)
-        rejection = stack.image_powers(nodes / rate).T
+        rejection = loops.powers(nodes, np.ones((1, 1, 1))).sum(axis=(0, 1, 2)).T
         rejection /= np.sinc(nodes / rate) ** 2  # the spectra are of means over frames
         if differenced:
             rejection /= 4 * np.sin(np.pi * nodes / rate) ** 2

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from lbt_synth.design.modal.stack import ModalFilters, number_per_mode
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.linear import Controller
-from lbt_synth.loop.simulation.run import SteppedController
+from lbt_synth.loop.simulation import SteppedController
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray, float_array, integer, real_array
 

@@ -178,12 +178,11 @@ class SingleModeLoop:
     @property
     def parameter(self) -> StateSpace:
         """The Youla parameter: from the noise to the command at unit sensor gain."""
-        commanding = self.at(1.0).commanding()
-        return replace(commanding, B=commanding.B[:, 1:], D=commanding.D[:, 1:])
+        return self.at(1.0).path("noise", "command")
 
     def complementary(self, sensor_gain: float = 1.0) -> StateSpace:
         """Return ``T = 1 - S`` at a sensor gain."""
-        s = self.at(sensor_gain).rejection()
+        s = self.at(sensor_gain).path("phase", "residual")
         return replace(s, C=-s.C, D=1 - s.D)
 
 

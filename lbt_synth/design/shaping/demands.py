@@ -136,8 +136,9 @@ class Bound:
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop, by level sets."""
         closed, name = loop.at(self.sensor_gain), f"peak of the {self.response}"
-        responses = {"rejection": closed.rejection, "noise": closed.noise_propagation}
-        system = responses.get(self.response, loop.complementary)()
+        sources = {"rejection": "phase", "noise": "noise"}
+        source = sources.get(self.response)
+        system = closed.path(source, "residual") if source else loop.complementary()
         if self.high_hz is None:
             peak = hinf_norm(system).upper
         else:

@@ -230,7 +230,7 @@ class VibrationBand:
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the worst variance in the real loop, by level sets, and that of the skirts."""
-        rejection = loop.held(self.sensor_gain).rejection()
+        rejection = loop.held(self.sensor_gain).path("phase", "residual")
         inside = (self.rms_nm * band_norm(rejection, self.low_hz, self.high_hz).upper) ** 2
         skirts = self.skirts(loop.hardware.frame_rate_hz)
         if skirts is None:

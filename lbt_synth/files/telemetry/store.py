@@ -17,7 +17,8 @@ from lbt_synth.errors import OutputError, ProblemError, TelemetryError
 from lbt_synth.files.file_checks import READERS, FileKind
 from lbt_synth.files.telemetry import aot
 from lbt_synth.files.telemetry.telemetry import FACTS, LAYERS, REQUIRED, Scalar, Telemetry
-from lbt_synth.loop import Imaging, Simulation
+from lbt_synth.loop import Imaging
+from lbt_synth.loop.simulation import Simulation
 from lbt_synth.models import LoopHardware, PositionLoop
 from lbt_synth.storage.array_file import Cards
 from lbt_synth.storage.atomic_files import write_atomically

@@ -30,10 +30,10 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop import (
     Imaging,
     close_loop,
-    jitter_strehl,
     residual_budget,
+    strehl,
 )
-from lbt_synth.loop.least_residuals.residual_limit import least_model_residual
+from lbt_synth.loop.least_residual import least_residual
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import PlantInputs, design_request
 from lbt_synth.models import TipTiltPlant
@@ -217,7 +217,7 @@ def prediction_against_data(
             "or another sensor gain. Identify the noise again."
         )
     try:
-        limit = least_model_residual(plant, frame_means=True)
+        limit = least_residual(plant.hardware, plant, frame_means=True)
     except ProblemError as error:  # modes that do not decouple, or a mirror without a limit
         notes.append(f"no {LIMIT}: {error}")
     else:
@@ -300,20 +300,20 @@ def _build_row(
     imaging: Imaging | None,
 ) -> PredictionRow:
     """Return a row of a residual on the data and a covariance (n, n) that the model promises."""
-    data_nm = error_nm = model_nm = strehl = model_strehl = np.nan
+    data_nm = error_nm = model_nm = replayed_strehl = model_strehl = np.nan
     if replayed is not None:
         data_nm, error_nm = replayed.rms_nm, replayed.rms_error_nm
-        strehl = np.nan if imaging is None else replayed.strehl(imaging)
+        replayed_strehl = np.nan if imaging is None else replayed.strehl(imaging)
     if promised is not None:
         model_nm = float(np.sqrt(np.trace(promised)))
-        model_strehl = np.nan if imaging is None else jitter_strehl(promised, imaging=imaging)
+        model_strehl = np.nan if imaging is None else strehl(promised, imaging)
     return PredictionRow(
         name=name,
         replayed_nm=data_nm,
         replayed_error_nm=error_nm,
         model_nm=model_nm,
         ratio=data_nm / model_nm if model_nm > 0 else np.nan,
-        strehl=strehl,
+        strehl=replayed_strehl,
         model_strehl=model_strehl,
         replayed=replayed,
         model_axis_nm=None if promised is None else frozen_copy(np.sqrt(np.diag(promised))),

@@ -241,7 +241,7 @@ def regress(
     runs = record.stretches()
     base = kalman(noisier(model, noise).plant()).controller
     series = record.pseudo_open_loop(model.sensor_gains)
-    steering = close_loop(path, base).steering()
+    steering = close_loop(path, base).path("phase", "command")
     late, taps = held_fraction(path), path.mirror_taps
     if late:  # the target of a command is the mean phase of its hold, which lies in two frames
         taps = np.eye(1, path.mirror_system.lead + 1, path.mirror_system.lead)[0]

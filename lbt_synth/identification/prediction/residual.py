@@ -13,7 +13,7 @@ which does not count.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -25,7 +25,7 @@ from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.stretches import Stretches, cut_stretches
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.block_filtering import filter_series
-from lbt_synth.loop import ClosedLoop, Imaging, jitter_strehl
+from lbt_synth.loop import ClosedLoop, Imaging, strehl
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, one_or_each
@@ -136,7 +136,7 @@ class ResidualEstimate:
             return float("nan")
         values, vectors = np.linalg.eigh(self.covariance_nm2)
         covariance = vectors * np.maximum(values, 0.0) @ vectors.T
-        return float(jitter_strehl(covariance, imaging=imaging))
+        return float(strehl(covariance, imaging))
 
     @property
     def text(self) -> str:
@@ -230,9 +230,11 @@ def replay(
     z(k) stands for phi_tot(k-1), without noise: the residual of frame k-1 is e(k). A loop that
     reads channels is given their readings (frames, c), which come in the frame of the measurement.
     """
-    path, driven = loop.rejection(), series
+    path, driven = loop.path("phase", "residual"), series
     if loop.reads_others and readings is not None:
-        path = loop.rejection_with_channels()
+        path, n = loop.path("all", "residual"), loop.hardware.modes
+        entering = np.r_[:n, n + loop.hardware.n_measurements : path.B.shape[-1]]
+        path = replace(path, B=path.B[..., entering], D=path.D[..., entering])
         driven = np.hstack([series, np.vstack([readings[:1], readings[:-1]])])
     return run_from_rest(path, driven, runs, settle_frames(loop.hardware))
 

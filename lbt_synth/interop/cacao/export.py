@@ -28,7 +28,6 @@ from lbt_synth.interop.proof import (
     ROUNDOFF,
     Written,
     filter_of_history,
-    history_filter,
     mode_variances,
     proved_gains,
     scenario_gains,
@@ -112,7 +111,7 @@ class PredictiveFilter:
         """Return the loop at a sensor gain, the filter 1 / D and its norm, made once."""
         if gain not in self._steering:
             loop = close_loop(self.hardware, self.design.controller, sensor_gain=gain)
-            s, back = loop.output_sensitivity(), np.linalg.inv(self.gains(gain))
+            s, back = loop.path("noise", "reading"), np.linalg.inv(self.gains(gain))
             rest = np.eye(len(back)) - back
             inverse = replace(s, C=rest @ s.C, D=rest @ s.D + back)
             self._steering[gain] = loop, inverse, float(hinf_norm(inverse))
@@ -253,7 +252,7 @@ def predictive_filter(design: Design) -> PredictiveFilter:
             "cacao counts with a sensor gain of 1, at which the loop of this design is unstable. "
             "Divide the reconstructor by the sensor gain, and design for a gain of 1."
         )
-    system = history_filter(loop).balanced()
+    system = loop.path("noise", "command").balanced()
     return PredictiveFilter(design=design, hardware=hardware, system=system)
 
 

@@ -25,7 +25,7 @@ from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.interop.pipeline import CERTIFICATE, Target
-from lbt_synth.interop.proof import ROUNDOFF, Written, filter_of_history, history_filter
+from lbt_synth.interop.proof import ROUNDOFF, Written, filter_of_history
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware
@@ -166,7 +166,7 @@ def filter_of(hardware: LoopHardware, own: Controller, response: FloatArray) -> 
         delay_frames=delay,
         response=response,
         taps=taps,
-        system=history_filter(close_loop(modal, own)),
+        system=close_loop(modal, own).path("noise", "command"),
     )
 
 

@@ -22,8 +22,8 @@ from lbt_synth.interop.specula.optics import (
     calibrate,
 )
 from lbt_synth.linear import Controller
-from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
-from lbt_synth.loop.simulation.run import SteppedController, run_frames
+from lbt_synth.loop.disturbances import draw_others, draw_phase
+from lbt_synth.loop.simulation import SteppedController, run_frames
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray, require_instance
 

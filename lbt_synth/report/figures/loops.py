@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear.norms import spectral_norms
-from lbt_synth.loop import ClosedLoop, broken_loops, close_loop, loop_margins, step_response
-from lbt_synth.loop.margins import BrokenLoop
-from lbt_synth.loop.simulation.run import SHOWN_FRAMES, LoopStep
+from lbt_synth.loop import ClosedLoop, close_loop, loop_margins
+from lbt_synth.loop.margins import BrokenLoop, broken_loops
+from lbt_synth.loop.simulation import SHOWN_FRAMES, LoopStep, step_response
 from lbt_synth.report.draw import (
     GREY,
     GUIDE,
@@ -187,7 +187,10 @@ def sigma_curves(
             system = design.error_system(problem.with_unit_weights() if unit_weights else problem)
             error = spectral_norms(system.frequency_response(grid))
         if name in loops and loops[name].is_stable:
-            S, N = loops[name].sensitivity(grid), loops[name].noise_transfer(grid)
+            S, N = (
+                loops[name].sensitivity(grid),
+                loops[name].path("noise", "residual").frequency_response(grid),
+            )
             diagonals = [np.abs(response.diagonal(axis1=1, axis2=2)).T for response in (S, N)]
             if _are_apart(S) and _are_apart(N) and not np.allclose(diagonals[0], diagonals[0][0]):
                 for axis, pair in enumerate(zip(*diagonals, strict=True)):

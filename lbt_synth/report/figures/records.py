@@ -15,8 +15,8 @@ from lbt_synth.identification import IdentifiedModel
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
-from lbt_synth.loop import ClosedLoop, Simulation, close_loop
-from lbt_synth.loop.simulation.run import Segment
+from lbt_synth.loop import ClosedLoop, close_loop
+from lbt_synth.loop.simulation import Segment, Simulation
 from lbt_synth.models import ARModel, Truth, Vibration
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.report.draw import (
@@ -201,7 +201,7 @@ def _residual_density(model: IdentifiedModel, loop: ClosedLoop, i: int) -> Float
     """Density of the residual of an axis, of the phase and the noise of all axes, (f,)."""
     f = model.axes[i].frequency_hz
     rejected = np.abs(loop.sensitivity(f)[:, i]) ** 2
-    passed = np.abs(loop.noise_transfer(f)[:, i]) ** 2
+    passed = np.abs(loop.path("noise", "residual").frequency_response(f)[:, i]) ** 2
     density = np.zeros(f.size)
     for j, axis in enumerate(model.axes):
         white = _noise_density(axis)

@@ -29,9 +29,8 @@ from lbt_synth.report.draw import (
 from lbt_synth.report.figures.loops import draw_design
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts
-from lbt_synth.studies import RobustnessMap, RobustnessRow
 from lbt_synth.studies.limits import LimitStudy
-from lbt_synth.studies.robustness import FAMILIES
+from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, RobustnessRow
 from lbt_synth.validation import FloatArray
 
 FREQUENCY_ERROR = ("frequency error, truth less design", "Hz")
@@ -126,7 +125,7 @@ def robustness_map_figure(
             grids.append((x, y, 100 * grid.strehl[row][np.ix_(up, across)]))
         label = f"{STREHL[0]} [{STREHL[1]}]"
         draw_map(panels, grids, label, blank="unstable loop")
-        for panel, (x, y, values), (_, _, grid) in zip(panels, grids, drawn, strict=True):
+        for panel, (x, y, values) in zip(panels, grids, strict=True):
             finite = values[np.isfinite(values)]
             if min(values.shape) > 1 and finite.size and np.ptp(finite) > 0:
                 dark_on_light = {"cmap": "gray_r", "norm": panel.collections[0].norm}
@@ -135,9 +134,6 @@ def robustness_map_figure(
                 panel.clabel(lines, fmt="%g", fontsize=7)
             if real_gain is not None and y[0] <= real_gain <= y[-1]:
                 panel.axhline(real_gain, label="real sensor gain", linestyle="--", **GUIDE)
-            for edge in grid.band_hz or ():
-                if x[0] < edge < x[-1]:
-                    panel.axvline(edge, label="edge of the design's band", linestyle="-.", **GUIDE)
     return panels[0].figure
 
 

@@ -27,7 +27,7 @@ import numpy as np
 
 import lbt_synth
 from lbt_synth.errors import FileError, MissingExtraError, ProblemError
-from lbt_synth.loop import LoopMargins
+from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.report.draw import Figure, Series, figure_series, house_style
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_together
 from lbt_synth.storage.input_files import read_bytes

@@ -9,18 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.storage.display_unit import shown_format, shown_unit
 from lbt_synth.storage.rows import cell_text
 from lbt_synth.storage.tables import Cell, Table
-from lbt_synth.validation import BoolArray, FloatArray, IntArray, float_array
+from lbt_synth.validation import BoolArray, FloatArray
 
 PERCENTS = (1.0, 5.0, 25.0, 50.0, 75.0, 95.0, 99.0)
 CONFIDENCE = 0.95  # of the interval of a percentile or a share
 _MOST_WORST = 10  # samples that are listed
 _FEWEST = 20  # samples for an index
 _CONSTANT = 1e-12  # scatter of a Strehl ratio that is rounding
-# With more groups than 8 and fewer samples, one parameter of a Sobol sequence inherits up to 9 % of
+# With more pieces than 8 and fewer samples, one parameter of a Sobol sequence inherits up to 9 % of
 # another
 _FEW_GROUPS, _MANY_SAMPLES = 8, 4096
 _MOST_VALUES = 32  # a parameter with more distinct values is continuous
@@ -88,70 +87,20 @@ class StudyStatistics:
 
 
 def study_statistics(
-    columns: Mapping[str, ArrayLike],
-    parameters: Sequence[str],
-    controllers: Sequence[str],
+    columns: Mapping[str, ArrayLike], parameters: Sequence[str], controllers: Sequence[str]
 ) -> StudyStatistics:
-    """Compute the statistics of a study's results.
+    """Compute the statistics of a study's results (n,), by the names of its columns.
 
-    Parameters
-    ----------
-    columns : mapping of str to (n,) array_like
-        Results: each parameter under its name and, for each controller, ``NAME.strehl`` (nan
-        where unstable or failed), ``NAME.residual_nm`` and ``NAME.stable`` (1, 0; nan where the
-        evaluation failed); ``row`` (number of the sample) is optional.
-    parameters : sequence of str
-        Names of the parameters.
-    controllers : sequence of str
-        Names of the controllers.
-
-    Returns
-    -------
-    StudyStatistics
-        An unstable loop counts as a Strehl ratio of 0; failed evaluations are left out and
-        counted.
-
-    Raises
-    ------
-    ProblemError
-        If a column is missing or holds impossible values.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> gain = np.linspace(0.5, 1.5, 201)
-    >>> stable = (gain < 1.4).astype(float)
-    >>> columns = {
-    ...     "gain": gain,
-    ...     "a.stable": stable,
-    ...     "a.residual_nm": 100 / gain,
-    ...     "a.strehl": np.where(stable, 0.6 * gain, np.nan),
-    ... }
-    >>> only = lbt.studies.study_statistics(columns, ["gain"], ["a"]).controllers[0]
-    >>> only.samples, only.unstable, round(only.strehl[50].value, 3), only.worst[0]
-    (201, 21, 0.537, 180)
+    An unstable loop counts as a Strehl ratio of 0; failed evaluations are left out and counted.
     """
-    for names, what in ((parameters, "parameters"), (controllers, "controllers")):
-        if isinstance(names, str) or len(set(names)) != len(names):
-            raise ProblemError(f"{what} must be a list of different names; got {names!r}.")
-    if not controllers:
-        raise ProblemError("controllers must name one at least; got none.")
-    size = len(read_column(columns, f"{controllers[0]}.stable"))
-    if not size:
-        raise ProblemError("the results must have at least one sample; got none.")
-    samples = {name: read_controller_samples(columns, name, size) for name in controllers}
-    values = {name: read_column(columns, name, size, finite=True) for name in parameters}
-    rows = np.arange(size)
-    if "row" in columns:
-        rows = read_column(columns, "row", size, finite=True).astype(np.int64)
-    orders = {name: np.argsort(numbers) for name, numbers in values.items()}
+    values = {name: np.asarray(columns[name], dtype=np.float64) for name in parameters}
+    rows = np.asarray(columns["row"])
     return StudyStatistics(
-        samples=size,
+        samples=len(rows),
         parameters=tuple(parameters),
         controllers=tuple(
-            _controller_statistics(name, columns, rows, values, orders)
-            for name, columns in samples.items()
+            _controller_statistics(name, controller_samples(columns, name), rows, values)
+            for name in controllers
         ),
     )
 
@@ -159,11 +108,10 @@ def study_statistics(
 def _controller_statistics(
     controller: str,
     samples: Samples,
-    rows: IntArray,
+    rows: FloatArray,
     values: Mapping[str, FloatArray],
-    orders: Mapping[str, IntArray],
 ) -> ControllerStatistics:
-    """Return the statistics of one controller, with the order of each parameter's values."""
+    """Return the statistics of one controller."""
     places = np.flatnonzero(samples["evaluated"])
     strehl, unstable = samples["strehl"][places], samples["unstable"][places]
     n = len(strehl)
@@ -179,56 +127,34 @@ def _controller_statistics(
         strehl=percentiles(strehl, PERCENTS),
         residual_nm=percentiles(samples["residual_nm"][places], PERCENTS),
         worst=tuple(worst.tolist()),
-        sensitivity={name: _sensitivity(values[name], orders[name], samples) for name in values},
+        sensitivity={
+            name: dict(
+                zip(
+                    ("index", "index_error"),
+                    first_order_index(numbers[places], strehl),
+                    strict=True,
+                )
+            )
+            for name, numbers in values.items()
+        },
     )
 
 
-def read_column(
-    columns: Mapping[str, Any], name: str, size: int | None = None, *, finite: bool = False
-) -> FloatArray:
-    """Return a column of the results, of the given length if there is one."""
-    if name not in columns:
-        raise ProblemError(
-            f"the results must have a column {name!r}; got {', '.join(map(repr, columns))}. "
-            "Check the names of parameters and controllers."
-        )
-    out = float_array(columns[name], f"column {name!r}")
-    if out.ndim != 1 or (size is not None and len(out) != size):
-        demand = "be 1-D" if size is None else f"have {size} rows, as the others"
-        raise DimensionError(f"column {name!r} must {demand}; got shape {out.shape}.")
-    _refuse_where(finite & ~np.isfinite(out), out, f"column {name!r} must be finite")
-    return out
-
-
-def read_controller_samples(
-    columns: Mapping[str, Any], controller: str, size: int | None = None
-) -> Samples:
-    """Read the columns of a controller, (n,) each: results, and what was evaluated and unstable.
+def controller_samples(columns: Mapping[str, ArrayLike], controller: str) -> Samples:
+    """Return the columns of a controller, (n,) each: results, and what was evaluated and unstable.
 
     An unstable loop has a Strehl ratio of 0 and an infinite residual, a failed evaluation has nan.
     """
-    mark = read_column(columns, f"{controller}.stable", size)
-    evaluated, stable = ~np.isnan(mark), mark == 1
-    wrong = evaluated & ~stable & (mark != 0)
-    _refuse_where(wrong, mark, f"column '{controller}.stable' must be 1, 0 or nan")
-    results: Samples = {}
-    for name, most, said, lost in (
-        ("strehl", 1 + 1e-9, "within [0, 1]", 0.0),
-        ("residual_nm", np.finfo(float).max, "finite and at least 0", np.inf),
-    ):
-        values = read_column(columns, f"{controller}.{name}", mark.size)
-        demand = f"column '{controller}.{name}' must be {said} where the loop is stable"
-        _refuse_where(stable & ~((values >= 0) & (values <= most)), values, demand)
-        results[name] = np.where(stable, values, np.where(evaluated, lost, np.nan))
-    return results | {"evaluated": evaluated, "unstable": evaluated & ~stable}
-
-
-def _refuse_where(wrong: BoolArray, values: FloatArray, demand: str) -> None:
-    """Refuse a column with wrong values, and show the first."""
-    if np.any(wrong):
-        row = int(np.argmax(wrong))
-        text = f"{demand}; got {values[row]:g} at index {row}. Check the file of the results."
-        raise (ProblemError if np.isfinite(values[row]) else NonFiniteError)(text)
+    mark, strehl, residual_nm = (
+        np.asarray(columns[f"{controller}.{name}"], dtype=np.float64)
+        for name in ("stable", "strehl", "residual_nm")
+    )
+    return {
+        "strehl": np.where(mark == 0, 0.0, strehl),
+        "residual_nm": np.where(mark == 0, np.inf, residual_nm),
+        "evaluated": ~np.isnan(mark),
+        "unstable": mark == 0,
+    }
 
 
 def percentiles(values: FloatArray, percents: Sequence[float]) -> dict[float, Interval]:
@@ -266,92 +192,40 @@ def share(where: BoolArray) -> Interval:
     return Interval(value=count / len(where), low=float(ends.low), high=float(ends.high))
 
 
-def _sensitivity(values: FloatArray, order: IntArray, samples: Samples) -> dict[str, float]:
-    """Return how much of the variance of the Strehl ratio one parameter explains."""
-    order = order[samples["evaluated"][order]]
-    ordered, index = values[order], (np.nan, np.nan)
-    if len(ordered) >= _FEWEST and ordered[0] < ordered[-1]:
-        index = first_order_index(ordered, samples["strehl"][order])
-    return dict(zip(("index", "index_error"), index, strict=True))
+def first_order_index(parameter: FloatArray, result: FloatArray) -> tuple[float, float]:
+    """Return ``Var(E[y | x]) / Var(y)`` of a result y (n,) for a parameter x (n,).
 
-
-def first_order_index(ordered: FloatArray, result: FloatArray) -> tuple[float, float]:
-    """Return ``Var(E[y | x]) / Var(y)`` of a result y (n,) for a parameter in rising order (n,).
-
-    Its standard error comes with it; both are nan if the result or the parameter is constant. The
-    mean given x is a line in each of n^(1/3) groups of equal size, at most 8 below 4096
-    samples (E. Plischke, E. Borgonovo, C. L. Smith, Eur. J. Oper. Res. 226, 536 (2013)), and one
-    value for each of a list.
+    Its standard error comes with it; both are nan if the result or the parameter is constant, or
+    of few samples. The mean given x is one value for each of a list, else a quadratic spline over
+    the rank, in n^(1/3) pieces or in 8 of them below 4096 samples.
     """
-    n = len(ordered)
+    from scipy.interpolate import make_lsq_spline
+    from scipy.stats import rankdata
+
+    n = len(parameter)
+    if n < _FEWEST or np.ptp(parameter) == 0 or np.std(result) <= _CONSTANT:
+        return np.nan, np.nan
     spread = result - np.mean(result)
     total = float(spread @ spread)
-    if total <= n * _CONSTANT**2:
-        return np.nan, np.nan
-    if is_list(ordered):
-        starts = value_starts(ordered)
-        coefficients, jumps = len(starts), np.full(1, np.inf)  # a list has no joints
-        counts = np.diff(np.append(starts, n))
-        fit = np.repeat(np.add.reduceat(spread, starts) / counts, counts)
+    _, group, counts = np.unique(parameter, return_inverse=True, return_counts=True)
+    if len(counts) <= min(_MOST_VALUES, max(2, n // 5)):
+        coefficients = len(counts)
+        fit = (np.bincount(group, spread) / counts)[group]
     else:
-        groups = round(n ** (1 / 3))
-        starts = group_starts(ordered, groups if n >= _MANY_SAMPLES else min(groups, _FEW_GROUPS))
-        coefficients = 2 * len(starts)
-        fit, jumps = _lines(spread, _ranks(ordered), starts)
-    # a jump between lines of n / B samples has 8 B / n of the variance of their scatter, which is
-    # less for even samples than for independent ones
-    scatter = float(np.sum((spread - fit) ** 2)) / (n - coefficients)
-    scatter = min(scatter, float(np.mean(jumps**2)) / 8 * n / len(starts))
+        pieces = max(_FEW_GROUPS, round(n ** (1 / 3)) if n >= _MANY_SAMPLES else 0)
+        order, ranks = np.argsort(parameter), rankdata(parameter)
+        joints = np.linspace(ranks.min(), ranks.max(), pieces + 1)
+        knots = np.pad(joints, 2, mode="edge")
+        coefficients = pieces + 2
+        fit = make_lsq_spline(ranks[order], spread[order], knots, 2)(ranks)
     squares = (spread - fit) ** 2
     unexplained = float(np.sum(squares)) / total
     # a fit follows some of the scatter (T. L. Kelley, Proc. Natl. Acad. Sci. 21, 554 (1935))
-    correction = (coefficients - 1) * scatter / total
+    correction = (coefficients - 1) * unexplained / (n - coefficients)
     # what a sample adds to the index, to first order; at least the error of an index of 0
     influence = (squares - unexplained * spread * spread) * (n / total)
     least = unexplained * (2 * (coefficients - 1)) ** 0.5 / n
     return 1 - unexplained - correction, max(float(np.std(influence)) / n**0.5, least)
-
-
-def _lines(
-    values: FloatArray, ranks: FloatArray, starts: IntArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return lines over the rank, one for each group, at every sample, and the jumps between."""
-    counts = np.diff(np.append(starts, len(values)))
-    means = np.add.reduceat(values, starts) / counts
-    place = ranks - np.repeat(starts + (counts + 1) / 2, counts)
-    widths = np.add.reduceat(place * place, starts)
-    slopes = np.add.reduceat(place * values, starts) / np.where(widths > 0, widths, 1.0)
-    rises = slopes * counts / 2
-    fit = np.repeat(means, counts) + np.repeat(slopes, counts) * place
-    return fit, (means - rises)[1:] - (means + rises)[:-1]
-
-
-def _ranks(ordered: FloatArray) -> FloatArray:
-    """Return the ranks of values that are in order."""
-    starts = value_starts(ordered)
-    counts = np.diff(np.append(starts, len(ordered)))
-    ranks: FloatArray = np.repeat(starts + (counts + 1) / 2, counts)
-    return ranks
-
-
-def is_list(ordered: FloatArray) -> bool:
-    """Whether a parameter, given in rising order, takes few values, as from a list of a study."""
-    distinct = 1 + int(np.count_nonzero(np.diff(ordered)))
-    return distinct <= min(_MOST_VALUES, max(2, len(ordered) // 5))
-
-
-def value_starts(ordered: FloatArray) -> IntArray:
-    """Return the first index of each value of a list, given in rising order."""
-    return np.concatenate(([0], 1 + np.flatnonzero(np.diff(ordered)))).astype(np.int64)
-
-
-def group_starts(ordered: FloatArray, groups: int) -> IntArray:
-    """Return the first index of each of some groups of about equal size, in rising order.
-
-    Equal values are in one group, so that the order of their samples is of no matter.
-    """
-    n = len(ordered)
-    return np.unique(np.searchsorted(ordered, ordered[np.arange(groups) * n // groups]))
 
 
 def summary_tables(statistics: StudyStatistics) -> tuple[Table, ...]:
@@ -423,7 +297,7 @@ def worst_table(
     def at(column: str) -> list[float]:
         return [float(value) for value in np.asarray(columns[column], dtype=np.float64)[places]]
 
-    rows = [f"{row:.0f}" for row in at("row")] if "row" in columns else [str(i) for i in places]
+    rows = [f"{row:.0f}" for row in at("row")]
     strehls: list[str | Cell] = [
         percent(strehl) if stable else Cell(text="unstable", tone="bad")
         for strehl, stable in zip(at(f"{name}.strehl"), at(f"{name}.stable"), strict=True)

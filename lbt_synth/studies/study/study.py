@@ -39,8 +39,6 @@ from lbt_synth.validation import FloatArray, integer
 
 DELAY_ERROR = "error.delay_frames"
 NOISE_FACTOR = "error.noise_factor"
-EXACT_COLUMNS = ("strehl", *RESIDUALS, "stable")
-SIMULATED_COLUMNS = ("strehl", "residual_nm", "stable")
 _EDGE = 2.0**-32  # levels stay this far from 0 and 1, where a normal quantile is infinite
 # of one sample: what designs assume, the real loop, and what that really meets
 Sample = tuple[Config, LoopHardware, Truth]
@@ -76,7 +74,6 @@ class ParameterSection(Section):
     uniform: Annotated[list[float], Field(min_length=2, max_length=2)] | None = None
     normal: NormalSection | None = None
     list_: Annotated[list[float], Field(min_length=1)] | None = Field(default=None, alias="list")
-    weights: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1)] | None = None
     also: list[str] = Field(default_factory=list)
 
     @model_validator(mode="before")
@@ -92,8 +89,6 @@ class ParameterSection(Section):
         if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
             low, high = self.uniform
             raise ValueError(f"uniform: must be [low, high]; got [{low:g}, {high:g}]")
-        if self.weights is not None and len(self.weights) != len(self.list_ or ()):
-            raise ValueError("weights goes with list, one for each of its values")
         return self
 
     @property
@@ -118,8 +113,6 @@ class ParameterSection(Section):
             ends = {"from": self.normal.low, "to": self.normal.high}
             return out + "".join(f", {k} {v:g}" for k, v in ends.items() if v is not None)
         shown = [f"{value:g}" for value in self.values]
-        if len(set(self.weights or ())) > 1:
-            shown = [f"{v} ({w:g})" for v, w in zip(shown, self.weights or (), strict=True)]
         if len(shown) > 8:
             shown[4:-3] = ["..."]
         return f"one of {', '.join(shown)}"
@@ -137,8 +130,7 @@ class ParameterSection(Section):
         if self.uniform is not None:
             low, high = self.uniform
             return np.clip(low + level * (high - low), low, high)
-        bounds = np.cumsum(self.weights or [1.0] * len(self.values))
-        return np.array(self.values)[np.searchsorted(bounds[:-1] / bounds[-1], level, side="right")]
+        return np.array(self.values)[(level * len(self.values)).astype(np.int64)]
 
     def extremes(self, samples: int) -> tuple[float, float]:
         """Return the ends, or values beyond which half a sample is expected."""
@@ -195,9 +187,7 @@ class StudySection(Section):
     version: Annotated[int, Field(ge=1, le=1)]
     config: str
     samples: Annotated[int, Field(ge=1, le=2**30)]
-    sampling: Literal["sobol", "latin_hypercube"] = "sobol"
     seed: Annotated[int, Field(ge=0)] = 0
-    evaluation: Literal["exact", "simulation"] = "exact"
     controllers: Annotated[dict[ControllerName, ControllerSection], Field(min_length=1)]
     parameters: Annotated[dict[str, ParameterSection], Field(min_length=1)]
 
@@ -247,8 +237,7 @@ class Study:
     @property
     def result_columns(self) -> tuple[str, ...]:
         """Names of the results, controller by controller."""
-        evaluation = self.settings.evaluation
-        return tuple(c for name in self.controllers for c in result_columns(name, evaluation))
+        return tuple(c for name in self.controllers for c in result_columns(name))
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -271,34 +260,25 @@ class Study:
         columns = [law.quantile(next(levels) if law.varies else none) for law in distributions]
         return np.stack(columns, axis=1)
 
-    def simulation_seed(self, row: int) -> int:
-        """Return the seed of the simulation of one sample."""
-        drawn = np.random.SeedSequence(self.settings.seed, spawn_key=(row,)).generate_state(1)
-        return int(drawn[0])
-
     def parameters_by_name(self, values: Sequence[float] | FloatArray) -> dict[str, float]:
         """Return a row of :meth:`values` as a dictionary."""
         return dict(zip(self.parameter_names, np.asarray(values).tolist(), strict=True))
 
 
-def result_columns(controller: str, evaluation: str) -> tuple[str, ...]:
+def result_columns(controller: str) -> tuple[str, ...]:
     """Return the names of the results of one controller."""
-    names = EXACT_COLUMNS if evaluation == "exact" else SIMULATED_COLUMNS
-    return tuple(f"{controller}.{name}" for name in names)
+    return tuple(f"{controller}.{name}" for name in ("strehl", *RESIDUALS, "stable"))
 
 
 def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) -> FloatArray:
-    """Return points ``start`` to ``stop`` of a study's sampling, (., dimensions) in [0, 1).
+    """Return points ``start`` to ``stop`` of a study's Sobol sequence, (., dimensions) in [0, 1).
 
-    The seed fixes every point. A longer Sobol sequence begins with the same points, and is
-    balanced where it has 2^k of them. A Latin hypercube is made as a whole.
+    The seed fixes every point. A longer sequence begins with the same points, and is balanced where
+    it has 2^k of them.
     """
     if dimensions == 0 or stop == start:
         return np.zeros((stop - start, dimensions))
-    if settings.sampling == "latin_hypercube":
-        points = _sampler("LatinHypercube", dimensions, settings.seed, settings.samples)
-        return np.asarray(points[start:stop])
-    engine = _sampler("Sobol", dimensions, settings.seed).reset()
+    engine = _sampler(dimensions, settings.seed).reset()
     if start > 0:
         return np.asarray(engine.fast_forward(start).random(stop - start))
     # a first number of points that is no power of 2 is warned of
@@ -306,12 +286,11 @@ def unit_points(settings: StudySection, dimensions: int, start: int, stop: int) 
 
 
 @lru_cache(maxsize=1)
-def _sampler(kind: str, dimensions: int, seed: int, points: int = 0) -> Any:
-    """Return a sampler, whose scrambling takes longer than a part, or its first points."""
+def _sampler(dimensions: int, seed: int) -> Any:
+    """Return a sampler, whose scrambling takes longer than a part."""
     from scipy.stats import qmc
 
-    sampler = getattr(qmc, kind)(dimensions, seed=np.random.default_rng(seed))
-    return sampler.random(points) if points else sampler
+    return qmc.Sobol(dimensions, seed=np.random.default_rng(seed))
 
 
 def is_error(parameter: str) -> bool:
@@ -410,11 +389,11 @@ def load_study(path: str | os.PathLike[str]) -> Study:
     for where, values in _corners(study):
         with refuse_config(f"{source}: {where}", where.split(" ")[0]):
             samples.append((where, make_sample(study, values)))
-    if config.truth.drifts and settings.evaluation == "exact":
+    if config.truth.drifts:
         raise ConfigError(
-            f"{source}: a vibration of the truth drifts, so that there is no exact answer; "
-            "set evaluation: simulation.",
-            path="evaluation",
+            f"{config_file}: a vibration of the truth drifts, so that there is no exact answer; "
+            "give it one frequency, or simulate it.",
+            path="config",
         )
     study = replace(
         study,
@@ -436,7 +415,7 @@ def _require_names(settings: StudySection, source: Path) -> None:
     first: dict[str, str] = {}
     for name in settings.controllers:
         other = first.setdefault(name.casefold(), name)
-        taken = [p for p in settings.parameters if p in result_columns(name, settings.evaluation)]
+        taken = [p for p in settings.parameters if p in result_columns(name)]
         if other != name:
             why = f"its files need a name that differs by more than its case from {other}"
         elif name.casefold().startswith("row_"):

@@ -78,7 +78,7 @@ def test_a_narrow_line_of_a_tabulated_spectrum_is_not_missed():
     )
     bounded = shaped(CommandRms(at_most_nm=10, turbulence=line, noise_nm=1e-3))
     loop = lbt.close_loop(ONE, bounded.controller)
-    assert 100 * abs(loop.commanding().frequency_response([f0])[0, 0, 1]) < 10
+    assert 100 * abs(loop.path("noise", "command").frequency_response([f0])[0, 0, 0]) < 10
     rejecting = shaped(terms=[ResidualVariance(turbulence=line, noise_nm=NOISE)], functions=30)
     residual = 100 * abs(lbt.close_loop(ONE, rejecting.controller).sensitivity([f0])[0, 0, 0])
     assert residual < rejecting.objective_nm[0]

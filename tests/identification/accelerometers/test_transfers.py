@@ -17,7 +17,7 @@ from lbt_synth.identification.accelerometers.transfers import (
     AccelerometerTransfers,
     accelerometer_transfers,
 )
-from lbt_synth.loop.simulation.disturbances import draw_others, draw_phase
+from lbt_synth.loop.disturbances import draw_others, draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite
 
 RATE = 1000.0

@@ -115,7 +115,7 @@ def test_a_table_of_one_axis():
     assert table.test == ((4450, 5000), (5500, 9000))
     row = table["Kalman"]
     assert abs(row.deviations) < 4
-    strehl = lbt.loop.jitter_strehl([[row.replayed_nm**2]], imaging=CAMERA)
+    strehl = lbt.strehl([[row.replayed_nm**2]], CAMERA)
     assert row.strehl == pytest.approx(strehl, rel=1e-12)
 
 

@@ -24,7 +24,7 @@ from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.interop.c.terms import RunningSource, source_terms
 from lbt_synth.interop.pipeline import target_named, target_names
 from lbt_synth.interop.proof import rehearsal_error
-from lbt_synth.loop.simulation.run import Drop
+from lbt_synth.loop.simulation import Drop
 
 LIMITS = {"double": 1e-12, "single": 1e-5}
 

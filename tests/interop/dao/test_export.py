@@ -28,7 +28,7 @@ from lbt_synth.interop.dao.export import (
 )
 from lbt_synth.interop.proof import _rounding_left, prove_written
 from lbt_synth.linear.norms import band_norm
-from lbt_synth.loop.simulation.disturbances import draw_disturbance
+from lbt_synth.loop.disturbances import draw_disturbance
 from lbt_synth.loop.stable_range import radii_by_gain
 
 BALANCE = 1e-13  # of a coefficient
@@ -289,7 +289,7 @@ def test_residuals_are_those_of_the_design(case, shaped):
         air, line, *_ = specification.terms
         truth = lbt.Truth(turbulence=air.turbulence, noise_nm=air.noise_nm, sensor_gain=gain)
         budget = lbt.residual_budget(around, truth, frame_means=True)
-        peak = band_norm(around.rejection(), line.low_hz, line.high_hz).upper
+        peak = band_norm(around.path("phase", "residual"), line.low_hz, line.high_hz).upper
         expected.append(np.hypot(budget.rms_nm, line.rms_nm * peak))
     assert loop.gains == (1.0, 0.6)
     assert loop.residuals_nm(c) == pytest.approx(expected, rel=2e-3)

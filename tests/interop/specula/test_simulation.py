@@ -13,7 +13,7 @@ import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.interop import run_end_to_end
 from lbt_synth.interop.specula.simulation import accompany_filter, mix_controller
-from lbt_synth.loop.simulation.disturbances import draw_phase
+from lbt_synth.loop.disturbances import draw_phase
 from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
 
 

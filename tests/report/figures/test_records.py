@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support.eris import eris_model
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.run import Drop, run_segments
+from lbt_synth.loop.simulation import Drop, run_segments
 from lbt_synth.report.figures.records import (
     exact_spectrum,
     run_spectra,

@@ -16,6 +16,7 @@ from lbt_synth.report.figures.studies import (
     tradeoff_figure,
 )
 from lbt_synth.studies import robustness, robustness_map
+from lbt_synth.studies.limits import limits
 
 
 def test_robustness_figure_draws_the_paper_beside(config):
@@ -108,7 +109,7 @@ def test_limits_name_designs_and_what_moves(config):
     slow = lbt.integrator(config.hardware, gain=0.3)
     designs = {"kalman": lbt.kalman(config.plant), "slow": slow}
     parts = config.hardware, config.truth, config.imaging
-    study = lbt.studies.limits(designs, *parts, errors_hz=[-1, 1])
+    study = limits(designs, *parts, errors_hz=[-1, 1])
     (axes,) = limits_figure(study).axes
     assert legend(axes)[:2] == ["Kalman", "slow"]
     assert axes.get_xlabel() == "frequency of the true vibration [Hz]"

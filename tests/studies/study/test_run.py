@@ -1,8 +1,12 @@
-"""Runs of studies: what they write, resume and refuse."""
+"""Studies that run, resume and are replayed; samples one by one, and at once against that."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.plants import LBT_YAML
 from support.studies import (
+    BASE,
     LBT_TEXT,
     TWO,
     assert_whole,
@@ -11,12 +15,15 @@ from support.studies import (
     make_folder,
     part_rows,
     read_table,
+    study_file,
 )
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.studies.study.run import replay_row
-from lbt_synth.studies.study.sample import evaluate_samples
+from lbt_synth.models import SinusoidalVibration
+from lbt_synth.studies.study import run as evaluation
+from lbt_synth.studies.study.run import evaluate_samples, replay_row
+from lbt_synth.studies.study.study import make_sample
 
 
 def part_path(folder, place):
@@ -97,16 +104,13 @@ def test_tables_are_written_from_the_parts(tmp_path):
     assert_whole(folder, study)
 
 
-@pytest.mark.parametrize(("evaluation", "turbulence"), [("exact", "ar2"), ("simulation", "ar1")])
-def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
-    base = LBT_TEXT.replace("kind: ar1", f"kind: {turbulence}").replace(
+def test_a_row_is_replayed(tmp_path):
+    base = LBT_TEXT.replace("kind: ar1", "kind: ar2").replace(
         "turbulence: frozen_flow", "turbulence: model"
     )
-    base = base.replace("frames: 8000", "frames: 300").replace("cases: 4", "cases: 2")
     study = load_small_study(
         tmp_path,
         base=base,
-        evaluation=evaluation,
         samples="4",
         controllers="{a: {design: integrator, gain: 0.4}, own: {design: kalman, for: sample}}",
         parameters="{atmosphere.seeing_arcsec: {uniform: [0.6, 1]}, error.delay_frames: {uniform: "
@@ -128,23 +132,7 @@ def test_a_row_is_replayed(tmp_path, evaluation, turbulence):
     for name, path in (("a", folder / "a.fits"), ("own", folder / "row_2_own.fits")):
         design = lbt.load_gain(path)
         loop = lbt.close_loop(real.hardware, design.controller, sensor_gain=real.truth.sensor_gain)
-        if evaluation == "exact":
-            found = lbt.strehl(lbt.residual_budget(loop, real.truth), real.imaging)
-        else:
-            section = real.settings.simulation
-            found = (
-                lbt.simulate(
-                    design.controller,
-                    real.truth,
-                    hardware=real.hardware,
-                    frames=300,
-                    cases=2,
-                    seed=section.seed,
-                    settle_frames=section.settle_frames,
-                )
-                .strehl(real.imaging)
-                .mean()
-            )
+        found = lbt.strehl(lbt.residual_budget(loop, real.truth), real.imaging)
         assert found == pytest.approx(again.fresh[f"{name}.strehl"], rel=1e-9)
 
 
@@ -167,3 +155,290 @@ def test_a_row_of_an_unfinished_study(tmp_path):
     assert replay_row(study, folder, 59).stored == {}
     with pytest.raises(ProblemError, match="rows 0 to 59; got row 60"):
         replay_row(study, folder, 60)
+
+
+def test_a_sample_is_a_configuration(tmp_path):
+    text = LBT_TEXT.replace("sensor_gain: 1.0", "sensor_gain: 0.8")
+    study = load_small_study(
+        tmp_path,
+        base=text,
+        parameters="{atmosphere.seeing_arcsec: {list: [0.5, 1.1]}, imaging.wavelength_um: 1.65, "
+        "sensor.pyramid.subapertures_across: {list: [20, 30]}, 'robustness.errors_hz[0]': -4, "
+        "'truth.vibrations[0].rms_mas': {uniform: [10, 20], also: ['model.vibrations[0].rms_mas']}, "
+        "error.delay_frames: {uniform: [0, 0.5]}, error.noise_factor: {uniform: [1, 2]}}",
+    )
+    for values in study.values(0, 4):
+        named = study.parameters_by_name(values)
+        config, hardware, truth = make_sample(study, values)
+        settings = config.settings
+        assert settings.atmosphere.seeing_arcsec == named["atmosphere.seeing_arcsec"]
+        assert settings.imaging.wavelength_um == 1.65
+        assert settings.robustness.errors_hz[:2] == [-4, -3]
+        assert settings.sensor.pyramid.subapertures_across in (20, 30)
+        rms = named["truth.vibrations[0].rms_mas"]
+        assert settings.model.vibrations[0].rms_mas == settings.truth.vibrations[0].rms_mas == rms
+        assert truth.sensor_gain == 0.8
+        assert config.hardware.delay_frames == 2.0
+        assert hardware.delay_frames == 2.0 + named["error.delay_frames"]
+        assert truth.noise_nm == pytest.approx(config.noise_nm * named["error.noise_factor"])
+        # the same from a file: the independent way
+        content = text.replace(
+            "seeing_arcsec: 0.8", f"seeing_arcsec: {settings.atmosphere.seeing_arcsec!r}"
+        )
+        content = content.replace("rms_mas: 80.0", f"rms_mas: {rms!r}")
+        content = content.replace(
+            "subapertures_across: 30",
+            f"subapertures_across: {settings.sensor.pyramid.subapertures_across}",
+        )
+        (tmp_path / "same.yaml").write_text(content)
+        same = lbt.load_config(tmp_path / "same.yaml")
+        np.testing.assert_array_equal(same.plant.A, config.plant.A)
+        np.testing.assert_array_equal(same.plant.B, config.plant.B)
+        assert same.truth.noise_nm == config.truth.noise_nm
+    assert study.config.settings.atmosphere.seeing_arcsec == 0.8  # the base is as it was
+
+
+def test_a_point_is_what_the_library_says(tmp_path):
+    study = load_small_study(
+        tmp_path,
+        samples="4",
+        controllers="{fixed: {design: kalman}, own: {design: kalman, for: sample}, "
+        "wild: {design: integrator, gain: 0.9}}",
+        parameters="{'truth.vibrations[0].frequency_hz': {uniform: [18, 22], also: "
+        "['model.vibrations[0].frequency_hz']}, error.delay_frames: {uniform: [0.2, 0.4]}, "
+        "error.noise_factor: 1.5, truth.sensor_gain: 0.7}",
+    )
+    values = study.values()
+    columns, failures = evaluate_samples(study, values[1:], 1)
+    assert failures == []
+    assert tuple(columns) == study.result_columns
+    config = study.config
+    fixed = lbt.kalman(config.plant)
+    for i, (frequency, delay, _, _) in enumerate(values[1:]):
+        line = replace(config.plant.vibrations[0], frequency_hz=frequency)
+        plant = lbt.tip_tilt_plant(
+            frame_rate_hz=800,
+            turbulence=config.plant.turbulence[0],
+            vibrations=[line],
+            noise_nm=15.0,
+            modes=1,
+        )
+        hardware = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=2 + delay)
+        truth = lbt.Truth(
+            turbulence=config.plant.turbulence[0],
+            vibrations=(SinusoidalVibration(frequency_hz=frequency, rms_nm=500, direction=(1.0,)),),
+            noise_nm=22.5,
+            sensor_gain=0.7,
+        )
+        for name, design in (("fixed", fixed), ("own", lbt.kalman(plant))):
+            loop = lbt.close_loop(hardware, design.controller, sensor_gain=0.7)
+            budget = lbt.residual_budget(loop, truth)
+            for column in ("residual_nm", "turbulence_nm", "vibration_nm", "noise_nm", "within_nm"):
+                expected = getattr(budget, column.replace("residual", "rms"))
+                assert columns[f"{name}.{column}"][i] == pytest.approx(expected, rel=1e-9)
+            expected = lbt.strehl(budget, config.imaging)
+            assert columns[f"{name}.strehl"][i] == pytest.approx(expected, rel=1e-9)
+            assert columns[f"{name}.stable"][i] == 1
+    assert np.all(columns["own.residual_nm"] < 1.05 * columns["fixed.residual_nm"])
+
+
+COUNT = 8
+NOISE = "error.noise_factor: {uniform: [0.9, 1.1]}"
+GAIN = "truth.sensor_gain: {uniform: [0.5, 1]}"
+FIXED = "{slow: {design: integrator, gain: 0.3}, kalman: {design: kalman}}"
+OWN = "{own: {design: kalman, for: sample}}"
+BOTH = "{kalman: {design: kalman}, own: {design: kalman, for: sample}}"
+
+
+def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
+    """Hold each column against the evaluation one by one; return the columns and failures."""
+    study = lbt.studies.load_study(
+        study_file(tmp_path, base=base, controllers=controllers, parameters=parameters, **more)
+    )
+    values = study.values(0, count)
+    columns, failures = evaluate_samples(study, values, 0)
+    single, failed = evaluate_samples(study, values, 0, together=False)
+    assert columns.keys() == single.keys()
+    for name, expected in single.items():
+        assert columns[name] == pytest.approx(expected, rel=1e-6, nan_ok=True), name
+    assert failures == failed
+    return study, columns, failures
+
+
+def counted(monkeypatch):
+    """Count the samples that are evaluated one by one."""
+    rows = []
+    real = evaluation.evaluate_row
+
+    def spy(study, values, row):
+        rows.append(row)
+        return real(study, values, row)
+
+    monkeypatch.setattr(evaluation, "evaluate_row", spy)
+    return rows
+
+
+WEATHER = """{
+  atmosphere.seeing_arcsec: {uniform: [0.5, 1.2]},
+  atmosphere.wind_speed_m_s: {list: [10, 20]},
+  atmosphere.outer_scale_m: {list: [15, 25]},
+  'truth.vibrations[0].frequency_hz': {normal: {mean: 20, deviation: 0.5}},
+  'truth.vibrations[0].rms_mas': {uniform: [40, 100], also: ['model.vibrations[0].rms_mas']},
+  'model.vibrations[0].damping': {uniform: [0.002, 0.02]},
+  sensor.pyramid.photons: {uniform: [20, 100]},
+  truth.sensor_gain: {uniform: [0.3, 1.3]},
+  error.delay_frames: {uniform: [-0.5, 1.5]},
+  error.noise_factor: {uniform: [0.5, 2]}
+}"""
+
+
+def test_filters_for_their_own_samples(tmp_path, monkeypatch):
+    own = {"base": LBT_TEXT, "controllers": BOTH, "parameters": WEATHER}
+    study, columns, _ = agree(tmp_path, count=6, **own)
+    rows = counted(monkeypatch)
+    evaluate_samples(study, study.values(0, 6), 0)
+    assert rows == [3, 3]  # all of them at once, and one of each controller by itself
+    strehl = columns["own.strehl"]
+    assert len(np.unique(strehl[~np.isnan(strehl)])) >= 3
+
+
+LOOP = "truth.sensor_gain: {uniform: [0.4, 1.1]}"
+DELAY = "error.delay_frames: {list: [0, 0.25]}"
+TIP = "\n    - {kind: sinusoid, axis: tip, frequency_hz: 20.0, rms_mas: 80.0}"
+MIRROR = "mirror:\n  local_loop: {natural_frequency_hz: 50, damping: 0.5, bandwidth_hz: 400}\n"
+SPREAD = BASE.replace("rms_nm: 500.0}]", "rms_nm: 500.0, spread_hz: 1.0, lines: 3}]", 1)
+SINUSOID = "[{kind: sinusoid, frequency_hz: 20.0, rms_nm: 500.0}]"
+CHANGED = {  # a configuration, what is put in place of what, parameters, samples
+    "turbulence of kind ar2": (LBT_TEXT, {"kind: ar1": "kind: ar2"}, WEATHER, 5),
+    "one axis and the turbulence of the model": (
+        BASE,
+        {},
+        "'truth.vibrations[0].rms_nm': {uniform: [100, 900]}, 'model.vibrations[0].frequency_hz': "
+        f"{{uniform: [18, 22]}}, sensor.noise_nm: {{uniform: [5, 30]}}, {LOOP}",
+        COUNT,
+    ),
+    "resonances and vibrations of the model, which both move": (
+        LBT_TEXT,
+        {TIP: " model"},
+        "'model.vibrations[0].frequency_hz': {uniform: [18, 22]}, 'model.vibrations[0].rms_mas': "
+        "{uniform: [40, 100]}, 'model.vibrations[0].damping': {uniform: [0.002, 0.02]}, " + DELAY,
+        5,
+    ),
+    "vibrations of the model that are several lines": (
+        SPREAD,
+        {SINUSOID: "model"},
+        f"sensor.noise_nm: {{uniform: [5, 30]}}, {LOOP}",
+        5,
+    ),
+    "a mirror with dynamics": (LBT_TEXT, {"mirror:\n": MIRROR}, f"{LOOP}, {DELAY}", 5),
+    "a diagonal vibration, without a filter per axis": (
+        LBT_TEXT,
+        {"axis: tip,": "direction_deg: 30,", "axis: both,": "direction_deg: 30,"},
+        "'truth.vibrations[0].frequency_hz': {uniform: [19, 21]}",
+        4,
+    ),
+    "the delay that designs assume": (
+        LBT_TEXT,
+        {},
+        "loop.delay_frames: {list: [1, 2, 2.5]}, truth.sensor_gain: {uniform: [0.4, 1]}",
+        12,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_changed_configurations(tmp_path, name):
+    base, changes, parameters, count = CHANGED[name]
+    for old, new in changes.items():
+        assert old in base
+        base = base.replace(old, new)
+    parameters = parameters if parameters is WEATHER else f"{{{parameters}}}"
+    agree(tmp_path, base=base, controllers=BOTH, parameters=parameters, count=count)
+
+
+def test_samples_that_the_configuration_refuses(tmp_path):
+    """A tail of the normal distribution below 0: those fail as they do on their own."""
+    parameters = """{
+      'truth.vibrations[0].rms_nm': {normal: {mean: 300, deviation: 100, high: 900}},
+      truth.sensor_gain: {normal: {mean: 0.8, deviation: 0.1, low: 0.5}}
+    }"""
+    study, *_ = agree(tmp_path, base=BASE, controllers=FIXED, parameters=parameters)
+    values = study.values(0, COUNT)
+    values[2, 0] = -5.0
+    values[4, 1] = 0.0
+    columns, failures = evaluate_samples(study, values, 100)
+    _, failed = evaluate_samples(study, values, 100, together=False)
+    lost = [(row, name) for row in (102, 104) for name in ("slow", "kalman")]
+    assert [failure[:2] for failure in failures] == lost
+    assert "greater than" in failures[0][2]
+    assert failures == failed
+    assert np.flatnonzero(np.isnan(columns["slow.stable"])).tolist() == [2, 4]
+
+
+def test_a_filter_that_cannot_be_designed(tmp_path):
+    """The others of its batch are designed all the same."""
+    parameters = """{
+      sensor.noise_nm: {uniform: [5, 30]},
+      'model.vibrations[0].rms_nm': {uniform: [100, 900]}
+    }"""
+    study, *_ = agree(tmp_path, base=BASE, controllers=OWN, parameters=parameters)
+    values = study.values(0, COUNT)
+    values[3, 1] = 1e170  # its variance overflows
+    columns, failures = evaluate_samples(study, values, 0)
+    assert {row for row, _, _ in failures} == {3}
+    assert np.isfinite(columns["own.strehl"]).sum() == COUNT - 1
+
+
+UNREAD = ("version", "design", "simulation", "robustness", "end_to_end")
+
+
+def numbers_of(section, path=""):
+    """Yield the path and the value of each number."""
+    if isinstance(section, dict):
+        for key, value in section.items():
+            yield from numbers_of(value, f"{path}.{key}" if path else key)
+    elif isinstance(section, list):
+        for i, value in enumerate(section):
+            yield from numbers_of(value, f"{path}[{i}]")
+    elif isinstance(section, int | float):
+        yield path, section
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        number
+        for number in numbers_of(lbt.load_config(LBT_YAML).settings.model_dump())
+        if not number[0].startswith(UNREAD) and number[0] != "loop.frame_rate_hz"
+    ],
+)
+def test_every_number_of_a_configuration(tmp_path, path, value):
+    """Whether it is one value for all or an array, the answers are those of each by itself."""
+    other = value + 1 if isinstance(value, int) else 0.96 * value
+    agree(
+        tmp_path,
+        base=LBT_TEXT,
+        controllers=OWN,
+        parameters=f"{{'{path}': {{list: [{value!r}, {other!r}]}}, {NOISE}}}",
+        count=4,
+    )
+
+
+def test_two_answers_stop_a_study(tmp_path, monkeypatch):
+    study = lbt.studies.load_study(
+        study_file(
+            tmp_path,
+            base=BASE,
+            controllers=FIXED,
+            parameters="{truth.sensor_gain: {uniform: [0.4, 1]}}",
+        )
+    )
+    real = evaluation.ensemble_residuals
+
+    def wrong(matrices, hardware, ensemble):
+        residuals = real(matrices, hardware, ensemble)
+        return replace(residuals, noise_nm2=1.001 * residuals.noise_nm2)
+
+    monkeypatch.setattr(evaluation, "ensemble_residuals", wrong)
+    with pytest.raises(lbt.errors.CertificateError, match="row 14 has slow.*by itself"):
+        evaluate_samples(study, study.values(10, 16)[:8], 11)

@@ -174,8 +174,7 @@ def draw_phase(
 
     Each part has its own random stream: a truth with one more vibration keeps its turbulence. Time
     0 of a vibration that drifts is frame ``zero_frame``. With ``oscillators``, resonances that
-    channels of the truth see are continuous, others AR2 processes. With ``frame_means`` spectra,
-    and the rms of lines, are those of the numbers that frames have.
+    channels of the truth see are continuous, others AR2 processes.
     """
     n = hardware.modes
     turbulence_rng, *line_rngs = rng.spawn(1 + len(truth.vibrations))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -18,7 +19,7 @@ from lbt_synth.linear.controller import (
     as_controller,
 )
 from lbt_synth.loop.closed_loop import ClosedLoop, close_loop, reads_others
-from lbt_synth.loop.simulation.disturbances import Disturbance, draw_disturbance
+from lbt_synth.loop.disturbances import Disturbance, draw_disturbance
 from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.models.plant.assembly import memory, other_exposures, own_exposure
@@ -55,10 +56,6 @@ class Drop:
                 f"{self.end_s:g} s."
             )
 
-    def covers(self, time_s: float) -> bool:
-        """Whether the sensor is away at a time."""
-        return self.start_s <= time_s < self.end_s
-
 
 @runtime_checkable
 class SteppedController(Protocol):
@@ -75,32 +72,18 @@ class SteppedController(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Simulation(Summarised):
-    """Series of a closed loop, after it has settled.
+    """Series of a closed loop, after it has settled."""
 
-    Attributes
-    ----------
-    total_nm, residual_nm : (cases, frames, n) ndarray
-        Mean phase over each frame before and after the correction [nm].
-    image_nm2 : (cases, frames, n) ndarray
-        Mean square of the residual, as the camera sees it, while the command holds that arrives in
-        a frame [nm^2].
-    commands : (cases, frames, m) ndarray
-        Commands u(k), as the mirror applied them.
-    measurements : (cases, frames, q) ndarray
-        Measurements y(k); of several sensors all of them, held from one reading to the next.
-    frame_rate_hz : float
-        Frame rate [Hz].
-    seed : int
-        Seed of the random series; 0 where they were recorded.
-    """
-
-    total_nm: FloatArray
-    residual_nm: FloatArray
+    total_nm: FloatArray  # mean phase over each frame, (cases, frames, n)
+    residual_nm: FloatArray  # the same after the correction
+    # mean square of the residual, as the camera sees it, while the command holds that arrives in a
+    # frame, (cases, frames, n)
     image_nm2: FloatArray
-    commands: FloatArray
+    commands: FloatArray  # u(k), as the mirror applied them, (cases, frames, m)
+    # y(k); of several sensors all, held from one reading to the next, (cases, frames, q)
     measurements: FloatArray
     frame_rate_hz: float
-    seed: int
+    seed: int  # of the random series; 0 where they were recorded
 
     def _brief(self) -> str:
         cases, frames, modes = self.residual_nm.shape
@@ -138,39 +121,32 @@ def simulate(
 ) -> Simulation:
     """Close the loop in the time domain.
 
-    The random series depend on the seed, the truth and the number of frames
-    only: controllers that are given the same ones meet the same disturbances,
-    if ``settle_frames`` is the same too. Time 0 of a vibration that drifts is the first frame
-    that is kept.
+    The random series depend on the seed, the truth and the number of frames only: controllers that
+    are given the same ones, and the same ``settle_frames``, meet the same disturbances. Time 0 of a
+    vibration that drifts is the first frame that is kept.
 
     Parameters
     ----------
     controller : Controller, Design, EstimatorForm or object with ``step(y)`` and ``reset()``
         The controller; a :class:`Controller` of the loop's own sensor runs at the speed of matrix
-        products where the stroke is not limited. The form of
-        :func:`~lbt_synth.linear.estimator_form` is given the commands that were applied. A design
-        of several sensors has its fall-backs with it.
+        products where the stroke is not limited. A design of several sensors has its fall-backs.
     disturbance : Truth or Disturbance
         A truth, from which phase and noise are drawn; or the series themselves.
     hardware : LoopHardware
         Sensors, mirror and delay.
     frames : int, optional
         Frames to keep; all by default where the series are given.
-    cases : int, optional
-        Independent runs at once, of a truth.
-    seed : int, optional
-        Seed of the random series, of a truth.
+    cases, seed : int, optional
+        Independent runs at once, and the seed of the random series, of a truth.
     settle_frames : int, optional
-        Frames run before and dropped; by default until the slowest mode of the
-        loop has decayed to 1e-4 (1000 frames for a stepped controller), and none of series that are
-        given.
+        Frames run before and dropped; by default until the slowest mode of the loop has decayed to
+        1e-4 (1000 frames for a stepped controller), and none of series that are given.
     stroke : float, optional
         Largest modulus of a command that the mirror applies; without a limit by default.
     drops : sequence of Drop, optional
         Sensors that fail, in a loop of several; they count from the first frame that is kept.
     frame_means : bool, optional
-        Whether the phase of a frame that is drawn is one number, as in
-        :func:`residual_budget`.
+        Whether the phase of a frame that is drawn is one number, as in :func:`residual_budget`.
 
     Returns
     -------
@@ -190,13 +166,9 @@ def simulate(
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800)
     >>> lazy = lbt.integrator(path, gain=0.5)
-    >>> shake = lbt.Truth(
-    ...     turbulence=None,
-    ...     noise_nm=10.0,
-    ...     vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100),),
-    ... )
-    >>> run = lbt.simulate(lazy, shake, hardware=path, frames=4000)
-    >>> exact = lbt.residual_budget(lbt.close_loop(path, lazy.controller), shake)
+    >>> noisy = lbt.Truth(turbulence=None, noise_nm=10.0)
+    >>> run = lbt.simulate(lazy, noisy, hardware=path, frames=4000)
+    >>> exact = lbt.residual_budget(lbt.close_loop(path, lazy.controller), noisy)
     >>> bool(abs(run.rms_nm[0] / exact.rms_nm - 1) < 0.05)
     True
     """
@@ -231,7 +203,19 @@ def simulate(
         outputs = _step(
             running, disturbance, path, limit, _events(drops, path, settle, disturbance.frames)
         )
-    return _record(disturbance, outputs, path, settle=settle, seed=seed)
+    n, m = path.modes, path.n_commands
+    squares = outputs[:, :, :n] ** 2
+    if not disturbance.frame_means:
+        squares = _held_squares(disturbance, outputs[:, :, n : n + m], path)
+    return Simulation(
+        total_nm=frozen_copy(disturbance.phase_nm[:, settle:]),
+        residual_nm=frozen_copy(outputs[:, settle:, :n]),
+        image_nm2=frozen_copy(squares[:, settle:]),
+        commands=frozen_copy(outputs[:, settle:, n : n + m]),
+        measurements=frozen_copy(outputs[:, settle:, n + m :]),
+        frame_rate_hz=path.frame_rate_hz,
+        seed=seed,
+    )
 
 
 def _started(
@@ -265,31 +249,6 @@ def _require_memory(hardware: LoopHardware, *, frames: int, cases: int, settle: 
             f"frames x cases must fit into {_MOST_GIGABYTES:g} GB; got {frames} x {cases}, which "
             f"need {gigabytes:.3g} GB. Run fewer cases at once, with different seeds."
         )
-
-
-def _record(
-    disturbance: Disturbance,
-    outputs: FloatArray,
-    hardware: LoopHardware,
-    *,
-    settle: int,
-    seed: int,
-) -> Simulation:
-    """Return the series of a loop after it has settled, from ``phi_res, u, y`` side by side."""
-    n, m = hardware.modes, hardware.n_commands
-    residual = outputs[:, settle:, :n]
-    squares: FloatArray = residual**2
-    if not disturbance.frame_means:
-        squares = _held_squares(disturbance, outputs[:, :, n : n + m], hardware)[:, settle:]
-    return Simulation(
-        total_nm=frozen_copy(disturbance.phase_nm[:, settle:]),
-        residual_nm=frozen_copy(residual),
-        image_nm2=frozen_copy(squares),
-        commands=frozen_copy(outputs[:, settle:, n : n + m]),
-        measurements=frozen_copy(outputs[:, settle:, n + m :]),
-        frame_rate_hz=hardware.frame_rate_hz,
-        seed=seed,
-    )
 
 
 def _held_squares(
@@ -330,9 +289,8 @@ def run_frames(
     """Run a controller around whatever is measured and corrected, frame by frame.
 
     In frame k ``measure(k)`` returns y(k), and ``expose(k, correction, u)`` is given what the taps
-    of the mirror make of u(k), u(k-1), ... as they were applied, clipped at the stroke. The shape
-    is that of a command, (m,) or (m, cases). A controller of ours is told what was applied in the
-    last frame; commands that are not finite, or of another shape, are refused.
+    of the mirror make of the commands, (m,) or (m, cases), as they were applied, clipped at the
+    stroke. A controller of ours is told what was applied in the last frame.
     """
     controller.reset()
     commands = np.zeros((len(taps), *shape))  # u(k), u(k-1), ...
@@ -413,16 +371,13 @@ def _events(
     drops: Sequence[Drop], hardware: LoopHardware, settle: int, frames: int
 ) -> dict[int, Segment]:
     """Return what fails from which frame on."""
+    units, rate = hardware.suite.units, hardware.frame_rate_hz
     for drop in drops:
-        if drop.unit not in hardware.suite.units:
+        if drop.unit not in units:
             raise ProblemError(
-                f"a sensor that fails must be one of {', '.join(hardware.suite.units)}; got "
-                f"{drop.unit!r}."
+                f"a sensor that fails must be one of {', '.join(units)}; got {drop.unit!r}."
             )
-    if not drops:
-        return {}
-    rate = hardware.frame_rate_hz
-    segments = run_segments(drops, (frames - settle) / rate)
+    segments = run_segments(drops, (frames - settle) / rate) if drops else ()
     return {settle + int(np.ceil(s.start_s * rate - 1e-6)): s for s in segments}
 
 
@@ -446,14 +401,13 @@ class Segment:
 def run_segments(drops: Sequence[Drop], duration_s: float) -> tuple[Segment, ...]:
     """Return the times between failures and returns of sensors in a run."""
     events = {0.0, *(t for d in drops for t in (d.start_s, d.end_s) if t < duration_s)}
-    starts = sorted(events)
-    out = []
-    for start_s, end_s in zip(starts, [*starts[1:], duration_s], strict=True):
-        away = [drop for drop in drops if drop.covers(start_s)]
+    segments = []
+    for start_s, end_s in pairwise([*sorted(events), duration_s]):
+        away = [drop for drop in drops if drop.start_s <= start_s < drop.end_s]
         missing = tuple(sorted({d.unit for d in away if d.reading == "missing"}))
         wrong = {d.unit: d.reading for d in away if d.unit not in missing}
-        out.append(Segment(start_s=start_s, end_s=end_s, missing=missing, wrong=wrong))
-    return tuple(out)
+        segments.append(Segment(start_s=start_s, end_s=end_s, missing=missing, wrong=wrong))
+    return tuple(segments)
 
 
 SHOWN_FRAMES = 120  # of a response, unless more are asked for
@@ -483,37 +437,7 @@ class LoopStep:
 
 
 def step_response(loop: ClosedLoop, *, axis: int = 0, frames: int = SHOWN_FRAMES) -> LoopStep:
-    """Return the response of a loop to a step of the wavefront.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        The loop.
-    axis : int, optional
-        Axis on which the step is, from 0.
-    frames : int, optional
-        Frames from the step on.
-
-    Returns
-    -------
-    LoopStep
-        Without other disturbances or noise.
-
-    Raises
-    ------
-    ProblemError
-        If there is no such axis, or no frame.
-
-    Examples
-    --------
-    Nothing reaches the mirror within the two frames of delay:
-
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> loop = lbt.close_loop(path, lbt.integrator(path, gain=0.5).controller)
-    >>> lbt.loop.step_response(loop, frames=5).residual.tolist()
-    [1.0, 1.0, 0.5, 0.0, -0.25]
-    """
+    """Return the response of a loop to a step of the wavefront on an axis, without noise."""
     n = loop.hardware.modes
     own = integer(axis, "axis", at_least=0, below=n)
     inputs = np.zeros((integer(frames, "frames", at_least=1), n + loop.hardware.n_measurements))

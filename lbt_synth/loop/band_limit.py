@@ -18,8 +18,7 @@ import numpy as np
 
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.loop.least_residuals.mode_spectra import ModeSpectrum, Prediction
-from lbt_synth.loop.least_residuals.residual_limit import mode_limit, truth_modes
+from lbt_synth.loop.least_residual import ModeSpectrum, Prediction, mode_limit, truth_modes
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import checked_direction
 from lbt_synth.validation import FloatArray, frozen_copy, number
@@ -59,53 +58,13 @@ def least_worst_residual(
     direction: Sequence[float] = (1.0, 0.0),
     frame_means: bool = False,
 ) -> BandLimit:
-    """Least worst residual of any linear controller with a sinusoid anywhere in a band.
+    """Least worst residual [nm rms] of any linear controller with a sinusoid anywhere in a band.
 
-    The controller knows the truth, the band, and the size and direction of the sinusoid, but
-    not its frequency; what counts is the frequency that is worst for it. In the image the limit is
-    the larger of two: with the least mean over a frame and the least motion within one, over the
-    band; and with all of the mean rejected, and the motion within a frame at the upper end.
-
-    Parameters
-    ----------
-    hardware : LoopHardware
-        The loop, with any delay. The sensor must see and the mirror reach every mode.
-    truth : Truth
-        All else; of its own sinusoids what moves within a frame counts, as in
-        :func:`least_residual`.
-    band_hz : tuple of float
-        Lowest and highest frequency of the sinusoid [Hz], between 0 and Nyquist.
-    rms_nm : float
-        Its standard deviation, amplitude / sqrt(2) [nm].
-    direction : sequence of float, optional
-        Its direction over the modes, made a unit vector.
-    frame_means : bool, optional
-        As in :func:`residual_budget`.
-
-    Returns
-    -------
-    BandLimit
-        The limit, a worst case that is achieved, and the density that is hardest to reject.
-
-    Raises
-    ------
-    ProblemError
-        If the band or the sinusoid does not fit the loop, or the modes do not decouple.
-    NumericalError
-        If the search does not settle.
-
-    Examples
-    --------
-    Where nothing else moves and the noise is 3 nm, a line that may lie anywhere is white noise:
-
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> calm = lbt.Truth(turbulence=None, noise_nm=3.0)
-    >>> limit = lbt.loop.least_worst_residual(
-    ...     path, calm, band_hz=(1e-9, 399.999999), rms_nm=4.0, direction=(1,), frame_means=True
-    ... )
-    >>> round(limit.rms_nm, 4), round(limit.achieved_nm, 4)
-    (4.0, 4.0)
+    The controller knows the truth, the band, and the size and direction of
+    the sinusoid, but not its frequency; what counts is the frequency that is worst for it. In the
+    image the limit is the larger of two: with the least mean over a frame and the least motion
+    within one, over the band; and with all of the mean rejected, and the motion within a frame at
+    the upper end. Other sinusoids count as in :func:`least_residual`.
     """
     nyquist = hardware.frame_rate_hz / 2
     low, high = _checked_band(band_hz, nyquist)
@@ -118,7 +77,7 @@ def least_worst_residual(
     most, least = (1.0, 1.0) if frame_means else np.sinc(np.array(ends) / 2) ** 2
     power = line.rms_nm**2  # of which these parts are in the mean over a frame, at either end
     saddle, gap, x, weight = _find_saddle(modes[own], ends, least * power)
-    variance = np.array([mode_limit(mode)[0] for mode in modes])
+    variance = np.array([mode_limit(mode) for mode in modes])
     lower = max(saddle + (1 - most) * power, variance[own] + (1 - least) * power)
     upper = max((saddle + gap) * most / least + (1 - least) * power, lower)
     variance[own] = lower
@@ -154,11 +113,24 @@ class _Band:
     """One mode with a band, prepared for many densities of the sinusoid."""
 
     mode: ModeSpectrum
-    reference: float  # unit of the logarithm [nm^2]
     outside: FloatArray  # integrals of the logarithm outside the band
     x: FloatArray  # nodes within the band, in units of Nyquist
     quadrature: FloatArray  # their weights
     base: FloatArray  # spectrum with noise there, without the sinusoid
+
+    @staticmethod
+    def of(mode: ModeSpectrum, ends: tuple[float, float]) -> _Band:
+        """Prepare a mode with a band."""
+        width, noise = ends[1] - ends[0], mode.noise_nm2
+        panels = mode.log_moments(ends)
+        middle = (panels.low + panels.high) / 2
+        inside = (middle > ends[0]) & (middle < ends[1])
+        cuts = [np.linspace(*ends, _PANELS + 1), panels.low[inside], panels.high[inside]]
+        edges = np.unique(np.clip(np.concatenate(cuts), *ends))
+        edges = edges[np.concatenate([[True], np.diff(edges) > 1e-4 * width / _PANELS])]
+        x, q = gauss_panels(edges, _ORDER)
+        outside = panels.integrals[~inside].sum(axis=0)
+        return _Band(mode, outside, x, q, mode.power(x) + noise)
 
     def fill(self, shape: FloatArray, total: float) -> tuple[float, FloatArray]:
         """Return the level, and what a ``total`` adds to fill the base up to ``level * shape``."""
@@ -174,31 +146,26 @@ class _Band:
     def predict(self, added: FloatArray) -> Prediction:
         """Return the best prediction with some spectrum added within the band."""
         noise = self.mode.noise_nm2
-        logarithm = np.log1p if noise > 0 else np.log
-        values = logarithm((self.base - noise + added) / self.reference)
-        inside = (self.quadrature * values) @ self.mode.inner.weights(self.x)
-        return Prediction.of(self.mode.inner, self.outside + inside)
+        values = np.log1p((self.base - noise + added) / noise)
+        inside = (self.quadrature * values) @ self.mode.cosines(self.x)
+        return Prediction.of(self.outside + inside, self.mode.target)
 
     def bounds(
         self, prediction: Prediction, added: FloatArray, worst: float
     ) -> tuple[float, float]:
         """Lower bound [nm^2] of a density, and how far above it its filter's worst case is."""
-        total = float(self.quadrature @ added)
-        sigma2 = self.reference * np.exp(prediction.mean_log)
+        total, noise = float(self.quadrature @ added), self.mode.noise_nm2
         rejection = prediction.error_power(self.x) / (self.base + added)
         mean = float(self.quadrature @ (added * rejection))
-        gap = float(sigma2) * (total * worst - mean)
-        return prediction.variance(self.reference, self.mode.noise_nm2), max(gap, 0.0)
+        gap = noise * float(np.exp(prediction.mean_log)) * (total * worst - mean)
+        return prediction.variance(noise), max(gap, 0.0)
 
 
 def _find_saddle(
     mode: ModeSpectrum, ends: tuple[float, float], total: float
 ) -> tuple[float, float, FloatArray, FloatArray]:
     """Return lower bound and gap [nm^2], and the worst density: its nodes and their weights."""
-    band = _prepare_band(mode, ends, total)
-    if band is None:  # the spectrum vanishes outside the band: the line is known from its past
-        x, q = gauss_panels(np.linspace(*ends, _PANELS + 1), _ORDER)
-        return 0.0, 0.0, x, q / q.sum()
+    band = _Band.of(mode, ends)
     # the worst case is sought between the nodes, too
     fine = np.unique(np.concatenate([np.linspace(*ends, 8 * _PANELS + 1), band.x]))
     base = mode.power(fine) + mode.noise_nm2
@@ -232,22 +199,3 @@ def _step_towards(shape: FloatArray, target: FloatArray, share: float) -> FloatA
     """Weighted geometric mean, kept off zero."""
     mixed = shape ** (1 - share) * target**share
     return np.asarray(np.maximum(mixed, 1e-14 * np.max(mixed)))
-
-
-def _prepare_band(mode: ModeSpectrum, ends: tuple[float, float], total: float) -> _Band | None:
-    """Prepare a mode with a band; None where its spectrum vanishes outside of it."""
-    noise, reference, width = mode.noise_nm2, mode.reference(), ends[1] - ends[0]
-    if noise == 0:
-        reference = max(reference, total / width)
-    # without noise the line fills the band, and the spectrum may vanish only outside of it
-    panels = mode.log_moments(reference, ends=ends, skip=noise == 0)
-    if panels is None:
-        return None
-    middle = (panels.low + panels.high) / 2
-    inside = (middle > ends[0]) & (middle < ends[1])
-    cuts = [np.linspace(*ends, _PANELS + 1), panels.low[inside], panels.high[inside]]
-    edges = np.unique(np.clip(np.concatenate(cuts), *ends))
-    edges = edges[np.concatenate([[True], np.diff(edges) > 1e-4 * width / _PANELS])]
-    x, q = gauss_panels(edges, _ORDER)
-    outside = panels.integrals[~inside].sum(axis=0)
-    return _Band(mode, reference, outside, x, q, mode.power(x) + noise)

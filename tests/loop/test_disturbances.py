@@ -6,7 +6,7 @@ from scipy.integrate import trapezoid
 from support.uneven_axes import LOOPS, QUICK, SLOW, TABLE
 
 import lbt_synth as lbt
-from lbt_synth.loop.simulation.disturbances import draw_disturbance, draw_others, draw_phase
+from lbt_synth.loop.disturbances import draw_disturbance, draw_others, draw_phase
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 
 
