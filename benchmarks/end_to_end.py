@@ -73,8 +73,7 @@ def optimised() -> None:
     found = lbt.design.modal.modal_gains_from_telemetry(
         first.measurements,
         first.commands,
-        frame_rate_hz=path.frame_rate_hz,
-        delay_frames=path.delay_frames,
+        hardware=path,
         sensor_gain=gains,
         margin=0.3,
     )

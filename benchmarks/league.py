@@ -119,7 +119,7 @@ def simulate_record(seed: int, seconds: float) -> lbt.identification.LoopRecord:
 
 def best_gain(left: Callable[[float], float], hardware: lbt.models.LoopHardware) -> float:
     """Return the gain of an integrator that leaves least, below the limit of stability."""
-    limit = lbt.design.integrator_gain_limit(hardware.delay_frames)
+    limit = lbt.design.integrator_gain_limit(hardware)
     gains = np.geomspace(0.02, 0.95, 24) * limit  # finer than the width of a minimum
     values = [left(gain) for gain in gains]
     k = int(np.argmin(values))

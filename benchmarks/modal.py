@@ -9,7 +9,6 @@ import argparse
 
 import numpy as np
 from harness import seconds
-from scipy.optimize import minimize_scalar
 
 import lbt_synth as lbt
 from lbt_synth.models.turbulence.ar_models import noll_orders
@@ -31,19 +30,11 @@ def main() -> None:
     modes = lbt.models.modal_turbulence(air, modes=MODES, frame_rate_hz=RATE_HZ)
     radial, _ = noll_orders(MODES)
     noise = lbt.models.pyramid_modal_noise_nm(15.5, modes=MODES, modulation_lambda_over_d=4)
-    optimised = lbt.design.modal.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ)
-
-    def integrators(gains):
-        control = lbt.design.modal.MixedController(gains=gains)
-        path = optimised.hardware
-        return lbt.design.modal.modal_residuals(control, modes, noise_nm=noise, hardware=path)
-
-    best = minimize_scalar(
-        lambda g: total(integrators(np.full(MODES, g))), bounds=(0.01, 0.9), method="bounded"
-    )
-    filters = lbt.design.modal.modal_filters(modes, noise_nm=noise)
+    path = lbt.LoopHardware(frame_rate_hz=RATE_HZ)
+    known = {"hardware": path, "noise_nm": noise}
+    optimised = lbt.design.modal.modal_gains(modes, **known)
+    filters = lbt.design.modal.modal_filters(modes, **known)
     rows = {
-        f"integrators, gain {best.x:.2f}": integrators(np.full(MODES, best.x)),
         "integrators, optimised gains": optimised.rms_nm,
         "Kalman filters": filters.rms_nm,
     }
@@ -61,28 +52,17 @@ def main() -> None:
     line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6)
     shaken = {0: [line], 1: [line]}
     print("with a vibration of 563.6 nm at 20 Hz on tip and on tilt:")
-    gains = lbt.design.modal.modal_gains(
-        modes, noise_nm=noise, frame_rate_hz=RATE_HZ, vibrations=shaken
-    )
-    tilt = lbt.design.modal.modal_filters(
-        [modes.take(0), modes.take(1)], noise_nm=noise[:2], vibrations=shaken
-    )
-    mixed = lbt.design.modal.MixedController(filter=tilt, gains=gains.gains)
-    every = lbt.design.modal.modal_filters(modes, noise_nm=noise, vibrations=shaken)
+    gains = lbt.design.modal.modal_gains(modes, **known, vibrations=shaken)
+    every = lbt.design.modal.modal_filters(modes, **known, vibrations=shaken)
     rows_shaken = {
         "integrators, optimised gains": gains.rms_nm,
-        "mixed: tip/tilt Kalman, the rest so": lbt.design.modal.modal_residuals(
-            mixed, modes, noise_nm=noise, vibrations=shaken
-        ),
         "Kalman filters": every.rms_nm,
     }
     for name, rms in rows_shaken.items():
         print(f"{name:36s} {total(rms):7.1f} {total(rms[:2]):7.1f}")
 
-    design = seconds(lambda: lbt.design.modal.modal_filters(modes, noise_nm=noise), 9)
-    search = seconds(
-        lambda: lbt.design.modal.modal_gains(modes, noise_nm=noise, frame_rate_hz=RATE_HZ), 9
-    )
+    design = seconds(lambda: lbt.design.modal.modal_filters(modes, **known), 9)
+    search = seconds(lambda: lbt.design.modal.modal_gains(modes, **known), 9)
     times = f"filters {1e3 * design:.0f} ms, optimised gains {1e3 * search:.0f} ms"
     print(f"design of {MODES} modes: {times}")
     if output:

@@ -47,7 +47,7 @@ def turbulence_models() -> None:
         "Kalman, AR1": lbt.models.ar1_turbulence(air, frame_rate_hz=800),
         "Kalman, AR2": lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=noise_nm),
     }
-    designs = {"integrator": lbt.design.optimal_integrator(path, calm)} | {
+    designs = {"integrator": lbt.integrator(path, truth=calm)} | {
         name: lbt.kalman(lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=model, noise_nm=noise_nm))
         for name, model in models.items()
     }

@@ -102,7 +102,7 @@ def design_hard(seed: int) -> None:
     # the noise of the truth is that of the measurements, whose gain the path has here
     same = replace(truth, sensor_gain=1.0)
     left = []
-    for controller in (made.controller, lbt.kalman(made.model.plant()).controller):
+    for controller in (made.design.controller, lbt.kalman(made.model.plant()).controller):
         loop = lbt.close_loop(path, controller)
         left.append(lbt.residual_budget(loop, same).rms_nm if loop.is_stable else float("inf"))
     gains = " and ".join(

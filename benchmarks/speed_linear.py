@@ -119,11 +119,11 @@ def shaped(functions: int) -> Row:
         ),
     ]
     spec = lbt.design.shaping.Specification(
-        objective=lbt.design.shaping.Total(terms=tuple(terms)),
+        terms=terms,
         demands=(
-            lbt.design.shaping.ModulusMargin(at_least=0.45),
+            lbt.design.shaping.Bound(response="rejection", at_most=1 / 0.45),
             lbt.design.shaping.LoopErrors(low=0.25, high=1.3),
-            lbt.design.shaping.Attenuation(low_hz=0, high_hz=1, at_most=0.05),
+            lbt.design.shaping.Bound(response="rejection", low_hz=0, high_hz=1, at_most=0.05),
             lbt.design.shaping.LoopErrors(delay_frames=0.3),
         ),
     )

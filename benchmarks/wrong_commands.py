@@ -126,7 +126,7 @@ def try_design(loop: Loop, record: lbt.identification.LoopRecord) -> tuple[str, 
     except lbt.errors.LbtSynthError as error:
         return f"refused: {error}", np.nan
     warned = any(PART_SIZE in note for note in made.model.notes)
-    closed = lbt.close_loop(loop.path, made.controller, sensor_gain=loop.truth.sensor_gain)
+    closed = lbt.close_loop(loop.path, made.design.controller, sensor_gain=loop.truth.sensor_gain)
     if not closed.is_stable:
         return "UNSTABLE", np.inf
     try:

@@ -151,7 +151,7 @@ def designs(plant: lbt.models.TipTiltPlant, met: Disturbance) -> dict[str, lbt.D
     slow = lbt.models.SumSpectrum(parts=[met.turbulence[0], met.background[0]]).psd(f)
     table = lbt.models.TabulatedSpectrum(frequency_hz=f, density_nm2_hz=slow)
     return {
-        "integrator": lbt.design.model_integrator(plant),
+        "integrator": lbt.integrator(plant.hardware, truth=plant),
         "Kalman": lbt.kalman(plant),
         "H-infinity": lbt.hinf(plant, gamma_ratio=1.2, route="riccati"),
         "robust": lbt.robust(plant, bands=BANDS, turbulence=table),

@@ -17,8 +17,9 @@ noise_nm = lbt.models.pyramid_modal_noise_nm(15.5, modes=672, modulation_lambda_
 # %%
 # The best integrator of each mode, and a Kalman filter of each mode.
 
-integrators = lbt.design.modal.modal_gains(modes, noise_nm=noise_nm, frame_rate_hz=800)
-filters = lbt.design.modal.modal_filters(modes, noise_nm=noise_nm)
+path = lbt.LoopHardware(frame_rate_hz=800)
+integrators = lbt.design.modal.modal_gains(modes, hardware=path, noise_nm=noise_nm)
+filters = lbt.design.modal.modal_filters(modes, hardware=path, noise_nm=noise_nm)
 print(f"{filters.n_modes} filters, {len(filters.designs)} different and certified")
 
 # %%

@@ -173,7 +173,6 @@ _TABLE = """
     record accelerometers
     >
     --method | @record_methods | default: kalman, unless another quick one leaves less
-    --gamma-ratio | float | bound of the norm as a multiple of the least (default 1.2)
     -o --output | required | gain file (.fits or .npz); the configuration goes beside it (.yaml)
   diagnose | records | Say what ran in a record, what is wrong, what it costs, and what to change.
     series

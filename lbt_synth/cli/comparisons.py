@@ -103,7 +103,9 @@ def run_limits(arguments: Namespace) -> Report:
     config = load_shown(arguments)
     files = load_designs(arguments.gains, config)
     designs = {
-        method.name: config.design(method.name, **method.in_comparison)
+        method.name: config.design(
+            method.name, **method.reference_options, **method.compared_options
+        )
         for method in reference_methods()
     }
     designs |= {f"{name} (file)" if name in designs else name: d for name, d in files.items()}
@@ -344,9 +346,9 @@ def run_modal(arguments: Namespace) -> Report:
             if abs(share) > 1e-9:  # more than rounding
                 tilted = replace(line, rms_nm=abs(share) * line.rms_nm, direction=(1.0,))
                 lines.setdefault(axis, []).append(tilted)
-    loop: dict[str, Any] = {name: getattr(hardware, name) for name in ("delay_frames", "mirror")}
-    loop |= {"noise_nm": noise_nm, "vibrations": lines, "sensor_gain": config.sensor_gain}
-    gains = modal_gains(air, frame_rate_hz=air.frame_rate_hz, **loop)
+    loop: dict[str, Any] = {"hardware": hardware, "noise_nm": noise_nm, "vibrations": lines}
+    loop["sensor_gain"] = config.sensor_gain
+    gains = modal_gains(air, **loop)
     residuals = {
         "integrators, optimised gains": gains.rms_nm,
         "Kalman filters": modal_filters(air, **loop).rms_nm,

@@ -18,18 +18,16 @@ from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest, read_design, require_gain_name
 from lbt_synth.loop import LoopMargins, close_loop, loop_margins
 from lbt_synth.methods.registry import design_title, option_names
-from lbt_synth.methods.request import Wording, design_request
+from lbt_synth.methods.request import design_request
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact_table, json_record, row_table
-
-_WORDING = Wording(method="--method {}", option="--{}")
 
 
 def run_design(arguments: Namespace) -> Report:
     """Design a controller and write its gain file."""
     options = given_options(arguments, *option_names())
-    request = design_request(arguments.method, options, _WORDING)
+    request = design_request(arguments.method, options)
     require_writable(require_gain_name(arguments.output), inputs=[arguments.config])
     config = load_shown(arguments)
     design = config.design(request)

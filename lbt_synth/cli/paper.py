@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs, load_shown
 from lbt_synth.cli.output import PERCENT, Report
@@ -202,7 +204,7 @@ def _run_facts(loop_run: EndToEndRun, design: Design, calibration: Calibration, 
         "tip_tilt_gain_error": ("  standard error", {"format": ".3f"}),
         "tip_tilt_noise_nm": ("what it leaves of their measurements", rms),
     }
-    condition = calibration.reconstructor.condition_number
+    condition = float(np.linalg.cond(calibration.reconstructor))
     return facts(
         gain=fact(gain),
         method=fact(design.method),

@@ -105,7 +105,6 @@ def run_auto(arguments: Namespace) -> Report:
         made = identification.design_from_record(
             record,
             method=arguments.method,
-            gamma_ratio=arguments.gamma_ratio,
             imaging=imaging,
             accept_record=arguments.accept_record,
             command_scale_known="--command-scale" in record.read_with

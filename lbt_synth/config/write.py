@@ -19,7 +19,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedModel
 from lbt_synth.identification.accelerometers.transfers import AccelerometerTransfers
 from lbt_synth.models import ARModel
-from lbt_synth.validation import number, require_instance
+from lbt_synth.validation import number
 
 _AXES = ("tip", "tilt")
 _NAME = "accelerometer"  # of the instrument that all channels make
@@ -37,20 +37,8 @@ def config_text(settings: FileSection, comments: Mapping[str, str] | None = None
     Comments are by the paths of keys, such as ``model.vibrations[0].rms_nm``, and stand at the ends
     of their lines; that of ``""`` heads the file, and may have several lines.
     """
-    require_instance(settings, FileSection)
-    content = settings.model_dump(exclude_unset=True)
-    unused = dict(comments or {})
-    head = unused.pop("", "")
-    for key, comment in unused.items():
-        if comment.splitlines() not in ([comment], []):
-            raise ProblemError(f"the comment on {key} must be one line; got {comment!r}.")
-    document = _commented(content, "", unused)
-    if unused:
-        raise ProblemError(
-            f"comments must be on keys that are written; got one on {next(iter(unused))}, which is "
-            "not. Keys are paths such as model.vibrations[0].rms_nm."
-        )
-    text = _dump(document, head)
+    content, comments = settings.model_dump(exclude_unset=True), comments or {}
+    text = _dump(_commented(content, "", comments), comments.get("", ""))
     try:
         again = FileSection.model_validate(YAML(typ="safe", pure=True).load(text))
     except (YAMLError, ValueError) as error:
@@ -68,14 +56,14 @@ def turbulence_content(model: ARModel) -> dict[str, Any]:
     return {"kind": "ar", "coefficients": coefficients, "driving_rms_nm": driving_rms_nm}
 
 
-def _commented(value: Any, path: str, comments: dict[str, str]) -> Any:
-    """Return a value with its comments for ruamel; the comments used leave the mapping."""
+def _commented(value: Any, path: str, comments: Mapping[str, str]) -> Any:
+    """Return a value with its comments for ruamel."""
     if isinstance(value, dict):
         section = CommentedMap()
         for key, inner in value.items():
             place = f"{path}.{key}" if path else key
             section[key] = _commented(inner, place, comments)
-            if comment := comments.pop(place, ""):
+            if comment := comments.get(place):
                 section.yaml_add_eol_comment(comment, key, column=_COLUMN)
         return section
     if not isinstance(value, list):
@@ -84,7 +72,7 @@ def _commented(value: Any, path: str, comments: dict[str, str]) -> Any:
     for i, inner in enumerate(value):
         place = f"{path}[{i}]"
         entries.append(_commented(inner, place, comments))
-        if comment := comments.pop(place, ""):
+        if comment := comments.get(place):
             depth = path.count(".") + 1
             entries.yaml_set_comment_before_after_key(i, before=comment, indent=2 * depth)
     if not (value and isinstance(value[0], dict)):
@@ -135,8 +123,7 @@ def identified_config(
         content["mirror"] = {"local_loop": asdict(model.mirror)}
     vibrations = _vibration_sections(model, comments)
     if accelerometers is not None and accelerometers.used:
-        delay = model.delay_frames
-        content["sensors"] = {_NAME: _accelerometer_section(accelerometers, delay, comments)}
+        content["sensors"] = {_NAME: _accelerometer_section(accelerometers, model, comments)}
         _add_motions(vibrations, accelerometers, comments)
     content["model"] = {"turbulence": []}
     for index, (name, axis) in enumerate(zip(_AXES, axes, strict=False)):
@@ -244,18 +231,18 @@ def _vibration_sections(model: IdentifiedModel, comments: dict[str, str]) -> lis
 
 
 def _accelerometer_section(
-    transfers: AccelerometerTransfers, delay_frames: float, comments: dict[str, str]
+    transfers: AccelerometerTransfers, model: IdentifiedModel, comments: dict[str, str]
 ) -> dict[str, Any]:
     """Return the section of the channels that are used, and comment on their delay."""
-    age, path = transfers.loop_age(delay_frames), f"sensors.{_NAME}.delay_frames"
+    age, path = transfers.loop_age(model.delay_frames), f"sensors.{_NAME}.delay_frames"
     comments[path] = f"readings come {age - 1} frames after the wavefront's"
     if age != transfers.age_frames:
         apart = transfers.age_frames - 1
         comments[path] = f"not known: the clocks were {apart} frames apart; give the real delay"
     return {
         "kind": "accelerometer",
-        "rate_hz": float(transfers.rate_hz),
-        "delay_frames": float(age + delay_frames - 1),
+        "rate_hz": float(model.frame_rate_hz),
+        "delay_frames": float(age + model.delay_frames - 1),
         "channels": [row.channel for row in transfers.used],
         "noise_m_s2": [float(row.noise_m_s2) for row in transfers.used],
     }

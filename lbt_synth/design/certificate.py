@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.errors import CertificateError, DimensionError, ProblemError
+from lbt_synth.errors import CertificateError, DimensionError
 from lbt_synth.linear import (
     EstimationProblem,
     StateSpace,
@@ -22,7 +22,7 @@ from lbt_synth.loop import ClosedLoop
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.storage.rows import Column, column, row_table
 from lbt_synth.storage.summaries import Summarised, Summary
-from lbt_synth.validation import FloatArray, frozen_copy, number, set_fields
+from lbt_synth.validation import FloatArray, frozen_copy, set_fields
 
 TOLERANCE = 1e-6  # relative, of norms, variances and gains: what two routes differ by at most
 ORIGIN_TOLERANCE = 1e-5  # of a filter from that of its equation, and of a bound that is reached
@@ -100,17 +100,9 @@ class Certificate(Summarised):
         return float(np.sqrt(np.sum(self.rms_per_output**2)))
 
     def require(self, hint: str = "") -> Certificate:
-        """Return the certificate itself, or raise if a check failed.
+        """Return the certificate itself, or raise CertificateError with the checks that failed.
 
-        Parameters
-        ----------
-        hint : str, optional
-            What to try; ends the message.
-
-        Raises
-        ------
-        CertificateError
-            With the names of the failed checks.
+        The hint says what to try, and ends the message.
         """
         failed = [check for check in self.checks if not check.passed]
         if failed:
@@ -198,21 +190,10 @@ def _examine_variance(error: StateSpace) -> tuple[FloatArray, FloatArray, tuple[
     rms, other = float(np.sqrt(variances.sum())), float(np.sqrt(adjoint.sum()))
     least = min(rms, other) + _rounding(error)
     apart = 1 - min(least / max(rms, other, _TINY), 1.0) ** 2
-    checks = (
-        Check(
-            "residual of the Lyapunov equation",
-            residual / max(size, _TINY),
-            RESIDUAL_TOLERANCE,
-            "relative, 1-norm",
-        ),
-        Check(
-            "variance, against its adjoint equation",
-            apart,
-            TOLERANCE,
-            "relative, two Lyapunov equations",
-        ),
-    )
-    return P, variances, checks
+    name, relative = "residual of the Lyapunov equation", residual / max(size, _TINY)
+    solved = Check(name, relative, RESIDUAL_TOLERANCE, "relative, 1-norm")
+    name, how = "variance, against its adjoint equation", "relative, two Lyapunov equations"
+    return P, variances, (solved, Check(name, apart, TOLERANCE, how))
 
 
 def _rounding(error: StateSpace) -> float:
@@ -221,60 +202,26 @@ def _rounding(error: StateSpace) -> float:
     return max(float(_NOTHING * through), _TINY)
 
 
-def certify_infeasible(problem: EstimationProblem, level: float, witness: Witness) -> Check:
-    """Check that a witness proves what is claimed of it: no filter below a level of gamma.
+def proved_level(problem: EstimationProblem, witness: Witness | None) -> float:
+    """Return a level of gamma that a witness proves no filter to reach; 0 without one.
 
     The covariance of the Kalman filter, by the Riccati equation, enters in two places only: it
     weighs what rounding took from the proof, and it spans the space of the estimation error.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-        The problem.
-    level : float
-        Level that is claimed infeasible; 0 claims nothing.
-    witness : Witness
-        Disturbances that no measurement shows.
-
-    Returns
-    -------
-    Check
-        Passed if the level exceeds the level that the witness proves by less than a relative
-        1e-9.
-
-    Raises
-    ------
-    ProblemError
-        If the witness is not a :class:`Witness`, or the level negative.
-    DimensionError
-        If the witness does not fit the problem.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import lbt_synth as lbt
-    >>> p = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> push = Witness(states=np.zeros((1, 1)), disturbances=np.array([[1.0], [0.0]]))
-    >>> (
-    ...     lbt.design.certify_infeasible(p, 1.0, push).passed,
-    ...     lbt.design.certify_infeasible(p, 1.1, push).passed,
-    ... )
-    (True, False)
     """
-    if not isinstance(witness, Witness):
-        raise ProblemError(
-            "expected a Witness, such as that of an H-infinity design; got "
-            f"{type(witness).__name__}."
-        )
+    if witness is None:
+        return 0.0
     x, w, sizes = witness.states, witness.disturbances, problem.B.shape[-2:]
     if (x.shape[-2], w.shape[-2]) != sizes:
         raise DimensionError(
             f"a witness must have {sizes[0]} rows of states, {sizes[1]} rows of "
             f"disturbances and as many columns in both; got {x.shape} and {w.shape}."
         )
-    claimed = number(level, "level", at_least=0)
-    proved = infeasible_level(problem, witness, kalman_riccati(problem).P)
-    above = claimed / max(proved, _TINY) - 1
+    return infeasible_level(problem, witness, kalman_riccati(problem).P)
+
+
+def certify_infeasible(problem: EstimationProblem, level: float, witness: Witness | None) -> Check:
+    """Check that a witness proves a level, to a relative 1e-9; a level of 0 claims nothing."""
+    above = level / max(proved_level(problem, witness), _TINY) - 1
     name = "infeasible level over the level proved, less 1"
     return Check(name, above, INFEASIBLE_TOLERANCE, BY_DISTURBANCES)
 

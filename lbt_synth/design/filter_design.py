@@ -32,15 +32,16 @@ from lbt_synth.design.certificate import (
 )
 from lbt_synth.design.result import (
     MODEL_LIMITS,
+    SENSOR_FACTS,
     Design,
     RowTable,
     SolverReport,
     model_limits,
+    sensor_facts,
     with_certificate,
 )
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
-from lbt_synth.linear.estimation_problem import decorrelate
 from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.matrix_functions import relative_distance
 from lbt_synth.linear.riccati.filtering import (
@@ -49,7 +50,7 @@ from lbt_synth.linear.riccati.filtering import (
     kalman_riccati,
     meets_level,
 )
-from lbt_synth.loop import ClosedLoop, close_loop, residual_budget, stable_sensor_gains
+from lbt_synth.loop import ClosedLoop, close_loop, residual_budget
 from lbt_synth.loop.budget import model_readings
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import Column, column, nm_column, table_row
@@ -62,8 +63,6 @@ from lbt_synth.validation import (
 )
 
 MOST_UNITS = 6  # sensors and channels of which every subset gets a filter
-LONGEST_DWELL = 10_000  # periods
-_REGULAR = 1e-2  # of the covariance's diagonal, added: some states are functions of others
 ORIGIN = "distance from its Riccati filter"
 
 
@@ -82,15 +81,6 @@ def _check_bound(evidence: Evidence, gamma: float) -> Iterator[Check]:
     yield Check(name, value, ORIGIN_TOLERANCE, "relative")
 
 
-def _check_rms_bound(evidence: Evidence, bound: float) -> Iterator[Check]:
-    """Check that the deviation keeps its bound, and uses it."""
-    apart = evidence.certificate.rms / bound - 1
-    name = "standard deviation of the estimation error over its bound, less 1"
-    yield Check(name, apart, TOLERANCE, "Lyapunov equation")
-    name = "bound over the standard deviation of the estimation error, less 1"
-    yield Check(name, -apart, ORIGIN_TOLERANCE, "Lyapunov equation")
-
-
 def _check_least(evidence: Evidence, least: float) -> Iterator[Check]:
     """Check the least norm on both sides: the level above is met, the level below is not."""
     problem, sides = evidence.design.problem, (-TOLERANCE, TOLERANCE)
@@ -106,35 +96,11 @@ def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
     value = level / evidence.certificate.gamma - 1
     name = "infeasible level over the norm achieved, less 1"
     yield Check(name, value, INFEASIBLE_TOLERANCE, LEVEL_SETS)
-    proved = certify_infeasible(problem, level, evidence.design.proof)
+    proved = certify_infeasible(problem, level, evidence.design.witness)
     below = -proved.value / (1 + proved.value)
     yield proved
     name = "level proved over the infeasible level, less 1"
     yield Check(name, below, TOLERANCE, proved.computed_by)
-
-
-RMS = measured_claim("rms", "estimation error, rms")
-GAMMA = measured_claim("gamma", "estimation error, H-infinity norm")
-GAMMA_REQUESTED = Claim(
-    name="gamma_requested", heading="bound asked for", unit="nm", checks=_check_bound
-)
-RMS_REQUESTED = Claim(
-    name="rms_requested", heading="rms asked for", unit="nm", checks=_check_rms_bound
-)
-GAMMA_LEAST = Claim(
-    name="gamma_least",
-    heading="least norm of any filter, upper bound",
-    unit="nm",
-    format=".9g",
-    checks=_check_least,
-)
-GAMMA_INFEASIBLE = Claim(
-    name="gamma_infeasible",
-    heading="least norm of any filter, lower bound",
-    unit="nm",
-    format=".9g",
-    checks=_check_infeasible,
-)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -179,8 +145,6 @@ class FilterDesign(Design):
         The problem (a plant, for a telescope).
     gain_predictor : (n, q) ndarray
         ``(A P C' + S) (C P C' + R)^-1``: of ``x(k+1|k) = A x(k|k-1) + gain (y(k) - C x(k|k-1))``.
-    gain_filter : (n, q) ndarray
-        ``P C' (C P C' + R)^-1``: of ``x(k|k) = x(k|k-1) + gain (y(k) - C x(k|k-1))``.
     witness : Witness or None
         Disturbances that no measurement shows: the proof that no filter reaches
         ``gamma_infeasible``.
@@ -188,57 +152,48 @@ class FilterDesign(Design):
         Where the loop has other sensors beside its own: the filter of the remaining ones, for each
         set of sensors and channels that may fail.
 
-    The gains are (N, n, q) where the sensors have a common period of N frames.
+    The gain is (N, n, q) where the sensors have a common period of N frames.
     """
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
-        *(RMS, GAMMA, RMS_REQUESTED, GAMMA_REQUESTED, GAMMA_LEAST, GAMMA_INFEASIBLE),
+        measured_claim("rms", "estimation error, rms"),
+        measured_claim("gamma", "estimation error, H-infinity norm"),
+        Claim(name="gamma_requested", heading="bound asked for", unit="nm", checks=_check_bound),
+        Claim(
+            name="gamma_least",
+            heading="least norm of any filter, upper bound",
+            unit="nm",
+            format=".9g",
+            checks=_check_least,
+        ),
+        Claim(
+            name="gamma_infeasible",
+            heading="least norm of any filter, lower bound",
+            unit="nm",
+            format=".9g",
+            checks=_check_infeasible,
+        ),
     )
     DERIVED: ClassVar[tuple[Column, ...]] = (
         *MODEL_LIMITS,
-        Column(name="sensors", heading="sensors and channels"),
+        *SENSOR_FACTS,
         Column(name="period", heading="common period", unit="frames"),
-        Column(name="loop_radius", heading="spectral radius of the loop, over a period"),
-        Column(name="gain_low", heading="stable gain factors, from", format=".4g"),
-        Column(name="gain_high", heading="stable gain factors, to", format=".4g"),
-        Column(
-            name="dwell_frames",
-            heading="stable if sensors fail or return no sooner than after",
-            unit="frames",
-            help="Whatever the order: a proof, where the plant is its model; sooner may be stable",
-        ),
     )
     is_estimator: ClassVar[bool] = True
 
     problem: EstimationProblem
     gain_predictor: FloatArray
-    gain_filter: FloatArray
     witness: Witness | None = None
     fallbacks: tuple[Fallback, ...] = ()
 
     def __post_init__(self) -> None:
-        gains = {"gain_predictor": self.gain_predictor, "gain_filter": self.gain_filter}
-        named = {name: self.problem.checked_gain(gain, name) for name, gain in gains.items()}
-        set_fields(self, **named)
+        gain = self.problem.checked_gain(self.gain_predictor, "gain_predictor")
+        set_fields(self, gain_predictor=gain)
         Design.__post_init__(self)
 
     def make_controller(self) -> Controller:
         """Return the controller of the predictor gain."""
         return self.problem.controller(self.gain_predictor)
-
-    @property
-    def proof(self) -> Witness:
-        """The witness; without one, no disturbance at all, which proves nothing."""
-        (n, p), N = self.problem.B.shape[-2:], self.problem.period
-        shapes = [(N, n, 1), (N, p, 1)] if N > 1 else [(n, 1), (p, 1)]
-        states, disturbances = (np.zeros(shape) for shape in shapes)
-        nothing = Witness(states=states, disturbances=disturbances)
-        return self.witness or nothing
-
-    @property
-    def is_bounded(self) -> bool:
-        """Whether the design was given a bound; without one its variance is the least."""
-        return not self.claims.keys().isdisjoint({"gamma_requested", "rms_requested"})
 
     @property
     def knows_mirror(self) -> bool:
@@ -254,15 +209,7 @@ class FilterDesign(Design):
         plant = self.problem
         if not reads_several(plant):
             return dict(model_limits(self))
-        low, high = stable_sensor_gains(plant.hardware, self.controller)
-        return {
-            "sensors": ", ".join(plant.hardware.suite.units),
-            "period": plant.period,
-            "loop_radius": self.close(plant.hardware).spectral_radius,
-            "gain_low": low,
-            "gain_high": high,
-            "dwell_frames": dwell_frames(plant, self.gain_predictor, self.fallbacks),
-        }
+        return {**sensor_facts(self, plant.hardware), "period": plant.period}
 
     @property
     def controllers(self) -> dict[frozenset[str], Controller]:
@@ -294,13 +241,13 @@ class FilterDesign(Design):
         return self.error_system().poles
 
     def examine(self) -> Evidence:
-        """Compute the norms of the error, and check the gains against each other."""
-        least = not self.is_bounded
+        """Compute the norms of the error, and check the gains of fall-backs."""
+        least = "gamma_requested" not in self.claims
         certificate = certify_filter(self.problem, self.gain_predictor, least_variance=least)
         if not certificate.checks[0].passed:
             return Evidence(design=self, certificate=certificate)
         kalman = kalman_riccati(self.problem)
-        checks = [*certificate.checks, self._gain_check()]
+        checks = list(certificate.checks)
         if reads_several(self.problem):
             checks += fallback_checks(self.problem, self.fallbacks)
         if least:
@@ -309,36 +256,15 @@ class FilterDesign(Design):
         certificate = replace(certificate, checks=tuple(checks))
         return Evidence(design=self, certificate=certificate, kalman=kalman)
 
-    def _gain_check(self) -> Check:
-        """Check that the two gains are of one filter, in the states that go on."""
-        problem, apart = self.problem, 0.0
-        shape = (problem.period, problem.n_states, problem.n_measurements)
-        gains = zip(
-            *(np.reshape(g, shape) for g in (self.gain_predictor, self.gain_filter)), strict=True
-        )
-        for t, (predictor, filtering) in enumerate(gains):
-            A, _, injection = decorrelate(problem, t)
-            rows, goes_on = problem.read[t], np.any(A != 0, axis=1)  # not so an innovation's memory
-            made = A @ filtering[:, rows] + injection
-            off = (made - predictor[:, rows])[goes_on]
-            apart = max(apart, float(np.max(np.abs(off), initial=0.0)))
-        size = max(float(np.max(np.abs(self.gain_predictor), initial=0.0)), 1e-300)
-        value = apart / size
-        how = "A times the filter gain, relative"
-        return Check("predictor gain against the filter gain", value, TOLERANCE, how)
-
 
 def _distance(design: FilterDesign, origin: FilterRiccati) -> float:
-    """Return how far both gains of a filter are from those of a Riccati equation, relative."""
-    gains = np.concatenate([design.gain_predictor, design.gain_filter], axis=-2)
-    other = np.concatenate([origin.gain_predictor, origin.gain_filter], axis=-2)
-    return relative_distance(gains, other)
+    """Return how far the gain of a filter is from that of a Riccati equation, relative."""
+    return relative_distance(design.gain_predictor, origin.gain_predictor)
 
 
 def filter_design(
     problem: EstimationProblem,
     gain_predictor: FloatArray,
-    gain_filter: FloatArray,
     *,
     method: str,
     solver: SolverReport,
@@ -351,7 +277,6 @@ def filter_design(
         solver=solver,
         problem=problem,
         gain_predictor=gain_predictor,
-        gain_filter=gain_filter,
         witness=witness,
         fallbacks=make_fallbacks(problem),
         claims={name: value for name, value in claims.items() if value is not None},
@@ -476,49 +401,3 @@ def _offset_nm(loop: ClosedLoop, readings: FloatArray) -> float:
 def failed_loop(plant: TipTiltPlant, gains: FloatArray, missing: tuple[str, ...]) -> ClosedLoop:
     """Return the loop of a plant in which some sensors read zero."""
     return close_loop(plant.hardware, plant.controller(gains), blind=missing)
-
-
-def dwell_frames(
-    plant: TipTiltPlant, gains: FloatArray, fallbacks: tuple[Fallback, ...]
-) -> int | None:
-    """Return frames that each filter must stay for any sequence of them to be stable.
-
-    Stable filters that take turns need not be stable. Where the plant is its model, the estimation
-    error does not depend on the commands; it shrinks in a fixed norm while a filter stays long
-    enough, whichever filter came before. The norm weighs the error by the covariance of the
-    plant's state, mean over the phases. If a filter shrinks it in any number of periods from m to
-    2 m - 1, it does in any more.
-    """
-    P = plant.error_system(np.zeros_like(gains)).covariances().mean(axis=0)
-    sizes = np.diag(P)
-    if not sizes.all():  # states that the plant leaves at zero hold past innovations
-        errors = plant.error_system(gains).covariances().mean(axis=0)
-        sizes = np.where(sizes > 0, sizes, np.diag(errors) / _REGULAR)
-    root = np.linalg.cholesky(P + _REGULAR * np.diag(sizes))
-    filters = [gains, *(each.gains for each in fallbacks)]
-    needed = [_periods(plant.error_system(own), root) for own in filters]
-    periods = [each for each in needed if each is not None]
-    return (max(periods) + 2) * plant.period - 2 if len(periods) == len(filters) else None
-
-
-def _periods(error: StateSpace, root: FloatArray) -> int | None:
-    """Return after how many whole periods an error has shrunk, wherever in a period it begins."""
-    inverse, each = np.linalg.inv(root), np.eye(len(root))
-
-    def size(transition: FloatArray) -> float:
-        return float(np.linalg.norm(inverse @ transition @ root, 2))
-
-    before = after = 1.0  # of the parts of a period at both ends
-    head = tail = each
-    transitions = error.stacks()[0]
-    for A, last in zip(transitions[:-1], transitions[:0:-1], strict=True):
-        head, tail = A @ head, tail @ last
-        after, before = max(after, size(head)), max(before, size(tail))
-    allowed, period = 1 / (before * after), error.monodromy
-    transition, shrunk = each, 0
-    for count in range(1, LONGEST_DWELL):
-        transition = period @ transition
-        shrunk = shrunk if size(transition) < allowed else count
-        if count >= 2 * shrunk + 1:
-            return shrunk + 1
-    return None

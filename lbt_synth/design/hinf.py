@@ -31,7 +31,6 @@ def hinf(
     *,
     gamma: float | None = None,
     gamma_ratio: float | None = None,
-    horizon: int = 1,
     route: str | None = None,
 ) -> FilterDesign:
     """Design an H-infinity filter of an estimation problem.
@@ -48,9 +47,6 @@ def hinf(
         Bound on the H-infinity norm from w to the estimation error.
     gamma_ratio : float, optional
         The same bound as a multiple, at least 1, of the least gamma.
-    horizon : int, optional
-        Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
-        filter (a-posteriori), 2 and more predict further, as ``problem.ahead``.
     route : {"lmi", "riccati"}, optional
         How the least gamma is found: linear matrix inequality, or gamma-Riccati equation, of which
         the filter of a larger bound is the central one. By default the inequality up to 20 states,
@@ -87,7 +83,6 @@ def hinf(
     gamma, gamma_ratio = checked_bounds(
         gamma, gamma_ratio, far_above="the filter is the Kalman filter"
     )
-    problem = problem.ahead(horizon)
     start = kalman_riccati(problem)
     if route == "lmi":
         problem.require_one_phase("the inequality", "route='riccati'")
@@ -137,7 +132,6 @@ def _design(
     else:
         _, level, gains = least_gamma(problem, lower=lower, upper=upper, start=start)
         witness = worst_invisible_disturbance(problem, gains.P, level, start.P)
-
     least, infeasible = _verified_bracket(problem, start, gains, witness)
     requested = gamma if gamma is not None else least * (gamma_ratio or 1)
     require_reachable(requested, least)
@@ -146,9 +140,8 @@ def _design(
     design = filter_design(
         problem,
         gains.gain_predictor,
-        gains.gain_filter,
         method="hinf",
-        solver=SolverReport(route=route, status=gains.status, iterations=gains.iterations),
+        solver=SolverReport(route=route, status=gains.status),
         gamma_requested=max(requested, least),
         gamma_least=least,
         gamma_infeasible=infeasible,

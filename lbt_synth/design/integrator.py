@@ -15,7 +15,6 @@ from lbt_synth.design.result import Design, SolverReport, with_certificate
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear import Controller, hinf_norm
 from lbt_synth.loop import ClosedLoop, LoopEnsemble, close_loop, stable_sensor_gains
-from lbt_synth.loop.budget import noise_covariance
 from lbt_synth.loop.ensemble import ensemble_vibration, residuals_from_matrices, textbook_matrices
 from lbt_synth.loop.margins import phase_margin_deg
 from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
@@ -202,31 +201,42 @@ class IntegratorDesign(Design):
 
 
 def integrator(
-    hardware: LoopHardware, *, gain: float | None = None, law: IntegratorLaw = PURE
+    hardware: LoopHardware,
+    *,
+    gain: float | None = None,
+    truth: Truth | TipTiltPlant | None = None,
+    law: IntegratorLaw = PURE,
 ) -> IntegratorDesign:
     """Integrator ``u(k) = u(k-1) + gain R y(k)``, or one of another law.
 
-    R is the pseudoinverse of the sensor matrix times the influence matrix.
+    R is the pseudoinverse of the sensor matrix times the influence matrix. The gain is given; or
+    leaves the least residual for a truth; or is the largest one that keeps the margins of the law.
 
     Parameters
     ----------
     hardware : LoopHardware
         The loop.
     gain : float, optional
-        Gain, above 0 and below :func:`integrator_gain_limit`; by default the largest one that
-        keeps the margins that the law demands.
+        Gain, above 0 and below :func:`integrator_gain_limit`.
+    truth : Truth or TipTiltPlant, optional
+        Disturbances, noise and sensor gain for which the residual is least; or the plant whose
+        model is the truth.
     law : IntegratorLaw, optional
-        Leak, zero and second integrator, and demands; by default a pure integrator.
+        Leak, zero and second integrator, and margins to keep at unit sensor gain; by default a
+        pure integrator without a demand.
 
     Returns
     -------
     IntegratorDesign
-        Certified design.
+        Certified design. The best gain is within a relative 1e-6 of the best among those from 1e-4
+        to 0.999 of the largest stable one at unit sensor gain that keep the margins;
+        ``solver.status`` says when an end of that range, not the truth, decided.
 
     Raises
     ------
     ProblemError
-        If the gain is not a positive number, or neither a gain nor a demand is given.
+        If the gain is not a positive number, there is both a gain and a truth, or neither nor a
+        demand, or nothing disturbs the loop.
     InfeasibleError
         If no gain keeps the margins that are demanded.
     CertificateError
@@ -241,16 +251,24 @@ def integrator(
     >>> half = lbt.design.IntegratorLaw(modulus_margin=0.5)
     >>> round(lbt.integrator(path, law=half).gain, 3)
     0.454
+    >>> slow = lbt.models.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=800)
+    >>> 0.2 < lbt.integrator(path, truth=lbt.Truth(turbulence=slow, noise_nm=20.0)).gain < 0.6
+    True
     """
+    require_instance(hardware, LoopHardware, "hardware")
+    if gain is not None and truth is not None:
+        raise ProblemError("give an integrator a gain or a truth; got both.")
     if gain is not None:
-        given = number(gain, "gain", above=0)
-        return _design_with_gain(hardware, given, law, route="closed form", status="given")
+        chosen = number(gain, "gain", above=0)
+        return _design_with_gain(hardware, chosen, law, route="closed form", status="given")
+    if truth is not None:
+        return _least_residual(hardware, law, truth)
     if not law.demands:
         raise ProblemError(
-            "an integrator needs a gain or a demand; got neither. Try gain=0.3, or "
+            "an integrator needs a gain, a truth or a demand; got none. Try gain=0.3, or "
             "law=IntegratorLaw(phase_margin_deg=45)."
         )
-    allowed = _allowed_gains(hardware, law, _TRIALS * hardware_gain_limit(hardware, law))
+    allowed = _allowed_gains(hardware, law, _TRIALS * integrator_gain_limit(hardware, law))
     most = float(np.exp(allowed[-1]))
     return _design_with_gain(hardware, most, law, route="search", status="largest gain")
 
@@ -261,22 +279,24 @@ def _design_with_gain(
     """Make the design of a gain and certify it."""
     design = IntegratorDesign(
         method="integrator",
-        solver=SolverReport(route=route, status=status, iterations=0),
+        solver=SolverReport(route=route, status=status),
         problem=hardware,
         claims={"gain": gain, **law.changes()},
     )
     return with_certificate(design, f"Lower the gain {gain:.6g}.")
 
 
-def integrator_gain_limit(delay_frames: float) -> float:
-    """Gain at which an integrator loop becomes unstable.
+def integrator_gain_limit(hardware: LoopHardware, law: IntegratorLaw = PURE) -> float:
+    """Gain at which the loop of a law becomes unstable, with the dynamics of the mirror.
 
-    It is ``2 sin(pi / (2 (2 d - 1)))`` for a whole delay of d frames.
+    It is ``2 sin(pi / (2 (2 d - 1)))`` for an integrator and a whole delay of d frames.
 
     Parameters
     ----------
-    delay_frames : float
-        Total delay [frames], at least 1.
+    hardware : LoopHardware
+        Delay, mirror and frame rate; its matrices play no part.
+    law : IntegratorLaw, optional
+        Leak, zero and second integrator; by default a pure integrator.
 
     Returns
     -------
@@ -285,20 +305,16 @@ def integrator_gain_limit(delay_frames: float) -> float:
 
     Raises
     ------
-    ProblemError
-        If the delay is below 1 or not a number.
+    InfeasibleError
+        If no gain of two integrators is stable.
 
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> [round(lbt.design.integrator_gain_limit(d), 3) for d in (2, 3, 4)]
+    >>> paths = [lbt.LoopHardware(frame_rate_hz=800, delay_frames=d) for d in (2, 3, 4)]
+    >>> [round(lbt.design.integrator_gain_limit(path), 3) for path in paths]
     [1.0, 0.618, 0.445]
     """
-    return hardware_gain_limit(LoopHardware(frame_rate_hz=1.0, delay_frames=delay_frames, modes=1))
-
-
-def hardware_gain_limit(hardware: LoopHardware, law: IntegratorLaw = PURE) -> float:
-    """Gain at which the loop of a law becomes unstable, with the dynamics of the mirror."""
     single = hardware.single_mode()
     taps = single.mirror_taps
     mean_delay_frames = 1 + float(np.abs(np.arange(taps.size) @ taps))
@@ -351,138 +367,59 @@ def _allowed_gains(hardware: LoopHardware, law: IntegratorLaw, trials: FloatArra
     return np.unique(np.concatenate([tried[first : last + 1], ends]))
 
 
-def optimal_integrator(
-    hardware: LoopHardware, truth: Truth, *, law: IntegratorLaw = PURE
-) -> IntegratorDesign:
-    """Integrator whose gain leaves the least residual for a given truth.
-
-    Parameters
-    ----------
-    hardware : LoopHardware
-        The loop.
-    truth : Truth
-        Disturbances, noise and sensor gain.
-    law : IntegratorLaw, optional
-        Leak, zero and second integrator, and margins to keep at unit sensor gain; by default a
-        pure integrator without a demand.
-
-    Returns
-    -------
-    IntegratorDesign
-        Certified design. The gain is within a relative 1e-6 of the best among those from 1e-4 to
-        0.999 of the largest stable one at unit sensor gain that keep the margins;
-        ``solver.status`` says when an end of that range, not the truth, decided.
-
-    Raises
-    ------
-    ProblemError
-        If nothing disturbs the loop.
-    InfeasibleError
-        If no gain keeps the margins that are demanded.
-    CertificateError
-        If the design does not pass its checks.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
-    >>> slow = lbt.models.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=800)
-    >>> design = lbt.design.optimal_integrator(path, lbt.Truth(turbulence=slow, noise_nm=20.0))
-    >>> 0.2 < design.gain < 0.6
-    True
-    """
-    turbulence = truth.turbulence_groups(hardware.modes)
-    if not turbulence and not truth.vibrations and not np.any(truth.noise_nm):
-        raise ProblemError(
-            "the truth must disturb the loop; got no turbulence, vibration or noise."
-        )
-    ensemble = LoopEnsemble(
-        sensor_gain=truth.sensor_gain,
-        turbulence=truth.turbulence_per_mode(hardware.modes),
-        noise_nm=truth.noise_per_measurement(hardware.n_measurements)[None],
-        vibrations=tuple(map(ensemble_vibration, stationary_vibrations(truth.vibrations))),
-    )
-
-    variances = _ensemble_variances(hardware, law, ensemble)
-    return _least_residual(hardware, law, variances, truth.sensor_gain)
-
-
-def model_integrator(plant: TipTiltPlant, *, law: IntegratorLaw = PURE) -> IntegratorDesign:
-    """Integrator whose gain leaves the least residual where a plant's model is the truth.
-
-    Parameters
-    ----------
-    plant : TipTiltPlant
-        Turbulence of each mode, vibrations, noise and loop.
-    law : IntegratorLaw, optional
-        As that of :func:`optimal_integrator`.
-
-    Returns
-    -------
-    IntegratorDesign
-        Certified design, as that of :func:`optimal_integrator`.
-
-    Raises
-    ------
-    InfeasibleError
-        If no gain keeps the margins that are demanded.
-    CertificateError
-        If the design does not pass its checks.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> slow = lbt.models.ARModel(coefficients=[0.999], driving_rms_nm=10.0, frame_rate_hz=800)
-    >>> plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=slow, noise_nm=20.0)
-    >>> truth = lbt.Truth(turbulence=slow, noise_nm=20.0)
-    >>> same = lbt.design.optimal_integrator(plant.hardware, truth)
-    >>> bool(abs(lbt.design.model_integrator(plant).gain / same.gain - 1) < 1e-6)
-    True
-    """
-    require_instance(plant, TipTiltPlant)
-    hardware, factor = plant.hardware, plant.D[:, -plant.hardware.n_measurements :]
-    lines = [  # those of a plant are means over frames
-        replace(line, rms_nm=line.rms_nm / np.sinc(line.frequency_hz / hardware.frame_rate_hz))
-        for line in plant.vibrations
-    ]
-    moving = tuple(map(ensemble_vibration, lines))
-    conditions = LoopEnsemble(turbulence=plant.turbulence, vibrations=moving)
-    disturbed = _ensemble_variances(hardware, law, conditions)
-
-    def from_noise(gain: float) -> float:
-        loop = close_loop(hardware, law.controller(hardware, gain))
-        return float(np.trace(noise_covariance(loop, factor))) if loop.is_stable else np.nan
-
-    def variances(gains: FloatArray) -> FloatArray:
-        return disturbed(gains) + [from_noise(gain) for gain in gains.tolist()]
-
-    return _least_residual(hardware, law, variances, 1.0)
-
-
-def _ensemble_variances(
-    hardware: LoopHardware, law: IntegratorLaw, ensemble: LoopEnsemble
+def _residuals_by_gain(
+    hardware: LoopHardware, law: IntegratorLaw, truth: Truth | TipTiltPlant
 ) -> Callable[[FloatArray], FloatArray]:
-    """Return what loops under the same conditions leave in the image, by their gains (k,)."""
+    """Return what loops leave in the image [nm^2] by their gains (k,), nan if unstable."""
+    if isinstance(truth, TipTiltPlant):
+        rate = hardware.frame_rate_hz
+        lines = [  # those of a plant are means over frames
+            replace(line, rms_nm=line.rms_nm / np.sinc(line.frequency_hz / rate))
+            for line in truth.vibrations
+        ]
+        # readings over the square root of their noise have independent noise of 1
+        unit, factor = np.ones(hardware.n_measurements), truth.own_noise_factor
+        whitened = frozen_copy(np.linalg.solve(factor, hardware.sensor))
+        seen = replace(hardware, sensor_matrix=whitened)
+        ensemble = LoopEnsemble(
+            turbulence=truth.turbulence,
+            noise_nm=unit[None],
+            vibrations=tuple(map(ensemble_vibration, lines)),
+        )
+    else:
+        require_instance(truth, Truth, "truth")
+        noise_nm = truth.noise_per_measurement(hardware.n_measurements)
+        groups = truth.turbulence_groups(hardware.modes)
+        if not groups and not truth.vibrations and not np.any(noise_nm):
+            raise ProblemError(
+                "the truth must disturb the loop; got no turbulence, vibration or noise."
+            )
+        factor, seen = np.eye(hardware.n_measurements), hardware
+        ensemble = LoopEnsemble(
+            sensor_gain=truth.sensor_gain,
+            turbulence=truth.turbulence_per_mode(hardware.modes),
+            noise_nm=noise_nm[None],
+            vibrations=tuple(map(ensemble_vibration, stationary_vibrations(truth.vibrations))),
+        )
     A, B, C, D = textbook_matrices([law.controller(hardware, 1.0)])
 
     def variances(gains: FloatArray) -> FloatArray:
-        factor, whole = gains[:, None, None], np.ones((gains.size, 1, 1))
-        scaled = (whole * A, factor * B, whole * C, factor * D)  # a gain scales the input
-        loops = replace(ensemble, loops=gains.size)
-        residuals = residuals_from_matrices(scaled, hardware, loops, in_image=True)
-        return np.asarray(residuals.rms_nm**2)
+        scale, one = gains[:, None, None], np.ones((gains.size, 1, 1))
+        loops = one * A, scale * (B @ factor), one * C, scale * (D @ factor)
+        conditions = replace(ensemble, loops=gains.size)
+        budget = residuals_from_matrices(loops, seen, conditions, in_image=True)
+        return np.asarray(budget.rms_nm**2)
 
     return variances
 
 
 def _least_residual(
-    hardware: LoopHardware,
-    law: IntegratorLaw,
-    variances: Callable[[FloatArray], FloatArray],
-    sensor_gain: float,
+    hardware: LoopHardware, law: IntegratorLaw, truth: Truth | TipTiltPlant
 ) -> IntegratorDesign:
-    """Refine each local minimum of ``variances`` over gains, nan if unstable; take the least."""
-    gains = _TRIALS * hardware_gain_limit(hardware, law) / max(1.0, sensor_gain)
+    """Refine each local minimum of the residual over the gain, and take the least."""
+    variances = _residuals_by_gain(hardware, law, truth)
+    sensor_gain = truth.sensor_gain if isinstance(truth, Truth) else 1.0
+    gains = _TRIALS * integrator_gain_limit(hardware, law) / max(1.0, sensor_gain)
     trials = _allowed_gains(hardware, law, gains) if law.demands else np.log(gains)
 
     def left(log_gains: FloatArray) -> FloatArray:

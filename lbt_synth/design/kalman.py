@@ -11,16 +11,14 @@ from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.validation import FloatArray, require_instance
 
 
-def kalman(problem: EstimationProblem, *, horizon: int = 1) -> FilterDesign:
+def kalman(problem: EstimationProblem) -> FilterDesign:
     """Design the steady-state Kalman filter of an estimation problem.
 
     Parameters
     ----------
     problem : EstimationProblem
-        The problem; a plant gives a controller.
-    horizon : int, optional
-        Frames from the newest measurement to the estimate: 1 is the predictor, 0 the
-        filter, 2 and more predict further, as ``problem.ahead``.
+        The problem; a plant gives a controller. The estimate is one frame ahead of the newest
+        measurement; ``problem.ahead`` is the problem of another one.
 
     Returns
     -------
@@ -44,16 +42,13 @@ def kalman(problem: EstimationProblem, *, horizon: int = 1) -> FilterDesign:
     >>> round(float(design.gain_predictor[0, 0]), 9), design.certificate.passed
     (0.618033989, True)
     """
-    problem = require_instance(problem, EstimationProblem).ahead(horizon)
+    require_instance(problem, EstimationProblem)
     solution = kalman_riccati(problem)
     return filter_design(
         problem,
         solution.gain_predictor,
-        solution.gain_filter,
         method="kalman",
-        solver=SolverReport(
-            route="riccati", status=solution.status, iterations=solution.iterations
-        ),
+        solver=SolverReport(route="riccati", status=solution.status),
     )
 
 

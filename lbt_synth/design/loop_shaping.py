@@ -26,19 +26,10 @@ from lbt_synth.design.shaping.channel import (
     laguerre_basis,
     mode_loop,
 )
-from lbt_synth.design.shaping.demands import (
-    Demand,
-    LoopErrors,
-    ModulusMargin,
-    MovingSensorGain,
-)
-from lbt_synth.design.shaping.objectives import Leaf, ResidualVariance, Total, VibrationBand, leaves
+from lbt_synth.design.shaping.demands import Bound, Demand, LoopErrors
 from lbt_synth.design.shaping.solution import ModeSolution, reduce_mode, solve_mode
-from lbt_synth.design.shaping.specification import (
-    Specification,
-    specified_limit,
-    violated_demands,
-)
+from lbt_synth.design.shaping.specification import Specification, violated_demands
+from lbt_synth.design.shaping.terms import ResidualVariance, Term, VibrationBand
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
@@ -115,10 +106,9 @@ def shape(
     >>> import lbt_synth as lbt
     >>> path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     >>> slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
-    >>> spec = lbt.design.shaping.Specification(
-    ...     objective=lbt.design.shaping.ResidualVariance(turbulence=slow, noise_nm=20.0),
-    ...     demands=[lbt.design.shaping.ModulusMargin(at_least=0.6)],
-    ... )
+    >>> air = lbt.design.shaping.ResidualVariance(turbulence=slow, noise_nm=20.0)
+    >>> margin = lbt.design.shaping.Bound(response="rejection", at_most=1 / 0.6)
+    >>> spec = lbt.design.shaping.Specification(terms=[air], demands=[margin])
     >>> design = lbt.design.shape(path, spec, functions=12, states=None)
     >>> loop = lbt.close_loop(path, design.controller)
     >>> lbt.loop_margins(loop).modulus > 0.6
@@ -153,16 +143,15 @@ def shape(
             solved[spec.key] = long, chosen
     longs, modes = zip(*(solved[spec.key] for spec in specifications), strict=True)
     parameters = tuple(mode.parameter for mode in modes)
-    status, rounds = modes[0].status, max(long.programmes for long in longs)
+    status = modes[0].status
     design = ShapedDesign(
         method="robust",
-        solver=SolverReport(route="youla", status=status, iterations=rounds),
+        solver=SolverReport(route="youla", status=status),
         problem=hardware,
         specifications=specifications,
         parameters=parameters,
         claims={"objective_nm": tuple(mode.objective_nm * (1 + TOLERANCE / 2) for mode in modes)},
         long_objective_nm=tuple(long.objective_nm for long in longs),
-        long_functions=size,
     )
     return with_certificate(design, "Try more functions, or looser demands.")
 
@@ -173,7 +162,7 @@ def _check_objective(evidence: Evidence, claimed: tuple[float, ...]) -> Iterator
     for prefix, mode in design.distinct_modes():
         loop = mode_loop(design.problem, design.parameters[mode])
         try:
-            objective = float(np.sqrt(design.specifications[mode].objective.measured_nm2(loop)))
+            objective = float(np.sqrt(design.specifications[mode].measured_nm2(loop)))
         except UnstableLoopError:
             objective = np.inf
         above, below = _excess(objective, claimed[mode]), _excess(claimed[mode], objective)
@@ -220,23 +209,7 @@ class TermRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ShapedDesign(Design):
-    """A controller shaped in the closed loop, mode by mode.
-
-    It claims the root of the objective of each mode [nm].
-
-    Attributes
-    ----------
-    problem : LoopHardware
-        The loop.
-    specifications : tuple of Specification
-        One per mode.
-    parameters : tuple of Controller
-        Youla parameter of each mode, from its pseudo-open-loop measurement to its command.
-    long_objective_nm : tuple of float
-        Objective of the long parameter, before it was reduced [nm]; the solver's word.
-    long_functions : int
-        Functions of the long parameter.
-    """
+    """A controller shaped in the closed loop; it claims the root of each objective [nm]."""
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
         Claim(name="objective_nm", unit="nm", checks=_check_objective),
@@ -244,20 +217,14 @@ class ShapedDesign(Design):
     DERIVED: ClassVar[tuple[Column, ...]] = (
         Column(name="states_per_mode", heading="states of one mode, past commands included"),
         Column(name="loss", heading="objective above the long parameter's", unit="%", scale=100),
-        Column(
-            name="limit_nm", heading="least worst residual over its bands, all modes", unit="nm"
-        ),
-        Column(
-            name="above_limit_percent", heading="residual at unit sensor gain above it", unit="%"
-        ),
         Column(name="long_objective_nm", unit="nm"),
     )
 
     problem: LoopHardware
-    specifications: tuple[Specification, ...]
+    specifications: tuple[Specification, ...]  # one per mode
+    # Youla parameter of each mode, from its pseudo-open-loop measurement to its command
     parameters: tuple[Controller, ...]
-    long_objective_nm: tuple[float, ...]
-    long_functions: int
+    long_objective_nm: tuple[float, ...]  # before the reduction [nm]; the solver's word
 
     def __post_init__(self) -> None:
         per_mode = self.specifications, self.parameters, self.objective_nm, self.long_objective_nm
@@ -322,16 +289,6 @@ class ShapedDesign(Design):
         return max(short / long - 1 for short, long in pairs)
 
     @property
-    def is_reduced(self) -> bool:
-        """Whether the parameters have fewer poles than the long one."""
-        return any(p.n_states < self.long_functions for p in self.parameters)
-
-    def demand_labels(self) -> tuple[tuple[int, str], ...]:
-        """Demands in words: mode, demand."""
-        specs = enumerate(self.specifications)
-        return tuple((mode, demand.label) for mode, spec in specs for demand in spec.demands)
-
-    @property
     def expected_residual_nm(self) -> float:
         """Root of the sum of the squared objectives of the modes."""
         return float(np.linalg.norm(self.objective_nm))
@@ -339,31 +296,32 @@ class ShapedDesign(Design):
     @property
     def vibration_bands(self) -> tuple[VibrationBand, ...]:
         """Bands of the specifications, mode by mode."""
-        parts = (leaf for spec in self.specifications for leaf in leaves(spec.objective))
-        return tuple(part for part in parts if isinstance(part, VibrationBand))
+        terms = (term for spec in self.specifications for term in spec.terms)
+        return tuple(term for term in terms if isinstance(term, VibrationBand))
 
     def violated_demands(self, controller: Controller) -> tuple[str, ...]:
         """Return the demands that a controller violates, none where it couples the modes."""
         return violated_demands(self.specifications, self.problem, controller) or ()
 
     def derived(self) -> dict[str, Any]:
-        """Return what the controller is, beside the limits over its bands."""
-        limit_nm, above = specified_limit(self.specifications, self.problem, self.parameters)
-        named = {name: getattr(self, name) for name in ("states_per_mode", "loss")}
-        named["long_objective_nm"] = self.long_objective_nm
-        return {**named, "limit_nm": limit_nm, "above_limit_percent": above}
+        """Return what the reduction cost, and from what."""
+        return {column.name: getattr(self, column.name) for column in self.DERIVED}
 
     def terms_nm(self) -> tuple[tuple[int, str, float], ...]:
         """Residual of each term in the real loop: mode, what it is, [nm rms]."""
         return tuple(
-            (mode, leaf.label, float(np.sqrt(leaf.measured_nm2(loop))))
+            (mode, term.label, float(np.sqrt(term.measured_nm2(loop))))
             for mode, (spec, loop) in enumerate(zip(self.specifications, self._loops, strict=True))
-            for leaf in leaves(spec.objective)
+            for term in spec.terms
         )
 
     def tables(self) -> tuple[RowTable, ...]:
         """Return the demands, and the residual of each term."""
-        demands = [DemandRow(demand=label, mode=mode + 1) for mode, label in self.demand_labels()]
+        demands = [
+            DemandRow(demand=demand.label, mode=mode)
+            for mode, spec in enumerate(self.specifications, 1)
+            for demand in spec.demands
+        ]
         terms = [
             TermRow(term=text, mode=mode + 1, rms_nm=rms) for mode, text, rms in self.terms_nm()
         ]
@@ -374,7 +332,7 @@ class ShapedDesign(Design):
 
     def notes(self) -> list[str]:
         """Return a warning where the long parameter is not long enough."""
-        if not (self.is_reduced and self.loss < 0):
+        if not self.loss < 0:
             return []
         return [
             f"note: the long parameter is not long enough: one of {self.states_per_mode} states "
@@ -507,16 +465,15 @@ def robust(
         raise ProblemError(f"sensor_gain must be (low, high); got {sensor_gain!r}.")
     low, high = ends
     further = sequence(demands, "demands")
-    fixed: list[Demand] = [ModulusMargin(at_least=modulus_margin)]
+    margin = number(modulus_margin, "modulus_margin", above=0, below=1)
+    fixed: list[Demand] = [Bound(response="rejection", at_most=1 / margin)]
     late = delay_error_frames
     if late is None:
         late = _DELAY_ERROR if plant.hardware.mirror is None else 0.0
-    if late or ((low, high) != (1, 1) and not moving_gain):
-        fixed.append(LoopErrors(low=low, high=high, delay_frames=late))
     if moving_gain and (low, high) == (1, 1):
         raise ProblemError("moving_gain needs the interval in which it moves; give sensor_gain.")
-    if moving_gain:
-        fixed.append(MovingSensorGain(low=low, high=high))
+    if late or (low, high) != (1, 1):
+        fixed.append(LoopErrors(low=low, high=high, delay_frames=late, moving=moving_gain))
     deviations = noise_per_mode(plant.hardware, plant.R)
     by_mode: dict[object, Specification] = {}
     specifications = []
@@ -527,9 +484,9 @@ def robust(
         key = f"{noise_nm:.9g}", id(spectrum), own, wide
         if key not in by_mode:
             air = ResidualVariance(turbulence=spectrum, noise_nm=noise_nm)
-            terms: tuple[Leaf, ...] = (air, *_resonance_terms(plant, wide), *own)
+            terms: tuple[Term, ...] = (air, *_resonance_terms(plant, wide), *own)
             terms = tuple(replace(term, sensor_gain=g) for g in gains for term in terms)
-            by_mode[key] = Specification(objective=Total(terms=terms), demands=(*fixed, *further))
+            by_mode[key] = Specification(terms=terms, demands=(*fixed, *further))
         specifications.append(by_mode[key])
     path = plant.hardware
     return shape(path, specifications, functions=functions, pole=pole, states=states, loss=loss)

@@ -106,17 +106,6 @@ class LqgDesign(Design):
     The commands are ``N u(k) = gain_state x_hat(k+1|k) - N gain_mirror m(k)``, with x the
     states of :attr:`estimation` and m those of the mirror's core, one set a command. The
     error, with ``rms`` and ``gamma``, is the residual of the loop in the pieces of a hold.
-
-    Attributes
-    ----------
-    problem : TipTiltPlant
-        The plant, with the loop and the mirror.
-    gain_predictor : (n, q) ndarray
-        Kalman gain of the estimation.
-    gain_state : (modes, n) ndarray
-        From the predicted disturbance to the command of each mode.
-    gain_mirror : (c,) ndarray
-        From the states of the mirror's core to the command.
     """
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
@@ -129,9 +118,9 @@ class LqgDesign(Design):
     is_estimator: ClassVar[bool] = True
 
     problem: TipTiltPlant
-    gain_predictor: FloatArray
-    gain_state: FloatArray
-    gain_mirror: Vector
+    gain_predictor: FloatArray  # (n, q): Kalman gain of the estimation
+    gain_state: FloatArray  # (modes, n): from the predicted disturbance to each mode's command
+    gain_mirror: Vector  # (c,): from the states of the mirror's core to the command
 
     def __post_init__(self) -> None:
         model, mirror = self.estimation, mirror_core(self.problem)
@@ -149,8 +138,13 @@ class LqgDesign(Design):
 
     def make_controller(self) -> Controller:
         """Return the controller of the filter and the regulator."""
-        gains = self.gain_predictor, self.gain_state, self.gain_mirror
-        return lqg_controller(self.problem, *gains)
+        hardware = self.problem.hardware  # whose states of mirror and delay the law reads, too
+        full = replace(self.estimation, hardware=hardware).full()
+        states, law = len(self.gain_predictor), np.zeros((hardware.modes, full.n_states))
+        law[:, :states] = self.gain_state
+        end = states + self.gain_mirror.size * hardware.n_commands
+        law[:, states:end] = -np.kron(self.gain_mirror, hardware.influence)
+        return full.controller(self.gain_predictor, hardware.projector @ law)
 
     @property
     def command_weight(self) -> float:
@@ -231,19 +225,6 @@ class LqgDesign(Design):
         return Evidence(design=self, certificate=replace(certificate, checks=tuple(checks)))
 
 
-def lqg_controller(
-    plant: TipTiltPlant, gain_predictor: FloatArray, gain_state: FloatArray, gain_mirror: FloatArray
-) -> Controller:
-    """Make the controller from y(k) to u(k): the filter, and the states of mirror and delay."""
-    hardware = plant.hardware
-    full = replace(estimation_plant(plant), hardware=hardware).full()
-    states, law = len(gain_predictor), np.zeros((hardware.modes, full.n_states))
-    law[:, :states] = gain_state
-    end = states + gain_mirror.size * hardware.n_commands
-    law[:, states:end] = -np.kron(gain_mirror, hardware.influence)
-    return full.controller(gain_predictor, hardware.projector @ law)
-
-
 def estimation_plant(plant: TipTiltPlant) -> TipTiltPlant:
     """Plant whose state holds the phase in the frames in which the next command holds."""
     hardware = plant.hardware
@@ -321,7 +302,6 @@ class Regulator(NamedTuple):
     gain_mirror: FloatArray
     weight: float  # ``d^2 + rho + G'XG``
     status: str
-    iterations: int
 
 
 def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
@@ -395,7 +375,6 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
         solver=SolverReport(
             route="riccati",
             status=f"{solution.status}; mirror: {regulator.status}",
-            iterations=solution.iterations + regulator.iterations,
         ),
         problem=plant,
         gain_predictor=solution.gain_predictor,
@@ -414,7 +393,7 @@ def _regulator(core: Response, pieces: Pieces, A: FloatArray, rho: float) -> Reg
     weight = float(d @ d) + rho
     if core.n_states == 0:
         gain_state = np.einsum("g,gan->an", d, L) / weight
-        return Regulator(gain_state, np.zeros(0), weight, "settled", 0)
+        return Regulator(gain_state, np.zeros(0), weight, "settled")
     solved = solve_dare(F, G[:, None], h.T @ h, [[weight]], (d @ h)[:, None])
     X = solved.X
     total = float(weight + G @ X @ G)
@@ -426,4 +405,4 @@ def _regulator(core: Response, pieces: Pieces, A: FloatArray, rho: float) -> Reg
     stein = np.eye(len(drives)) - np.kron(closed.T, A.T)
     crossed = np.linalg.solve(stein, drives).T.reshape(-1, *map(len, (F, A)))
     gain_state = (np.einsum("g,gan->an", d, L) - np.einsum("i,aij,jk->ak", G, crossed, A)) / total
-    return Regulator(gain_state, gain_mirror, total, solved.route, solved.iterations)
+    return Regulator(gain_state, gain_mirror, total, solved.route)

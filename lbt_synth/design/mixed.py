@@ -1,37 +1,31 @@
-"""The mixed filter: least variance under a bound on the norm, and the reverse.
+"""The mixed filter: least variance under a bound on the norm.
 
-It completes a central H-infinity filter, chosen by the norm or the variance that it achieves.
+It completes a central H-infinity filter, chosen by the norm that it achieves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
 
+from lbt_synth.design.certificate import proved_level
 from lbt_synth.design.filter_design import FilterDesign, filter_design
-from lbt_synth.design.hinf import AT_LEAST, hinf, require_reachable
+from lbt_synth.design.hinf import hinf, require_reachable
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import SolverReport
-from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import (
     EstimationProblem,
     StateSpace,
     hinf_norm,
 )
-from lbt_synth.linear.infeasibility_proof import infeasible_level
+from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.linear.riccati.filtering import FilterRiccati, gamma_riccati, kalman_riccati
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number, require_instance
-
-if TYPE_CHECKING:
-    from lbt_synth.linear.lmi.mixed import InnovationProgramme
-
-
-_Answer: TypeAlias = tuple[FloatArray, float, str]  # taps, level, what the solver said
 
 _DECADES = 4.0  # of gamma, over which a central filter is searched
 _ROUNDS = 20
@@ -47,11 +41,9 @@ def mixed(
     *,
     gamma: float | None = None,
     gamma_ratio: float | None = None,
-    rms: float | None = None,
     taps: int = _TAPS,
-    horizon: int = 1,
 ) -> FilterDesign:
-    """Design the filter of least variance under a bound on its norm, or the reverse.
+    """Design the filter of least variance under a bound on its norm.
 
     A base, the central H-infinity filter that just meets the bound, is completed with an
     impulse response on its innovations. All stable filters are of this kind, and the
@@ -68,20 +60,16 @@ def mixed(
         Bound on the H-infinity norm; the variance is made least.
     gamma_ratio : float, optional
         The same bound as a multiple, at least 1, of the least gamma.
-    rms : float, optional
-        Bound on the standard deviation of the error; the norm is made least.
     taps : int, optional
         Length of the impulse response, at most 64: states that the filter gets for each
         measurement.
-    horizon : int, optional
-        Frames from the newest measurement to the estimate, as ``problem.ahead``.
 
     Returns
     -------
     FilterDesign
         Certified design; its problem has the past innovations as further states. A bound
         that the Kalman filter meets gives the Kalman filter; one that only the filter of
-        the least gamma meets (within 1e-5), or that lets it in, gives that one.
+        the least gamma meets (within 1e-5) gives that one.
 
     Raises
     ------
@@ -95,67 +83,35 @@ def mixed(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> line = lbt.EstimationProblem(
-    ...     A=[[1.9, -0.99], [1.0, 0.0]],
-    ...     B=[[1.0, 0.0], [0.0, 0.0]],
-    ...     C=[[0.0, 1.0]],
-    ...     D=[[0.0, 3.0]],
-    ...     L=[[1.0, 0.0]],
-    ... )
+    >>> A, B, C = [[1.9, -0.99], [1.0, 0.0]], [[1.0, 0.0], [0.0, 0.0]], [[0.0, 1.0]]
+    >>> line = lbt.EstimationProblem(A=A, B=B, C=C, D=[[0.0, 3.0]], L=[[1.0, 0.0]])
     >>> central = lbt.hinf(line, gamma_ratio=1.1, route="riccati")
     >>> best = lbt.mixed(line, gamma=central.gamma)
     >>> best.gamma <= central.gamma * (1 + 1e-6) and best.rms < central.rms
     True
     """
     require_instance(problem, EstimationProblem)
-    if sum(bound is not None for bound in (gamma, gamma_ratio, rms)) != 1:
+    if (gamma is None) == (gamma_ratio is None):
         raise ProblemError(
-            "give one of gamma, gamma_ratio and rms; "
-            f"got gamma={gamma!r}, gamma_ratio={gamma_ratio!r}, rms={rms!r}."
+            f"give one of gamma and gamma_ratio; got gamma={gamma!r}, gamma_ratio={gamma_ratio!r}."
         )
     length = require_taps(taps)
-    problem = problem.ahead(horizon)
     if length != _TAPS:
         problem.require_one_phase("an impulse response on the innovations", "to leave out taps")
     least, best = hinf(problem, route="riccati"), kalman(problem)
-    if rms is not None:
-        bound = number(rms, "rms", above=0)
-        if bound < best.rms * (1 - AT_LEAST):
-            raise InfeasibleError(
-                f"rms must be at least {best.rms:.9g}, that of the Kalman filter; got {bound:.9g}."
-            )
-        if bound >= least.rms:  # the least norm of all is within the bound
-            return least
-
-        def measure(norm: float, deviation: float) -> float:
-            return bound - deviation
-
-        def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
-            return programme.minimize(grid, variance=(bound * (1 - _EXCESS / 2)) ** 2)
-    else:
-        if gamma_ratio is not None:
-            gamma = least.gamma_least * number(gamma_ratio, "gamma_ratio", at_least=1)
-        bound = number(gamma, "gamma", above=0)
-        require_reachable(bound, least.gamma_least)
-        if bound >= best.gamma:  # the least variance of all is within the bound
-            return best
-        if bound <= least.gamma_least * (1 + _EDGE):  # there is no room for anything else
-            return least
-
-        def measure(norm: float, deviation: float) -> float:
-            return norm - bound
-
-        def solve(programme: InnovationProgramme, grid: FloatArray) -> _Answer:
-            return programme.minimize(grid, gamma=bound * (1 - _EXCESS / 2))
-
-    base = _central_member(problem, least, measure)
+    if gamma_ratio is not None:
+        gamma = least.gamma_least * number(gamma_ratio, "gamma_ratio", at_least=1)
+    bound = number(gamma, "gamma", above=0)
+    require_reachable(bound, least.gamma_least)
+    if bound >= best.gamma:  # the least variance of all is within the bound
+        return best
+    if bound <= least.gamma_least * (1 + _EDGE):  # there is no room for anything else
+        return least
+    base = _central_member(problem, least, bound)
     if not problem.reads_all:  # no impulse response: the least variance among central filters
-        return _central_design(
-            base, least, method="mixed", gamma_requested=gamma, rms_requested=rms
-        )
-    impulse, solver = _complete_base(problem, base, length, solve)
-    claims = {"solver": solver, "gamma_requested": gamma, "rms_requested": rms}
-    return _mixed_design(problem, base, impulse, least, **claims)
+        return _central_design(base, least, method="mixed", bound=bound)
+    taps_of_base, solver = _complete_base(problem, base, length, bound)
+    return _mixed_design(problem, base, taps_of_base, least, solver=solver, gamma_requested=bound)
 
 
 def require_taps(taps: int) -> int:
@@ -167,7 +123,7 @@ def _complete_base(
     problem: EstimationProblem,
     base: FilterDesign | FilterRiccati,
     length: int,
-    solve: Callable[[InnovationProgramme, FloatArray], _Answer],
+    bound: float,
 ) -> tuple[FloatArray, SolverReport]:
     """Find the taps on the innovations of a base filter, and say how.
 
@@ -178,14 +134,14 @@ def _complete_base(
     programme = InnovationProgramme.from_predictor(problem, base.gain_predictor, taps=length)
     even = np.linspace(0, 0.5 / problem.dt_s, _FIRST_GRID)
     grid = np.unique(np.concatenate([even, _frequencies_near_poles(programme.error)]))
-    excess = np.inf
-    for rounds in range(1, _ROUNDS + 1):
-        taps, level, status = solve(programme, grid)
+    excess, level = np.inf, bound * (1 - _EXCESS / 2)
+    for _ in range(_ROUNDS):
+        taps, status = programme.minimize_variance(level, grid)
         error = problem.with_memory(taps).error_system(_extend_gain(base.gain_predictor, length))
         peak = hinf_norm(error)
         excess = peak.value / level - 1
         if excess <= _EXCESS:
-            return taps, SolverReport(route="youla", status=status, iterations=rounds)
+            return taps, SolverReport(route="youla", status=status)
         fine = np.linspace(0, 0.5 / error.dt_s, _FINE_GRID)
         fine = np.unique(np.concatenate([fine, _frequencies_near_poles(error)]))
         sigma = spectral_norms(error.frequency_response(fine))
@@ -211,21 +167,23 @@ def _mixed_design(
     extended = problem.with_memory(taps)
     size, q = taps.shape[1], base.gain_predictor.shape[1]
     gain = _extend_gain(base.gain_predictor, size // q)
-    padding = np.zeros((size, least.proof.states.shape[1]))
-    states = frozen_copy(np.vstack([least.proof.states, padding]))
-    witness = replace(least.proof, states=states)
-    proved = infeasible_level(extended, witness, kalman_riccati(extended).P)
-    innovation_gain = np.vstack([base.gain_filter, np.zeros((size, q))])
+    witness = least.witness and _padded(least.witness, size)
+    proved = proved_level(extended, witness)
     return filter_design(
         extended,
         gain,
-        innovation_gain,
         method="mixed",
         gamma_least=least.gamma_least,
         gamma_infeasible=min(least.gamma_infeasible, proved),
         witness=witness,
         **claims,
     )
+
+
+def _padded(witness: Witness, size: int) -> Witness:
+    """Return a witness of a problem with further states, which are zero."""
+    padding = np.zeros((size, witness.states.shape[1]))
+    return replace(witness, states=frozen_copy(np.vstack([witness.states, padding])))
 
 
 def _extend_gain(gain_predictor: FloatArray, length: int) -> FloatArray:
@@ -243,86 +201,56 @@ def _frequencies_near_poles(error: StateSpace) -> FloatArray:
 
 
 def central_filter(problem: EstimationProblem, *, gamma: float) -> FilterDesign:
-    """Design the central H-infinity filter that has a given norm.
+    """Design the central H-infinity filter that has a given norm; above its own, the Kalman filter.
 
-    The filter that :func:`hinf` makes for a bound stays below it; this one reaches it, and
-    has less variance.
-
-    Parameters
-    ----------
-    problem : EstimationProblem
-        The problem; a plant gives a controller.
-    gamma : float
-        Norm to reach. From that of the Kalman filter up, the Kalman filter is returned.
-
-    Returns
-    -------
-    FilterDesign
-        Certified design.
-
-    Raises
-    ------
-    InfeasibleError
-        If the norm is below the least gamma.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    >>> round(lbt.design.central_filter(walk, gamma=1.5).gamma, 6)
-    1.5
+    The filter that :func:`hinf` makes for a bound stays below it; this one has less variance.
     """
-    require_instance(problem, EstimationProblem)
-    bound = number(gamma, "gamma", above=0)
     least = hinf(problem, route="riccati")
-    require_reachable(bound, least.gamma_least)
-    gains = _central_member(problem, least, lambda norm, _: norm - bound)
-    return _central_design(gains, least, method="hinf", gamma_requested=bound * (1 + _EXCESS))
+    require_reachable(gamma, least.gamma_least)
+    gains = _central_member(problem, least, gamma)
+    return _central_design(gains, least, method="hinf", bound=gamma * (1 + _EXCESS))
 
 
 def _central_design(
-    gains: FilterDesign | FilterRiccati, least: FilterDesign, *, method: str, **bounds: float | None
+    gains: FilterDesign | FilterRiccati, least: FilterDesign, *, method: str, bound: float
 ) -> FilterDesign:
     """Make the design of a central filter that reaches its bound."""
     return filter_design(
         least.problem,
         gains.gain_predictor,
-        gains.gain_filter,
         method=method,
-        solver=SolverReport(route="riccati", status="norm reached", iterations=0),
+        solver=SolverReport(route="riccati", status="norm reached"),
+        gamma_requested=bound,
         gamma_least=least.gamma_least,
         gamma_infeasible=least.gamma_infeasible,
         witness=least.witness,
-        **bounds,
     )
 
 
 def _central_member(
-    problem: EstimationProblem, least: FilterDesign, measure: Callable[[float, float], float]
+    problem: EstimationProblem, least: FilterDesign, bound: float
 ) -> FilterDesign | FilterRiccati:
-    """Return the central filter at which a rising measure of norm and deviation is zero.
+    """Return the central filter whose norm just meets a bound.
 
-    The central filters go from that of the least gamma to the Kalman filter; where the measure does
-    not change its sign, it is one of these.
+    The central filters go from that of the least gamma to the Kalman filter, and their norms rise.
     """
     start = kalman_riccati(problem)
     filters: dict[float, FilterDesign | FilterRiccati] = {0.0: least}
-    sizes = {0.0: measure(least.gamma, least.rms)}
+    excesses = {0.0: least.gamma - bound}
 
-    def size(decades: float) -> float:
+    def excess(decades: float) -> float:
         level = least.gamma * 10**decades
         solution = gamma_riccati(problem, level, start=start) if decades else None
         if solution is not None:
-            error = problem.error_system(solution.gain_predictor)
-            variance = float(np.trace(np.mean(error.output_covariances(), axis=0)))
             filters[decades] = solution
-            sizes[decades] = measure(float(hinf_norm(error)), float(np.sqrt(variance)))
-        return sizes.get(decades, sizes[0.0])
+            error = problem.error_system(solution.gain_predictor)
+            excesses[decades] = float(hinf_norm(error)) - bound
+        return excesses.get(decades, excesses[0.0])
 
-    if sizes[0.0] >= 0:
+    if excesses[0.0] >= 0:
         return least
-    if size(_DECADES) <= 0:
+    if excess(_DECADES) <= 0:
         return start
-    brentq(size, 0.0, _DECADES, xtol=1e-9)
+    brentq(excess, 0.0, _DECADES, xtol=1e-9)
     # the closest on the side of smaller norms
-    return filters[max(decades for decades, value in sizes.items() if value <= 0)]
+    return filters[max(decades for decades, value in excesses.items() if value <= 0)]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from lbt_synth.design.certificate import (
     measured_claim,
 )
 from lbt_synth.design.hinf import AT_LEAST, LARGEST_LMI, checked_bounds
-from lbt_synth.design.result import Design, SolverReport, with_certificate, without_units
+from lbt_synth.design.result import Design, SolverReport, with_certificate
 from lbt_synth.errors import (
     CertificateError,
     InfeasibleError,
@@ -43,9 +43,10 @@ from lbt_synth.linear.output_feedback.two_riccati import (
     free_parameter,
     scaled_plant,
 )
-from lbt_synth.storage.rows import fact_table, row_table
-from lbt_synth.storage.summaries import Summary
-from lbt_synth.validation import choice, integer, number
+from lbt_synth.validation import integer, number
+
+# a controller in the units of the plant as given, and the checks of its loop
+_CheckedLoop: TypeAlias = tuple[StateSpace, Certificate]
 
 _SHARES = (0.0, 1e-6, 1e-5, 1e-4)  # of the errors and disturbances, added in turn
 _SMALLER_SHARES = (1e-7, 1e-8)  # for plants of which the others leave more than there is
@@ -84,22 +85,7 @@ def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ControllerDesign(Design):
-    """A certified controller of a generalised plant, ``u = K y``.
-
-    Attributes
-    ----------
-    problem : GeneralizedPlant
-        The plant.
-    controller : StateSpace
-        From y to u, in textbook form.
-    closed_loop : StateSpace
-        From w to z; ``gamma`` is its norm, ``rms`` that of z for white w of unit variance.
-    witness : ControlWitness
-        The proof that ``gamma_infeasible`` cannot be reached; its ``reason`` says why in words.
-    regularised : float
-        Share of the errors and disturbances that was added because the plant's own equations are
-        singular, or leave rounding alone; mostly 0. The certificate is that of the plant as given.
-    """
+    """A certified controller of a generalised plant, ``u = K y``."""
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
         measured_claim("gamma", "gamma, the norm from w to z"),
@@ -115,19 +101,24 @@ class ControllerDesign(Design):
     )
 
     problem: GeneralizedPlant
-    controller: StateSpace  # type: ignore[assignment]
-    closed_loop: StateSpace
-    witness: ControlWitness = NO_PROOF
+    controller: StateSpace  # type: ignore[assignment]  # from y to u, in textbook form
+    witness: ControlWitness = NO_PROOF  # of ``gamma_infeasible``; its reason says why in words
+    # share of the errors and disturbances that was added because the plant's own equations are
+    # singular, or leave rounding alone; the certificate is that of the plant as given
     regularised: float = 0.0
 
     def make_controller(self) -> StateSpace:  # type: ignore[override]
         """Return the controller as it was computed."""
         return self.controller
 
+    @property
+    def closed_loop(self) -> StateSpace:
+        """System from w to z: ``gamma`` is its norm, ``rms`` that of z for white w of size one."""
+        return self.problem.closed_loop(self.controller)
+
     def examine(self) -> Evidence:
         """Compute the norms of the closed loop."""
-        name = "spectral radius of the closed loop"
-        return Evidence(design=self, certificate=certify_error(self.closed_loop, stability=name))
+        return Evidence(design=self, certificate=_certify_loop(self.closed_loop))
 
     def notes(self) -> list[str]:
         """Return why no controller is below the level, and what was added to a singular plant."""
@@ -135,13 +126,6 @@ class ControllerDesign(Design):
         if self.regularised:
             notes.append(f"singular problem, regularised by a share of {self.regularised:g}")
         return notes
-
-    def _summarise(self) -> Summary:
-        tables = [
-            without_units(fact_table("Controller", self.facts())),
-            row_table("Certificate", self.certificate.checks),
-        ]
-        return Summary(tables=tables, notes=self.notes())
 
 
 def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:
@@ -175,15 +159,8 @@ def h2_controller(plant: GeneralizedPlant) -> ControllerDesign:
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> P = lbt.linear.GeneralizedPlant(
-    ...     A=1.0,
-    ...     B1=[[1.0, 0.0]],
-    ...     B2=1.0,
-    ...     C1=[[1.0], [0.0]],
-    ...     C2=1.0,
-    ...     D12=[[0.0], [1.0]],
-    ...     D21=[[0.0, 1.0]],
-    ... )
+    >>> sides = {"B1": [[1.0, 0]], "D21": [[0, 1.0]], "C1": [[1.0], [0]], "D12": [[0], [1.0]]}
+    >>> P = lbt.linear.GeneralizedPlant(A=1.0, B2=1.0, C2=1.0, **sides)
     >>> round(lbt.h2_controller(P).rms ** 4, 6)
     5.0
     """
@@ -194,7 +171,7 @@ def _design_h2(scaled: ScaledPlant, equations: TwoRiccati, share: float) -> Cont
     """Return the controller of least variance of a scaled plant's equations."""
     checked = _checked_loop(scaled, equations.least_variance())
     claims = {} if share else {"rms_least": _least_rms(equations) / scaled.unit}
-    return _certified(scaled, checked, share, claims, method="h2", route="riccati")
+    return _certified(scaled, checked, share, claims, method="h2")
 
 
 def _least_rms(equations: TwoRiccati) -> float:
@@ -215,7 +192,6 @@ def hinf_controller(
     *,
     gamma: float | None = None,
     gamma_ratio: float | None = None,
-    route: str = "riccati",
 ) -> ControllerDesign:
     """Design an H-infinity controller of a generalised plant, ``u = K y``.
 
@@ -231,9 +207,6 @@ def hinf_controller(
         Bound on the H-infinity norm from w to z.
     gamma_ratio : float, optional
         The same bound as a multiple, at least 1, of the least gamma.
-    route : {"riccati", "lmi"}
-        How the least gamma is found: by two Riccati equations, or by linear matrix
-        inequalities. Both give the central controller.
 
     Returns
     -------
@@ -261,24 +234,16 @@ def hinf_controller(
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> P = lbt.linear.GeneralizedPlant(
-    ...     A=1.0,
-    ...     B1=[[1.0, 0.0]],
-    ...     B2=1.0,
-    ...     C1=[[1.0], [0.0]],
-    ...     C2=1.0,
-    ...     D12=[[0.0], [1.0]],
-    ...     D21=[[0.0, 1.0]],
-    ... )
+    >>> sides = {"B1": [[1.0, 0]], "D21": [[0, 1.0]], "C1": [[1.0], [0]], "D12": [[0], [1.0]]}
+    >>> P = lbt.linear.GeneralizedPlant(A=1.0, B2=1.0, C2=1.0, **sides)
     >>> K = lbt.hinf_controller(P, gamma_ratio=1.1)
     >>> K.gamma_infeasible <= K.gamma_least < K.gamma <= K.gamma_requested
     True
     """
-    choice(route, "route", ("riccati", "lmi"))
     far_above = "the controller is that of least variance"
     gamma, gamma_ratio = checked_bounds(gamma, gamma_ratio, far_above=far_above)
     return _first_certified(
-        plant, partial(_design_hinf, gamma=gamma, gamma_ratio=gamma_ratio or 1.0, route=route)
+        plant, partial(_design_hinf, gamma=gamma, gamma_ratio=gamma_ratio or 1.0)
     )
 
 
@@ -289,10 +254,9 @@ def _design_hinf(
     *,
     gamma: float | None,
     gamma_ratio: float,
-    route: str,
 ) -> ControllerDesign:
     """Return the central controller of a level, or the one next to the least level."""
-    bracket = _Bracket.of(scaled, equations, route, share)
+    bracket = _Bracket.of(scaled, equations, share)
     requested = bracket.least * gamma_ratio if gamma is None else gamma
     bracket.require(requested)
     above = None
@@ -304,9 +268,7 @@ def _design_hinf(
         "gamma_infeasible": bracket.infeasible,
     }
     checked = bracket.reached if above is None else _checked_loop(scaled, above)
-    return _certified(
-        scaled, checked, share, claims, method="hinf", route=route, witness=bracket.witness
-    )
+    return _certified(scaled, checked, share, claims, method="hinf", witness=bracket.witness)
 
 
 class _Bracket(NamedTuple):
@@ -319,21 +281,19 @@ class _Bracket(NamedTuple):
     @property
     def least(self) -> float:
         """The norm that a controller reaches."""
-        return self.reached.certificate.gamma
+        return self.reached[1].gamma
 
     @classmethod
-    def of(cls, scaled: ScaledPlant, equations: TwoRiccati, route: str, share: float) -> _Bracket:
+    def of(cls, scaled: ScaledPlant, equations: TwoRiccati, share: float) -> _Bracket:
         """Find a controller next to the least level, and the best proof of a lower one."""
         solution = equations.least_level()
         aparts = [*_APART.tolist(), _FAR] if share in _SMALLER_SHARES else _APART.tolist()
         reached = _least_controller(scaled, equations, solution.gamma, aparts)
-        least, size = reached.certificate.gamma, len(scaled.plant.A)
+        least, size = reached[1].gamma, len(scaled.plant.A)
         candidates = [NO_PROOF, *equations.proofs(solution, scaled.plant)]
         proofs = [max(((_proved(scaled, x), x) for x in candidates), key=lambda proof: proof[0])]
         level, closed = proofs[0]
-        if route == "lmi":
-            proofs.append(_inequality_proof(scaled, solution.gamma))
-        elif level < least * (1 - _LOOSE) and size <= LARGEST_LMI:
+        if level < least * (1 - _LOOSE) and size <= LARGEST_LMI:
             with suppress(NumericalError):
                 proofs.append(_inequality_proof(scaled, solution.gamma))
         proved, witness = max(proofs, key=lambda proof: proof[0])
@@ -382,12 +342,12 @@ def _least_controller(
         if controller is None:
             continue
         with suppress(NumericalError):  # a loop that is not well posed
-            found = _checked_loop(scaled, controller)
-            if not found.certificate.passed:
+            checked = _checked_loop(scaled, controller)
+            if not checked[1].passed:
                 continue
-            if best is None or found.certificate.gamma < best.certificate.gamma:
-                best = found
-            if found.certificate.gamma * scaled.unit <= least * (1 + 2 * apart):
+            if best is None or checked[1].gamma < best[1].gamma:
+                best = checked
+            if checked[1].gamma * scaled.unit <= least * (1 + 2 * apart):
                 break
     if best is None:
         raise NumericalError(
@@ -445,15 +405,8 @@ def mixed_controller(plant: GeneralizedPlant, *, gamma: float, taps: int = 24) -
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> P = lbt.linear.GeneralizedPlant(
-    ...     A=1.0,
-    ...     B1=[[1.0, 0.0]],
-    ...     B2=1.0,
-    ...     C1=[[1.0], [0.0]],
-    ...     C2=1.0,
-    ...     D12=[[0.0], [1.0]],
-    ...     D21=[[0.0, 1.0]],
-    ... )
+    >>> sides = {"B1": [[1.0, 0]], "D21": [[0, 1.0]], "C1": [[1.0], [0]], "D12": [[0], [1.0]]}
+    >>> P = lbt.linear.GeneralizedPlant(A=1.0, B2=1.0, C2=1.0, **sides)
     >>> least, quiet = lbt.hinf_controller(P), lbt.h2_controller(P)
     >>> K = lbt.mixed_controller(P, gamma=1.05 * least.gamma)
     >>> K.gamma <= 1.05 * least.gamma < quiet.gamma and quiet.rms < K.rms < least.rms
@@ -469,15 +422,15 @@ def _design_mixed(
 ) -> ControllerDesign:
     """Return the controller of least variance, or the quietest that meets the bound."""
     checked = _checked_loop(scaled, equations.least_variance())
-    if checked.certificate.gamma > gamma:
+    if checked[1].gamma > gamma:
         checked = _checked_loop(scaled, _quietest(scaled, equations, gamma, taps))
     claims = {"gamma_requested": gamma}
-    return _certified(scaled, checked, share, claims, method="mixed", route="free parameter")
+    return _certified(scaled, checked, share, claims, method="mixed")
 
 
 def _quietest(scaled: ScaledPlant, equations: TwoRiccati, gamma: float, taps: int) -> StateSpace:
     """Return the controller of least variance below a level, if there is one."""
-    bracket = _Bracket.of(scaled, equations, "riccati", 0.0)
+    bracket = _Bracket.of(scaled, equations, 0.0)
     bracket.require(gamma)
     loop, level = free_parameter(equations), gamma * scaled.unit
     frequency_hz = np.linspace(0, 0.5 / loop.T11.dt_s, _POINTS)
@@ -485,7 +438,7 @@ def _quietest(scaled: ScaledPlant, equations: TwoRiccati, gamma: float, taps: in
 
     for _ in range(_ROUNDS):
         try:
-            found = least_variance_below(loop, level * (1 - _INSIDE), taps, frequency_hz)
+            parameter = least_variance_below(loop, level * (1 - _INSIDE), taps, frequency_hz)
         except NumericalError as error:
             raise InfeasibleError(
                 f"no controller with {taps} taps was found below gamma = {gamma:.6g}; the "
@@ -494,7 +447,7 @@ def _quietest(scaled: ScaledPlant, equations: TwoRiccati, gamma: float, taps: in
                 gamma=gamma,
                 gamma_least=bracket.least,
             ) from error
-        controller = loop.controller(found)
+        controller = loop.controller(parameter)
         peak = hinf_norm(scaled.plant.closed_loop(controller))
         if peak.upper <= level:
             break
@@ -502,19 +455,14 @@ def _quietest(scaled: ScaledPlant, equations: TwoRiccati, gamma: float, taps: in
     return controller
 
 
-class _CheckedLoop(NamedTuple):
-    """A controller and its loop, with the checks of the loop."""
-
-    controller: StateSpace
-    loop: StateSpace
-    certificate: Certificate
+def _certify_loop(loop: StateSpace) -> Certificate:
+    return certify_error(loop, stability="spectral radius of the closed loop")
 
 
 def _checked_loop(scaled: ScaledPlant, controller: StateSpace) -> _CheckedLoop:
-    """Close the loop of a controller of the scaled plant, and check it."""
+    """Return a controller of the scaled plant in the given units, and the checks of its loop."""
     K, loop = scaled.closed_loop(controller)
-    certificate = certify_error(loop, stability="spectral radius of the closed loop")
-    return _CheckedLoop(controller=K, loop=loop, certificate=certificate)
+    return K, _certify_loop(loop)
 
 
 def _level(design: ControllerDesign) -> float:
@@ -566,19 +514,19 @@ def _certified(
     claims: dict[str, float],
     *,
     method: str,
-    route: str,
     witness: ControlWitness = NO_PROOF,
 ) -> ControllerDesign:
     """Check what is claimed of a loop, and return the design; CertificateError if it fails."""
+    controller, certificate = checked
+    route = "free parameter" if method == "mixed" else "riccati"
     design = ControllerDesign(
         method=method,
         problem=scaled.given,
-        controller=checked.controller,
-        closed_loop=checked.loop,
+        controller=controller,
         claims=claims,
         witness=witness,
-        solver=SolverReport(route=route, status="solved", iterations=0),
+        solver=SolverReport(route=route, status="solved"),
         regularised=share,
     )
-    evidence = Evidence(design=design, certificate=checked.certificate)
+    evidence = Evidence(design=design, certificate=certificate)
     return with_certificate(design, "Try a larger gamma, or more taps.", evidence=evidence)

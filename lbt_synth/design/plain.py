@@ -14,9 +14,7 @@ _MODELS = (
     *("WavefrontSensor", "Accelerometer"),
 )
 _SHAPING = (
-    *("Specification", "ResidualVariance", "VibrationBand", "Total", "Worst", "CommandRms"),
-    *("ModulusMargin", "NoisePeak", "Attenuation", "LoopErrors", "MovingSensorGain"),
-    "MirrorUncertainty",
+    *("Specification", "ResidualVariance", "VibrationBand", "Bound", "CommandRms", "LoopErrors"),
 )
 _ROOMS = dict.fromkeys(_MODELS, "lbt_synth.models")
 _ROOMS |= dict.fromkeys(_SHAPING, "lbt_synth.design.shaping")

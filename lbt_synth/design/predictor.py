@@ -15,12 +15,20 @@ import numpy as np
 from scipy.linalg import block_diag, svd
 
 from lbt_synth.design.certificate import TOLERANCE, Check, Claim, Evidence, stability_check
-from lbt_synth.design.result import UNCERTIFIED, Design, RowTable, SolverReport, with_certificate
+from lbt_synth.design.result import (
+    SENSOR_FACTS,
+    UNCERTIFIED,
+    Design,
+    RowTable,
+    SolverReport,
+    sensor_facts,
+    with_certificate,
+)
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
-from lbt_synth.loop import close_loop, stable_sensor_gains
+from lbt_synth.loop import close_loop
 from lbt_synth.loop.closed_loop import youla_controller, youla_parameter
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import Column, column, table_row
@@ -55,14 +63,6 @@ class PredictorDesign(Design):
     It claims what it leaves on frames of its record that it was not fitted to, as does its
     fall-back without the other sensors [nm rms], by which share the fit itself adds to that, and
     the command that a reading of unit white noise makes, for each reading of both filters.
-
-    Attributes
-    ----------
-    problem : LoopHardware
-        The loop, with the sensors that are read.
-    parameters : tuple of Controller
-        The filter from the pseudo-open-loop measurement and the readings of all other sensors to
-        the command; where there are others, one without them as a fall-back.
     """
 
     CLAIMS: ClassVar[tuple[Claim, ...]] = (
@@ -72,14 +72,11 @@ class PredictorDesign(Design):
         Claim(name="alone_nm", heading="residual of the fall-back on these frames", unit="nm"),
         Claim(name="command_rms", checks=_check_noise),
     )
-    DERIVED: ClassVar[tuple[Column, ...]] = (
-        Column(name="sensors", heading="sensors and channels"),
-        Column(name="loop_radius", heading="spectral radius of the loop"),
-        Column(name="gain_low", heading="stable gain factors, from", format=".4g"),
-        Column(name="gain_high", heading="stable gain factors, to", format=".4g"),
-    )
+    DERIVED: ClassVar[tuple[Column, ...]] = SENSOR_FACTS
 
-    problem: LoopHardware
+    problem: LoopHardware  # with the sensors that are read
+    # the filter from the pseudo-open-loop measurement and the readings of all other sensors to
+    # the command; where there are others, one without them as a fall-back
     parameters: tuple[Controller, ...]
 
     def make_controller(self) -> Controller:
@@ -111,13 +108,7 @@ class PredictorDesign(Design):
 
     def derived(self) -> dict[str, Any]:
         """Return the sensors, and where the loop is stable."""
-        low, high = stable_sensor_gains(self.problem, self.controller)
-        return {
-            "sensors": ", ".join(self.problem.suite.units),
-            "loop_radius": self.close(self.problem).spectral_radius,
-            "gain_low": low,
-            "gain_high": high,
-        }
+        return dict(sensor_facts(self, self.problem))
 
     def tables(self) -> tuple[RowTable, ...]:
         """Return what noise of each reading becomes."""
@@ -173,17 +164,10 @@ def command_rms(parameters: Sequence[Controller]) -> tuple[float, ...]:
 def regression_filter(
     hardware: LoopHardware, base: Controller, coefficients: FloatArray
 ) -> Controller:
-    """Return the filter of a base controller and of what a regression adds to it.
+    """Return the filter of a base, whose loop is stable, and of what a regression adds to it.
 
-    Parameters
-    ----------
-    hardware : LoopHardware
-        The loop of its own sensor; its influence matrix can be inverted.
-    base : Controller
-        From y(k) to u(k), of a loop that is stable.
-    coefficients : (taps, n, 2 n + c) array_like
-        What is added to the correction of each mode, per value of the base's correction, of the
-        pseudo-open-loop measurement and of the channels; the newest first.
+    The coefficients (taps, n, 2 n + c) are added to the correction of each mode, per value of the
+    base's correction, of the pseudo-open-loop measurement and of the channels; the newest first.
     """
     taps, n, signals = coefficients.shape
     own = youla_parameter(hardware, base)
@@ -267,6 +251,6 @@ def predictor_design(
         problem=hardware,
         parameters=short,
         claims={**claims, "command_rms": command_rms(short)},
-        solver=SolverReport(route="least squares", status=status, iterations=1),
+        solver=SolverReport(route="least squares", status=status),
     )
     return with_certificate(design, "Try a longer record, or the method kalman.")

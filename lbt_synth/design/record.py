@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,6 @@ from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.validation import (
     FloatArray,
     frozen_copy,
-    integer,
     number,
     sequence,
     text,
@@ -49,13 +47,6 @@ class DesignRecord:
         """Join two records."""
         return DesignRecord(self.arrays | other.arrays, self.meta | other.meta)
 
-    def controller(self, prefix: str = "", D: FloatArray | None = None) -> Controller:
-        """Return the controller of the arrays with a prefix; D may be given."""
-        names = "ABCD" if D is None else "ABC"
-        given = {} if D is None else {"D": D}
-        arrays = {name: self.arrays[f"{prefix}{name}"] for name in names}
-        return Controller(**arrays, **given, dt_s=self.meta["dt_s"])
-
     def common(self) -> dict[str, Any]:
         """Return what every design has, as arguments of its class; it is not certified yet."""
         solver, claims = self.meta["solver"], self.meta["claims"]
@@ -66,7 +57,6 @@ class DesignRecord:
             "solver": SolverReport(
                 route=text(solver["route"], "route"),
                 status=text(solver["status"], "status"),
-                iterations=integer(solver["iterations"], "iterations", at_least=0),
             ),
             "assumptions": tuple(
                 text(a, "assumptions") for a in sequence(self.meta["assumptions"], "assumptions")
@@ -114,97 +104,70 @@ def _claimed(value: Any, name: str) -> float | tuple[float, ...]:
     return value if type(value) is int else claim
 
 
-class _Codec(NamedTuple):
-    """How a field of a design stands in a record: packed under its name, and back."""
-
-    pack: Callable[[str, Any], DesignRecord]
-    unpack: Callable[[str, DesignRecord], Any]
-
-
-def _pack_array(name: str, array: FloatArray) -> DesignRecord:
-    """Record an array; an empty one, which FITS cannot hold, is left out."""
-    return DesignRecord({name.upper(): np.atleast_2d(array)} if array.size else {})
-
-
-def _pack_parameters(name: str, parameters: tuple[Controller, ...]) -> DesignRecord:
-    arrays = {
-        f"YOULA{mode + 1}_{letter}": getattr(parameter, letter)
-        for mode, parameter in enumerate(parameters)
-        for letter in "ABC"
-    }
-    return DesignRecord(arrays)
-
-
-def _unpack_parameters(name: str, record: DesignRecord) -> tuple[Controller, ...]:
-    arrays = record.arrays
-    count = sum(key.startswith("YOULA") and key.endswith("_A") for key in arrays)
-    prefixes = [f"YOULA{place + 1}_" for place in range(count)]
-    sizes = [(len(arrays[f"{at}C"]), arrays[f"{at}B"].shape[1]) for at in prefixes]
-    pairs = zip(prefixes, sizes, strict=True)
-    return tuple(record.controller(prefix, D=np.zeros(size)) for prefix, size in pairs)
+def _pack(name: str, value: Any) -> DesignRecord:
+    """Record a field of a design; an empty array, which FITS cannot hold, is left out."""
+    match value:
+        case None:
+            return DesignRecord()
+        case np.ndarray():
+            return DesignRecord({name.upper(): np.atleast_2d(value)} if value.size else {})
+        case Witness():
+            return DesignRecord({"WITNESS_X": value.states, "WITNESS_W": value.disturbances})
+        case (Controller(), *_):
+            places = enumerate(value, 1)
+            arrays = {f"YOULA{i}_{key}": getattr(one, key) for i, one in places for key in "ABC"}
+            return DesignRecord(arrays)
+        case (Fallback(), *_):
+            gains = np.stack([fallback.gains for fallback in value])
+            missing = [list(fallback.missing) for fallback in value]
+            return DesignRecord({name.upper(): gains}, {name: missing})
+        case _:
+            return DesignRecord(meta={name: to_plain(value)})
 
 
-def _pack_witness(name: str, witness: Witness | None) -> DesignRecord:
-    if witness is None:
-        return DesignRecord()
-    return DesignRecord({"WITNESS_X": witness.states, "WITNESS_W": witness.disturbances})
+def _unpack(name: str, kind: str, record: DesignRecord) -> Any:
+    """Return a field of a design, by the type that it has."""
+    arrays, meta = record.arrays, record.meta
+    match kind:
+        case "FloatArray":
+            return arrays[name.upper()]
+        case "Vector":
+            return frozen_copy(np.ravel(arrays.get(name.upper(), [])))
+        case "Witness | None":
+            if "WITNESS_X" not in arrays:
+                return None
+            return Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
+        case "tuple[Controller, ...]":
+            count = sum(key.startswith("YOULA") and key.endswith("_A") for key in arrays)
+            return tuple(_parameter(f"YOULA{place + 1}_", record) for place in range(count))
+        case "tuple[Fallback, ...]":
+            gains = arrays[name.upper()] if meta[name] else ()
+            if len(gains) != len(meta[name]):
+                raise ValueError(f"{name.upper()} must be {len(meta[name])} filters")
+            pairs = zip(meta[name], gains, strict=True)
+            return tuple(Fallback(missing=tuple(m), gains=frozen_copy(g)) for m, g in pairs)
+        case "tuple[float, ...]":
+            return tuple(number(value, name, above=0) for value in meta[name])
+        case _:
+            return from_plain(meta[name])
 
 
-def _unpack_witness(name: str, record: DesignRecord) -> Witness | None:
-    arrays = record.arrays
-    if "WITNESS_X" not in arrays:
-        return None
-    return Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
+def _parameter(prefix: str, record: DesignRecord) -> Controller:
+    """Return a parameter without feedthrough."""
+    shape = len(record.arrays[f"{prefix}C"]), record.arrays[f"{prefix}B"].shape[1]
+    arrays = {key: record.arrays[f"{prefix}{key}"] for key in "ABC"}
+    return Controller(**arrays, D=np.zeros(shape), dt_s=record.meta["dt_s"])
 
 
-def _pack_fallbacks(name: str, fallbacks: tuple[Fallback, ...]) -> DesignRecord:
-    arrays = {name.upper(): np.stack([f.gains for f in fallbacks])} if fallbacks else {}
-    return DesignRecord(arrays, {name: [list(fallback.missing) for fallback in fallbacks]})
-
-
-def _unpack_fallbacks(name: str, record: DesignRecord) -> tuple[Fallback, ...]:
-    missing = record.meta[name]
-    gains = record.arrays[name.upper()] if missing else ()
-    if len(gains) != len(missing):
-        raise ValueError(f"{name.upper()} must be {len(missing)} filters; got {len(gains)}")
-    return tuple(
-        Fallback(missing=tuple(sensors), gains=frozen_copy(gain))
-        for sensors, gain in zip(missing, gains, strict=True)
-    )
-
-
-_CODECS = {  # by the type of the field
-    "FloatArray": _Codec(_pack_array, lambda name, record: record.arrays[name.upper()]),
-    "Vector": _Codec(
-        _pack_array, lambda name, record: frozen_copy(np.ravel(record.arrays.get(name.upper(), [])))
-    ),
-    "Witness | None": _Codec(_pack_witness, _unpack_witness),
-    "tuple[Fallback, ...]": _Codec(_pack_fallbacks, _unpack_fallbacks),
-    "tuple[Controller, ...]": _Codec(_pack_parameters, _unpack_parameters),
-    "tuple[Specification, ...]": _Codec(
-        lambda name, specifications: DesignRecord(meta={name: to_plain(specifications)}),
-        lambda name, record: from_plain(record.meta[name]),
-    ),
-    "tuple[float, ...]": _Codec(
-        lambda name, values: DesignRecord(meta={name: list(values)}),
-        lambda name, record: tuple(number(v, name, above=0) for v in record.meta[name]),
-    ),
-    "int": _Codec(
-        lambda name, value: DesignRecord(meta={name: value}),
-        lambda name, record: integer(record.meta[name], name),
-    ),
-}
-
-
-def _stored_fields(kind: type[Design]) -> Iterator[tuple[str, _Codec]]:
-    """Yield the fields that a kind of design has beyond those of every design."""
+def _own_fields(kind: type[Design]) -> dict[str, str]:
+    """Return the fields, with their types, that a kind of design has beyond every design's."""
     common = {part.name for part in fields(Design)}
-    return ((f.name, _CODECS[str(f.type)]) for f in fields(kind) if f.name not in common)
+    return {part.name: str(part.type) for part in fields(kind) if part.name not in common}
 
 
 def rebuild_design(kind: type[Design], record: DesignRecord) -> Design:
     """Make a design of a kind from its record, without a certificate."""
-    stored = {name: codec.unpack(name, record) for name, codec in _stored_fields(kind)}
+    stored = {name: _unpack(name, hint, record) for name, hint in _own_fields(kind).items()}
     return kind(**record.common(), **stored)
 
 
@@ -225,8 +188,8 @@ def record_design(design: Design) -> DesignRecord:
     record = DesignRecord(arrays, meta)
     if design.hardware is not None:
         record |= record_hardware(design.hardware)
-    for name, codec in _stored_fields(type(design)):
-        record |= codec.pack(name, getattr(design, name))
+    for name in _own_fields(type(design)):
+        record |= _pack(name, getattr(design, name))
     return record | record_problem(design.problem)
 
 

@@ -12,7 +12,13 @@ import numpy as np
 from lbt_synth.design.certificate import Certificate, Claim, Evidence, stability_check
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, EstimationProblem, StateSpace
-from lbt_synth.loop import ClosedLoop, close_loop, loop_margins, residual_budget
+from lbt_synth.loop import (
+    ClosedLoop,
+    close_loop,
+    loop_margins,
+    residual_budget,
+    stable_sensor_gains,
+)
 from lbt_synth.loop.closed_loop import reads_others
 from lbt_synth.loop.least_residuals.residual_limit import (
     above_percent,
@@ -40,6 +46,12 @@ _BRIEFLY = (
     *("certificate", "gain", "residual_nm", "limit_nm", "gamma"),
     *("modulus", "gain_low", "gain_high", "phase_deg"),
 )
+SENSOR_FACTS = (
+    Column(name="sensors", heading="sensors and channels"),
+    Column(name="loop_radius", heading="spectral radius of the loop, over a period"),
+    Column(name="gain_low", heading="stable gain factors, from", format=".4g"),
+    Column(name="gain_high", heading="stable gain factors, to", format=".4g"),
+)
 MODEL_LIMITS = (
     Column(name="residual_nm", heading="residual in its model, rms", unit="nm"),
     Column(name="limit_nm", heading=LIMIT_HEADING, unit="nm"),
@@ -57,13 +69,10 @@ class SolverReport:
         "riccati", "lmi" or "closed form".
     status : str
         What the solver said of itself.
-    iterations : int
-        Iterations it took.
     """
 
     route: str
     status: str
-    iterations: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,11 +166,6 @@ class Design(Summarised, ABC):
     def gamma_requested(self) -> float:
         """Bound that the H-infinity design was given; nan without one."""
         return float(self.claims.get("gamma_requested", np.nan))
-
-    @property
-    def rms_requested(self) -> float:
-        """Bound on the standard deviation that the design was given; nan without one."""
-        return float(self.claims.get("rms_requested", np.nan))
 
     @property
     def gamma_least(self) -> float:
@@ -268,7 +272,8 @@ class Design(Summarised, ABC):
         notes = [f"assumes: {assumption}." for assumption in self.assumptions]
         if self.hardware is None:
             said = Facts((*self.CLAIMS, *self.DERIVED), facts.values)
-            return Summary(tables=[without_units(fact_table("Design", said, passed))], notes=notes)
+            table = without_units(fact_table("Design", said, passed))
+            return Summary(tables=[table], notes=[*notes, *self.notes()])
         loop = close_loop(self.hardware, self)
         alone = not loop.feedback().reads_others
         margins = [loop_margins(loop)] if loop.is_stable and alone else []
@@ -281,10 +286,6 @@ class Design(Summarised, ABC):
     def poles(self) -> ComplexArray:
         """Poles that the design places, (n,)."""
         return np.linalg.eigvals(self.controller.A).astype(np.complex128)
-
-    def to_control(self) -> Any:
-        """Return the controller as a ``control.StateSpace``, ``u(k) = C x(k) + D y(k)``."""
-        return self.controller.to_statespace().to_control()
 
     def recertify(self) -> Certificate:
         """Compute the certificate again from the matrices, and check each claim; passed or not."""
@@ -339,6 +340,14 @@ def model_limits(design: Design) -> Mapping[str, float | None]:
     limit_nm = limit_or_nan(lambda: least_model_residual(plant))
     values = residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
     return {column.name: value for column, value in zip(MODEL_LIMITS, values, strict=True)}
+
+
+def sensor_facts(design: Design, hardware: LoopHardware) -> Mapping[str, Any]:
+    """Return the sensors of a design, and where its loop is stable."""
+    radius = design.close(hardware).spectral_radius
+    gains = stable_sensor_gains(hardware, design.controller)
+    values = ", ".join(hardware.suite.units), radius, *gains
+    return {column.name: value for column, value in zip(SENSOR_FACTS, values, strict=True)}
 
 
 def without_units(table: Table) -> Table:

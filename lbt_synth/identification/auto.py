@@ -48,14 +48,13 @@ from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import LoopRecord, require_length
 from lbt_synth.identification.stretches import keep_frames, split_halves
-from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, residual_budget, stable_sensor_gains
 from lbt_synth.methods.registry import (
     default_method,
     method_named,
     record_methods,
 )
-from lbt_synth.methods.request import design_request, option_owners
+from lbt_synth.methods.request import design_request
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -81,11 +80,6 @@ class RecordedDesign(Summarised):
     channels: tuple[ChannelValue, ...] = ()  # what each accelerometer is worth, if they are read
     notes: tuple[str, ...]  # warnings about the design
 
-    @property
-    def controller(self) -> Controller:
-        """The controller of the design."""
-        return self.design.controller
-
     def _brief(self) -> str:
         return f"{self.name}, {self.model.hardware._brief()}"
 
@@ -99,7 +93,6 @@ def design_from_record(
     record: LoopRecord,
     *,
     method: str | None = None,
-    gamma_ratio: float | None = None,
     sensor_gain: float | Sequence[float] | None = None,
     imaging: Imaging | None = None,
     accept_record: bool = False,
@@ -125,8 +118,6 @@ def design_from_record(
         What the loop recorded; the delay must be known.
     method : str, optional
         Method of synthesis that needs no more than a plant; chosen by default.
-    gamma_ratio : float, optional
-        For methods with a bound: the norm as a multiple of the least one; 1.2 by default.
     sensor_gain : float or one per axis, optional
         As for :func:`identify`.
     imaging : Imaging, optional
@@ -180,13 +171,12 @@ def design_from_record(
     >>> bool(table[made.name].replayed_nm < 0.5 * table["what ran"].replayed_nm)
     True
     """
-    defaults = {} if gamma_ratio is None else {"gamma_ratio": gamma_ratio}
     beside = None
     if accelerations is not None:
         require_instance(record, LoopRecord)
         beside = channels_beside(record, accelerations, channels)
         record = keep_frames(record, beside.good)
-    _require_able(record, method, defaults)
+    _require_able(record, method)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
     step = progress or (lambda _: None)
     options |= {"sensor_gain": sensor_gain}
@@ -196,7 +186,7 @@ def design_from_record(
     step(1)
     names = quick_methods() if method is None else [method]
     requests = {name: {} if method else method_named(name).reference_options for name in names}
-    inputs: dict[str, Any] = {"channels": beside, "defaults": defaults}
+    inputs: dict[str, Any] = {"channels": beside}
     camera = imaging or Imaging()
     held_out, designs = compare_designs(record, half, requests, imaging=camera, **inputs)
     if not designs:
@@ -265,13 +255,11 @@ def _claims(table: PredictionTable, title: str, saved: float) -> dict[str, float
     return claims
 
 
-def _require_able(record: LoopRecord, method: str | None, defaults: Mapping[str, Any]) -> None:
-    """Refuse a record that is too short, or a method and options that cannot be."""
+def _require_able(record: LoopRecord, method: str | None) -> None:
+    """Refuse a record that is too short, or a method that needs more than a plant."""
     require_instance(record, LoopRecord)
     if method is not None:
         choice(method, "method", record_methods())
-    if defaults:  # refuses what the method does not take
-        design_request(method or option_owners("gamma_ratio")[0], defaults)
     _ = record.hardware  # refuses a record without a delay
     require_length(record, seconds=LEAST_SECONDS)
 

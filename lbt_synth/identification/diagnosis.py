@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lbt_synth.design import Design, model_integrator
+from lbt_synth.design import Design, integrator
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
@@ -440,7 +440,8 @@ def _compare(
     table, designs = compare_designs(
         record, half, {name: {} for name in names}, others=given, running=running, imaging=imaging
     )
-    designs[INTEGRATOR] = model_integrator(half.plant())  # the comparison has it
+    plant = half.plant()
+    designs[INTEGRATOR] = integrator(plant.hardware, truth=plant)  # the comparison has it
     residuals = {row.name: row.replayed.total_nm2 for row in table.entries if row.replayed}
     best = min(designs, key=lambda name: residuals[name])
     chosen, lines = designs[best], disturbance_lines(half)
@@ -541,6 +542,7 @@ def _gain_text(diagnosis: Diagnosis) -> str:
     law = diagnosis.law
     if law is None or law.order != 1 or diagnosis.model is None:
         return ""
-    design = model_integrator(diagnosis.model.plant())
+    plant = diagnosis.model.plant()
+    design = integrator(plant.hardware, truth=plant)
     best = float(np.mean(np.diag(design.controller.B)))
     return f" from {float(np.mean(np.diag(law.gain))):.3g} to {best:.3g}"

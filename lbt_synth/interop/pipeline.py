@@ -15,7 +15,7 @@ from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -288,8 +288,9 @@ def _designs_of_modes(
 ) -> tuple[list[ModeDesign], int]:
     """Return the designs of a file, each certified, and the number of its modes."""
     mixed, modal = program.join is not None, program.modal or modes is not None
-    start = getattr(design, "start", None)  # of a stack of designs
-    design = cast("Design | MixedController", design if start is None else start())
+    if isinstance(design, ModalFilters):
+        count = design.n_modes
+        design = MixedController(filter=design, gains=np.zeros(count), filtered=range(count))
     if isinstance(design, MixedController):
         if not mixed:
             raise ProblemError(
@@ -330,8 +331,6 @@ def _designs_of_modes(
 
 def _designs_of_mixture(control: MixedController) -> list[ModeDesign]:
     """Return the design of each mode; modes that get no command have none."""
-    if control.reconstructor is not None:
-        raise ProblemError("the RTC reconstructs modes itself; got a reconstructor.")
     loop, kind = control.hardware, type(control.filter).__name__
     if loop is None:
         raise ProblemError(f"the filter must be a certified design or ModalFilters; got {kind}.")

@@ -13,15 +13,7 @@ from scipy.linalg import block_diag
 
 from lbt_synth.design import Check, Design
 from lbt_synth.design.shaping.channel import SingleModeLoop
-from lbt_synth.design.shaping.demands import (
-    Attenuation,
-    CommandRms,
-    Demand,
-    LoopErrors,
-    MirrorUncertainty,
-    MovingSensorGain,
-)
-from lbt_synth.design.shaping.objectives import leaves
+from lbt_synth.design.shaping.demands import CommandRms, Demand, LoopErrors
 from lbt_synth.design.shaping.specification import Specification
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
@@ -192,14 +184,14 @@ def proved_gains(design: Design, hardware: LoopHardware) -> tuple[float, float]:
 def demanded_gains(specifications: Iterable[Specification]) -> tuple[float, float]:
     """Return the least and the largest sensor gain that demands name, 1 among them."""
     demands = [demand for spec in specifications for demand in spec.demands]
-    ranges = [d for d in demands if isinstance(d, LoopErrors | MovingSensorGain)]
+    ranges = [d for d in demands if isinstance(d, LoopErrors)]
     return min([1.0, *(r.low for r in ranges)]), max([1.0, *(r.high for r in ranges)])
 
 
 def scenario_gains(design: Design) -> tuple[float, ...]:
     """Return the sensor gains at which the residual is compared."""
-    terms = [leaf for spec in design.mode_specifications for leaf in leaves(spec.objective)]
-    return tuple(sorted({leaf.sensor_gain for leaf in terms}, reverse=True)) or _SCENARIOS
+    terms = [term for spec in design.mode_specifications for term in spec.terms]
+    return tuple(sorted({term.sensor_gain for term in terms}, reverse=True)) or _SCENARIOS
 
 
 def _residual_check(design: Design, hardware: LoopHardware, written: Written, gain: float) -> Check:
@@ -269,7 +261,7 @@ def _shaped_variances(design: Design, loop: ClosedLoop) -> FloatArray:
     """Variance of each output under the terms of a shaped design, mode by mode."""
     variances = np.zeros(len(loop.system.C))
     for mode, spec in enumerate(design.mode_specifications):
-        terms = [x for x in leaves(spec.objective) if x.sensor_gain == loop.sensor_gain]
+        terms = [term for term in spec.terms if term.sensor_gain == loop.sensor_gain]
         for row in range(variances.size):
             one = _mode_of(loop, mode, slice(row, row + 1))
             variances[row] += sum(term.measured_nm2(one) for term in terms)
@@ -313,16 +305,11 @@ def _demand_checks(
     """Check the demands on each mode in the loop as written; equal modes once."""
     if not design.mode_specifications:
         return []
-    hardware, s = loop.hardware, loop.system
-    n, m = hardware.modes, hardware.n_commands
-    to_modes = np.zeros((3 * n, len(s.C)))
-    to_modes[:n, :n] = np.eye(n)
-    to_modes[n : 2 * n, n : n + m] = hardware.influence
-    to_modes[2 * n :, n + m :] = np.linalg.pinv(hardware.sensor)
-    modal = replace(loop, system=replace(s, C=to_modes @ s.C, D=to_modes @ s.D))
     checks = []
     for mode in sorted(set(design.first_equal_modes)):
-        mode_alone = _mode_of(modal, mode, slice(mode, None, n))
+        mode_alone = SingleModeLoop(
+            hardware=loop.hardware, controller=loop.controller, mode=mode, in_frames=True
+        )
         for demand in design.mode_specifications[mode].demands:
             more = _demand_change(demand, change) if change else 0.0
             for check in demand.checks(mode_alone):
@@ -334,16 +321,15 @@ def _demand_checks(
 
 def _demand_change(demand: Demand, change: Callable[[float], float]) -> float:
     """Bound how much what is left out moves the value of a demand."""
-    if isinstance(demand, CommandRms | MovingSensorGain):  # no bound on a response
+    # no bound on a response
+    if isinstance(demand, CommandRms) or (isinstance(demand, LoopErrors) and demand.moving):
         raise ProblemError(
             "a filter that is cut is proved for demands on responses of the loop; got "
             f"{demand.label}. Use a target with states, such as c or pyrtc."
         )
-    if isinstance(demand, Attenuation):
-        return change(demand.sensor_gain)
-    factor = demand.relative if isinstance(demand, MirrorUncertainty) else 1.0
-    factor = 1 + demand.high if isinstance(demand, LoopErrors) else factor  # taps of two loops
-    return factor * change(1.0)
+    if isinstance(demand, LoopErrors):  # taps of two loops
+        return (1 + demand.high) * change(1.0)
+    return change(demand.sensor_gain)
 
 
 def rehearsal_error(design: Design, twin: SteppedController) -> float:

@@ -81,41 +81,23 @@ class FunctionBound:
     limit: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CombinedFunction:
-    """Weighted sum of functions, or the largest of them, weighted."""
-
-    parts: tuple[Fractions | CombinedFunction, ...]
-    weights: tuple[float, ...]
-    worst: bool
-
-    def value(self, c: FloatArray) -> float:
-        """Value at coefficients c."""
-        values = [w * part.value(c) for w, part in zip(self.weights, self.parts, strict=True)]
-        return max(values) if self.worst else sum(values)
-
-
-Function: TypeAlias = Fractions | CombinedFunction
+Function: TypeAlias = tuple[Fractions, ...]  # their sum
 Constraint: TypeAlias = Discs | HalfPlanes | FunctionBound
+
+
+def total_value(function: Function, c: FloatArray) -> float:
+    """Return the value of a function at coefficients c."""
+    return sum(part.value(c) for part in function)
 
 
 def is_convex(function: Function) -> bool:
     """Whether no denominator depends on the coefficients."""
-    return all(leaf.steering is None for leaf in leaf_fractions(function))
-
-
-def leaf_fractions(function: Function) -> tuple[Fractions, ...]:
-    """Return the leaves of a function, in order."""
-    if isinstance(function, CombinedFunction):
-        return tuple(leaf for part in function.parts for leaf in leaf_fractions(part))
-    return (function,)
+    return all(part.steering is None for part in function)
 
 
 def without_denominators(function: Function) -> Function:
     """Return the function with all denominators set to one: its value at the nominal gain."""
-    if isinstance(function, CombinedFunction):
-        return replace(function, parts=tuple(without_denominators(p) for p in function.parts))
-    return replace(function, steering=None)
+    return tuple(replace(part, steering=None) for part in function)
 
 
 def merge_constraints(constraints: tuple[Constraint, ...]) -> tuple[Constraint, ...]:

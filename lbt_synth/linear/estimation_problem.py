@@ -201,25 +201,18 @@ class EstimationProblem(LinearSystem):
         integer; if it is 2 or more while ``B D'`` is not zero, as part of the noise would act on
         the states before it is measured; and if it is not 1 while the period is longer than a
         sample.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-        >>> [round(lbt.kalman(walk, horizon=h).rms ** 2, 6) for h in (-1, 0, 1, 2)]
-        [0.472136, 0.618034, 1.618034, 2.618034]
         """
-        steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON, at_most=LONGEST_HORIZON)
+        steps = integer(frames, "frames", at_least=-LONGEST_HORIZON, at_most=LONGEST_HORIZON)
         if steps == 1:
             return self
-        self.require_one_phase(f"an estimate {steps} samples ahead", "horizon=1")
+        self.require_one_phase(f"an estimate {steps} samples ahead", "frames=1")
         if steps > 1:
             size = np.linalg.norm(self.B, 2) * np.linalg.norm(self.D, 2)
             if np.linalg.norm(self.S, 2) > 1e-12 * size:
                 raise ProblemError(
                     f"a prediction of {steps} samples needs process and measurement noise that are "
                     "uncorrelated (B D' = 0); got B D' with a norm of "
-                    f"{np.linalg.norm(self.S, 2):.3g}. Try horizon=1, or separate the noises."
+                    f"{np.linalg.norm(self.S, 2):.3g}. Try frames=1, or separate the noises."
                 )
         entry = self.C if steps > 1 else self.L
         n, width = self.n_states, len(entry)

@@ -144,13 +144,6 @@ class GeneralizedPlant(Summarised):
         A controller that does not fit is a DimensionError or, as another sampling period, a
         ProblemError; a singular ``I - D22 D``, with which the loop has no solution, is a
         NumericalError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> P = lbt.linear.GeneralizedPlant(A=1.0, B1=1.0, B2=1.0, C1=1.0, C2=1.0)
-        >>> P.closed_loop(lbt.linear.StateSpace(A=0.0, B=0.0, C=0.0, D=-1.0)).spectral_radius
-        0.0
         """
         require_instance(controller, StateSpace, "controller")
         _, m2, _, p2 = self.sizes

@@ -289,13 +289,6 @@ class StateSpace(LinearSystem):
         """Transfer matrices (f, p, m), ``D + C (zI - A)^-1 B`` at ``z = exp(2 pi i f dt)``.
 
         A frequency [Hz] of a pole on the unit circle and a longer period are a ProblemError.
-
-        Examples
-        --------
-        >>> import lbt_synth as lbt
-        >>> delay = lbt.linear.StateSpace(A=[[0.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt_s=0.25)
-        >>> complex(delay.frequency_response([1.0])[0, 0, 0].round(12))
-        -1j
         """
         self.require_one_phase("a transfer matrix", "phase_response(...), or lifted()")
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))

@@ -103,11 +103,6 @@ class Method:
     compared_options: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def in_comparison(self) -> dict[str, Any]:
-        """Options of the design that stands beside others and the limits."""
-        return {**self.reference_options, **self.compared_options}
-
-    @property
     def kind(self) -> type[Design]:
         """The class of its designs, imported."""
         kind: type[Design] = resolve_name(self.design)

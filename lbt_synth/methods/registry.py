@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
@@ -17,27 +17,13 @@ if TYPE_CHECKING:
     from lbt_synth.design.integrator import IntegratorDesign
     from lbt_synth.design.result import Design
 
-Horizon = Annotated[
-    int,
-    Field(
-        description="frames from the newest measurement to the estimate: the filter is for a loop "
-        "with a delay of loop.delay_frames + horizon - 1, at least 1 frame",
-        json_schema_extra={"instead": "Set loop.delay_frames in the configuration instead."},
-    ),
-]
 _FILTER = "lbt_synth.design.filter_design:FilterDesign"
-_BOUNDS = frozenset({"gamma", "gamma_ratio", "rms"})  # at most one is given
+_BOUNDS = frozenset({"gamma", "gamma_ratio"})  # at most one is given
 _SIZES = {"gain", "phase_margin_deg", "modulus_margin"}  # what decides the gain of an integrator
 
 
-class KalmanOptions(Section):
-    """Options of the Kalman filter."""
-
-    horizon: Horizon = 1
-
-
 class BoundOptions(Section):
-    """A bound on the H-infinity norm, and the horizon."""
+    """A bound on the H-infinity norm."""
 
     gamma: float | None = Field(default=None, gt=0, description="bound of the H-infinity norm [nm]")
     gamma_ratio: float = Field(
@@ -50,13 +36,12 @@ class BoundOptions(Section):
             "filter.",
         },
     )
-    horizon: Horizon = 1
 
     def arguments(self) -> dict[str, Any]:
         """Return the options of which one is the bound: an absolute one, else the multiple."""
         values = self.model_dump()
-        absolute = next((name for name in ("rms", "gamma") if values.get(name)), "gamma_ratio")
-        return {n: v for n, v in values.items() if n not in _BOUNDS or n == absolute}
+        del values["gamma" if self.gamma is None else "gamma_ratio"]
+        return values
 
 
 class HinfOptions(BoundOptions):
@@ -70,12 +55,6 @@ class HinfOptions(BoundOptions):
 class MixedOptions(BoundOptions):
     """Options of the mixed filter."""
 
-    rms: float | None = Field(
-        default=None,
-        gt=0,
-        description="bound of the estimation error [nm rms] instead, under which the norm is "
-        "minimised",
-    )
     taps: int = Field(
         default=16, ge=1, le=64, description="past innovations that the filter weighs"
     )
@@ -139,7 +118,7 @@ def _build_lqg(inputs: DesignInputs, options: LqgOptions) -> Design:
 
 
 def _build_integrator(inputs: DesignInputs, options: IntegratorOptions) -> IntegratorDesign:
-    from lbt_synth.design.integrator import IntegratorLaw, integrator, optimal_integrator
+    from lbt_synth.design.integrator import IntegratorLaw, integrator
 
     section: IntegratorOptions | None = inputs.method_section(INTEGRATOR.name)
     chosen = options.model_dump(exclude_unset=True)
@@ -148,10 +127,8 @@ def _build_integrator(inputs: DesignInputs, options: IntegratorOptions) -> Integ
         usual = {name: value for name, value in usual.items() if name not in _SIZES}
     values = usual | chosen
     gain = values.pop("gain", None)
-    law = IntegratorLaw(**values)
-    if gain is None:
-        return optimal_integrator(inputs.hardware, inputs.truth, law=law)
-    return integrator(inputs.hardware, gain=gain, law=law)
+    truth = inputs.truth if gain is None else None
+    return integrator(inputs.hardware, gain=gain, truth=truth, law=IntegratorLaw(**values))
 
 
 def _build_predictor(inputs: DesignInputs, options: Section) -> Design:
@@ -163,7 +140,7 @@ KALMAN = Method(
     title="Kalman filter",
     label="Kalman",
     design=_FILTER,
-    options=KalmanOptions,
+    options=Section,
     build=_filter_of("lbt_synth.design.kalman:kalman"),
     batched=True,
     reference_rank=1,

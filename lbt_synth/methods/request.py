@@ -26,24 +26,6 @@ _SHORT_WORDS = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wording:
-    """How a surface writes a method and an option, and the place in a file that has them."""
-
-    method: str = "method {}"
-    option: str = "{}"
-    place: str = ""
-
-    def place_of(self, option: str) -> str:
-        """Return where an option stands."""
-        return f"{self.place}.{option}" if self.place else self.name(option)
-
-    def name(self, option: str) -> str:
-        """Return the name of an option as people write it."""
-        dashed = option.replace("_", "-") if self.option.startswith("--") else option
-        return self.option.format(dashed)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class DesignRequest:
     """A method of synthesis and its options; the inputs of a design give the others."""
 
@@ -65,28 +47,20 @@ class DesignRequest:
         return self.method.build(inputs, options)
 
 
-def design_request(
-    name: str, given: Mapping[str, Any], wording: Wording | None = None
-) -> DesignRequest:
-    """Check the options of a method; ProblemError in the words of the surface they came from."""
-    method, words = method_named(name), wording or Wording()
-    called = words.method.format(name)
-    where = f"{words.place}: {called}" if words.place else called
+def design_request(name: str, given: Mapping[str, Any]) -> DesignRequest:
+    """Check the options of a method, by their names in Python; raise ProblemError."""
+    method = method_named(name)
     for option in given:
         if option not in method.options.model_fields:
-            raise ProblemError(_describe_stranger(option, method, called, words))
+            raise ProblemError(_describe_stranger(option, method))
     both = [option for option in given if option in method.exclusive]
     if len(both) > 1:
-        names = ", ".join(
-            map(words.name, sorted(method.exclusive & method.options.model_fields.keys()))
-        )
-        raise ProblemError(
-            f"{where} takes at most one of {names}; got {' and '.join(map(words.name, both))}."
-        )
+        names = ", ".join(sorted(method.exclusive & method.options.model_fields.keys()))
+        raise ProblemError(f"method {name} takes at most one of {names}; got {' and '.join(both)}.")
     try:
         options = method.options.model_validate(dict(given))
     except ValidationError as error:
-        raise ProblemError(_describe_error(error, method, where, words)) from None
+        raise ProblemError(_describe_error(error, method)) from None
     return DesignRequest(method=method, given=dict(given), options=options)
 
 
@@ -104,40 +78,33 @@ def option_owners(option: str) -> list[str]:
     return [m.name for m in METHODS.values() if option in m.options.model_fields]
 
 
-def _describe_stranger(option: str, method: Method, called: str, words: Wording) -> str:
+def _describe_stranger(option: str, method: Method) -> str:
     """Describe an option that a method does not have."""
-    place, owners = words.place_of(option), option_owners(option)
-    if owners:
-        extra = _extra(method_named(owners[0]), option).get("instead", "")
-        others = words.method.format(" or ".join(owners))
-        return f"{place} goes with {others}; got {called}. {extra}".rstrip()
-    known = map(words.name, sorted(method.options.model_fields))
-    return f"{place} is no option of {called}; {suggest_word(words.name(option), known)}"
+    if owners := option_owners(option):
+        return f"{option} goes with method {' or '.join(owners)}; got method {method.name}."
+    suggestion = suggest_word(option, sorted(method.options.model_fields))
+    return f"{option} is no option of method {method.name}; {suggestion}"
 
 
-def _extra(method: Method, option: str) -> dict[str, Any]:
-    """Return what an option says beyond its type: advice where it is refused."""
-    extra = method.options.model_fields[option].json_schema_extra
-    return extra if isinstance(extra, dict) else {}
-
-
-def _describe_error(error: ValidationError, method: Method, where: str, words: Wording) -> str:
+def _describe_error(error: ValidationError, method: Method) -> str:
+    """Describe the first option that does not fit."""
     first = error.errors()[0]
-    option = str(first["loc"][0])
-    name, field = words.name(option), method.options.model_fields[option]
+    name = str(first["loc"][0])
+    field = method.options.model_fields[name]
     if first["type"] == "missing":
         example = f"; try {name} {field.examples[0]}" if field.examples else ""
-        return f"{where} needs {name}, the {field.description}{example}."
+        return f"method {method.name} needs {name}, the {field.description}{example}."
     if first["type"] == "literal_error":
         expected = first["ctx"]["expected"].replace("'", "")
-        return f"{where} takes {name} {expected}; got {name} {first['input']}."
-    text = first["msg"].removeprefix("Input should be ")
+        return f"method {method.name} takes {name} {expected}; got {name} {first['input']}."
+    limit = first["msg"].removeprefix("Input should be ")
     for long, short in _SHORT_WORDS.items():
-        text = text.replace(long, short)
+        limit = limit.replace(long, short)
     got = first["input"]
     shown = f"{got:g}" if isinstance(got, float) else repr(got)
-    hint = _extra(method, option).get("hint", "")
-    return f"{words.place_of(option)} must be {text}; got {shown}. {hint}".rstrip()
+    extra = field.json_schema_extra  # advice where it is refused
+    hint = extra.get("hint", "") if isinstance(extra, dict) else ""
+    return f"{name} must be {limit}; got {shown}. {hint}".rstrip()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

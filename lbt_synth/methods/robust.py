@@ -36,16 +36,11 @@ _PLAIN = {"moving_gain", "modulus_margin", "delay_error_frames", "functions", "p
 _PLAIN |= {"states", "loss"}  # options that robust takes as they are
 
 
-class _Ends(Section):
-    """The ends of a band."""
+class BandSection(Section):
+    """A band in which a vibration may be anywhere."""
 
     low_hz: HertzFromZero = Field(description="lower end of the band [Hz]")
     high_hz: Hertz = Field(description="upper end of the band [Hz]")
-
-
-class BandSection(_Ends):
-    """A band in which a vibration may be anywhere."""
-
     rms_nm: Nanometres | None = Field(default=None, description="standard deviation [nm rms]")
     rms_mas: Milliarcseconds | None = Field(default=None, description="standard deviation [mas]")
     axis: Axis = Field(default="both", description="tip, tilt or both")
@@ -58,17 +53,18 @@ class BandSection(_Ends):
         return self
 
 
-class AttenuationSection(_Ends):
-    """One step of a mask on the rejection."""
+class BoundSection(Section):
+    """A bound on a response of the loop, in a band or at all frequencies."""
 
-    at_most: Ratio = Field(description="largest modulus of the rejection in it")
-    sensor_gain: Gain | None = Field(default=None, description="real sensor gain at which it holds")
-
-
-class MirrorUncertaintySection(_Ends):
-    """Relative uncertainty of the mirror in a band."""
-
-    relative: Ratio = Field(description="relative error of the mirror's response")
+    response: Literal["rejection", "noise", "complementary"] = Field(
+        description="rejection of disturbances, amplification of noise, or T"
+    )
+    at_most: Ratio = Field(description="its largest modulus")
+    low_hz: HertzFromZero = Field(default=0.0, description="lower end of the band [Hz]")
+    high_hz: Hertz | None = Field(default=None, description="upper end of the band [Hz]")
+    sensor_gain: Gain | None = Field(
+        default=None, description="real sensor gain at which a rejection is bounded"
+    )
 
 
 class RobustSection(Section):
@@ -100,9 +96,6 @@ class RobustSection(Section):
         lt=1,
         description="least modulus margin at model.sensor_gain",
     )
-    noise_peak: Ratio | None = Field(
-        default=None, description="largest amplification of noise at any frequency"
-    )
     delay_error_frames: float | None = Field(
         default=None,
         ge=0,
@@ -116,11 +109,8 @@ class RobustSection(Section):
     command_step_nm: Nanometres | None = Field(
         default=None, description="largest rms of their steps [nm]"
     )
-    attenuation: list[AttenuationSection] = Field(
-        default=[], description="upper bounds on the rejection"
-    )
-    mirror_uncertainty: list[MirrorUncertaintySection] = Field(
-        default=[], description="errors of the mirror for which the loop stays stable"
+    bounds: list[BoundSection] = Field(
+        default=[], description="upper bounds on responses of the loop"
     )
     functions: int = Field(default=60, ge=1, le=1000, description="functions of the long parameter")
     pole: float = Field(default=0.7, ge=0, lt=1, description="common pole of these functions")
@@ -215,23 +205,18 @@ def _list_demands(
 ) -> list[Demand]:
     """Return the demands of the section, those on commands under the turbulence of the design."""
     from lbt_synth.design.loop_shaping import noise_per_mode
-    from lbt_synth.design.shaping import Attenuation, CommandRms, MirrorUncertainty, NoisePeak
+    from lbt_synth.design.shaping import Bound, CommandRms
     from lbt_synth.models.spectra import spectrum_key
 
     demands: list[Demand] = []
-    if section.noise_peak is not None:
-        demands.append(NoisePeak(at_most=section.noise_peak))
-    for i, step in enumerate(section.attenuation):
-        gain = 1.0 if step.sensor_gain is None else step.sensor_gain / inputs.sensor_gain
-        with name_key(f"{_KEY}.attenuation[{i}]"):
-            demands.append(Attenuation(**{**step.model_dump(), "sensor_gain": gain}))
-    for i, error in enumerate(section.mirror_uncertainty):
-        with name_key(f"{_KEY}.mirror_uncertainty[{i}]"):
-            demands.append(MirrorUncertainty(**error.model_dump()))
-    bounds = {False: section.command_stroke_nm, True: section.command_step_nm}
+    for i, bound in enumerate(section.bounds):
+        gain = 1.0 if bound.sensor_gain is None else bound.sensor_gain / inputs.sensor_gain
+        with name_key(f"{_KEY}.bounds[{i}]"):
+            demands.append(Bound(**{**bound.model_dump(), "sensor_gain": gain}))
+    commands_nm = {False: section.command_stroke_nm, True: section.command_step_nm}
     models = inputs.plant.turbulence
-    for rate, bound in bounds.items():
-        if bound is None:
+    for rate, at_most_nm in commands_nm.items():
+        if at_most_nm is None:
             continue
         if spectrum is None and len({spectrum_key(model) for model in models}) > 1:
             raise ConfigError(
@@ -243,7 +228,7 @@ def _list_demands(
         noise_nm = float(max(noise_per_mode(inputs.hardware, inputs.plant.own_sensor_alone().R)))
         turbulence = models[0] if spectrum is None else spectrum
         demands.append(
-            CommandRms(at_most_nm=bound, rate=rate, turbulence=turbulence, noise_nm=noise_nm)
+            CommandRms(at_most_nm=at_most_nm, rate=rate, turbulence=turbulence, noise_nm=noise_nm)
         )
     return demands
 

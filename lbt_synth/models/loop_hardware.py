@@ -76,12 +76,6 @@ class LoopHardware(Summarised):
     >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.25)
     >>> [float(tap) for tap in path.mirror_taps]  # of u(k), u(k-1), u(k-2)
     [0.0, 0.75, 0.25]
-    >>> shell = lbt.models.PositionLoop.from_bandwidth(
-    ...     natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
-    ... )
-    >>> moving = lbt.LoopHardware(frame_rate_hz=800, mirror=shell)
-    >>> moving.mirror_taps[:3].round(3).tolist()
-    [0.0, 0.631, 0.387]
     """
 
     frame_rate_hz: Positive

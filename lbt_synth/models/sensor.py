@@ -118,8 +118,8 @@ def pyramid_modal_noise_nm(
     A modulated pyramid measures slopes at spatial frequencies below its modulation and phase
     above. A mode of radial order n has about ``(n + 1) / 2`` periods over the pupil, so its
     noise is taken as that of the tilt times ``2 / (n + 1)``, and not less than one over the
-    modulation. This is a convenient model; a measured interaction matrix gives the noise of its
-    modes (:class:`Reconstructor`).
+    modulation. This is a convenient model; the rows of the inverse of a measured interaction
+    matrix give the noise of its modes.
 
     Parameters
     ----------

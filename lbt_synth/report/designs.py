@@ -394,7 +394,7 @@ def design_page(
     --------
     >>> import lbt_synth as lbt
     >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
+    >>> slow = lbt.integrator(config.hardware, truth=config.truth)
     >>> lbt.report.design_page(config, {"slow": slow}, title="Tonight").title
     'Tonight'
     """

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import lbt_synth
-from lbt_synth.design import Design, FilterDesign, hinf, integrator, kalman, optimal_integrator
+from lbt_synth.design import Design, FilterDesign, hinf, integrator, kalman
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop import run_end_to_end
 from lbt_synth.interop.specula.optics import (
@@ -253,7 +253,7 @@ def plan_rows(
     problems = filter_problems()
     hardware = hardware or problems[KALMAN.name][0].hardware
     if gains is None:  # the paper raised the gain for the vibration
-        best = optimal_integrator(hardware, replace(PAPER_TRUTH, vibrations=()))
+        best = integrator(hardware, truth=replace(PAPER_TRUTH, vibrations=()))
         gains = best.gain, CLASSICAL_EFFECTIVE_GAIN / TRUTH_SENSOR_GAIN
     for line in (line for line in (*TABLE_II, *TABLE_III) if line.table in tables):
         moved_hz = None if line.error_hz is None else VIBRATION_HZ + line.error_hz

@@ -15,14 +15,13 @@ from lbt_synth.config import Config
 from lbt_synth.design import (
     Design,
     FilterDesign,
-    central_filter,
     hinf,
+    integrator,
     kalman,
     lqg,
     mixed,
-    optimal_integrator,
 )
-from lbt_synth.design.mixed import require_taps
+from lbt_synth.design.mixed import central_filter, require_taps
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import EstimationProblem
@@ -436,7 +435,7 @@ def mirror_rows(
     settled = replace(plant, hardware=replace(hardware, mirror=None))
     regulated = lqg(plant, command_weight=command_weight)
     designs: dict[str, Design] = {
-        "integrator, best gain": optimal_integrator(hardware, truth),
+        "integrator, best gain": integrator(hardware, truth=truth),
         "kalman, settled mirror": kalman(settled),
         "kalman, real positions": kalman(plant),
         regulated.method: regulated,

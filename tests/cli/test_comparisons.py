@@ -184,14 +184,13 @@ def test_modal_knows_the_local_loop(capsys):
     status, text, _ = run(capsys, "modal", slow, "--modes", 5, "--json")
     assert status == 0
     data, config = json.loads(text), lbt.load_config(slow)
-    shell = config.hardware.mirror
-    assert shell is not None
+    assert config.hardware.mirror is not None
     air = lbt.models.modal_turbulence(config.atmosphere, modes=5, frame_rate_hz=800)
     noise = lbt.models.pyramid_modal_noise_nm(config.noise_nm, modes=5, modulation_lambda_over_d=4)
     line = config.plant.vibrations[0]
-    known = {"noise_nm": noise, "vibrations": {0: line, 1: line}}
-    gains = lbt.design.modal.modal_gains(air, frame_rate_hz=800, mirror=shell, **known)
-    filters = lbt.design.modal.modal_filters(air, mirror=shell, **known)
+    known = {"hardware": config.hardware, "noise_nm": noise, "vibrations": {0: line, 1: line}}
+    gains = lbt.design.modal.modal_gains(air, **known)
+    filters = lbt.design.modal.modal_filters(air, **known)
     assert data["rows"][0]["gain"] == pytest.approx(gains.gains[0])
     assert data["residual_nm"]["Kalman filters"] == pytest.approx((filters.rms_nm**2).sum() ** 0.5)
 

@@ -183,7 +183,7 @@ def test_auto_tests_its_design_on_unseen_data(made, recorded_loop):
 
 
 def test_auto_says_what_it_found(capsys, recorded_night, tmp_path):
-    options = ("--method", "hinf", "--gamma-ratio", 1.3, "--sensor-gain", GAIN, "--no-figure")
+    options = ("--method", "hinf", "--sensor-gain", GAIN, "--no-figure")
     files = ("-o", tmp_path / "h.npz")
     status, text, error = run(capsys, "auto", recorded_night, *options, *files)
     assert (status, error) == (0, "")

@@ -275,8 +275,8 @@ def test_mistakes_of_sensors_are_named(tmp_path, old, new, said):
         load_sensors(tmp_path, old, new)
 
 
-def test_a_horizon_makes_all_sensors_later(sensors_config):
-    hardware = sensors_config.design("kalman", horizon=2).hardware
+def test_a_prediction_further_ahead_has_all_sensors_later(sensors_config):
+    hardware = sensors_config.plant.ahead(2).hardware
     assert hardware.delay_frames == 3
     assert [sensor.delay_frames for sensor in hardware.suite.sensors] == [3.0, 2.0]
 

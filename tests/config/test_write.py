@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.identified_models import ONE_AXIS, SHELL, TILT, TIP, TWO, Line, Model, save_identified
 from support.plants import ROOT
-from support.refusals import require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.config.schema import FileSection
@@ -70,21 +69,11 @@ def test_whatever_is_set_is_read_again(noise, a, angle, frequency, frames, scale
     assert "odd" in text  # config_text reads it again, and refuses what has changed
 
 
-def test_what_cannot_be_written_is_refused():
+def test_what_would_not_be_read_again_is_refused():
     settings, _ = identified_config(ONE_AXIS)
-
-    def text(settings=settings, **comments):
-        return lambda: config_text(settings, {f"loop.{key}": c for key, c in comments.items()})
-
-    again = "cannot be written so that it is read again"
-    require_refusals(
-        [
-            (text(frame_rate_khz="?"), ProblemError, "one on loop.frame_rate_khz"),
-            (text(delay_frames="a\nb"), ProblemError, "must be one line"),
-            (text(frame_rate_hz="\x00"), ProblemError, again),
-            (text({"version": 1}), ProblemError, "FileSection"),
-        ]
-    )
+    for comment in ("\x00", "a\nb: 1"):
+        with pytest.raises(ProblemError, match="read again"):
+            config_text(settings, {"loop.frame_rate_hz": comment})
 
 
 @pytest.mark.parametrize("model", [TWO, ONE_AXIS, replace(TWO, mirror=SHELL, delay_frames=2.4)])
@@ -219,7 +208,6 @@ def test_accelerometers_that_show_lines_become_a_sensor(tmp_path, age, delay):
         shift_frames=age - 1,
         shift_error_frames=0.1,
         age_frames=age,
-        rate_hz=1000.0,
     )
     path = save_identified(tmp_path, TWO, accelerometers=found)
     plant = lbt.load_config(path).plant

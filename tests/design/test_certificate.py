@@ -7,8 +7,8 @@ import pytest
 from support.rational import exact_covariance
 
 import lbt_synth as lbt
-from lbt_synth.design.certificate import certify_error, certify_filter
-from lbt_synth.errors import CertificateError, DimensionError, ProblemError
+from lbt_synth.design.certificate import certify_error, certify_filter, certify_infeasible
+from lbt_synth.errors import CertificateError, DimensionError
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.infeasibility_proof import Witness
 
@@ -68,14 +68,11 @@ def test_a_gain_beside_the_optimal_one_is_refused_from_a_millionth_on(axis_plant
 
 def test_what_is_no_witness_of_the_problem_is_refused():
     problem = lbt.EstimationProblem(A=0.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
-    certify = lbt.design.certify_infeasible
     nothing, wide = (
         Witness(states=np.zeros((n, 1)), disturbances=np.zeros((2, 1))) for n in (1, 2)
     )
-    assert certify(problem, 0.0, nothing).passed  # a level of zero claims nothing
-    assert not certify(problem, 1e-3, nothing).passed
-    with pytest.raises(ProblemError, match="expected a Witness.*; got tuple"):
-        certify(problem, 1.0, (np.zeros((1, 1)), np.zeros((2, 1))))
+    assert certify_infeasible(problem, 0.0, nothing).passed  # a level of zero claims nothing
+    assert not certify_infeasible(problem, 1e-3, nothing).passed
     words = r"1 rows of states, 2 rows of disturbances .*; got \(2, 1\) and \(2, 1\)"
     with pytest.raises(DimensionError, match=words):
-        certify(problem, 1.0, wide)
+        certify_infeasible(problem, 1.0, wide)

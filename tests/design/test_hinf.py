@@ -198,7 +198,7 @@ def test_many_states_take_the_equation_by_default():
 @given(seed=SEEDS, n=st.integers(1, 3))
 def test_more_measurements_lower_the_least_gamma(seed, n):
     p = with_own_noise(random_problem(np.random.default_rng(seed), n))
-    least = [lbt.hinf(p, horizon=h, route="riccati").gamma_least for h in (-1, 0, 1, 2)]
+    least = [lbt.hinf(p.ahead(h), route="riccati").gamma_least for h in (-1, 0, 1, 2)]
     for earlier, later in itertools.pairwise(least):
         assert earlier <= later * (1 + 1e-9)
 
@@ -208,7 +208,7 @@ def test_more_measurements_lower_the_least_gamma(seed, n):
 def test_hinf_filter_form_against_its_own_riccati_condition(seed, n):
     """Hassibi, Sayed, Kailath: the filter of a level exists iff P^-1 + C'R^-1 C - L'L / g^2 > 0."""
     p = with_own_noise(random_problem(np.random.default_rng(seed), n))
-    least = lbt.hinf(p, horizon=0, route="riccati").gamma_least
+    least = lbt.hinf(p.ahead(0), route="riccati").gamma_least
 
     def exists(gamma):
         outputs = np.vstack([p.C, p.L])
@@ -234,22 +234,22 @@ def test_a_horizon_is_a_delay_of_the_loop(make, options):
     p = lbt_axis_plant()
     bare = lbt.EstimationProblem(A=p.A, B=p.B, C=p.C, D=p.D, L=p.L, dt_s=p.dt_s)
     for horizon, delay in ((0, 1), (3, 4)):
-        shifted = make(p, horizon=horizon, **options)
+        shifted = make(p.ahead(horizon), **options)
         direct = make(lbt_axis_plant(delay_frames=delay), **options)
         assert shifted.hardware.delay_frames == delay
         assert shifted.rms == pytest.approx(direct.rms, rel=1e-10)
         assert shifted.gamma == pytest.approx(direct.gamma, rel=1e-9)
         # and of the general construction, which knows nothing of telescopes
-        assert make(bare, horizon=horizon, **options).rms == pytest.approx(direct.rms, rel=1e-9)
+        assert make(bare.ahead(horizon), **options).rms == pytest.approx(direct.rms, rel=1e-9)
     with pytest.raises(ProblemError, match="delay of 1 to 100 frames; got -1"):
-        make(p, horizon=-1, **options)
+        make(p.ahead(-1), **options)
 
 
 def test_noise_far_below_the_signal_is_left_to_the_equation():
     """The inequality's gain is singular there; the equation needs no inverse."""
     quiet = lbt.EstimationProblem(A=0.5, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1e-6]], L=1.0)
     with pytest.raises(NumericalError, match="riccati"):
-        lbt.hinf(quiet, horizon=0, route="lmi")
-    design = lbt.hinf(quiet, horizon=0)
+        lbt.hinf(quiet.ahead(0), route="lmi")
+    design = lbt.hinf(quiet.ahead(0))
     assert design.solver.route == "riccati"
     assert design.gamma == pytest.approx(1e-6, rel=1e-3)

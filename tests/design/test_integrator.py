@@ -13,7 +13,7 @@ from support.refusals import require_refusals
 from support.uneven_axes import LOOPS, QUICK, RATE, SLOW
 
 import lbt_synth as lbt
-from lbt_synth.design import IntegratorLaw, model_integrator, optimal_integrator
+from lbt_synth.design import IntegratorLaw, integrator, integrator_gain_limit
 from lbt_synth.errors import CertificateError, DimensionError, InfeasibleError, ProblemError
 from lbt_synth.models import ARModel
 
@@ -22,14 +22,15 @@ PATH = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
 
 @pytest.mark.parametrize(("delay", "limit"), [(1, 2.0), (2, 1.0), (3, 0.618034), (4, 0.445042)])
 def test_limits_of_whole_delays(delay, limit):
-    assert lbt.design.integrator_gain_limit(delay) == pytest.approx(limit, abs=1e-6)
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay)
+    assert integrator_gain_limit(path) == pytest.approx(limit, abs=1e-6)
 
 
 @settings(max_examples=10)
 @given(delay=st.floats(1, 4.5))
 def test_the_limit_is_where_the_loop_turns_unstable(delay):
-    limit = lbt.design.integrator_gain_limit(delay)
     path = lbt.LoopHardware(frame_rate_hz=1, delay_frames=delay, modes=1)
+    limit = integrator_gain_limit(path)
     for factor, is_stable in ((1 - 1e-4, True), (1 + 1e-4, False)):
         controller = lbt.Controller(A=1.0, B=factor * limit, C=1.0, D=0.0)
         assert (lbt.close_loop(path, controller).spectral_radius < 1) == is_stable
@@ -55,7 +56,7 @@ def test_the_best_gain_is_the_least_of_two_minima(sensor_gain):
     def residual(gain):
         return residual_of(path, truth, gain / sensor_gain, sensor_gain)
 
-    best = residual(optimal_integrator(path, truth).gain * sensor_gain)
+    best = residual(integrator(path, truth=truth).gain * sensor_gain)
     assert residual(0.0117) < min(residual(0.005), residual(0.03))  # the other minimum
     assert best <= min(map(residual, np.linspace(0.005, min(0.615, sensor_gain * 0.61), 62)))
 
@@ -74,8 +75,8 @@ def test_reconstructor_inverts_any_sensor():
 @pytest.mark.parametrize(("delay", "mirror"), [(2.49, None), (2.25, SHELL)])
 def test_the_integrator_of_a_plant_is_that_of_its_truth(delay, mirror):
     plant = a_plant(delay=delay, mirror=mirror)
-    design = model_integrator(plant)
-    of_truth = optimal_integrator(plant.hardware, truth_of_all_moments())
+    design = integrator(plant.hardware, truth=plant)
+    of_truth = integrator(plant.hardware, truth=truth_of_all_moments())
     assert design.gain == pytest.approx(of_truth.gain, rel=1e-5)
     assert design.certificate.passed
 
@@ -97,7 +98,7 @@ def test_the_integrator_of_a_plant_leaves_the_least_of_its_budget():
     def residual(gain):
         return residual_of(plant.hardware, plant, gain)
 
-    gain = model_integrator(plant).gain
+    gain = integrator(plant.hardware, truth=plant).gain
     best = minimize_scalar(residual, bounds=(0.5 * gain, 1.5 * gain), options={"xatol": 1e-7})
     assert gain == pytest.approx(best.x, rel=1e-4)
     assert residual(gain) <= best.fun * (1 + 1e-12)
@@ -117,7 +118,7 @@ def test_truths_of_other_loops_are_refused():
             (lambda t=truth: lbt.residual_budget(loop, t), DimensionError, words),
             (lambda t=truth: lbt.loop.least_residual(single, t), DimensionError, words),
             (lambda t=truth: lbt.simulate(design.controller, t, **run), DimensionError, words),
-            (lambda t=truth: optimal_integrator(single, t), DimensionError, words),
+            (lambda t=truth: integrator(single, truth=t), DimensionError, words),
         ]
     for wrong in ({"noise_nm": [1.0]}, {"noise_nm": 1.0, "sensor_gain": [1.0]}):
         known = {"frame_rate_hz": RATE, "turbulence": SLOW, **wrong}
@@ -127,7 +128,7 @@ def test_truths_of_other_loops_are_refused():
 
 def test_where_no_loop_is_best_the_status_says_so():
     """White noise alone: each gain adds to it, the least that is tried adds least."""
-    idle = optimal_integrator(PATH, lbt.Truth(turbulence=None, noise_nm=20.0))
+    idle = integrator(PATH, truth=lbt.Truth(turbulence=None, noise_nm=20.0))
     assert idle.solver.status.startswith("limited by the least gain tried")
     assert idle.gain == pytest.approx(1e-4, rel=1e-3)
 
@@ -190,7 +191,7 @@ def test_the_best_gain_within_a_demand():
     air = ARModel(coefficients=[0.999], driving_rms_nm=30, frame_rate_hz=RATE)
     truth = lbt.Truth(turbulence=air, noise_nm=1.0)
     free, bound, easy = (
-        optimal_integrator(PATH, truth, law=IntegratorLaw(phase_margin_deg=demand))
+        integrator(PATH, truth=truth, law=IntegratorLaw(phase_margin_deg=demand))
         for demand in (None, 50, 5)
     )
     assert bound.gain < free.gain
@@ -201,27 +202,30 @@ def test_the_best_gain_within_a_demand():
 
 
 def test_refusals():
-    def integrator(gain=None, **law):
-        return lambda: lbt.integrator(PATH, gain=gain, law=IntegratorLaw(**law))
+    def designed(gain=None, truth=None, **law):
+        return lambda: integrator(PATH, gain=gain, truth=truth, law=IntegratorLaw(**law))
 
-    still = lbt.Truth(turbulence=[None, None], noise_nm=[0, 0])
+    still = lbt.Truth(turbulence=None, noise_nm=0.0)
     half = "zero_hz must be below half the frame rate"
     require_refusals(
         [
-            (integrator(1.01), CertificateError, "spectral radius of the closed loop"),
-            (integrator(1.0), CertificateError, "spectral radius"),  # marginal
-            (integrator(0.0), ProblemError, "gain must be above 0"),
-            (integrator(phase_margin_deg=95), InfeasibleError, "no gain keeps phase_margin_deg 95"),
-            (integrator(), ProblemError, "a gain or a demand; got neither"),
-            (integrator(0.1, zero_hz=400), ProblemError, half),
-            (integrator(0.55, phase_margin_deg=45), CertificateError, "phase margin demanded over"),
-            (integrator(leak=1.01), ProblemError, "leak"),
-            (integrator(integrators=3), ProblemError, "integrators"),
-            (integrator(modulus_margin=1.0), ProblemError, "modulus_margin"),
-            (lambda: optimal_integrator(LOOPS[0], still), ProblemError, "must disturb the loop"),
+            (designed(1.01), CertificateError, "spectral radius of the closed loop"),
+            (designed(1.0), CertificateError, "spectral radius"),  # marginal
+            (designed(0.0), ProblemError, "gain must be above 0"),
+            (designed(phase_margin_deg=95), InfeasibleError, "no gain keeps phase_margin_deg 95"),
+            (designed(), ProblemError, "a gain, a truth or a demand; got none"),
+            (designed(0.1, zero_hz=400), ProblemError, half),
+            (designed(0.55, phase_margin_deg=45), CertificateError, "phase margin demanded over"),
+            (designed(leak=1.01), ProblemError, "leak"),
+            (designed(integrators=3), ProblemError, "integrators"),
+            (designed(modulus_margin=1.0), ProblemError, "modulus_margin"),
+            (designed(truth=still), ProblemError, "must disturb the loop"),
+            (designed(truth=PATH), ProblemError, "truth must be a Truth; got LoopHardware"),
+            (designed(0.1, truth=still), ProblemError, "a gain or a truth; got both"),
+            (lambda: integrator(3, gain=0.1), ProblemError, "hardware must be a LoopHardware"),
         ]
     )
-    assert integrator(0.5, phase_margin_deg=45)().certificate.passed
+    assert designed(0.5, phase_margin_deg=45)().certificate.passed
 
 
 def test_a_gain_file_keeps_the_law_and_its_claim(tmp_path):

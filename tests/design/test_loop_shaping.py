@@ -7,21 +7,16 @@ import pytest
 from support.plants import LBT_YAML
 from support.refusals import require_refusals
 from support.robust_config import EXAMPLE
-from support.shaping import BASIC, NOISE, ONE, RATE, SLOW, shaped, spec
+from support.shaping import BASIC, NOISE, ONE, RATE, SLOW, attenuation, margin, shaped, spec
 
 import lbt_synth as lbt
 from lbt_synth.design.shaping import (
-    Attenuation,
+    Bound,
     CommandRms,
     LoopErrors,
-    MirrorUncertainty,
-    ModulusMargin,
-    NoisePeak,
     ResidualVariance,
     Specification,
-    Total,
     VibrationBand,
-    Worst,
 )
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.models import ARModel
@@ -35,7 +30,7 @@ def plant_of(turbulence=SLOW, noise_nm=NOISE, **options):
 
 def test_nothing_to_reject_leaves_nothing():
     idle = ResidualVariance(turbulence=None, noise_nm=10, sensor_gain=0.5)
-    design = shaped(ModulusMargin(at_least=0.5), objective=idle, functions=8)
+    design = shaped(margin(0.5), terms=[idle], functions=8)
     assert design.objective_nm[0] < 1e-3
 
 
@@ -43,8 +38,8 @@ def test_nothing_to_reject_leaves_nothing():
 def test_without_demands_the_optimum_is_the_kalman_filter(delay, coefficients):
     model = ARModel(coefficients=coefficients, driving_rms_nm=20.0, frame_rate_hz=RATE)
     plant = plant_of(model, modes=1, delay_frames=delay)
-    objective = ResidualVariance(turbulence=model, noise_nm=NOISE)
-    design = shaped(objective=objective, path=plant.hardware, functions=30)
+    terms = [ResidualVariance(turbulence=model, noise_nm=NOISE)]
+    design = shaped(terms=terms, path=plant.hardware, functions=30)
     best = lbt.kalman(plant).rms
     assert best * (1 - 1e-7) <= design.objective_nm[0] <= best * 1.002
 
@@ -55,20 +50,20 @@ def test_few_poles_reach_the_kalman_filter_too():
     assert design.objective_nm[0] <= lbt.kalman(plant_of(modes=1)).rms * 1.012
     assert design.loss <= 0.01
     assert shaped(states=4, loss=0.01).states_per_mode == 2  # as few as are needed
-    loud = Total(terms=(BASIC, VibrationBand(low_hz=15, high_hz=25, rms_nm=500)))
+    loud = [BASIC, VibrationBand(low_hz=15, high_hz=25, rms_nm=500)]
     words = "no controller of 5 states per mode came within 1 %"
     with pytest.raises(InfeasibleError, match=words):
-        shaped(objective=loud, functions=30, states=5, loss=0.01)
+        shaped(terms=loud, functions=30, states=5, loss=0.01)
 
 
 def test_every_demand_holds_in_a_loop_measured_by_other_means():
     demands = (
-        ModulusMargin(at_least=0.55),
-        NoisePeak(at_most=1.9),
-        Attenuation(low_hz=0, high_hz=2, at_most=0.12),
-        Attenuation(low_hz=4, high_hz=6, at_most=0.5, sensor_gain=0.6),
+        margin(0.55),
+        Bound(response="noise", at_most=1.9),
+        attenuation(0, 2, 0.12),
+        attenuation(4, 6, 0.5, sensor_gain=0.6),
         LoopErrors(low=0.3, high=1.6),
-        MirrorUncertainty(relative=0.7, low_hz=150, high_hz=400),
+        Bound(response="complementary", at_most=1 / 0.7, low_hz=150, high_hz=400),
         LoopErrors(delay_frames=0.5),
         CommandRms(at_most_nm=40, turbulence=SLOW, noise_nm=NOISE, rate=True),
     )
@@ -93,13 +88,13 @@ def test_every_demand_holds_in_a_loop_measured_by_other_means():
 
 
 def test_each_mode_may_have_its_own_specification():
-    line = Total(terms=(BASIC, VibrationBand(low_hz=19, high_hz=21, rms_nm=100)))
+    line = [BASIC, VibrationBand(low_hz=19, high_hz=21, rms_nm=100)]
     path = lbt.LoopHardware(
         frame_rate_hz=RATE,
         sensor_matrix=[[1.0, 0.3], [-0.2, 0.9], [0.4, 0.0]],
         influence_matrix=[[0.8, 0.1, 0.0], [0.0, 0.5, 0.4]],
     )
-    design = lbt.design.shape(path, [spec(), spec(objective=line)], functions=20, states=None)
+    design = lbt.design.shape(path, [spec(), spec(terms=line)], functions=20, states=None)
     assert design.certificate.passed
     assert design.objective_nm[0] < design.objective_nm[1]
     rejected = np.abs(lbt.close_loop(path, design.controller).sensitivity([20.0])[0])
@@ -112,7 +107,7 @@ def test_robust_scales_the_noise_with_the_sensor_and_shares_equal_modes():
     for model, noise, gain in ((SLOW, NOISE, 2.0), (tiny, 4e-10, 3.0)):  # of any size
         plant = plant_of(model, noise, sensor_matrix=np.diag([1.0, gain]))
         design = lbt.robust(plant, bands=[], functions=8, states=None)
-        noises = [s.objective.terms[0].noise_nm for s in design.specifications]
+        noises = [s.terms[0].noise_nm for s in design.specifications]
         assert noises == pytest.approx([noise, noise / gain], rel=1e-6)
     same = lbt.robust(plant_of(), bands=[], functions=8, states=None)
     assert same.specifications[0] is same.specifications[1]
@@ -124,43 +119,45 @@ def test_what_makes_no_sense_is_refused():
     other = ARModel(coefficients=[0.9], driving_rms_nm=1.0, frame_rate_hz=100)
     flat = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=[[1.0, 1.0]])
     command = {"at_most_nm": 9, "turbulence": SLOW, "noise_nm": 1}
-    slower, peak = CommandRms(**command | {"turbulence": other}), NoisePeak(at_most=3)
-    high, mask = VibrationBand(low_hz=5, high_hz=500, rms_nm=1), {"low_hz": 0, "high_hz": 1}
+    slower, peak = CommandRms(**command | {"turbulence": other}), margin(0.5)
+    high, noise = VibrationBand(low_hz=5, high_hz=500, rms_nm=1), {"response": "noise"}
     rows = [
         (lambda: ResidualVariance(turbulence=None, noise_nm=0), "turbulence or noise; got neither"),
         (lambda: ResidualVariance(turbulence=3, noise_nm=1), "must be an Atmosphere"),
         (lambda: ResidualVariance(turbulence=SLOW, noise_nm=-1), "noise_nm must be at least 0"),
         (lambda: VibrationBand(low_hz=5, high_hz=5, rms_nm=1), "high_hz must be above 5"),
         (lambda: VibrationBand(low_hz=5, high_hz=6, rms_nm=0), "rms_nm must be above 0"),
-        (lambda: Total(terms=()), "at least one term"),
-        (lambda: Total(terms=(3,)), "an objective is made of"),
-        (lambda: Total(terms=BASIC), "terms must be a list"),
-        (lambda: Worst(terms=(BASIC,), weights=(1, 2)), "one per term, 1; got 2"),
-        (lambda: ModulusMargin(at_least=1), "at_least must be below 1"),
-        (lambda: NoisePeak(at_most=0), "at_most must be above 0"),
-        (lambda: Attenuation(**mask, at_most=3, sensor_gain=0.5), "below 2 at sensor gain 0.5"),
+        (lambda: spec(terms=()), "at least one term"),
+        (lambda: spec(terms=(3,)), "terms must be of ResidualVariance, VibrationBand; got int"),
+        (lambda: spec(terms=BASIC), "terms must be a list"),
+        (lambda: Bound(**noise, at_most=0), "at_most must be above 0"),
+        (lambda: Bound(**noise, at_most=1, sensor_gain=2), "on noise is at sensor gain 1; got 2"),
+        (lambda: Bound(response="S", at_most=1), "response must be"),
+        (lambda: attenuation(2, 1, 1), "high_hz must be above 2"),
+        (lambda: attenuation(0, 1, 3, sensor_gain=0.5), "below 2 at sensor gain 0.5"),
         (lambda: LoopErrors(low=1.1, high=1.3), "low must be at most 1"),
         (lambda: LoopErrors(low=0.5, high=0.9), "high must be at least 1"),
         (lambda: LoopErrors(delay_frames=1.5), "frames must be at most 1"),
-        (lambda: MirrorUncertainty(relative=0, low_hz=0, high_hz=1), "relative must be above 0"),
+        (lambda: LoopErrors(delay_frames=0.5, moving=True), "in which a gain may move"),
         (lambda: CommandRms(**command | {"at_most_nm": -1}), "at_most_nm must be above 0"),
         (lambda: CommandRms(**command, rate="x"), "rate must be True or False"),
-        (lambda: spec(3), "a demand must be one of ModulusMargin"),
-        (lambda: spec(objective=3), "an objective is made of"),
-        (lambda: Specification(objective=BASIC, demands=peak), "demands must be a list"),
+        (lambda: spec(3), "demands must be of Bound, CommandRms, LoopErrors; got int"),
+        (lambda: spec(peak, peak), "given once; got twice 'modulus margin"),
+        (lambda: Specification(terms=[BASIC], demands=peak), "demands must be a list"),
         (lambda: shape(3, spec()), "such as plant.hardware, must be a LoopHardware; got int"),
         (lambda: shape(ONE, 3), "expected a Specification"),
         (lambda: shape(ONE, [spec(), spec()]), "one for each of 1 modes; got 2"),
         (lambda: shape(ONE, spec(), functions=401), "functions must be at most 400"),
         (lambda: shape(ONE, spec(), pole=1.0), "pole must be below 1"),
         (lambda: shape(ONE, spec(), states=1), "states must be at least 2"),
-        (lambda: shape(ONE, spec(objective=high)), "Nyquist frequency 400 Hz; got 5 to 500"),
+        (lambda: shape(ONE, spec(terms=[high])), "Nyquist frequency 400 Hz; got 5 to 500"),
         (lambda: shape(flat, spec()), "sensor_matrix must have rank 2"),
         (lambda: shape(ONE, spec(slower)), "sampled at the loop's 800 Hz; got 100"),
         (lambda: lbt.robust(one, bands=None), "bands must be a list"),
         (lambda: lbt.robust(one, bands=[], sensor_gain=(1,)), r"must be \(low, high\)"),
         (lambda: lbt.robust(one, bands=[], scenarios=1.0), "scenarios must be a list"),
         (lambda: lbt.robust(one, bands=[], scenarios=[]), "at least one sensor gain"),
+        (lambda: lbt.robust(one, modulus_margin=1), "modulus_margin must be below 1"),
         (lambda: lbt.robust(one, bands=[3]), "each of bands must be a VibrationBand"),
         (lambda: lbt.robust(3, bands=[]), "plant must be a TipTiltPlant"),
         (lambda: lbt.loop.least_residual(None, None), "expected a LoopHardware"),

@@ -10,10 +10,11 @@ from scipy.linalg import solve_discrete_are
 from support.lqg import shell, slow_plant
 from support.plants import lbt_axis_plant
 from support.refusals import require_refusals
+from support.shaping import margin, shaped
 
 import lbt_synth as lbt
 from lbt_synth.design.lqg import _pieces, loop_variances, mirror_core
-from lbt_synth.design.shaping import LoopErrors, ModulusMargin, ResidualVariance, Specification
+from lbt_synth.design.shaping import LoopErrors, ResidualVariance
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.loop.budget import settling_error
@@ -152,7 +153,7 @@ def test_what_is_left_of_the_settled_mirror():
 def test_the_other_designs_take_a_moving_mirror():
     plant = slow_plant(2.25, shell(300.0), modes=2)
     truth, path = truth_of(plant), plant.hardware
-    integrator = lbt.design.optimal_integrator(path, truth)
+    integrator = lbt.integrator(path, truth=truth)
     limit = lbt.loop.least_residual(path, truth, frame_means=True).rms_nm
     for design in (lbt.kalman(plant), lbt.hinf(plant, gamma_ratio=1.3), integrator, lbt.lqg(plant)):
         loop = lbt.close_loop(path, design.controller)
@@ -163,13 +164,12 @@ def test_the_other_designs_take_a_moving_mirror():
 def test_shaping_takes_a_moving_mirror_and_refuses_its_delay_errors():
     slow = ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
     plant = slow_plant(2.0, shell(300.0), vibrations=None, turbulence=slow, noise_nm=20.0)
-    objective = ResidualVariance(turbulence=slow, noise_nm=20.0)
+    terms = [ResidualVariance(turbulence=slow, noise_nm=20.0)]
 
     def shape(demand):
-        spec = Specification(objective=objective, demands=[demand])
-        return lbt.design.shape(plant.hardware, spec, functions=25, states=None)
+        return shaped(demand, terms=terms, path=plant.hardware, functions=25)
 
-    design = shape(ModulusMargin(at_least=0.5))
+    design = shape(margin(0.5))
     loop = lbt.close_loop(plant.hardware, design.controller)
     assert lbt.loop_margins(loop).modulus > 0.5
     free = lbt.close_loop(plant.hardware, lbt.lqg(plant).controller)

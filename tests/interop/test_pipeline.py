@@ -495,7 +495,7 @@ def test_a_design_and_integrators_make_one_matrix(tmp_path, designs):
 def test_filters_of_all_modes_make_one_matrix(tmp_path):
     line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=50, direction=(1.0,))
     models = {"noise_nm": [5.0, 6.0, 7.0], "vibrations": {1: [line]}, "sensor_gain": 0.8}
-    filters = modal_filters([AIR] * 3, **models)
+    filters = modal_filters([AIR] * 3, hardware=lbt.LoopHardware(frame_rate_hz=800), **models)
     matrix = np.load(lbt.interop.export(tmp_path / "k.npy", filters, "dao").files[0])
     z = np.exp(2j * np.pi * np.linspace(0.01, 0.49, 20))
     for mode in range(3):

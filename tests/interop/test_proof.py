@@ -48,7 +48,7 @@ def test_another_gain_costs_residual_and_demands(shaped):
     louder = replace(shaped.controller, C=1.1 * shaped.controller.C, D=1.1 * shaped.controller.D)
     failed = {check.name for check in prove(shaped, louder) if not check.passed}
     assert "residual at sensor gain 1, loss" in failed
-    assert "mode 1: peak of the sensitivity" in failed
+    assert "mode 1: peak of the rejection at sensor gain 1" in failed
 
 
 def test_noise_in_the_sums_is_that_of_the_closed_form():

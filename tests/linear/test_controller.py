@@ -18,9 +18,8 @@ def law(**changes):
 def shaped(delay):
     slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1, delay_frames=delay)
-    spec = lbt.design.shaping.Specification(
-        objective=lbt.design.shaping.ResidualVariance(turbulence=slow, noise_nm=20.0)
-    )
+    air = lbt.design.shaping.ResidualVariance(turbulence=slow, noise_nm=20.0)
+    spec = lbt.design.shaping.Specification(terms=[air])
     return lbt.design.shape(path, spec, functions=8, states=None)
 
 

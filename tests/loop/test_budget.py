@@ -490,7 +490,6 @@ def test_refusals():
         (lambda: met(loop=lbt.close_loop(PATH, WILD)), UnstableLoopError, "an unstable one"),
         (lambda: met(loop=gained(8.0), sensor_gain=8.0), UnstableLoopError, "at sensor gain 8"),
         (lambda: lbt.residual_budget(LOOP, PATH), ProblemError, "expected a Truth"),
-        (lambda: lbt.design.model_integrator(PATH), ProblemError, "expected a TipTiltPlant"),
         (lambda: met(loop=LOOP.system), ProblemError, "must be a ClosedLoop"),
         (lambda: closed(example_plant(), blind=("m9",)), ProblemError, "is called 'm9'"),
         (lambda: lbt.close_loop(example_plant().hardware, FEW), ProblemError, "in a period of 4"),

@@ -100,7 +100,7 @@ def test_a_study_takes_a_method_of_the_table(leaky, tmp_path, capsys):
     study.write_text(STUDY.format(config=CONFIG, leak=-1.0))
     status, _, error = run(capsys, "study", study, "-o", tmp_path / "out2")
     assert status == 2
-    assert "controllers.own.leak_per_s must be above 0; got -1." in error
+    assert "controllers.own: leak_per_s must be above 0; got -1." in error
 
 
 def test_no_other_file_names_a_method():
@@ -119,8 +119,8 @@ def test_an_option_that_no_method_has(tmp_path, capsys):
     study.write_text(text.replace("leak_per_s: 5.0", "gama_ratio: 1.2"))
     status, _, error = run(capsys, "study", study, "-o", tmp_path / "out")
     assert status == 2
-    assert "controllers.forgetful.gama_ratio is no option of design: hinf; did you mean " in error
+    assert "controllers.forgetful: gama_ratio is no option of method hinf; did you mean " in error
     assert "gamma_ratio?" in error
     study.write_text(text.replace("leak_per_s: 5.0", "weird: 1.2"))
     _, _, error = run(capsys, "study", study, "-o", tmp_path / "out")
-    assert "known are gamma, gamma_ratio, horizon, route." in error
+    assert "known are gamma, gamma_ratio, route." in error

@@ -8,6 +8,7 @@ from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 from lbt_synth.design.certificate import Evidence
+from lbt_synth.design.result import SolverReport
 from lbt_synth.validation import set_fields
 
 
@@ -29,7 +30,7 @@ class BareDesign(lbt.Design):
 
 def bare_design(controller):
     """A design of any controller, without a loop."""
-    solver = lbt.design.SolverReport(route="riccati", status="made", iterations=0)
+    solver = SolverReport(route="riccati", status="made")
     return BareDesign(method="kalman", problem=controller, solver=solver)
 
 
@@ -48,7 +49,7 @@ def lbt_designs():
     return {
         "kalman": lbt.kalman(config.plant),
         "hinf": lbt.hinf(config.plant, gamma_ratio=1.2),
-        "integrator": lbt.design.optimal_integrator(config.hardware, config.truth),
+        "integrator": lbt.integrator(config.hardware, truth=config.truth),
         "prior": prior(15),
         "turned": turn_states(prior(3)),
     }

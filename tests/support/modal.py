@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 
 import numpy as np
+from scipy.linalg import block_diag
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
@@ -44,21 +45,54 @@ def single_plant(air, mode, lines, noise, gain, **path):
     )
 
 
-def integrator_residuals(gains, air, *, noise_nm, vibrations=None, sensor_gain=1.0, **path):
-    """Return what an integrator for each mode leaves, (n,)."""
-    return lbt.design.modal.modal_residuals(
-        lbt.design.modal.MixedController(gains=gains),
-        air,
-        noise_nm=noise_nm,
-        vibrations=vibrations,
-        hardware=lbt.LoopHardware(**({"frame_rate_hz": RATE} | path)),
-        sensor_gain=sensor_gain,
+def path_of(**options):
+    """Return the loop of modes that have a unit sensor."""
+    return lbt.LoopHardware(**({"frame_rate_hz": RATE} | options))
+
+
+def integrator_residuals(gains, air, *, noise_nm, hardware=None, vibrations=None, **conditions):
+    """Return what an integrator for each mode leaves in the image, (n,), nan if unstable."""
+    path, n = (hardware or path_of()).single_mode(), len(gains)
+    lines = {mode: np.atleast_1d(some).tolist() for mode, some in (vibrations or {}).items()}
+    nothing = lbt.Vibration(frequency_hz=20, damping=0.5, rms_nm=1e-9)
+    moving = []
+    for i in range(max(map(len, lines.values()), default=0)):
+        each = [some[i] if len(some := lines.get(mode, [])) > i else nothing for mode in range(n)]
+        frequency_hz = np.array([line.frequency_hz for line in each])
+        moving.append(
+            lbt.loop.EnsembleVibration(
+                frequency_hz=frequency_hz,
+                rms_nm=[line.rms_nm for line in each] / np.sinc(frequency_hz * path.dt_s),
+                damping=[line.damping for line in each],
+                direction=(1.0,),
+            )
+        )
+    ensemble = lbt.loop.LoopEnsemble(
+        loops=n,
+        turbulence=[air],
+        noise_nm=np.broadcast_to(noise_nm, n)[:, None],
+        vibrations=tuple(moving),
+        **conditions,
+    )
+    controllers = [lbt.Controller(A=1.0, B=g, C=1.0, D=0.0, dt_s=path.dt_s) for g in gains]
+    return lbt.loop.ensemble_residuals(controllers, path, ensemble).rms_nm
+
+
+def joint_controller(parts, n):
+    """Return controllers of some modes each as one linear controller of all."""
+    parts = [(np.eye(n)[list(modes)], controller) for modes, controller in parts]
+    return lbt.Controller(
+        A=block_diag(*(k.A for _, k in parts)),
+        B=np.vstack([k.B @ chosen for chosen, k in parts]),
+        C=np.hstack([chosen.T @ k.C for chosen, k in parts]),
+        D=sum(chosen.T @ k.D @ chosen for chosen, k in parts),
+        dt_s=1 / RATE,
     )
 
 
-def integrator_run(gains, total, noise, *, sensor_gain=1.0, **path):
+def integrator_run(gains, total, noise, *, sensor_gain=1.0, hardware=None):
     """Return measurements and commands, (frames, n) each, of an integrator for each mode."""
-    hardware = lbt.LoopHardware(**({"frame_rate_hz": RATE, "modes": 1} | path))
+    hardware = (hardware or path_of()).single_mode()
     sensor_gains = np.broadcast_to(sensor_gain, len(total))
     runs = [
         lbt.simulate(

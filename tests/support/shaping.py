@@ -20,13 +20,26 @@ def channel(size=12, pole=0.6, delay=2.0):
     return Channel(hardware=path, basis=laguerre_basis(size, pole, dt_s=1 / RATE))
 
 
-def spec(*demands, objective=BASIC):
-    return lbt.design.shaping.Specification(objective=objective, demands=demands)
+def margin(at_least):
+    """Return the demand of a modulus margin."""
+    return lbt.design.shaping.Bound(response="rejection", at_most=1 / at_least)
 
 
-def shaped(*demands, objective=BASIC, path=ONE, functions=20, states=None, **options):
-    """Return the design of a loop for an objective and demands."""
-    specification = spec(*demands, objective=objective)
+def attenuation(low_hz, high_hz, at_most, sensor_gain=1.0):
+    """Return the demand of a rejection in a band."""
+    ends = {"low_hz": low_hz, "high_hz": high_hz}
+    return lbt.design.shaping.Bound(
+        response="rejection", at_most=at_most, sensor_gain=sensor_gain, **ends
+    )
+
+
+def spec(*demands, terms=(BASIC,)):
+    return lbt.design.shaping.Specification(terms=terms, demands=demands)
+
+
+def shaped(*demands, terms=(BASIC,), path=ONE, functions=20, states=None, **options):
+    """Return the design of a loop for terms and demands."""
+    specification = spec(*demands, terms=terms)
     return lbt.design.shape(path, specification, functions=functions, states=states, **options)
 
 
@@ -38,14 +51,12 @@ def random_coefficients(size, seed=0):
 def shaped_design():
     """A shaped design of few states."""
     demands = (
-        lbt.design.shaping.ModulusMargin(at_least=0.5),
+        margin(0.5),
         lbt.design.shaping.CommandRms(at_most_nm=200, turbulence=SLOW, noise_nm=NOISE, rate=True),
     )
     table = lbt.models.TabulatedSpectrum(frequency_hz=[1, 10, 100], density_nm2_hz=[500, 20, 0.1])
-    objective = lbt.design.shaping.Total(
-        terms=(
-            lbt.design.shaping.ResidualVariance(turbulence=table, noise_nm=NOISE),
-            lbt.design.shaping.VibrationBand(low_hz=9, high_hz=11, rms_nm=50),
-        )
+    terms = (
+        lbt.design.shaping.ResidualVariance(turbulence=table, noise_nm=NOISE),
+        lbt.design.shaping.VibrationBand(low_hz=9, high_hz=11, rms_nm=50),
     )
-    return lbt.design.shape(ONE, spec(*demands, objective=objective), functions=16, states=10)
+    return lbt.design.shape(ONE, spec(*demands, terms=terms), functions=16, states=10)

@@ -21,6 +21,7 @@ FAULTS = {  # measurements and commands of the wrong record, and its repair
     "a tenth": (lambda y, u: (y, 0.1 * u), CommandRepair(scale=(10.0,))),
     "late": (lambda y, u: (y[1:], u[:-1]), CommandRepair(shift_frames=-1)),
     "early": (lambda y, u: (y[:-2], u[2:]), CommandRepair(shift_frames=2)),
+    "early, turned": (lambda y, u: (y[:-2], -u[2:]), CommandRepair(shift_frames=2, sign=(-1,))),
     "increments": (
         lambda y, u: (y, np.diff(u, axis=0, prepend=0)),
         CommandRepair(increments=True),

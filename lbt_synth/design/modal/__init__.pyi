@@ -1,9 +1,5 @@
 from .gains import modal_gains as modal_gains
 from .gains import modal_gains_from_telemetry as modal_gains_from_telemetry
 from .mixed_controller import MixedController as MixedController
-from .reconstructor import Reconstructor as Reconstructor
-from .reconstructor import project_out as project_out
-from .reconstructor import reconstructor as reconstructor
 from .stack import ModalFilters as ModalFilters
 from .stack import modal_filters as modal_filters
-from .stack import modal_residuals as modal_residuals

@@ -24,14 +24,14 @@ from numpy.typing import ArrayLike
 from scipy.signal import welch
 from scipy.special import comb
 
-from lbt_synth.design.integrator import PURE, TRIED_GAINS, hardware_gain_limit
+from lbt_synth.design.integrator import PURE, TRIED_GAINS, integrator_gain_limit
 from lbt_synth.design.modal.stack import Vibrations, lines_per_mode, number_per_mode
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels, graded_edges
 from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.ensemble import textbook_matrices
 from lbt_synth.loop.stacks import close_loops, stack_evaluator
-from lbt_synth.models import ARModel, LoopHardware, PositionLoop, Spectrum
+from lbt_synth.models import ARModel, LoopHardware, Spectrum
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.validation import (
@@ -41,6 +41,7 @@ from lbt_synth.validation import (
     number,
     read_only,
     real_array,
+    require_instance,
 )
 
 Density = Callable[[FloatArray], FloatArray]
@@ -70,19 +71,16 @@ class ModalGains:
     limit: FloatArray
     limited: BoolArray  # (n,): whether the gain is at that limit
     noise_nm: FloatArray  # (n,): measurement noise that was given or found [nm]
-    hardware: LoopHardware  # loop of one mode, with delay, mirror and frame rate
 
 
 def modal_gains(
     spectra: ARModel | Sequence[Spectrum],
     *,
+    hardware: LoopHardware,
     noise_nm: ArrayLike,
-    frame_rate_hz: float,
     vibrations: Vibrations | None = None,
-    delay_frames: float = 2.0,
     sensor_gain: ArrayLike = 1.0,
     margin: float = 0.001,
-    mirror: PositionLoop | None = None,
 ) -> ModalGains:
     """Find the integrator gain of least residual for every mode, from spectra.
 
@@ -90,22 +88,17 @@ def modal_gains(
     ----------
     spectra : ARModel or sequence of Spectrum
         Spectrum of each mode's phase: models, an Atmosphere, tables.
+    hardware : LoopHardware
+        Delay, mirror and frame rate of all modes; its matrices play no part.
     noise_nm : float or (n,) array_like
         Measurement noise of each mode per frame [nm], at least 0.
-    frame_rate_hz : float
-        Frame rate [Hz].
     vibrations : mapping of int to Vibration or list of them, optional
         Vibrations of some modes, as means over frames; their directions play no part.
-    delay_frames : float, optional
-        Total delay [frames], at least 1, fractions allowed.
     sensor_gain : float or (n,) array_like, optional
         Sensor (optical) gain of each mode, known.
     margin : float, optional
         Distance from the stability limit as a part of it: gains are at most ``(1 - margin)``
-        times :func:`integrator_gain_limit` (or the limit with the mirror's dynamics), and that
-        over a sensor gain above 1.
-    mirror : PositionLoop, optional
-        Dynamics of the mirror, the same for all modes; one that settles at once by default.
+        times :func:`integrator_gain_limit`, and that over a sensor gain above 1.
 
     Returns
     -------
@@ -126,13 +119,12 @@ def modal_gains(
     ...     seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22
     ... )
     >>> modes = lbt.models.modal_turbulence(air, modes=100, frame_rate_hz=800)
-    >>> found = lbt.design.modal.modal_gains(modes, noise_nm=15.5, frame_rate_hz=800)
-    >>> found.gains[[0, 50, 99]].round(3).tolist()
+    >>> path = lbt.LoopHardware(frame_rate_hz=800)
+    >>> best = lbt.design.modal.modal_gains(modes, hardware=path, noise_nm=15.5)
+    >>> best.gains[[0, 50, 99]].round(3).tolist()
     [0.456, 0.304, 0.212]
     """
-    path = LoopHardware(
-        frame_rate_hz=frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
-    )
+    path = require_instance(hardware, LoopHardware, "hardware").single_mode()
     rate = path.frame_rate_hz
     densities, count, edges = _spectra_per_mode(spectra, path)
     lines = lines_per_mode(vibrations, count)
@@ -145,8 +137,8 @@ def modal_gains(
         return out
 
     edges += [_model_edges(model) for _, model in models]
-    noise = number_per_mode(noise_nm, "noise_nm", count, zero=True)
-    gain = number_per_mode(sensor_gain, "sensor_gain", count)
+    noise = number_per_mode(noise_nm, "noise_nm", count, at_least=0)
+    gain = number_per_mode(sensor_gain, "sensor_gain", count, above=0)
     panels = np.concatenate(edges)
     return _find_gains(path, density, panels, noise_nm=noise, gain=gain, margin=margin)
 
@@ -155,13 +147,11 @@ def modal_gains_from_telemetry(
     measurements: ArrayLike,
     commands: ArrayLike,
     *,
-    frame_rate_hz: float,
+    hardware: LoopHardware,
     noise_nm: ArrayLike | None = None,
-    delay_frames: float = 2.0,
     sensor_gain: ArrayLike = 1.0,
     margin: float = 0.001,
     segment_frames: int = 1024,
-    mirror: PositionLoop | None = None,
 ) -> ModalGains:
     """Find the integrator gain of least residual for every mode, from a running loop.
 
@@ -173,22 +163,18 @@ def modal_gains_from_telemetry(
     ----------
     measurements, commands : (frames, n) array_like
         Modal measurements y(k) and commands u(k) [nm], one row per frame as in telemetry.
-    frame_rate_hz : float
-        Frame rate [Hz].
+    hardware : LoopHardware
+        Delay, mirror and frame rate of all modes; its matrices play no part.
     noise_nm : float or (n,) array_like, optional
         Measurement noise per frame [nm]; by default the mean of the periodogram's upper
         fifth, where there should be nothing but noise: turbulence that reaches up there makes
         the noise too large and the residuals too small, and does not change the gains.
-    delay_frames : float, optional
-        Total delay of the loop [frames], at least 1, fractions allowed.
     sensor_gain : float or (n,) array_like, optional
         Sensor (optical) gain of each mode, known.
     margin : float, optional
         Distance from the stability limit as a part of it, as for :func:`modal_gains`.
     segment_frames : int, optional
         Length of the periodogram's segments [frames], at least 16.
-    mirror : PositionLoop, optional
-        Dynamics of the mirror, the same for all modes; one that settles at once by default.
 
     Returns
     -------
@@ -224,15 +210,13 @@ def modal_gains_from_telemetry(
     ...     noise=5.0 * rng.standard_normal((20_000, 1)),
     ... )
     >>> run = lbt.simulate(lbt.integrator(path, gain=0.3), walk, hardware=path)
-    >>> found = lbt.design.modal.modal_gains_from_telemetry(
-    ...     run.measurements[0], run.commands[0], frame_rate_hz=800
+    >>> best = lbt.design.modal.modal_gains_from_telemetry(
+    ...     run.measurements[0], run.commands[0], hardware=path
     ... )
-    >>> bool(abs(found.noise_nm[0] - 5) < 0.5), bool(0.1 < found.gains[0] < 0.25)
+    >>> bool(abs(best.noise_nm[0] - 5) < 0.5), bool(0.1 < best.gains[0] < 0.25)
     (True, True)
     """
-    path = LoopHardware(
-        frame_rate_hz=frame_rate_hz, delay_frames=delay_frames, modes=1, mirror=mirror
-    )
+    path = require_instance(hardware, LoopHardware, "hardware").single_mode()
     rate, taps = path.frame_rate_hz, path.mirror_taps
     y, u = real_array(measurements, "measurements"), real_array(commands, "commands")
     if y.ndim != 2 or y.shape != u.shape or y.size == 0:
@@ -242,7 +226,7 @@ def modal_gains_from_telemetry(
     y, u = y.T, u.T
     count, frames = y.shape
     segment = integer(segment_frames, "segment_frames", at_least=16)
-    gain = number_per_mode(sensor_gain, "sensor_gain", count)
+    gain = number_per_mode(sensor_gain, "sensor_gain", count, above=0)
     first = len(taps)  # frame whose correction is known
     if frames - first <= segment:
         raise ProblemError(
@@ -263,7 +247,7 @@ def modal_gains_from_telemetry(
         quiet = frequency > _QUIET * rate
         noise = np.sqrt(np.mean(power[:, quiet] / unit[quiet], axis=1)) * gain
     else:
-        noise = number_per_mode(noise_nm, "noise_nm", count, zero=True)
+        noise = number_per_mode(noise_nm, "noise_nm", count, at_least=0)
     table = power - np.outer((noise / gain) ** 2, unit)
 
     def density(wanted: FloatArray) -> FloatArray:
@@ -343,7 +327,7 @@ def _find_gains(
     sensor's.
     """
     least, most = TRIED_GAINS
-    rate, limit = path.frame_rate_hz, hardware_gain_limit(path)
+    rate, limit = path.frame_rate_hz, integrator_gain_limit(path)
     noise_nm2 = (noise_nm / gain) ** 2
     distance = number(margin, "margin", at_least=round(1 - most, 9), below=1)
     loop_gains = np.geomspace(least, _HIGHEST, _GRID) * limit
@@ -399,7 +383,6 @@ def _find_gains(
         limit=read_only(allowed),
         limited=read_only(gains > allowed * (1 - 1e-6)),
         noise_nm=noise_nm,
-        hardware=path,
     )
 
 

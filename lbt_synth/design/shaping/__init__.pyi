@@ -1,12 +1,6 @@
-from .demands import Attenuation as Attenuation
+from .demands import Bound as Bound
 from .demands import CommandRms as CommandRms
 from .demands import LoopErrors as LoopErrors
-from .demands import MirrorUncertainty as MirrorUncertainty
-from .demands import ModulusMargin as ModulusMargin
-from .demands import MovingSensorGain as MovingSensorGain
-from .demands import NoisePeak as NoisePeak
-from .objectives import ResidualVariance as ResidualVariance
-from .objectives import Total as Total
-from .objectives import VibrationBand as VibrationBand
-from .objectives import Worst as Worst
 from .specification import Specification as Specification
+from .terms import ResidualVariance as ResidualVariance
+from .terms import VibrationBand as VibrationBand

@@ -154,18 +154,19 @@ class Channel:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SingleModeLoop:
-    """A controller of one mode in its loop, at any sensor gain."""
+    """What a loop does to one mode, at any sensor gain: of a controller that couples no modes."""
 
-    hardware: LoopHardware
+    hardware: LoopHardware  # of all modes
     controller: Controller
+    mode: int = 0
     in_frames: bool = False  # whether its outputs stand for frames, and not for holds
     _loops: dict[float, ClosedLoop] = field(default_factory=dict)
 
     def at(self, sensor_gain: float) -> ClosedLoop:
-        """Return the loop at a sensor gain."""
+        """Return the loop of the mode at a sensor gain, with a unit sensor and influence."""
         if sensor_gain not in self._loops:
             loop = close_loop(self.hardware, self.controller, sensor_gain=sensor_gain)
-            self._loops[sensor_gain] = loop
+            self._loops[sensor_gain] = mode_of(loop, self.mode)
         return self._loops[sensor_gain]
 
     def held(self, sensor_gain: float) -> ClosedLoop:
@@ -175,21 +176,29 @@ class SingleModeLoop:
         return replace(loop, system=_held_system(loop, late)) if late else loop
 
     @property
-    def sensitivity(self) -> StateSpace:
-        """S at unit sensor gain."""
-        return self.at(1.0).output_sensitivity()
-
-    @property
     def parameter(self) -> StateSpace:
         """The Youla parameter: from the noise to the command at unit sensor gain."""
-        commanding, modes = self.at(1.0).commanding(), self.hardware.modes
-        return replace(commanding, B=commanding.B[:, modes:], D=commanding.D[:, modes:])
+        commanding = self.at(1.0).commanding()
+        return replace(commanding, B=commanding.B[:, 1:], D=commanding.D[:, 1:])
 
-    @property
-    def complementary(self) -> StateSpace:
-        """``T = 1 - S`` at unit sensor gain."""
-        s = self.sensitivity
+    def complementary(self, sensor_gain: float = 1.0) -> StateSpace:
+        """Return ``T = 1 - S`` at a sensor gain."""
+        s = self.at(sensor_gain).rejection()
         return replace(s, C=-s.C, D=1 - s.D)
+
+
+def mode_of(loop: ClosedLoop, mode: int) -> ClosedLoop:
+    """Return what a loop does to one mode: noise enters as the mode's own sensor."""
+    hardware, s, n = loop.hardware, loop.system, loop.hardware.modes
+    if all(np.array_equal(matrix, [[1.0]]) for matrix in (hardware.sensor, hardware.influence)):
+        return loop
+    noise, row = hardware.sensor[:, mode], np.zeros((3, len(s.C)))
+    row[0, mode] = 1.0
+    row[1, n : n + hardware.n_commands] = hardware.influence[mode]
+    row[2, n + hardware.n_commands :] = np.linalg.pinv(hardware.sensor)[mode]
+    B, D = (np.stack([M[:, mode], M[:, n:] @ noise], axis=1) for M in (s.B, s.D))
+    system = replace(s, B=B, C=row @ s.C, D=row @ D)
+    return replace(loop, system=system, hardware=hardware.single_mode())
 
 
 def held_fraction(hardware: LoopHardware) -> float:

@@ -7,157 +7,123 @@ the real loop over all frequencies, which know nothing of the programme.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 
 from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.channel import Channel, SingleModeLoop
-from lbt_synth.design.shaping.frequencies import (
-    LEVEL_SETS,
-    ROOM,
-    Band,
-    CheckedFields,
-    Grid,
-    discs,
-    spectrum_edges,
-)
-from lbt_synth.design.shaping.objectives import ResidualVariance
+from lbt_synth.design.shaping.frequencies import ROOM, Grid, band_text, discs, spectrum_edges
+from lbt_synth.design.shaping.terms import ResidualVariance
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import hinf_norm
 from lbt_synth.linear.convex_functions import Constraint, Fractions, FunctionBound, HalfPlanes
-from lbt_synth.linear.norms import largest_real_part
+from lbt_synth.linear.norms import band_norm, largest_real_part
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.budget import resonance_edges
 from lbt_synth.loop.stable_range import (
     CIRCLE_LIMIT,
     LoopChange,
     append_taps,
-    circle_norm,
     loop_changes,
 )
 from lbt_synth.models import LoopHardware, Spectrum
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.validation import FloatArray, Positive, set_fields
+from lbt_synth.validation import (
+    FloatArray,
+    NotNegative,
+    Positive,
+    check_fields,
+    choice,
+    number,
+    set_fields,
+)
 
+LEVEL_SETS = "level sets, all frequencies"
+_REJECTION = "rejection"
+_RESPONSES = {
+    _REJECTION: "rejection",
+    "noise": "amplification of noise",
+    "complementary": "complementary sensitivity",
+}
 _HOLDS_ONE = "The range must hold 1, the gain that is designed for; set model.sensor_gain."
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ModulusMargin(CheckedFields):
-    """Least distance of the loop from instability, ``1 / max |S|``, at unit sensor gain.
+class Bound:
+    """Bound on a response of the loop, over a band or at all frequencies.
+
+    A modulus margin m is a bound of 1 / m on the rejection at all frequencies. Stability for every
+    unmodelled relative error of the mirror's response below r is a bound of 1 / r on T.
 
     Parameters
     ----------
-    at_least : float
-        The margin, in (0, 1).
-
-    Raises
-    ------
-    ProblemError
-        If it is out of its range.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lbt.design.shaping.ModulusMargin(at_least=0.45).label
-    'modulus margin of at least 0.45'
-    """
-
-    _label: ClassVar = "modulus margin of at least {0.at_least:g}"
-    at_least: Annotated[float, ("above", 0), ("below", 1)]
-
-    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
-        """Return the convex constraints at the points of a grid."""
-        f = grid.points_hz
-        return (discs(f, -channel.complementary_rows(f), 1.0, (1 - ROOM) / self.at_least),)
-
-    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
-        """Check the real loop."""
-        peak = hinf_norm(loop.sensitivity).upper
-        return (Check("peak of the sensitivity", peak, 1 / self.at_least, LEVEL_SETS),)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NoisePeak(CheckedFields):
-    """Largest amplification of measurement noise into the residual, at any frequency.
-
-    Parameters
-    ----------
+    response : {"rejection", "noise", "complementary"}
+        The residual of a unit disturbance, ``S``; that of a unit of measurement noise; or the
+        complementary sensitivity ``T``.
     at_most : float
-        The amplification at unit sensor gain.
-
-    Raises
-    ------
-    ProblemError
-        If it is not positive.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lbt.design.shaping.NoisePeak(at_most=2).at_most
-    2.0
-    """
-
-    _label: ClassVar = "noise amplified by at most {0.at_most:g}"
-    at_most: Positive
-
-    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
-        """Return the convex constraints at the points of a grid."""
-        f = grid.points_hz
-        return (discs(f, channel.noise_rows(f), 0.0, (1 - ROOM) * self.at_most),)
-
-    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
-        """Check the real loop."""
-        peak = hinf_norm(loop.at(1.0).noise_propagation()).upper
-        return (Check("peak of the noise transfer", peak, self.at_most, LEVEL_SETS),)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Attenuation(Band):
-    """Bound on the rejection over a band: one step of a mask.
-
-    Exact at any sensor gain g: ``|1 - T| <= a |1 - (1 - g) T|`` is a disc of T for
-    ``a |1 - g| < 1``.
-
-    Parameters
-    ----------
-    low_hz, high_hz : float
-        Ends of the band [Hz].
-    at_most : float
-        Largest residual for a unit disturbance.
+        Largest modulus of the response.
+    low_hz, high_hz : float, optional
+        Ends of a band [Hz]; all frequencies without ``high_hz``.
     sensor_gain : float, optional
-        Sensor gain at which it holds.
+        Sensor gain at which a rejection is bounded; the other two are at 1.
 
     Raises
     ------
     ProblemError
         If a value is out of its range, or the bound is too loose to be convex at this gain.
 
+    Notes
+    -----
+    The rejection is exact at any sensor gain g: ``|1 - T| <= a |1 - (1 - g) T|`` is a disc of T for
+    ``a |1 - g| < 1``.
+
     Examples
     --------
     >>> import lbt_synth as lbt
-    >>> lbt.design.shaping.Attenuation(low_hz=0, high_hz=2, at_most=0.01).label
-    'attenuation to 0.01 in 0-2 Hz at sensor gain 1'
+    >>> lbt.design.shaping.Bound(response="rejection", low_hz=0, high_hz=2, at_most=0.01).label
+    'rejection of at most 0.01 in 0-2 Hz at sensor gain 1'
     """
 
-    _label: ClassVar = (
-        "attenuation to {0.at_most:g} in {0.band_text} at sensor gain {0.sensor_gain:g}"
-    )
+    response: str
     at_most: Positive
+    low_hz: NotNegative = 0.0
+    high_hz: float | None = None
     sensor_gain: Positive = 1.0
 
     def __post_init__(self) -> None:
-        Band.__post_init__(self)
-        if not self.at_most * abs(1 - self.sensor_gain) < 1:
+        choice(self.response, "response", tuple(_RESPONSES))
+        check_fields(self)
+        if self.high_hz is not None:
+            set_fields(self, high_hz=number(self.high_hz, "high_hz", above=self.low_hz))
+        rest = abs(1 - self.sensor_gain)
+        if rest and self.response != _REJECTION:
             raise ProblemError(
-                f"at_most must be below {1 / abs(1 - self.sensor_gain):.6g} at sensor gain "
-                f"{self.sensor_gain:g}, where it is no convex bound; got {self.at_most:g}."
+                f"a bound on {self.response} is at sensor gain 1; got {self.sensor_gain:g}."
             )
+        if not self.at_most * rest < 1:
+            raise ProblemError(
+                f"at_most must be below {1 / rest:.6g} at sensor gain {self.sensor_gain:g}, where "
+                f"it is no convex bound; got {self.at_most:g}."
+            )
+
+    @property
+    def label(self) -> str:
+        """What tables and messages call it."""
+        words = f"{_RESPONSES[self.response]} of at most {self.at_most:.4g}"
+        if self.high_hz is not None:
+            words += f" in {band_text(self.low_hz, self.high_hz)}"
+        elif self.response == _REJECTION and self.sensor_gain == 1:
+            return f"modulus margin of at least {1 / self.at_most:.4g}"
+        return words + f" at sensor gain {self.sensor_gain:g}" * (self.response == _REJECTION)
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
-        f = grid.within(self.low_hz, self.high_hz)
+        f = grid.points_hz if self.high_hz is None else grid.within(self.low_hz, self.high_hz)
+        if self.response != _REJECTION:
+            noise = self.response == "noise"
+            rows = channel.noise_rows(f) if noise else channel.complementary_rows(f)
+            return (discs(f, rows, 0.0, (1 - ROOM) * self.at_most),)
         rest = 1 - self.sensor_gain
         # near the edge of convexity a small part of the disc's radius is a large one of the bound
         stretch = (1 + self.at_most * abs(rest)) / (1 - self.at_most * abs(rest))
@@ -168,14 +134,21 @@ class Attenuation(Band):
         return (discs(f, -channel.complementary_rows(f), centre, radius),)
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
-        """Check the real loop."""
-        name = f"rejection in {self.band_text} at sensor gain {self.sensor_gain:g}"
-        peak = self.peak(loop.at(self.sensor_gain).rejection())
-        return (self.check(name, peak, self.at_most),)
+        """Check the real loop, by level sets."""
+        closed, name = loop.at(self.sensor_gain), f"peak of the {self.response}"
+        responses = {"rejection": closed.rejection, "noise": closed.noise_propagation}
+        system = responses.get(self.response, loop.complementary)()
+        if self.high_hz is None:
+            peak = hinf_norm(system).upper
+        else:
+            name += f" in {band_text(self.low_hz, self.high_hz)}"
+            peak = band_norm(system, self.low_hz, self.high_hz).upper
+        name += f" at sensor gain {self.sensor_gain:g}" * (self.response == _REJECTION)
+        return (Check(name, peak, self.at_most, LEVEL_SETS),)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CommandRms(CheckedFields):
+class CommandRms:
     """Bound on the stroke or on the step of the commands, under turbulence and noise.
 
     Parameters
@@ -204,19 +177,27 @@ class CommandRms(CheckedFields):
     'command step of at most 30 nm rms'
     """
 
-    _label: ClassVar = "command {0._what} of at most {0._shown_limit}"
     at_most_nm: Positive
     turbulence: Spectrum | None
     noise_nm: float
     rate: bool = False
 
     def __post_init__(self) -> None:
-        CheckedFields.__post_init__(self)
+        check_fields(self)
         if not isinstance(self.rate, bool):
             raise ProblemError(f"rate must be True or False; got {self.rate!r}.")
         # the same disturbances as those of a variance
         disturbance = ResidualVariance(turbulence=self.turbulence, noise_nm=self.noise_nm)
         set_fields(self, noise_nm=disturbance.noise_nm)
+
+    @property
+    def label(self) -> str:
+        """What tables and messages call it."""
+        return f"command {self._what} of at most {nm_text(self.at_most_nm, 'g', unit='nm rms')}"
+
+    @property
+    def _what(self) -> str:
+        return "step" if self.rate else "stroke"
 
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints over the nodes of a grid."""
@@ -242,14 +223,6 @@ class CommandRms(CheckedFields):
         name = f"rms of the command {self._what} over its bound"
         return (Check(name, share, 1.0, "adaptive quadrature"),)
 
-    @property
-    def _shown_limit(self) -> str:
-        return nm_text(self.at_most_nm, "g", unit="nm rms")
-
-    @property
-    def _what(self) -> str:
-        return "step" if self.rate else "stroke"
-
     def _density(self, f: FloatArray, nyquist_hz: float, dt_s: float) -> FloatArray:
         """Spectrum of what drives Q, and of its steps where those are bounded [nm^2/Hz]."""
         density = np.full(f.size, self.noise_nm**2 / nyquist_hz)
@@ -259,8 +232,10 @@ class CommandRms(CheckedFields):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LoopErrors(CheckedFields):
+class LoopErrors:
     """Guaranteed stability for every sensor gain of an interval and every delay error, together.
+
+    The gain stays, or moves at any speed while the delay is right.
 
     With the mirror's response ``M_d`` at a delay d, the loop is stable at the gain g and the delay
     ``d + e`` while ``1 + z^-1 (g M_(d+e) - M_d) Q`` does not vanish: its real part is kept above
@@ -268,18 +243,25 @@ class LoopErrors(CheckedFields):
     response is piecewise linear in e; so the ends of both intervals and the whole delays between
     stand for all loops. A delay below one frame does not occur.
 
+    For a gain that moves, with ``a = high - 1`` and ``b = 1 - low``, one Lyapunov function for all
+    gains exists if and only if ``|T - (a - b) / (2 a b)| < (a + b) / (2 a b)`` at all frequencies
+    (the circle criterion): convex in T, so nothing is lost. At an end of 1 the disc is the
+    half-plane of a gain that stays.
+
     Parameters
     ----------
     low, high : float, optional
         Ends of the interval of gains, around 1 (the gain that is designed for).
     delay_frames : float, optional
         Largest error of the delay, late or early [frames], at most 1.
+    moving : bool, optional
+        Whether the gain may move in its interval, at any speed.
 
     Raises
     ------
     ProblemError
-        If the interval does not hold 1, or is not positive, or nothing is uncertain; in a design
-        with an error of the delay, if the mirror has dynamics.
+        If the interval does not hold 1, or is not positive, nothing is uncertain, or a gain moves
+        without an interval; in a design with an error of the delay, if the mirror has dynamics.
 
     Examples
     --------
@@ -291,23 +273,36 @@ class LoopErrors(CheckedFields):
     low: Annotated[float, ("above", 0), ("at_most", 1), ("hint", _HOLDS_ONE)] = 1.0
     high: Annotated[float, ("at_least", 1), ("hint", _HOLDS_ONE)] = 1.0
     delay_frames: Annotated[float, ("at_least", 0), ("at_most", 1)] = 0.0
+    moving: bool = False
 
     def __post_init__(self) -> None:
-        CheckedFields.__post_init__(self)
-        if self.low == self.high and not self.delay_frames:
+        check_fields(self)
+        if self.low == self.high and (self.moving or not self.delay_frames):
             raise ProblemError(
-                "loop errors need an interval of gains, or an error of the delay; got neither."
+                "loop errors need an interval of gains, in which a gain may move, or an error of "
+                "the delay; got neither."
             )
 
     @property
     def label(self) -> str:
         """What is demanded, in words."""
-        gains = f"sensor gains {self.low:g} to {self.high:g}" * (self.low < self.high)
+        kind = "moving sensor gains" if self.moving else "sensor gains"
+        gains = f"{kind} {self.low:g} to {self.high:g}" * (self.low < self.high)
         late = f"delay errors up to {self.delay_frames:g} frames" * (self.delay_frames > 0)
         return f"stability for {' and '.join(text for text in (gains, late) if text)}"
 
+    @property
+    def _disc(self) -> tuple[float, float] | None:
+        """Centre and radius of the disc for T of a gain that moves to both sides, else None."""
+        a, b = self.high - 1, 1 - self.low
+        if not (self.moving and a > 0 and b > 0):
+            return None
+        return (a - b) / (2 * a * b), (a + b) / (2 * a * b)
+
     def _changes(self, hardware: LoopHardware) -> list[LoopChange]:
-        """Return the loops that stand for all."""
+        """Return the loops that stand for all whose gain and delay stay."""
+        if self._disc is not None and not self.delay_frames:
+            return []
         if self.delay_frames and hardware.mirror is not None:
             raise ProblemError(
                 "a bound for all delay errors needs a mirror that settles at once, whose response "
@@ -319,19 +314,21 @@ class LoopErrors(CheckedFields):
     def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
         """Return the convex constraints at the points of a grid."""
         f = grid.points_hz
-        rows = channel.command_rows(f)
-        changes = [taps for *_, taps in self._changes(channel.hardware)]
+        rows, bounds = channel.command_rows(f), np.full(f.size, 1 - ROOM)
         turns = np.exp(-2j * np.pi * f * channel.hardware.dt_s)[:, None]
-        powers = turns ** np.arange(max(taps.size for taps in changes))
-        bounds = np.full(f.size, 1 - ROOM)
-        responses = ((powers[:, : taps.size] @ taps)[:, None] * rows for taps in changes)
-        return tuple(
-            HalfPlanes(frequency_hz=f, rows=response.real, bounds=bounds) for response in responses
-        )
+        constraints: list[Constraint] = []
+        for *_, taps in self._changes(channel.hardware):
+            response = (turns ** np.arange(taps.size) @ taps)[:, None] * rows
+            constraints.append(HalfPlanes(frequency_hz=f, rows=response.real, bounds=bounds))
+        if self._disc is not None:
+            centre, radius = self._disc
+            rows = channel.complementary_rows(f)
+            constraints.append(discs(f, rows, -centre, (1 - ROOM) * radius))
+        return tuple(constraints)
 
     def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
         """Check the real loop, over all frequencies."""
-        return tuple(
+        checks = [
             Check(
                 f"loop change by a sensor gain of {gain:g} and a delay of {delay_frames:g} frames",
                 largest_real_part(append_taps(loop.parameter, taps)),
@@ -339,104 +336,15 @@ class LoopErrors(CheckedFields):
                 LEVEL_SETS,
             )
             for gain, delay_frames, taps in self._changes(loop.hardware)
-        )
+        ]
+        if self.moving:
+            middle, value = (self.low + self.high) / 2, np.inf
+            if loop.at(middle).is_stable:
+                peak = hinf_norm(loop.complementary(middle)).upper
+                value = (self.high - self.low) / (2 * middle) * peak
+            name = f"circle criterion of a moving gain, {self.low:g} to {self.high:g}"
+            checks.append(Check(name, value, CIRCLE_LIMIT, LEVEL_SETS))
+        return tuple(checks)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MovingSensorGain(CheckedFields):
-    """Guaranteed stability for a sensor gain that moves in an interval, at any speed.
-
-    With ``a = high - 1`` and ``b = 1 - low``, one Lyapunov function for all gains exists if and
-    only if ``|T - (a - b) / (2 a b)| < (a + b) / (2 a b)`` at all frequencies (the circle
-    criterion): convex in T, so nothing is lost. At an end of 1 the disc is a half-plane.
-
-    Parameters
-    ----------
-    low, high : float
-        Ends of the interval, around 1 (the gain that is designed for).
-
-    Raises
-    ------
-    ProblemError
-        If the interval does not hold 1, or is not positive.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lbt.design.shaping.MovingSensorGain(low=0.25, high=1.3).label
-    'stability while the sensor gain moves in 0.25 to 1.3'
-    """
-
-    _label: ClassVar = "stability while the sensor gain moves in {0.low:g} to {0.high:g}"
-
-    low: Annotated[float, ("above", 0), ("at_most", 1), ("hint", _HOLDS_ONE)]
-    high: Annotated[float, ("at_least", 1), ("hint", _HOLDS_ONE)]
-
-    def _disc(self) -> tuple[float, float] | None:
-        """Return centre and radius of the disc for T; None for a half-plane."""
-        a, b = self.high - 1, 1 - self.low
-        return ((a - b) / (2 * a * b), (a + b) / (2 * a * b)) if a > 0 and b > 0 else None
-
-    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
-        """Return the convex constraints at the points of a grid."""
-        disc, f = self._disc(), grid.points_hz
-        if disc is None:
-            return LoopErrors(low=self.low, high=self.high).constraints(channel, grid)
-        return (discs(f, channel.complementary_rows(f), -disc[0], (1 - ROOM) * disc[1]),)
-
-    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
-        """Check the real loop by the norm at the middle of the interval."""
-        value = circle_norm(loop.at(1.0), low=self.low, high=self.high)
-        name = f"circle criterion of a moving gain, {self.low:g} to {self.high:g}"
-        return (Check(name, value, CIRCLE_LIMIT, LEVEL_SETS),)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MirrorUncertainty(Band):
-    """Guaranteed stability for any unmodelled mirror dynamics below a relative size.
-
-    The mirror's response is ``M (1 + delta)`` with ``|delta| <= relative`` in the band (and
-    stable): the loop stays stable while ``relative |T| < 1`` there. Give one for each band.
-
-    Parameters
-    ----------
-    relative : float
-        Largest relative error of the response.
-    low_hz, high_hz : float
-        Ends of the band [Hz]; up to the Nyquist frequency for all that lies above.
-
-    Raises
-    ------
-    ProblemError
-        If a value is out of its range.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> lbt.design.shaping.MirrorUncertainty(relative=0.5, low_hz=150, high_hz=400).relative
-    0.5
-    """
-
-    _label: ClassVar = "stability for mirror errors of {0.relative:g} in {0.band_text}"
-    relative: Positive
-
-    def constraints(self, channel: Channel, grid: Grid) -> tuple[Constraint, ...]:
-        """Return the convex constraints at the points of a grid."""
-        f = grid.within(self.low_hz, self.high_hz)
-        return (discs(f, channel.complementary_rows(f), 0.0, (1 - ROOM) / self.relative),)
-
-    def checks(self, loop: SingleModeLoop) -> tuple[Check, ...]:
-        """Check the real loop."""
-        name = f"|T| in {self.band_text} times the mirror's error"
-        return (self.check(name, self.relative * self.peak(loop.complementary), 1.0),)
-
-
-Demand: TypeAlias = (
-    ModulusMargin
-    | NoisePeak
-    | Attenuation
-    | CommandRms
-    | LoopErrors
-    | MovingSensorGain
-    | MirrorUncertainty
-)
+Demand: TypeAlias = Bound | CommandRms | LoopErrors

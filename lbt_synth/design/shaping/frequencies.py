@@ -2,73 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
-from lbt_synth.design.certificate import Check
 from lbt_synth.design.shaping.channel import Channel
-from lbt_synth.linear import StateSpace
 from lbt_synth.linear.convex_functions import Discs
-from lbt_synth.linear.norms import band_norm
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models import ARModel, Spectrum
 from lbt_synth.models.spectra import breakpoints_below
-from lbt_synth.validation import ComplexArray, Finite, FloatArray, NotNegative, check_fields, number
+from lbt_synth.validation import ComplexArray, FloatArray
 
 ROOM = 1e-3  # part of a bound that the programme leaves for what lies between its points
-LEVEL_SETS = "level sets, all frequencies"
 _ORDER = 5
 _BAND_POINTS = 15
 _MOST_EDGES = 400
 
 
-class CheckedFields:
-    """Base of terms and demands, whose field types hold the bounds of their numbers."""
-
-    __slots__ = ()
-    _label: ClassVar = ""  # format of the label, of the object
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-
-    @property
-    def label(self) -> str:
-        """What tables and messages call it."""
-        return self._label.format(self)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Band(CheckedFields):
-    """Band from ``low_hz`` to ``high_hz``, both included, from which terms and demands derive."""
-
-    low_hz: NotNegative
-    high_hz: Finite
-
-    def __post_init__(self) -> None:
-        CheckedFields.__post_init__(self)
-        number(self.high_hz, "high_hz", above=self.low_hz)
-
-    @property
-    def band_text(self) -> str:
-        """The band in words."""
-        return f"{self.low_hz:g}-{self.high_hz:g} Hz"
-
-    def peak(self, system: StateSpace) -> float:
-        """Return an upper bound of a system's largest gain in the band, by level sets."""
-        return band_norm(system, self.low_hz, self.high_hz).upper
-
-    def check(self, name: str, peak: float, limit: float) -> Check:
-        """Return the check of a peak in the band."""
-        return Check(name, peak, limit, "level sets, all of the band")
-
-
-def distinct_bands(parts: Iterable[object]) -> tuple[tuple[float, float], ...]:
-    """Return the different bands (low, high) of terms and demands, in order [Hz]."""
-    bands = [part for part in parts if isinstance(part, Band)]
-    return tuple(dict.fromkeys((band.low_hz, band.high_hz) for band in bands))
+def band_text(low_hz: float, high_hz: float) -> str:
+    """Return a band in words."""
+    return f"{low_hz:g}-{high_hz:g} Hz"
 
 
 def discs(frequency_hz: FloatArray, rows: ComplexArray, centre: float, radius: float) -> Discs:

@@ -9,8 +9,8 @@ import numpy as np
 
 from lbt_synth.design.shaping.channel import Channel, mode_loop
 from lbt_synth.design.shaping.frequencies import ROOM, Grid, fine_frequencies
-from lbt_synth.design.shaping.objectives import frequency_costs, noise_level
 from lbt_synth.design.shaping.specification import Specification
+from lbt_synth.design.shaping.terms import frequency_costs, noise_level
 from lbt_synth.errors import InfeasibleError, NumericalError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import (
@@ -19,8 +19,8 @@ from lbt_synth.linear.convex_functions import (
     Function,
     HalfPlanes,
     is_convex,
-    leaf_fractions,
     merge_constraints,
+    total_value,
     without_denominators,
 )
 from lbt_synth.validation import FloatArray
@@ -44,7 +44,6 @@ class ModeSolution:
     grid: Grid  # of the last programme
     coefficients: FloatArray  # (n,)
     objectives_nm2: tuple[float, ...]  # at the optimum for unit gain, and after each programme
-    programmes: int  # number of them
     status: str  # what the solver said of the last programme
     objective_nm: float  # root of the objective in the real loop
 
@@ -70,7 +69,7 @@ def solve_mode(
         programme = _Programme(spec, channel, fineness)
         c, values = _minimise(programme, start)
         loop = mode_loop(channel.hardware, channel.basis.parameter(c))
-        exact = spec.objective.measured_nm2(loop)
+        exact = spec.measured_nm2(loop)
         miss = abs(values[-1] - exact) / max(exact, _NOTHING_NM2)
         if miss < _MISS and all(check.passed for check in spec.checks(loop)):
             return ModeSolution(
@@ -78,7 +77,6 @@ def solve_mode(
                 grid=programme.grid,
                 coefficients=c,
                 objectives_nm2=tuple(values),
-                programmes=programme.solved,
                 status=programme.status,
                 objective_nm=float(np.sqrt(exact)),
             )
@@ -97,7 +95,7 @@ def _minimise(programme: _Programme, start: FloatArray | None) -> tuple[FloatArr
     if not convex and start is not None and programme.is_stable(start):
         return _lower_objective(programme, start, [])
     c = _minimize_at_unit_gain(programme, convex=convex)
-    values = [programme.function.value(c)]
+    values = [total_value(programme.function, c)]
     return (c, values) if convex else _lower_objective(programme, c, values)
 
 
@@ -119,7 +117,7 @@ def _lower_objective(
         while programme.merit(c + share * step) > before and share > _LEAST_SHARE:
             share /= 2
         c = c + share * step
-        values.append(programme.function.value(c))
+        values.append(total_value(programme.function, c))
         settled = before - programme.merit(c) <= _DECREASE * before
         if not programme.refine(c) and settled:
             return c, values
@@ -134,8 +132,8 @@ class _Programme:
         self.function, self.groups = specification.compile(channel, self.grid)
         self.size, self.solved, self.status = channel.basis.size, 0, ""
         # a guess of the final objective, within a few powers of ten
-        zero = 1e-4 * self.function.value(np.zeros(self.size))
-        self.scale = max(4 * noise_level(specification.objective) ** 2, zero)
+        zero = 1e-4 * total_value(self.function, np.zeros(self.size))
+        self.scale = max(4 * noise_level(specification.terms) ** 2, zero)
         self._excess = np.zeros(0)
         fine = replace(self.grid, points_hz=fine_frequencies(channel, _FINE * fineness))
         function, groups = specification.compile(channel, fine)
@@ -170,7 +168,7 @@ class _Programme:
         bounds = [bound for group in self.groups for bound in group]
         planes = [bound for bound in bounds if isinstance(bound, Discs | HalfPlanes)]
         excess = max((float(np.max(plane.use(c))) - 1 for plane in planes), default=0.0)
-        return self.function.value(c) * (1 + _PENALTY * max(excess, 0.0))
+        return total_value(self.function, c) * (1 + _PENALTY * max(excess, 0.0))
 
     def refine(self, c: FloatArray) -> bool:
         """Add the frequencies at which coefficients exceed bounds; return whether there are any."""
@@ -183,11 +181,10 @@ class _Programme:
     def _find_excess(self, c: FloatArray) -> FloatArray:
         """Frequencies at which bounds, or the programme's own worst cases, are exceeded [Hz]."""
         function, constraints = self._fine
-        pairs = zip(leaf_fractions(self.function), leaf_fractions(function), strict=True)
         uses = [
-            (leaf.frequency_hz, leaf.values(c) / (coarse.value(c) * (1 + _MISS)))
-            for coarse, leaf in pairs
-            if leaf.worst
+            (fine.frequency_hz, fine.values(c) / (coarse.value(c) * (1 + _MISS)))
+            for coarse, fine in zip(self.function, function, strict=True)
+            if fine.worst
         ]
         uses += [
             (bound.frequency_hz, bound.use(c))
@@ -281,8 +278,8 @@ def solve_with_few(spec: Specification, long: ModeSolution, size: int) -> ModeSo
     """
     channel, f, w = long.channel, long.grid.nodes_hz, long.grid.weights_hz
     basis, nyquist = channel.basis, channel.nyquist_hz
-    noise = noise_level(spec.objective) ** 2 / nyquist
-    cost = w * (frequency_costs(spec.objective, f, 2 * nyquist) + noise)
+    noise = noise_level(spec.terms) ** 2 / nyquist
+    cost = w * (frequency_costs(spec.terms, f, 2 * nyquist) + noise)
     weight = np.sqrt(cost / np.sum(cost) + _FLAT**2 * w / nyquist)
     few, start = basis.truncated(long.coefficients, size, f, weight)
     shorter = Channel(hardware=channel.hardware, basis=few)

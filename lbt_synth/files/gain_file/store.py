@@ -35,8 +35,8 @@ CONVENTION = (
     "x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k): the output is read from the new state. "
     "y(k) = SENSOR phi_res(k-1) + noise; phi_cor(k) = INFLUENCE u(k-delay_frames+1), or the "
     "mirror's exposure-averaged answer to these commands where META holds a mirror. "
-    "GAIN_PREDICTOR: x(k+1|k) = A x(k|k-1) + G (y - C x(k|k-1)); "
-    "GAIN_FILTER: x(k|k) = x(k|k-1) + G (y - C x(k|k-1)); A, B, C, D, L of the plant in PLANT_*."
+    "GAIN_PREDICTOR: x(k+1|k) = A x(k|k-1) + G (y - C x(k|k-1)); A, B, C, D, L of the plant in "
+    "PLANT_*."
 )
 FITS_LAYOUT_VERSION = 1  # of SPECULA's state-space filter file
 _ARRAY_TOLERANCE = 1e-9  # relative, of an entry; and a thousandth of that, of the largest

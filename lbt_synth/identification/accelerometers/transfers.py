@@ -85,7 +85,6 @@ class AccelerometerTransfers:
     shift_error_frames: float  # standard error; infinite without any line
     # age of a reading for which the phases hold; 1 is the wavefront's of the same frame
     age_frames: int
-    rate_hz: float  # readings per second, after averaging
 
     @property
     def used(self) -> tuple[ChannelRow, ...]:
@@ -172,7 +171,6 @@ def accelerometer_transfers(
         shift_frames=shift,
         shift_error_frames=error,
         age_frames=lag + 1,
-        rate_hz=model.frame_rate_hz,
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.design import Design, model_integrator
+from lbt_synth.design import Design, integrator
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification.accelerometers.readings import Channels
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
@@ -185,7 +185,7 @@ def prediction_against_data(
     fit, later = (frames.stretches() for frames in split_halves(record))
     test = settled_test(runs, later, hardware)
     noise = mode_noise(hardware, plant.R, noise_error_nm)
-    designs = {INTEGRATOR: model_integrator(plant), **controllers}
+    designs = {INTEGRATOR: integrator(hardware, truth=plant), **controllers}
     if running is not None:
         designs[RAN] = running
     loops = {
@@ -233,7 +233,6 @@ def design_inputs(
     channels: Channels | None = None,
     noise: float = 1.0,
     penalty: float | None = None,
-    defaults: Mapping[str, Any] | None = None,
 ) -> PlantInputs:
     """Return what a method makes a design of: a model with more noise, its record and channels."""
 
@@ -242,7 +241,7 @@ def design_inputs(
         return past.design(penalty)
 
     plant = noisier(model, noise).plant()
-    return PlantInputs(plant=plant, design_defaults=defaults or {}, predict=predict)
+    return PlantInputs(plant=plant, predict=predict)
 
 
 def compare_designs(

@@ -25,8 +25,8 @@ from scipy.signal import sos2tf, tf2sos
 from lbt_synth.design import Design
 from lbt_synth.design.result import require_hardware
 from lbt_synth.design.shaping.channel import Channel, laguerre_basis
-from lbt_synth.design.shaping.objectives import ResidualVariance, leaves, spectrum_of
 from lbt_synth.design.shaping.specification import Specification
+from lbt_synth.design.shaping.terms import ResidualVariance, spectrum_of
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop.pipeline import ModeDesign, Target
 from lbt_synth.interop.proof import (
@@ -160,7 +160,7 @@ def mode_loop(
     more = [grid.points_hz, *(grid.within(*band) for band in specification.bands_hz)]
     f = np.concatenate([grid.nodes_hz, *more])
     width = np.concatenate([grid.weights_hz, np.zeros(f.size - grid.nodes_hz.size)])
-    terms = leaves(specification.objective)
+    terms = specification.terms
     gains = tuple(sorted({term.sensor_gain for term in terms}, reverse=True))
     phase, noise, line, spread = np.zeros((4, len(gains), f.size))
     for term in terms:

@@ -13,7 +13,6 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 
-from lbt_synth.design.modal import Reconstructor, reconstructor
 from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.models.sensor_suite import Motions
@@ -395,8 +394,8 @@ class Calibration:
 
     modes: Modes  # shapes of the mirror
     reference: FloatArray  # (q,): slopes of a flat wavefront
-    # generalised inverse of the interaction matrix (slopes per nanometre of each mode)
-    reconstructor: Reconstructor
+    # (n, q): inverse of the interaction matrix (slopes per nanometre of each mode)
+    reconstructor: FloatArray
 
 
 def calibrate(
@@ -419,6 +418,11 @@ def calibrate(
         matrix[:, mode] = pair / (2 * setup.calibration_nm)
         if progress is not None:
             progress(1)
-    return Calibration(
-        modes=modes, reference=frozen_copy(reference), reconstructor=reconstructor(matrix)
-    )
+    rank = np.linalg.matrix_rank(matrix)
+    if rank < matrix.shape[1]:
+        raise ProblemError(
+            f"the sensor must tell {matrix.shape[1]} modes apart; got an interaction matrix of "
+            f"rank {rank}. Control fewer modes."
+        )
+    inverse = frozen_copy(np.linalg.pinv(matrix))
+    return Calibration(modes=modes, reference=frozen_copy(reference), reconstructor=inverse)

@@ -285,7 +285,7 @@ def _run_frames(
 ) -> dict[str, FloatArray]:
     """Run all frames; return the series and the mean image after those that settle."""
     modes, kept = calibration.modes, len(tilts) - settle
-    inverse, n = calibration.reconstructor.matrix, len(calibration.modes.shapes)
+    inverse, n = calibration.reconstructor, len(calibration.modes.shapes)
     out = {name: np.empty((kept, n)) for name in ("measurements", "commands", "residual_nm")}
     strehl, others = np.empty(kept), np.empty(kept)
     psf, slopes, y = np.zeros(()), calibration.reference, np.zeros(n)

@@ -30,7 +30,6 @@ from scipy.linalg import eigh
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear.convex_functions import (
-    CombinedFunction,
     Constraint,
     Discs,
     Fractions,
@@ -156,7 +155,7 @@ def minimize(
     Return the coefficients, None if the constraints cannot hold together, and the solver's status.
     """
     origin = np.zeros(size) if start is None else start
-    programme = ConicProgramme(size + _count_levels(function))
+    programme = ConicProgramme(size + sum(part.worst for part in function))
     for constraint in constraints:
         _constrain(programme, constraint, origin)
     linear, roots = _Model(programme, origin, scale).expression(function)
@@ -190,12 +189,6 @@ def minimize_relaxation(
     return np.where(rigid, 0.0, x[size:])
 
 
-def _count_levels(function: Function) -> int:
-    """Count the largest values of a function: each is one more unknown."""
-    parts = function.parts if isinstance(function, CombinedFunction) else ()
-    return int(function.worst) + sum(_count_levels(part) for part in parts)
-
-
 class _Model:
     """Convex models of functions of a step from an origin, over their scale.
 
@@ -208,15 +201,12 @@ class _Model:
 
     def expression(self, function: Function) -> tuple[FloatArray, FloatArray]:
         """Return the linear part, (x,), and the roots, (k, x), of a function."""
-        if isinstance(function, CombinedFunction):
-            weighted = list(zip(function.weights, function.parts, strict=True))
-            if function.worst:
-                return self._largest(weighted)
-            models = [(w, self.expression(part)) for w, part in weighted]
-            linear = np.sum([w * line for w, (line, _) in models], axis=0)
-            return linear, np.concatenate([np.sqrt(w) * roots for w, (_, roots) in models])
-        if function.worst:
-            return self._worst(function)
+        models = [self._worst(part) if part.worst else self._sum(part) for part in function]
+        linear, roots = zip(*models, strict=True)
+        return np.sum(linear, axis=0), np.concatenate(roots)
+
+    def _sum(self, function: Fractions) -> tuple[FloatArray, FloatArray]:
+        """Model the sum of all fractions to second order."""
         gradient, hessian = _second_order(function, self.origin)
         pad = self.programme.size - self.origin.size
         root = semidefinite_root(hessian / self.scale).T
@@ -224,30 +214,13 @@ class _Model:
 
     def _worst(self, function: Fractions) -> tuple[FloatArray, FloatArray]:
         """Bound all fractions by the square of a level, a new unknown."""
-        level = self._next_level()
+        level = np.zeros(self.programme.size)
+        level[self.level] = 1.0
+        self.level += 1
         values, slopes, _ = _expand(function, self.origin)
         unit = 1 / np.sqrt(self.scale)
         _bound_norms(self.programme, values * unit, slopes * unit, level, 0.0)
         return np.zeros(self.programme.size), level[None]
-
-    def _largest(self, weighted: list[tuple[float, Function]]) -> tuple[FloatArray, FloatArray]:
-        """Bound all weighted parts by a level, a new unknown."""
-        level = self._next_level()
-        for weight, part in weighted:
-            linear, roots = self.expression(part)
-            # weight (value + linear x + |roots x|^2) <= level, as |(2 v, 1 - u)| <= 1 + u
-            room = level / weight - linear
-            value = part.value(self.origin) / self.scale if not part.worst else 0.0
-            rows = np.concatenate([room[None], 2 * roots, -room[None]])
-            offsets = np.concatenate([[1 - value], np.zeros(len(roots)), [1 + value]])
-            self.programme.add_second_order(rows, offsets[None])
-        return level, np.zeros((0, self.programme.size))
-
-    def _next_level(self) -> FloatArray:
-        level = np.zeros(self.programme.size)
-        level[self.level] = 1.0
-        self.level += 1
-        return level
 
 
 def _expand(

@@ -1,4 +1,4 @@
-"""Minimise the variance of a filter under a bound on its norm, or the reverse.
+"""Minimise the variance of a filter under a bound on its norm.
 
 With any stable predictor gain as a base, every stable filter is the base plus a stable
 system Q driven by the base's innovations (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE
@@ -38,10 +38,9 @@ class InnovationProgramme:
     error: StateSpace  # from w to ``L e``
     innovation: StateSpace  # from w to the scaled innovations
     whitening: FloatArray  # (q, q): scales the innovations
-    # ``variance = floor + ||c root - target||^2``
+    # the variance is ``||c root - target||^2`` and a constant
     root: FloatArray  # (T q, T q): square root of the Gram matrix of the past innovations
     target: FloatArray  # (l, T q)
-    floor: float  # least variance that these taps reach
     scale: float  # size of the error, by which levels are divided
     taps: int  # T
 
@@ -74,43 +73,33 @@ class InnovationProgramme:
             whitening=np.asarray(whitening, dtype=np.float64),
             root=root,
             target=np.asarray(target, dtype=np.float64),
-            floor=total - float(np.sum(target**2)),
             scale=float(np.sqrt(total)),
             taps=taps,
         )
 
-    def minimize(
-        self, frequency_hz: FloatArray, *, gamma: float | None = None, variance: float | None = None
-    ) -> tuple[FloatArray, float, str]:
-        """Minimise the variance with the error below gamma at the frequencies, or the reverse.
+    def minimize_variance(self, gamma: float, frequency_hz: FloatArray) -> tuple[FloatArray, str]:
+        """Minimise the variance with the error below gamma at the frequencies.
 
-        Returns the taps (l, T q), gamma and the status of the solver.
+        Returns the taps (l, T q) and the status of the solver.
         """
-        level = None if gamma is None else gamma / self.scale
-        distance = None
-        if variance is not None:
-            distance = float(np.sqrt(max(variance - self.floor, 0.0))) / self.scale
         N, E = (s.frequency_response(frequency_hz) for s in (self.innovation, self.error))
         outputs, q = len(self.target), N.shape[1]
         taps: Any = 0  # (l, T q), zero between groups
-        bound, constraints = cp.Variable(nonneg=True), []
+        constraints: list[Any] = []
         phase = np.exp(-2j * np.pi * frequency_hz * self.error.dt_s)
         powers = phase[:, None] ** np.arange(1, self.taps + 1)
         for rows, columns in _independent_groups(N, E):
             Q = cp.Variable((len(rows), self.taps * len(columns)))
             past = np.kron(np.eye(self.taps), np.eye(q)[columns])
             taps = taps + np.eye(outputs)[:, rows] @ Q @ past
-            limit = bound if level is None else level
             responses = N[:, columns], E[:, rows] / self.scale
-            constraints += _bound_norm(*responses, powers, Q, limit)
+            constraints += _bound_norm(*responses, powers, Q, gamma / self.scale)
         spread = cp.norm(taps @ self.root - self.target / self.scale, "fro")
-        constraints.append(spread <= (bound if distance is None else distance))
-        run = solve(cp.Minimize(bound), constraints)
+        run = solve(cp.Minimize(spread), constraints)
         advice = "Try a larger bound, or another number of taps."
         require_optimum(run, "the programme of the mixed filter", advice)
         unscaled = self.scale * taps.value @ np.kron(np.eye(self.taps), self.whitening)
-        reached = gamma if gamma is not None else float(bound.value) * self.scale
-        return np.asarray(unscaled, dtype=np.float64), reached, run[0]
+        return np.asarray(unscaled, dtype=np.float64), run[0]
 
 
 def _independent_groups(N: ComplexArray, E: ComplexArray) -> list[tuple[list[int], list[int]]]:

@@ -151,14 +151,14 @@ class TipTiltPlant(EstimationProblem):
         plant returned has a delay of ``delay_frames + frames - 1``. A delay below one frame, or
         ``frames`` that are no integer, raise a ProblemError.
         """
-        steps = integer(frames, "horizon", at_least=-LONGEST_HORIZON)
+        steps = integer(frames, "frames", at_least=-LONGEST_HORIZON)
         if steps == 1:
             return self
         hw = self.hardware
         delay = hw.delay_frames + steps - 1
         if not 1 <= delay <= LONGEST_HORIZON:
             raise ProblemError(
-                f"horizon must leave the loop a delay of 1 to {LONGEST_HORIZON} frames; got "
+                f"frames must leave the loop a delay of 1 to {LONGEST_HORIZON} frames; got "
                 f"{steps}, which makes {delay:g}.",
                 in_python="For an estimate without a loop, make an EstimationProblem of the "
                 "plant's matrices.",

@@ -337,7 +337,7 @@ def write_page(
     --------
     >>> import lbt_synth as lbt, pathlib, tempfile
     >>> config = lbt.load_config("examples/lbt.yaml")
-    >>> slow = lbt.design.optimal_integrator(config.hardware, config.truth)
+    >>> slow = lbt.integrator(config.hardware, truth=config.truth)
     >>> page = lbt.report.design_page(config, {"integrator": slow})
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     [file.name for file in lbt.report.write_page(page, pathlib.Path(folder) / "a.html")]

@@ -32,7 +32,7 @@ from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.loop import ClosedLoop
 from lbt_synth.methods.method import Section
 from lbt_synth.methods.registry import method_named
-from lbt_synth.methods.request import DesignRequest, Wording, design_request, fixed_design
+from lbt_synth.methods.request import DesignRequest, design_request, fixed_design
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.studies.grid import RESIDUALS
 from lbt_synth.validation import FloatArray, integer
@@ -454,9 +454,8 @@ def _make_controller(study: Study, name: str) -> Design | DesignRequest:
     method = str(section.design)
     with name_file(study.source), name_key(f"{place}.design"):
         method_named(method)
-    with refuse_config(f"{study.source}", place):
-        words = Wording(method="design: {}", place=place)
-        request = design_request(method, section.options, words)
+    with refuse_config(f"{study.source}: {place}", place):
+        request = design_request(method, section.options)
     if section.for_ == "sample":
         return request
     try:

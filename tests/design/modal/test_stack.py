@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import solve_discrete_lyapunov
 from support.modal import (
     HUM,
     LINE,
     RATE,
-    integrator_residuals,
+    joint_controller,
+    path_of,
     single_plant,
     some_air,
     tip_tilt_filter,
@@ -19,9 +19,8 @@ from support.refusals import require_refusals
 
 import lbt_synth as lbt
 import lbt_synth.design.modal.stack
-from lbt_synth.design.modal import MixedController, modal_filters, modal_residuals, reconstructor
-from lbt_synth.design.modal.stack import joining_check
-from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError, UnstableLoopError
+from lbt_synth.design.modal import MixedController, modal_filters
+from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
 from lbt_synth.models import ARModel, PositionLoop
 
 
@@ -37,19 +36,18 @@ def test_each_filter_is_that_of_kalman(delay, order, bandwidth):
         )
     air = some_air(n, order)
     noise, gain = np.linspace(5, 30, n), np.linspace(0.5, 1.1, n)
-    lines, known = {1: [LINE, HUM], 2: HUM}, {"delay_frames": delay, "mirror": shell}
-    filters = modal_filters(air, noise_nm=noise, vibrations=lines, sensor_gain=gain, **known)
+    known = {"delay_frames": delay, "mirror": shell}
+    conditions = {"noise_nm": noise, "vibrations": {1: [LINE, HUM], 2: HUM}, "sensor_gain": gain}
+    conditions["hardware"] = path_of(**known)
+    filters = modal_filters(air, **conditions)
     path = filters.hardware
     assert (path.mirror, path.frame_rate_hz, path.delay_frames) == (shell, RATE, delay)
-    exact = modal_residuals(filters, air, noise_nm=noise, vibrations=lines, sensor_gain=gain)
-    assert np.allclose(exact, filters.rms_nm, rtol=1e-9)
     for i, mode_lines in enumerate(([], [LINE, HUM], [HUM])):
         one = lbt.kalman(single_plant(air, i, mode_lines, noise[i], gain[i], **known))
         mine = filters.design(i)
         assert np.array_equal(mine.gain_predictor, one.gain_predictor)
         for name in "ABCD":
             assert np.array_equal(getattr(mine.controller, name), getattr(one.controller, name))
-        assert filters.certificate.rms_per_output[i] == one.rms
         moving = [
             replace(line, rms_nm=line.rms_nm / np.sinc(line.frequency_hz / RATE))
             for line in mode_lines
@@ -64,7 +62,7 @@ def test_equal_modes_share_a_design():
     air = some_air(2)
     slow, fast = air.take(0), air.take(1)
     known = {"noise_nm": [5.0, 5.0, 5.0, 6.0, 5.0], "vibrations": {4: LINE}}
-    filters = modal_filters([slow, fast, slow, slow, slow], **known)
+    filters = modal_filters([slow, fast, slow, slow, slow], hardware=path_of(), **known)
     assert filters.which.tolist() == [0, 1, 0, 2, 3]
     assert len(filters.designs) == 4
     assert filters.rms_nm[0] == filters.rms_nm[2]
@@ -72,13 +70,6 @@ def test_equal_modes_share_a_design():
 
 def test_a_failing_mode_is_named(monkeypatch):
     air = some_air(4)
-    filters = modal_filters(air, noise_nm=10.0)
-    off = filters.rms_nm * np.array([1.0, 1.0, 1.001, 1.0])
-    check = joining_check(off, filters.rms_nm)
-    assert not check.passed
-    assert check.name.endswith("(mode 2)")
-    assert "modes 0, 1, 2 and 3" in joining_check(2 * off, filters.rms_nm).name
-    assert not joining_check(np.full(4, np.nan), filters.rms_nm).passed
 
     def failing(plant):
         if plant.turbulence[0].driving_rms_nm == air.driving_rms_nm[2]:
@@ -87,7 +78,7 @@ def test_a_failing_mode_is_named(monkeypatch):
 
     monkeypatch.setattr(lbt_synth.design.modal.stack, "kalman", failing)
     with pytest.raises(lbt.errors.CertificateError, match="filter of mode 2: no good") as caught:
-        modal_filters(air, noise_nm=10.0)
+        modal_filters(air, hardware=path_of(), noise_nm=10.0)
     assert caught.value.failed == ("distance",)
 
 
@@ -95,40 +86,51 @@ def test_bad_filters_are_refused():
     air = some_air(3)
 
     def filters(noise_nm=1, **options):
-        return lambda: modal_filters(air, noise_nm=noise_nm, **options)
+        options = {"hardware": path_of(), "noise_nm": noise_nm} | options
+        return lambda: modal_filters(air, **options)
 
-    made = modal_filters([air.take(0)], noise_nm=1.0)
+    made = modal_filters([air.take(0)], hardware=path_of(), noise_nm=1.0)
     lines = "list of Vibration"
     require_refusals(
         [
             (filters(0.0), ProblemError, "noise_nm must be above 0"),
             (filters([1.0, 2.0]), DimensionError, "one per mode .3."),
             (filters(np.nan), NonFiniteError, "noise_nm"),
-            (filters(delay_frames=0.5), ProblemError, "delay_frames"),
+            (filters(hardware=3), ProblemError, "hardware must be a LoopHardware"),
+            (filters(hardware=path_of(frame_rate_hz=400)), ProblemError, "loop's 400 Hz; got 800"),
             (filters(sensor_gain=-1), ProblemError, "sensor_gain must be above 0"),
             (filters(vibrations=[LINE]), ProblemError, "must be a mapping"),
             (filters(vibrations={3: LINE}), ProblemError, "must be at most 2; got 3"),
             (filters(vibrations={0: 3}), ProblemError, lines),
             (filters(vibrations={0: [1]}), ProblemError, lines),
-            (filters(mirror=3), ProblemError, "PositionLoop"),
             (lambda: made.design(1), ProblemError, "mode must be at most 0; got 1"),
-            (lambda: made.start().step([1.0, 2.0]), DimensionError, r"\(1,\)"),
-            (lambda: made.start().step(["a"]), ProblemError, "y must be an array of numbers"),
         ]
     )
 
 
+def law(gain, leak=1.0):
+    return lbt.Controller(A=leak, B=gain, C=1.0, D=0.0, dt_s=1 / RATE)
+
+
 def controller_of(kind, n, delay):
-    """Return a controller of n modes: integrators, filters, or some of both."""
-    air, gains = some_air(n), np.linspace(0.1, 0.3, n)
-    if kind == "integrators":
-        return MixedController(gains=gains, leak=np.linspace(0.98, 1, n))
+    """Return a controller of n modes, and the controllers of some modes that it is made of."""
+    air, gains, leak = some_air(n), np.linspace(0.1, 0.3, n), np.linspace(0.98, 1, n)
+    path = path_of(delay_frames=delay)
+    filters, filtered, parts = None, (), []
     if kind == "filters":
-        return modal_filters(air, noise_nm=8.0, vibrations={0: [LINE]}, delay_frames=delay)
-    if kind == "mixed":
-        return MixedController(filter=tip_tilt_filter(delay), gains=gains, filtered=(3, 1))
-    two = modal_filters([air.take(0)] * 2, noise_nm=8.0, delay_frames=delay)
-    return MixedController(filter=two, gains=gains, filtered=(2, 0))
+        filters = modal_filters(air, hardware=path, noise_nm=8.0, vibrations={0: [LINE]})
+        filtered = range(n)
+    elif kind == "mixed":
+        filters, filtered = tip_tilt_filter(delay), (3, 1)
+        parts = [(filtered, filters.controller)]
+    elif kind == "both":
+        filters = modal_filters([air.take(0)] * 2, hardware=path, noise_nm=8.0)
+        filtered = (2, 0)
+    if kind in ("filters", "both"):
+        parts = [((mode,), filters.design(i).controller) for i, mode in enumerate(filtered)]
+    parts += [((i,), law(gains[i], leak[i])) for i in range(n) if i not in filtered]
+    known = {"filtered": filtered} if filters else {}
+    return MixedController(filter=filters, gains=gains, leak=leak, **known), parts
 
 
 @pytest.mark.parametrize(
@@ -136,112 +138,14 @@ def controller_of(kind, n, delay):
 )
 def test_stepped_modes_are_the_linear_controller_of_all(kind, delay):
     n, frames = 5, 900  # some filters alone grow by 1.04 a frame
-    controller = controller_of(kind, n, delay)
+    controller, parts = controller_of(kind, n, delay)
     rng = np.random.default_rng(4)
     total, noise = 100 * rng.standard_normal((frames, n)), 8 * rng.standard_normal((frames, n))
     gain = np.linspace(0.6, 1.1, n)
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, sensor_matrix=np.diag(gain))
-    running = controller.start() if kind == "filters" else controller
-    stepped = recorded_run(running, path, total, noise)
-    linear = recorded_run(running.as_controller(1 / RATE), path, total, noise)
+    stepped = recorded_run(controller, path, total, noise)
+    linear = recorded_run(joint_controller(parts, n), path, total, noise)
     assert np.allclose(stepped, linear, atol=1e-10 * np.abs(linear).max())
-
-
-@pytest.mark.parametrize(
-    ("kind", "frame_means"),
-    [("integrators", True), ("filters", False), ("mixed", True), ("both", False)],
-)
-def test_exact_residuals_are_those_of_the_budget(kind, frame_means):
-    n, delay = 5, 2.4
-    controller = controller_of(kind, n, delay)
-    air, noise, gain = some_air(n, 2), np.linspace(1, 9, n), np.linspace(0.6, 1.1, n)
-    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, sensor_matrix=np.diag(gain))
-    known = {"noise_nm": noise, "vibrations": {2: [HUM], 3: [LINE, HUM]}, "hardware": path}
-    residuals = modal_residuals(controller, air, sensor_gain=gain, frame_means=frame_means, **known)
-    running = controller.start() if kind == "filters" else controller
-    closed = lbt.close_loop(path, running.as_controller(1 / RATE))
-
-    def along(i, line):
-        held = 1 if frame_means else np.sinc(line.frequency_hz / RATE)
-        return replace(line, rms_nm=line.rms_nm / held, direction=np.eye(n)[i])
-
-    truth = lbt.Truth(
-        turbulence=[air.take(i) for i in range(n)],
-        vibrations=[along(2, HUM), along(3, LINE), along(3, HUM)],
-        noise_nm=0.0,
-    )
-    variance = np.diag(lbt.residual_budget(closed, truth, frame_means=frame_means).total_nm2).copy()
-    for i in range(n):
-        B = closed.system.B[:, n + i : n + i + 1] * noise[i]
-        D = closed.system.D[:, n + i : n + i + 1] * noise[i]
-        P = solve_discrete_lyapunov(closed.system.A, B @ B.T)
-        C = closed.system.C
-        powers = np.diag(C @ P @ C.T + D @ D.T)
-        # a command holds for one frame, and passes with its whole power
-        variance += powers[:n] if frame_means else powers[n : 2 * n]
-    assert np.allclose(residuals, np.sqrt(variance), rtol=1e-8)
-
-
-def test_bad_loops_are_refused():
-    known = {"noise_nm": 1.0}
-
-    def residuals(gains, modes, **options):
-        return lambda: integrator_residuals(gains, some_air(modes), **known, **options)
-
-    def of(control, **options):
-        return lambda: modal_residuals(control, some_air(1), **known, **options)
-
-    one = MixedController(gains=[0.5])
-    bent = MixedController(gains=[0.5], reconstructor=reconstructor([[2.0]]))
-    two = modal_filters(some_air(2), noise_nm=1.0)
-    narrow = {"filter": two, "gains": [0.1, 0.1], "filtered": (0,)}
-    require_refusals(
-        [
-            (residuals([0.5, 0.5, 1.2], 3), UnstableLoopError, "mode 2"),
-            (residuals([0.5, 1.1, 1.2], 3), UnstableLoopError, "modes 1 and 2"),
-            (residuals([0.5, 0.5, 0.5], 2), DimensionError, "must have 3 modes; got 2"),
-            (of([0.5]), ProblemError, "MixedController or ModalFilters"),
-            (of(bent), ProblemError, "reconstructor"),
-            (of(one), ProblemError, "hardware must be given"),
-            (of(one, hardware=2.0), ProblemError, "hardware must be a LoopHardware"),
-            (lambda: MixedController(**narrow), DimensionError, "the 1 filtered modes; got 2"),
-        ]
-    )
-    assert residuals([0.5, 0.5, 1.2], 3, sensor_gain=0.5)().size == 3
-
-
-def test_loops_have_the_rate_of_their_filters():
-    air = some_air(2)
-    slow = ARModel(coefficients=[0.9], driving_rms_nm=5, frame_rate_hz=400)
-    filters = modal_filters(air, noise_nm=10.0, delay_frames=3)
-    mixed = MixedController(filter=filters, gains=[0.0, 0.0])
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=RATE, turbulence=air.take(0), noise_nm=10.0, delay_frames=3
-    )
-    both = MixedController(filter=lbt.kalman(plant), gains=[0.0, 0.0, 0.2])
-    slower, odd = lbt.LoopHardware(frame_rate_hz=400), "loop's 800 Hz; got 400 Hz"
-    for controller in (filters, mixed, both):
-        n = controller.n_modes
-        wide, other = [air.take(0)] * n, [slow] * n
-
-        def residuals(air=wide, controller=controller, **options):
-            return modal_residuals(controller, air, noise_nm=10.0, **options)
-
-        for delay in (3.0, 2.8):
-            path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay)
-            assert np.allclose(residuals(), residuals(hardware=path)) is (delay == 3.0)
-        rows = [
-            (lambda r=residuals, a=other: r(a), ProblemError, odd),
-            (lambda r=residuals: r(hardware=slower), ProblemError, "rate of the filters, 800 Hz"),
-        ]
-        if controller is not filters:
-            assert controller.as_controller().dt_s == 1 / RATE
-            late = lambda c=controller: c.as_controller(1 / 400)  # noqa: E731
-            rows.append((late, ProblemError, "dt_s must be that of the filter"))
-        require_refusals(rows)
-    assert np.allclose(modal_residuals(mixed, air, noise_nm=10.0), filters.rms_nm, rtol=1e-9)
-    with pytest.raises(ProblemError, match=odd):
-        integrator_residuals([0.1, 0.1], [slow] * 2, noise_nm=1.0)
 
 
 def test_a_process_that_is_all_but_a_walk_leaves_what_a_walk_leaves():
@@ -252,6 +156,6 @@ def test_a_process_that_is_all_but_a_walk_leaves_what_a_walk_leaves():
         air = ARModel(
             coefficients=[[0.9], [1 - distance]], driving_rms_nm=[1.0, v], frame_rate_hz=RATE
         )
-        known = {"hardware": lbt.LoopHardware(frame_rate_hz=RATE), "frame_means": True}
-        residual = modal_residuals(MixedController(gains=[g, g]), air, noise_nm=n, **known)[1]
-        assert residual == pytest.approx(walk, rel=1e-7)
+        ensemble = lbt.loop.LoopEnsemble(loops=2, turbulence=[air], noise_nm=[[n], [n]])
+        left = lbt.loop.ensemble_residuals(law(g), path_of(modes=1), ensemble, frame_means=True)
+        assert left.rms_nm[1] == pytest.approx(walk, rel=1e-7)

@@ -2,22 +2,33 @@
 
 import numpy as np
 import pytest
-from support.shaping import NOISE, ONE, RATE, SLOW, channel, random_coefficients, shaped, spec
+from support.shaping import (
+    NOISE,
+    ONE,
+    RATE,
+    SLOW,
+    attenuation,
+    channel,
+    margin,
+    random_coefficients,
+    shaped,
+    spec,
+)
 
 import lbt_synth as lbt
 from lbt_synth.design import shaping
-from lbt_synth.design.shaping import Attenuation, CommandRms, LoopErrors, MovingSensorGain
+from lbt_synth.design.shaping import Bound, CommandRms, LoopErrors
 from lbt_synth.design.shaping.channel import mode_loop
 from lbt_synth.storage.display_unit import own_display_unit, show_in
 
 DEMANDS = [
-    shaping.ModulusMargin(at_least=0.4),
-    shaping.NoisePeak(at_most=2),
-    Attenuation(low_hz=3, high_hz=9, at_most=0.7),
-    Attenuation(low_hz=3, high_hz=9, at_most=1.4, sensor_gain=0.5),
+    margin(0.4),
+    Bound(response="noise", at_most=2),
+    attenuation(3, 9, 0.7),
+    attenuation(3, 9, 1.4, sensor_gain=0.5),
     LoopErrors(low=0.4, high=1.0),
     LoopErrors(low=1.0, high=1.5),
-    shaping.MirrorUncertainty(relative=0.4, low_hz=100, high_hz=400),
+    Bound(response="complementary", at_most=2.5, low_hz=100, high_hz=400),
     LoopErrors(delay_frames=0.3),
     CommandRms(at_most_nm=30, turbulence=SLOW, noise_nm=NOISE),
     CommandRms(at_most_nm=30, turbulence=SLOW, noise_nm=NOISE, rate=True),
@@ -46,8 +57,8 @@ def test_a_demand_holds_in_the_programme_where_it_holds_in_the_loop(demand):
 @pytest.mark.parametrize(("at_most", "gain"), [(1.9, 1.5), (1.7, 0.45)])
 def test_attenuation_near_the_edge_of_convexity_is_certified(at_most, gain):
     eager = shaping.ResidualVariance(turbulence=SLOW, noise_nm=2.0)
-    mask = Attenuation(low_hz=0, high_hz=400, at_most=at_most, sensor_gain=gain)
-    loop = lbt.close_loop(ONE, shaped(mask, objective=eager).controller, sensor_gain=gain)
+    mask = attenuation(0, 400, at_most, sensor_gain=gain)
+    loop = lbt.close_loop(ONE, shaped(mask, terms=[eager]).controller, sensor_gain=gain)
     assert np.max(np.abs(loop.sensitivity(np.linspace(0, 400, 8001)))) < at_most
 
 
@@ -55,30 +66,31 @@ def test_attenuation_near_the_edge_of_convexity_is_certified(at_most, gain):
 def test_a_loop_is_stable_at_every_delay_within_its_error(delay, error):
     path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1)
     eager = shaping.ResidualVariance(turbulence=SLOW, noise_nm=1.0)
-    design = shaped(LoopErrors(delay_frames=error), objective=eager, path=path)
+    design = shaped(LoopErrors(delay_frames=error), terms=[eager], path=path)
     for e in np.linspace(-error, error, 41):
         real = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=max(delay + e, 1.0), modes=1)
         assert lbt.close_loop(real, design.controller).is_stable
     if delay == 2.0:  # without the demand it is not
         late = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=3.0, modes=1)
-        free = shaped(objective=eager, path=path)
+        free = shaped(terms=[eager], path=path)
         assert not lbt.close_loop(late, free.controller).is_stable
 
 
 LINE = shaping.VibrationBand(low_hz=16, high_hz=24, rms_nm=500)
 
 
-def shape_for_a_gain(kind, low, high):
+def shape_for_a_gain(low, high, *, moving):
     """Return one design, and the check of a gain that moves in its interval."""
-    design = shaped(kind(low=low, high=high), objective=LINE, functions=12)
-    moves = MovingSensorGain(low=low, high=high)
-    return design, moves.checks(mode_loop(ONE, design.parameters[0]))[0]
+    errors = LoopErrors(low=low, high=high, moving=moving)
+    design = shaped(errors, terms=[LINE], functions=12)
+    moves = LoopErrors(low=low, high=high, moving=True)
+    return design, moves.checks(mode_loop(ONE, design.parameters[0]))[-1]
 
 
 def test_a_moving_gain_is_proved_where_constant_ones_are_not_enough():
     """A switch between stable gains breaks the loop that the circle criterion does not prove."""
-    still, failed = shape_for_a_gain(LoopErrors, 0.3, 1.5)
-    moves, passed = shape_for_a_gain(MovingSensorGain, 0.3, 1.5)
+    still, failed = shape_for_a_gain(0.3, 1.5, moving=False)
+    moves, passed = shape_for_a_gain(0.3, 1.5, moving=True)
     assert (passed.passed, failed.passed) == (True, False)
     assert passed.name == "circle criterion of a moving gain, 0.3 to 1.5"
     low, high = (
@@ -94,17 +106,17 @@ def test_a_moving_gain_is_proved_where_constant_ones_are_not_enough():
 @pytest.mark.parametrize(("low", "high"), [(0.3, 1.0), (1.0, 1.5)])
 def test_a_gain_that_moves_on_one_side_costs_nothing(low, high):
     """The disc is a half-plane then, the same as for a constant gain."""
-    still, check = shape_for_a_gain(LoopErrors, low, high)
+    still, check = shape_for_a_gain(low, high, moving=False)
     assert check.passed
-    moves, _ = shape_for_a_gain(MovingSensorGain, low, high)
+    moves, _ = shape_for_a_gain(low, high, moving=True)
     assert moves.objective_nm == pytest.approx(still.objective_nm, rel=1e-6)
 
 
 def test_a_moving_gain_that_clashes_is_named():
-    demands = MovingSensorGain(low=0.5, high=3.0), Attenuation(low_hz=16, high_hz=24, at_most=1e-3)
+    demands = LoopErrors(low=0.5, high=3.0, moving=True), attenuation(16, 24, 1e-3)
     with pytest.raises(lbt.errors.InfeasibleError) as caught:
-        shaped(*demands, objective=LINE, functions=16)
-    assert any("while the sensor gain moves" in text for text in caught.value.conflict)
+        shaped(*demands, terms=[LINE], functions=16)
+    assert any("moving sensor gains" in text for text in caught.value.conflict)
 
 
 def test_a_demand_has_its_limit_in_the_unit():

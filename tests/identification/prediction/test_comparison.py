@@ -91,7 +91,7 @@ def test_the_table():
     gained, error = table["what ran"].replayed.above(table["Kalman"].replayed)
     assert gained > 4 * error
     assert table["Kalman"].replayed_nm == table["Kalman"].replayed.rms_nm
-    best = lbt.design.model_integrator(plant)
+    best = lbt.integrator(plant.hardware, truth=plant)
     loop = lbt.close_loop(plant.hardware, best.controller)
     exact = lbt.residual_budget(loop, plant, frame_means=True)
     assert table["best integrator"].model_nm == exact.rms_nm

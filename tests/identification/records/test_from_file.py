@@ -52,37 +52,28 @@ def test_every_format_gives_the_same_record(tmp_path, series, kind):
     assert "commands: " in text
 
 
-def test_telemetry_of_ours(tmp_path):
+@pytest.mark.parametrize("name", ["a.fits", "a.npz"])
+def test_telemetry_of_ours(tmp_path, name):
     path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.4)
-    truth = lbt.Truth(
-        turbulence=None, vibrations=(lbt.models.SinusoidalVibration(frequency_hz=20, rms_nm=100),)
-    )
-    run = lbt.simulate(lbt.integrator(path, gain=0.2).controller, truth, hardware=path, frames=99)
-    for name in ("a.fits", "a.npz"):
-        file = lbt.files.save_telemetry(
-            tmp_path / name, lbt.files.telemetry_from_simulation(run, path)
-        )
-        seen = lbt.load_record(file)
-        assert np.array_equal(seen.measurements, run.measurements[0])
-        assert np.array_equal(seen.mirror_taps, path.mirror_taps)
-        assert seen.source == str(file)
-        assert lbt.load_record(file, axes=[1]).axes == 1
-        with pytest.raises(ProblemError, match=f"{name}: .*neither columns nor commands"):
-            lbt.load_record(file, columns={"measurements": 0})
+    run = ran(path, frames=99)
+    telemetry = lbt.files.telemetry_from_simulation(run, path)
+    file = lbt.files.save_telemetry(tmp_path / name, telemetry)
+    seen = lbt.load_record(file)
+    assert np.array_equal(seen.measurements, run.measurements[0])
+    assert np.array_equal(seen.mirror_taps, path.mirror_taps)
+    assert seen.source == str(file)
+    assert lbt.load_record(file, axes=[1]).axes == 1
+    with pytest.raises(ProblemError, match=f"{name}: .*neither columns nor commands"):
+        lbt.load_record(file, columns={"measurements": 0})
 
 
 @pytest.mark.e2e
 def test_telemetry_of_the_standard(tmp_path):
-    rng = np.random.default_rng(0)
-    seen = lbt.files.Telemetry(
-        frame_rate_hz=800,
-        delay_frames=2,
-        commands=rng.standard_normal((50, 2)),
-        measurements=rng.standard_normal((50, 2)),
-    )
+    y, u = np.random.default_rng(0).standard_normal((2, 50, 2))
+    seen = lbt.files.Telemetry(frame_rate_hz=800, delay_frames=2, commands=u, measurements=y)
     back = lbt.load_record(lbt.files.save_telemetry(tmp_path / "a.aot.fits", seen))
-    assert np.allclose(back.measurements, seen.measurements)
-    assert np.allclose(back.commands, seen.commands)
+    assert np.allclose(back.measurements, y)
+    assert np.allclose(back.commands, u)
     assert np.flatnonzero(~back.usable).tolist() == [0, 1]
 
 

@@ -16,6 +16,7 @@ from support.sensor_loops import SLOW, example_plant
 
 import lbt_synth as lbt
 from lbt_synth.design.predictor import predictor_design, regression_filter
+from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.interop import pipeline
 from lbt_synth.interop.c import export as c_export
@@ -172,7 +173,7 @@ def test_words_cannot_leave_the_comment(tmp_path, designs, evil):
     design = replace(
         designs["integrator"],
         method=evil,
-        solver=lbt.design.SolverReport(route=evil, status=evil, iterations=0),
+        solver=SolverReport(route=evil, status=evil),
         certificate=lbt.design.Certificate(
             checks=(check,), gamma=np.nan, rms_per_output=np.zeros(0)
         ),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from support.recorded_runs import recorded_run
+from support.shaping import attenuation
 
 import lbt_synth as lbt
 from lbt_synth.interop.cacao.export import AppliedFilter, PredictiveFilter, predictive_filter
@@ -179,20 +180,21 @@ def test_rounding_is_bounded_by_a_loop_in_that_arithmetic(path):
     assert 0 < np.std(single[:, 0] - double[:, 0]) < 3 * bound * np.std(double[:, 0])
 
 
-@pytest.mark.parametrize("kind", ["Attenuation", "LoopErrors", "MirrorUncertainty"])
-def test_demands_are_moved_by_what_is_left_out(kind):
+@pytest.mark.parametrize(
+    "demand",
+    [
+        attenuation(0, 2, 0.2, sensor_gain=0.7),
+        lbt.design.shaping.LoopErrors(delay_frames=0.2),
+        lbt.design.shaping.Bound(response="complementary", at_most=2.5, low_hz=150, high_hz=250),
+    ],
+    ids=lambda demand: demand.label,
+)
+def test_demands_are_moved_by_what_is_left_out(demand):
     """The value of each demand in the certificate is above that of the loop around the taps."""
     shaping = lbt.design.shaping
-    options = {
-        "Attenuation": {"low_hz": 0, "high_hz": 2, "at_most": 0.2, "sensor_gain": 0.7},
-        "LoopErrors": {"delay_frames": 0.2},
-        "MirrorUncertainty": {"relative": 0.4, "low_hz": 150, "high_hz": 250},
-    }
-    demand = getattr(shaping, kind)(**options[kind])
-    objective = shaping.ResidualVariance(turbulence=AIR, noise_nm=15.0)
     path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
-    objective = replace(objective, turbulence=replace(AIR, frame_rate_hz=500))
-    spec = shaping.Specification(objective=objective, demands=[demand])
+    air = shaping.ResidualVariance(turbulence=replace(AIR, frame_rate_hz=500), noise_nm=15.0)
+    spec = shaping.Specification(terms=[air], demands=[demand])
     design = lbt.design.shape(path, spec, functions=8, states=None)
     found = predictive_filter(design)
     steps = found.fewest_steps(0.01)
@@ -211,7 +213,7 @@ def test_a_demand_that_no_response_bounds_is_refused(tmp_path):
     shaping = lbt.design.shaping
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     spec = shaping.Specification(
-        objective=shaping.ResidualVariance(turbulence=AIR, noise_nm=15.0),
+        terms=[shaping.ResidualVariance(turbulence=AIR, noise_nm=15.0)],
         demands=[shaping.CommandRms(at_most_nm=1e4, turbulence=AIR, noise_nm=15.0)],
     )
     design = lbt.design.shape(path, spec, functions=8, states=None)

@@ -69,7 +69,7 @@ def test_scalar_closed_forms(horizon):
     for i, (a, q, r) in enumerate(CORNERS):
         exact = closed_form(a, q, r, horizon)
         for route, rel in (("riccati", 1e-8), ("lmi", 1e-7))[: 2 if i % 4 == 1 else 1]:
-            design = lbt.hinf(scalar(a, q, r), horizon=horizon, route=route)
+            design = lbt.hinf(scalar(a, q, r).ahead(horizon), route=route)
             assert design.gamma_least == pytest.approx(exact, rel=rel), (a, q, r)
             assert design.gamma_infeasible == pytest.approx(exact, rel=rel), (a, q, r)
 

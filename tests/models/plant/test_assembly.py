@@ -118,8 +118,8 @@ def test_a_prediction_further_ahead_has_the_same_readings(steps):
     plant = example_plant((FAST,))
     parts = {name: getattr(plant, name) for name in "ABCDL"}
     bare = lbt.EstimationProblem(**parts)  # which predicts without knowing of sensors
-    expected = lbt.kalman(bare, horizon=steps).rms
-    assert lbt.kalman(plant, horizon=steps).rms == pytest.approx(expected, rel=1e-9)
+    expected = lbt.kalman(bare.ahead(steps)).rms
+    assert lbt.kalman(plant.ahead(steps)).rms == pytest.approx(expected, rel=1e-9)
     several = example_plant()
     near, far = several.hardware, several.ahead(steps).hardware
     for one, other in zip(near.suite.sensors, far.suite.sensors, strict=True):

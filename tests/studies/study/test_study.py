@@ -9,7 +9,7 @@ from scipy.stats import qmc
 from support.studies import BASE, load_small_study, study_file
 
 import lbt_synth as lbt
-from lbt_synth.design import optimal_integrator
+from lbt_synth.design import integrator
 from lbt_synth.errors import ConfigError, ProblemError
 from lbt_synth.studies.study.study import ParameterSection, unit_points
 
@@ -120,7 +120,7 @@ def test_controllers(tmp_path):
         "kalman for the configuration",
         "hinf (gamma_ratio 1.5) for each sample",
     ]
-    assert d.gain == optimal_integrator(study.config.hardware, study.config.truth).gain
+    assert d.gain == integrator(study.config.hardware, truth=study.config.truth).gain
     assert study.result_columns[:7] == (
         "a.strehl",
         "a.residual_nm",
@@ -183,7 +183,7 @@ controllers: {sensor: {design: kalman}} & parameters: {sensor.noise_nm: 4} => bo
 controllers: {a: {}} => expected exactly one of design, file => controllers.a
 controllers: {a: {design: kalmn}} => controllers\.a\.design: method must be one of .*Did you mean kalman\? => controllers.a.design
 controllers: {a: {file: a.fits, for: sample}} => for goes with design
-controllers: {a: {design: kalman, gain: 0.5}} => gain goes with design: integrator
+controllers: {a: {design: kalman, gain: 0.5}} => gain goes with method integrator
 controllers: {a: {design: robust}} => controllers.a: .*design.robust is missing => design.robust
 parameters: {loop.frame_rate_hz: {list: [700, 800, 900]}} => controllers.slow, parameters.loop.frame_rate_hz at 700: the controller must run at
 config: "a\0.yaml" => cannot read .*null byte

@@ -1,18 +1,20 @@
-"""What a shaped loop minimises: variances and worst vibrations, their sum or their largest."""
+"""What a shaped loop minimises, summed: variances, and worst vibrations in bands."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, ClassVar, TypeAlias
+from typing import Annotated, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.design.shaping.channel import Channel, SingleModeLoop
-from lbt_synth.design.shaping.frequencies import Band, CheckedFields, Grid
+from lbt_synth.design.shaping.frequencies import Grid, band_text
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear.convex_functions import CombinedFunction, Fractions, Function
+from lbt_synth.linear.convex_functions import Fractions, Function
+from lbt_synth.linear.norms import band_norm
 from lbt_synth.loop import residual_budget
 from lbt_synth.models import (
     ARModel,
@@ -23,13 +25,13 @@ from lbt_synth.models import (
     Vibration,
 )
 from lbt_synth.validation import (
+    Finite,
     FloatArray,
     NotNegative,
     Positive,
+    check_fields,
     number,
     real_array,
-    sequence,
-    set_fields,
 )
 
 _PLACES = 17  # of a resonance in its band
@@ -37,7 +39,7 @@ _RECORDED = Atmosphere | ARModel | TabulatedSpectrum | None  # what a gain file 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ResidualVariance(CheckedFields):
+class ResidualVariance:
     """Variance of turbulence and noise in the residual of one mode.
 
     Parameters
@@ -61,7 +63,6 @@ class ResidualVariance(CheckedFields):
     1.0
     """
 
-    _label: ClassVar = "{0._what} at sensor gain {0.sensor_gain:g}"
     turbulence: Spectrum | None
     noise_nm: NotNegative
     sensor_gain: Positive = 1.0
@@ -72,25 +73,24 @@ class ResidualVariance(CheckedFields):
                 "turbulence must be an Atmosphere, an ARModel, a TabulatedSpectrum or None; got "
                 f"{type(self.turbulence).__name__}. Sample it into a TabulatedSpectrum."
             )
-        CheckedFields.__post_init__(self)
+        check_fields(self)
         if self.turbulence is None and self.noise_nm == 0:
             raise ProblemError("a variance needs turbulence or noise; got neither.")
 
     @property
-    def _what(self) -> str:
-        return "turbulence and noise" if self.noise_nm else "disturbance"
+    def label(self) -> str:
+        """What tables and messages call it."""
+        what = "turbulence and noise" if self.noise_nm else "disturbance"
+        return f"{what} at sensor gain {self.sensor_gain:g}"
 
-    def function(self, channel: Channel, grid: Grid) -> Fractions:
+    def function(self, channel: Channel, grid: Grid) -> Function:
         """Return the variance over a grid as a function of the coefficients [nm^2]."""
         f, w = grid.nodes_hz, grid.weights_hz
         left = _left_of(self.turbulence, self.sensor_gain, channel, grid)
         noise = self.noise_nm * np.sqrt(w / channel.nyquist_hz)
         noise_rows = noise[:, None, None] * channel.residual_noise_rows(f)[:, None]
-        return replace(
-            left,
-            rows=np.concatenate([left.rows, noise_rows], axis=1),
-            centres=np.pad(left.centres, ((0, 0), (0, 1))),
-        )
+        rows = np.concatenate([left.rows, noise_rows], axis=1)
+        return (replace(left, rows=rows, centres=np.pad(left.centres, ((0, 0), (0, 1)))),)
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the variance in the real loop, exactly."""
@@ -163,7 +163,7 @@ class Skirts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VibrationBand(Band):
+class VibrationBand:
     """Worst residual of a vibration that may be anywhere in a band of frequencies.
 
     Parameters
@@ -191,10 +191,21 @@ class VibrationBand(Band):
     'vibration in 16.5-23.5 Hz at sensor gain 1'
     """
 
-    _label: ClassVar = "vibration in {0.band_text} at sensor gain {0.sensor_gain:g}"
+    low_hz: NotNegative
+    high_hz: Finite
     rms_nm: Positive
     sensor_gain: Positive = 1.0
     damping: Annotated[float, ("at_least", 0), ("below", 1)] = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        number(self.high_hz, "high_hz", above=self.low_hz)
+
+    @property
+    def label(self) -> str:
+        """What tables and messages call it."""
+        band = band_text(self.low_hz, self.high_hz)
+        return f"vibration in {band} at sensor gain {self.sensor_gain:g}"
 
     def skirts(self, frame_rate_hz: float) -> Skirts | None:
         """Return what a resonance has outside the band; None for a sinusoid."""
@@ -214,150 +225,42 @@ class VibrationBand(Band):
         )
         skirts = self.skirts(2 * channel.nyquist_hz)
         if skirts is None:
-            return inside
-        outside = _left_of(skirts, self.sensor_gain, channel, grid)
-        return CombinedFunction(parts=(inside, outside), weights=(1.0, 1.0), worst=False)
+            return (inside,)
+        return inside, _left_of(skirts, self.sensor_gain, channel, grid)
 
     def measured_nm2(self, loop: SingleModeLoop) -> float:
         """Return the worst variance in the real loop, by level sets, and that of the skirts."""
-        inside = (self.rms_nm * self.peak(loop.held(self.sensor_gain).rejection())) ** 2
+        rejection = loop.held(self.sensor_gain).rejection()
+        inside = (self.rms_nm * band_norm(rejection, self.low_hz, self.high_hz).upper) ** 2
         skirts = self.skirts(loop.hardware.frame_rate_hz)
         if skirts is None:
             return inside
         return inside + _measured_left(skirts, 0.0, self.sensor_gain, loop)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _CombinedTerms:
-    """Weighted terms, of which the sum or the largest counts."""
-
-    largest: ClassVar[bool] = False  # the largest term instead of the sum
-
-    terms: tuple[Term, ...]
-    weights: tuple[float, ...] | None = None
-
-    def __post_init__(self) -> None:
-        terms = sequence(self.terms, "terms")
-        for term in terms:
-            require_term(term)
-        if not terms:
-            raise ProblemError("an objective needs at least one term; got none.")
-        given = (1.0,) * len(terms) if self.weights is None else sequence(self.weights, "weights")
-        if len(given) != len(terms):
-            raise ProblemError(f"weights must be one per term, {len(terms)}; got {len(given)}.")
-        set_fields(self, terms=terms, weights=tuple(number(w, "weights", above=0) for w in given))
-
-    @property
-    def factors(self) -> tuple[float, ...]:
-        """Weights of the terms, one each."""
-        return () if self.weights is None else self.weights
-
-    def function(self, channel: Channel, grid: Grid) -> Function:
-        """Return the objective over a grid as a function of the coefficients [nm^2]."""
-        parts = tuple(term.function(channel, grid) for term in self.terms)
-        return CombinedFunction(parts=parts, weights=self.factors, worst=self.largest)
-
-    def measured_nm2(self, loop: SingleModeLoop) -> float:
-        """Return the objective of the real loop [nm^2]."""
-        pairs = zip(self.factors, self.terms, strict=True)
-        values = [weight * term.measured_nm2(loop) for weight, term in pairs]
-        return max(values) if self.largest else sum(values)
+Term: TypeAlias = ResidualVariance | VibrationBand
 
 
-class Total(_CombinedTerms):
-    """Weighted sum of terms.
-
-    Parameters
-    ----------
-    terms : sequence of ResidualVariance, VibrationBand, Total or Worst
-        What is added up.
-    weights : sequence of float, optional
-        One a term; 1 by default.
-
-    Raises
-    ------
-    ProblemError
-        If there is no term, or the weights do not fit.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> noise = lbt.design.shaping.ResidualVariance(turbulence=None, noise_nm=15.5)
-    >>> line = lbt.design.shaping.VibrationBand(low_hz=16.5, high_hz=23.5, rms_nm=797)
-    >>> lbt.design.shaping.Total(terms=(noise, line)).factors
-    (1.0, 1.0)
-    """
-
-    __slots__ = ()
+def spectrum_of(term: Term, frame_rate_hz: float) -> Spectrum | None:
+    """Return the spectrum of a term: its turbulence, or the skirts of a band."""
+    return term.skirts(frame_rate_hz) if isinstance(term, VibrationBand) else term.turbulence
 
 
-class Worst(_CombinedTerms):
-    """Largest of weighted terms.
-
-    Parameters
-    ----------
-    terms : sequence of ResidualVariance, VibrationBand, Total or Worst
-        What is compared.
-    weights : sequence of float, optional
-        One a term; 1 by default.
-
-    Raises
-    ------
-    ProblemError
-        If there is no term, or the weights do not fit.
-
-    Examples
-    --------
-    >>> import lbt_synth as lbt
-    >>> low = lbt.design.shaping.VibrationBand(low_hz=10, high_hz=12, rms_nm=100)
-    >>> high = lbt.design.shaping.VibrationBand(low_hz=40, high_hz=45, rms_nm=100)
-    >>> lbt.design.shaping.Worst(terms=(low, high), weights=(1, 2)).factors
-    (1.0, 2.0)
-    """
-
-    __slots__ = ()
-    largest = True
-
-
-Leaf: TypeAlias = ResidualVariance | VibrationBand
-Term: TypeAlias = ResidualVariance | VibrationBand | _CombinedTerms
-
-
-def require_term(term: object) -> None:
-    """Refuse anything that is not a term of an objective."""
-    if not isinstance(term, Term):
-        raise ProblemError(
-            "an objective is made of ResidualVariance, VibrationBand, Total and Worst; got "
-            f"{type(term).__name__}."
-        )
-
-
-def leaves(term: Term) -> tuple[Leaf, ...]:
-    """Return the variances and vibrations of an objective, in order."""
-    if isinstance(term, _CombinedTerms):
-        return tuple(leaf for part in term.terms for leaf in leaves(part))
-    return (term,)
-
-
-def spectrum_of(leaf: Leaf, frame_rate_hz: float) -> Spectrum | None:
-    """Return the spectrum of a leaf: its turbulence, or the skirts of a band."""
-    return leaf.skirts(frame_rate_hz) if isinstance(leaf, VibrationBand) else leaf.turbulence
-
-
-def frequency_costs(term: Term, frequency_hz: FloatArray, frame_rate_hz: float) -> FloatArray:
+def frequency_costs(
+    terms: Iterable[Term], frequency_hz: FloatArray, frame_rate_hz: float
+) -> FloatArray:
     """Cost of an error of T at each frequency, up to a factor: spectra and bands."""
     cost = np.zeros(frequency_hz.size)
-    for leaf in leaves(term):
-        if isinstance(leaf, VibrationBand):
-            inside = (frequency_hz >= leaf.low_hz) & (frequency_hz <= leaf.high_hz)
-            cost += np.where(inside, 3 * leaf.rms_nm**2 / (leaf.high_hz - leaf.low_hz), 0.0)
-        spectrum = spectrum_of(leaf, frame_rate_hz)
+    for term in terms:
+        if isinstance(term, VibrationBand):
+            inside = (frequency_hz >= term.low_hz) & (frequency_hz <= term.high_hz)
+            cost += np.where(inside, 3 * term.rms_nm**2 / (term.high_hz - term.low_hz), 0.0)
+        spectrum = spectrum_of(term, frame_rate_hz)
         if spectrum is not None:
             cost += spectrum.psd(frequency_hz)
     return cost
 
 
-def noise_level(term: Term) -> float:
-    """Largest noise of an objective [nm]."""
-    found = [leaf.noise_nm for leaf in leaves(term) if isinstance(leaf, ResidualVariance)]
-    return max(found, default=0.0)
+def noise_level(terms: Iterable[Term]) -> float:
+    """Return the largest noise of some terms [nm]."""
+    return max((t.noise_nm for t in terms if isinstance(t, ResidualVariance)), default=0.0)
