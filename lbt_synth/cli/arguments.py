@@ -17,6 +17,7 @@ import re
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from textwrap import wrap
 from typing import Any, NamedTuple, NoReturn, cast
 
 import lbt_synth
@@ -239,6 +240,15 @@ COMMANDS = {
     for title, arguments in _blocks(_TABLE)
     for name, module, text in (title.split(" | "),)
 }
+_GROUPS = {  # by the first command of each
+    "init": "start: a configuration to begin with",
+    "design": "design: from a configuration to a gain file",
+    "compare": "look: what a design does in the loop, and what could be better",
+    "show": "prove: what a gain file holds, and whether it is true",
+    "telemetry": "records: from what a loop recorded to a model and a design",
+    "export": "at the telescope: a gain file in another program",
+    "paper": "the paper and the simulator: Agapito et al. 2008, and loops with a pyramid",
+}
 _CHOICES = {  # what an argument may be: a tuple, or the function that returns it, slow to import
     "units": UNITS,
     "accelerations": tuple(M_S2),
@@ -366,17 +376,33 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
     parser = Parser(
         prog="lbt-synth",
         description="Design, certify and analyse tip/tilt controllers that reject vibrations.",
-        epilog="Exit status: 0 done, 1 a design or verification failed, 2 wrong usage or input.",
+        epilog=f"{_list_commands()}\n\nExit status: 0 done, 1 a design or verification failed, 2 "
+        "wrong usage or input.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"lbt-synth {lbt_synth.__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+    commands = parser.add_subparsers(
+        dest="command", metavar="COMMAND", required=True, help="one of those below"
+    )
     for name, command in COMMANDS.items():
-        added = commands.add_parser(name, help=command.text, description=command.text)
+        # completions have the commands with a help; the groups list them for everybody else
+        listed: dict[str, Any] = {"help": command.text} if len(named) > 1 else {}
+        added = commands.add_parser(name, description=command.text, **listed)
         added.add_argument("--json", action="store_true", help="print one JSON object instead")
         added.add_argument("--verbose", action="store_true", help="print all tables and notes")
         if name in named:
             _add_arguments(added, command.arguments)
     return parser
+
+
+def _list_commands() -> str:
+    """Return the commands in their groups, each with its help."""
+    lines = list[str]()
+    for name, command in COMMANDS.items():
+        lines += ["", _GROUPS[name]] if name in _GROUPS else []
+        first, rest = f"  {name:14}", " " * 16
+        lines += wrap(command.text.rstrip("."), 80, initial_indent=first, subsequent_indent=rest)
+    return "\n".join(lines[1:])
 
 
 def full_parser() -> argparse.ArgumentParser:

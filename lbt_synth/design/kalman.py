@@ -8,10 +8,10 @@ from lbt_synth.design.filter_design import FilterDesign, filter_design
 from lbt_synth.design.result import SolverReport
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.validation import FloatArray, require_instance
+from lbt_synth.validation import FloatArray, choice, require_instance
 
 
-def kalman(problem: EstimationProblem) -> FilterDesign:
+def kalman(problem: EstimationProblem, *, route: str = "riccati") -> FilterDesign:
     """Design the steady-state Kalman filter of an estimation problem.
 
     Parameters
@@ -19,6 +19,9 @@ def kalman(problem: EstimationProblem) -> FilterDesign:
     problem : EstimationProblem
         The problem; a plant gives a controller. The estimate is one frame ahead of the newest
         measurement; ``problem.ahead`` is the problem of another one.
+    route : {"riccati", "sdp"}, optional
+        The Riccati equation, or a semidefinite programme, which takes from the Riccati
+        solution only the coordinates and the scale of its variables.
 
     Returns
     -------
@@ -43,12 +46,19 @@ def kalman(problem: EstimationProblem) -> FilterDesign:
     (0.618033989, True)
     """
     require_instance(problem, EstimationProblem)
+    choice(route, "route", ("riccati", "sdp"))
     solution = kalman_riccati(problem)
+    if route == "sdp":
+        problem.require_one_phase("the semidefinite programme", "route='riccati'")
+        from lbt_synth.linear.lmi.filters import kalman_sdp
+
+        scale = error_scale(problem, solution.P)
+        solution = kalman_sdp(problem, coordinates=solution.P, scale=scale)
     return filter_design(
         problem,
         solution.gain_predictor,
         method="kalman",
-        solver=SolverReport(route="riccati", status=solution.status),
+        solver=SolverReport(route=route, status=solution.status),
     )
 
 

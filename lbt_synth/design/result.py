@@ -66,7 +66,7 @@ class SolverReport:
     Attributes
     ----------
     route : str
-        "riccati", "lmi" or "closed form".
+        "riccati", "sdp", "lmi" or "closed form".
     status : str
         What the solver said of itself.
     """

@@ -22,6 +22,14 @@ _BOUNDS = frozenset({"gamma", "gamma_ratio"})  # at most one is given
 _SIZES = {"gain", "phase_margin_deg", "modulus_margin"}  # what decides the gain of an integrator
 
 
+class KalmanOptions(Section):
+    """Options of the Kalman filter."""
+
+    route: Literal["riccati", "sdp"] = Field(
+        default="riccati", description="solver, riccati or sdp"
+    )
+
+
 class BoundOptions(Section):
     """A bound on the H-infinity norm."""
 
@@ -140,7 +148,7 @@ KALMAN = Method(
     title="Kalman filter",
     label="Kalman",
     design=_FILTER,
-    options=Section,
+    options=KalmanOptions,
     build=_filter_of("lbt_synth.design.kalman:kalman"),
     batched=True,
     reference_rank=1,

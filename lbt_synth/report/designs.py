@@ -463,7 +463,7 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
         if one.design.hardware is not None:
             differences = loop_differences(one.design.hardware, config.hardware)
             notes += [f"{one.name} was {text}" for text in differences]
-    return [*blocks, *config._summarise().tables, *(Notice(text=note) for note in notes)]
+    return [*blocks, *(Notice(text=note) for note in notes)]
 
 
 def _failure_blocks(report: DesignReport) -> list[Block]:

@@ -22,7 +22,6 @@ from lbt_synth.report.designs import (
 )
 from lbt_synth.report.draw import figure_series
 from lbt_synth.report.page.html import page_html
-from lbt_synth.storage.tables import Table
 from lbt_synth.studies.limits import limits
 
 
@@ -210,7 +209,6 @@ def test_a_truth_without_vibrations(config, designs):
     page = report_page(report, {}, "calm")
     assert [chart.key for chart in page.charts] == ["sigma", "bode", "step"]
     assert page.title == "calm"
-    assert "Truth" in [block.caption for block in page.blocks if isinstance(block, Table)]
     assert verdict(report).startswith("slow leaves ")
 
 

@@ -1,7 +1,8 @@
-"""Find the least gamma of a predictor by a semidefinite programme.
+"""Solve for the Kalman predictor and for the least gamma of one by semidefinite programmes.
 
-The gain is eliminated: with N a basis of the null space of
-``[C D]``, a filter with error norm below gamma exists if and only if some P satisfies::
+For the least gamma the gain is eliminated: with N a basis of the null space of ``[C D]``, a filter
+with error norm below gamma exists if and only if some P satisfies::
+
 
     Nx'P Nx + gamma^2 Nw'Nw - (A Nx + B Nw)' P (A Nx + B Nw) - (L Nx)'(L Nx) > 0
     P - L'L > 0
@@ -30,51 +31,81 @@ from lbt_synth.validation import FloatArray, IntArray, frozen_copy
 _ADVICE = 'Try route="riccati".'
 
 
+class _Balanced:
+    """A problem in states of which ``coordinates`` is the identity, with unit noise.
+
+    These decide how accurate a solver is, not what it finds.
+    """
+
+    def __init__(self, problem: EstimationProblem, coordinates: FloatArray, scale: float) -> None:
+        A_s, B_s, self.injection = decorrelate(problem)
+        self.basis, inverse = whitening_coordinates(coordinates)
+        self.whitening = np.linalg.inv(np.linalg.cholesky(problem.R))
+        self.problem = EstimationProblem(
+            A=inverse @ A_s @ self.basis,
+            B=inverse @ B_s,
+            C=self.whitening @ problem.C @ self.basis,
+            D=self.whitening @ problem.D,
+            L=problem.L @ self.basis / scale,
+        )
+
+    def filter(self, P: FloatArray, information: FloatArray, run: tuple[str, int]) -> FilterRiccati:
+        """Return the filter of a solution P and of the information that it has of the states."""
+        C = self.problem.C
+        try:  # the inverse of the information may be singular, the gain stays finite
+            gain_filter = np.linalg.solve(information + C.T @ C, C.T)
+        except np.linalg.LinAlgError as error:
+            raise NumericalError(
+                f"the inequality's storage matrix has no gain: {error}. {_ADVICE}", status=run[0]
+            ) from error
+        gain = self.basis @ self.problem.A @ gain_filter @ self.whitening + self.injection
+        return FilterRiccati(
+            P=frozen_copy(self.basis @ P @ self.basis.T),
+            gain_predictor=frozen_copy(gain),
+            gain_filter=frozen_copy(self.basis @ gain_filter @ self.whitening),
+            status=run[0],
+            iterations=run[1],
+        )
+
+
+def kalman_sdp(
+    problem: EstimationProblem, *, coordinates: FloatArray, scale: float
+) -> FilterRiccati:
+    """Maximise tr P subject to ``[[APA' + BB' - P, APC'], [CPA', DD' + CPC']] >= 0``, ``P >= 0``.
+
+    The stabilising solution of the filter Riccati equation is the greatest P that satisfies the
+    inequality (S. Boyd et al., "Linear Matrix Inequalities in System and Control Theory", SIAM
+    (1994), doi:10.1137/1.9781611970777).
+    """
+    balanced = _Balanced(problem, coordinates, scale)
+    A, B, C, R = (getattr(balanced.problem, name) for name in "ABCR")
+    P = symmetric_variable(_parts(balanced.problem)[0])
+    riccati = cp.bmat([[A @ P @ A.T + B @ B.T - P, A @ P @ C.T], [C @ P @ A.T, R + C @ P @ C.T]])
+    run = solve(cp.Maximize(cp.trace(P)), [symmetrise(riccati) >> 0, P >> 0])
+    require_optimum(run, "the semidefinite programme of the Kalman filter", _ADVICE)
+    return balanced.filter(P.value, np.linalg.inv(P.value), run)
+
+
 def least_gamma_lmi(
     problem: EstimationProblem, *, coordinates: FloatArray, scale: float
 ) -> tuple[FilterRiccati, Witness]:
-    """Find the least gamma, and a filter that reaches it; the dual solution is its witness.
-
-    The programme is in states of which ``coordinates``, (n, n), is the identity, with measurements
-    of unit noise. These decide how accurate the solver is, not what it finds.
-    """
-    A_s, B_s, injection = decorrelate(problem)
-    basis, inverse = whitening_coordinates(coordinates)
-    whitening = np.linalg.inv(np.linalg.cholesky(problem.R))
-    balanced = EstimationProblem(
-        A=inverse @ A_s @ basis,
-        B=inverse @ B_s,
-        C=whitening @ problem.C @ basis,
-        D=whitening @ problem.D,
-        L=problem.L @ basis / scale,
-    )
-    A, B, C, L, n = balanced.A, balanced.B, balanced.C, balanced.L, balanced.n_states
-    hidden, parts = _invisible_basis(balanced)
-    Nx, Nw = hidden[:n], hidden[n:]
-    P, level = symmetric_variable(_parts(balanced)[0]), cp.Variable(nonneg=True)
+    """Find the least gamma, and a filter that reaches it; the dual solution is its witness."""
+    balanced = _Balanced(problem, coordinates, scale)
+    A, B, L = (getattr(balanced.problem, name) for name in "ABL")
+    hidden, parts = _invisible_basis(balanced.problem)
+    Nx, Nw = np.split(hidden, [len(A)])
+    P, level = symmetric_variable(_parts(balanced.problem)[0]), cp.Variable(nonneg=True)
     step, seen = A @ Nx + B @ Nw, L @ Nx
     supplied = Nx.T @ P @ Nx + level * (Nw.T @ Nw)
     dissipation = symmetrise(supplied - step.T @ P @ step - seen.T @ seen) >> 0
     run = solve(cp.Minimize(level), [dissipation, P - L.T @ L >> 0])
     require_optimum(run, "the least gamma's semidefinite programme", _ADVICE)
     storage = (P.value + P.value.T) / 2 / level.value
-    information = storage - L.T @ L / level.value
-    try:  # Pt^-1 may be singular, the gain stays finite
-        gain_filter = np.linalg.solve(information + C.T @ C, C.T)
-    except np.linalg.LinAlgError as error:
-        raise NumericalError(
-            f"the inequality's storage matrix has no gain: {error}. {_ADVICE}", status=run[0]
-        ) from error
-    solution = FilterRiccati(
-        P=frozen_copy(basis @ np.linalg.inv(storage) @ basis.T),
-        gain_predictor=frozen_copy(basis @ A @ gain_filter @ whitening + injection),
-        gain_filter=frozen_copy(basis @ gain_filter @ whitening),
-        status=run[0],
-        iterations=run[1],
-    )
+    solution = balanced.filter(np.linalg.inv(storage), storage - L.T @ L / level.value, run)
     moments = np.where(parts[:, None] == parts, dissipation.dual_value, 0.0)
     pairs = hidden @ semidefinite_root(moments)
-    return solution, Witness(states=basis @ pairs[:n], disturbances=pairs[n:])
+    states, disturbances = np.split(pairs, [len(A)])
+    return solution, Witness(states=balanced.basis @ states, disturbances=disturbances)
 
 
 def _parts(problem: EstimationProblem) -> tuple[IntArray, IntArray]:

@@ -7,7 +7,7 @@ from scipy.linalg import block_diag
 import lbt_synth as lbt
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear.lmi import filters
-from lbt_synth.linear.lmi.filters import least_gamma_lmi
+from lbt_synth.linear.lmi.filters import kalman_sdp, least_gamma_lmi
 
 
 def random_axis(rng):
@@ -42,12 +42,16 @@ def test_axes_that_have_nothing_in_common_stay_apart(seed):
     assert least.gamma_least == pytest.approx(max(alone), rel=1e-6)
     assert least.gamma_infeasible == pytest.approx(max(alone), rel=1e-6)
     near = lbt.hinf(whole, gamma_ratio=1.1, route="lmi")
-    for design in (least, near):
+    for design in (lbt.kalman(whole, route="sdp"), least, near):
         assert not np.any(design.gain_predictor[other])
 
 
 def test_a_programme_that_did_not_end_gives_no_filter(monkeypatch):
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     monkeypatch.setattr(filters, "solve", lambda *_: ("user_limit", 200))
-    with pytest.raises(NumericalError, match=r"least gamma's .* ended as"):
-        least_gamma_lmi(walk, coordinates=np.eye(1), scale=1.0)
+    for programme, words in (
+        (kalman_sdp, "of the Kalman filter ended as"),
+        (least_gamma_lmi, r"least gamma's .* ended as"),
+    ):
+        with pytest.raises(NumericalError, match=words):
+            programme(walk, coordinates=np.eye(1), scale=1.0)
