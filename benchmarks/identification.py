@@ -34,7 +34,7 @@ from harness import (
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
-from lbt_synth.identification.stretches import split_halves
+from lbt_synth.identification.records.record import split_halves
 
 RATE = 1000.0
 NEAR_HZ = 0.1

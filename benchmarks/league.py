@@ -32,7 +32,7 @@ from lbt_synth.identification.prediction.residual import (
     settled_test,
 )
 from lbt_synth.identification.records.faults import mark
-from lbt_synth.identification.stretches import Stretches, cut_stretches, keep_frames
+from lbt_synth.identification.records.record import Stretches, cut_stretches, keep_frames
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.validation import FloatArray

@@ -19,7 +19,7 @@ from lbt_synth.cli.telemetry import (
     require_series,
 )
 from lbt_synth.config.write import RAISED, config_text, identified_config, require_writable_facts
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import require_gain_name
 from lbt_synth.identification import IdentifiedModel, LoopRecord, SpectrumRecord
@@ -68,8 +68,12 @@ def run_identify(arguments: Namespace) -> Report:
     if readings is not None and isinstance(record, LoopRecord):
         channels, values, notes = readings
         report.notes += [f"note: {note}." for note in notes]
-        transfers = accelerometer_transfers(model, record, values, channels=channels)
-        add_accelerometers(report, transfers)
+        try:
+            transfers = accelerometer_transfers(model, record, values, channels=channels)
+        except LbtSynthError as error:  # the model is not lost
+            report.notes.append(f"warning: the accelerometers were not compared: {error}")
+        else:
+            add_accelerometers(report, transfers)
     report.notes += [marked_note(doubt) for doubt in doubts]
     write_files(report, places, arguments, record, model, accelerometers=transfers)
     return report

@@ -46,8 +46,12 @@ from lbt_synth.identification.prediction.regression import (
 )
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
-from lbt_synth.identification.records.record import LoopRecord, require_length
-from lbt_synth.identification.stretches import keep_frames, split_halves
+from lbt_synth.identification.records.record import (
+    LoopRecord,
+    keep_frames,
+    require_length,
+    split_halves,
+)
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, residual_budget, stable_sensor_gains
 from lbt_synth.methods.registry import (
     default_method,

@@ -31,12 +31,11 @@ from lbt_synth.identification.prediction.comparison import (
 )
 from lbt_synth.identification.prediction.residual import MUCH, gather
 from lbt_synth.identification.records.from_series import TREND, end_scatters
-from lbt_synth.identification.records.record import FEW, LoopRecord, require_length
-from lbt_synth.identification.stretches import split_halves
+from lbt_synth.identification.records.record import FEW, LoopRecord, require_length, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, loop_margins, residual_budget
 from lbt_synth.loop.stable_range import stable_sensor_gains
-from lbt_synth.methods.registry import METHODS, reference_methods
+from lbt_synth.methods.registry import METHODS, default_method, reference_methods
 from lbt_synth.models import TipTiltPlant, Truth
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.display_unit import nm_text
@@ -317,6 +316,7 @@ class Diagnosis:
     def findings(self) -> tuple[Finding, ...]:
         """What the record tells, the most urgent first; the last one is about its residual."""
         faults = list(_find_faults(self)) or [_judge_loop(self)]
+        faults += _missed_by_the_model(self)
         return (*faults, Finding(sentence=_residual_text(self), advice=_advice_text(self)))
 
     @property
@@ -462,6 +462,21 @@ def _find_faults(diagnosis: Diagnosis) -> Iterator[Finding]:
         yield Finding(
             sentence=f"The commands are not those that the mirror followed: {diagnosis.doubt}.",
             advice=f"First {diagnosis.commands.advice}.",
+        )
+
+
+def _missed_by_the_model(diagnosis: Diagnosis) -> Iterator[Finding]:
+    """Say where the model misses what past readings tell: a predictor leaves clearly less."""
+    rows = {row.name: row.replayed for row in diagnosis.residuals}
+    model = rows.get(METHODS[default_method()].title)
+    data = next((rows.get(m.title) for m in METHODS.values() if m.of_record), None)
+    if model and data and model.is_clearly_above(data):
+        low, high = (diagnosis.record.frame_rate_hz * end for end in model.excess_band(data))
+        less_nm = nm_text(float(np.sqrt(model.total_nm2 - data.total_nm2)))
+        yield Finding(
+            tone="note",
+            sentence=f"The model misses {less_nm} that past readings tell, above all between "
+            f"{low:.0f} and {high:.0f} Hz.",
         )
 
 

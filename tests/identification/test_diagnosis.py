@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.control_laws import RATE, SteppedLaw, ordinary_loop, run_law
 from support.diagnoses import GAIN, given_design, line_diagnosis, line_record, short_record
-from support.recorded_loops import LINE
+from support.recorded_loops import LINE, spliced_record
 
 import lbt_synth as lbt
 from lbt_synth.identification import diagnose, loop_record
@@ -209,3 +209,15 @@ def test_along_what_a_line_shakes(good):
     assert line_name(replace(line, direction=(0.0, 1.0))).endswith(" Hz (tilt)")
     (part,) = (row.part for row in good.costs if row.part.startswith("line"))
     assert f"% of the {part}" in good.verdict[1]
+
+
+def test_what_the_model_misses_has_its_band():
+    """A fit of one line takes that at 60 Hz, and leaves the other to a predictor."""
+    lines = ((25.0, 0.01, 200.0), (60.0, 0.02, 60.0))
+    record = spliced_record((0,), lines=lines, frames=10_000, sensor_gain=1.0)
+    shown = diagnose(record, sensor_gain=1.0, most_lines=1)
+    (missed,) = (f.sentence for f in shown.findings if f.sentence.startswith("The model misses"))
+    low, high = map(float, missed.split(" between ")[1].removesuffix(" Hz.").split(" and "))
+    assert 20 < low < 25 < high < 31
+    full = diagnose(record, sensor_gain=1.0)
+    assert not any(f.sentence.startswith("The model misses") for f in full.findings)

@@ -34,8 +34,7 @@ from lbt_synth.identification.fit.periodogram import (
 )
 from lbt_synth.identification.fit.shared_lines import couple_axes
 from lbt_synth.identification.records.faults import MAD, RARE
-from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
-from lbt_synth.identification.stretches import Stretches
+from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord, Stretches
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, each_of, require_instance
 

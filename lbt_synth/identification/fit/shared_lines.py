@@ -43,8 +43,7 @@ from lbt_synth.identification.fit.whittle import (
     spectral_matrix,
 )
 from lbt_synth.identification.records.faults import SURPRISING
-from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.stretches import Stretches
+from lbt_synth.identification.records.record import LoopRecord, Stretches
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 
 _MOST_SHARED = 0.9  # of the turbulence, where a fit begins

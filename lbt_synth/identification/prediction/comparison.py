@@ -24,8 +24,7 @@ from lbt_synth.identification.prediction.residual import (
     settled_test,
 )
 from lbt_synth.identification.records.faults import SURPRISING
-from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.stretches import Stretches, split_halves
+from lbt_synth.identification.records.record import LoopRecord, Stretches, split_halves
 from lbt_synth.linear import Controller
 from lbt_synth.loop import (
     Imaging,

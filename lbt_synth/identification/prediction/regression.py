@@ -28,8 +28,12 @@ from lbt_synth.identification.prediction.residual import (
     run_from_rest,
     settle_frames,
 )
-from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.stretches import Stretches, cut_stretches, split_halves
+from lbt_synth.identification.records.record import (
+    LoopRecord,
+    Stretches,
+    cut_stretches,
+    split_halves,
+)
 from lbt_synth.linear import Controller
 from lbt_synth.loop import close_loop
 from lbt_synth.models import LoopHardware

@@ -19,10 +19,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import rfft
+from scipy.signal import welch
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.records.faults import SURPRISING
-from lbt_synth.identification.stretches import Stretches, cut_stretches
+from lbt_synth.identification.records.record import Stretches, cut_stretches
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.loop import ClosedLoop, Imaging, strehl
@@ -33,6 +34,7 @@ from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, one_or_e
 MUCH = 1.25  # ratio of residuals that no error excuses: that of a line that beats is too large
 _ERRORS = 2.0  # standard errors by which one residual is clearly above another
 _LEAST_SHARE = 0.02  # of the measured variance: 1 % of the rms, less than conditions change by
+_SEGMENT = 256  # frames of a spectrum: 4 Hz at 1 kHz, as finely as an excess is told
 _SETTLE_S = 0.5  # of a stretch, in which loops that reject a hertz forget where they began
 
 
@@ -115,6 +117,17 @@ class ResidualEstimate:
         difference, error = self.above(other)
         excused = (MUCH**2 - 1) * max(other.total_nm2, other.total_error_nm2)
         return difference > max(_LEAST_SHARE * self.measured_nm2, min(_ERRORS * error, excused))
+
+    def excess_band(self, other: ResidualEstimate) -> tuple[float, float]:
+        """Return the band around the largest excess of power over another residual [1/frame]."""
+        powers = (welch(one.measured_nm, nperseg=_SEGMENT, axis=0)[1] for one in (self, other))
+        more = np.subtract(*(np.sum(power, axis=1) for power in powers))
+        peak, below = int(np.argmax(more)), np.flatnonzero(more < np.max(more) / 2)
+        low, high = (
+            max(below[below < peak], default=-1),
+            min(below[below > peak], default=len(more)),
+        )
+        return (low + 0.5) / _SEGMENT, (high - 0.5) / _SEGMENT
 
     def parts(self, count: int) -> list[ResidualEstimate]:
         """Return the residuals of so many consecutive parts of the frames, of equal length."""

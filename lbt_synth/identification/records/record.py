@@ -39,6 +39,7 @@ from lbt_synth.validation import (
 BRIDGED_FRAMES = 3  # of a hole, over which a slow phase is a cubic
 FEW = 0.01  # of the frames, that may have a fault or be bridged: they move no result
 NOT_KNOWN = "correction not known"
+Stretches: TypeAlias = tuple[tuple[int, int], ...]  # (start, stop) of contiguous usable frames
 _Delay: TypeAlias = Annotated[float, ("at_least", 1), ("at_most", 100)]
 _LEAST_FRAMES = 4 * SHORTEST_SEGMENT  # half of which show a model to be tested on the others
 LEAST_SECONDS = 2.0  # slower turbulence moves no filter by much
@@ -362,3 +363,33 @@ class SpectrumRecord:
         """Root of the integral over the frequencies of the record, (axes,) [nm]."""
         middles = (self.density_nm2_hz[1:] + self.density_nm2_hz[:-1]) / 2
         return frozen_copy(np.sqrt(np.diff(self.frequency_hz) @ middles))
+
+
+def keep_frames(record: LoopRecord, kept: BoolArray) -> LoopRecord:
+    """Return a record of which no other frames (frames,) are usable."""
+    bridges = None if record.bridges is None else record.bridges & kept
+    return replace(record, measured=record.measured & kept, bridges=bridges)
+
+
+def split_halves(record: LoopRecord) -> tuple[LoopRecord, LoopRecord]:
+    """Return a record with the first half of its usable frames, to fit, and the rest, to test."""
+    runs = record.stretches()
+    count = int(np.sum(record.usable))
+    if count < 2:
+        raise ProblemError(
+            f"a record must leave frames to fit and to test on; got {count} usable frames. Record "
+            "more."
+        )
+    first = mark(np.array(cut_stretches(runs, 0, count // 2)), record.frames)
+    return keep_frames(record, first), keep_frames(record, ~first)
+
+
+def cut_stretches(stretches: Stretches, first: int, last: int) -> Stretches:
+    """Return the usable frames from one count of them to another."""
+    out, before = [], 0
+    for start, stop in stretches:
+        low, high = max(first - before, 0), min(last - before, stop - start)
+        if low < high:
+            out.append((start + low, start + high))
+        before += stop - start
+    return tuple(out)

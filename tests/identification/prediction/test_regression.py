@@ -21,7 +21,7 @@ from lbt_synth.identification.prediction.regression import (
     regress,
 )
 from lbt_synth.identification.prediction.residual import replay
-from lbt_synth.identification.stretches import keep_frames, split_halves
+from lbt_synth.identification.records.record import keep_frames, split_halves
 from lbt_synth.loop import close_loop
 
 

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import loop_record
-from lbt_synth.identification.records.record import LoopRecord
-from lbt_synth.identification.stretches import cut_stretches, split_halves
+from lbt_synth.identification.records.record import LoopRecord, cut_stretches, split_halves
 
 
 def frames_in(stretches):
