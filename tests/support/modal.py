@@ -9,6 +9,9 @@ from scipy.linalg import block_diag
 from support.plants import lbt_axis_plant
 
 import lbt_synth as lbt
+from lbt_synth.loop.budget import ensemble_residuals
+from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble
+from lbt_synth.loop.evaluator import textbook_matrices
 
 RATE = 800.0
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=563.6, direction=(1,))
@@ -60,14 +63,14 @@ def integrator_residuals(gains, air, *, noise_nm, hardware=None, vibrations=None
         each = [some[i] if len(some := lines.get(mode, [])) > i else nothing for mode in range(n)]
         frequency_hz = np.array([line.frequency_hz for line in each])
         moving.append(
-            lbt.loop.EnsembleVibration(
+            EnsembleVibration(
                 frequency_hz=frequency_hz,
                 rms_nm=[line.rms_nm for line in each] / np.sinc(frequency_hz * path.dt_s),
                 damping=[line.damping for line in each],
                 direction=(1.0,),
             )
         )
-    ensemble = lbt.loop.LoopEnsemble(
+    ensemble = LoopEnsemble(
         loops=n,
         turbulence=[air],
         noise_nm=np.broadcast_to(noise_nm, n)[:, None],
@@ -75,7 +78,7 @@ def integrator_residuals(gains, air, *, noise_nm, hardware=None, vibrations=None
         **conditions,
     )
     controllers = [lbt.Controller(A=1.0, B=g, C=1.0, D=0.0, dt_s=path.dt_s) for g in gains]
-    return lbt.loop.ensemble_residuals(controllers, path, ensemble).rms_nm
+    return ensemble_residuals(textbook_matrices(controllers), path, ensemble).rms_nm
 
 
 def joint_controller(parts, n):

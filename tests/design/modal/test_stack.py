@@ -21,6 +21,9 @@ import lbt_synth as lbt
 import lbt_synth.design.modal.stack
 from lbt_synth.design.modal import MixedController, modal_filters
 from lbt_synth.errors import DimensionError, NonFiniteError, ProblemError
+from lbt_synth.loop.budget import ensemble_residuals
+from lbt_synth.loop.ensemble import LoopEnsemble
+from lbt_synth.loop.evaluator import textbook_matrices
 from lbt_synth.models import ARModel, PositionLoop
 
 
@@ -156,6 +159,8 @@ def test_a_process_that_is_all_but_a_walk_leaves_what_a_walk_leaves():
         air = ARModel(
             coefficients=[[0.9], [1 - distance]], driving_rms_nm=[1.0, v], frame_rate_hz=RATE
         )
-        ensemble = lbt.loop.LoopEnsemble(loops=2, turbulence=[air], noise_nm=[[n], [n]])
-        left = lbt.loop.ensemble_residuals(law(g), path_of(modes=1), ensemble, frame_means=True)
+        ensemble = LoopEnsemble(loops=2, turbulence=[air], noise_nm=[[n], [n]])
+        left = ensemble_residuals(
+            textbook_matrices([law(g)]), path_of(modes=1), ensemble, frame_means=True
+        )
         assert left.rms_nm[1] == pytest.approx(walk, rel=1e-7)
