@@ -28,10 +28,7 @@ from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residual import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.models.turbulence.ar_models import noll_orders
-from lbt_synth.report.designs import (
-    refine_values,
-    require_compatible,
-)
+from lbt_synth.report.designs import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_map_figure
 from lbt_synth.report.figures.studies import (
     limits_figure,

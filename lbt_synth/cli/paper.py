@@ -19,12 +19,7 @@ from lbt_synth.design import Design, FilterDesign
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import Telemetry, load_gain, save_gain, save_telemetry
 from lbt_synth.interop.specula import simulation
-from lbt_synth.interop.specula.optics import (
-    Calibration,
-    EndToEndSetup,
-    calibrate,
-    specula_version,
-)
+from lbt_synth.interop.specula.optics import Calibration, EndToEndSetup, calibrate, specula_version
 from lbt_synth.interop.specula.simulation import EndToEndRun, mix_controller, unread_sensors
 from lbt_synth.methods.registry import design_label, design_title
 from lbt_synth.report.draw import save_figure

@@ -12,12 +12,7 @@ from lbt_synth.cli.arguments import given_options, refuse_options
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs, say_accelerometers
 from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.cli.streams import count_progress
-from lbt_synth.cli.telemetry import (
-    load_series,
-    record_imaging,
-    record_telescope,
-    require_series,
-)
+from lbt_synth.cli.telemetry import load_series, record_imaging, record_telescope, require_series
 from lbt_synth.config.write import RAISED, config_text, identified_config, require_writable_facts
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.files import save_gain

@@ -11,11 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from lbt_synth.cli.arguments import given_options, refuse_options
-from lbt_synth.cli.loop_inputs import (
-    load_designs,
-    load_shown,
-    loop_difference_notes,
-)
+from lbt_synth.cli.loop_inputs import load_designs, load_shown, loop_difference_notes
 from lbt_synth.cli.output import PERCENT, RMS, Report, write_telemetry
 from lbt_synth.config import Config
 from lbt_synth.design import Design
@@ -23,12 +19,7 @@ from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.linear import estimator_form
-from lbt_synth.loop import (
-    Imaging,
-    residual_budget,
-    simulate,
-    strehl,
-)
+from lbt_synth.loop import Imaging, residual_budget, simulate, strehl
 from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.loop.simulation import READINGS, Drop, Segment, Simulation, settling_frames
 from lbt_synth.models import Truth

@@ -5,14 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
-from pydantic import (
-    Discriminator,
-    Field,
-    Tag,
-    ValidationError,
-    create_model,
-    model_validator,
-)
+from pydantic import Discriminator, Field, Tag, ValidationError, create_model, model_validator
 
 from lbt_synth.methods import quantities as q
 from lbt_synth.methods.method import Section

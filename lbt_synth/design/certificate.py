@@ -9,11 +9,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.errors import CertificateError, DimensionError
-from lbt_synth.linear import (
-    EstimationProblem,
-    StateSpace,
-    hinf_norm,
-)
+from lbt_synth.linear import EstimationProblem, StateSpace, hinf_norm
 from lbt_synth.linear.infeasibility_proof import Witness, infeasible_level
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.linear.norms import spectral_norms

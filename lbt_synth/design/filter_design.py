@@ -54,13 +54,7 @@ from lbt_synth.loop import ClosedLoop, close_loop, residual_budget
 from lbt_synth.loop.budget import model_readings
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import Column, column, nm_column, table_row
-from lbt_synth.validation import (
-    BoolArray,
-    ComplexArray,
-    FloatArray,
-    frozen_copy,
-    set_fields,
-)
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, set_fields
 
 MOST_UNITS = 6  # sensors and channels of which every subset gets a filter
 ORIGIN = "distance from its Riccati filter"

@@ -13,19 +13,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lbt_synth.design.certificate import ORIGIN_TOLERANCE, TOLERANCE, Check, Claim, Evidence
-from lbt_synth.design.result import (
-    UNCERTIFIED,
-    Design,
-    RowTable,
-    SolverReport,
-    with_certificate,
-)
-from lbt_synth.design.shaping.channel import (
-    Channel,
-    SingleModeLoop,
-    laguerre_basis,
-    mode_loop,
-)
+from lbt_synth.design.result import UNCERTIFIED, Design, RowTable, SolverReport, with_certificate
+from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, laguerre_basis, mode_loop
 from lbt_synth.design.shaping.demands import Bound, Demand, LoopErrors
 from lbt_synth.design.shaping.solution import ModeSolution, reduce_mode, solve_mode
 from lbt_synth.design.shaping.specification import Specification, violated_demands

@@ -50,13 +50,7 @@ from lbt_synth.models.mirror.frame_rate_system import Response, tapped_mirror
 from lbt_synth.models.plant.assembly import held_frames
 from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.storage.rows import Column
-from lbt_synth.validation import (
-    ComplexArray,
-    FloatArray,
-    frozen_copy,
-    number,
-    require_instance,
-)
+from lbt_synth.validation import ComplexArray, FloatArray, frozen_copy, number, require_instance
 
 Vector: TypeAlias = FloatArray  # which may be empty
 

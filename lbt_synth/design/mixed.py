@@ -17,11 +17,7 @@ from lbt_synth.design.hinf import hinf, require_reachable
 from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import NumericalError, ProblemError
-from lbt_synth.linear import (
-    EstimationProblem,
-    StateSpace,
-    hinf_norm,
-)
+from lbt_synth.linear import EstimationProblem, StateSpace, hinf_norm
 from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.linear.riccati.filtering import FilterRiccati, gamma_riccati, kalman_riccati

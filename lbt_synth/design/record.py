@@ -16,13 +16,7 @@ from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.models import LoopHardware, SensorSuite, TipTiltPlant
 from lbt_synth.models.plant.assembly import PlantParts
 from lbt_synth.models.plant.tip_tilt import assemble
-from lbt_synth.validation import (
-    FloatArray,
-    frozen_copy,
-    number,
-    sequence,
-    text,
-)
+from lbt_synth.validation import FloatArray, frozen_copy, number, sequence, text
 
 Arrays = dict[str, FloatArray]
 Meta = dict[str, Any]

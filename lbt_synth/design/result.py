@@ -20,11 +20,7 @@ from lbt_synth.loop import (
     stable_sensor_gains,
 )
 from lbt_synth.loop.closed_loop import reads_others
-from lbt_synth.loop.least_residual import (
-    above_percent,
-    least_residual,
-    limit_or_nan,
-)
+from lbt_synth.loop.least_residual import above_percent, least_residual, limit_or_nan
 from lbt_synth.models import LoopHardware, TipTiltPlant
 from lbt_synth.storage.rows import Column, Facts, fact_table
 from lbt_synth.storage.summaries import Summarised, Summary

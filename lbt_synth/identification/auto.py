@@ -39,11 +39,7 @@ from lbt_synth.identification.prediction.comparison import (
     compare_designs,
     design_inputs,
 )
-from lbt_synth.identification.prediction.regression import (
-    ChannelValue,
-    channel_values,
-    regress,
-)
+from lbt_synth.identification.prediction.regression import ChannelValue, channel_values, regress
 from lbt_synth.identification.prediction.residual import ResidualEstimate
 from lbt_synth.identification.records.record import LEAST_SECONDS as LEAST_RECORD_SECONDS
 from lbt_synth.identification.records.record import (
@@ -53,11 +49,7 @@ from lbt_synth.identification.records.record import (
     split_halves,
 )
 from lbt_synth.loop import ClosedLoop, Imaging, close_loop, residual_budget, stable_sensor_gains
-from lbt_synth.methods.registry import (
-    default_method,
-    method_named,
-    record_methods,
-)
+from lbt_synth.methods.registry import default_method, method_named, record_methods
 from lbt_synth.methods.request import design_request
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.display_unit import nm_text

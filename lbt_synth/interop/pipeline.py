@@ -29,12 +29,7 @@ from lbt_synth.interop.proof import FRAMES, LOSS, Written, prove_written, rehear
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.disturbances import Disturbance
-from lbt_synth.loop.simulation import (
-    Simulation,
-    SteppedController,
-    settling_frames,
-    simulate,
-)
+from lbt_synth.loop.simulation import Simulation, SteppedController, settling_frames, simulate
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.atomic_files import make_directory, require_ending, write_together
 from lbt_synth.storage.rows import json_record

@@ -12,14 +12,7 @@ from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear.lyapunov import stationary_covariance
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.models import (
-    ARModel,
-    LoopHardware,
-    SinusoidalVibration,
-    Spectrum,
-    Truth,
-    Vibration,
-)
+from lbt_synth.models import ARModel, LoopHardware, SinusoidalVibration, Spectrum, Truth, Vibration
 from lbt_synth.models.mirror.frame_rate_system import Hold
 from lbt_synth.models.plant.seen_vibration import SeenVibration, seen_vibration
 from lbt_synth.models.sensor_suite import Accelerometer, Motion, checked_motions, period_frames

@@ -33,12 +33,7 @@ from lbt_synth.linear.quadrature import adaptive_integral, graded_edges, panel_r
 from lbt_synth.linear.state_space import stacked_response
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, ClosedLoop, last_frame, loop_matrices
 from lbt_synth.models import ARModel, Atmosphere, LoopHardware, Spectrum
-from lbt_synth.models.mirror.frame_rate_system import (
-    Hold,
-    Response,
-    mirror_system,
-    tapped_mirror,
-)
+from lbt_synth.models.mirror.frame_rate_system import Hold, Response, mirror_system, tapped_mirror
 from lbt_synth.models.spectra import breakpoints_below, companions, densities, spectrum_density
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 

@@ -37,11 +37,7 @@ from lbt_synth.linear.controller import HasController, as_controller
 from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.linear.norms import fold_angles, largest_real_part, popov_angles, square_parts
 from lbt_synth.linear.state_space import schur_form, schur_response
-from lbt_synth.loop.closed_loop import (
-    ClosedLoop,
-    checked_loop_matrices,
-    close_loop,
-)
+from lbt_synth.loop.closed_loop import ClosedLoop, checked_loop_matrices, close_loop
 from lbt_synth.loop.evaluator import close_loops, textbook_matrices
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import instant_mirror, tapped_mirror

@@ -15,12 +15,7 @@ from lbt_synth.design import Check, Design
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.linear import Controller
-from lbt_synth.loop import (
-    ClosedLoop,
-    loop_margins,
-    residual_budget,
-    stable_sensor_gains,
-)
+from lbt_synth.loop import ClosedLoop, loop_margins, residual_budget, stable_sensor_gains
 from lbt_synth.loop.band_limit import BandLimit
 from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.loop.least_residual import ResidualLimit

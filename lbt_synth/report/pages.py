@@ -21,14 +21,7 @@ from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.request import fixed_design
-from lbt_synth.report.draw import (
-    GUIDE,
-    PANEL_IN,
-    draw_map,
-    drawing,
-    line_style,
-    name_axes,
-)
+from lbt_synth.report.draw import GUIDE, PANEL_IN, draw_map, drawing, line_style, name_axes
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.studies import STREHL
 from lbt_synth.report.page.html import (

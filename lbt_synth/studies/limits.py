@@ -12,12 +12,7 @@ import numpy as np
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import LbtSynthError, ProblemError
-from lbt_synth.loop import (
-    ClosedLoop,
-    Imaging,
-    least_residual,
-    residual_budget,
-)
+from lbt_synth.loop import ClosedLoop, Imaging, least_residual, residual_budget
 from lbt_synth.loop.band_limit import BandLimit, least_worst_residual
 from lbt_synth.loop.least_residual import ResidualLimit, above_percent, limit_or_none
 from lbt_synth.loop.margins import phase_margin_deg

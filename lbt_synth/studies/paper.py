@@ -27,12 +27,7 @@ import lbt_synth
 from lbt_synth.design import Design, FilterDesign, hinf, integrator, kalman
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop import run_end_to_end
-from lbt_synth.interop.specula.optics import (
-    Calibration,
-    EndToEndSetup,
-    calibrate,
-    specula_version,
-)
+from lbt_synth.interop.specula.optics import Calibration, EndToEndSetup, calibrate, specula_version
 from lbt_synth.interop.specula.simulation import mix_controller
 from lbt_synth.loop import Imaging, close_loop
 from lbt_synth.methods.registry import HINF, KALMAN

@@ -11,27 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lbt_synth.config import Config
-from lbt_synth.design import (
-    Design,
-    FilterDesign,
-    hinf,
-    integrator,
-    kalman,
-    lqg,
-    mixed,
-)
+from lbt_synth.design import Design, FilterDesign, hinf, integrator, kalman, lqg, mixed
 from lbt_synth.design.mixed import central_filter, require_taps
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.controller import as_controller
-from lbt_synth.loop import (
-    Imaging,
-    close_loop,
-    loop_margins,
-    residual_budget,
-    simulate,
-)
+from lbt_synth.loop import Imaging, close_loop, loop_margins, residual_budget, simulate
 from lbt_synth.loop.budget import ensemble_residuals
 from lbt_synth.loop.closed_loop import require_matching_controller
 from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration

@@ -13,14 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import run
-from support.studies import (
-    TWO,
-    assert_whole,
-    evaluate_quickly,
-    part_rows,
-    read_table,
-    study_file,
-)
+from support.studies import TWO, assert_whole, evaluate_quickly, part_rows, read_table, study_file
 
 import lbt_synth as lbt
 from lbt_synth.cli.study import connect_cluster

@@ -11,12 +11,7 @@ from support.plants import ROOT
 
 import lbt_synth as lbt
 from lbt_synth.config.schema import FileSection
-from lbt_synth.config.write import (
-    RAISED,
-    config_text,
-    identified_config,
-    require_writable_facts,
-)
+from lbt_synth.config.write import RAISED, config_text, identified_config, require_writable_facts
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification.accelerometers.transfers import (
     AccelerometerTransfers,

@@ -20,12 +20,7 @@ from support.sensor_loops import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.design.filter_design import (
-    failed_loop,
-    failure_rows,
-    failure_sets,
-    make_fallbacks,
-)
+from lbt_synth.design.filter_design import failed_loop, failure_rows, failure_sets, make_fallbacks
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.budget import model_readings, residual_budget

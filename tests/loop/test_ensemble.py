@@ -12,12 +12,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.loop import budget
 from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble
 from lbt_synth.loop.evaluator import split_into_parts, textbook_matrices
-from lbt_synth.models import (
-    ARModel,
-    PositionLoop,
-    SinusoidalVibration,
-    SumSpectrum,
-)
+from lbt_synth.models import ARModel, PositionLoop, SinusoidalVibration, SumSpectrum
 
 CAMERA = lbt.Imaging(diameter_m=8.22, obstruction=0.11)
 

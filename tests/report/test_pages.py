@@ -14,11 +14,7 @@ from support.study_pages import CONTROLLERS, night, page_of, results
 
 import lbt_synth as lbt
 from lbt_synth.report.page.html import Chart, Notice, page_html, write_page
-from lbt_synth.report.pages import (
-    binned_map,
-    cumulative_points,
-    diagnosis_page,
-)
+from lbt_synth.report.pages import binned_map, cumulative_points, diagnosis_page
 from lbt_synth.storage.tables import Cell, Table
 from lbt_synth.studies.study.run import evaluate_samples
 from lbt_synth.studies.study.statistics import study_statistics

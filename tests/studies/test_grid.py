@@ -12,13 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.studies import (
-    assert_whole,
-    evaluate_quickly,
-    load_small_study,
-    make_folder,
-    part_rows,
-)
+from support.studies import assert_whole, evaluate_quickly, load_small_study, make_folder, part_rows
 
 from lbt_synth.errors import NumericalError, OutputError
 from lbt_synth.storage import array_file

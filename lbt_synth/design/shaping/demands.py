@@ -21,12 +21,7 @@ from lbt_synth.linear.convex_functions import Constraint, Fractions, FunctionBou
 from lbt_synth.linear.norms import band_norm, largest_real_part
 from lbt_synth.linear.quadrature import adaptive_integral
 from lbt_synth.loop.budget import resonance_edges
-from lbt_synth.loop.stable_range import (
-    CIRCLE_LIMIT,
-    LoopChange,
-    append_taps,
-    loop_changes,
-)
+from lbt_synth.loop.stable_range import CIRCLE_LIMIT, LoopChange, append_taps, loop_changes
 from lbt_synth.models import LoopHardware, Spectrum
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import (

@@ -16,14 +16,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear.convex_functions import Fractions, Function
 from lbt_synth.linear.norms import band_norm
 from lbt_synth.loop import residual_budget
-from lbt_synth.models import (
-    ARModel,
-    Atmosphere,
-    Spectrum,
-    TabulatedSpectrum,
-    Truth,
-    Vibration,
-)
+from lbt_synth.models import ARModel, Atmosphere, Spectrum, TabulatedSpectrum, Truth, Vibration
 from lbt_synth.validation import (
     Finite,
     FloatArray,

@@ -24,11 +24,7 @@ from scipy.special import gammaincc
 from lbt_synth.design.filter_design import MOST_UNITS
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.accelerometers.readings import read_channels
-from lbt_synth.identification.fit.identified_model import (
-    DIFFERENT,
-    IdentifiedLine,
-    IdentifiedModel,
-)
+from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedLine, IdentifiedModel
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT, TAPER
 from lbt_synth.identification.records.faults import runs
 from lbt_synth.identification.records.record import LoopRecord

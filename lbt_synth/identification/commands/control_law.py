@@ -23,14 +23,7 @@ from lbt_synth.identification.records.faults import MAD, SURPRISING, find_satura
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.linear import Controller
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import (
-    BoolArray,
-    ComplexArray,
-    FloatArray,
-    IntArray,
-    read_only,
-    square,
-)
+from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray, read_only, square
 
 _LAGS = range(-4, 5)  # frames by which the first measurement may be late
 _ROWS_PER_VALUE = 16  # of each coefficient: a law from fewer frames explains its own noise

@@ -17,12 +17,7 @@ from scipy.ndimage import uniform_filter1d
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.identification.fit import fitting
-from lbt_synth.identification.fit.fitting import (
-    GAIN_STEP,
-    PLAUSIBLE_GAINS,
-    TYPICAL_GAIN,
-    Search,
-)
+from lbt_synth.identification.fit.fitting import GAIN_STEP, PLAUSIBLE_GAINS, TYPICAL_GAIN, Search
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.spectrum_model import (
     Background,

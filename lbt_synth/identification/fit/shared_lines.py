@@ -26,12 +26,7 @@ from lbt_synth.identification.fit.identified_model import (
     standard_errors,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
-from lbt_synth.identification.fit.spectrum_model import (
-    BACKGROUND,
-    GAIN,
-    Component,
-    SpectrumModel,
-)
+from lbt_synth.identification.fit.spectrum_model import BACKGROUND, GAIN, Component, SpectrumModel
 from lbt_synth.identification.fit.whittle import (
     EXACT,
     HOPE,

@@ -26,12 +26,7 @@ from lbt_synth.identification.prediction.residual import (
 from lbt_synth.identification.records.faults import SURPRISING
 from lbt_synth.identification.records.record import LoopRecord, Stretches, split_halves
 from lbt_synth.linear import Controller
-from lbt_synth.loop import (
-    Imaging,
-    close_loop,
-    residual_budget,
-    strehl,
-)
+from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.loop.least_residual import least_residual
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import PlantInputs, design_request

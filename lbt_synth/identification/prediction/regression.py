@@ -23,11 +23,7 @@ from lbt_synth.design.shaping.channel import held_fraction
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.identification.accelerometers.readings import Channels
 from lbt_synth.identification.fit.identified_model import IdentifiedModel
-from lbt_synth.identification.prediction.residual import (
-    gather,
-    run_from_rest,
-    settle_frames,
-)
+from lbt_synth.identification.prediction.residual import gather, run_from_rest, settle_frames
 from lbt_synth.identification.records.record import (
     LoopRecord,
     Stretches,

@@ -11,12 +11,7 @@ from scipy.interpolate import CubicSpline
 
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification.fit.periodogram import SHORTEST_SEGMENT
-from lbt_synth.identification.records.faults import (
-    Finding,
-    findings_in,
-    mark,
-    runs,
-)
+from lbt_synth.identification.records.faults import Finding, findings_in, mark, runs
 from lbt_synth.models import LoopHardware, PositionLoop, TabulatedSpectrum
 from lbt_synth.models.loop_hardware import past_corrections
 from lbt_synth.validation import (

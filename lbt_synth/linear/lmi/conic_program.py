@@ -29,13 +29,7 @@ from scipy import sparse
 from scipy.linalg import eigh
 
 from lbt_synth.errors import NumericalError
-from lbt_synth.linear.convex_functions import (
-    Constraint,
-    Discs,
-    Fractions,
-    Function,
-    HalfPlanes,
-)
+from lbt_synth.linear.convex_functions import Constraint, Discs, Fractions, Function, HalfPlanes
 from lbt_synth.linear.matrix_functions import semidefinite_root
 from lbt_synth.validation import ComplexArray, FloatArray
 

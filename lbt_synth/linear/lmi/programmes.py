@@ -7,12 +7,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from lbt_synth.linear.lmi.conic_program import (
-    ATTEMPTS,
-    SETTINGS,
-    refused_panic,
-    solver_error,
-)
+from lbt_synth.linear.lmi.conic_program import ATTEMPTS, SETTINGS, refused_panic, solver_error
 from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import IntArray
 

@@ -32,12 +32,7 @@ from lbt_synth.linear.matrix_functions import (
     relative_distance,
     symmetrise,
 )
-from lbt_synth.linear.riccati.dare import (
-    ERROR_LIMIT,
-    require_seen,
-    solve_dare,
-    weight_root,
-)
+from lbt_synth.linear.riccati.dare import ERROR_LIMIT, require_seen, solve_dare, weight_root
 from lbt_synth.linear.riccati.equations import Equations, doubling
 from lbt_synth.validation import FloatArray, frozen_copy
 

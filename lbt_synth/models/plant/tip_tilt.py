@@ -31,12 +31,7 @@ from lbt_synth.models.spectra import ARModel
 from lbt_synth.models.truth import Entering
 from lbt_synth.models.vibration import Vibration, spread_lines
 from lbt_synth.storage.words import count_text
-from lbt_synth.validation import (
-    FloatArray,
-    integer,
-    one_or_each,
-    require_instance,
-)
+from lbt_synth.validation import FloatArray, integer, one_or_each, require_instance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

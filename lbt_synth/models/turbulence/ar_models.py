@@ -19,11 +19,7 @@ from lbt_synth.errors import NumericalError
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.models.resonance_spectrum import coefficient_rows, drive_ratio, unit_density
 from lbt_synth.models.spectra import ARModel
-from lbt_synth.models.turbulence.atmosphere import (
-    LOWEST,
-    Atmosphere,
-    kolmogorov_constant_nm2,
-)
+from lbt_synth.models.turbulence.atmosphere import LOWEST, Atmosphere, kolmogorov_constant_nm2
 from lbt_synth.validation import (
     FloatArray,
     IntArray,

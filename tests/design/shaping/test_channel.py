@@ -6,12 +6,7 @@ from support.shaping import RATE
 
 import lbt_synth as lbt
 from lbt_synth.design.loop_shaping import controller_from_parameters
-from lbt_synth.design.shaping.channel import (
-    Channel,
-    SingleModeLoop,
-    laguerre_basis,
-    mode_loop,
-)
+from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, laguerre_basis, mode_loop
 
 
 @pytest.mark.parametrize("pole", [0.0, -0.3, 0.95])

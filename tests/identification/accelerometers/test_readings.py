@@ -4,11 +4,7 @@ import numpy as np
 import pytest
 
 from lbt_synth.errors import ProblemError, TelemetryError
-from lbt_synth.identification.accelerometers.readings import (
-    load_readings,
-    read_channels,
-    resample,
-)
+from lbt_synth.identification.accelerometers.readings import load_readings, read_channels, resample
 
 RATE = 1000.0
 FRAMES = 4000

@@ -23,12 +23,7 @@ from support.recorded_loops import (
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.identification import (
-    IdentifiedModel,
-    LoopRecord,
-    SpectrumRecord,
-    loop_record,
-)
+from lbt_synth.identification import IdentifiedModel, LoopRecord, SpectrumRecord, loop_record
 from lbt_synth.identification.fit import identify, order_search
 from lbt_synth.identification.fit.fitting import Search
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis

@@ -12,12 +12,7 @@ from support.exports import bare_design, lbt_designs
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.c.export import frame_cost
-from lbt_synth.interop.c.terms import (
-    RunningSource,
-    as_computed,
-    read_source,
-    source_terms,
-)
+from lbt_synth.interop.c.terms import RunningSource, as_computed, read_source, source_terms
 from lbt_synth.interop.proof import prove_written, rehearsal_error
 from lbt_synth.linear import estimator_form
 

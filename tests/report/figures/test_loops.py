@@ -8,11 +8,7 @@ import pytest
 from support.figures import legend
 
 import lbt_synth as lbt
-from lbt_synth.report.figures.loops import (
-    closed_loops,
-    frequency_grid,
-    sigma_curves,
-)
+from lbt_synth.report.figures.loops import closed_loops, frequency_grid, sigma_curves
 
 FIGURES = lbt.report.figures
 PATH = lbt.LoopHardware(frame_rate_hz=800)
