@@ -22,7 +22,6 @@ folder = Path(tempfile.mkdtemp())
 version: 1
 config: lbt.yaml
 samples: 1024
-sampling: sobol
 seed: 1
 controllers:
   integrator: {design: integrator, gain: 0.4}

@@ -132,7 +132,12 @@ class MixedController:
         command = np.zeros(self.gains.size)
         if self._running is not None:
             modes = list(self.filtered)
-            command[modes] = self._running.step(measured[modes])
+            filtered = float_array(self._running.step(measured[modes]), "the filter's command")
+            if filtered.shape != (len(modes),):
+                raise DimensionError(
+                    f"the filter's command must have shape ({len(modes)},); got {filtered.shape}."
+                )
+            command[modes] = filtered
         for i, bank in enumerate(self._banks):
             entry = measured[bank.modes][..., None]
             self._states[i] = bank.A @ self._states[i] + bank.B @ entry
