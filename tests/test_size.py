@@ -14,28 +14,28 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3455,
-    "config": 1653,
-    "design": 6265,
-    "files": 1243,
-    "identification": 8899,
-    "interop": 3756,
-    "linear": 4895,
-    "loop": 3988,
-    "methods": 853,
-    "models": 3873,
-    "report": 3342,
+    "cli": 3464,
+    "config": 1634,
+    "design": 6201,
+    "files": 1244,
+    "identification": 8875,
+    "interop": 3733,
+    "linear": 4829,
+    "loop": 3965,
+    "methods": 861,
+    "models": 3858,
+    "report": 3328,
     "storage": 1027,
-    "studies": 2761,
+    "studies": 2735,
     "errors, validation": 554,
 }
 COUNTS = {
-    "files of the package": 204,
-    "public names": 163,
-    "tuned constants": 496,
-    "lines of tests": 31029,
-    "lines of benchmarks": 4016,
-    "words of docs": 59817,
+    "files of the package": 202,
+    "public names": 145,
+    "tuned constants": 494,
+    "lines of tests": 30617,
+    "lines of benchmarks": 4018,
+    "words of docs": 59781,
 }
 
 
