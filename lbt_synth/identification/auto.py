@@ -481,9 +481,12 @@ def _assume_noise(
             return unstable_gains(designs[step], intervals) is None
         return False
 
-    steps = range(8 * _MOST_NOISE + 1)
-    least = bisect_left(steps, True, lo=1, key=is_stable)
-    return (designs[least], 2.0 ** (least / 8)) if least < len(steps) else None
+    # octave by octave, because a loop may be unstable again at more noise
+    last = next((step for step in range(8, 8 * _MOST_NOISE + 1, 8) if is_stable(step)), None)
+    if last is None:
+        return None
+    least = bisect_left(range(last), True, lo=last - 7, key=is_stable)
+    return designs[least], 2.0 ** (least / 8)
 
 
 def _in_words(intervals: FloatArray) -> str:
