@@ -123,7 +123,7 @@ def run_all(measure: Callable[[int], Row], asked: argparse.Namespace) -> list[Ro
 def write_figures(name: str, figures: Row) -> None:
     """Put the figures of a benchmark into the file that keeps them."""
     book = json.loads(FIGURES.read_text())
-    FIGURES.write_text(json.dumps({**book, name: figures}, indent=1) + "\n")
+    FIGURES.write_text(json.dumps({**book, name: figures}, indent=2) + "\n")
 
 
 def lagged(series: np.ndarray, count: int) -> np.ndarray:
