@@ -23,7 +23,7 @@ LINES = {
     "linear": 4829,
     "loop": 3965,
     "methods": 861,
-    "models": 3858,
+    "models": 3851,
     "report": 3328,
     "storage": 1027,
     "studies": 2735,

@@ -47,13 +47,6 @@ class Response:
         """Number of states."""
         return len(self.B)
 
-    @property
-    def is_tapped(self) -> bool:
-        """Whether its states are its past inputs: D and C are its impulse response."""
-        n = self.n_states
-        shifts = np.array_equal(self.A, np.eye(n, k=-1))
-        return shifts and np.array_equal(self.B, np.eye(n, 1)[:, 0])
-
     def repeated(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return A, B, C of as many equal systems, each state of all of them side by side."""
         parts = (self.A, self.B[:, None], self.C[None])
