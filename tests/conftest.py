@@ -5,6 +5,7 @@ import gc
 import hypothesis
 import matplotlib as mpl
 import pytest
+from support.design_reports import SMALL, three_designs
 from support.plants import LBT_YAML, lbt_axis_plant
 from support.several_sensors import write_config
 
@@ -56,9 +57,33 @@ def air():
     return lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def config():
     return lbt.load_config(LBT_YAML)
+
+
+@pytest.fixture(scope="session")
+def lbt_designs(config):
+    """Three designs for that configuration."""
+    return {
+        "kalman": lbt.kalman(config.plant),
+        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati"),
+        "integrator": lbt.integrator(config.hardware, gain=0.5),
+    }
+
+
+@pytest.fixture(scope="session")
+def small_config(tmp_path_factory):
+    """The same loop with few errors, frames and cases."""
+    file = tmp_path_factory.mktemp("small") / "small.yaml"
+    file.write_text(SMALL)
+    return lbt.load_config(file)
+
+
+@pytest.fixture(scope="session")
+def small_designs(small_config):
+    """A Kalman filter, an integrator, and one whose loop is unstable, by name."""
+    return three_designs(small_config)
 
 
 @pytest.fixture(scope="module")

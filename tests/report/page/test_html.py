@@ -103,25 +103,17 @@ def test_a_number_and_its_error_stay_in_one_line():
 
 
 def test_drawings_keep_their_text():
-    def texts_of(svg):
-        return re.findall(r"<text[^>]*>(.*?)</text>", svg)
-
-    svg = chart_svg(every_mark()[0])
-    words = texts_of(svg)
-    for word in ("frequency [Hz]", "size [-]", "steps [nm]", "first", "second", "only named"):
-        assert word in words
+    strange = "$\\frac{$ 文字"  # no mathematics, and no such glyph
+    svg = chart_svg(every_mark(strange)[0])
+    texts = re.findall(r"<text[^>]*>(.*?)</text>", svg)
+    assert {"frequency [Hz]", "steps [nm]", "only named", strange} <= set(texts)
     assert 'viewBox="0 0' in svg
     assert " width=" not in svg.split(">")[0]
-    strange = chart_svg(every_mark("$\\frac{$ 文字")[0])  # no mathematics, and no such glyph
-    assert "$\\frac{$ 文字" in texts_of(strange)
 
 
 def test_nothing_is_fetched(plain):
     reader = Reader(plain)
-    assert not reader.named("link")
-    assert not reader.named("img")
-    assert not reader.named("iframe")
-    assert not reader.named("script")
+    assert {"link", "img", "iframe", "script"}.isdisjoint(tag for tag, _ in reader.elements)
     (policy,) = [a for a in reader.named("meta") if "http-equiv" in a]
     assert "default-src 'none'" in policy["content"]
     assert "http" not in policy["content"]
@@ -133,11 +125,6 @@ def test_nothing_is_fetched(plain):
 def test_hostile_names_stay_names(hostile, plain):
     reader, usual = Reader(hostile), Reader(plain)
     assert {tag for tag, _ in reader.elements} == {tag for tag, _ in usual.elements}
-    # titles of drawings are wrapped where they are long
-    outside, there = (
-        Reader(re.sub("<svg .*?</svg>", "", text, flags=re.DOTALL)) for text in (hostile, plain)
-    )
-    assert [tag for tag, _ in outside.elements] == [tag for tag, _ in there.elements]
     assert not reader.named("script")
     assert reader.texts["title"][0] == f"Page of {HOSTILE}"
     assert HOSTILE in reader.texts["th"]  # of a table of numbers
