@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.figures import legend
+from support.lqg import shell, slow_plant
 from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
@@ -13,7 +14,7 @@ from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.report.figures.studies import tradeoff_figure
 from lbt_synth.studies import robustness, robustness_map
-from lbt_synth.studies.robustness import run_failures
+from lbt_synth.studies.robustness import mirror_rows, run_failures
 
 
 def test_robustness_rows(config):
@@ -239,3 +240,11 @@ def test_the_front_of_the_lbt(axis_plant):
     variance, gains = tradeoff_figure(points).axes
     assert legend(variance)[0] == "least variance at this norm"
     assert gains.get_xlabel() == "H∞ norm of the estimation error [nm]"
+
+
+def test_a_slow_mirror_needs_a_design_that_knows_it():
+    plant = slow_plant(2.0, shell())
+    truth = lbt.Truth(turbulence=plant.turbulence, vibrations=plant.vibrations, noise_nm=15.5)
+    rows = {row.design: row for row in mirror_rows(plant, truth, CAMERA)}
+    assert not rows["kalman, settled mirror"].stable
+    assert rows["lqg"].residual_nm < 0.7 * rows["kalman, real positions"].residual_nm

@@ -90,8 +90,10 @@ def test_variances_with_an_outer_scale():
     air = lbt.Atmosphere(outer_scale_m=22, **SITE)
     found = zernike_variances(air, 36)
     assert found[0] == pytest.approx(air.tilt_rms_nm**2, rel=1e-7)
-    scale = kolmogorov(air, 5) / kolmogorov_integral(air, 5, None)
-    assert found[4] == pytest.approx(scale * kolmogorov_integral(air, 5, 22.0), rel=1e-5)
+    scale = kolmogorov(air, 5) / (6 * kolmogorov_integral(air, 5, None))
+    for n in (1, 5):
+        expected = scale * (n + 1) * kolmogorov_integral(air, n, 22.0)
+        assert found[n - 1] == pytest.approx(expected, rel=1e-5)
     assert np.all(np.diff(found) < 0)
 
 

@@ -19,18 +19,6 @@ def test_tilt_rms_of_the_lbt(air):
     assert replace(air, obstruction=0.11).tilt_rms_nm == pytest.approx(595.3, abs=0.5)
 
 
-def test_tilt_variance_against_adaptive_quadrature(air):
-    r0, D = air.fried_parameter_m, 8.22
-
-    def integrand(f):
-        bessel = 2 * jv(2, np.pi * D * f) / (np.pi * D * f)
-        return f * 0.0228956 * r0 ** (-5 / 3) * (f**2 + 22.0**-2) ** (-11 / 6) * bessel**2
-
-    total = sum(quad(integrand, a, b, limit=400)[0] for a, b in ((1e-9, 0.1), (0.1, 1), (1, 40)))
-    variance_rad2 = 2 * np.pi * 2 * total
-    assert air.tilt_rms_nm == pytest.approx(np.sqrt(variance_rad2) * 500 / (2 * np.pi), rel=1e-5)
-
-
 def test_tilt_spectrum_between_the_points_of_its_table(air):
     """By adaptive quadrature over the other spatial frequency."""
     r0, D, V = air.fried_parameter_m, air.diameter_m, air.wind_speed_m_s

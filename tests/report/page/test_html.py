@@ -130,25 +130,20 @@ def test_hostile_names_stay_names(hostile, plain):
     assert HOSTILE in reader.texts["th"]  # of a table of numbers
 
 
-def luminance(shade):
-    """Of "#rrggbb"."""
-    parts = np.array([int(shade[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+def contrast(*shades):
+    """Contrast ratio of WCAG 2.2 of two texts "#rrggbb"."""
+    parts = np.array([[int(shade[i : i + 2], 16) / 255 for i in (1, 3, 5)] for shade in shades])
     linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
-    return float(linear @ [0.2126, 0.7152, 0.0722])
-
-
-def contrast(one, other):
-    """Contrast ratio of WCAG 2.2."""
-    dark, light = sorted([luminance(one), luminance(other)])
+    dark, light = np.sort(linear @ [0.2126, 0.7152, 0.0722])
     return (light + 0.05) / (dark + 0.05)
 
 
 def test_contrast_of_texts(plain):
     assert contrast("#000000", "#ffffff") == pytest.approx(21)
     named = dict(re.findall(r"--([a-z-]+): (#[0-9a-f]{6});", plain))
-    on_paper = [(ink, "paper") for ink in ("ink", "soft", "link", "good", "note", "bad")]
-    on_tints = [("ink", f"{kind}tint") for kind in ("", "note-", "good-")]
-    for ink, paper in (*on_paper, *on_tints, ("bad", "bad-tint")):
+    pairs = [(ink, "paper") for ink in ("ink", "soft", "link", "good", "note", "bad")]
+    pairs += [("ink", f"{kind}tint") for kind in ("", "note-", "good-")] + [("bad", "bad-tint")]
+    for ink, paper in pairs:
         assert contrast(named[ink], named[paper]) >= 4.5, (ink, paper)
 
 

@@ -156,22 +156,17 @@ def test_constants_have_no_index():
 
 def test_one_odd_sample_makes_no_index():
     """One unstable loop of 1000 gave a parameter without effect an index of 0.8."""
-    rng = np.random.default_rng(0)
+    rng, order = np.random.default_rng(0), np.arange(1000.0)
     quiet = 0.82 + 0.005 * rng.normal(size=1000)
-    found = []
-    for place in rng.integers(0, 1000, 60):
-        result = quiet.copy()
-        result[place] = 0.0
-        found.append(first_order_index(np.arange(1000.0), result)[0])
-    assert np.max(np.abs(found)) < 0.05
+    for place in rng.integers(0, 1000, 20):
+        result = np.where(order == place, 0.0, quiet)
+        assert abs(first_order_index(order, result)[0]) < 0.05
 
 
-@pytest.mark.parametrize("shuffled", [False, True])
-def test_the_order_of_tied_samples_makes_no_index(shuffled):
+def test_the_order_of_tied_samples_makes_no_index():
     """A grid of 64 x 64 gave the parameter without effect 0.32."""
-    one, other = (each.ravel() for each in np.meshgrid(np.arange(64.0), np.arange(64.0)))
-    order = np.random.default_rng(1).permutation(4096) if shuffled else np.arange(4096)
-    columns = make_columns({"a": other[order], "b": one[order]}, {"k": one[order] / 64})
+    one, other = (axis.ravel() for axis in np.meshgrid(np.arange(64.0), np.arange(64.0)))
+    columns = make_columns({"a": other, "b": one}, {"k": one / 64})
     rows = study_statistics(columns, ["a", "b"], ["k"]).controllers[0].sensitivity
     assert abs(rows["a"]["index"]) < 0.01
     assert rows["b"]["index"] == pytest.approx(1, abs=0.01)
@@ -182,9 +177,8 @@ def test_a_controller_that_always_failed_has_dashes_and_no_numbers():
     columns |= {"b.stable": np.full(50, NAN), "b.strehl": np.full(50, NAN)}
     columns["b.residual_nm"] = np.full(50, NAN)
     found = study_statistics(columns, ["p"], ["a", "b"])
-    assert found.controllers[1].samples == 0
-    assert found.controllers[1].failed == 50
-    assert found.controllers[1].worst == ()
+    failed = found.controllers[1]
+    assert (failed.samples, failed.failed, failed.worst) == (0, 50, ())
     first = summary_tables(found)[0]
     column = {row[0]: cell_text(row[2]) for row in first.rows if len(row) > 1}
     assert (column.pop("evaluated"), column.pop("failed")) == ("0", "50")
