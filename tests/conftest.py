@@ -1,11 +1,12 @@
 """Plants that many tests share."""
 
 import gc
+import re
+from dataclasses import replace
 
 import hypothesis
 import matplotlib as mpl
 import pytest
-from support.design_reports import SMALL, three_designs
 from support.plants import LBT_YAML, lbt_axis_plant
 from support.several_sensors import write_config
 
@@ -75,15 +76,19 @@ def lbt_designs(config):
 @pytest.fixture(scope="session")
 def small_config(tmp_path_factory):
     """The same loop with few errors, frames and cases."""
+    text = LBT_YAML.read_text().replace("frames: 8000", "frames: 1000")
+    few = "errors_hz: [-3.5, 3.5]\n  sensor_gains: [0.3, 0.5, 1.0, 1.3]"
     file = tmp_path_factory.mktemp("small") / "small.yaml"
-    file.write_text(SMALL)
+    file.write_text(re.sub("errors_hz: .*", few, text.replace("cases: 4", "cases: 2")))
     return lbt.load_config(file)
 
 
 @pytest.fixture(scope="session")
 def small_designs(small_config):
     """A Kalman filter, an integrator, and one whose loop is unstable, by name."""
-    return three_designs(small_config)
+    slow = lbt.integrator(small_config.hardware, gain=0.4)
+    wild = replace(slow, claims={"gain": 1.5})  # unstable at gains above 2/3
+    return {"kalman": lbt.kalman(small_config.plant), "slow": slow, "wild": wild}
 
 
 @pytest.fixture(scope="module")

@@ -149,25 +149,16 @@ def test_a_band_that_covers_a_wide_resonance_takes_its_place():
         assert len(design.specifications[0].terms) == terms
 
 
-def test_bands_have_an_axis_and_the_damping_of_the_model(small, tmp_path):
-    section = """
-  robust:
-    bands:
-      - {low_hz: 16.0, high_hz: 20.0, rms_nm: 100, axis: tip}
-      - {low_hz: 30.0, high_hz: 33.0, rms_nm: 50, axis: tilt, damping: 0.03}
-      - {low_hz: 60.0, high_hz: 70.0, rms_nm: 20}
-    functions: 8
-    states: null
-"""
-    model = (
-        "    kind: ar2",
-        (
-            "    kind: ar2\n  vibrations:\n"
-            "    - {axis: both, frequency_hz: 18.0, damping: 0.01, rms_nm: 100}\n"
-            "    - {axis: tip, frequency_hz: 31.0, damping: 0.02, rms_nm: 100}"
-        ),
+def test_bands_have_an_axis_and_the_damping_of_the_model(tmp_path):
+    edges = [(16.0, 20.0, {"axis": "tip"}), (30.0, 33.0, {"axis": "tilt", "damping": 0.03})]
+    edges += [(60.0, 70.0, {})]
+    wanted = [{"low_hz": low, "high_hz": high, "rms_nm": 50.0} | more for low, high, more in edges]
+    line = {"axis": "both", "frequency_hz": 18.0, "damping": 0.01, "rms_nm": 100.0}
+    content = minimal_config(
+        model={"vibrations": [line, line | {"axis": "tip", "frequency_hz": 31.0}]},
+        design={"robust": {"bands": wanted, "functions": 8, "states": None}},
     )
-    design = lbt.load_config(small(section, model=model)).design("robust")
+    design = lbt.load_config(write_config(tmp_path, content)).design("robust")
     bands = [
         [(term.low_hz, term.damping) for term in spec.terms[1:]] for spec in design.specifications
     ]
