@@ -29,7 +29,7 @@ import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.budget import residual_budget
-from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
+from lbt_synth.models import Accelerometer, Motion, PositionLoop, Truth, WavefrontSensor
 
 # Loops in continuous time, run in small steps from their equations, without the package's.
 # The camera sees the phase less the mirror in the middle of each step.
@@ -443,6 +443,19 @@ def test_a_loop_of_two_sensors_has_what_a_run_in_small_steps_leaves(delay):
     budget = lbt.residual_budget(loop, truth)
     expected = 100**2 * power_of_two_sensors(plant, controller, 62.5, (0.6, 0.8))
     np.testing.assert_allclose(budget.vibration_nm2 + budget.within_nm2, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("changes", [{"delay_frames": 2.49}, {"mirror": SHELL}])
+def test_a_line_that_channels_hardly_see_is_one_that_they_do_not(changes):
+    """One is a sampled oscillator, the other an autoregressive process: alike with no damping."""
+    line = lbt.Vibration(frequency_hz=60, damping=1e-5, rms_nm=300, direction=(3, 4))
+    _, loop = closed(example_plant((FAST,), **changes))
+    seen, unseen = (
+        lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,), motions=(motion,)))
+        for motion in ({"m1": Motion(size=1e-9)}, {})
+    )
+    np.testing.assert_allclose(seen.random_vibration_nm2, unseen.random_vibration_nm2, rtol=1e-4)
+    np.testing.assert_allclose(seen.within_nm2, unseen.within_nm2, rtol=1e-4)
 
 
 PATH = lbt.LoopHardware(frame_rate_hz=800)

@@ -215,7 +215,8 @@ def test_the_error_of_an_hinf_filter_is_below_its_level(seed):
     problem = random_periodic_problem(seed)
     start = kalman_riccati(problem)
     kalman = lbt.hinf_norm(problem.error_system(start.gain_predictor)).upper
-    _, least, solution = least_gamma(problem, lower=0.0, upper=kalman)
+    below, least, solution = least_gamma(problem, lower=0.0, upper=kalman)
+    assert (1 - 2e-11) * least < below < least
     assert 0.99 * least < proved(problem, start, solution, least) <= least
     assert least <= kalman * (1 + 1e-9)
     for level in (1.001 * least, 1.3 * least):
@@ -247,13 +248,20 @@ def test_a_mode_that_no_reading_sees():
         kalman_riccati(hidden)
 
 
-def test_an_equation_that_is_not_solved(monkeypatch):
-    monkeypatch.setattr(filtering, "ERROR_LIMIT", -1.0)
-    with pytest.raises(NumericalError, match="solved only to a relative"):
-        kalman_riccati(walk())
-
-
-def test_a_level_that_is_not_met_is_no_upper_bound():
-    problem = walk()
+def test_equations_that_are_not_solved(monkeypatch):
+    problem, growing, from_zero = walk(), walk(A=[[[1.1]]]), np.zeros((1, 1))
+    unread = replace(growing, read=[[False], [False]])
     with pytest.raises(InfeasibleError, match="no gamma up to"):
         least_gamma(problem, lower=0.0, upper=0.1)
+    with pytest.raises(NumericalError, match="solved only to a relative inf"):
+        filtering._settle_phases(unread, from_zero)
+    monkeypatch.setattr(filtering, "ERROR_LIMIT", -1.0)
+    with pytest.raises(NumericalError, match="solved only to a relative"):
+        kalman_riccati(problem)
+    monkeypatch.undo()
+    monkeypatch.setattr(filtering, "_RESIDUAL_LIMIT", -1.0)
+    with pytest.raises(NumericalError, match="solved only to a relative residual of"):
+        gamma_riccati(problem, 10.0)
+    monkeypatch.setattr(filtering.GammaEquation, "solution", lambda *_: None)
+    with pytest.raises(NumericalError, match="the least gamma was not bracketed"):
+        least_gamma(problem, lower=0.0, upper=10.0)
