@@ -249,12 +249,11 @@ def test_a_mode_that_no_reading_sees():
 
 
 def test_equations_that_are_not_solved(monkeypatch):
-    problem, growing, from_zero = walk(), walk(A=[[[1.1]]]), np.zeros((1, 1))
-    unread = replace(growing, read=[[False], [False]])
+    problem = walk()
     with pytest.raises(InfeasibleError, match="no gamma up to"):
         least_gamma(problem, lower=0.0, upper=0.1)
     with pytest.raises(NumericalError, match="solved only to a relative inf"):
-        filtering._settle_phases(unread, from_zero)
+        filtering._settle_phases(walk(A=[[[1.1]]]), np.zeros((1, 1)))  # the gain is 0
     monkeypatch.setattr(filtering, "ERROR_LIMIT", -1.0)
     with pytest.raises(NumericalError, match="solved only to a relative"):
         kalman_riccati(problem)
