@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
-from support.plants import LBT_YAML
 from support.predictions import SHELL, a_plant, truth_of_all_moments
 from support.refusals import require_refusals
 from support.uneven_axes import LOOPS, QUICK, RATE, SLOW
@@ -237,15 +236,3 @@ def test_a_gain_file_keeps_the_law_and_its_claim(tmp_path):
     bold = dataclasses.replace(design, claims={**design.claims, "modulus_margin": 0.6})
     with pytest.raises(lbt.errors.GainFileError, match="modulus margin demanded over achieved"):
         lbt.load_gain(lbt.save_gain(tmp_path / "bold.npz", bold))
-
-
-def test_a_configuration_gives_the_law_of_its_baseline(tmp_path):
-    section = "\ndesign:\n  integrator: {phase_margin_deg: 45}\n"
-    (tmp_path / "own.yaml").write_text(LBT_YAML.read_text().replace("\ndesign:\n", section))
-    config = lbt.load_config(tmp_path / "own.yaml")
-    for options, law in (
-        ({}, IntegratorLaw(phase_margin_deg=45)),
-        ({"modulus_margin": 0.6}, IntegratorLaw(modulus_margin=0.6)),  # in place of the file's
-        ({"gain": 0.2}, IntegratorLaw()),
-    ):
-        assert config.design("integrator", **options).law == law

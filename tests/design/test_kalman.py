@@ -7,12 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.plants import lbt_axis_plant, random_problem, with_own_noise
 from support.random_plants import random_plant
-from support.uneven_axes import QUICK, RATE, SLOW
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import estimator_form
-from lbt_synth.loop.least_residual import least_residual
 
 SEEDS = st.integers(0, 10_000)
 
@@ -29,34 +27,6 @@ def test_kalman_against_a_long_recursion_and_by_sdp(axis_plant):
     assert np.allclose(sdp.gain_predictor, gain, rtol=1e-6)
     assert sdp.rms == pytest.approx(design.rms, rel=1e-9)
     assert sdp.solver.route == "sdp"
-
-
-def test_kalman_gains_with_correlated_noise():
-    problem = random_problem(np.random.default_rng(8), 3, 2)
-    P = scipy.linalg.solve_discrete_are(problem.A.T, problem.C.T, problem.Q, problem.R, s=problem.S)
-    innovation = problem.C @ P @ problem.C.T + problem.R
-    predictor = (problem.A @ P @ problem.C.T + problem.S) @ np.linalg.inv(innovation)
-    design = lbt.kalman(problem)
-    assert np.allclose(design.gain_predictor, predictor, rtol=1e-8)
-
-
-def test_the_plant_of_uneven_axes_is_two_plants():
-    def plant(turbulence, noise, gain, **modes):
-        known = {"frame_rate_hz": RATE, "noise_nm": noise, "sensor_gain": gain, **modes}
-        return lbt.tip_tilt_plant(turbulence=turbulence, **known)
-
-    both = plant([SLOW, QUICK], [15.5, 6.0], [0.9, 0.7])
-    np.testing.assert_array_equal(both.hardware.sensor, np.diag([0.9, 0.7]))
-    np.testing.assert_allclose(both.R, np.diag([15.5, 6.0]) ** 2, rtol=1e-14)
-    alone = [
-        lbt.kalman(plant(SLOW, 15.5, 0.9, modes=1)),
-        lbt.kalman(plant(QUICK, 6.0, 0.7, modes=1)),
-    ]
-    alone_nm = [design.rms for design in alone]
-    assert lbt.kalman(both).rms == pytest.approx(np.hypot(*alone_nm), rel=1e-9)
-    limit = least_residual(both.hardware, both)
-    means = limit.variance_nm2 - limit.within_nm2
-    np.testing.assert_allclose(np.sqrt(means), alone_nm, rtol=1e-6)
 
 
 @settings(max_examples=10)

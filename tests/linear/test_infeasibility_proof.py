@@ -1,7 +1,5 @@
 """The proof that no filter reaches a level, and proofs that are none."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -59,16 +57,6 @@ def test_states_without_error_prove_nothing():
     assert not certify_infeasible(
         extended, 1.1 * least, Witness(states=memory, disturbances=1e-6 * np.ones((2, 2)))
     ).passed
-
-
-def test_forged_claims_and_claims_without_a_proof_are_found_out(axis_plant):
-    design = lbt.hinf(axis_plant, gamma_ratio=1.2, route="riccati")
-    assert design.recertify().passed
-    claims = {**design.claims, "gamma_infeasible": 1.001 * design.gamma_infeasible}
-    forged = dataclasses.replace(design, claims=claims).recertify()
-    failed = [check.name for check in forged.checks if not check.passed]
-    assert failed == ["infeasible level over the level proved, less 1"]
-    assert not dataclasses.replace(design, witness=None).recertify().passed
 
 
 def witness(states, disturbances):

@@ -7,7 +7,6 @@ from scipy.linalg import toeplitz
 from support.limits import RATE, Anonymous, ar, path, variance
 from support.lqg import shell
 from support.refusals import require_refusals
-from support.uneven_axes import LOOPS, QUICK, SLOW
 
 import lbt_synth as lbt
 from lbt_synth.design.result import model_limits
@@ -182,22 +181,6 @@ def test_more_measurements_than_modes():
     assert variance(mixed, **model, noise_nm=3.0) == pytest.approx(
         variance(path(), **model, noise_nm=3.0) + variance(path(), **model, noise_nm=1.0)
     )
-
-
-def test_equal_models_may_be_turned_into_each_other():
-    """Two models of the same numbers are one turbulence: a vibration across them decouples."""
-    both, _ = LOOPS
-    again = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=60.0, frame_rate_hz=RATE)
-    line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1, 1))
-    one = lbt.loop.least_residual(both, lbt.Truth(turbulence=SLOW, vibrations=[line], noise_nm=5))
-    two = lbt.loop.least_residual(
-        both, lbt.Truth(turbulence=[SLOW, again], vibrations=[line], noise_nm=5)
-    )
-    assert two.rms_nm == pytest.approx(one.rms_nm, rel=1e-12)
-    with pytest.raises(lbt.errors.ProblemError, match="a limit needs modes that decouple"):
-        lbt.loop.least_residual(
-            both, lbt.Truth(turbulence=[SLOW, QUICK], vibrations=[line], noise_nm=5)
-        )
 
 
 @pytest.mark.parametrize(
