@@ -5,13 +5,12 @@ import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.plants import lbt_axis_plant, random_problem, with_own_noise
+from support.plants import random_problem, with_own_noise
 from support.random_plants import random_plant
 from support.refusals import require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import estimator_form
 
 SEEDS = st.integers(0, 10_000)
 
@@ -73,26 +72,6 @@ def test_wrong_horizons():
     wrong = (1.0, "1", None, True, 101, -101)
     rows += [(lambda k=frames: WALK.ahead(k), ProblemError, "frames must be") for frames in wrong]
     require_refusals(rows)
-
-
-@pytest.mark.parametrize(("horizon", "delay"), [(0, 2.5), (1, 2.0), (2, 3.0)])
-def test_the_known_input_is_taken_out_exactly(horizon, delay):
-    """Whatever the commands, the estimate is the same to rounding."""
-    plant = lbt_axis_plant(modes=2, delay_frames=delay).ahead(horizon)
-    estimator, taps = estimator_form(lbt.kalman(plant)), plant.hardware.mirror_taps
-    rng, frames = np.random.default_rng(0), 400
-    commands = 1e3 * rng.standard_normal((frames, 2))
-    phase = np.cumsum(rng.standard_normal((frames, 2)), axis=0)
-    # y(k) = phase(k-1) - N sum_i taps_i u(k-1-i): the commands that frame k-1 has seen
-    corrections = np.zeros((frames, 2))
-    for i, tap in enumerate(taps):
-        corrections[1 + i :] += tap * commands[: frames - 1 - i]
-    free, past = np.zeros((2, frames, 2))
-    free[1:], past[1:] = phase[:-1], commands[:-1]
-    with_commands, without = estimator.start(), estimator.start()
-    for k in range(frames):
-        one = with_commands.step(free[k] - corrections[k], past[k])
-        assert np.max(np.abs(one - without.step(free[k], np.zeros(2)))) < 1e-7
 
 
 def plain_residual(plant, P):

@@ -137,26 +137,6 @@ def test_a_mirror_with_dynamics(kalman):
     agree(found, design, w, lambda i: AIR)
 
 
-@pytest.mark.parametrize(
-    ("wind", "leak", "outer"),
-    [
-        ([0.01, 0.3, 3.4, 22.0, 95.0], 0.95, None),
-        ([9.4, 12.0, 21.9, 32.2], 1.0, 200.0),
-    ],
-)
-def test_slow_and_fast_winds_together(wind, leak, outer):
-    """With a leak the slowest parts of the spectrum remain, to the flat end of Kolmogorov's."""
-    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-    controller = lbt.Controller(A=leak, B=0.3, C=1.0, D=0.0, dt_s=1 / RATE)
-    air = replace(AIR, outer_scale_m=outer)
-    flows = replace(air, wind_speed_m_s=wind)
-    found = ensemble_residuals(controller, path, LoopEnsemble(turbulence=flows))
-    loop = lbt.close_loop(path, controller)
-    for speed, residual in zip(wind, found.turbulence_nm, strict=True):
-        truth = lbt.Truth(turbulence=replace(air, wind_speed_m_s=speed))
-        assert residual == pytest.approx(lbt.residual_budget(loop, truth).turbulence_nm, rel=1e-6)
-
-
 @pytest.mark.parametrize(("delay", "distance"), [(2.3, 1e-7), (3.0, 1e-3), (4.7, 1e-5)])
 def test_next_to_instability(delay, distance):
     """A process, whose residual is a Lyapunov equation's, as a spectrum."""
