@@ -1,8 +1,8 @@
 """Files that the tests of several commands read."""
 
 import pytest
+from support.exports import lbt_config, lbt_designs
 from support.night import GAIN, simulated_night
-from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 
@@ -11,12 +11,8 @@ import lbt_synth as lbt
 def gains(tmp_path_factory):
     """Gain files of three designs for the LBT, by their names."""
     folder = tmp_path_factory.mktemp("gains")
-    config = lbt.load_config(LBT_YAML)
-    designs = {
-        "kalman": lbt.kalman(config.plant),
-        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati"),
-        "integrator": lbt.integrator(config.hardware, gain=0.5),
-    }
+    designs = {name: lbt_designs()[name] for name in ("kalman", "hinf")}
+    designs["integrator"] = lbt.integrator(lbt_config().hardware, gain=0.5)
     return {name: lbt.save_gain(folder / f"{name}.fits", d) for name, d in designs.items()}
 
 
