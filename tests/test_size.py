@@ -111,7 +111,7 @@ def test_no_count_grows():
         "files of the package": dict.fromkeys(modules, 1),
         "public names": {path: _public_names(path) for path in PACKAGE.rglob("__init__.pyi")},
         "tuned constants": {path: _constants(path) for path in modules},
-        "lines of tests": 30005{path: _lines(path) for path in (ROOT / "tests").rglob("*.py")},
+        "lines of tests": {path: _lines(path) for path in (ROOT / "tests").rglob("*.py")},
         "lines of benchmarks": {path: _lines(path) for path in (ROOT / "benchmarks").rglob("*.py")},
         "words of docs": {p: len(p.read_text(encoding="utf-8").split()) for p in _pages()},
     }
