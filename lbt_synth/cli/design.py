@@ -95,15 +95,18 @@ def _say_model(design: Design) -> str:
     return f"{title} has {design.controller.n_states} states."
 
 
-def add_moving_gain(report: Report, design: Design) -> None:
-    """Add the intervals of a sensor gain that moves, for a design with a stable loop."""
-    from lbt_synth.loop.stable_range import moving_gain
+def add_moving_gains(report: Report, design: Design) -> None:
+    """Add what is proved of a moving gain and of clipping, for a design with a stable loop."""
+    from lbt_synth.loop.stable_range import clipped_commands, moving_gain
 
     if design.hardware is None or design.other_sensors:
         return
     loop = close_loop(design.hardware, design)
     if loop.is_stable:
         report.add_facts("Sensor gain that moves", moving_gain(loop), key="moving_gain")
+        clipped = clipped_commands(loop)
+        caption = "Commands that are clipped; at most 10000 strokes are sought"
+        report.add_facts(caption, clipped, key="clipped_commands")
 
 
 def _loop_notes(design: Design, alone: float) -> list[str]:
@@ -131,7 +134,7 @@ def run_show(arguments: Namespace) -> Report:
     if design.configuration:
         add_truth(report, design, config_from_text(design.configuration, Path(arguments.gain)))
     describe_design(report, design)
-    add_moving_gain(report, design)
+    add_moving_gains(report, design)
     report.data |= {"file": arguments.gain, "digest": digest}
     report.notes += [
         f"proved: the certificate, computed again from this file of digest {digest}.",

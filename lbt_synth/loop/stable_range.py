@@ -18,11 +18,19 @@ the unit circle, where X is ``z^-1 (g M_d' - M_d)`` times what commands answer t
 sensor sees it. It does not while the Hermitian part of X lies above -1. ``M_d'`` is piecewise
 linear in ``d'``, so that a few loops stand for all of a box of gains and delays: X of any other is
 an average of theirs.
+
+A command that is clipped at the stroke is the command times a gain d(k) in ``[r, 1]``, while it
+asks for at most ``1 / r`` times the stroke. With v asked for and ``w = v - e`` applied, ``e = (1 -
+d) v`` comes back through the stable loop as ``v = T_w e``, and the loop stays stable, whatever d
+does, if the Hermitian part of ``T_w`` lies below ``1 / (1 - r)`` (the circle criterion: H. K.
+Khalil, Nonlinear Systems, 3rd ed., section 7.1; in discrete time E. I. Jury, B. W. Lee, IEEE Trans.
+Autom. Control 9, 51 (1964)). An estimator form is given w: e comes back through its state, too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -32,8 +40,14 @@ import numpy as np
 from numpy.polynomial.polynomial import polysub
 from scipy.optimize.elementwise import find_root
 
+from lbt_synth.errors import NumericalError
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
-from lbt_synth.linear.controller import HasController, as_controller
+from lbt_synth.linear.controller import (
+    EstimatorForm,
+    HasController,
+    as_controller,
+    estimator_form,
+)
 from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.linear.norms import fold_angles, largest_real_part, popov_angles, square_parts
 from lbt_synth.linear.state_space import schur_form, schur_response
@@ -339,6 +353,98 @@ def moving_gain(loop: ClosedLoop) -> MovingGain:
         moving_low=low,
         moving_high=high,
     )
+
+
+def stroke_ratio(
+    hardware: LoopHardware,
+    controller: Controller | HasController | EstimatorForm,
+    *,
+    sensor_gain: float = 1.0,
+) -> float:
+    """Return how many times the stroke commands may ask for, with a loop that is proved stable.
+
+    A mirror that clips applies a command times a gain that moves from frame to frame. The circle
+    criterion proves the loop while no command asks for more than this many strokes; beyond it, and
+    for a mirror that is stuck, nothing is said.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        Sensor, mirror and delay.
+    controller : Controller, Design or EstimatorForm
+        In the plain form, which assumes that its commands are applied, or in the form that is given
+        those that were, as :func:`simulate` takes it.
+    sensor_gain : float, optional
+        Real gain of the sensor relative to its matrix.
+
+    Returns
+    -------
+    float
+        The ratio, above 1; 1e4 where it is that or more.
+
+    Raises
+    ------
+    UnstableLoopError
+        If the loop is unstable where nothing is clipped.
+    ProblemError
+        If the controller reads other sensors, or the sizes clash.
+
+    Examples
+    --------
+    With a pole p, the loop of one frame ``x(k+1) = (p - g d(k)) x(k)`` needs ``d > (p - 1) / g``:
+
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
+    >>> eager = lbt.Controller(A=1.1, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
+    >>> round(lbt.loop.stroke_ratio(path, eager), 4)  # 0.5 / 0.1
+    5.0
+    """
+    fed_back = None
+    if isinstance(controller, EstimatorForm):
+        fed_back, controller = controller.applied, controller.to_controller()
+    plain = as_controller(controller)
+    loop = close_loop(hardware.own_sensor_alone(), plain, sensor_gain=sensor_gain)
+    loop.require_stable()
+    level = largest_real_part(_answer_to_clipping(loop, fed_back)) / CIRCLE_LIMIT
+    return _WIDEST if level <= 1 else min(level / (level - 1), _WIDEST)
+
+
+@table_row
+class ClippedCommands:
+    """How many times the stroke commands may ask for, as :func:`stroke_ratio` proves it.
+
+    The form that is given the applied commands is nan for a controller without one.
+    """
+
+    plain: float = column("proved in the plain form, up to", unit="strokes")
+    estimator: float = column("  in the estimator form, up to", unit="strokes")
+
+
+def clipped_commands(loop: ClosedLoop) -> ClippedCommands:
+    """Return how many times the stroke commands may ask for in a stable loop, in both forms."""
+    ratio = partial(stroke_ratio, loop.hardware, sensor_gain=loop.sensor_gain)
+    estimator = np.nan
+    with suppress(NumericalError):
+        estimator = ratio(estimator_form(loop.controller))
+    return ClippedCommands(plain=ratio(loop.controller), estimator=estimator)
+
+
+def _answer_to_clipping(loop: ClosedLoop, fed_back: FloatArray | None) -> StateSpace:
+    """Return ``T_w``: from what was clipped off to commands, for a gain (n, m) of applied ones."""
+    k, hardware = loop.controller, loop.hardware
+    mirror, influence = hardware.mirror_system.whole, hardware.influence
+    A, C, (n, m) = loop.system.A, loop.path("noise", "command").C, influence.shape
+    shown = np.zeros((len(A), m))  # what a unit of a command does to the mirror, and the residual
+    shown[k.n_states : -n], shown[-n:] = mirror.repeated(m)[1], -mirror.D * influence
+    T = StateSpace(A=A, B=-shown, C=C, D=np.zeros((m, m)), dt_s=loop.system.dt_s)
+    if fed_back is None:
+        return T
+    # the controller hears of it one frame later, and corrects the command of that frame
+    state, answer = np.zeros((len(A), m)), k.C @ fed_back
+    state[: k.n_states] = fed_back
+    late = np.vstack([state + shown @ answer, np.zeros((m, m))])
+    A = np.hstack([np.vstack([A, np.zeros((m, len(A)))]), late])
+    return replace(T, A=A, B=-np.vstack([shown, np.eye(m)]), C=np.hstack([C, answer]))
 
 
 def loop_changes(

@@ -104,6 +104,7 @@ def test_show_and_verify(capsys, gains, name):
     assert status == 0
     assert "stable gain factors, from" in text
     assert "proved while it moves at any speed, from" in text
+    assert "proved in the plain form, up to" in text
     status, text, _ = run(capsys, "show", gains[name], "--json")
     data = json.loads(text)
     assert status == 0
@@ -111,6 +112,11 @@ def test_show_and_verify(capsys, gains, name):
     moving = data["moving_gain"]
     assert moving["constant_low"] < moving["moving_low"] < 1
     assert 1 < moving["moving_high"] < moving["constant_high"]
+    design = lbt.load_gain(gains[name])
+    forms = {"plain": design, "estimator": lbt.linear.estimator_form(design)}
+    ratios = {form: lbt.loop.stroke_ratio(design.hardware, law) for form, law in forms.items()}
+    assert data["clipped_commands"] == pytest.approx(ratios)
+    assert (1 < ratios["plain"] < 20) == (name == "kalman")
     assert data["digest"] == load_with_digest(gains[name])[1]
     status, text, _ = run(capsys, "verify", gains[name])
     assert status == 0

@@ -23,6 +23,7 @@ from lbt_synth.loop.stable_range import (
     affine_radii,
     append_taps,
     circle_norm,
+    clipped_commands,
     errors_together,
     loop_changes,
     moving_gain,
@@ -170,6 +171,118 @@ def test_intervals_are_of_the_sensor_gain_whatever_the_loop_has():
     assert [loop.is_stable for loop in loops] == [True] * 9 + [False] * 2
     with pytest.raises(lbt.errors.UnstableLoopError):
         moving_gain(integrator_loop(2, gain=1.5))
+
+
+def one_pole(pole, gain=0.5, *, delay_frames=1):
+    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay_frames, modes=1)
+    return path, lbt.Controller(A=pole, B=gain, C=1.0, D=0.0, dt_s=1 / 800)
+
+
+@pytest.mark.parametrize(("pole", "gain"), [(1.01, 0.5), (1.1, 0.5), (1.3, 1.2), (1.6, 0.9)])
+def test_one_state_is_proved_exactly_where_no_clip_sets_it_free(pole, gain):
+    """``|p - g d| < 1`` at ``d = 1 / ratio`` is necessary and sufficient."""
+    assert lbt.loop.stroke_ratio(*one_pole(pole, gain)) == pytest.approx(
+        gain / (pole - 1), rel=2e-6 * gain / (pole - 1)
+    )
+
+
+@pytest.mark.parametrize(("pole", "gain"), [(1.0, 0.5), (1.0, 1.9), (0.9, 0.5), (1.1, 0.5)])
+def test_an_integrator_of_one_frame_bears_any_clip(pole, gain):
+    """Given what was applied, ``v(k) = (p - g) w(k-1)`` decays whatever is clipped."""
+    path, law = one_pole(pole, gain)
+    both = clipped_commands(lbt.close_loop(path, law))
+    assert both.estimator == 1e4
+    assert (both.plain == 1e4) == (pole <= 1)
+
+
+def clip_peak(hardware, controller, sensor_gain):
+    """Largest ``T_w`` of both forms on a grid, by ``T_w = P / (1 + P)`` of the broken loop."""
+    f = np.linspace(0.01, hardware.frame_rate_hz / 2 - 0.01, 4001)
+    z = np.exp(2j * np.pi * f * hardware.dt_s)[:, None, None]
+    taps = hardware.mirror_taps
+    delay = sum(tap * z ** -(1.0 + i) for i, tap in enumerate(taps))
+    seen = sensor_gain * delay * (hardware.sensor @ hardware.influence)
+    form = lbt.linear.estimator_form(controller)
+    identity, peaks = np.eye(form.A.shape[0]), []
+    for A, L in ((controller.A, 0 * form.applied), (form.A, form.applied)):
+        state = z * np.linalg.inv(z * identity - A)
+        P = form.C @ state @ (form.B @ seen - L / z)
+        T = np.linalg.solve(np.eye(P.shape[1]) + P, P)
+        peaks.append(np.linalg.eigvalsh(T + T.conj().swapaxes(1, 2)).max() / 2)
+    return peaks
+
+
+@pytest.mark.parametrize("delay_frames", [1.0, 2.0, 2.4, 3.0])
+@pytest.mark.parametrize("influence", [np.eye(2), [[1.0, 0.3], [-0.2, 0.8]]])
+def test_what_a_clip_sees_is_the_loop_broken_at_the_command(delay_frames, influence):
+    hardware = lbt.LoopHardware(
+        frame_rate_hz=800, delay_frames=delay_frames, influence_matrix=influence, modes=2
+    )
+    back = np.linalg.inv(influence)
+    law = lbt.Controller(A=np.eye(2), B=0.35 * back, C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / 800)
+    for gain in (0.8, 1.0, 1.5):
+        both = clipped_commands(lbt.close_loop(hardware, law, sensor_gain=gain))
+        for ratio, peak in zip(
+            (both.plain, both.estimator), clip_peak(hardware, law, gain), strict=True
+        ):
+            expected = peak / (peak - 1) if peak > 1 + 1e-4 else 1e4
+            assert ratio == pytest.approx(expected, rel=1e-3)
+
+
+def test_a_common_lyapunov_function_of_clips_exists_inside_and_none_beyond():
+    """``v(k) = d v(k-1) - g d v(k-3)`` of an integrator of three frames, given the last command."""
+    path, law = one_pole(1.0, delay_frames=3)
+    ratio = clipped_commands(lbt.close_loop(path, law)).estimator
+    assert 2 < ratio < 4
+    for factor, proved in ((0.99, True), (1.01, False)):
+        clips = [
+            np.array([[d, 0, -0.5 * d], [1, 0, 0], [0, 1, 0]]) for d in (1 / (factor * ratio), 1)
+        ]
+        assert (common_lyapunov(*clips)[0] > 0) == proved
+
+
+def clipped_runs(design, kicks, *, estimator):
+    """Return the largest request and the last residual of loops of two frames, one a kick."""
+    run = (lbt.linear.estimator_form(design) if estimator else design.controller).start()
+    applied, asked = np.zeros((2, 1, kicks.shape[1])), np.zeros(kicks.shape[1])
+    residual = np.zeros((1, kicks.shape[1]))
+    for k in range(3000):
+        u = run.step(residual, applied[0])
+        residual = (kicks[k] if k < len(kicks) else 0.0) - applied[0]
+        applied = np.stack([np.clip(u, -1, 1), applied[0]])
+        asked = np.maximum(asked, np.abs(u[0]))
+    return asked, np.abs(residual[0])
+
+
+def test_loops_that_ask_for_less_than_is_proved_come_back_and_some_beyond_do_not():
+    plant = lbt_axis_plant()
+    design, rng = lbt.kalman(plant), np.random.default_rng(0)
+    both = clipped_commands(lbt.close_loop(plant.hardware, design))
+    low, _ = lbt.loop.stable_sensor_gains(plant.hardware, design)
+    assert 1 < both.plain < 1 / low
+    kicks = rng.standard_normal((60, 2000)) * np.geomspace(0.1, 60, 2000)
+    asked, last = clipped_runs(design, kicks, estimator=False)
+    clipped = (asked > 1.5) & (asked < both.plain)
+    assert np.count_nonzero(clipped) > 100
+    assert last[asked < both.plain].max() < 1e-6
+    assert np.count_nonzero(last > 0.9) > 10  # the residual is the stroke
+    assert both.estimator == 1e4
+    asked, last = clipped_runs(design, kicks, estimator=True)
+    assert asked.max() > 5 * both.plain
+    assert last.max() < 1e-6
+
+
+def test_only_stable_loops_that_read_their_own_sensor_have_a_ratio():
+    with pytest.raises(lbt.errors.UnstableLoopError):
+        lbt.loop.stroke_ratio(*one_pole(1.0, 1.5, delay_frames=2))
+    plant = example_plant()
+    with pytest.raises(lbt.errors.ProblemError, match="several sensors"):
+        lbt.loop.stroke_ratio(plant.hardware, lbt.kalman(plant))
+    path, _ = one_pole(1.0)
+    zeros = {"A": [[0, 0], [1, 0]], "B": [[1], [0]], "C": [[0.05, 0.1]], "D": 0.0}  # at z = -2
+    both = clipped_commands(lbt.close_loop(path, lbt.Controller(**zeros, dt_s=1 / 800)))
+    assert both.plain == 1e4
+    assert np.isnan(both.estimator)
 
 
 def test_a_loop_that_the_gain_does_not_touch_is_proved_for_all_gains():
