@@ -30,7 +30,6 @@ Autom. Control 9, 51 (1964)). An estimator form is given w: e comes back through
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -40,14 +39,8 @@ import numpy as np
 from numpy.polynomial.polynomial import polysub
 from scipy.optimize.elementwise import find_root
 
-from lbt_synth.errors import NumericalError
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
-from lbt_synth.linear.controller import (
-    EstimatorForm,
-    HasController,
-    as_controller,
-    estimator_form,
-)
+from lbt_synth.linear.controller import EstimatorForm, HasController, as_controller
 from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.linear.norms import fold_angles, largest_real_part, popov_angles, square_parts
 from lbt_synth.linear.state_space import schur_form, schur_response
@@ -363,17 +356,14 @@ def stroke_ratio(
 ) -> float:
     """Return how many times the stroke commands may ask for, with a loop that is proved stable.
 
-    A mirror that clips applies a command times a gain that moves from frame to frame. The circle
-    criterion proves the loop while no command asks for more than this many strokes; beyond it, and
-    for a mirror that is stuck, nothing is said.
+    The circle criterion proves no more, and says nothing of commands beyond.
 
     Parameters
     ----------
     hardware : LoopHardware
         Sensor, mirror and delay.
     controller : Controller, Design or EstimatorForm
-        In the plain form, which assumes that its commands are applied, or in the form that is given
-        those that were, as :func:`simulate` takes it.
+        The plain form, which assumes that its commands are applied, or the one that is given those.
     sensor_gain : float, optional
         Real gain of the sensor relative to its matrix.
 
@@ -399,52 +389,29 @@ def stroke_ratio(
     >>> round(lbt.loop.stroke_ratio(path, eager), 4)  # 0.5 / 0.1
     5.0
     """
-    fed_back = None
     if isinstance(controller, EstimatorForm):
-        fed_back, controller = controller.applied, controller.to_controller()
-    plain = as_controller(controller)
+        plain, fed_back = controller.to_controller(), controller.applied
+    else:
+        plain = as_controller(controller)
+        fed_back = np.zeros(plain.C.T.shape)
     loop = close_loop(hardware.own_sensor_alone(), plain, sensor_gain=sensor_gain)
     loop.require_stable()
     level = largest_real_part(_answer_to_clipping(loop, fed_back)) / CIRCLE_LIMIT
     return _WIDEST if level <= 1 else min(level / (level - 1), _WIDEST)
 
 
-@table_row
-class ClippedCommands:
-    """How many times the stroke commands may ask for, as :func:`stroke_ratio` proves it.
-
-    The form that is given the applied commands is nan for a controller without one.
-    """
-
-    plain: float = column("proved in the plain form, up to", unit="strokes")
-    estimator: float = column("  in the estimator form, up to", unit="strokes")
-
-
-def clipped_commands(loop: ClosedLoop) -> ClippedCommands:
-    """Return how many times the stroke commands may ask for in a stable loop, in both forms."""
-    ratio = partial(stroke_ratio, loop.hardware, sensor_gain=loop.sensor_gain)
-    estimator = np.nan
-    with suppress(NumericalError):
-        estimator = ratio(estimator_form(loop.controller))
-    return ClippedCommands(plain=ratio(loop.controller), estimator=estimator)
-
-
-def _answer_to_clipping(loop: ClosedLoop, fed_back: FloatArray | None) -> StateSpace:
-    """Return ``T_w``: from what was clipped off to commands, for a gain (n, m) of applied ones."""
+def _answer_to_clipping(loop: ClosedLoop, fed_back: FloatArray) -> StateSpace:
+    """Return ``T_w``, from what is clipped off to commands, of which (n, m) are fed back."""
     k, hardware = loop.controller, loop.hardware
     mirror, influence = hardware.mirror_system.whole, hardware.influence
     A, C, (n, m) = loop.system.A, loop.path("noise", "command").C, influence.shape
     shown = np.zeros((len(A), m))  # what a unit of a command does to the mirror, and the residual
     shown[k.n_states : -n], shown[-n:] = mirror.repeated(m)[1], -mirror.D * influence
-    T = StateSpace(A=A, B=-shown, C=C, D=np.zeros((m, m)), dt_s=loop.system.dt_s)
-    if fed_back is None:
-        return T
-    # the controller hears of it one frame later, and corrects the command of that frame
-    state, answer = np.zeros((len(A), m)), k.C @ fed_back
+    state, answer = np.zeros((len(A), m)), k.C @ fed_back  # one frame later, where it is fed back
     state[: k.n_states] = fed_back
-    late = np.vstack([state + shown @ answer, np.zeros((m, m))])
-    A = np.hstack([np.vstack([A, np.zeros((m, len(A)))]), late])
-    return replace(T, A=A, B=-np.vstack([shown, np.eye(m)]), C=np.hstack([C, answer]))
+    A = np.block([[A, state + shown @ answer], [np.zeros((m, len(A) + m))]])
+    B, C, D = -np.vstack([shown, np.eye(m)]), np.hstack([C, answer]), np.zeros((m, m))
+    return StateSpace(A=A, B=B, C=C, D=D, dt_s=loop.system.dt_s)
 
 
 def loop_changes(

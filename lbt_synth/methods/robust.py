@@ -104,11 +104,7 @@ class RobustSection(Section):
         "sensor_gain (default: 0.1 where the mirror settles at once, else 0)",
     )
     stroke_ratio: float | None = Field(
-        default=None,
-        gt=1,
-        le=1e4,
-        description="stable while commands that ask for up to this many strokes are clipped, "
-        "at model.sensor_gain",
+        default=None, gt=1, le=1e4, description="stable with commands of that many strokes, clipped"
     )
     command_stroke_nm: Nanometres | None = Field(
         default=None, description="largest rms of the commands [nm]"

@@ -10,13 +10,14 @@ from types import SimpleNamespace
 import numpy as np
 
 from lbt_synth.config import Config
+from lbt_synth.config.samples import at_frame_rate
 from lbt_synth.design import Design
-from lbt_synth.errors import LbtSynthError, ProblemError
-from lbt_synth.loop import ClosedLoop, Imaging, least_residual, residual_budget
+from lbt_synth.errors import LbtSynthError, ProblemError, refuse_config
+from lbt_synth.loop import ClosedLoop, Imaging, least_residual, residual_budget, strehl
 from lbt_synth.loop.band_limit import BandLimit, least_worst_residual
 from lbt_synth.loop.least_residual import ResidualLimit, above_percent, limit_or_none
 from lbt_synth.loop.margins import phase_margin_deg
-from lbt_synth.methods.registry import reference_methods
+from lbt_synth.methods.registry import INTEGRATOR, KALMAN, reference_methods
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
@@ -188,6 +189,27 @@ def _residual_curve(
     moved = [still.with_frequency_error(float(shift)) for shift in (0.0, *shifts)]
     first, *others = (np.trace(residual_budget(loop, shaken).total_nm2) for shaken in moved)
     return np.asarray(np.sqrt(residual_nm**2 - first + np.array(others)))
+
+
+def limits_at_rate(
+    config: Config, frame_rate_hz: float
+) -> tuple[Config, dict[str, tuple[float, float]]]:
+    """Return the configuration of the same star at another frame rate, and what it leaves.
+
+    That is the residual [nm rms] and the Strehl ratio of an integrator, of the Kalman filter, and
+    of the limit as a Gaussian motion, nan where there is none.
+    """
+    with refuse_config(f"at {frame_rate_hz:.6g} Hz"):
+        here = at_frame_rate(config, frame_rate_hz)
+        designs = {m.name: here.design(m.name, **m.compared_options) for m in (INTEGRATOR, KALMAN)}
+        study = limits(designs, here.hardware, here.truth, here.imaging)
+    leaves = {row.design: (row.residual_nm, row.strehl) for row in study.rows}
+    leaves["limit"] = np.nan, np.nan
+    if study.limit is not None:
+        axes = study.limit.directions
+        covariance = axes.T @ (study.limit.variance_nm2[:, None] * axes)
+        leaves["limit"] = study.limit.rms_nm, strehl(covariance, here.imaging)
+    return here, leaves
 
 
 def compare_in_truth(

@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from support.plants import LBT_YAML, ROOT
 from support.robust_config import robust_writer
 
 import lbt_synth as lbt
-from lbt_synth.cli.design import describe_design
+from lbt_synth.cli.design import add_moving_gains, describe_design
 from lbt_synth.cli.main import main
 from lbt_synth.cli.output import Report
 from lbt_synth.files.gain_file.store import load_with_digest
@@ -122,6 +123,16 @@ def test_show_and_verify(capsys, gains, name):
     assert status == 0
     assert "verified" in text
     assert json.loads(run(capsys, "verify", gains[name], "--json")[1])["passed"] is True
+
+
+def test_a_controller_without_an_estimator_form_has_no_number_for_it():
+    zeros = {"A": [[0, 0], [1, 0]], "B": [[1], [0]], "C": [[0.05, 0.1]], "D": 0.0}  # at z = -2
+    law = lbt.Controller(**zeros, dt_s=1 / 800)
+    hardware = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
+    design = SimpleNamespace(hardware=hardware, controller=law, other_sensors=())
+    report = Report()
+    add_moving_gains(report, design)
+    assert report.data["clipped_commands"] == {"plain": 1e4, "estimator": None}
 
 
 @pytest.mark.parametrize("name", ["kalman", "turned"])
