@@ -164,7 +164,8 @@ def _limits_over_rates(config: Config, arguments: Namespace) -> Report:
         said = f"{nm_text(residual_nm[place], '.1f')} rms, Strehl ratio {100 * ratio[place]:.1f} %"
         best.append(f"{rates[place]:.0f} Hz{end} for the {design_title(name)} ({said})")
         report.data[f"best_{name}_hz"] = rates[place]
-    report.verdict.append(f"The best frame rate is {listing_text(best)}.")
+    none = "none: all loops are unstable in the truth"
+    report.verdict.append(f"The best frame rate is {listing_text(best) or none}.")
     report.add_rows(
         "rows",
         f"The same star at other frame rates; {config.imaging.label}",

@@ -101,7 +101,7 @@ def _with_value(section: Any, keys: Keys, value: Any) -> Any:
     return section.model_copy(update={first: _with_value(getattr(section, first), rest, value)})
 
 
-def with_arrays(settings: FileSection, values: Mapping[Keys, Any]) -> FileSection:
+def with_values(settings: FileSection, values: Mapping[Keys, Any]) -> FileSection:
     """Return settings with other values, or arrays (b,) of samples that differ, unchecked."""
     for keys, numbers in values.items():
         settings = _with_value(settings, keys, numbers)
@@ -128,7 +128,7 @@ def at_frame_rate(config: Config, frame_rate_hz: float) -> Config:
     else:
         name = "noise_nm" if sensor.noise_mas is None else "noise_mas"
         values["sensor", name] = (np.sqrt(ratio) * np.array(getattr(sensor, name))).tolist()
-    return build_config(with_arrays(settings, values), config.source)
+    return build_config(with_values(settings, values), config.source)
 
 
 def array_keys(settings: FileSection) -> set[Keys]:
@@ -169,7 +169,7 @@ def build_ensemble(
     The configuration is that of one of them. Their real delays less those of the configuration, and
     their real noise over it, are (b,).
     """
-    settings, flows = with_arrays(config.settings, values), None
+    settings, flows = with_values(config.settings, values), None
     delay = settings.loop.delay_frames + delay_error_frames
     for extreme in (np.min(delay), np.max(delay)):
         replace(config.hardware, delay_frames=float(extreme))  # refuses what no loop has

@@ -218,13 +218,14 @@ def clip_peak(hardware, controller, sensor_gain):
 
 @pytest.mark.parametrize("delay_frames", [1.0, 2.0, 2.4, 3.0])
 @pytest.mark.parametrize("influence", [np.eye(2), [[1.0, 0.3], [-0.2, 0.8]]])
-def test_what_a_clip_sees_is_the_loop_broken_at_the_command(delay_frames, influence):
+@pytest.mark.parametrize("mirror", [None, shell()])
+def test_what_a_clip_sees_is_the_loop_broken_at_the_command(delay_frames, influence, mirror):
     hardware = lbt.LoopHardware(
-        frame_rate_hz=800, delay_frames=delay_frames, influence_matrix=influence, modes=2
+        frame_rate_hz=800, delay_frames=delay_frames, influence_matrix=influence, mirror=mirror
     )
-    back = np.linalg.inv(influence)
-    law = lbt.Controller(A=np.eye(2), B=0.35 * back, C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / 800)
-    for gain in (0.8, 1.0, 1.5):
+    A, B, none = np.diag([1.05, 1.0]), np.diag([0.35, 0.25]), np.zeros((2, 2))
+    law = lbt.Controller(A=A, B=B, C=np.linalg.inv(influence), D=none, dt_s=1 / 800)
+    for gain in (0.6, 1.4) if mirror is None else (0.3, 0.5):
         ratios = strokes(hardware, law, sensor_gain=gain)
         for ratio, peak in zip(ratios, clip_peak(hardware, law, gain), strict=True):
             expected = peak / (peak - 1) if peak > 1 + 1e-4 else 1e4
@@ -242,17 +243,28 @@ def test_a_common_lyapunov_function_of_clips_exists_inside_and_none_beyond():
         assert (common_lyapunov(*clips)[0] > 0) == proved
 
 
-def clipped_runs(design, kicks, *, estimator):
-    """Return the largest request and the last residual of loops of two frames, one a kick."""
-    run = (lbt.linear.estimator_form(design) if estimator else design.controller).start()
-    applied, asked = np.zeros((2, 1, kicks.shape[1])), np.zeros(kicks.shape[1])
-    residual = np.zeros((1, kicks.shape[1]))
-    for k in range(3000):
-        u = run.step(residual, applied[0])
-        residual = (kicks[k] if k < len(kicks) else 0.0) - applied[0]
-        applied = np.stack([np.clip(u, -1, 1), applied[0]])
+def clipped_runs(design, kicks, *, estimator, frames=3000):
+    """Return the largest request and the residuals of loops of two frames, one a column of kicks.
+
+    The last loop runs in the simulation, too.
+    """
+    form = lbt.linear.estimator_form(design) if estimator else design.controller
+    phase = np.zeros((frames, kicks.shape[1]))
+    phase[: len(kicks)] = kicks
+    run, asked = form.start(), np.zeros(kicks.shape[1])
+    applied, residuals = (
+        np.zeros((frames + 1, kicks.shape[1])),
+        np.zeros((frames + 1, *asked.shape)),
+    )
+    for k in range(frames):
+        u = run.step(residuals[k][None], applied[k][None])
+        residuals[k + 1] = phase[k] - applied[k]  # the command of the frame before
+        applied[k + 1] = np.clip(u[0], -1, 1)
         asked = np.maximum(asked, np.abs(u[0]))
-    return asked, np.abs(residual[0])
+    met = lbt.loop.Disturbance(phase_nm=phase[:, -1:])
+    simulated = lbt.simulate(form, met, hardware=design.hardware, stroke=1.0)
+    assert simulated.commands[0, :, 0] == pytest.approx(applied[1:, -1], abs=1e-9)
+    return asked, np.abs(residuals[-1])
 
 
 def test_loops_that_ask_for_less_than_is_proved_come_back_and_some_beyond_do_not():
