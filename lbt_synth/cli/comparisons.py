@@ -24,7 +24,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residual import limit_or_nan
-from lbt_synth.methods.registry import design_label, design_title, reference_methods
+from lbt_synth.methods.registry import design_title, reference_methods
 from lbt_synth.report.designs import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_map_figure
 from lbt_synth.report.figures.studies import (
@@ -157,10 +157,12 @@ def _limits_over_rates(config: Config, arguments: Namespace) -> Report:
     if shell is not None:  # its local loop runs a whole number of samples per frame
         rates = np.unique(shell.sampling_hz / np.maximum(np.round(shell.sampling_hz / rates), 1))
     compared = (limits_at_rate(config, rate) for rate in rates.tolist())
-    points = list(track_progress(compared, total=rates.size, what="frame rates"))
-    columns = {name: np.array([leaves[name] for _, leaves in points]).T for name in points[0][1]}
-    report, best = Report(), []
-    for name, (residual_nm, ratio) in columns.items():
+    rows = list(track_progress(compared, total=rates.size, what="frame rates"))
+    report, best, curves = Report(), list[str](), dict[str, FloatArray]()
+    for name in ("integrator", "kalman", "limit"):
+        cells = [(row.values[f"{name}_nm"], row.values[f"{name}_strehl"]) for row in rows]
+        residual_nm, ratio = np.array(cells).T
+        curves[name] = residual_nm
         if np.isnan(residual_nm).all():  # unstable, or without a limit, at each rate
             continue
         place = int(np.nanargmin(residual_nm))
@@ -173,8 +175,8 @@ def _limits_over_rates(config: Config, arguments: Namespace) -> Report:
     report.add_rows(
         "rows",
         f"The same star at other frame rates; {config.imaging.label}",
-        [_rate_row(here, leaves) for here, leaves in points],
-        figure=lambda: frame_rate_figure(rates, {n: nm for n, (nm, _) in columns.items()}),
+        rows,
+        figure=lambda: frame_rate_figure(rates, curves),
     )
     noise = "the noise is that of photons, its variance in proportion to the rate"
     if config.settings.sensor.pyramid is not None:
@@ -183,19 +185,6 @@ def _limits_over_rates(config: Config, arguments: Namespace) -> Report:
     delay += "; no other sensor is read" * bool(config.other_sensors)
     report.notes.append(f"assumes: the photons per second stay; {noise}; {delay}.")
     return report
-
-
-def _rate_row(here: Config, leaves: Mapping[str, tuple[float, float]]) -> Facts:
-    """Return the line of a frame rate."""
-    noise_nm = float(np.sqrt(np.mean(np.square(here.noise_nm))))
-    cells = {
-        "frame_rate_hz": fact(here.hardware.frame_rate_hz, "rate", unit="Hz", format=".0f"),
-        "noise_nm": fact(noise_nm, "noise", **RMS),
-    }
-    for name, (residual_nm, ratio) in leaves.items():
-        cells[f"{name}_nm"] = fact(residual_nm, design_label(name), **RMS)
-        cells[f"{name}_strehl"] = fact(ratio, "Strehl", **PERCENT)
-    return facts(**cells)
 
 
 def run_tradeoff(arguments: Namespace) -> Report:

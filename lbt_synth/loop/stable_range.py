@@ -19,12 +19,11 @@ sensor sees it. It does not while the Hermitian part of X lies above -1. ``M_d'`
 linear in ``d'``, so that a few loops stand for all of a box of gains and delays: X of any other is
 an average of theirs.
 
-A command that is clipped at the stroke is the command times a gain d(k) in ``[r, 1]``, while it
-asks for at most ``1 / r`` times the stroke. With v asked for and ``w = v - e`` applied, ``e = (1 -
-d) v`` comes back through the stable loop as ``v = T_w e``, and the loop stays stable, whatever d
-does, if the Hermitian part of ``T_w`` lies below ``1 / (1 - r)`` (the circle criterion: H. K.
-Khalil, Nonlinear Systems, 3rd ed., section 7.1; in discrete time E. I. Jury, B. W. Lee, IEEE Trans.
-Autom. Control 9, 51 (1964)). An estimator form is given w: e comes back through its state, too.
+A command v that is clipped at the stroke is applied as ``d(k) v`` with d(k) in ``[r, 1]``, while it
+asks for at most ``1 / r`` strokes. What is clipped off comes back through the loop as ``v = T_w (1
+- d) v``, and the loop stays stable, whatever d does, if the Hermitian part of ``T_w`` lies below
+``1 / (1 - r)`` (the circle criterion: H. K. Khalil, Nonlinear Systems, 3rd ed., section 7.1; in
+discrete time E. I. Jury, B. W. Lee, IEEE Trans. Autom. Control 9, 51 (1964)).
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from lbt_synth.loop import ClosedLoop, Imaging, least_residual, residual_budget,
 from lbt_synth.loop.band_limit import BandLimit, least_worst_residual
 from lbt_synth.loop.least_residual import ResidualLimit, above_percent, limit_or_none
 from lbt_synth.loop.margins import phase_margin_deg
-from lbt_synth.methods.registry import INTEGRATOR, KALMAN, reference_methods
+from lbt_synth.methods.registry import INTEGRATOR, KALMAN, design_label, reference_methods
 from lbt_synth.models import (
     LoopHardware,
     SinusoidalVibration,
@@ -210,13 +210,10 @@ def _residual_curve(
     return np.asarray(np.sqrt(residual_nm**2 - first + np.array(others)))
 
 
-def limits_at_rate(
-    config: Config, frame_rate_hz: float
-) -> tuple[Config, dict[str, tuple[float, float]]]:
-    """Return the configuration of the same star at another frame rate, and what it leaves.
+def limits_at_rate(config: Config, frame_rate_hz: float) -> Facts:
+    """Return what designs, and the limit, leave of the same star at another frame rate.
 
-    That is the residual [nm rms] and the Strehl ratio of an integrator, of the Kalman filter, and
-    of the limit as a Gaussian motion, nan where there is none.
+    The Strehl ratio of the limit is that of a Gaussian motion; what there is not is nan.
     """
     with refuse_config(f"at {frame_rate_hz:.6g} Hz"):
         here = at_frame_rate(config, frame_rate_hz)
@@ -228,7 +225,15 @@ def limits_at_rate(
         axes = study.limit.directions
         covariance = axes.T @ (study.limit.variance_nm2[:, None] * axes)
         leaves["limit"] = study.limit.rms_nm, strehl(covariance, here.imaging)
-    return here, leaves
+    noise_nm = float(np.sqrt(np.mean(np.square(here.noise_nm))))
+    cells = {
+        "frame_rate_hz": fact(frame_rate_hz, "rate", unit="Hz", format=".0f"),
+        "noise_nm": fact(noise_nm, "noise", unit="nm", format=".1f"),
+    }
+    for name, (residual_nm, ratio) in leaves.items():
+        cells[f"{name}_nm"] = fact(residual_nm, design_label(name), unit="nm", format=".1f")
+        cells[f"{name}_strehl"] = fact(ratio, "Strehl", unit="%", scale=100, format=".2f")
+    return facts(**cells)
 
 
 def compare_in_truth(
