@@ -13,7 +13,6 @@ import numpy as np
 from lbt_synth.config import Config
 from lbt_synth.config.samples import at_frame_rate
 from lbt_synth.design import Design
-from lbt_synth.design.modal import modal_filters, modal_gains
 from lbt_synth.errors import LbtSynthError, ProblemError, refuse_config
 from lbt_synth.loop import ClosedLoop, Imaging, least_residual, residual_budget, strehl
 from lbt_synth.loop.band_limit import BandLimit, least_worst_residual
@@ -357,6 +356,8 @@ class ModalStudy:
 
 def compare_modes(config: Config, modes: int) -> ModalStudy:
     """Compare integrators of the best gains with Kalman filters, for the first modes of a loop."""
+    from lbt_synth.design.modal import modal_filters, modal_gains
+
     hardware, sensor_gain = config.hardware, config.settings.model.sensor_gain
     reason = "the turbulence of hundreds of modes is computed from it"
     rate_hz = hardware.frame_rate_hz

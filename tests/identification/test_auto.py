@@ -43,8 +43,11 @@ def strong_loop(line=LINE) -> tuple[LoopRecord, IdentifiedModel]:
 
 
 def test_a_design_is_doubted_where_the_gains_disagree() -> None:
-    first, other = strong_loop()[0], spliced_record((1,), lines=LINE, frames=6000, sensor_gain=0.4)
-    pairs = ((getattr(first, name)[:6000], getattr(other, name)) for name in SERIES)
+    first, other = (
+        strong_loop()[0],
+        spliced_record((1,), lines=LINE, frames=12_000, sensor_gain=0.4),
+    )
+    pairs = ((getattr(first, name)[:12_000], getattr(other, name)) for name in SERIES)
     made = lbt.design_from_record(loop_record(*map(np.vstack, pairs), **LOOP), method="hinf")
     assert made.name == "H-infinity filter"
     assert any("sensor gain" in note for note in made.notes)

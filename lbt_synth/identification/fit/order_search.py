@@ -83,14 +83,12 @@ def find_models(
     near = [
         rival
         for rival in rivals
-        if any(
-            cost(search, rival) - cost(search, best) < _AS_LIKELY
-            for cost in (fitting.cost, _cost_of_noise)
+        if min(
+            fitting.cost(search, rival) - fitting.cost(search, best),
+            _cost_of_noise(search, rival) - _cost_of_noise(search, best),
+            _cost_beside(search, rival, best),
         )
-        or (
-            _is_plausible(rival.spectrum.background.gain)
-            and _cost_of_prediction(search, rival) - _cost_of_prediction(search, best) < _AS_LIKELY
-        )
+        < _AS_LIKELY
     ]
     return (best if best is model else fitting.prune(search, best, thorough=True)), near
 
@@ -132,10 +130,20 @@ def _is_plausible(gain: float) -> bool:
     return PLAUSIBLE_GAINS[0] <= gain <= PLAUSIBLE_GAINS[1]
 
 
-def _cost_of_prediction(search: Search, model: FittedModel) -> float:
-    """Return the cost of a model of which each parameter costs 1, as Akaike has it."""
-    price = fitting.total_price(search, model.spectrum)
-    return fitting.cost(search, model) - price * (1 - 1 / search.parameter_price)
+def _cost_beside(search: Search, rival: FittedModel, best: FittedModel) -> float:
+    """Return what a rival of a plausible gain costs more, if a parameter costs 1 as in Akaike's.
+
+    It may have one component more: with several, some gain explains all spectra.
+    """
+    more = len(rival.spectrum.components) - len(best.spectrum.components)
+    if more > 1 or not _is_plausible(rival.spectrum.background.gain):
+        return float("inf")
+    costs = [
+        fitting.cost(search, model)
+        - fitting.total_price(search, model.spectrum) * (1 - 1 / search.parameter_price)
+        for model in (rival, best)
+    ]
+    return costs[0] - costs[1]
 
 
 def _cost_of_noise(search: Search, model: FittedModel) -> float:
