@@ -204,20 +204,17 @@ def crossings(T: StateSpace, *, real_part: float | None = None) -> tuple[FloatAr
     def response(at: FloatArray) -> ComplexArray:
         return np.asarray(schur_response(form, np.exp(1j * at))[:, 0, 0])
 
-    def excess(there: ComplexArray) -> FloatArray:
+    def excess(at: FloatArray) -> FloatArray:
+        there = response(at)
         return there.imag if real_part is None else there.real - real_part
 
-    def excess_at(at: FloatArray) -> FloatArray:
-        return excess(response(at))
-
     middle = (angles[1:] + angles[:-1]) / 2
-    signs, there = np.sign(excess_at(middle)), response(angles)
-    zero = np.abs(excess(there)) <= _REAL * np.abs(there)
+    signs, zero = np.sign(excess(middle)), np.abs(excess(angles)) <= _REAL * abs(response(angles))
     (turns,) = np.nonzero((signs[1:] * signs[:-1] < 0) & ~zero[1:-1])  # of an inaccurate angle
     crossed = np.zeros(0)
     if turns.size:
         ends = middle[turns], middle[turns + 1]
-        crossed = find_root(excess_at, ends, tolerances={"xatol": 1e-15, "xrtol": 0.0}).x
+        crossed = find_root(excess, ends, tolerances={"xatol": 1e-15, "xrtol": 0.0}).x
     places = np.sort(np.concatenate([angles[zero], crossed]))
     places = places[np.diff(places, prepend=-1.0) > _REAL]  # z and 1 / z differ by rounding
     return places, response(places)

@@ -4,7 +4,6 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
 from support.plants import lbt_axis_plant
 from support.refusals import refused, require_refusals
 
@@ -13,7 +12,6 @@ from lbt_synth.errors import InfeasibleError, NumericalError, ProblemError
 from lbt_synth.linear.norms import spectral_norms
 
 KALMAN_NM, LEAST_GAMMA_NM = 135.958, 155.5373
-SEEDS = st.integers(0, 10_000)
 
 
 def test_the_numbers_of_the_lbt(axis_plant):

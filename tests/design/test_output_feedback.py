@@ -114,7 +114,7 @@ def test_refusals():
 # Problems on which python-control (152, 367, 973) and Octave (13, 14) fail, hang or give no reason.
 # They are posed in continuous time, and sampled by the bilinear map, which keeps the norm.
 
-A, B, C = MASS = (
+A, B, C = (
     np.array([[0.0, 1.0], [0.0, 0.0]]),
     np.array([[0.0], [1.0]]),
     np.array([[1.0, 0.0]]),
