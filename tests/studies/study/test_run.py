@@ -133,8 +133,8 @@ def test_a_row_is_replayed(tmp_path):
         assert found == pytest.approx(again.fresh[f"{name}.strehl"], rel=1e-9)
 
 
-@pytest.mark.usefixtures("small_parts")
-def test_a_row_of_an_unfinished_study(tmp_path):
+def test_a_row_of_an_unfinished_study(tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "_ROWS_TOGETHER", 7)
     study, folder = load_small_study(tmp_path, samples="60"), make_folder(tmp_path)
     assert replay_row(study, folder, 3).stored == {}
 
@@ -236,7 +236,6 @@ def test_a_point_is_what_the_library_says(tmp_path):
 
 COUNT = 8
 NOISE = "error.noise_factor: {uniform: [0.9, 1.1]}"
-GAIN = "truth.sensor_gain: {uniform: [0.5, 1]}"
 FIXED = "{slow: {design: integrator, gain: 0.3}, kalman: {design: kalman}}"
 OWN = "{own: {design: kalman, for: sample}}"
 BOTH = "{kalman: {design: kalman}, own: {design: kalman, for: sample}}"
@@ -346,7 +345,7 @@ def test_samples_that_the_configuration_refuses(tmp_path):
       'truth.vibrations[0].rms_nm': {normal: {mean: 300, deviation: 100, high: 900}},
       truth.sensor_gain: {normal: {mean: 0.8, deviation: 0.1, low: 0.5}}
     }"""
-    study, *_ = agree(tmp_path, base=BASE, controllers=FIXED, parameters=parameters)
+    study = load_small_study(tmp_path, controllers=FIXED, parameters=parameters)
     values = study.values(0, COUNT)
     values[2, 0] = -5.0
     values[4, 1] = 0.0
@@ -365,7 +364,7 @@ def test_a_filter_that_cannot_be_designed(tmp_path):
       sensor.noise_nm: {uniform: [5, 30]},
       'model.vibrations[0].rms_nm': {uniform: [100, 900]}
     }"""
-    study, *_ = agree(tmp_path, base=BASE, controllers=OWN, parameters=parameters)
+    study = load_small_study(tmp_path, controllers=OWN, parameters=parameters)
     values = study.values(0, COUNT)
     values[3, 1] = 1e170  # its variance overflows
     columns, failures = evaluate_samples(study, values, 0)
