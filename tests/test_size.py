@@ -14,19 +14,19 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3464,
+    "cli": 3301,
     "config": 1634,
     "design": 6201,
     "files": 1244,
     "identification": 8875,
-    "interop": 3733,
+    "interop": 3730,
     "linear": 4829,
     "loop": 3965,
     "methods": 861,
     "models": 3851,
     "report": 3328,
     "storage": 1027,
-    "studies": 2735,
+    "studies": 2926,
     "errors, validation": 554,
 }
 COUNTS = {
