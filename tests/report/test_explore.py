@@ -80,15 +80,15 @@ def test_moves_in_words_and_in_the_unit_that_is_shown(start):
 def test_curves_are_those_of_the_loop(start, first):
     design, curves = first.design, first.shown["Kalman"].curves
     loop = lbt.close_loop(start.hardware, design.controller)
-    grid, rejection = curves["Rejection"]
-    np.testing.assert_allclose(rejection, spectral_norms(loop.sensitivity(grid)))
-    np.testing.assert_allclose(
-        curves["Noise"][1], spectral_norms(loop.path("noise", "residual").frequency_response(grid))
-    )
-    error = spectral_norms(design.error_system().frequency_response(grid))
-    np.testing.assert_allclose(curves["Estimation error"][1], error)
-    spectrum = exact_spectrum(loop, start.truth, grid, 2048)
-    np.testing.assert_allclose(curves["Residual spectrum"][1], spectrum)
+    grid = curves["Rejection"][0]
+    noise = loop.path("noise", "residual").frequency_response(grid)
+    for title, values in (
+        ("Rejection", spectral_norms(loop.sensitivity(grid))),
+        ("Noise", spectral_norms(noise)),
+        ("Estimation error", spectral_norms(design.error_system().frequency_response(grid))),
+        ("Residual spectrum", exact_spectrum(loop, start.truth, grid, 2048)),
+    ):
+        np.testing.assert_allclose(curves[title][1], values)
     assert "Estimation error" not in first.shown["old"].curves
 
 
