@@ -9,12 +9,10 @@ from support.refusals import require_refusals
 
 import lbt_synth as lbt
 
-QUICK = {"natural_frequency_hz": 50, "damping": 0.5, "bandwidth_hz": 500}
 SLOW = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 70, "delay_samples": 2}
-
-
-def shell(**changes):
-    return lbt.models.PositionLoop.from_bandwidth(**{**QUICK, **changes})
+shell = partial(
+    lbt.models.PositionLoop.from_bandwidth, natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
+)
 
 
 def test_the_step_is_that_of_a_second_order_system_when_sampled_fast():
