@@ -24,7 +24,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residual import limit_or_nan
-from lbt_synth.methods.registry import design_title, reference_methods
+from lbt_synth.methods.registry import INTEGRATOR, KALMAN, design_title, reference_methods
 from lbt_synth.report.designs import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_map_figure
 from lbt_synth.report.figures.studies import (
@@ -159,7 +159,7 @@ def _limits_over_rates(config: Config, arguments: Namespace) -> Report:
     compared = (limits_at_rate(config, rate) for rate in rates.tolist())
     rows = list(track_progress(compared, total=rates.size, what="frame rates"))
     report, best, curves = Report(), list[str](), dict[str, FloatArray]()
-    for name in ("integrator", "kalman", "limit"):
+    for name in (INTEGRATOR.name, KALMAN.name, "limit"):
         cells = [(row.values[f"{name}_nm"], row.values[f"{name}_strehl"]) for row in rows]
         residual_nm, ratio = np.array(cells).T
         curves[name] = residual_nm

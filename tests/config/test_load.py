@@ -157,8 +157,7 @@ def test_what_is_missing_or_does_not_fit_is_said(tmp_path, sections, key, text):
 
 def test_the_smallest_file_of_the_documentation(tmp_path):
     page = (ROOT / "docs" / "configuration.md").read_text()
-    path = tmp_path / "page.yaml"
-    path.write_text(page.split("```yaml\n")[1].split("```")[0])
+    path = write_config(tmp_path, page.split("```yaml\n")[1].split("```")[0])
     assert lbt.load_config(path).design("kalman").certificate.passed
 
 
@@ -173,9 +172,7 @@ def test_templates_and_examples_come_with_the_package():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_template_makes_certified_filters(tmp_path, name):
-    path = tmp_path / "t.yaml"
-    path.write_text(telescope_template(name))
-    config = lbt.load_config(path)
+    config = lbt.load_config(write_config(tmp_path, telescope_template(name)))
     designs = config.design("kalman"), config.design("integrator")
     loops = [lbt.close_loop(config.hardware, design.controller) for design in designs]
     residual, baseline = (lbt.residual_budget(loop, config.truth).rms_nm for loop in loops)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from support.configs import write_config
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
@@ -41,10 +42,8 @@ def test_which_numbers_are_taken_as_arrays(config, tmp_path):
     # what the real turbulence is computed from, where it is the model's
     for kind, noise in (("ar1", True), ("ar2", False)):
         text = LBT_YAML.read_text().replace("kind: ar1", f"kind: {kind}")
-        (tmp_path / "c.yaml").write_text(
-            text.replace("turbulence: frozen_flow", "turbulence: model")
-        )
-        keys = array_keys(lbt.load_config(tmp_path / "c.yaml").settings)
+        file = write_config(tmp_path, text.replace("turbulence: frozen_flow", "turbulence: model"))
+        keys = array_keys(lbt.load_config(file).settings)
         assert parse_path("atmosphere.seeing_arcsec") not in keys
         assert (parse_path("sensor.pyramid.photons") in keys) == noise
 

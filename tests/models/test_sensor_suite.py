@@ -1,6 +1,7 @@
 """Sensors beside the loop's own: ages, schedules, accelerations, refusals."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,15 +15,9 @@ from lbt_synth.models.sensor_suite import checked_motions, period_frames
 PATH = LoopHardware(frame_rate_hz=1000, delay_frames=2, modes=2)
 
 
-def wavefront(**changes):
-    return WavefrontSensor(
-        **({"name": "truth", "rate_hz": 250, "delay_frames": 3, "noise_nm": 4.0} | changes)
-    )
-
-
-def accelerometer(**changes):
-    facts = {"name": "mirror", "rate_hz": 1000, "delay_frames": 2, "channels": ("m1", "m2")}
-    return Accelerometer(**(facts | {"noise_m_s2": 2e-4} | changes))
+wavefront = partial(WavefrontSensor, name="truth", rate_hz=250, delay_frames=3, noise_nm=4.0)
+readings = {"rate_hz": 1000, "delay_frames": 2, "noise_m_s2": 2e-4}
+accelerometer = partial(Accelerometer, name="mirror", channels=("m1", "m2"), **readings)
 
 
 def test_the_high_pass_turns_and_weakens():

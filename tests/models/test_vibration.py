@@ -1,6 +1,7 @@
 """Vibrations: their processes, their drift, and what is no vibration."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -76,9 +77,7 @@ def test_a_direction_is_scaled_once():
 
 
 def test_wrong_vibrations_are_refused():
-    def line(**changes):
-        return lbt.Vibration(**({"frequency_hz": 20, "damping": 0.1, "rms_nm": 1} | changes))
-
+    line = partial(lbt.Vibration, frequency_hz=20, damping=0.1, rms_nm=1)
     beyond = "below the Nyquist frequency 400 Hz; got 500 Hz"
     for call, words in (
         *((lambda v=v: line(damping=v), "damping must be") for v in (0.0, -1.0)),

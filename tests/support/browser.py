@@ -8,11 +8,8 @@ PHONE = {"width": 360, "height": 740, "deviceScaleFactor": 2, "mobile": True}
 DESK = {"width": 1280, "height": 900, "deviceScaleFactor": 1, "mobile": False}
 
 
-def chromium(profile, *hosts, requests=True):
-    """Start headless Chromium, to which no names are known but those of hosts.
-
-    It lists the requests of its pages, which takes time from whatever is measured.
-    """
+def chromium(profile, *hosts):
+    """Start headless Chromium, to which no names are known but those of hosts."""
     from selenium import webdriver
 
     options = webdriver.ChromeOptions()
@@ -20,8 +17,7 @@ def chromium(profile, *hosts, requests=True):
     rules = ", ".join(["MAP * ~NOTFOUND", *(f"EXCLUDE {host}" for host in hosts)])
     for option in (*OPTIONS, f"--host-resolver-rules={rules}", f"--user-data-dir={profile}"):
         options.add_argument(option)
-    logs = {"browser": "ALL"} | ({"performance": "ALL"} if requests else {})
-    options.set_capability("goog:loggingPrefs", logs)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     service = webdriver.ChromeService(executable_path="/usr/bin/chromedriver")
     return webdriver.Chrome(options=options, service=service)
 
@@ -41,10 +37,3 @@ def opened(browser, address, screen=DESK):
     browser.get(address)
     complete = "return location.href !== 'about:blank' && document.readyState === 'complete'"
     WebDriverWait(browser, 60).until(lambda driver: driver.execute_script(complete))
-
-
-def chain(browser):
-    """Return what the hand does next."""
-    from selenium.webdriver import ActionChains
-
-    return ActionChains(browser)

@@ -1,5 +1,7 @@
 """The mirror at the frame rate, against brute force and closed forms."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,12 +11,10 @@ from scipy.integrate import solve_ivp
 import lbt_synth as lbt
 from lbt_synth.models.mirror.frame_rate_system import instant_mirror, lifted_mirror
 
-QUICK = {"natural_frequency_hz": 50, "damping": 0.5, "bandwidth_hz": 500}
 SLOW = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 70, "delay_samples": 2}
-
-
-def shell(**changes):
-    return lbt.models.PositionLoop.from_bandwidth(**{**QUICK, **changes})
+shell = partial(
+    lbt.models.PositionLoop.from_bandwidth, natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
+)
 
 
 def brute_taps(mirror, frame_rate_hz, delay_frames, frames):

@@ -1,17 +1,18 @@
 """The local position loop of the mirror, against python-control and closed forms."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from support.refusals import require_refusals
 
 import lbt_synth as lbt
 
-QUICK = {"natural_frequency_hz": 50, "damping": 0.5, "bandwidth_hz": 500}
 SLOW = {"natural_frequency_hz": 20, "damping": 0.5, "bandwidth_hz": 70, "delay_samples": 2}
-
-
-def shell(**changes):
-    return lbt.models.PositionLoop.from_bandwidth(**{**QUICK, **changes})
+shell = partial(
+    lbt.models.PositionLoop.from_bandwidth, natural_frequency_hz=50, damping=0.5, bandwidth_hz=500
+)
 
 
 def test_the_step_is_that_of_a_second_order_system_when_sampled_fast():
@@ -37,26 +38,18 @@ def test_a_step_response_in_blocks_is_that_sample_by_sample(changes):
         state = loop.A @ state + loop.B[:, 0] * r
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"bandwidth_hz": 30}, "bandwidth_hz must be at least 50"),
-        ({"natural_frequency_hz": 0}, "natural_frequency_hz must be above 0"),
-        ({"bandwidth_hz": 5000, "delay_samples": 6}, "local loop of the mirror must be stable"),
-        ({"delay_samples": 1000}, "delay_samples must be at most 64"),
-        ({"sampling_hz": 80.0}, "natural_frequency_hz must lie below half"),
-        ({"feed_forward": 11}, "feed_forward must be at most 10"),
-        ({"damping": 20.0}, "bandwidth_damping must be at least"),
-    ],
-)
-def test_impossible_local_loops_are_refused(changes, message):
-    with pytest.raises(lbt.errors.ProblemError, match=message):
-        shell(**changes)
-
-
-def test_a_mirror_without_any_force_is_refused():
+def test_impossible_local_loops_are_refused():
     none = dict.fromkeys(("proportional_per_s2", "derivative_per_s", "feed_forward"), 0)
-    with pytest.raises(lbt.errors.ProblemError, match="must follow its command"):
-        lbt.models.PositionLoop(natural_frequency_hz=10, damping=1, **none)
-    with pytest.raises(lbt.errors.ProblemError, match="tolerance must be below 1"):
-        shell().step_response(1.0)
+    forceless = {"natural_frequency_hz": 10, "damping": 1, **none}
+    rows = [
+        (partial(shell, bandwidth_hz=30), "bandwidth_hz must be at least 50"),
+        (partial(shell, natural_frequency_hz=0), "natural_frequency_hz must be above 0"),
+        (partial(shell, bandwidth_hz=5000, delay_samples=6), "local loop of the mirror must be st"),
+        (partial(shell, delay_samples=1000), "delay_samples must be at most 64"),
+        (partial(shell, sampling_hz=80.0), "natural_frequency_hz must lie below half"),
+        (partial(shell, feed_forward=11), "feed_forward must be at most 10"),
+        (partial(shell, damping=20.0), "bandwidth_damping must be at least"),
+        (partial(lbt.models.PositionLoop, **forceless), "must follow its command"),
+        (partial(shell().step_response, 1.0), "tolerance must be below 1"),
+    ]
+    require_refusals((call, lbt.errors.ProblemError, words) for call, words in rows)

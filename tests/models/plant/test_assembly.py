@@ -1,10 +1,12 @@
 """Plants of several sensors: what they hold, and where they are plants of one."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from support.periodic_problems import relative_distance
+from support.refusals import require_refusals
 from support.sensor_loops import AIR, FAST, MOTIONS, SLOW, example_plant, held_mean
 
 import lbt_synth as lbt
@@ -126,24 +128,19 @@ def test_a_prediction_further_ahead_has_the_same_readings(steps):
         assert other.age_frames(far) == pytest.approx(one.age_frames(near))
 
 
-SUITE = SensorSuite(sensors=(FAST,))
-
-
-@pytest.mark.parametrize(
-    ("make", "error", "words"),
-    [
-        (lambda p: p.with_sensors((SLOW,)), ProblemError, "suite must be a"),
-        (lambda p: p.with_sensors(SUITE, MOTIONS[:1]), DimensionError, "one mapping per vibration"),
-        (lambda p: replace(p.parts(), motions=MOTIONS[:1]), DimensionError, "one mapping"),
-        (lambda p: p.controller(np.zeros((1, 2, 3))), DimensionError, "gain_predictor must have"),
+def test_refusals():
+    plant, suite = example_plant(), SensorSuite(sensors=(FAST,))
+    motions = {"motions": MOTIONS[:1]}
+    rows = [
+        (partial(plant.with_sensors, (SLOW,)), ProblemError, "suite must be a"),
+        (partial(plant.with_sensors, suite, MOTIONS[:1]), DimensionError, "mapping per vibration"),
+        (partial(replace, plant.parts(), **motions), DimensionError, "one mapping"),
         (
-            lambda p: example_plant((FAST,), delay_frames=4),
-            ProblemError,
-            "at least 3 of its frames",
+            partial(plant.controller, np.zeros((1, 2, 3))),
+            DimensionError,
+            "gain_predictor must have",
         ),
-        (lambda p: p.require_own_sensor("this"), ProblemError, "truth, m1, m2 see, too"),
-    ],
-)
-def test_refusals(make, error, words):
-    with pytest.raises(error, match=words):
-        make(example_plant())
+        (partial(example_plant, (FAST,), delay_frames=4), ProblemError, "at least 3 of its frames"),
+        (partial(plant.require_own_sensor, "this"), ProblemError, "truth, m1, m2 see, too"),
+    ]
+    require_refusals(rows)

@@ -1,5 +1,7 @@
 """Vibrations that accelerometers see, against oscillators that are kicked within each frame."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
@@ -22,9 +24,8 @@ RMS_NM, NOISE_NM = 563.6, 77.5
 AIR = lbt.models.ARModel(coefficients=[0.5], driving_rms_nm=2e-4, frame_rate_hz=RATE_HZ)
 
 
-def mirror(**changes):
-    facts = {"name": "mirror", "rate_hz": RATE_HZ, "delay_frames": 1, "noise_m_s2": 1e-3}
-    return Accelerometer(**(facts | {"channels": ("a", "v")} | changes))
+reading = {"rate_hz": RATE_HZ, "delay_frames": 1, "noise_m_s2": 1e-3}
+mirror = partial(Accelerometer, name="mirror", channels=("a", "v"), **reading)
 
 
 def lag_covariances(A, B, C):

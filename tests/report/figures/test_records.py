@@ -43,16 +43,6 @@ def test_figure_of_a_short_spectrum(model):
             assert y > top
 
 
-def test_the_labels_of_axes_are_whole_and_beside_their_numbers(model):
-    figure = lbt.report.figures.identification_figure(model)
-    figure.draw_without_rendering()
-    for axes in figure.axes:
-        label = axes.yaxis.label.get_window_extent()
-        assert label.x0 >= 0
-        numbers = [text for text in axes.get_yticklabels() if text.get_text()]
-        assert label.x1 <= min(text.get_window_extent().x0 for text in numbers)
-
-
 @given(st.lists(st.floats(0, 1), max_size=40))
 def test_labels_do_not_overlap(wanted):
     wanted = sorted(wanted)

@@ -16,7 +16,16 @@ from lbt_synth.studies.study.statistics import (
 )
 
 NAN = float("nan")
-RESULTS = ("stable", "strehl", "residual_nm")
+SMALL = {  # five samples of two controllers, with unstable loops and a failure
+    "row": np.array([10, 11, 12, 13, 14]),
+    "gain": np.array([0.5, 0.6, 0.7, 0.8, 0.9]),
+    "a.stable": np.array([1, 0, 1, NAN, 1]),
+    "a.strehl": np.array([0.8, NAN, 0.4, NAN, 0.6]),
+    "a.residual_nm": np.array([50, NAN, 90, NAN, 70]),
+    "b.stable": np.array([1, 0, 0, 1, 1]),
+    "b.strehl": np.array([0.7, NAN, NAN, 0.5, 0.6]),
+    "b.residual_nm": np.array([60, NAN, NAN, 80, 70]),
+}
 
 
 def make_columns(parameters, strehls, **changes):
@@ -32,8 +41,8 @@ def cell_text(cell):
     return cell if isinstance(cell, str) else cell.text
 
 
-def test_unstable_counts_as_zero_and_failed_is_left_out(small):
-    found = study_statistics(small, ["gain"], ["a", "b"])
+def test_unstable_counts_as_zero_and_failed_is_left_out():
+    found = study_statistics(SMALL, ["gain"], ["a", "b"])
     a, b = found.controllers
     assert (a.samples, a.failed, a.unstable, a.unstable_share.value) == (4, 1, 1, 0.25)
     assert (b.samples, b.failed, b.unstable, b.unstable_share.value) == (5, 0, 2, 0.4)
@@ -178,8 +187,8 @@ def test_a_controller_that_always_failed_has_dashes_and_no_numbers():
     assert set(column.values()) == {"-"}
 
 
-def test_tables(small):
-    found = study_statistics(small, ["gain"], ["a", "b"])
+def test_tables():
+    found = study_statistics(SMALL, ["gain"], ["a", "b"])
     tables = {table.caption.split(" over")[0]: table for table in summary_tables(found)}
     assert len(tables) == 2  # too few samples for indices
     strehl = {
@@ -197,6 +206,6 @@ def test_tables(small):
         angles = summary_tables(found)[1]
     assert angles.headings[0] == "residual [mas rms]"
     assert {row[0]: row[1] for row in angles.rows if len(row) > 1}["50th percentile"] == "10.00"
-    worst = worst_table(found.controllers[0], small, ["gain"])
+    worst = worst_table(found.controllers[0], SMALL, ["gain"])
     assert [cell_text(cell) for cell in worst.rows[0]] == ["11", "unstable", "0.6"]
     assert [cell_text(cell) for cell in worst.rows[1]] == ["12", "40.0", "0.7"]

@@ -71,16 +71,11 @@ def test_distributions(tmp_path):
         "truth.sensor_gain: {normal: {mean: 0.1, deviation: 0.01, low: 0.2}}}",
     )
     values = study.values()
-    expected = [
-        stats.uniform(100, 200),
-        stats.norm(400, 50),
-        stats.truncnorm(-0.5, 3, 20, 1),
-        None,
-        stats.truncnorm(10, np.inf, 0.1, 0.01),
-    ]
-    for column, law in zip(values.T, expected, strict=True):
-        if law is not None:  # Sobol's points follow a law far more closely than random ones
-            assert stats.kstest(column, law.cdf).statistic < 2 / 4096
+    truncated = stats.truncnorm(-0.5, 3, 20, 1), stats.truncnorm(10, np.inf, 0.1, 0.01)
+    laws = stats.uniform(100, 200), stats.norm(400, 50), *truncated
+    for column, law in zip(values[:, [0, 1, 2, 4]].T, laws, strict=True):
+        # Sobol's points follow a law far more closely than random ones
+        assert stats.kstest(column, law.cdf).statistic < 2 / 4096
     found, counts = np.unique(values[:, 3], return_counts=True)
     assert found.tolist() == [10, 20, 30]
     assert counts.tolist() == [1024, 1024, 2048]
