@@ -78,17 +78,23 @@ def coefficient_rows(frequency: FloatArray, damping: FloatArray) -> FloatArray:
     return np.stack([poles, 0.0 - squares], axis=-1)
 
 
-def unit_density(frequency: float, damping: float, s: FloatArray, sections: int = 1) -> FloatArray:
-    """Spectrum of unit variance of a resonance, or of some in series, (f,) as s is."""
-    b, p, _ = recursion(frequency, damping)
+def unit_densities(
+    frequency: Sequence[float], damping: Sequence[float], s: FloatArray, sections: Sequence[int]
+) -> FloatArray:
+    """Spectra of unit variance of c resonances, each of some sections in series, (c, f)."""
+    b, p = np.array([recursion(*pair)[:2] for pair in zip(frequency, damping, strict=True)]).T[
+        ..., None
+    ]
     size = s * ((p - 2) / 2)
     size += b
     size *= size
-    size += p**2 * s * (1 - s / 4)
+    size += p**2 * (s * (1 - s / 4))
     density = np.asarray(_drive(b, p) / size)
-    if sections == 1:
-        return density
-    return np.asarray(density**sections / series_variance(frequency, damping, sections)[0])
+    for i, m in enumerate(sections):
+        if m > 1:
+            density[i] **= m
+            density[i] /= series_variance(frequency[i], damping[i], m)[0]
+    return density
 
 
 @lru_cache(maxsize=512)

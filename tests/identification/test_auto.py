@@ -43,8 +43,11 @@ def strong_loop(line=LINE) -> tuple[LoopRecord, IdentifiedModel]:
 
 
 def test_a_design_is_doubted_where_the_gains_disagree() -> None:
-    first, other = strong_loop()[0], spliced_record((1,), lines=LINE, frames=6000, sensor_gain=0.4)
-    pairs = ((getattr(first, name)[:6000], getattr(other, name)) for name in SERIES)
+    first, other = (
+        strong_loop()[0],
+        spliced_record((1,), lines=LINE, frames=12_000, sensor_gain=0.4),
+    )
+    pairs = ((getattr(first, name)[:12_000], getattr(other, name)) for name in SERIES)
     made = lbt.design_from_record(loop_record(*map(np.vstack, pairs), **LOOP), method="hinf")
     assert made.name == "H-infinity filter"
     assert any("sensor gain" in note for note in made.notes)
@@ -287,7 +290,7 @@ def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain() -> None:
 
 def test_axes_of_different_gains_may_have_those_of_both() -> None:
     """Commands of one axis at twice their size gave a design that was unstable in the loop."""
-    y, u = (series[:6000] for series in ordinary_loop())
+    y, u = ordinary_loop()
     made = record(y, u * [1.0, 2.0])
     model = lbt.identify(made)
     assert model.sensor_gains == pytest.approx((0.7, 0.35), rel=0.15)

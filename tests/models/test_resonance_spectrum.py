@@ -13,7 +13,7 @@ from lbt_synth.models.resonance_spectrum import (
     drive_ratio,
     log_roll_off,
     resonance_densities,
-    unit_density,
+    unit_densities,
 )
 
 RATE = 1000.0
@@ -74,15 +74,20 @@ def test_a_bump_has_unit_variance_and_right_slopes(
 ) -> None:
     w = np.linspace(0, np.pi, 200_001)
     s = 4 * np.sin(w / 2) ** 2
-    assert trapezoid(unit_density(frequency, damping, s, sections), w) == pytest.approx(np.pi)
+    assert trapezoid(unit_densities([frequency], [damping], s, [sections])[0], w) == pytest.approx(
+        np.pi
+    )
     h, unit = 1e-5, np.ones(1)
     _, slopes = resonance_densities(frequency * unit, damping * unit, unit, s, [sections])
     for slope, move in zip(slopes[0], ((h, 0), (0, h)), strict=True):
         up, down = (
             np.log(
-                unit_density(
-                    frequency * np.exp(t * move[0]), damping * np.exp(t * move[1]), s, sections
-                )
+                unit_densities(
+                    [frequency * np.exp(t * move[0])],
+                    [damping * np.exp(t * move[1])],
+                    s,
+                    [sections],
+                )[0]
             )
             for t in (1, -1)
         )

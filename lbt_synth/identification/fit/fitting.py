@@ -36,7 +36,7 @@ from lbt_synth.identification.fit.whittle import (
     density,
     minimise,
     observe_information,
-    part_density,
+    part_densities,
 )
 from lbt_synth.models.resonance_spectrum import PARAMETERS
 from lbt_synth.validation import integer, number
@@ -324,7 +324,11 @@ def _drop(
         power = float(np.logaddexp(line.log_power, spectrum.components[i].log_power))
         return spectrum.exchange(neighbour, replace(line, log_power=power)).exchange(i)
     smaller, noise = spectrum.exchange(i), float(np.exp(spectrum.background.log_noise))
-    white = float(np.min(part_density(data, spectrum, i))) * data.frame_rate_hz / 2
+    white = (
+        float(np.min(part_densities(data, spectrum, spectrum.components[i : i + 1])))
+        * data.frame_rate_hz
+        / 2
+    )
     if white > noise:
         return smaller.with_background(log_noise=float(np.log(noise + white)))
     return smaller
@@ -358,7 +362,7 @@ def centre_line(search: Search, spectrum: SpectrumModel, i: int) -> SpectrumMode
         moves = product(np.log1p(shifts * step / centre), _POWERS)
         # the width stays
         trials = [line, *(line.shift(move, -move, power) for move, power in moves)]
-        lines = [part_density(data, spectrum.exchange(i, trial), i) for trial in trials]
-        best = int(np.argmin(contrasts(data, spectrum.background.gain, rest + np.array(lines))))
+        densities = rest + part_densities(data, spectrum, trials)
+        best = int(np.argmin(contrasts(data, spectrum.background.gain, densities)))
         line = trials[best]
     return spectrum.exchange(i, line)

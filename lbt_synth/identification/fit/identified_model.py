@@ -18,7 +18,7 @@ from lbt_synth.identification.fit.whittle import (
     derivatives,
     invert_information,
     minimise,
-    part_density,
+    part_densities,
 )
 from lbt_synth.models import (
     ARModel,
@@ -299,7 +299,7 @@ def describe_axis(
     background, rate = spectrum.background, data.frame_rate_hz
     gain, covariance = background.gain, model.covariance
     errors = standard_errors(spectrum, covariance)
-    densities = np.array([part_density(data, spectrum, i) for i in range(len(spectrum.components))])
+    densities = part_densities(data, spectrum)
     fitted = density(data, spectrum)
     first, *resonances = [
         _describe_line(search, model, i, errors, covariance, densities[i], fitted)

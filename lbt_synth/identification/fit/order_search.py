@@ -47,6 +47,7 @@ _BESIDE = 0.08  # of its frequency: lines that are nearer may be one bump
 _ROUGH = 30.0  # prices: a bump of several lines that begins with less is not fitted
 _TO_HALF = 2 * float(np.log(2))  # square of a Gaussian's half width over its variance
 _OTHER_GAINS = (0.45, 1.05)  # of a sensor, from which models that are as likely are sought
+_AROUND = (0.8, 1.25)  # of a gain: where they are sought, too
 _AS_LIKELY = 5.0  # log-likelihood by which one of two gains is excluded
 
 Excess = tuple[float, Component]  # what it would add to the log-likelihood, and a component
@@ -73,17 +74,12 @@ def find_models(
     rivals = [model] if rival is None else [model, rival]
     best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
     if search.finds_gain and start is None and not _is_clear(best):
-        for gain in _OTHER_GAINS:
-            if abs(np.log(gain) - best.spectrum.background.log_gain) >= GAIN_STEP:
-                with suppress(NumericalError):
-                    held = find_components(replace(search, gain=gain), rounds=FEW_ROUNDS)
-                    rival = fitting.fit(search, held.spectrum)
-                    rivals += [] if rival is None else [rival]
-        for i, component in enumerate(best.spectrum.components):
-            if i and component.damping_ratio > WIDE_DAMPING / 2:  # the gain may be that without it
-                rival = fitting.fit(search, best.spectrum.exchange(i))
-                rivals += [] if rival is None else [rival]
-        best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
+        for _ in range(2):  # a clearly better one has rivals of its own
+            begun, rivals = best, [*rivals, *_rivals(search, best.spectrum)]
+            best = min(rivals, key=lambda rival: _cost_of_noise(search, rival))
+            if _cost_of_noise(search, best) > _cost_of_noise(search, begun) - _CLEARLY:
+                break
+            best = fitting.prune(search, best, thorough=True)
     near = [
         rival
         for rival in rivals
@@ -91,8 +87,33 @@ def find_models(
             cost(search, rival) - cost(search, best) < _AS_LIKELY
             for cost in (fitting.cost, _cost_of_noise)
         )
+        or (
+            _is_plausible(rival.spectrum.background.gain)
+            and _cost_of_prediction(search, rival) - _cost_of_prediction(search, best) < _AS_LIKELY
+        )
     ]
     return (best if best is model else fitting.prune(search, best, thorough=True)), near
+
+
+def _rivals(search: Search, spectrum: SpectrumModel) -> Iterator[FittedModel]:
+    """Yield models that begin at other gains, and without each flat resonance."""
+    gain = spectrum.background.gain
+    # the components of an implausible gain may be those of what it explains
+    start = spectrum if _is_plausible(gain) else None
+    gains = [*_OTHER_GAINS, *(gain * np.array(_AROUND)).tolist()]
+    trials = [
+        spectrum.exchange(i)
+        for i, component in enumerate(spectrum.components)
+        if i and component.damping_ratio > WIDE_DAMPING / 2
+    ]
+    for other in gains:
+        if abs(np.log(other / gain)) >= GAIN_STEP:
+            with suppress(NumericalError):
+                held = replace(search, gain=other)
+                trials.append(find_components(held, start, rounds=FEW_ROUNDS).spectrum)
+    for trial in trials:
+        if (rival := fitting.fit(search, trial)) is not None:
+            yield rival
 
 
 def _is_clear(model: FittedModel) -> bool:
@@ -103,9 +124,18 @@ def _is_clear(model: FittedModel) -> bool:
     """
     background, turbulence = model.spectrum.background, model.spectrum.components[0]
     narrow = all(c.is_narrow for c in model.spectrum.lines) and not background.colour
-    low, high = PLAUSIBLE_GAINS
-    plausible = low <= background.gain <= high and model.gain_error < GAIN_STEP
+    plausible = _is_plausible(background.gain) and model.gain_error < GAIN_STEP
     return narrow and plausible and turbulence.damping_ratio < _OVERDAMPED
+
+
+def _is_plausible(gain: float) -> bool:
+    return PLAUSIBLE_GAINS[0] <= gain <= PLAUSIBLE_GAINS[1]
+
+
+def _cost_of_prediction(search: Search, model: FittedModel) -> float:
+    """Return the cost of a model of which each parameter costs 1, as Akaike has it."""
+    price = fitting.total_price(search, model.spectrum)
+    return fitting.cost(search, model) - price * (1 - 1 / search.parameter_price)
 
 
 def _cost_of_noise(search: Search, model: FittedModel) -> float:
@@ -393,8 +423,8 @@ def _excess_bands(
         starts = starts[width * step <= widest]
         mean = np.maximum((total[starts + width] - total[starts]) / width, 1)
         gain = (weight[starts + width] - weight[starts]) * (mean - 1 - np.log(mean))
-        best = np.argsort(gain)[::-1][: 8 * most]
-        best = best[gain[best] > least]
+        above = np.flatnonzero(gain > least)
+        best = above[np.argsort(gain[above])[::-1][: 8 * most]]
         bands += [(float(gain[i]), int(starts[i]), int(starts[i]) + width) for i in best]
         width *= 2
     apart: list[tuple[float, int, int]] = []

@@ -34,7 +34,7 @@ from lbt_synth.identification.fit.whittle import (
     contrast,
     invert_information,
     observe_information,
-    part_density,
+    part_densities,
     spectral_matrix,
 )
 from lbt_synth.identification.records.faults import SURPRISING
@@ -132,7 +132,7 @@ def _find_common(
     It is the excess of the cross-spectrum over that of the model, relative to the geometric mean of
     the densities of the components.
     """
-    densities = [part_density(data, spectrum, i) for i in parts]
+    densities = part_densities(data, spectrum, [spectrum.components[i] for i in parts])
     line, matrix = np.sqrt(densities[0] * densities[-1]), spectral_matrix(data, spectrum)
     weight = data.count * line / (matrix[0, 0] * matrix[1, 1])
     slope = float(np.sum(weight * (data.matrix(spectrum.gains)[0, 1] - matrix[0, 1])))

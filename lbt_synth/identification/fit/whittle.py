@@ -55,7 +55,7 @@ from lbt_synth.models.resonance_spectrum import (
     PARAMETERS,
     log_roll_off,
     resonance_densities,
-    unit_density,
+    unit_densities,
 )
 from lbt_synth.validation import FloatArray, IntArray
 
@@ -95,14 +95,14 @@ class FittedModel:
 
 
 def log_smearing(
-    half_width: float, distance: FloatArray
+    half_width: FloatArray | float, distance: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the logarithm of the ratio of a smeared line to the line itself, (f,).
 
     The derivatives by the logarithm of the half width and by the distance follow.
     """
     e, b = TAPER / 2, 2 * np.pi / TAPER
-    p = 2 * np.pi * (max(half_width, _NARROWEST) + 1j * distance)
+    p = 2 * np.pi * (np.maximum(half_width, _NARROWEST) + 1j * distance)
     r, s, edge, end = 1 / p, 1 / (p**2 + b**2), np.exp(-e * p), np.exp((2 * e - 1) * p)
     lobes, weight = end * (1 + edge) ** 2 - 2 * edge, (b**2 * r * s) ** 2
     transform = (4 - 6 * e - 2 * r) * r + (e * p + 2 + 2 * b**2 * s) * s + weight * lobes
@@ -148,18 +148,25 @@ def _smear(
     """
     if data.duration_s is None:
         return
-    periods = data.frequency_hz * data.duration_s
+    periods, lines = data.frequency_hz * data.duration_s, []
     for i, c in enumerate(components):
         place = c.frequency / data.angle_s * data.duration_s
         half_width = c.damping_ratio * place
-        if c.kind != "line" or c.sections > 1 or half_width > WIDE:
-            continue
-        band = slice(*np.searchsorted(periods, [place - SKIRT, place + SKIRT]))
-        log_ratio, by_width, by_distance = log_smearing(half_width, periods[band] - place)
-        density[i, band] *= np.exp(log_ratio)
+        if c.kind == "line" and c.sections == 1 and half_width <= WIDE:
+            band = slice(*np.searchsorted(periods, [place - SKIRT, place + SKIRT]))
+            lines.append((i, band, place, half_width, periods[band] - place))
+    if not lines:
+        return
+    sizes = [line[4].size for line in lines]
+    widths = np.repeat([line[3] for line in lines], sizes)
+    smeared = np.array(log_smearing(widths, np.concatenate([line[4] for line in lines])))
+    for (i, band, place, *_), rows in zip(
+        lines, np.split(smeared, np.cumsum(sizes)[:-1], axis=1), strict=True
+    ):
+        density[i, band] *= np.exp(rows[0])
         if slopes is not None:
-            slopes[i, 0, band] += by_width - by_distance * place
-            slopes[i, 1, band] += by_width
+            slopes[i, 0, band] += rows[1] - rows[2] * place
+            slopes[i, 1, band] += rows[1]
 
 
 def _log_fall(
@@ -173,30 +180,39 @@ def _log_fall(
     return fall if order == 1 else fall + data.log_frame_mean, slope
 
 
-def part_density(data: LoopPeriodogram, spectrum: SpectrumModel, i: int) -> FloatArray:
-    """Return the density of component i of a spectrum along its direction, (f,)."""
-    c = spectrum.components[i]
-    density = unit_density(c.frequency, c.damping_ratio, data.half_angle_square, c.sections)
-    if c.kind == "turbulence":
-        log_corner = spectrum.axes[c.axis or 0].log_corner
-        density *= np.exp(_log_fall(data, log_corner, spectrum.roll_off_order)[0])
-    _smear(data, [c], density[None])
-    return np.asarray(2 / data.frame_rate_hz * np.exp(c.log_power) * density)
+def part_densities(
+    data: LoopPeriodogram, spectrum: SpectrumModel, components: Sequence[Component] | None = None
+) -> FloatArray:
+    """Return the density of each component of a spectrum along its direction, (c, f).
+
+    Others that might be in it may be given.
+    """
+    components = spectrum.components if components is None else components
+    if not components:
+        return np.zeros((0, data.frequency_hz.size))
+    places = [(c.frequency, c.damping_ratio, c.sections, c.log_power) for c in components]
+    frequency, ratio, sections, log_power = zip(*places, strict=True)
+    density = unit_densities(frequency, ratio, data.half_angle_square, sections)
+    density *= 2 / data.frame_rate_hz * np.exp(log_power)[:, None]
+    for row, component in zip(density, components, strict=True):
+        if component.kind == "turbulence":
+            log_corner = spectrum.axes[component.axis or 0].log_corner
+            row *= np.exp(_log_fall(data, log_corner, spectrum.roll_off_order)[0])
+    _smear(data, components, density)
+    return density
 
 
 def density(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:
     """Return the density of the spectrum of one axis, (f,)."""
-    total = _noise_density(data, spectrum)[0]
-    for i in range(len(spectrum.components)):
-        total += part_density(data, spectrum, i)
-    return np.asarray(total)
+    parts = part_densities(data, spectrum)
+    return np.asarray(_noise_density(data, spectrum)[0] + np.sum(parts, axis=0))
 
 
 def spectral_matrix(data: LoopPeriodogram, spectrum: SpectrumModel) -> FloatArray:
     """Return the spectrum of n axes, (n, n, f)."""
     matrix = np.eye(len(spectrum.axes))[:, :, None] * _noise_density(data, spectrum)
-    for i, a in enumerate(spectrum.directions):
-        matrix += np.multiply.outer(np.outer(a, a), part_density(data, spectrum, i))
+    for a, part in zip(spectrum.directions, part_densities(data, spectrum), strict=True):
+        matrix += np.multiply.outer(np.outer(a, a), part)
     return matrix
 
 

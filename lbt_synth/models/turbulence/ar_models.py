@@ -17,7 +17,7 @@ from scipy.special import jv
 
 from lbt_synth.errors import NumericalError
 from lbt_synth.linear.quadrature import gauss_panels
-from lbt_synth.models.resonance_spectrum import coefficient_rows, drive_ratio, unit_density
+from lbt_synth.models.resonance_spectrum import coefficient_rows, drive_ratio, unit_densities
 from lbt_synth.models.spectra import ARModel
 from lbt_synth.models.turbulence.atmosphere import LOWEST, Atmosphere, kolmogorov_constant_nm2
 from lbt_synth.validation import (
@@ -126,7 +126,8 @@ def ar2_turbulence(atmosphere: Atmosphere, *, frame_rate_hz: float, noise_nm: fl
     def contrast(p: FloatArray) -> float:
         """Take the mean of log(model / numerator), which has no narrow peaks, for log(model)."""
         angle, damping = _unpack(p, rate)
-        shape, numerator = np.log(unit_density(angle, damping, s)), drive_ratio(angle, damping)
+        shape = np.log(unit_densities([angle], [damping], s, [1])[0])
+        numerator = drive_ratio(angle, damping)
         model = 1 + (rms / noise) ** 2 * np.exp(shape)
         return float(np.log(numerator) + weight @ (np.log(model) - shape + target / model))
 
