@@ -145,7 +145,7 @@ def test_an_implausible_gain_is_doubted_however_well_it_is_known(monkeypatch) ->
     monkeypatch.setattr(order_search, "find_components", spy)
     air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=12, diameter_m=8.22)
     for gain, doubted in ((0.6, False), (1.5, True)):
-        found = identify.find_axis(Search(data=expected_periodogram(air, 5.0, gain)))
+        found = identify.find_axis(Search(data=expected_periodogram(air, 5.0, gain, 8)))
         assert any(tried) == doubted
         assert found.sensor_gain == pytest.approx(gain, rel=0.03)  # and stays where it is right
 
