@@ -424,13 +424,13 @@ def test_a_jump_is_found_noted_and_cut() -> None:
     assert axis.noise_nm == pytest.approx(6, abs=4 * axis.noise_error_nm)
 
 
-@pytest.mark.parametrize("lost", [(5008, 6154), (2000, 9000)])
-def test_frames_that_were_lost_do_not_move_the_gain(lost: tuple[int, int]) -> None:
+def test_frames_that_were_lost_do_not_move_the_gain() -> None:
     made = spliced_record((3,), lines=LINE, frames=20_000)
-    kept = np.delete(np.arange(made.frames), np.arange(*lost))
     known = {"frame_rate_hz": RATE, "delay_frames": 2, "unit": "nm"}
-    model = lbt.identify(loop_record(made.measurements[kept], made.commands[kept], **known))
-    (axis,) = model.axes
-    assert axis.sensor_gain == pytest.approx(0.6, abs=4 * axis.sensor_gain_error)
-    assert axis.sensor_gain_error < 0.05
-    assert any("jump" in note for note in model.notes)
+    for lost in ((5008, 6154), (2000, 9000)):
+        kept = np.delete(np.arange(made.frames), np.arange(*lost))
+        model = lbt.identify(loop_record(made.measurements[kept], made.commands[kept], **known))
+        (axis,) = model.axes
+        assert axis.sensor_gain == pytest.approx(0.6, abs=4 * axis.sensor_gain_error)
+        assert axis.sensor_gain_error < 0.05
+        assert any("jump" in note for note in model.notes)

@@ -65,12 +65,12 @@ def test_one_spike_is_one_outlier(seed, at, sign):
     assert np.max(np.abs(seen.measurements)) < 300  # the filler is not the spike
 
 
-@pytest.mark.parametrize("length", [2, 4])
-def test_spikes_side_by_side(length):
-    y = 15 * np.random.default_rng(length).standard_normal(5000)
-    y[1000 : 1000 + length] += 400
-    unusable = set(np.flatnonzero(~of_series(y).usable))
-    assert {1000, 1000 + length - 1} <= unusable <= set(range(998, 1002 + length))
+def test_spikes_side_by_side():
+    for length in (2, 4):
+        y = 15 * np.random.default_rng(length).standard_normal(5000)
+        y[1000 : 1000 + length] += 400
+        unusable = set(np.flatnonzero(~of_series(y).usable))
+        assert {1000, 1000 + length - 1} <= unusable <= set(range(998, 1002 + length))
 
 
 @pytest.mark.parametrize("step", [None, 1.0])
