@@ -176,11 +176,5 @@ def test_what_cannot_be_tracked_is_refused():
             (tracked(coupled), ProblemError, "each measurement must be of one axis"),
         ]
     )
-    for y, error, words in (
-        ([0.0, 0.0], DimensionError, r"y must have shape \(1,\)"),
-        (["a"], ProblemError, "y must be an array of numbers; got list"),
-        ([1j], ProblemError, "y must be real; got complex numbers"),
-        ([[1.0], [1.0, 2.0]], ProblemError, "y must be a rectangular array"),
-    ):
-        refused(lambda y=y: tracker.step(y), error, words)
+    refused(lambda: tracker.step([0.0, 0.0]), DimensionError, r"y must have shape \(1,\)")
     assert np.array_equal(tracker.step([0]), [0.0])  # nothing was taken in

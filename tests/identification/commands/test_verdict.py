@@ -103,6 +103,7 @@ def test_a_slow_computer_is_not_a_late_record() -> None:
     verdict = explain_commands(record(*run_law(law, truth=truth, hardware=path, frames=10_000)))
     assert verdict.accepted
     assert verdict.law.lag_frames == 1
+    assert verdict.law.lag_text == ", 1 frame late"
     assert "the total delay of a new design is 3 frames" in verdict.notes[0]
 
 

@@ -145,7 +145,7 @@ def test_an_implausible_gain_is_doubted_however_well_it_is_known(monkeypatch) ->
     monkeypatch.setattr(order_search, "find_components", spy)
     air = lbt.Atmosphere(seeing_arcsec=1.0, outer_scale_m=25, wind_speed_m_s=12, diameter_m=8.22)
     for gain, doubted in ((0.6, False), (1.5, True)):
-        found = identify.find_axis(Search(data=expected_periodogram(air, 5.0, gain)))
+        found = identify.find_axis(Search(data=expected_periodogram(air, 5.0, gain, 8)))
         assert any(tried) == doubted
         assert found.sensor_gain == pytest.approx(gain, rel=0.03)  # and stays where it is right
 
@@ -424,13 +424,13 @@ def test_a_jump_is_found_noted_and_cut() -> None:
     assert axis.noise_nm == pytest.approx(6, abs=4 * axis.noise_error_nm)
 
 
-@pytest.mark.parametrize("lost", [(5008, 6154), (2000, 9000)])
-def test_frames_that_were_lost_do_not_move_the_gain(lost: tuple[int, int]) -> None:
+def test_frames_that_were_lost_do_not_move_the_gain() -> None:
     made = spliced_record((3,), lines=LINE, frames=20_000)
-    kept = np.delete(np.arange(made.frames), np.arange(*lost))
     known = {"frame_rate_hz": RATE, "delay_frames": 2, "unit": "nm"}
-    model = lbt.identify(loop_record(made.measurements[kept], made.commands[kept], **known))
-    (axis,) = model.axes
-    assert axis.sensor_gain == pytest.approx(0.6, abs=4 * axis.sensor_gain_error)
-    assert axis.sensor_gain_error < 0.05
-    assert any("jump" in note for note in model.notes)
+    for lost in ((5008, 6154), (2000, 9000)):
+        kept = np.delete(np.arange(made.frames), np.arange(*lost))
+        model = lbt.identify(loop_record(made.measurements[kept], made.commands[kept], **known))
+        (axis,) = model.axes
+        assert axis.sensor_gain == pytest.approx(0.6, abs=4 * axis.sensor_gain_error)
+        assert axis.sensor_gain_error < 0.05
+        assert any("jump" in note for note in model.notes)

@@ -31,6 +31,7 @@ def test_neither_lines_that_are_missing_nor_rounding_carry_the_gain_away() -> No
     assert one.fitted_model.contrast == pytest.approx(other.fitted_model.contrast, abs=0.5)
 
 
+@pytest.mark.study
 def test_rounding_does_not_move_the_search_and_a_resonance_widens_the_error_of_the_gain() -> None:
     """A lower gain and one resonance less are nearly as likely: rounding moved from 0.76 to 0.93."""
     record = hidden_resonance_record(3)

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.diagnoses import line_record
 from support.predictions import (
+    CAMERA,
     GOOD,
     PATH,
     RATE,
@@ -101,9 +102,16 @@ def test_the_noise_of_coupled_sensors_has_common_errors():
 
 def test_a_residual_far_below_zero_refutes_the_noise():
     z = 10 * np.random.default_rng(0).standard_normal((4000, 1))
-    right, wrong = (replayed_residual(z, idle(1), ONE_MODE, noise_nm=s) for s in (10.0, 12.0))
+    shown, right, wrong = (
+        replayed_residual(z, idle(1), ONE_MODE, noise_nm=noise_nm) for noise_nm in (7.0, 10.0, 12.0)
+    )
     assert not right.refuted
     assert np.isfinite(right.upper_nm)
+    assert shown.text == f"{shown.rms_nm:.3g} +- {shown.rms_error_nm:.2g} nm"
+    assert right.text == f"at most {right.upper_nm:.2g} nm (the noise hides it)"
+    assert "more noise than the data" in wrong.text
+    assert 0 < right.strehl(CAMERA) <= 1
+    assert np.isnan(wrong.strehl(CAMERA))
     assert wrong.refuted
     below = -wrong.total_nm2 / wrong.total_error_nm2
     assert below == pytest.approx(44 * np.sqrt(3600 / 2) / 100, rel=0.1)

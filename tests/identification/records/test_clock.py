@@ -80,15 +80,14 @@ def test_a_stated_rate_is_held_against_the_times(frames):
         assert (near.frame_rate_hz, near.notes) == (rate, ())
 
 
-@pytest.mark.parametrize("rate", [800, 998.5, 999.9, 1000])
+@pytest.mark.parametrize("rate", [800, 999.9, 1000])
 @pytest.mark.parametrize("rounding", [np.round, np.floor])
 def test_rounded_times_lose_no_frame_at_a_known_rate(rate, rounding):
     y, ms = noise(20_000), np.arange(20_000) / rate * 1e3
     times = 1e-3 * rounding(ms + 0.25)
     seen = loop_record(y, frame_rate_hz=rate, times_s=times, unit="nm")
-    assert seen.frame_rate_hz == rate
+    assert (seen.frame_rate_hz, seen.usable.all()) == (rate, True)
     assert np.array_equal(seen.measurements[:, 0], y)
-    assert seen.usable.all()
     if rate != 1000:
         with pytest.raises(ProblemError, match="may be rounded: .*Give frame_rate_hz"):
             loop_record(y, times_s=times, unit="nm")

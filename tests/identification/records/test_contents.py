@@ -210,11 +210,10 @@ def test_x_and_y_may_be_a_clock_and_its_series(tmp_path, series):
 
 
 def test_a_remark_is_no_series_and_refuses_no_file(tmp_path):
-    path = tmp_path / "a.csv"
+    path, known = tmp_path / "a.csv", {"frame_rate_hz": RATE, "delay_frames": 1}
     path.write_text("y_nm,u_nm,remark\n" + "".join(f"{k % 7},{k % 5},calm\n" for k in range(60)))
-    seen = lbt.load_record(path, frame_rate_hz=RATE, delay_frames=1)
+    seen = lbt.load_record(path, **known)
     assert seen.frames == 60
     assert "not used: remark" in seen.notes
     remark = {"measurements": "y_nm", "commands": "remark"}
-    seen = lbt.load_record(path, columns=remark, frame_rate_hz=RATE, unit="nm", delay_frames=1)
-    assert not seen.usable.any()
+    assert not lbt.load_record(path, columns=remark, unit="nm", **known).usable.any()
