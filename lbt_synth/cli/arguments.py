@@ -111,6 +111,7 @@ _TABLE = """
         is given those that were (default plain)
     outputs
     --telemetry | meta:FILE | write the first run (.fits, .npz)
+    --spectrum | meta:FILE | write the spectrum of the exact residual, as TIPTOP reads it (.fits)
   report | pages | Write a page about designs in the loop of a configuration.
     unit config gains+
     --title | | heading of the page (default: names the configuration)
