@@ -15,6 +15,10 @@ FORBIDDEN = {
     "design/new_method.py": ("cvxpy", "Only linear.lmi imports cvxpy"),
     "interop/new_program.py": ("specula", "Only interop.specula.optics imports specula"),
     "files/telemetry/new_format.py": ("aotpy", "Only files.telemetry.aot imports aotpy"),
+    "files/telemetry/new_archive.py": (
+        "h5py",
+        "Only identification.records.contents imports h5py",
+    ),
     "studies/study/new_pool.py": ("distributed", "Only studies.grid imports distributed"),
     "report/page/new_chart.py": ("bokeh", "Only report.explore imports bokeh"),
     "report/page/new_sheet.py": ("weasyprint", "Only report.page.html imports weasyprint"),

@@ -51,6 +51,7 @@ _SHARED = """
     --commands | | another file, with the commands
     --columns | nargs:+ meta:ROLE=NAME | by name or number, as measurements=tip,tilt times= or
         open_loop=0,1
+    --loop | | of the control loops of an AOT file, by name or number from 0 (default: the first)
     --axes | int nargs:+ | which of several columns or modes, from 0
     --sensor-gain | float nargs:+ | sensor gain that is known, of both axes or of each
     --command-increments | switch | they are increments: add them up
@@ -60,8 +61,8 @@ _SHARED = """
     --command-matrix | float nargs:+ meta:NUMBER | to the axes of the measurements, row after row
     --command-scale | float nargs:+ | factor, of both axes or of each; 1: as large as applied
   series
-    file | | telemetry, or FITS, NPY, NPZ or CSV with what a loop measured and commanded, or an
-        open-loop series (identify: or a spectrum)
+    file | | telemetry, or FITS, NPY, NPZ, CSV, HDF5, MATLAB or IDL with what a loop measured and
+        commanded, or an open-loop series (identify: or a spectrum)
     reading
     > what is known beforehand
     --noise-nm | float nargs:+ | noise per frame of the sensor [nm], beside a spectrum without
@@ -111,6 +112,7 @@ _TABLE = """
         is given those that were (default plain)
     outputs
     --telemetry | meta:FILE | write the first run (.fits, .npz)
+    --spectrum | meta:FILE | write the spectrum of the exact residual, as TIPTOP reads it (.fits)
   report | pages | Write a page about designs in the loop of a configuration.
     unit config gains+
     --title | | heading of the page (default: names the configuration)
@@ -165,7 +167,7 @@ _TABLE = """
   verify | design | Recompute the certificate of a gain file.
     gain
   telemetry | telemetry | Show what telemetry or a record holds, and write it as telemetry.
-    file | | telemetry, or a record of series (FITS, NPY, NPZ or CSV)
+    file | | telemetry, or a record of series (FITS, CSV, HDF5 and others)
     reading
     >
     -o --output | | file to write (.fits, .npz or .aot.fits)

@@ -19,12 +19,13 @@ from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.linear import estimator_form
-from lbt_synth.loop import Imaging, residual_budget, simulate, strehl
-from lbt_synth.loop.budget import ResidualBudget
+from lbt_synth.loop import ClosedLoop, Imaging, residual_budget, simulate, strehl
+from lbt_synth.loop.budget import ResidualBudget, residual_spectrum
 from lbt_synth.loop.simulation import READINGS, Drop, Segment, Simulation, settling_frames
 from lbt_synth.models import Truth
 from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
-from lbt_synth.storage.atomic_files import require_writable
+from lbt_synth.storage.array_file import fits_bytes
+from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import Facts, fact, facts
@@ -33,6 +34,7 @@ from lbt_synth.studies.robustness import run_failures
 
 _TIME = r"(\d+\.?\d*)s?"
 _DROP = re.compile(rf"([^@]+)@{_TIME}(?:\.\.{_TIME})?(?::({'|'.join(READINGS)}))?")
+_SPECTRUM_STEP_HZ = 0.2  # at which MASTSEL 1.5 reads a spectrum for TIPTOP; P3 1.6 takes half of it
 _AFTER_S = 5.0  # that a run lasts beyond the last event, if --frames is not given
 # a line of the table, the runs, the parts between failures of sensors, and what to say
 _Run: TypeAlias = tuple[Facts, Simulation, list[tuple[Segment, Facts]], list[str]]
@@ -57,14 +59,21 @@ def run(arguments: Namespace) -> Report:
     if arguments.telemetry is not None:
         require_telemetry_name(arguments.telemetry)
         require_writable(arguments.telemetry, inputs=[arguments.config, *arguments.gains])
+    if arguments.spectrum is not None:
+        require_ending(arguments.spectrum, "a spectrum", [".fits"])
+        require_writable(arguments.spectrum, inputs=[arguments.config, *arguments.gains])
     if (count := len(arguments.gains)) > 1:
-        single = ("output", "telemetry", "drop")
+        single = ("output", "telemetry", "spectrum", "drop")
         refuse_options(arguments, single, f"goes with one gain file; got {count}")
     config = load_shown(arguments)
     truth = config.truth
     if arguments.sensor_gain is not None:
         truth = replace(truth, sensor_gain=arguments.sensor_gain / config.sensor_gain)
     designs = load_designs(arguments.gains, config)
+    if arguments.spectrum is not None:  # what does not fit is refused before any run
+        (design,) = designs.values()
+        loop = design.close(config.hardware, sensor_gain=truth.sensor_gain)
+        spectrum = tiptop_spectrum(loop, truth)
     runs = [_run(arguments, name, design, truth, config) for name, design in designs.items()]
     report = _describe_runs(runs, truth, config)
     design, (_, simulation, segments, _) = next(iter(designs.values())), runs[0]
@@ -86,7 +95,20 @@ def run(arguments: Namespace) -> Report:
             },
         )
         write_telemetry(report, arguments.telemetry, recorded, key="telemetry")
+    if arguments.spectrum is not None:
+        report.note_written(write_atomically(arguments.spectrum, spectrum), "spectrum")
     return report
+
+
+def tiptop_spectrum(loop: ClosedLoop, truth: Truth) -> bytes:
+    """Return the spectrum of a residual as TIPTOP's windPsdFile: rows of frequency, tip, tilt."""
+    if (modes := loop.hardware.modes) > 2:
+        raise ProblemError(f"--spectrum takes a loop of tip and tilt; got {modes} modes.")
+    frequency_hz, density = residual_spectrum(loop, truth, _SPECTRUM_STEP_HZ)
+    rows = np.zeros((3, frequency_hz.size + 1))  # from 0 Hz
+    rows[0, 1:], rows[1 : 1 + modes, 1:] = frequency_hz, density.T
+    cards = {"BUNIT": ("nm^2/Hz", "of rows 2 and 3: tip and tilt, one-sided")}
+    return fits_bytes(cards, {}, primary_data=rows)
 
 
 def _run(arguments: Namespace, name: str, design: Design, truth: Truth, config: Config) -> _Run:

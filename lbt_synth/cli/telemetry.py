@@ -15,7 +15,7 @@ from lbt_synth.cli.output import Report, write_telemetry
 from lbt_synth.errors import ProblemError
 from lbt_synth.files import Telemetry, load_telemetry
 from lbt_synth.files.telemetry.store import require_telemetry_name
-from lbt_synth.files.telemetry.telemetry import LAYERS
+from lbt_synth.files.telemetry.telemetry import FACTS, LAYERS
 from lbt_synth.identification import LoopRecord, SpectrumRecord, load_record
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
 from lbt_synth.identification.records.from_file import is_telemetry, telemetry_of_record
@@ -62,6 +62,7 @@ def load_series(
     record = load_record(
         arguments.file,
         columns=_parse_columns(arguments.columns),
+        loop=arguments.loop,
         **facts,
     )
     repair = CommandRepair(
@@ -122,16 +123,6 @@ def _parse_columns(pairs: Sequence[str] | None) -> dict[str, list[str | int]] | 
     return out
 
 
-_LOOP = {  # what telemetry says of the loop that it is from: headings and units
-    "frame_rate_hz": ("frame rate", "Hz"),
-    "delay_frames": ("total delay", "frames"),
-    "sensor_gain": ("sensor gain", ""),
-    "imaging_wavelength_um": ("imaging wavelength", "um"),
-    "diameter_m": ("telescope diameter", "m"),
-    "obstruction": ("central obstruction", ""),
-}
-
-
 def run(arguments: Namespace) -> Report:
     """Show telemetry, or a record as telemetry, and write it."""
     output = arguments.output
@@ -141,18 +132,18 @@ def run(arguments: Namespace) -> Report:
         require_writable(output, inputs=list(named.values()))
     notes: list[str] = []
     if is_telemetry(arguments.file) and not is_read_anew(arguments):
-        telemetry = load_telemetry(arguments.file)
+        telemetry = load_telemetry(arguments.file, loop=arguments.loop)
     else:
         record = require_series(load_series(arguments), "telemetry holds")
         telemetry = telemetry_of_record(record)
-        notes = [
-            f"note: {record.summary()}",
-            *(f"note: {note}" for note in record.notes),
-        ]
+        notes = [f"note: {note}" for note in (record.summary(), *record.notes)]
     choose_unit(arguments, telemetry.diameter_m)
     report = _describe_telemetry(telemetry)
     report.data["file"] = arguments.file
     report.notes += notes
+    if "aot_loops" in telemetry.metadata:
+        taken, loops = (telemetry.metadata[key] for key in ("aot_loop", "aot_loops"))
+        report.notes.append(f"note: {taken} is one of the control loops {loops}; see --loop")
     if "timing" not in telemetry.metadata:  # of another program
         report.notes.append(telemetry.convention)
     if output is not None:
@@ -173,7 +164,11 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
     units = {name: layer.unit_in(telemetry) for name, _, layer in arrays}
     mirror = telemetry.mirror
     what = facts(
-        **{n: fact(getattr(telemetry, n), text, unit=unit) for n, (text, unit) in _LOOP.items()}
+        **{
+            name: fact(getattr(telemetry, name), text, unit=unit)
+            for name, (_, unit, text) in FACTS.items()
+            if not name.endswith("_unit")
+        }
     )
     mirror_record = None if mirror is None else asdict(mirror)
     report = Report(

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.matrix_functions import transpose
-from lbt_synth.linear.quadrature import adaptive_integral, graded_edges
+from lbt_synth.linear.quadrature import adaptive_integral, gauss_panels, graded_edges
 from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
 from lbt_synth.loop.ensemble import (
     EnsembleVibration,
@@ -25,6 +26,7 @@ from lbt_synth.loop.evaluator import (
     close_loops,
     loop_evaluator,
     period_roots,
+    process_poles,
 )
 from lbt_synth.models import (
     ARModel,
@@ -37,6 +39,7 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.sensor_suite import Motion, Motions, checked_motions
+from lbt_synth.models.spectra import breakpoints_below, spectrum_density
 from lbt_synth.models.vibration import checked_direction, sampled_lines
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact, fact_table, facts
@@ -50,6 +53,7 @@ from lbt_synth.validation import (
     require_instance,
 )
 
+_NODES = 6  # of a panel of a spectrum, whose power they have to 1e-6
 _TOGETHER = 2048  # loops with the same frequencies: as many as repay their panels
 _COVARIANCES = ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "within_nm2")
 _ORIGINS = {
@@ -220,6 +224,63 @@ def residual_budget(
         within_nm2=frozen_copy(budget.within_nm2.mean(axis=0) + seen[1]),
         line_amplitudes_nm=read_only(amplitudes.reshape(-1, n)),
     )
+
+
+def random_density(
+    loop: ClosedLoop, truth: Truth, frequency_hz: FloatArray, *, in_image: bool
+) -> FloatArray:
+    """One-sided spectrum of what is random in the residual, (f, n) [nm^2/Hz].
+
+    It is of means over frames, or of the image: motion within a hold has its cause's frequency.
+    """
+    n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
+    turbulence, vibrations, noise = truth.entering(loop.hardware, sensor_gain=loop.sensor_gain)
+    origins = [(spectrum, np.eye(n)[:, list(modes)]) for spectrum, modes in turbulence]
+    for line in vibrations:
+        if isinstance(line, Vibration):
+            along = np.sinc(line.frequency_hz / rate) * checked_direction(line, loop.hardware)
+            origins.append((line.ar_model(rate), along[:, None]))
+    rows, factor = loop_evaluator(loop, in_image=in_image), _noise_factor(loop, noise)
+    seen = replace(rows, B=rows.B[..., n:] @ factor, D=rows.D[..., n:] @ factor).system()
+    response = seen.phase_response(frequency_hz)  # (f, phases, pieces n, p)
+    pieces = np.abs(response.reshape(*response.shape[:2], -1, n, factor.shape[1])) ** 2
+    total = 2 / rate * np.einsum("g,ftgip->fi", (rows.hold or STILL).weights, pieces)
+    for spectrum, entry in origins:
+        density = spectrum_density(spectrum, frequency_hz)
+        if isinstance(spectrum, ARModel) == in_image:  # a process is one of means over frames
+            density *= np.sinc(frequency_hz / rate) ** (-2 if in_image else 2)
+        total += np.einsum("hiift->fi", rows.powers(entry[None])(frequency_hz)) * density[:, None]
+    return np.asarray(total / rows.phases)
+
+
+def residual_spectrum(
+    loop: ClosedLoop, truth: Truth, step_hz: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return multiples (f,) of a step, and the mean spectrum of the image about each, (f, n).
+
+    It is one-sided [nm^2/Hz]; its sums times the step are the residual of the budget.
+    """
+    if loop.reads_others:
+        raise ProblemError("a spectrum is of a loop that reads its own sensor alone.")
+    loop.require_stable()
+    rate = loop.hardware.frame_rate_hz
+    frequency_hz = step_hz * np.arange(1, round(rate / 2 / step_hz) + 1)
+    ends = np.array([0.0, *(frequency_hz[:-1] + step_hz / 2), rate / 2])
+    edges, power = [ends, resonance_edges(loop)], np.zeros((ends.size - 1, loop.hardware.modes))
+    for spectrum, _ in truth.turbulence_groups(loop.hardware.modes):
+        edges.append(breakpoints_below(spectrum, rate / 2))
+    for line in truth.vibrations:
+        if isinstance(line, Vibration):
+            poles = process_poles(line.ar_model(rate).coefficients[None]).ravel()
+            edges.append(graded_edges(poles) * rate / 2)
+        else:
+            alone = replace(truth, turbulence=None, noise_nm=0.0, vibrations=(line,))
+            covariance = residual_budget(loop, alone).total_nm2
+            power[np.searchsorted(ends, line.frequency_hz) - 1] += np.diag(covariance)
+    nodes, weights = gauss_panels(np.unique(np.hstack(edges)), _NODES)
+    density = random_density(loop, truth, nodes, in_image=True)
+    np.add.at(power, np.searchsorted(ends, nodes) - 1, weights[:, None] * density)
+    return np.asarray(frequency_hz), power / step_hz
 
 
 def residual_of_parts(

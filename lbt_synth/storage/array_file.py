@@ -44,6 +44,7 @@ def fits_bytes(
     *,
     headers: Mapping[str, Mapping[str, Any]] | None = None,
     comments: Sequence[str] = (),
+    primary_data: FloatArray | None = None,
 ) -> bytes:
     """Return a primary HDU of cards, and one image HDU per array and for the text, with checksums.
 
@@ -51,7 +52,7 @@ def fits_bytes(
     """
     from astropy.io import fits
 
-    primary = fits.PrimaryHDU()
+    primary = fits.PrimaryHDU(primary_data)
     primary.header.update(cards)
     for line in comments:
         primary.header.add_comment(line)

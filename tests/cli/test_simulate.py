@@ -3,12 +3,18 @@
 import json
 import re
 
+import numpy as np
 import pytest
+from astropy.io import fits
 from support.commands import refuse_commands, run, run_done, run_json
 from support.drifting import drift_file
 from support.plants import LBT_YAML
 from support.several_sensors import CONFIG as SEVERAL_SENSORS
 from support.several_sensors import write_config
+
+import lbt_synth as lbt
+from lbt_synth.cli.simulate import tiptop_spectrum
+from lbt_synth.errors import ProblemError
 
 CONFIG = str(LBT_YAML)
 
@@ -27,6 +33,39 @@ def test_simulate(tmp_path, capsys, gains):
     dim = run_json(capsys, *words, "--sensor-gain", 0.4)
     assert dim["sensor_gain"] == 0.4
     assert dim["designs"][0]["strehl_exact"] < row["strehl_exact"]
+
+
+def test_the_spectrum_is_what_tiptop_reads(tmp_path, capsys, gains):
+    """By the formulas of its packages: MASTSEL 1.5.4, loadWindPsd; P3 1.6.4, windShakePSD."""
+    out = tmp_path / "residual.fits"
+    words = ("simulate", CONFIG, gains["kalman"], "--frames", 50, "--spectrum", out)
+    data = run_json(capsys, *words)
+    assert data["spectrum"] == str(out)
+    residual_nm = data["designs"][0]["residual_exact_nm"]
+    with fits.open(out, checksum=True) as units:
+        rows = units[0].data
+        assert (units[0].header["BUNIT"], rows.shape) == ("nm^2/Hz", (3, 2001))
+    for first_hz, points in ((0.2, 5 * 400), (0.1, 5 * 800)):
+        frequency_hz = np.linspace(first_hz, 400, points)
+        tip, tilt = (np.interp(frequency_hz, rows[0], row, left=0, right=0) for row in rows[1:])
+        power = np.sum(tip + tilt) * (frequency_hz[1] - frequency_hz[0])
+        assert np.sqrt(power) == pytest.approx(residual_nm, rel=1e-4)
+    assert np.sqrt(np.trapezoid(rows[1:], rows[0]).sum()) == pytest.approx(residual_nm, rel=1e-4)
+
+
+def test_spectra_that_are_refused(tmp_path, capsys, gains):
+    out = tmp_path / "residual.fits"
+    rows = (
+        ("simulate CONFIG KALMAN --spectrum a.csv", "a spectrum must end in .fits; got 'a.csv'"),
+        ("simulate CONFIG KALMAN HINF --spectrum OUT", "--spectrum goes with one gain file; got 2"),
+    )
+    places = {name.upper(): path for name, path in gains.items()}
+    refuse_commands(capsys, rows, CONFIG=CONFIG, OUT=out, **places)
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=3)
+    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3).controller)
+    with pytest.raises(ProblemError, match="takes a loop of tip and tilt; got 3 modes"):
+        tiptop_spectrum(loop, lbt.Truth(turbulence=None, noise_nm=1.0))
+    assert not out.exists()
 
 
 def test_a_mirror_of_little_stroke(capsys, gains):

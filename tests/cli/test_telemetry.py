@@ -59,6 +59,15 @@ def test_conversion_between_formats(tmp_path, capsys, night):
     assert same(lbt.files.load_telemetry(night), lbt.files.load_telemetry(out))
 
 
+def test_the_control_loop_that_was_taken_is_told(tmp_path, capsys):
+    loops = {"aot_loop": "HO loop", "aot_loops": "HO loop, TT loop"}
+    night = lbt.files.save_telemetry(tmp_path / "night.npz", full(metadata=loops))
+    text = run_done(capsys, "telemetry", night)
+    assert "HO loop is one of the control loops HO loop, TT loop; see --loop" in text
+    refused = "loop chooses a control loop of a file of the AOT standard; this is none."
+    refuse_commands(capsys, [("telemetry NIGHT --loop 1", refused)], NIGHT=night)
+
+
 @pytest.mark.e2e
 def test_conversion_to_the_standard_says_what_is_lost(tmp_path, capsys, night):
     out = tmp_path / "copy.aot.fits"

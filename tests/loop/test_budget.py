@@ -27,7 +27,7 @@ from support.sensor_loops import SLOW as OTHER
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.loop.budget import residual_budget
+from lbt_synth.loop.budget import residual_budget, residual_spectrum
 from lbt_synth.models import Accelerometer, Motion, PositionLoop, Truth, WavefrontSensor
 
 # Loops in continuous time, run in small steps from their equations, without the package's.
@@ -465,3 +465,68 @@ def test_refusals():
         (lambda: gained(0.0), ProblemError, "sensor_gain"),
     ]
     require_refusals(rows)
+
+
+RATE = 500.0
+DRIFT = lbt.models.ARModel(coefficients=[0.98], driving_rms_nm=5.0, frame_rate_hz=RATE)
+AIR = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
+TURNED = lbt.models.SinusoidalVibration(frequency_hz=20.04, rms_nm=300, direction=(0.6, 0.8))
+THIN = lbt.Vibration(frequency_hz=33.3, damping=0.001, rms_nm=50, direction=(0.8, -0.6))
+
+
+@pytest.mark.parametrize("air", [None, AIR, DRIFT], ids=["noise", "spectrum", "process"])
+@pytest.mark.parametrize(
+    "mirror",
+    [
+        {},
+        {"delay_frames": 2.4},
+        {
+            "mirror": PositionLoop.from_bandwidth(
+                natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
+            )
+        },
+    ],
+    ids=["settled", "fraction", "dynamics"],
+)
+def test_the_sums_of_the_spectrum_are_the_exact_residual(air, mirror):
+    """By frequencies, what the budget has from covariances."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, **mirror)
+    truth = Truth(turbulence=air, noise_nm=(15.5, 8.0), vibrations=(TURNED, THIN))
+    loop = lbt.close_loop(path, lbt.integrator(path, gain=0.3).controller)
+    frequency_hz, density = residual_spectrum(loop, truth, 0.2)
+    exact = np.diag(residual_budget(loop, truth).total_nm2)
+    assert density.sum(axis=0) * 0.2 == pytest.approx(exact, rel=1e-6)
+    assert frequency_hz[[0, -1]] == pytest.approx([0.2, RATE / 2])
+    quiet = replace(truth, vibrations=(THIN,))
+    of_line = density - residual_spectrum(loop, quiet, 0.2)[1]
+    place = np.argmin(np.abs(frequency_hz - 20.04))
+    assert np.flatnonzero(np.any(of_line > 1e-9 * of_line.max(), axis=1)).tolist() == [place]
+    assert of_line[place, 1] / of_line[place, 0] == pytest.approx((0.8 / 0.6) ** 2)
+
+
+def test_the_spectrum_of_noise_through_an_integrator():
+    """``g / (z - 1 + g)`` of white noise, whose spectrum changes little within a step."""
+    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
+    lazy = lbt.Controller(A=1.0, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
+    truth = Truth(turbulence=None, noise_nm=3.0)
+    frequency_hz, density = residual_spectrum(lbt.close_loop(path, lazy), truth, 0.2)
+    gain = np.abs(0.5 / (np.exp(2j * np.pi * frequency_hz / 800) - 0.5)) ** 2
+    # the ends take in half a step more and less
+    assert density[1:-1, 0] == pytest.approx(2 * 9 / 800 * gain[1:-1], rel=1e-5)
+    assert density[[0, -1], 0] == pytest.approx(2 * 9 / 800 * gain[[0, -1]] * [1.5, 0.5], rel=1e-4)
+
+
+def test_loops_that_have_no_spectrum():
+    path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+    wild = lbt.Controller(A=1.0, B=3.0, C=1.0, D=0.0, dt_s=1 / 800)
+    truth = Truth(turbulence=None, noise_nm=3.0)
+    with pytest.raises(UnstableLoopError):
+        residual_spectrum(lbt.close_loop(path, wild), truth, 0.2)
+    drift = replace(TURNED, direction=(1,), end_hz=21.0, duration_s=10.0)
+    still = lbt.close_loop(path, lbt.integrator(path, gain=0.3).controller)
+    with pytest.raises(ProblemError, match="a truth that is stationary"):
+        residual_spectrum(still, replace(truth, vibrations=(drift,)), 0.2)
+    plant = example_plant()
+    loop = lbt.kalman(plant).close(plant.hardware)
+    with pytest.raises(ProblemError, match="a loop that reads its own sensor alone"):
+        residual_spectrum(loop, plant, 0.2)

@@ -28,6 +28,7 @@ _VERSION_CARD = "AOT-VERS"
 _OWN_CARD = "LBTSYNTH"  # one card with what the standard has no field for, JSON
 _NM = {"m": 1e9, "um": 1e3, "nm": 1.0}
 _FOREIGN = "that of another program: the AOT standard does not say which exposure a row is of"
+NO_LOOPS = "loop chooses a control loop of a file of the AOT standard; this is none. Leave it out."
 _UNSAFE = "'&/"  # characters that a FITS text over several cards does not always keep
 _INSTALL = 'it needs aotpy: pip install "lbt-synth[aot]"'
 
@@ -155,8 +156,8 @@ def _header_cards(aotpy: Any, seen: Telemetry) -> list[Any]:
     return cards
 
 
-def from_bytes(content: bytes, source: Path) -> Telemetry:
-    """Read the first control loop that has series, and what describes it."""
+def from_bytes(content: bytes, source: Path, wanted: str | int | None = None) -> Telemetry:
+    """Read a control loop that has series, the first or that of a name or number, as telemetry."""
     aotpy = require_aotpy(source, TelemetryError, "read")
     with ignore_warnings():  # foreign files deviate in many small ways
         try:
@@ -182,9 +183,18 @@ def from_bytes(content: bytes, source: Path) -> Telemetry:
         raise TelemetryError(
             f"{source} has no control loop with commands and measurements.", path=source
         )
-    fields = _loop_fields(loops[0]) | _system_fields(system)
+    names = [loop.uid for loop in loops]
+    keys = [*names, *map(str, range(len(names)))]  # a name that is a number comes first
+    if (key := str(0 if wanted is None else wanted)) not in keys:
+        raise TelemetryError(
+            f"{source} has the control loops {', '.join(names)}, from 0; got {wanted!r}.",
+            path=source,
+        )
+    place = keys.index(key) % len(names)
+    fields = _loop_fields(loops[place]) | _system_fields(system)
     if len(loops) > 1:
-        fields["metadata"] = {**fields["metadata"], "aot_loop": loops[0].uid}
+        taken = {"aot_loop": names[place], "aot_loops": ", ".join(names)}
+        fields["metadata"] = {**fields["metadata"], **taken}
     return Telemetry(**fields)
 
 
@@ -210,26 +220,28 @@ def _system_fields(system: Any) -> dict[str, Any]:
 
 
 def _loop_fields(loop: Any) -> dict[str, Any]:
-    """Fields of a loop and its sensor; modal coefficients are taken for measurements."""
+    """Fields of a loop; measurements are its modes, or what two commands correct, or slopes."""
     sensor, modal, clock = loop.input_sensor, loop.modal_coefficients, loop.time
-    commands, command_unit = _in_nm(loop.commands, "m")
+    command_unit, influence = loop.commands.unit or "m", _data(loop.commands_to_modes)
     gain, response = _data(sensor.optical_gain), _data(loop.modes_to_measurements)
-    y, unit = _in_nm(sensor.measurements if modal is None else modal)
+    control, image = _data(loop.control_matrix), sensor.measurements if modal is None else modal
+    y, unit = _data(image).reshape(len(image.data), -1), image.unit or ""
     if response is not None and response.ndim == 3:  # (s_v, d, n) to (d s_v, n)
         response = response.transpose(1, 0, 2).reshape(-1, response.shape[2])
     if modal is not None and response is not None:
         back = _data(loop.measurements_to_modes)
         response = None if back is None else back.reshape(len(back), -1) @ response
+    elif control is not None and len(control) <= 2 and modal is response is influence is None:
+        y, unit = y @ control.reshape(len(control), -1).T, command_unit
+    times = getattr(clock or loop.commands.time, "timestamps", None) or [0.0]
     fields: dict[str, Any] = {
-        "commands": commands,
-        "command_unit": command_unit,
-        "measurements": y.reshape(len(y), -1),
-        "measurement_unit": unit,
+        **_in_nm("command", _data(loop.commands), command_unit),
+        **_in_nm("measurement", y, unit),
         "delay_frames": loop.delay,
-        "influence_matrix": _data(loop.commands_to_modes),
+        "influence_matrix": influence,
         "interaction_matrix": response,
         "sensor_gain": None if gain is None else float(np.mean(gain)),
-        "times_s": getattr(clock or loop.commands.time, "timestamps", None) or None,
+        "times_s": times if any(times) else None,  # stamps that are all zero are none
     }
     fields["frame_rate_hz"] = _frame_rate(loop, fields["times_s"])
     return fields
@@ -248,8 +260,7 @@ def _data(image: Any) -> Any:
     return None if image is None else np.asarray(image.data, dtype=np.float64)
 
 
-def _in_nm(image: Any, unit: str = "") -> tuple[FloatArray, str]:
-    """Return lengths in nm, and other values in their own unit, or in a default one."""
-    unit = image.unit or unit
-    factor = _NM.get(unit)
-    return (_data(image), unit) if factor is None else (factor * _data(image), "nm")
+def _in_nm(name: str, series: FloatArray, unit: str) -> dict[str, Any]:
+    """Return a series with its unit: lengths in nm, other values in their own."""
+    factor, unit = (1.0, unit) if unit not in _NM else (_NM[unit], "nm")
+    return {f"{name}s": factor * series, f"{name}_unit": unit}

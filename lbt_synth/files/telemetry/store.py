@@ -95,7 +95,7 @@ def save_telemetry(path: str | os.PathLike[str], telemetry: Telemetry) -> Path:
     return _KIND.write(target, arrays, meta, cards, layer_cards(telemetry))
 
 
-def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
+def load_telemetry(path: str | os.PathLike[str], *, loop: str | int | None = None) -> Telemetry:
     """Read a telemetry file and check it: schema, digest, shapes, finiteness.
 
     Parameters
@@ -103,6 +103,8 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
     path : path-like
         File in the layout of this package (``.fits``, ``.npz``) or of the Adaptive Optics
         Telemetry standard (``.fits``); the header of a FITS file says which of the two it is.
+    loop : str or int, optional
+        Name or number (from 0) of a control loop of the standard; the first by default.
 
     Returns
     -------
@@ -129,7 +131,9 @@ def load_telemetry(path: str | os.PathLike[str]) -> Telemetry:
     content, is_fits = read_bytes(source, TelemetryError), source.suffix.lower() == ".fits"
     with _KIND.rebuilding(source):
         if is_fits and aot.is_aot(content):
-            return aot.from_bytes(content, source)
+            return aot.from_bytes(content, source, loop)
+        if loop is not None:
+            raise TelemetryError(f"{source}: {aot.NO_LOOPS}", path=source)
         return unpack(*_KIND.decode(content, source))
 
 
@@ -167,11 +171,14 @@ def unpack(arrays: dict[str, FloatArray], meta: Meta) -> Telemetry:
 
 def primary_cards(telemetry: Telemetry, meta: Meta) -> dict[str, tuple[Any, str]]:
     """Cards for people who look at the header; META is what is read back."""
-    known = {name: getattr(telemetry, name) for name in FACTS}
+    cards = {
+        card: (getattr(telemetry, name), f"[{unit}] {meaning}" if unit else meaning)
+        for name, (card, unit, meaning) in FACTS.items()
+    }
     return {
         "CREATOR": (f"lbt_synth {meta['library_version']}", "writer of this file"),
         "LBTTELEM": (_KIND.version, "version of the lbt_synth telemetry layout"),
-        **{FACTS[name][0]: (v, FACTS[name][1]) for name, v in known.items() if v is not None},
+        **{card: fact for card, fact in cards.items() if fact[0] is not None},
         "TIMING": (telemetry.convention, ""),
         "SHA256": (meta["digest"], ""),
     }

@@ -63,15 +63,15 @@ LAYERS = {  # by their names in files
 }
 REQUIRED = ("measurements",)
 _WITH_GAPS = ("commands", "measurements")  # in which NaN is a value that was lost
-FACTS: Mapping[str, tuple[str, str]] = {  # with their cards in a FITS header
-    "frame_rate_hz": ("RATE_HZ", "[Hz] frame rate"),
-    "delay_frames": ("DELAY", "[frames] total delay"),
-    "sensor_gain": ("SENSGAIN", "sensor gain over the interaction matrix"),
-    "imaging_wavelength_um": ("WAVELEN", "[um] of the camera"),
-    "diameter_m": ("DIAMETER", "[m] telescope"),
-    "obstruction": ("OBSTRUCT", "central obstruction over the diameter"),
-    "command_unit": ("CMDUNIT", "of the commands"),
-    "measurement_unit": ("MEASUNIT", "of the measurements"),
+FACTS: Mapping[str, tuple[str, str, str]] = {  # with their cards in a FITS header, and units
+    "frame_rate_hz": ("RATE_HZ", "Hz", "frame rate"),
+    "delay_frames": ("DELAY", "frames", "total delay"),
+    "sensor_gain": ("SENSGAIN", "", "sensor gain"),
+    "imaging_wavelength_um": ("WAVELEN", "um", "imaging wavelength"),
+    "diameter_m": ("DIAMETER", "m", "telescope diameter"),
+    "obstruction": ("OBSTRUCT", "", "central obstruction"),
+    "command_unit": ("CMDUNIT", "", "of the commands"),
+    "measurement_unit": ("MEASUNIT", "", "of the measurements"),
 }
 
 

@@ -96,7 +96,7 @@ ROLES = {
         "slopes error errors tip_tilt tiptilt tt"
     ),
     "open_loop": "pol pseudo_open_loop pseudoopenloop open_loop openloop disturbance disturbances",
-    "commands": "u cmd cmds command commands comm comms",
+    "commands": "u cmd cmds command commands comm comms ittm_positions",
     "times": "t time times timestamp timestamps time_stamp seconds",
     "frame_numbers": (
         "frame frames frame_number frame_numbers framenumber frame_no frameno frame_counter "
@@ -111,7 +111,8 @@ ROLES = {
 FACTS = {
     "frame_rate_hz": (
         "frame_rate_hz frame_rate framerate framrate framerat rate_hz fps loop_rate "
-        "looprate loop_freq loopfreq sampling_hz sampling_rate sampling_frequency fs"
+        "looprate loop_freq loopfreq sampling_hz sampling_rate sampling_frequency fs "
+        "eso_aos_loop_rate"
     ),
     "delay_frames": "delay_frames delayfrm delay_fr loop_delay_frames",
     "diameter_m": "diameter_m diameter telescope_diameter teldiam tel_diam",

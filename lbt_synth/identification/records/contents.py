@@ -1,13 +1,18 @@
 """What a file of series holds, and which of its columns make a record.
 
-Columns and facts come from FITS, NPY, NPZ and text tables.
+A reader for each format adds columns and facts: FITS, NumPy, text tables, HDF5, MATLAB and IDL.
+Names of structures and groups stand before those of their arrays, as in ``rec.y`` and ``night/y``.
 """
 
 from __future__ import annotations
 
+import io
+import re
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +30,16 @@ from lbt_synth.identification.records.columns import (
 from lbt_synth.storage.array_file import error_reason, open_fits, read_numpy
 from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.storage.input_files import read_bytes
+from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import choice, integer, sequence
 
 FITS = (".fits", ".fit", ".fts")
-TEXTS = (".csv", ".tsv", ".txt", ".dat")
-ENDINGS = (*FITS, ".npy", ".npz", *TEXTS)
 _DELIMITERS = (";", "\t", ",", "|")  # else blanks
+_HDF5 = b"\x89HDF\r\n\x1a\n"  # behind a block of 512 bytes in files of MATLAB 7.3
 # the roles that make a record: of a closed loop, of an open one, of a spectrum
 _KINDS = (("measurements", "commands"), ("open_loop",), ("density", "frequency"))
 CLOCKS = ("frame_numbers", "times")
+_ARRAY = re.compile(r".*\[(?=\d+\]$)")  # of which a name such as y[0] says that it is a column
 
 Roles = dict[str, list[Column]]
 
@@ -59,14 +65,17 @@ class Contents:
                 return
         self.facts.setdefault(fact, {})[where] = value
 
-    def add_array(self, name: str, values: npt.NDArray[Any], unit: str | None = None) -> None:
-        """Add the columns of an array; leave out what is no series of numbers."""
-        said = name or "an array"
+    def add_array(
+        self, name: str, values: npt.NDArray[Any], unit: str | None = None, *, group: str = ""
+    ) -> None:
+        """Add the columns of an array of a group; leave out what is no series of numbers."""
+        said = f"{group}{name}" or "an array"
         table = np.atleast_1d(np.squeeze(values))
         if values.dtype.kind not in "fiub" or values.size == 0 or table.ndim > 2:
             self.notes.append(f"{said} is no series of real numbers; it was left out")
         elif table.ndim == 1:
-            self.columns.append(parse_column(name, table.astype(np.float64), unit=unit))
+            column = parse_column(name, table.astype(np.float64), unit=unit)
+            self.columns.append(replace(column, name=f"{group}{name}"))
         else:
             if table.shape[1] > table.shape[0]:
                 table = table.T
@@ -74,7 +83,8 @@ class Contents:
                 self.notes.append(f"{said}: its longer side was taken for the frames")
             base = parse_column(name, np.empty(0), unit=unit)
             for axis, column in enumerate(table.T.astype(np.float64)):
-                self.columns.append(replace(base, name=f"{name}[{axis}]", values=column, axis=axis))
+                title = f"{group}{name}[{axis}]"
+                self.columns.append(replace(base, name=title, values=column, axis=axis))
 
 
 @contextmanager
@@ -92,12 +102,12 @@ def name_in_errors(path: Path) -> Iterator[None]:
 
 def read_contents(path: Path) -> Contents:
     """Return what a file holds."""
-    require_ending(path, "a record", ENDINGS, TelemetryError)
+    require_ending(path, "a record", _READERS, TelemetryError)
     content, ending, out = read_bytes(path, TelemetryError), path.suffix.lower(), Contents()
-    read = {**dict.fromkeys(FITS, _read_fits), ".npy": _read_numpy, ".npz": _read_numpy}
     with name_in_errors(path):
         try:
-            read.get(ending, _read_text)(out, content)
+            _READERS[ending](out, content)
+            _join_seconds(out)
         except LbtSynthError:
             raise
         except Exception as error:  # foreign bytes: the decoders raise whatever they like
@@ -105,6 +115,89 @@ def read_contents(path: Path) -> Contents:
                 f"cannot read {path} as {ending}: {error_reason(error)}.", path=path
             ) from error
     return out
+
+
+def _join_seconds(out: Contents) -> None:
+    """Make times of the seconds and microseconds of ESO's SPARTA, which stand in two columns."""
+    named = {column.name.lower(): column for column in out.columns}
+    if {"seconds", "useconds"} <= named.keys():
+        second, micro = named["seconds"], named["useconds"]
+        values, name = second.values + 1e-6 * micro.values, f"{second.name} + {micro.name}"
+        out.columns[out.columns.index(second)] = replace(second, name=name, values=values, unit="s")
+        out.columns.remove(micro)
+
+
+def _add_named(
+    out: Contents, name: str, value: Any, *, group: str = "", unit: str | None = None
+) -> None:
+    """Add an array, all that is in a structure, or a single number or text that is a fact."""
+    if isinstance(value, Mapping):
+        for key, member in value.items():
+            if not key.startswith("__"):  # as MATLAB's own names do
+                _add_named(out, key, member, group=f"{group}{name}." if name else group)
+        return
+    array, fact = np.asarray([] if isinstance(value, list) else value), recognise_fact(name)
+    if array.dtype.names:
+        fields = {key: array[key] for key in array.dtype.names}
+        _add_named(out, name, fields, group=group)
+    elif array.size == 1 and isinstance(item := array.item(), np.ndarray):  # as IDL nests them
+        _add_named(out, name, item, group=group)
+    elif array.size == 1 and fact is not None:
+        out.add_fact(fact, item.decode() if isinstance(item, bytes) else item, f"{group}{name}")
+    elif array.ndim == 0 or (array.size == 1 and array.dtype.kind in "USO"):
+        out.notes.append(f"not used: {group}{name}, a single value")
+    else:
+        out.add_array(name, array, unit, group=group)
+
+
+def _read_matlab(out: Contents, content: bytes) -> None:
+    """Add the variables of MATLAB; files of version 7.3 are HDF5."""
+    from scipy.io import loadmat
+
+    if _HDF5 in content[:1024]:
+        _read_hdf5(out, content)
+    else:
+        stream: Any = io.BytesIO(content)  # which its types do not know
+        _add_named(out, "", loadmat(stream, simplify_cells=True))
+
+
+def _read_idl(out: Contents, content: bytes) -> None:
+    """Add the variables of IDL, whose first axis is the last one here."""
+    from scipy.io import readsav
+
+    with tempfile.NamedTemporaryFile(suffix=".sav") as file, ignore_warnings():
+        file.write(content)
+        file.flush()
+        _add_named(out, "", readsav(file.name, python_dict=True))
+
+
+def _read_hdf5(out: Contents, content: bytes) -> None:
+    """Add the data sets and attributes of HDF5; what is in other files is not opened."""
+    try:
+        import h5py
+    except ImportError as error:
+        raise TelemetryError('it needs h5py: pip install "lbt-synth[hdf5]".') from error
+
+    def add(path: str, item: Any) -> None:
+        unit, (group, slash, name) = None, path.rpartition("/")
+        for key, value in item.attrs.items():
+            if (fact := recognise_fact(key)) == "unit":
+                unit = str(value)
+            elif fact is not None:
+                _add_named(out, key, value, group=path and f"{path}@")
+        if not isinstance(item, h5py.Dataset) or path[0] == "#":  # of MATLAB's cells
+            return
+        if item.external or item.is_virtual:
+            out.notes.append(f"{path} is in another file; it was left out")
+            return
+        series, kind = item[()], item.attrs.get("MATLAB_class")
+        if kind is not None:  # its columns come first
+            series = series.T if kind != b"char" else "".join(map(chr, np.ravel(series)))
+        _add_named(out, name, series, group=group + slash, unit=unit)
+
+    with h5py.File(io.BytesIO(content)) as file:
+        add("", file)
+        file.visititems(add)  # which follows no links
 
 
 def _read_fits(out: Contents, content: bytes) -> None:
@@ -132,21 +225,6 @@ def _add_table(out: Contents, unit: Any) -> None:
         if card.null not in (None, "") and raw.shape == data.shape:
             data = np.where(raw == card.null, np.nan, data)
         out.add_array(card.name, data, card.unit)
-
-
-def _read_numpy(out: Contents, content: bytes) -> None:
-    """Add arrays, each field of structured ones, and single numbers and texts as facts."""
-    for name, array in read_numpy(content).items():
-        fact = recognise_fact(name)
-        if array.dtype.names:
-            for field_name in array.dtype.names:
-                out.add_array(field_name, array[field_name])
-        elif array.size == 1 and fact is not None:
-            out.add_fact(fact, array.item(), name)
-        elif array.ndim == 0 or (array.size == 1 and array.dtype.kind in "US"):
-            out.notes.append(f"not used: {name}, a single value")
-        else:
-            out.add_array(name, array)
 
 
 def _read_text(out: Contents, content: bytes) -> None:
@@ -196,6 +274,18 @@ def _add_comment(out: Contents, comment: str) -> None:
             out.notes.append(f"the comment {key} was not taken for a unit: {value!r}")
         else:
             out.add_fact(fact, value, f"the comment {key}")
+
+
+_READERS = {
+    **dict.fromkeys(FITS, _read_fits),
+    **dict.fromkeys(
+        (".npy", ".npz"), lambda out, content: _add_named(out, "", read_numpy(content))
+    ),
+    **dict.fromkeys((".csv", ".tsv", ".txt", ".dat"), _read_text),
+    **dict.fromkeys((".h5", ".hdf5"), _read_hdf5),
+    ".mat": _read_matlab,
+    ".sav": _read_idl,
+}
 
 
 def choose_columns(
@@ -296,5 +386,9 @@ def number_axes(columns: Sequence[Column]) -> list[Column]:
 
 
 def join_names(columns: Sequence[Column]) -> str:
-    """Return the names of columns in one text."""
-    return ", ".join(column.name or "a column without a name" for column in columns)
+    """Return the names of columns in one text, of many columns of an array the first and last."""
+    names = list[str]()
+    for array, run in groupby(columns, lambda column: "".join(_ARRAY.findall(column.name))):
+        some = [column.name or "a column without a name" for column in run]
+        names += [f"{some[0]} to {some[-1]}"] if array and len(some) > 2 else some
+    return ", ".join(names)

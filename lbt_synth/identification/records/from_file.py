@@ -17,6 +17,7 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError, TelemetryError
 from lbt_synth.files import Telemetry, load_telemetry
+from lbt_synth.files.telemetry.aot import NO_LOOPS
 from lbt_synth.identification.records.clock import SAME_FRAME
 from lbt_synth.identification.records.columns import (
     UNITS,
@@ -68,8 +69,9 @@ def load_record(
     axes: Sequence[int] | None = None,
     columns: Mapping[str, Any] | None = None,
     commands: str | os.PathLike[str] | None = None,
+    loop: str | int | None = None,
 ) -> LoopRecord | SpectrumRecord:
-    r"""Read what a loop recorded: FITS, NPY, NPZ, CSV, or telemetry.
+    r"""Read what a loop recorded: FITS, NPY, NPZ, CSV, HDF5, MATLAB, IDL, or telemetry.
 
     Telemetry of this package and of the AOT standard is recognised; its measurements and commands
     become modes by its matrices. In other files, series are found by the names of columns, arrays
@@ -79,7 +81,8 @@ def load_record(
     Parameters
     ----------
     source : path-like or Telemetry
-        Telemetry, or a file that ends in .fits, .fit, .fts, .npy, .npz, .csv, .tsv, .txt or .dat.
+        Telemetry, or a file that ends in .fits, .fit, .fts, .npy, .npz, .csv, .tsv, .txt, .dat,
+        .mat, .sav, .h5 or .hdf5 (which need the extra ``hdf5``, as MATLAB 7.3 does).
     frame_rate_hz, unit, command_unit : optional
         As for :func:`loop_record`, where the source does not tell them; another unit is refused.
         That of a spectrum is nm^2/Hz or nm/sqrt(Hz) and so on.
@@ -96,6 +99,8 @@ def load_record(
     commands : path-like, optional
         Another file, with the commands. Rows are matched by the frame counters of both files, else
         by their times; without these there is one for each row.
+    loop : str or int, optional
+        Name or number (from 0) of a control loop of the AOT standard; the first by default.
 
     Returns
     -------
@@ -133,7 +138,9 @@ def load_record(
     }
     with name_in_errors(path := Path(name)):
         if telemetry is None and is_telemetry(path):
-            telemetry = load_telemetry(path)
+            telemetry = load_telemetry(path, loop=loop)
+        elif loop is not None:
+            raise ProblemError(NO_LOOPS)
         if telemetry is not None:
             if columns is not None or commands is not None:
                 raise ProblemError(
@@ -178,8 +185,10 @@ def _telemetry_record(
     measurements stay as they were recorded, and the sensor gain of the record is what they show of
     a unit of phase.
     """
-    n = telemetry.modes
-    chosen = choose_axes(axes, n, "modes")
+    n, what = telemetry.modes, "modes"
+    if (loops := telemetry.metadata.get("aot_loops")) is not None:
+        what += f" of {telemetry.metadata['aot_loop']}, the one taken of the control loops {loops}"
+    chosen = choose_axes(axes, n, what)
     facts = {name: value for name in _FACTS if (value := getattr(telemetry, name)) is not None}
     contents = Contents(facts={name: {"the telemetry": value} for name, value in facts.items()})
     roles: Roles = {}
@@ -203,6 +212,8 @@ def _telemetry_record(
         contents.notes.append(
             "of another program: that y(k) is of the exposure of frame k-1 is taken for granted"
         )
+    if loops is not None:
+        contents.notes.append(f"{what}; loop takes another")
     mirror = telemetry.mirror if mirror is None else mirror
     record = _build_loop(roles, contents, mirror=mirror, **stated)
     gains = tuple(map(float, str(telemetry.metadata.get(_STATED_GAIN, "")).split()))
@@ -357,9 +368,14 @@ def _build_loop(
         )
     _require_facts(roles, units, facts)
     (clock,), (counter,) = (roles.get(name, [None]) for name in ("times", "frame_numbers"))
-    times = None if clock is None else clock_factor(clock.unit, "s") * clock.values
-    if clock is not None and not clock.unit:
-        contents.notes.append(f"{clock.name} was taken for seconds")
+    times = None
+    if clock is not None:
+        times = clock_factor(clock.unit, "s") * clock.values
+        if not times.any() and facts["frame_rate_hz"] is not None:
+            contents.notes.append(f"{clock.name} is zero in all rows and was left out")
+            times = None
+        elif not clock.unit:
+            contents.notes.append(f"{clock.name} was taken for seconds")
     return loop_record(
         _stack_columns(columns),
         None if commands is None else _stack_columns(commands),

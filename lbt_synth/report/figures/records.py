@@ -16,9 +16,10 @@ from lbt_synth.identification.fit.identified_model import IdentifiedAxis, Identi
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import ClosedLoop, close_loop
+from lbt_synth.loop.budget import random_density
 from lbt_synth.loop.simulation import Segment, Simulation
-from lbt_synth.models import ARModel, Truth, Vibration
-from lbt_synth.models.vibration import checked_direction, stationary_vibrations
+from lbt_synth.models import Truth, Vibration
+from lbt_synth.models.vibration import checked_direction
 from lbt_synth.report.draw import (
     PANEL_IN,
     SHADE,
@@ -364,29 +365,15 @@ def exact_spectrum(
 ) -> FloatArray:
     """One-sided spectrum of the residual, summed over the axes [nm^2/Hz], (f,).
 
-    It is that of means over frames; a spectrum S of the phase counts as ``S sinc^2(f / f_s)``.
-    Random disturbances add ``|transfer|^2`` times that. A sinusoid of amplitude a at f0 adds what
-    Welch's method makes of it with a Hann window w of that length:
-    ``a^2 / 2 |W(f - f0)|^2 / (f_s sum w^2)``, W the window's Fourier transform.
+    It is that of means over frames. A sinusoid of amplitude a at f0 adds what Welch's method makes
+    of it with a Hann window w of that length: ``a^2 / 2 |W(f - f0)|^2 / (f_s sum w^2)``, W the
+    window's Fourier transform.
     """
-    n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
+    rate = loop.hardware.frame_rate_hz
     inside = np.clip(frequency_hz, frequency_hz[1] / 2, None)  # spectra may be infinite at 0
-    response = loop.system.frequency_response(inside)[:, :n]
-    rejection, noise_transfer = response[:, :, :n], response[:, :, n:]
-    total = np.zeros(frequency_hz.size)
-    for spectrum, modes in truth.turbulence_groups(n):
-        gain = np.sum(np.abs(rejection[:, :, list(modes)]) ** 2, axis=(1, 2))
-        share = 1.0 if isinstance(spectrum, ARModel) else np.sinc(inside / rate) ** 2
-        total += share * gain * spectrum.psd(inside)
-    noise = noise_transfer * truth.noise_per_measurement(loop.hardware.n_measurements)
-    total += np.sum(np.abs(noise) ** 2, axis=(1, 2)) * 2 / rate
-    for line in stationary_vibrations(truth.vibrations):
+    total: FloatArray = random_density(loop, truth, inside, in_image=False).sum(axis=1)
+    for line in (line for line in truth.vibrations if not isinstance(line, Vibration)):
         direction = checked_direction(line, loop.hardware)
-        if isinstance(line, Vibration):
-            gain = np.sum(np.abs(rejection @ direction) ** 2, axis=1)
-            share = np.sinc(line.frequency_hz / rate) ** 2
-            total += share * gain * line.ar_model(rate).psd(inside)
-            continue
         seen_nm = np.sinc(line.frequency_hz / rate) * line.amplitude_nm
         residual = seen_nm * loop.sensitivity([line.frequency_hz])[0] @ direction
         power = float(np.sum(np.abs(residual) ** 2)) / 2

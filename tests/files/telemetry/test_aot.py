@@ -211,16 +211,57 @@ def test_modal_coefficients_are_the_measurements(tmp_path):
     assert np.allclose(seen.interaction_matrix, np.einsum("mds,sdn->mn", back, response))
 
 
-def test_the_first_loop_with_series_is_taken(tmp_path):
-    def edit(system):
-        (loop,), (mirror,) = system.loops, system.wavefront_correctors
-        ends = {"input_sensor": loop.input_sensor, "commanded_corrector": mirror}
-        offload = aotpy.OffloadLoop("offload", input_corrector=mirror, commanded_corrector=mirror)
-        twin = dataclasses.replace(loop, uid="twin")
-        system.loops = [offload, loop, aotpy.ControlLoop("TT loop", **ends), twin]
+def two_loops(system):
+    """Loops as CIAO has them: a mirror of many actuators, and tip and tilt by the same sensor."""
+    (loop,), (mirror,) = system.loops, system.wavefront_correctors
+    ends = {"input_sensor": loop.input_sensor, "commanded_corrector": mirror}
+    offload = aotpy.OffloadLoop("offload", input_corrector=mirror, commanded_corrector=mirror)
+    steering = aotpy.TipTiltMirror("ITTM", telescope=system.main_telescope)
+    rng = np.random.default_rng(2)
+    tip_tilt = aotpy.ControlLoop(
+        "TT loop",
+        input_sensor=loop.input_sensor,
+        commanded_corrector=steering,
+        time=loop.time,
+        commands=aotpy.Image("positions", 1e-6 * rng.standard_normal((3, 2)), time=loop.time),
+        control_matrix=aotpy.Image("CM", rng.standard_normal((2, 2, 3))),
+        measurements_to_modes=aotpy.Image("S2M", rng.standard_normal((5, 2, 3))),
+        framerate=500.0,
+    )
+    system.wavefront_correctors = [mirror, steering]
+    system.loops = [offload, loop, aotpy.ControlLoop("no series", **ends), tip_tilt]
 
-    seen = load_telemetry(foreign(tmp_path, edit=edit)[0])
-    assert seen.metadata["aot_loop"] == "HO loop"
+
+def test_a_loop_is_chosen_by_name_or_number(tmp_path):
+    path, system = foreign(tmp_path, edit=two_loops)
+    first = load_telemetry(path)
+    assert first.metadata["aot_loop"] == "HO loop"
+    assert first.metadata["aot_loops"] == "HO loop, TT loop"
+    assert same(first, load_telemetry(path, loop=0))
+    seen = load_telemetry(path, loop="TT loop")
+    assert seen.metadata["aot_loop"] == "TT loop"
+    tip_tilt = system.loops[-1]
+    assert np.allclose(seen.commands, 1e9 * tip_tilt.commands.data)
+    slopes, control = tip_tilt.input_sensor.measurements.data, tip_tilt.control_matrix.data
+    assert np.allclose(seen.measurements, 1e9 * np.einsum("mds,tds->tm", control, slopes))
+    assert np.array_equal(lbt.load_record(path, loop="TT loop").measurements, seen.measurements)
+    for number in (1, "1"):
+        assert same(seen, load_telemetry(path, loop=number))
+    with pytest.raises(
+        TelemetryError, match=r"has the control loops HO loop, TT loop, from 0; got 2\."
+    ):
+        load_telemetry(path, loop=2)
+    with pytest.raises(
+        TelemetryError, match="loop chooses a control loop of a file of the AOT sta"
+    ):
+        load_telemetry(save_telemetry(tmp_path / "own.npz", full()), loop=0)
+
+
+def test_time_stamps_that_are_all_zero_are_none(tmp_path):
+    def edit(system):
+        system.loops[0].time.timestamps, system.loops[0].framerate = [0.0, 0.0, 0.0], 500.0
+
+    assert load_telemetry(foreign(tmp_path, edit=edit)[0]).times_s is None
 
 
 def test_the_rate_of_the_detector(tmp_path):

@@ -1,18 +1,24 @@
-"""What files hold: nulls, facts in arrays and comments, damage.
+"""What files hold: nulls, facts in arrays and comments, damage, structures and groups.
 
 Columns chosen by their names, their axes, or the call.
 """
 
+import dataclasses
+import gc
+import sys
 import tempfile
 from functools import partial
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
+import scipy.io
 from astropy.io import fits
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.record_files import csv, write_csv
+from support.record_files import csv, sparta_table, write_csv, write_sav
+from support.recorded_loops import integrator_loop
 from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
@@ -33,6 +39,9 @@ def test_damage(tmp_path):
         ("a.npz", b"PK", "it begins as neither an NPY file nor a ZIP archive does"),
         ("a.fits", b"SIMPLE", "cannot read .*a.fits as .fits"),
         ("a.fits", b"", "cannot read .*a.fits as .fits"),
+        ("a.h5", b"\x89HDF", "cannot read .*a.h5 as .h5"),
+        ("a.mat", b"MATLAB 5.0", "cannot read .*a.mat as .mat"),
+        ("a.mat", bytes(512) + b"\x89HDF\r\n\x1a\n", "cannot read .*a.mat as .mat"),
     ):
         (tmp_path / name).write_bytes(content)
         error = refused(partial(lbt.load_record, tmp_path / name), TelemetryError, words)
@@ -217,3 +226,194 @@ def test_a_remark_is_no_series_and_refuses_no_file(tmp_path):
     assert "not used: remark" in seen.notes
     remark = {"measurements": "y_nm", "commands": "remark"}
     assert not lbt.load_record(path, columns=remark, unit="nm", **known).usable.any()
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    """Measurements and commands of a loop at 1 kHz, (3000, 2) each."""
+    return integrator_loop(lines=((31.0, 0.004, 60.0),), frames=3002, axes=2)
+
+
+def write_hdf5(path, arrays, *, matlab=False, **facts):
+    """Arrays and facts in HDF5; of MATLAB 7.3 behind its block of text, columns first."""
+    with h5py.File(path, "w", userblock_size=512 if matlab else 0) as file:
+        for name, array in arrays.items():
+            file[name] = array.T if matlab else array
+        for name, value in facts.items():
+            if matlab:
+                text = isinstance(value, str)
+                file[name] = np.array([[ord(c)] for c in value], "u2") if text else [[value]]
+            else:
+                file.attrs[name] = value
+        for item in file.values() if matlab else ():
+            item.attrs["MATLAB_class"] = np.bytes_("char" if item.dtype == "u2" else "double")
+    if matlab:
+        with path.open("r+b") as stream:
+            stream.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + bytes(10) + b"\2IM")
+    return path
+
+
+FACTS = {"frame_rate_hz": 1000.0, "delay_frames": 1.0, "unit": "nm"}
+FORMATS = ["npz", "h5", "mat", "mat 7.3", "sav", "fits", "sparta"]
+
+
+def written(folder, form, y, u):
+    """Write a record in a format, with its facts where the format has a place for them."""
+    path, arrays = folder / f"a.{form.split()[0]}", {"y": y, "u": u}
+    if form == "npz":
+        np.savez(path, **arrays, **FACTS)
+    elif form == "h5":
+        write_hdf5(path, {"night/y": y, "night/u": u}, **FACTS)
+        with h5py.File(path, "a") as file:
+            file["night/y"].attrs["unit"] = file["night/u"].attrs["units"] = "nm"
+    elif form == "mat":
+        scipy.io.savemat(path, {"rec": {**arrays, **FACTS, "unit": "nm"}})
+    elif form == "mat 7.3":
+        write_hdf5(path, arrays, matlab=True, **FACTS)
+    elif form == "sav":
+        write_sav(path, **arrays, **FACTS)
+    elif form == "fits":
+        columns = [fits.Column(n, "2D", array=a, unit="nm") for n, a in arrays.items()]
+        table(path, *columns, FPS=1000.0, DELAYFRM=1.0)
+    else:
+        seconds = 1.7e9 + np.arange(len(y)) / 1000
+        path = sparta_table(folder / "a.fits", y, u, seconds=seconds, rate=1000.0)
+    return path
+
+
+@pytest.fixture(scope="module")
+def model(recorded, tmp_path_factory):
+    path = written(tmp_path_factory.mktemp("npz"), "npz", *recorded)
+    return lbt.identification.identify(lbt.load_record(path), sensor_gain=0.6)
+
+
+def same(one, other):
+    """Whether two results hold the same to the bit."""
+    if dataclasses.is_dataclass(one):
+        names = [f.name for f in dataclasses.fields(one) if f.name not in ("notes", "source")]
+        return all(same(getattr(one, name), getattr(other, name)) for name in names)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other, equal_nan=True)
+    return one == other or (one != one and other != other)
+
+
+@pytest.mark.parametrize("form", FORMATS[1:])
+def test_every_format_gives_the_same_model(tmp_path, recorded, model, form):
+    path = written(tmp_path, form, *recorded)
+    more = {}
+    if form == "sparta":
+        more = {"columns": {"measurements": "Gradients"}, "unit": "nm", "delay_frames": 1}
+    seen = lbt.load_record(path, **more)
+    assert np.array_equal(seen.measurements, recorded[0])
+    assert np.array_equal(seen.commands, recorded[1])
+    assert same(lbt.identification.identify(seen, sensor_gain=0.6), model)
+
+
+def test_the_comparison_sees_a_change_of_one_bit(tmp_path, recorded, model):
+    y, u = recorded
+    moved = y.copy()
+    moved[1500, 1] = np.nextafter(moved[1500, 1], np.inf)
+    seen = lbt.load_record(written(tmp_path, "npz", moved, u))
+    assert not same(lbt.identification.identify(seen, sensor_gain=0.6), model)
+
+
+def test_groups_and_structures_stand_before_their_arrays(tmp_path, series):
+    y, u = series
+    path = write_hdf5(tmp_path / "a.h5", {"one/y": y, "one/u": u, "two/y": u, "two/u": y}, fs=RATE)
+    with h5py.File(path, "a") as file:
+        file["remarks"] = ["calm"] * 60
+    with pytest.raises(
+        ProblemError, match=r"one/y\[0\], one/y\[1\], two/y\[0\], two/y\[1\] are all"
+    ):
+        lbt.load_record(path, unit="nm")
+    chosen = {"measurements": "two/y", "commands": ["one/u[1]", "one/u[0]"]}
+    seen = lbt.load_record(path, columns=chosen, unit="nm", axes=(1, 0))
+    assert np.array_equal(seen.measurements, u[:, ::-1])
+    assert np.array_equal(seen.commands, u)
+    assert "remarks is no series of real numbers; it was left out" in seen.notes
+    cell = np.array([np.zeros(3), np.zeros((2, 2)), "calm"], dtype=object)
+    scipy.io.savemat(tmp_path / "b.mat", {"night": {"dome": {"y": y}}, "u": u, "cell": cell})
+    seen = lbt.load_record(tmp_path / "b.mat", frame_rate_hz=RATE, unit="nm")
+    assert np.array_equal(seen.measurements, y)
+    assert "measurements: night.dome.y[0], night.dome.y[1]" in seen.notes
+    assert "cell is no series of real numbers; it was left out" in seen.notes
+    rows = np.array(
+        [(y, RATE)], dtype=[("POL", object), ("FS", float)]
+    )  # as scipy gives one of IDL
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("scipy.io.readsav", lambda *_, **__: {"night": rows.view(np.recarray)})
+        (tmp_path / "c.sav").touch()
+        seen = lbt.load_record(tmp_path / "c.sav", unit="nm")
+    assert np.array_equal(seen.measurements, y)
+    assert seen.frame_rate_hz == RATE
+
+
+def test_matlab_keeps_its_cells_elsewhere_and_its_columns_first(tmp_path):
+    square = np.array([[1.0, 4.0], [3.0, 5.0]])  # of two frames: no longer side tells them
+    path = write_hdf5(tmp_path / "a.mat", {"y": square}, matlab=True, fs=RATE)
+    with h5py.File(path, "a") as file:
+        file["#refs#/y"] = np.ones(7)
+    columns = {column.name: column.values.tolist() for column in read_contents(path).columns}
+    assert columns == {"y[0]": [1, 3], "y[1]": [4, 5]}
+
+
+def test_what_is_in_another_file_is_not_opened(tmp_path, series):
+    y, _ = series
+    other, path = tmp_path / "other.h5", tmp_path / "a.h5"
+    write_hdf5(other, {"pol": y})
+    y.tofile(tmp_path / "raw")
+    layout = h5py.VirtualLayout(shape=y.shape, dtype="f8")
+    layout[:] = h5py.VirtualSource(other, "pol", shape=y.shape)
+    with h5py.File(path, "w") as file:
+        file["linked"] = h5py.ExternalLink(other, "/pol")
+        file.create_virtual_dataset("virtual", layout)
+        raw = [(tmp_path / "raw", 0, y.nbytes)]
+        file.create_dataset("raw", y.shape, dtype="f8", external=raw)
+    contents = read_contents(path)
+    assert contents.columns == []
+    said = [
+        "raw is in another file; it was left out",
+        "virtual is in another file; it was left out",
+    ]
+    assert contents.notes == said
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_damaged_file_of_idl(tmp_path):
+    """Which scipy leaves open."""
+    (tmp_path / "a.sav").write_bytes(b"SR\0\4\0")
+    with pytest.raises(TelemetryError, match=r"cannot read .*a\.sav as \.sav"):
+        lbt.load_record(tmp_path / "a.sav")
+    gc.collect()
+
+
+def test_without_h5py_it_says_what_to_install(tmp_path, series, monkeypatch):
+    path = write_hdf5(tmp_path / "a.h5", {"pol": series[0]})
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(
+        TelemetryError, match=r'a\.h5: it needs h5py: pip install "lbt-synth\[hdf5\]"'
+    ):
+        lbt.load_record(path)
+
+
+def test_times_of_sparta(tmp_path, series):
+    """Seconds and microseconds belong together; times that are all zero are none beside a rate."""
+    y, u = series
+    seconds = 1.7e9 + 0.9 + np.delete(np.arange(62), [20, 21]) / RATE
+    path = sparta_table(tmp_path / "a.fits", y, u, seconds=seconds, rate=RATE)
+    read = {"columns": {"measurements": "Gradients", "frame_numbers": ()}, "unit": "nm"}
+    seen = lbt.load_record(path, **read)
+    assert np.flatnonzero(~seen.measured).tolist() == [20, 21]
+    assert "times: Seconds + USeconds" in seen.notes
+    assert "not used: FrameCounter, HODM_Positions[0] to HODM_Positions[59]" in seen.notes
+    bare = sparta_table(tmp_path / "b.fits", y, u, seconds=np.zeros(60), rate=RATE)
+    seen = lbt.load_record(bare, **read)
+    assert (seen.frame_rate_hz, seen.frames) == (RATE, 60)
+    assert "Seconds + USeconds is zero in all rows and was left out" in seen.notes
+    bare = sparta_table(tmp_path / "c.fits", y, u, seconds=np.zeros(60))
+    with pytest.raises(ProblemError, match=r"times_s must rise from row to row; all rows have 0"):
+        lbt.load_record(bare, **read)
+    assert lbt.load_record(bare, frame_rate_hz=RATE, **read).frames == 60

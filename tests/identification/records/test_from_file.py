@@ -80,6 +80,26 @@ def test_telemetry_of_the_standard(tmp_path):
     assert np.flatnonzero(~back.usable).tolist() == [0, 1]
 
 
+def test_the_control_loop_that_was_taken_is_named():
+    """In the note, and in what is refused."""
+    y, u = np.random.default_rng(0).standard_normal((2, 50, 3))
+    loops = {"aot_loop": "HO loop", "aot_loops": "HO loop, TT loop"}
+    seen = lbt.files.Telemetry(frame_rate_hz=800, commands=u, measurements=y, metadata=loops)
+    said = "modes of HO loop, the one taken of the control loops HO loop, TT loop"
+    with pytest.raises(ProblemError, match=f"there are 3 {said}; say which are tip and tilt"):
+        lbt.load_record(seen)
+    assert f"{said}; loop takes another" in lbt.load_record(seen, axes=(0, 1)).notes
+
+
+@pytest.mark.parametrize("loop", ["TT loop", 0])
+def test_only_the_standard_has_loops_to_choose_from(tmp_path, series, loop):
+    path = write_csv(tmp_path / "a.csv", ["pol"], [series[0][:, 0]])
+    with pytest.raises(
+        ProblemError, match=r"a\.csv: loop chooses a control loop of .*Leave it out"
+    ):
+        lbt.load_record(path, frame_rate_hz=RATE, unit="nm", loop=loop)
+
+
 def test_gaps_times_and_counters(tmp_path):
     path, y = tmp_path / "a.csv", np.random.default_rng(0).standard_normal(50)
     cells = {20: "", 30: "NaN"}
