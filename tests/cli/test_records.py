@@ -35,6 +35,8 @@ def test_identify_writes_a_configuration_that_designs(tmp_path, capsys, recorded
     )
     assert (status, error) == (0, "")
     assert text.startswith("1 vibration, the strongest of ")
+    told = r"tells 1 component from 0 by at most \d+ and from 2 by about \d+ units"
+    assert re.search(told, " ".join(text.split()))
     assert "\nVibrations\n" in text
     assert out.with_suffix(".png").stat().st_size > 10_000
     config = lbt.load_config(out)
@@ -175,6 +177,8 @@ def test_auto_tests_its_design_on_unseen_data(made, recorded_loop):
     assert rows["what ran"]["data_nm"] == pytest.approx(true * GAIN / gain, rel=0.05)
     assert data["gain_over_what_ran"]["residual_nm"][1] == kalman["data_nm"]
     assert data["certificate"] is True
+    assert data["axes"][0]["over_fewer"] > data["axes"][0]["over_more"] > 0
+    assert data["axes"][1]["over_fewer"] is None  # without a component
     assert data["method"] == "kalman"
     assert data["units"]["data_error_nm"] == "nm"
     assert lbt.load_gain(out).certificate.passed
@@ -217,6 +221,36 @@ def test_names_that_no_text_can_hold(tmp_path, capsys) -> None:
     status, _, error = run(capsys, *words)
     assert (status, error) == (0, "")
     assert "a\\x01.npz" in (tmp_path / "q.yaml").read_text()
+
+
+def test_several_nights_make_one_design_and_a_table(tmp_path, capsys) -> None:
+    for seed, hz in enumerate((29.0, 33.0)):
+        record = spliced_record((seed,), lines=((hz, 0.004, 60.0),), frames=9000)
+        file = tmp_path / f"night{seed}.npz"
+        np.savez(file, measurements=record.measurements, commands=record.commands)
+    words = ("auto", tmp_path / "night0.npz", tmp_path / "night1.npz", *FACTS)
+    status, text, error = run(capsys, *words, "-o", tmp_path / "robust.fits", "--json")
+    assert (status, error) == (0, "")
+    data = json.loads(text)
+    assert (data["written"], data["certificate"]) == ("all nights", True)
+    table = {row["design"]: row for row in data["nights"]}
+    assert list(table) == ["night0.npz", "night1.npz", "all nights"]
+    own = table["night1.npz"]["night1.npz"]
+    ratio = (table["night0.npz"]["night1.npz"] / own) ** 2
+    assert table["night0.npz"]["worst_ratio"] == pytest.approx(ratio)
+    assert f"that of night0.npz leaves {ratio:.2f} times the variance" in data["verdict"][0]
+    assert data["units"]["night0.npz"] == "nm"
+    assert lbt.load_gain(tmp_path / "robust.fits").certificate.passed
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["night0.npz", "night1.npz", "robust.fits"]
+    status, _, error = run(capsys, *words, "--commands", "u.npy", "-o", tmp_path / "no.fits")
+    assert (status, "--commands is for one record." in error) == (2, True)
+    status, _, error = run(capsys, *words[:2], *words[1:], "-o", tmp_path / "no.fits")
+    assert status == 2
+    assert "each record must have a name of its own; got night0.npz, night0.npz" in error
+    np.savez(tmp_path / "night1.npz", measurements=record.measurements[:2000])
+    status, _, error = run(capsys, *words, "-o", tmp_path / "no.fits")
+    assert status == 2
+    assert "night1.npz" in error
 
 
 def write(path, change=1.0, frames=None, **more):
