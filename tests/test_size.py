@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 202,
     "public names": 145,
     "tuned constants": 494,
-    "lines of tests": 30617,
+    "lines of tests": 30012,
     "lines of benchmarks": 4018,
     "words of docs": 59781,
 }

@@ -2,22 +2,15 @@
 
 import pytest
 from support.night import GAIN, simulated_night
-from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 
 
 @pytest.fixture(scope="session")
-def gains(tmp_path_factory):
+def gains(lbt_designs, tmp_path_factory):
     """Gain files of three designs for the LBT, by their names."""
     folder = tmp_path_factory.mktemp("gains")
-    config = lbt.load_config(LBT_YAML)
-    designs = {
-        "kalman": lbt.kalman(config.plant),
-        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati"),
-        "integrator": lbt.integrator(config.hardware, gain=0.5),
-    }
-    return {name: lbt.save_gain(folder / f"{name}.fits", d) for name, d in designs.items()}
+    return {name: lbt.save_gain(folder / f"{name}.fits", d) for name, d in lbt_designs.items()}
 
 
 @pytest.fixture(scope="session")

@@ -16,34 +16,16 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 from support.commands import hear_interruptions, run
-from support.design_reports import SMALL, three_designs
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    place = tmp_path_factory.mktemp("report")
-    (place / "small.yaml").write_text(SMALL)
-    return place
-
-
-@pytest.fixture(scope="module")
-def config(folder):
-    return lbt.load_config(folder / "small.yaml")
-
-
-@pytest.fixture(scope="module")
-def designs(config):
-    return three_designs(config)
-
-
-def test_command(folder, designs, capsys, monkeypatch):
-    monkeypatch.chdir(folder)
+def test_command(small_config, small_designs, capsys, monkeypatch):
+    monkeypatch.chdir(small_config.source.parent)
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "1700000000")
     for name in ("kalman", "slow"):
-        lbt.save_gain(f"{name}.fits", designs[name])
+        lbt.save_gain(f"{name}.fits", small_designs[name])
     command = ("report", "small.yaml", "kalman.fits", "slow.fits")
     status, out, error = run(capsys, *command, "-o", "r.html", "--json")
     assert (status, error) == (0, "")
@@ -51,8 +33,8 @@ def test_command(folder, designs, capsys, monkeypatch):
     assert data["files"] == ["r.html"]
     assert list(data["designs"]) == ["kalman", "slow"]
     kalman = data["designs"]["kalman"]
-    loop = lbt.close_loop(lbt.load_config("small.yaml").hardware, designs["kalman"].controller)
-    budget = lbt.residual_budget(loop, lbt.load_config("small.yaml").truth)
+    loop = lbt.close_loop(small_config.hardware, small_designs["kalman"].controller)
+    budget = lbt.residual_budget(loop, small_config.truth)
     assert kalman["residual_nm"] == pytest.approx(budget.rms_nm)
     assert kalman["certified"] is True
     assert (
@@ -68,14 +50,14 @@ def test_command(folder, designs, capsys, monkeypatch):
     assert Path("r.html").read_bytes() == first
 
 
-def test_gain_files_have_names_of_their_own(folder, designs, tmp_path, capsys):
+def test_gain_files_have_names_of_their_own(small_config, small_designs, tmp_path, capsys):
     for place in ("a", "b"):
         (tmp_path / place).mkdir()
-        lbt.save_gain(tmp_path / place / "k.fits", designs["slow"])
+        lbt.save_gain(tmp_path / place / "k.fits", small_designs["slow"])
     files, page = [tmp_path / place / "k.fits" for place in ("a", "b")], tmp_path / "r.html"
-    status, _, error = run(capsys, "report", folder / "small.yaml", *files, "-o", page)
+    status, _, error = run(capsys, "report", small_config.source, *files, "-o", page)
     assert (status, "must have a name of its own" in error) == (2, True)
-    assert run(capsys, "report", folder / "small.yaml", files[0], "-o", page)[0] == 0
+    assert run(capsys, "report", small_config.source, files[0], "-o", page)[0] == 0
     assert str(tmp_path) not in page.read_text()  # pages name no directories
 
 
@@ -133,10 +115,10 @@ def test_it_serves_until_it_is_interrupted(tmp_path):
         ("explore lbt.yaml FAST.fits", "must run at the configuration's 800 Hz; got a design for"),
     ],
 )
-def test_wrong_words_are_refused(capsys, tmp_path, monkeypatch, designs, words, message):
+def test_wrong_words_are_refused(capsys, tmp_path, monkeypatch, small_designs, words, message):
     monkeypatch.chdir(tmp_path)
     shutil.copy(LBT_YAML, "lbt.yaml")
-    lbt.save_gain("k.fits", designs["slow"])
+    lbt.save_gain("k.fits", small_designs["slow"])
     lbt.save_gain("FAST.fits", lbt.integrator(lbt.LoopHardware(frame_rate_hz=500), gain=0.3))
     status, out, error = run(capsys, *words.split(" "))
     assert (status, out, error.count("\n")) == (2, "", 1)

@@ -4,7 +4,6 @@ import sys
 from dataclasses import FrozenInstanceError, replace
 from xml.etree import ElementTree
 
-import control
 import numpy as np
 import pytest
 from support.plants import LBT_YAML
@@ -81,16 +80,6 @@ def test_whatever_a_script_holds_is_one_line_and_a_page(config, design):
     assert float(shown["residual"][0]) == pytest.approx(budget.rms_nm, abs=0.05)
 
 
-def test_designs_go_where_controllers_go(config, design):
-    one, other = (lbt.close_loop(config.hardware, each) for each in (design, design.controller))
-    assert np.array_equal(one.system.A, other.system.A)
-    gains = lbt.loop.stable_sensor_gains
-    assert gains(config.hardware, design) == gains(config.hardware, design.controller)
-    known = {"hardware": config.hardware, "frames": 20, "settle_frames": 0}
-    runs = [lbt.simulate(each, config.truth, **known) for each in (design, design.controller)]
-    assert np.array_equal(runs[0].residual_nm, runs[1].residual_nm)
-
-
 def test_wrong_arguments_are_refused_in_words(config, design):
     close, path = lbt.close_loop, config.hardware
     kalman = r"got Config. Try config\.plant, or config\.design\(\.\.\.\)\."
@@ -133,17 +122,6 @@ def test_wrong_solver_answers_do_not_leave_the_library(monkeypatch, axis_plant):
     monkeypatch.setattr(module, "_central", lambda *parts: replace(central(*parts), **unstable))
     with pytest.raises(CertificateError, match="spectral radius of the filter"):
         lbt.hinf(axis_plant, gamma_ratio=1.2, route="riccati")
-
-
-def test_to_control_is_the_same_controller(axis_plant):
-    design = lbt.kalman(axis_plant)
-    system = design.controller.to_statespace().to_control()
-    assert isinstance(system, control.StateSpace)
-    y = np.random.default_rng(0).standard_normal(200)
-    run = design.controller.start()
-    stepped = [run.step([value])[0] for value in y]
-    _, response = control.forced_response(system, U=y)
-    assert np.allclose(np.ravel(response), stepped, rtol=1e-9, atol=1e-12)
 
 
 def test_what_a_design_expects_to_leave(axis_plant, design):

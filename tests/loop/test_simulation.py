@@ -153,18 +153,6 @@ def test_the_wavefront_sensor_may_go_and_come_back(sensors_design, sensors_confi
     assert np.max(steps[:, 2998:3003]) < 2 * np.max(steps[:, :2990])
 
 
-def test_a_sinusoid_that_channels_see(sensors_design, sensors_config):
-    lines = tuple(
-        lbt.models.SinusoidalVibration(frequency_hz=f, rms_nm=100, direction=d)
-        for f, d in ((20, (1, 0)), (33, (0, 1)))
-    )
-    truth = replace(sensors_config.truth, vibrations=lines)
-    loop = sensors_design.close(sensors_config.hardware)
-    exact = lbt.residual_budget(loop, truth)
-    found = failing_run(sensors_design, truth, frames=10_000, cases=4)
-    assert np.sqrt(np.mean(found.rms_nm**2)) == pytest.approx(exact.rms_nm, rel=0.03)
-
-
 def test_wrong_drops(sensors_design, sensors_config):
     def fail(**facts):
         drops = [Drop(**({"unit": "m1"} | facts))]

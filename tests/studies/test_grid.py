@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import time
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
@@ -46,13 +45,6 @@ def test_a_sweep_knows_what_is_missing(tmp_path):
     assert (computed, counts) == (7, [5, 2, 2, 1, 2])
     assert not begun.exists()  # what a killed process had begun to write
     assert sweep.run(None, lambda rows: rows, part_rows=2)[1] == 0
-
-
-class Elsewhere(ThreadPoolExecutor):
-    """An executor that gets everything in bytes, as one of processes does."""
-
-    def submit(self, fn, *args):
-        return super().submit(*pickle.loads(pickle.dumps((fn, *args))))
 
 
 def test_a_part_is_believed_by_its_digest_alone(tmp_path):
