@@ -148,14 +148,8 @@ def _knows_scale(record: LoopRecord) -> bool:
 
 def _run_nights(arguments: Namespace, gain: Path) -> Report:
     """Design for several nights at once, and compare with the designs of each."""
-    of_one = (
-        "accelerometers",
-        "accelerometer_rate_hz",
-        "acceleration_unit",
-        "commands",
-        "noise_nm",
-    )
-    refuse_options(arguments, (*of_one, "wavelength_um"), "is for one record")
+    of_one = ["accelerometers", "accelerometer_rate_hz", "acceleration_unit", "commands"]
+    refuse_options(arguments, [*of_one, "noise_nm", "wavelength_um"], "is for one record")
     names = [printable(Path(path).name) for path in arguments.files]
     if len(set(names)) != len(names):
         raise ProblemError(f"each record must have a name of its own; got {', '.join(names)}.")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,9 @@ from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.loop import residual_budget
 from lbt_synth.methods.registry import default_method, method_named, record_methods
 from lbt_synth.methods.request import PlantInputs, design_request
-from lbt_synth.models import TipTiltPlant, Vibration, tip_tilt_plant
+from lbt_synth.models import TipTiltPlant, Vibration
+from lbt_synth.models.plant.assembly import PlantParts
+from lbt_synth.models.plant.tip_tilt import assemble
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import choice
 
@@ -43,19 +46,30 @@ _FACTS = {  # of one loop
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NightsDesign:
-    """A controller for several nights of one loop."""
+    """Controllers for several nights of one loop: of each night alone, and one for all of them."""
 
-    design: Design
-    name: str  # all nights, or the night whose design alone has the better worst night
-    nights: Mapping[str, RecordedDesign]  # model and design of each night
-    # of each design, of a night or of all, by the model of each night [nm rms over all axes]; nan
-    # where the loop is unstable at a sensor gain that the night allows
+    nights: Mapping[str, RecordedDesign]
+    designs: Mapping[str, Design]  # those of the nights, then that for all if one holds for all
+    # of each design by the model of each night [nm rms over all axes]; nan where the loop is
+    # unstable at a sensor gain that the night allows
     residual_nm: Mapping[str, Mapping[str, float]]
     notes: tuple[str, ...]
 
     def worst(self, name: str) -> tuple[float, str]:
         """Return the largest variance of a design over that of a night's own, and the night."""
-        return _worst(self.residual_nm, name)
+        own = {night: self.residual_nm[night][night] for night in self.nights}
+        ratios = ((nm / own[night], night) for night, nm in self.residual_nm[name].items())
+        return max((np.inf if np.isnan(ratio) else ratio**2, night) for ratio, night in ratios)
+
+    @property
+    def name(self) -> str:
+        """The design whose worst night is the best, that for all nights if they are equal."""
+        return min(reversed(list(self.designs)), key=lambda name: self.worst(name)[0])
+
+    @property
+    def design(self) -> Design:
+        """That design."""
+        return self.designs[self.name]
 
     @property
     def verdict(self) -> tuple[str, str]:
@@ -151,65 +165,49 @@ def design_from_nights(
             error.args = (f"{night}: {error}",)
             raise
     designs = {night: recorded.design for night, recorded in made.items()}
+    residual_nm = {night: _residuals_nm(design, made) for night, design in designs.items()}
     notes = [
         f"{'warning: ' * note.startswith('warning: ')}{night}: {note.removeprefix('warning: ')}"
         for night, recorded in made.items()
         for note in (*recorded.notes, *recorded.model.notes)
     ]
-    try:
-        known = options.get("command_scale_known", False)
-        designs[ALL], note = _design_for_all(made, chosen, command_scale_known=known)
-        notes = [note] * bool(note) + notes
-    except SynthesisError as error:
-        notes = [f"no design for all nights: {str(error).rstrip('.')}", *notes]
-    residual_nm = {
-        name: {night: _residual_nm(design, recorded) for night, recorded in made.items()}
-        for name, design in designs.items()
-    }
-    best = min(reversed(designs), key=lambda name: _worst(residual_nm, name)[0])
-    return NightsDesign(
-        design=designs[best], name=best, nights=made, residual_nm=residual_nm, notes=tuple(notes)
-    )
-
-
-def _worst(residual_nm: Mapping[str, Mapping[str, float]], name: str) -> tuple[float, str]:
-    """Return the largest ratio of a design, infinite where it is unstable, and its night."""
-    own = {night: residual_nm[night][night] for night in residual_nm[name]}
-    ratios = ((nm / own[night], night) for night, nm in residual_nm[name].items())
-    return max((np.inf if np.isnan(ratio) else ratio**2, night) for ratio, night in ratios)
-
-
-def _residual_nm(design: Design, night: RecordedDesign) -> float:
-    """Return what a design leaves by the model of a night, nan where it is unstable."""
-    loop = design.close(night.model.hardware)
-    if not loop.is_stable or unstable_gains(design, night.gains) is not None:
-        return np.nan
-    return float(residual_budget(loop, night.model.plant()).rms_nm)
-
-
-def _design_for_all(
-    nights: Mapping[str, RecordedDesign], method: str, *, command_scale_known: bool
-) -> tuple[Design, str]:
-    """Return the design for the mean of nights that is stable at all their gains, and a note."""
-    models = [night.model for night in nights.values()]
-    weights = [_residual_nm(night.design, night) ** -2 for night in nights.values()]
-    gains = np.array([night.gains for night in nights.values()])
+    weights = [residual_nm[night][night] ** -2 for night in made]
+    gains = np.array([recorded.gains for recorded in made.values()])
 
     def build(noise: float) -> Design:
-        plants = [noisier(model, noise).plant() for model in models]
-        return design_request(method, {}).build(PlantInputs(plant=mean_plant(plants, weights)))
+        plants = [noisier(recorded.model, noise).plant() for recorded in made.values()]
+        return design_request(chosen, {}).build(PlantInputs(plant=mean_plant(plants, weights)))
 
-    allowed = np.stack([gains[..., 0].min(axis=0), gains[..., 1].max(axis=0)], axis=1)
-    design, _, note = design_for_gains(
-        models[0], build, allowed, command_scale_known=command_scale_known
-    )
-    assumed = [
-        f"{name}: {assumption}"
-        for name, night in nights.items()
-        for assumption in night.design.assumptions
-        if not assumption.startswith(GAINS_LIE)
-    ]
-    return replace(design, assumptions=(*assumed, *design.assumptions)), note
+    try:
+        design, _, note = design_for_gains(
+            made[night].model,
+            build,
+            np.stack([gains[..., 0].min(axis=0), gains[..., 1].max(axis=0)], axis=1),
+            command_scale_known=options.get("command_scale_known") or not np.ptp(gains, -1).any(),
+        )
+    except SynthesisError as error:
+        notes.insert(0, f"no design for all nights: {str(error).rstrip('.')}")
+    else:
+        assumed = [
+            f"{night}: {assumption}"
+            for night, recorded in made.items()
+            for assumption in recorded.design.assumptions
+            if not assumption.startswith(GAINS_LIE)
+        ]
+        notes[:0] = [note] * bool(note)
+        designs[ALL] = replace(design, assumptions=(*assumed, *design.assumptions))
+        residual_nm[ALL] = _residuals_nm(design, made)
+    return NightsDesign(nights=made, designs=designs, residual_nm=residual_nm, notes=tuple(notes))
+
+
+def _residuals_nm(design: Design, nights: Mapping[str, RecordedDesign]) -> dict[str, float]:
+    """Return what a design leaves by the model of each night, nan where it is unstable."""
+    residual_nm = dict.fromkeys(nights, np.nan)
+    for name, night in nights.items():
+        loop = design.close(night.model.hardware)
+        if loop.is_stable and unstable_gains(design, night.gains) is None:
+            residual_nm[name] = float(residual_budget(loop, night.model.plant()).rms_nm)
+    return residual_nm
 
 
 def mean_plant(plants: Sequence[TipTiltPlant], weights: Sequence[float]) -> TipTiltPlant:
@@ -232,27 +230,30 @@ def mean_plant(plants: Sequence[TipTiltPlant], weights: Sequence[float]) -> TipT
         for share, plant in zip(shares, plants, strict=True)
         for line in plant.vibrations
     ]
-    return tip_tilt_plant(
-        frame_rate_hz=hardware.frame_rate_hz,
-        delay_frames=hardware.delay_frames,
-        turbulence=air,
-        vibrations=_merge(lines) or None,
-        noise_nm=np.tensordot(shares, noises, 1),
-        sensor_matrix=np.diag(gain),
-        mirror=hardware.mirror,
+    return assemble(
+        PlantParts(
+            hardware=replace(hardware, sensor_matrix=np.diag(gain)),
+            turbulence=tuple(air),
+            vibrations=tuple(_merge(lines)),
+            noise_factor=np.linalg.cholesky(np.tensordot(shares, noises, 1)),
+        )
     )
 
 
 def _merge(lines: Sequence[Vibration]) -> list[Vibration]:
-    """Return lines, those of a direction nearer than the half width of the wider one as one."""
+    """Return lines, with one for those that nearly are.
+
+    They have one direction, none is twice as wide, and they are nearer than its half width.
+    """
     merged = list[Vibration]()
     for line in sorted(lines, key=lambda one: (one.direction, one.sections, one.frequency_hz)):
         last = merged[-1] if merged else line
-        half_hz = max(one.damping * one.frequency_hz for one in (last, line))
+        half_hz, wider_hz = sorted(one.damping * one.frequency_hz for one in (last, line))
         same = (last.direction, last.sections) == (line.direction, line.sections)
-        if merged and same and line.frequency_hz - last.frequency_hz < half_hz:
-            strong, weak = sorted((merged.pop(), line), key=lambda one: -one.rms_nm)
-            rms_nm = float(np.hypot(strong.rms_nm, weak.rms_nm))
+        is_near = line.frequency_hz - last.frequency_hz < half_hz and wider_hz < 2 * half_hz
+        if merged and same and is_near:
+            weak, strong = sorted((merged.pop(), line), key=lambda one: one.rms_nm)
+            rms_nm = float(np.hypot(weak.rms_nm, strong.rms_nm))
             move_hz = (weak.rms_nm / rms_nm) ** 2 * (weak.frequency_hz - strong.frequency_hz)
             line = replace(strong, frequency_hz=strong.frequency_hz + move_hz, rms_nm=rms_nm)
         merged.append(line)
@@ -266,11 +267,9 @@ def require_one_loop(nights: Mapping[str, LoopRecord]) -> None:
             f"nights must be at least two; got {len(nights)}. Try design_from_record for one."
         )
     (first, record), *others = nights.items()
-    for name, other in others:
-        for fact, words in _FACTS.items():
-            expected, got = getattr(record, fact), getattr(other, fact)
-            if got != expected:
-                raise ProblemError(
-                    f"{name} has the {words} {got}, and {first} {expected}: one design is for the "
-                    f"nights of one loop. Say what is right, or leave {name} out."
-                )
+    for (name, other), fact in product(others, _FACTS):
+        if (got := getattr(other, fact)) != (expected := getattr(record, fact)):
+            raise ProblemError(
+                f"{name} has the {_FACTS[fact]} {got}, and {first} {expected}: one design is for "
+                f"the nights of one loop. Say what is right, or leave {name} out."
+            )

@@ -82,13 +82,24 @@ def test_lines_that_overlap_become_one_of_their_power() -> None:
     assert lines == pytest.approx({31.03: 60 / np.sqrt(2), 33.0: 60 / np.sqrt(2), 58.0: 25.0})
 
 
+def test_a_drift_and_a_line_at_its_frequency_stay_apart() -> None:
+    plant = true_plant(31.0)
+    for damping in (300.0, 0.3):
+        wide = Vibration(frequency_hz=31.01, damping=damping, rms_nm=90.0, direction=(1.0,))
+        drifting = lbt.models.plant.tip_tilt.with_vibrations(plant, [wide, *plant.vibrations])
+        mean = mean_plant([drifting, drifting, plant], [1.0, 1.0, 2.0])
+        lines = [(line.damping, line.rms_nm) for line in mean.vibrations]
+        assert np.array(lines) == pytest.approx(
+            np.array([MOVING, (damping, 90 / np.sqrt(2)), STILL[1:]])
+        )
+
+
 def test_the_design_for_all_nights_holds_on_nights_that_it_has_not_seen() -> None:
     """Of true nights of other lines, beside the filter for the truth of each."""
     made = three_nights()
     assert made.name == ALL
-    designs = {name: night.design for name, night in made.nights.items()} | {ALL: made.design}
     worst = {}
-    for name, design in designs.items():
+    for name, design in made.designs.items():
         truths = [true_plant(*facts) for facts in HELD_OUT]
         worst[name] = max(left_nm2(design, p) / left_nm2(lbt.kalman(p), p) for p in truths)
     assert worst[ALL] < 0.85 * min(worst[name] for name in NIGHTS)
@@ -116,9 +127,8 @@ def test_a_design_for_the_worst_place_of_each_line_leaves_more_on_the_nights_the
 
 def test_the_table_has_what_each_design_leaves_of_the_truth_of_each_night() -> None:
     made = three_nights()
-    designs = {name: night.design for name, night in made.nights.items()} | {ALL: made.design}
     for name, row in made.residual_nm.items():
-        expected = [np.sqrt(left_nm2(designs[name], true_plant(*NIGHTS[n]))) for n in row]
+        expected = [np.sqrt(left_nm2(made.designs[name], true_plant(*NIGHTS[n]))) for n in row]
         assert list(row.values()) == pytest.approx(expected, rel=0.15)
     assert made.worst("a") == pytest.approx(
         ((made.residual_nm["a"]["c"] / made.residual_nm["c"]["c"]) ** 2, "c")
@@ -154,8 +164,12 @@ def test_the_verdict_of_a_design_of_one_night(of_all, words) -> None:
     table = {"a": (10.0, np.nan), "b": (15.0, 20.0)} | ({ALL: of_all} if of_all else {})
     residual_nm = {name: dict(zip("ab", row, strict=True)) for name, row in table.items()}
     made = three_nights()
+    designs = {name: made.designs[name] for name in residual_nm}
     pair = {name: made.nights[name] for name in "ab"}
-    first, second = replace(made, name="b", nights=pair, residual_nm=residual_nm).verdict
+    made = replace(made, nights=pair, designs=designs, residual_nm=residual_nm)
+    assert made.name == "b"
+    assert made.design is made.nights["b"].design
+    first, second = made.verdict
     assert "that of a is unstable on b; that of b leaves 2.25 times" in first
     assert words in second
 
