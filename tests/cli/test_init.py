@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from support.commands import run
+from support.commands import refuse_commands, run_done, run_json
 
 import lbt_synth as lbt
 from lbt_synth.config.load import example_files, telescope_names
@@ -16,31 +16,28 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("telescope", telescope_names())
-def test_a_telescope_is_written_with_its_schema(here, capsys, telescope):
-    status, out, error = run(capsys, "init", "--telescope", telescope)
-    assert (status, error) == (0, "")
-    assert f"Next, put in your own numbers; then lbt-synth design {telescope}.yaml" in out
-    text = (here / f"{telescope}.yaml").read_text()
-    assert text.startswith("# yaml-language-server: $schema=lbt-synth.schema.json\n")
+def test_a_telescope_is_written_with_its_schema(here, capsys):
+    for telescope in telescope_names():
+        run_done(capsys, "init", "--telescope", telescope)
+        text = (here / f"{telescope}.yaml").read_text()
+        assert text.startswith("# yaml-language-server: $schema=lbt-synth.schema.json\n")
+        lbt.load_config(f"{telescope}.yaml")
     assert json.loads((here / "lbt-synth.schema.json").read_text()) == config_schema()
-    lbt.load_config(f"{telescope}.yaml")
 
 
 def test_nothing_is_replaced_without_force(here, capsys):
-    assert run(capsys, "init")[0] == 0
-    assert run(capsys, "init")[0] == 0  # the same again replaces nothing
+    for _ in range(2):  # the same again replaces nothing
+        run_done(capsys, "init")
     (here / "generic.yaml").write_text("mine")
-    status, _, error = run(capsys, "init")
-    assert status == 2
-    assert "generic.yaml would be replaced. Give another name by -o, or --force." in error
+    words = "generic.yaml would be replaced. Give another name by -o, or --force."
+    refuse_commands(capsys, [("init", words)])
     assert (here / "generic.yaml").read_text() == "mine"
-    status, out, _ = run(capsys, "init", "--force", "--json")
-    assert json.loads(out)["files"] == ["generic.yaml", "lbt-synth.schema.json"]
+    data = run_json(capsys, "init", "--force")
+    assert data["files"] == ["generic.yaml", "lbt-synth.schema.json"]
     lbt.load_config("generic.yaml")
 
 
 def test_the_examples_are_written_under_their_names(here, capsys):
-    assert run(capsys, "init", "--examples")[0] == 0
+    run_done(capsys, "init", "--examples")
     assert {file.name for file in (here / "examples").iterdir()} == set(example_files())
     lbt.studies.load_study("examples/study.yaml")

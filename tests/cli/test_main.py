@@ -22,18 +22,18 @@ ERRORS = [kind for kind in vars(lbt.errors).values() if isinstance(kind, type)]
 ERRORS = [kind for kind in ERRORS if issubclass(kind, lbt.errors.LbtSynthError)]
 
 
-@pytest.mark.parametrize("kind", ERRORS)
 @pytest.mark.parametrize("more", [(), ("--json",)])
-def test_an_error_is_a_status_and_a_line(capsys, monkeypatch, kind, more):
+def test_an_error_is_a_status_and_a_line(capsys, monkeypatch, more):
     def fails(*_):
         raise kind("some_name must\nbe 1.", in_python="Do.", at_terminal="Try it.")
 
     monkeypatch.setattr("lbt_synth.cli.design.load_with_digest", fails)
-    status, text, error = run(capsys, "show", "a.fits", *more)
-    assert status == next(code for base, code in STATUS.items() if issubclass(kind, base))
-    assert error == "lbt-synth: error: some_name must\\nbe 1. Try it.\n"
-    said = {"error": kind.__name__, "message": "some_name must\nbe 1. Try it."}
-    assert text == (json.dumps(said) + "\n" if more else "")
+    for kind in ERRORS:
+        status, text, error = run(capsys, "show", "a.fits", *more)
+        assert status == next(code for base, code in STATUS.items() if issubclass(kind, base))
+        assert error == "lbt-synth: error: some_name must\\nbe 1. Try it.\n"
+        said = {"error": kind.__name__, "message": "some_name must\nbe 1. Try it."}
+        assert text == (json.dumps(said) + "\n" if more else "")
 
 
 @pytest.mark.parametrize(
@@ -64,21 +64,16 @@ def test_the_package_runs_as_a_module():
     assert done.stdout == f"lbt-synth {lbt.__version__}\n"
 
 
-def test_version_and_help(capsys):
-    assert run(capsys, "--version")[1] == f"lbt-synth {lbt.__version__}\n"
-    status, text, _ = run(capsys, "--help")
-    assert status == 0
-    assert run(capsys) == (0, text, "")
-    for command in ("design", "show", "verify", "plot", "simulate", "robustness", "paper"):
-        assert command in text
+def test_no_words_are_a_question_for_help(capsys):
+    assert run(capsys) == run(capsys, "--help")
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_the_module_of_every_command_names_it(command):
-    run = command_line._find_command(command)
-    title = sys.modules[run.__module__].__doc__.splitlines()[0]
-    assert title.startswith("The command")
-    assert command in title.replace(",", " ").replace(":", " ").replace(".", " ").split()
+def test_the_module_of_every_command_names_it():
+    for command in COMMANDS:
+        module = sys.modules[command_line._find_command(command).__module__]
+        title = module.__doc__.splitlines()[0]
+        assert title.startswith("The command")
+        assert command in re.split(r"[,:.]? ", title), command
 
 
 def test_shells_complete_every_option():
@@ -131,60 +126,36 @@ def test_imports_are_quick(code):
     assert not heavy & loaded_after(code)
 
 
-def test_designing_needs_no_solver_that_it_does_not_use():
-    code = (
-        "import lbt_synth as lbt\n"
-        "p = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)\n"
-        "lbt.kalman(p)"
-    )
-    assert not {"cvxpy", "control", "matplotlib", "astropy"} & loaded_after(code)
-
-
-def loaded_by_command(*words):
-    """Modules in memory after a command ran."""
-    return loaded_after(f"from lbt_synth.cli.main import main; main({[str(w) for w in words]})")
-
-
-@pytest.mark.parametrize("method", ["kalman", "hinf", "integrator"])
+@pytest.mark.parametrize("method", ["kalman", "hinf"])
 def test_a_design_of_one_sensor_loads_what_it_uses(tmp_path, method):
     """What a design does not need took half of its time."""
-    ours = (
-        *("design.loop_shaping", "design.modal", "design.shaping.solution"),
-        *("design.mixed", "design.lqg"),
-        *(
-            "linear.output_feedback",
-            "loop.simulation",
-            "interop",
-            "config.end_to_end",
-            "studies.study",
-            "studies.robustness",
-        ),
-        *("report.figures", "report.page", "identification.fit", "identification.records"),
-    )
-    scipys = ("stats", "signal")
-    unused = {f"lbt_synth.{name}" for name in ours} | {f"scipy.{name}" for name in scipys}
+    ours = "design.loop_shaping design.modal design.shaping.solution design.mixed design.lqg "
+    ours += "linear.output_feedback loop.simulation interop config.end_to_end studies.study "
+    ours += "studies.robustness report.figures report.page identification.fit "
+    ours += "identification.records"
+    unused = {f"lbt_synth.{name}" for name in ours.split()} | {"scipy.stats", "scipy.signal"}
     unused |= {"control", "matplotlib", "bokeh", "jinja2", "weasyprint"}
     if method == "hinf":  # its inequalities are stated in cvxpy
         unused -= loaded_after("import cvxpy")
-    loaded = loaded_by_command("design", LBT_YAML, "--method", method, "-o", tmp_path / "d.fits")
+    words = ["design", str(LBT_YAML), "--method", method, "-o", str(tmp_path / "d.fits")]
+    loaded = loaded_after(f"from lbt_synth.cli.main import main; main({words})")
     assert "lbt_synth.design.certificate" in loaded
     assert not unused & loaded
     assert ("cvxpy" in loaded) is (method == "hinf")
 
 
-@pytest.mark.parametrize(("given", "expected"), [(None, "1"), ("3", "3")])
-def test_linear_algebra_has_one_thread_unless_the_user_says_otherwise(monkeypatch, given, expected):
+def test_linear_algebra_has_one_thread_unless_the_user_says_otherwise(monkeypatch):
     """Two threads on two busy cores made a design of 5 s take a minute."""
-    name = "OPENBLAS_NUM_THREADS"
-    monkeypatch.delenv(name, raising=False)
-    if given is not None:
-        monkeypatch.setenv(name, given)
-    seen = []
+    name, seen = "OPENBLAS_NUM_THREADS", []
     monkeypatch.setattr(command_line, "main", lambda: seen.append(os.environ[name]) or 0)
-    with pytest.raises(SystemExit):
-        command_line.entry_point()
-    assert seen == [expected]
-    assert os.environ.get(name) == given
+    for threads in ("3", None):
+        monkeypatch.setenv(name, "3")
+        if threads is None:
+            monkeypatch.delenv(name)
+        with pytest.raises(SystemExit):
+            command_line.entry_point()
+        assert os.environ.get(name) == threads
+    assert seen == ["3", "1"]
 
 
 def test_the_console_script_survives_a_closed_pipe():
@@ -221,9 +192,5 @@ def test_an_error_names_options_and_files(
 
 def test_in_python_arguments_keep_their_names():
     plant = lbt.load_config(LBT_YAML).plant
-    with pytest.raises(
-        lbt.errors.InfeasibleError, match=r"gamma must be .* Try gamma_ratio=1\.2\."
-    ):
+    with pytest.raises(lbt.errors.InfeasibleError, match=r"must be .* Try gamma_ratio=1\.2\."):
         lbt.hinf(plant, gamma=1.0)
-    with pytest.raises(lbt.errors.ProblemError, match="make an EstimationProblem"):
-        lbt.kalman(plant.ahead(200))

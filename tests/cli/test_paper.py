@@ -1,7 +1,9 @@
 """The commands paper and end-to-end: tables of the paper, and loops with a pyramid."""
 
+import contextlib
 import csv
 import importlib.metadata
+import io
 import json
 import os
 import re
@@ -13,7 +15,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.commands import run
 from support.end_to_end import CONFIG, load_setup, make_run
 from support.small_telescope import needs_specula, small_config
 
@@ -23,44 +24,29 @@ from lbt_synth.cli.main import main
 from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.interop.specula.simulation import mix_controller
 from lbt_synth.report.figures.studies import robustness_figure
-from lbt_synth.studies.paper import modal_row, paper_filters, plan_rows
 
 
-def test_paper_in_the_unit_of_the_user(tmp_path, capsys):
-    status, text, _ = run(capsys, "paper", "-o", tmp_path / "mas", "--unit", "mas", "--verbose")
-    assert status == 0
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """The folder of the paper, what the command says in mas, and its figure of robustness."""
+    drawn, said, folder = [], io.StringIO(), tmp_path_factory.mktemp("paper")
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
+        draw = lambda *rows: drawn.append(robustness_figure(*rows)) or drawn[-1]  # noqa: E731
+        patch.setattr(paper, "robustness_figure", draw)
+        assert main(["paper", "-o", str(folder), "--unit", "mas", "--verbose"]) == 0
+    return folder, said.getvalue(), drawn[0]
+
+
+def test_written_files(written):
+    folder, text, _ = written
     assert "Table III: Strehl ratio" in text
     assert re.search(r"turbulence pole, rms +0\.98860, 59\.38 mas ", text)
     assert re.search(r"80 mas as the rms of a sinusoid +80\.00 mas ", text)
     assert " nm" not in text
-    assert "797.0 nm" in (tmp_path / "mas" / "parameters.csv").read_text()  # CSV stays in nm
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("paper")
-
-
-@pytest.fixture(scope="module")
-def written(folder):
-    """The files of the paper, and the figures of robustness that were drawn for them."""
-    drawn = []
-
-    def draw(*arguments):
-        drawn.append(robustness_figure(*arguments))
-        return drawn[-1]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paper, "robustness_figure", draw)
-        rows = [(row, modal_row(row)) for row in plan_rows()]
-        return paper._write_paper(folder, rows, paper_filters()), drawn
-
-
-def test_written_files(folder, written):
-    files, _ = written
+    assert "797.0 nm" in (folder / "parameters.csv").read_text()  # CSV stays in nm
     tables = "table_ii.csv table_iii.csv parameters.csv paper_kalman.fits paper_hinf.fits"
     figures = "robustness.png robustness.pdf sigma.png sigma.pdf"
-    assert {path.name for path in files} == {*tables.split(), *figures.split()}
+    assert {path.name for path in folder.iterdir()} == {*tables.split(), *figures.split()}
     with (folder / "table_iii.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 30
@@ -69,8 +55,7 @@ def test_written_files(folder, written):
 
 
 def test_the_papers_points_lie_on_our_curves(written):
-    _, drawn = written
-    lines = {line.get_label(): line.get_xydata() for line in drawn[0].axes[0].get_lines()}
+    lines = {line.get_label(): line.get_xydata() for line in written[2].axes[0].get_lines()}
     assert len(lines) == 4
     for name in ("Kalman", "H∞"):
         ours, theirs = lines[name], sorted(map(tuple, lines[f"{name}, paper"]))

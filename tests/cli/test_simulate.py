@@ -4,176 +4,115 @@ import json
 import re
 
 import pytest
-from support.commands import run
+from support.commands import refuse_commands, run, run_done, run_json
 from support.drifting import drift_file
 from support.plants import LBT_YAML
 from support.several_sensors import CONFIG as SEVERAL_SENSORS
 from support.several_sensors import write_config
 
-from lbt_synth.cli.main import main
-
 CONFIG = str(LBT_YAML)
 
 
 def test_simulate(tmp_path, capsys, gains):
-    out = tmp_path / "run.png"
-    arguments = ("simulate", CONFIG, gains["kalman"], "--frames", 2000, "--cases", 2)
-    status, text, _ = run(capsys, *arguments, "-o", out)
-    assert status == 0
-    assert "Strehl ratio" in text
+    """A line for each gain file, as it would be alone: one seed is one weather."""
+    out, few = tmp_path / "run.png", ("--frames", 1000, "--cases", 2)
+    data = run_json(capsys, "simulate", CONFIG, *gains.values(), *few)
+    assert [row["design"] for row in data["designs"]] == list(gains)
+    words = ("simulate", CONFIG, gains["kalman"], *few)
+    (row,) = run_json(capsys, *words, "-o", out)["designs"]
+    assert row == data["designs"][0]
     assert out.exists()
-    data = json.loads(run(capsys, *arguments, "--json")[1])
-    (row,) = data["designs"]
     assert len(row["cases_strehl"]) == 2
     assert row["strehl_exact"] == pytest.approx(0.827, abs=0.002)
-    again = json.loads(run(capsys, *arguments, "--json")[1])
-    assert again == data  # seeds make runs repeatable
-    dim = json.loads(run(capsys, *arguments, "--json", "--sensor-gain", 0.4)[1])
+    dim = run_json(capsys, *words, "--sensor-gain", 0.4)
     assert dim["sensor_gain"] == 0.4
     assert dim["designs"][0]["strehl_exact"] < row["strehl_exact"]
 
 
 def test_a_mirror_of_little_stroke(capsys, gains):
-    arguments = ("simulate", CONFIG, gains["kalman"], "--frames", 500, "--cases", 1)
-    (free,) = json.loads(run(capsys, *arguments, "--json")[1])["designs"]
+    words = ("simulate", CONFIG, gains["kalman"], "--frames", 500, "--cases", 1)
+    (free,) = run_json(capsys, *words)["designs"]
     left = {}
     for form in ("plain", "estimator"):
-        limited = (*arguments, "--stroke", 1200, "--form", form)
-        (row,) = json.loads(run(capsys, *limited, "--json")[1])["designs"]
+        (row,) = run_json(capsys, *words, "--stroke", 1200, "--form", form)["designs"]
         left[form] = row["residual_simulated_nm"], row["clipped"]
     assert left["plain"] > left["estimator"] > (free["residual_simulated_nm"], 0)
     assert left["plain"][1] > left["estimator"][1] > 0
-    assert "note: the mirror clipped the commands of" in run(capsys, *limited)[1]
 
 
 def test_an_unstable_loop_has_status_1(capsys, gains):
-    status, out, error = run(
-        capsys, "simulate", CONFIG, gains["hinf"], "--sensor-gain", 0.3, "--json"
-    )
-    assert status == 1
-    assert json.loads(out)["error"] == "UnstableLoopError"
+    words = ("simulate", CONFIG, gains["hinf"], "--sensor-gain", 0.3, "--json")
+    status, out, error = run(capsys, *words)
+    assert (status, json.loads(out)["error"]) == (1, "UnstableLoopError")
     assert "the closed loop must be stable" in error
 
 
 def test_the_commands_simulate_it_or_refuse(tmp_path, capsys):
-    config, gain = str(drift_file(tmp_path)), str(tmp_path / "kalman.fits")
-    assert main(["design", config, "--method", "kalman", "-o", gain]) == 0
-    capsys.readouterr()
-    assert main(["simulate", config, gain]) == 0
-    out = capsys.readouterr().out
-    assert "a vibration drifts" in out
-    assert main(["simulate", config, gain, "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)["designs"]
+    """A vibration that drifts."""
+    config, gain = drift_file(tmp_path), tmp_path / "kalman.fits"
+    text = run_done(capsys, "design", config, "--method", "kalman", "-o", gain)
+    assert "a vibration of the truth drifts" in " ".join(text.split())
+    (row,) = run_json(capsys, "simulate", config, gain)["designs"]
     assert row["strehl_exact"] is None
     assert 0 < row["cases_strehl"][0] < 1
-    for refused in (
-        ["limits", config, gain],
-        ["robustness", config, gain, "-o", str(tmp_path / "r.csv")],
-        ["design", config, "--method", "integrator", "-o", str(tmp_path / "i.fits")],
-    ):
-        assert main(refused) == 2
-        assert "drifts from 17 to 23 Hz" in " ".join(capsys.readouterr().err.split())
-
-
-_OTHER_SENSORS = "runs with the sensors of the gain file beside the loop's own"
+    for words in ("limits CONFIG GAIN", "robustness CONFIG GAIN"):
+        rows = [(words, "drifts from 17 to 23 Hz")]
+        refuse_commands(capsys, rows, CONFIG=config, GAIN=gain)
 
 
 @pytest.fixture
 def config_file(tmp_path):
-    return write_config(tmp_path)
+    return write_config(tmp_path, SEVERAL_SENSORS)
 
 
 def test_sensors_that_fail_on_the_way(tmp_path, capsys, config_file, sensors_file):
+    """The run reaches beyond the last event."""
     figure = tmp_path / "drops.png"
-    status, text, _ = run(
-        capsys,
-        *("simulate", config_file, sensors_file, "--drop", "m2@0.5s", "-o", figure),
-        *("--drop", "wavefront@1s..1.2s:frozen", "--frames", 2000),
-    )
-    assert status == 0
-    assert "m2, wavefront" in text
+    drops = ("--drop", "m2@0.2s", "--drop", "wavefront@0.5s..0.7s:frozen")
+    data = run_json(capsys, "simulate", config_file, sensors_file, *drops, "--cases", 1)
+    assert data["frames"] == 5700
+    sensors = ["none", "m2", "m2, wavefront (frozen)", "m2"]
+    assert [row["sensors"] for row in data["segments"]] == sensors
+    short = ("--frames", 1000, "--cases", 1, "-o", figure)
+    text = run_done(capsys, "simulate", config_file, sensors_file, *drops, *short)
+    assert "Simulated between failures and returns" in text
     assert figure.stat().st_size > 10_000
 
 
-def test_the_run_reaches_beyond_the_last_event(capsys, config_file, sensors_file):
-    arguments = ("simulate", config_file, sensors_file, "--drop", "m2@0.5s", "--cases", 1, "--json")
-    data = json.loads(run(capsys, *arguments)[1])
-    assert data["frames"] == 5500
-    assert [row["sensors"] for row in data["segments"]] == ["none", "m2"]
-    assert "Simulated between failures and returns" in run(capsys, *arguments[:-1])[1]
+def test_what_it_refuses(capsys, config_file, sensors_file, gains):
+    rows = [
+        ("simulate SEVERAL SENSORS --drop m2", "--drop takes SENSOR@START..END"),
+        ("simulate SEVERAL SENSORS --drop m2@5s --frames 1000", "--frames must reach beyond"),
+        ("simulate SEVERAL SENSORS --stroke 100", "goes with a design of the loop's own sensor"),
+        ("simulate SEVERAL KALMAN --drop m2@1s", "--drop goes with a design of several sensors"),
+        ("simulate CONFIG KALMAN HINF -o a.png", "goes with one gain file; got 2."),
+        ("simulate CONFIG KALMAN HINF --telemetry a.fits", "goes with one gain file; got 2."),
+        ("plot sigma SENSORS", "is a design of several sensors"),
+        ("rehearse none.npz SENSORS --for c", "is a design of several sensors"),
+    ]
+    files = {"SEVERAL": config_file, "SENSORS": sensors_file, "CONFIG": CONFIG}
+    refuse_commands(capsys, rows, **files, KALMAN=gains["kalman"], HINF=gains["hinf"])
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("--drop", "m2"), "--drop takes SENSOR@START..END"),
-        (("--drop", "m2@5s", "--frames", 1000), "--frames must reach beyond"),
-        (("--stroke", 100), "--stroke goes with a design of the loop's own sensor alone."),
-    ],
-)
-def test_what_it_refuses(capsys, config_file, sensors_file, arguments, said):
-    status, out, error = run(capsys, "simulate", config_file, sensors_file, *arguments)
-    assert status != 0
-    assert out == ""
-    assert said in error
-
-
-def test_a_design_of_one_sensor_has_nothing_to_drop(capsys, config_file, gains):
-    status, _, error = run(capsys, "simulate", config_file, gains["kalman"], "--drop", "m2@1s")
-    assert status == 2
-    assert "--drop goes with a design of several sensors" in error
-
-
-@pytest.mark.parametrize("command", [("plot sigma",), ("rehearse none.npz", "--for", "c")])
-def test_commands_for_one_sensor_say_so(capsys, sensors_file, command):
-    status, out, error = run(capsys, *command[0].split(), sensors_file, *command[1:])
-    assert (status, out) == (2, "")
-    assert "is a design of several sensors" in error
-
-
-def test_show_prints_what_failures_do(capsys, sensors_file):
-    status, text, _ = run(capsys, "show", sensors_file, "--verbose")
-    assert status == 0
+def test_what_shows_a_design_of_several_sensors(capsys, config_file, sensors_file):
+    text = run_done(capsys, "show", sensors_file, "--verbose")
     assert "When sensors fail" in text
     assert "wavefront + slow + m1 + m2" in text
     assert "of the loop's own sensor in the truth" in text
-
-
-def test_verify_and_limits_take_it(tmp_path, capsys, sensors_file):
-    assert "verified" in run(capsys, "verify", sensors_file)[1]
-    few = write_config(tmp_path, SEVERAL_SENSORS + "robustness: {errors_hz: [0]}\n")
-    status, text, _ = run(capsys, "limits", few, sensors_file)
-    assert status == 0
+    assert "verified" in run_done(capsys, "verify", sensors_file)
+    text = run_done(capsys, "limits", config_file, sensors_file)
     assert re.search(r"^ +sensors +37\.40 ", text, re.MULTILINE)
-    assert _OTHER_SENSORS not in text
+    assert "runs with the sensors of the gain file" not in text
 
 
-@pytest.mark.parametrize("command", ["limits", "simulate"])
-def test_other_sensors_than_those_of_the_configuration_are_named(
-    tmp_path, capsys, sensors_file, command
-):
+def test_other_sensors_than_those_of_the_configuration_are_named(tmp_path, capsys, sensors_file):
     noisy = SEVERAL_SENSORS.replace("noise_m_s2: 2.0e-4", "noise_m_s2: 2.0e-2")
-    few = write_config(tmp_path, noisy + "robustness: {errors_hz: [0]}\n")
-    status, text, _ = run(capsys, command, few, sensors_file)
-    assert status == 0
-    assert _OTHER_SENSORS in text
+    words = ("simulate", write_config(tmp_path, noisy), sensors_file, "--frames", 500)
+    assert "runs with the sensors of the gain file beside the loop's own" in run_done(
+        capsys, *words
+    )
 
 
 def test_commands_that_read_the_own_sensor_alone_say_so(capsys, config_file):
-    status, text, _ = run(capsys, "tradeoff", config_file, "--points", 2)
-    assert status == 0
+    text = run_done(capsys, "tradeoff", config_file, "--points", 2, "--taps", 2)
     assert "note: the loop's own sensor is read alone, without slow, m1, m2." in text
-
-
-def test_several_gain_files_are_a_line_each(tmp_path, capsys, gains):
-    """Each line is what the command prints of the file alone: one seed is one weather."""
-    few = ("--frames", 500, "--cases", 2)
-    data = json.loads(run(capsys, "simulate", CONFIG, *gains.values(), *few, "--json")[1])
-    assert [row["design"] for row in data["designs"]] == list(gains)
-    for row, gain in zip(data["designs"], gains.values(), strict=True):
-        (alone,) = json.loads(run(capsys, "simulate", CONFIG, gain, *few, "--json")[1])["designs"]
-        assert row == alone
-    for option, name in (("-o", "a.png"), ("--telemetry", "a.fits")):
-        words = (*gains.values(), option, tmp_path / name)
-        status, _, error = run(capsys, "simulate", CONFIG, *words)
-        assert (status, "goes with one gain file; got 3." in error) == (2, True)

@@ -1,7 +1,6 @@
 """The command study: run, killed, interrupted, replayed, on Dask."""
 
 import contextlib
-import json
 import os
 import signal
 import subprocess
@@ -12,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.commands import run
+from support.commands import refuse_commands, run, run_done, run_json
 from support.studies import TWO, assert_whole, evaluate_quickly, part_rows, read_table, study_file
 
 import lbt_synth as lbt
@@ -62,61 +61,43 @@ def children(pid):
 
 
 def test_the_command(tmp_path, capsys):
-    path = study_file(tmp_path, samples="200", controllers=TWO, parameters=PARAMETERS)
-    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--verbose")
-    assert status == 0
+    path, folder = (
+        study_file(tmp_path, samples="40", controllers=TWO, parameters=PARAMETERS),
+        tmp_path / "out",
+    )
+    words = ("study", path, "-o", folder)
+    out = run_done(capsys, *words, "--verbose")
     for text in ("50th percentile", "unstable", "failed", "Worst samples of b", "sensor_gain"):
         assert text in out
-    assert "200 of 200 samples computed in" in out
-    study = lbt.studies.load_study(path)
-    assert_whole(tmp_path / "out", study, evaluate_samples)
-    assert b"<svg" in (tmp_path / "out" / "summary.html").read_bytes()
-    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--verbose")
-    assert status == 0
-    assert "is finished: 200 samples in results.csv; none computed" in out
-    for text in ("50th percentile", "sensor_gain", "unchanged: "):
-        assert text in out
-    page = tmp_path / "out" / "summary.html"
+    assert "40 of 40 samples computed in" in out
+    study, page = lbt.studies.load_study(path), folder / "summary.html"
+    assert_whole(folder, study, evaluate_samples)
+    assert b"<svg" in page.read_bytes()
     page.write_text("changed")
-    assert run(capsys, "study", path, "-o", tmp_path / "out")[0] == 0
+    data = run_json(capsys, *words)
+    assert (data["computed"], data["failures"]) == (0, 0)
+    table = read_table(folder / "results.csv")
+    for name, controller in zip("ab", data["statistics"]["controllers"], strict=True):
+        assert controller["mean"] == pytest.approx(np.nanmean(table[f"{name}.strehl"]), rel=1e-7)
     assert page.read_text() == "changed"
     page.unlink()
-    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--verbose")
-    assert status == 0
-    assert "200 samples" in out
+    out = run_done(capsys, *words, "--verbose")
+    assert "is finished: 40 samples in results.csv; none computed" in out
     assert f"written: {page}" in out
-    assert f"unchanged: {tmp_path / 'out' / 'results.csv'}" in out
+    assert f"unchanged: {folder / 'results.csv'}" in out
     assert b"computing time, of all processes together" in page.read_bytes()
-    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--row", "7")
-    assert status == 0
-    assert "Results of row 7" in out
-    assert (tmp_path / "out" / "row_7.yaml").exists()
-    status, out, error = run(capsys, "study", path, "-o", tmp_path / "out", "--row", "200")
-    assert (status, out) == (2, "")
-    assert "rows 0 to 199; got row 200" in error
-
-
-def test_json(tmp_path, capsys):
-    path = study_file(tmp_path, samples="20", parameters=PARAMETERS)
-    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--json")
-    data = json.loads(out)
-    assert (status, data["computed"], data["failures"]) == (0, 20, 0)
-    only = data["statistics"]["controllers"][0]
-    mean = np.mean(read_table(tmp_path / "out" / "results.csv")["slow.strehl"])
-    assert only["mean"] == pytest.approx(mean, rel=1e-7)
-    status, out, _ = run(capsys, "study", path, "-o", tmp_path / "out", "--row", "3", "--json")
-    again = json.loads(out)
-    assert again["fresh"]["slow.strehl"] == pytest.approx(again["stored"]["slow.strehl"], rel=1e-6)
+    again = run_json(capsys, *words, "--row", "7")
+    assert again["fresh"]["a.strehl"] == pytest.approx(again["stored"]["a.strehl"], rel=1e-6)
+    assert (folder / "row_7.yaml").exists()
+    rows = [(f"study {path} -o {folder} --row 40", "rows 0 to 39; got row 40")]
+    refuse_commands(capsys, rows)
 
 
 def test_dask_without_its_package(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     path = study_file(tmp_path, samples="4")
-    status, _, error = run(
-        capsys, "study", path, "-o", tmp_path / "out", "--dask", "tcp://localhost:8786"
-    )
-    assert status == 2
-    assert 'pip install "lbt-synth[dask]"' in error
+    words = f"study {path} -o {tmp_path}/out --dask tcp://localhost:8786"
+    refuse_commands(capsys, [(words, 'pip install "lbt-synth[dask]"')])
     assert not (tmp_path / "out").exists()
 
 
@@ -130,11 +111,10 @@ def undisturbed(tmp_path_factory):
     return read_table(done.results)
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_killed_it_goes_on_where_it_was(tmp_path, capsys, undisturbed, jobs):
+def test_killed_it_goes_on_where_it_was(tmp_path, capsys, undisturbed):
     path = study_file(tmp_path, samples="600", parameters=PARAMETERS)
     folder = tmp_path / "out"
-    first = started(path, "-o", folder, "--jobs", jobs)
+    first = started(path, "-o", folder, "--jobs", "2")
     wait_for(lambda: len(part_rows(folder)) >= 2, seconds=120)
     workers = children(first.pid)
     first.send_signal(signal.SIGKILL)
@@ -142,8 +122,7 @@ def test_killed_it_goes_on_where_it_was(tmp_path, capsys, undisturbed, jobs):
     kept = part_rows(folder)
     assert sum(stop - start for start, stop in kept) < 600
     wait_for(lambda: not any(alive(pid) for pid in workers))  # none is left behind
-    status, out, error = run(capsys, "study", path, "-o", folder)
-    assert status == 0, error
+    out = run_done(capsys, "study", path, "-o", folder)
     missing = 600 - sum(stop - start for start, stop in kept)
     assert f"{missing} of 600 samples computed" in out
     found = read_table(folder / "results.csv")

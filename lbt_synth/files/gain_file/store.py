@@ -218,14 +218,14 @@ def require_agreement(found: DesignRecord, expected: DesignRecord) -> None:
     Entries that no design has are left alone; a certificate is compared by
     :func:`require_certificate`.
     """
-    for name, own in expected.arrays.items():
+    for name, made in expected.arrays.items():
         array = found.arrays[name]
-        if array.shape != own.shape:
-            raise ValueError(f"{name} must be {own.shape} to match the design; got {array.shape}")
-        if not agree(array, own, _ARRAY_TOLERANCE):
-            apart = float(np.max(np.abs(array - own))) / max(float(np.max(np.abs(own))), 1e-300)
+        if array.shape != made.shape:
+            raise ValueError(f"{name} must be {made.shape} to match the design; got {array.shape}")
+        if not agree(array, made, _ARRAY_TOLERANCE):
+            apart = np.max(np.abs(array - made)) / np.max(np.abs([array, made]))
             raise ValueError(
-                f"{name} is not what plant, loop and gains make: it differs by {apart:.2g} of its "
+                f"{name} is not what plant, loop and gains make: it differs by {apart:.2g} of the "
                 "largest entry"
             )
     for key, value in expected.meta.items():
@@ -251,12 +251,11 @@ def require_certificate(stored: list[dict[str, Any]], computed: list[dict[str, A
 def require_same(found: Any, expected: Any, name: str) -> None:
     """Refuse plain metadata that are not the expected ones, numbers to a relative 1e-6."""
     if isinstance(expected, Mapping) and isinstance(found, Mapping):
-        for key in expected.keys() | found.keys():
-            if key not in expected:
-                raise ValueError(f"{name}.{key} is not known")
-            if key not in found:
-                raise ValueError(f"{name}.{key} is missing")
-            require_same(found[key], expected[key], f"{name}.{key}")
+        if unmatched := expected.keys() ^ found.keys():
+            word = "missing" if min(unmatched) in expected else "not known"
+            raise ValueError(f"{name}.{min(unmatched)} is {word}")
+        for key, value in expected.items():
+            require_same(found[key], value, f"{name}.{key}")
         return
     if isinstance(expected, list) and isinstance(found, list) and len(expected) == len(found):
         for i, (one, other) in enumerate(zip(found, expected, strict=True)):

@@ -36,7 +36,6 @@ MOST_GAINS = 1_000_000  # in the table: 8 MB of memory, 25 MB of source
 _IDENTIFIER = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 _SOURCE = re.compile(r"[A-Za-z0-9._+-]*\.c")
 _LONGEST = 25  # C99 distinguishes identifiers by 31 characters, six of them "_reset"
-_WIDTH = 96
 
 
 @table_row
@@ -158,7 +157,7 @@ def _exact_constant(value: float, *, single: bool) -> str:
 
 def _fill_lines(values: Iterable[str]) -> str:
     """Return entries of an array, indented, over as many lines as they need."""
-    return textwrap.fill(", ".join(values), _WIDTH, initial_indent="    ", subsequent_indent="    ")
+    return textwrap.indent(textwrap.fill(", ".join(values)), "    ")
 
 
 def _described(terms: SourceTerms) -> dict[str, Any]:
@@ -260,15 +259,13 @@ def _wrap_sum(terms: Sequence[tuple[str, str]]) -> str:
     """Return a sum of (sign, term) on lines of its own, none of which breaks a term."""
     text = " ".join(f"{sign} {term}".replace(" ", "\0") for sign, term in terms)
     text = text.removeprefix("+\0").replace("-\0", "-", text.startswith("-"))
-    indent = " " * 8
-    lines = textwrap.fill(text, _WIDTH - 1, initial_indent=indent, subsequent_indent=indent)
-    return "\n" + lines.replace("\0", " ")
+    return "\n" + textwrap.indent(textwrap.fill(text), "        ").replace("\0", " ")
 
 
 def _tables(terms: SourceTerms) -> dict[str, Any]:
     """Return the gains of each phase and of each set that is missing, and where they begin."""
     if not terms.tabled:
-        return {"gains": [], "count": 0, "due": [], "first": [], "sets": 0}
+        return {}
     units, gains = tuple(terms.rows), []
     sets = [
         frozenset(unit for i, unit in enumerate(units) if mask >> i & 1)

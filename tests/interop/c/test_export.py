@@ -440,12 +440,15 @@ def test_the_certificate_beside_the_source(sensor_files):
 
 
 def test_the_cost_is_that_of_the_source(sensor_files, sensors_design):
-    """Products of a frame in which all is read, counted in the text."""
-    text = sensor_files["double"].files[0].read_text()
-    cost = frame_cost(source_terms(sensors_design))
-    products = len(re.findall(r"[cv]\[\d+\] \*", text.split("int double_step")[1]))
-    estimates = int(re.search(r"add\(state->x, (\d+), gains", text)[1])
-    assert cost.multiplications == products + 6 * estimates
+    """Products and sums of a frame in which all is read, counted in the text."""
+    text = sensor_files["double"].files[0].read_text().split("int double_step")[1]
+    written, cost = (
+        "".join(re.findall(r"=\n([^;]*);", text)),
+        frame_cost(source_terms(sensors_design)),
+    )
+    gains = 6 * int(re.search(r"add\(state->x, (\d+), gains", text)[1])
+    assert cost.multiplications == written.count(" * ") + gains
+    assert cost.additions == written.count(" + ") + written.count(" - ") + gains
 
 
 @pytest.fixture(scope="module")
