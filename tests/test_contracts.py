@@ -15,7 +15,7 @@ FORBIDDEN = {
     "design/new_method.py": ("cvxpy", "Only linear.lmi imports cvxpy"),
     "interop/new_program.py": ("specula", "Only interop.specula.optics imports specula"),
     "files/telemetry/new_format.py": ("aotpy", "Only files.telemetry.aot imports aotpy"),
-    "studies/study/new_pool.py": ("distributed", "Only cli.study imports distributed"),
+    "studies/study/new_pool.py": ("distributed", "Only studies.grid imports distributed"),
     "report/page/new_chart.py": ("bokeh", "Only report.explore imports bokeh"),
     "report/page/new_sheet.py": ("weasyprint", "Only report.page.html imports weasyprint"),
     "report/new_page.py": ("jinja2", "Only report.page.html imports jinja2"),

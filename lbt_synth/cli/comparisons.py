@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import Any, NoReturn
 
 import numpy as np
 
-from lbt_synth import models, studies
+from lbt_synth import studies
 from lbt_synth.cli.loop_inputs import (
     load_designs,
     load_shown,
@@ -21,13 +20,11 @@ from lbt_synth.cli.output import PERCENT, RMS, Report
 from lbt_synth.cli.streams import track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.design.modal import modal_filters, modal_gains
-from lbt_synth.errors import ConfigError, ProblemError
+from lbt_synth.errors import ProblemError
 from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residual import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
-from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.report.designs import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_map_figure
 from lbt_synth.report.figures.studies import (
@@ -39,7 +36,7 @@ from lbt_synth.report.figures.studies import (
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.limits import LimitRow, LimitStudy, limits, say_residual
+from lbt_synth.studies.limits import LimitRow, LimitStudy, compare_modes, limits, say_residual
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, mirror_rows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
@@ -175,7 +172,7 @@ def run_mirror(arguments: Namespace) -> Report:
     plant, shell = config.plant.own_sensor_alone(), config.hardware.mirror
     if shell is None:
         why = "is missing: without it the mirror settles at once. lbt_slow_mirror.yaml of"
-        _refuse_key(config, "mirror.local_loop", f"{why} lbt-synth init --examples has it")
+        config.refuse_key("mirror.local_loop", f"{why} lbt-synth init --examples has it")
     hardware, step = plant.hardware, shell.step_response(arguments.tolerance)
     rows = mirror_rows(
         plant, config.truth, config.imaging, command_weight=config.settings.design.command_weight
@@ -234,14 +231,14 @@ def run_robustness(arguments: Namespace) -> Report:
         )
         maps[name] = replace(grid, sensor_gains=frozen_copy(gains))  # the real ones again
     real = int(np.argmin(np.abs(gains - config.sensor_gain * config.truth.sensor_gain)))
-    lines = [line for name in maps for line in _map_lines(name, maps[name], real)]
+    lines = [line for name, grid in maps.items() for line in grid.worst_points(name, real)]
     where = f"frequency errors of {np.min(errors):+g} to {np.max(errors):+g} Hz"
     caption = f"At a sensor gain of {gains[real]:.3g}: {config.imaging.label}, over {where}"
     report = Report(
         verdict=_say_maps(maps, real, where),
         tables=[row_table(caption, lines)],
         notes=named_difference_notes(config, designs),
-        rows=[point for name, grid in maps.items() for point in _map_points(name, grid)],
+        rows=[point for name, grid in maps.items() for point in grid.points(name)],
         figure=lambda: robustness_map_figure(maps),
     )
     report.data["maps"] = {name: asdict(grid) for name, grid in maps.items()}
@@ -279,117 +276,26 @@ def _parse_range(
     return np.linspace(low, high, int(count))
 
 
-def _map_points(name: str, grid: RobustnessMap) -> list[Facts]:
-    """Return a row for each point of the map of a gain file."""
-    axes = grid.delay_errors_frames, grid.sensor_gains, grid.errors_hz
-    names = ("delay_error_frames", "sensor_gain", "error_hz")
-    return [
-        facts(
-            file=fact(name),
-            **{key: fact(float(axis[i])) for key, axis, i in zip(names, axes, place, strict=True)},
-            strehl=fact(float(strehl)),
-            residual_nm=fact(float(grid.residual_nm[place])),
-            stable=fact(bool(grid.stable[place[:2]])),
-        )
-        for place, strehl in np.ndenumerate(grid.strehl)
-    ]
-
-
-def _map_lines(name: str, grid: RobustnessMap, real: int) -> Iterator[Facts]:
-    """Yield a row for each delay error at the real sensor gain, with its worst frequency error."""
-    for i, delay in enumerate(grid.delay_errors_frames):
-        stable, strehls = bool(grid.stable[i, real]), grid.strehl[i, real]
-        worst = int(np.argmin(strehls)) if stable else 0
-        centre = strehls[grid.errors_hz == 0]
-        at_hz = grid.errors_hz[worst] if stable else np.nan
-        yield facts(
-            file=fact(name, "file"),
-            delay_error=fact(delay, "delay error", unit="frames", format="+g"),
-            stable=fact(stable, "stable"),
-            centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **PERCENT),
-            worst=fact(strehls[worst], "worst Strehl", **PERCENT),
-            worst_hz=fact(at_hz, "at", unit="Hz", format="+.2f"),
-        )
-
-
 def run_modal(arguments: Namespace) -> Report:
     """Compare integrators, optimised gains and Kalman filters, mode by mode."""
     config = load_shown(arguments, all_modes=True)
-    settings, hardware = config.settings, config.hardware
-    modes = settings.mirror.modes if arguments.modes is None else arguments.modes
+    modes = config.settings.mirror.modes if arguments.modes is None else arguments.modes
     if modes is None:
-        _refuse_key(config, "mirror.modes", "is missing; give it, or --modes")
-    modes = integer(modes, "modes", at_least=2)
-    reason = "the turbulence of hundreds of modes is computed from it"
-    air = models.modal_turbulence(
-        config.require_atmosphere(reason), modes=modes, frame_rate_hz=hardware.frame_rate_hz
-    )
-    for key, value in (
-        ("sensor.noise_nm", config.noise_nm),
-        ("model.sensor_gain", settings.model.sensor_gain),
-    ):
-        if np.ndim(value):
-            _refuse_key(config, key, "must be one number for hundreds of modes; got one per axis")
-    pyramid, noise_nm = settings.sensor.pyramid, np.full(modes, float(config.noise_nm))
-    if pyramid is not None:
-        modulation = pyramid.modulation_lambda_over_d
-        noise_nm = models.pyramid_modal_noise_nm(
-            float(config.noise_nm), modes=modes, modulation_lambda_over_d=modulation
-        )
-    lines = dict[int, list[models.Vibration]]()
-    for line in config.plant.vibrations:  # each axis by itself
-        for axis, share in enumerate(line.direction):
-            if abs(share) > 1e-9:  # more than rounding
-                tilted = replace(line, rms_nm=abs(share) * line.rms_nm, direction=(1.0,))
-                lines.setdefault(axis, []).append(tilted)
-    loop: dict[str, Any] = {"hardware": hardware, "noise_nm": noise_nm, "vibrations": lines}
-    loop["sensor_gain"] = config.sensor_gain
-    gains = modal_gains(air, **loop)
-    residuals = {
-        "integrators, optimised gains": gains.rms_nm,
-        "Kalman filters": modal_filters(air, **loop).rms_nm,
-    }
-    totals_nm = {name: float(np.linalg.norm(rms_nm)) for name, rms_nm in residuals.items()}
-    air_nm = float(np.linalg.norm(air.rms_nm))
+        config.refuse_key("mirror.modes", "is missing; give it, or --modes")
+    study = compare_modes(config, integer(modes, "modes", at_least=2))
+    totals_nm = {name: float(np.linalg.norm(rms)) for name, rms in study.residual_nm.items()}
+    air_nm = float(np.linalg.norm(study.turbulence_nm))
     leaves = [f"{name} {nm_text(rms, '.1f')} rms" for name, rms in totals_nm.items()]
     report = Report(data={"modes": modes, "residual_nm": totals_nm, "turbulence_nm": air_nm})
     report.verdict.append(
         f"Of {nm_text(air_nm, '.1f')} rms of turbulence in {modes} modes, what is left is: "
         f"{'; '.join(leaves)}."
     )
+    shown = {"gains": study.gains, "turbulence_nm": study.turbulence_nm}
     report.add_rows(
         "rows",
         "By radial order, residuals over its modes",
-        _order_rows(air.rms_nm, noise_nm, gains.gains, *residuals.values()),
-        figure=lambda: modal_figure(residuals, gains=gains.gains, turbulence_nm=air.rms_nm),
+        study.by_radial_order(),
+        figure=lambda: modal_figure(study.residual_nm, **shown),
     )
     return report
-
-
-def _refuse_key(config: Config, key: str, why: str) -> NoReturn:
-    raise ConfigError(f"{config.source}: the key {key} {why}.", path=key)
-
-
-def _order_rows(
-    air_nm: FloatArray, noise_nm: FloatArray, gains: FloatArray, *residuals: FloatArray
-) -> list[Facts]:
-    """Return a row for each radial order: root sums of squares over its modes."""
-    radial, _ = noll_orders(noise_nm.size)
-    rows = []
-    for order in np.unique(radial):
-        which = radial == order
-        turbulence_nm, *left_nm = (
-            float(np.linalg.norm(rms_nm[which])) for rms_nm in (air_nm, *residuals)
-        )
-        rows.append(
-            facts(
-                radial_order=fact(int(order), "radial order"),
-                modes=fact(int(which.sum()), "modes"),
-                turbulence_nm=fact(turbulence_nm, "turbulence", **RMS),
-                noise_nm=fact(float(noise_nm[which][0]), "noise per mode", unit="nm", format=".2f"),
-                gain=fact(float(gains[which].mean()), "mean gain", format=".3f"),
-                optimised_nm=fact(left_nm[0], "optimised gains", **RMS),
-                kalman_nm=fact(left_nm[1], "Kalman", **RMS),
-            )
-        )
-    return rows

@@ -1,38 +1,29 @@
-"""The command study: run a study, say what it would cost, or replay one of its rows.
-
-Its work, and that of end-to-end, is done by processes of this machine or by a Dask cluster. Nothing
-else imports Dask.
-"""
+"""The command study: run a study, or replay one of its rows."""
 
 from __future__ import annotations
 
-import os
 from argparse import Namespace
 from collections.abc import Iterator
-from concurrent.futures import Executor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-import lbt_synth
 from lbt_synth import studies
 from lbt_synth.cli.loop_inputs import load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import count_progress, print_error
-from lbt_synth.errors import MissingExtraError, ProblemError
 from lbt_synth.report import study_page, write_page
 from lbt_synth.report.page.html import require_weasyprint
 from lbt_synth.report.pages import study_verdict
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing
-from lbt_synth.storage.thread_limits import WorkerPool, limit_threads
 from lbt_synth.storage.words import duration_text
+from lbt_synth.studies.grid import choose_engine
 from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, replay_row
 from lbt_synth.studies.study.statistics import study_statistics, summary_tables, worst_table
 from lbt_synth.studies.study.study import Study
 from lbt_synth.validation import integer
 
-_TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
 _FAILURE = ("row", "controller", "error")
 _WORST = 3  # rows of each controller that are printed; the page has more
 
@@ -121,23 +112,6 @@ def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     return report
 
 
-def choose_engine(
-    arguments: Namespace,
-) -> AbstractContextManager[tuple[Executor | None, int | None]]:
-    """Provide the executor of ``--dask`` or of ``--jobs`` with its workers; None for one job."""
-    if (dask := getattr(arguments, "dask", None)) is not None:
-        return connect_cluster(dask)
-    return nullcontext((None, None)) if arguments.jobs == 1 else _start_processes(arguments.jobs)
-
-
-@contextmanager
-def _start_processes(jobs: int) -> Iterator[tuple[Executor, int]]:
-    """Provide processes with one thread each, which end at once if the block fails."""
-    integer(jobs, "--jobs", at_least=1, at_most=8 * (os.cpu_count() or 1))
-    with limit_threads(), WorkerPool(jobs) as pool:
-        yield pool, jobs
-
-
 @contextmanager
 def run_in_parts(
     arguments: Namespace, folder: Path, *, total: int, what: str
@@ -147,7 +121,7 @@ def run_in_parts(
     An interruption says where what is finished stays.
     """
     with (
-        choose_engine(arguments) as (executor, workers),
+        choose_engine(arguments.jobs, getattr(arguments, "dask", None)) as (executor, workers),
         count_progress(total=total, what=what) as count,
     ):
         make_directory(folder)
@@ -156,46 +130,3 @@ def run_in_parts(
         except KeyboardInterrupt:
             print_error(f"what is finished is kept in {folder}; start it again to continue")
             raise
-
-
-@contextmanager
-def connect_cluster(address: str) -> Iterator[tuple[Executor, int]]:
-    """Provide the executor of a Dask scheduler with this package, and how many threads it has.
-
-    A scheduler can run code on its clients: name only one that you trust. Dask's own configuration
-    names the files of an encrypted connection.
-    """
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise MissingExtraError(
-            '--dask needs dask.distributed; try: pip install "lbt-synth[dask]".', extra="dask"
-        ) from error
-    try:
-        client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        text = " ".join(str(error).split()) or "no answer"
-        raise ProblemError(
-            f"no Dask scheduler answers at {address!r} ({text.rstrip('.')}). Expected an address "
-            "such as tcp://host:8786; start one with dask scheduler, and dask worker."
-        ) from error
-    with client:
-        try:
-            client.wait_for_workers(1, timeout=_TIMEOUT_S)
-        except TimeoutError as error:
-            raise ProblemError(
-                f"the scheduler at {address} has no workers; start some with dask worker {address}."
-            ) from error
-        _require_versions(address, client)
-        yield client.get_executor(pure=False), sum(client.ncores().values())
-
-
-def _require_versions(address: str, client: Any) -> None:
-    """Refuse workers without this version, whose results would be others."""
-    hosts = client.get_versions(packages=["lbt_synth"])["workers"]
-    versions = {host["packages"].get("lbt_synth") or "none" for host in hosts.values()}
-    if versions != {lbt_synth.__version__}:
-        raise ProblemError(
-            f"all workers must have lbt_synth {lbt_synth.__version__}, as here; those of {address} "
-            f"have {', '.join(sorted(versions))}. Start them from the same environment."
-        )

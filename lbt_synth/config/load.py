@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
@@ -172,9 +172,12 @@ class Config(Summarised):
     def require_atmosphere(self, reason: str) -> Atmosphere:
         """Return the atmosphere; raise ConfigError with the reason if the file has none."""
         if self.atmosphere is None:
-            text = f"{self.source}: the key atmosphere is missing: {reason}."
-            raise ConfigError(text, path="atmosphere")
+            self.refuse_key("atmosphere", f"is missing: {reason}")
         return self.atmosphere
+
+    def refuse_key(self, key: str, why: str) -> NoReturn:
+        """Raise ConfigError for a key of the file, in the words after its name."""
+        raise ConfigError(f"{self.source}: the key {key} {why}.", path=key)
 
     @property
     def end_to_end(self) -> EndToEndSetup:

@@ -409,7 +409,7 @@ def stacked_response(matrices: tuple[FloatArray, ...], z: ComplexArray) -> Compl
     direct = C @ np.linalg.solve(pencils, B.astype(np.complex128)) + D
     apart = np.max(np.abs(out[probes] - direct), axis=(0, 2, 3))
     agree = apart <= _AGREEMENT * np.max(np.abs(direct), axis=(0, 2, 3))
-    for k in np.flatnonzero(~agree):
+    for k in np.flatnonzero(~agree).tolist():
         out[:, k] = pointwise_response(StateSpace(A=A[k], B=B[k], C=C[k], D=D[k]), z)
     return out
 

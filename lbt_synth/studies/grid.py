@@ -2,7 +2,8 @@
 
 What a loop leaves has the same columns for one loop and for a stack of them. A part of a
 :class:`Sweep` holds the results of a fixed number of consecutive rows in a file that is named by
-them, and a sweep that was killed at any moment goes on with the rows that no part has.
+them, and a sweep that was killed at any moment goes on with the rows that no part has. The work is
+done in line, by processes of this machine, or by a Dask cluster; nothing else imports Dask.
 """
 
 from __future__ import annotations
@@ -21,7 +22,14 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
-from lbt_synth.errors import LbtSynthError, NumericalError, OutputError
+import lbt_synth
+from lbt_synth.errors import (
+    LbtSynthError,
+    MissingExtraError,
+    NumericalError,
+    OutputError,
+    ProblemError,
+)
 from lbt_synth.loop import ClosedLoop, Imaging, residual_budget, strehl
 from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.models import Truth
@@ -33,7 +41,8 @@ from lbt_synth.storage.atomic_files import (
     write_atomically,
 )
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.validation import FloatArray
+from lbt_synth.storage.thread_limits import WorkerPool, limit_threads
+from lbt_synth.validation import FloatArray, integer
 
 Rows = tuple[int, int]  # the first, and the one after the last
 Failure = tuple[int, str, str]  # a row, the controller without a result on it, and why
@@ -42,6 +51,7 @@ RESIDUALS = {"residual_nm": "rms_nm"} | {  # columns, and the attributes of what
     name: name for name in ("turbulence_nm", "vibration_nm", "noise_nm", "within_nm")
 }
 _PART = re.compile(r"([0-9]{10})-([0-9]{10})\.npz")
+_TIMEOUT_S = 10  # for a scheduler of Dask and its first worker to answer
 _DELETE = "Delete it, and it is computed again."
 
 
@@ -232,3 +242,63 @@ def _explain_failure(rows: Rows) -> Iterator[None]:
             "of memory, or has another lbt_synth than this one. What is written is kept: start "
             "the study again, perhaps with fewer jobs, and it goes on from there."
         ) from error
+
+
+def choose_engine(
+    jobs: int, dask: str | None = None
+) -> contextlib.AbstractContextManager[tuple[futures.Executor | None, int | None]]:
+    """Provide the executor of a Dask scheduler or of processes with its workers; None for one."""
+    if dask is not None:
+        return connect_cluster(dask)
+    return contextlib.nullcontext((None, None)) if jobs == 1 else _start_processes(jobs)
+
+
+@contextlib.contextmanager
+def _start_processes(jobs: int) -> Iterator[tuple[futures.Executor, int]]:
+    """Provide processes with one thread each, which end at once if the block fails."""
+    integer(jobs, "--jobs", at_least=1, at_most=8 * (os.cpu_count() or 1))
+    with limit_threads(), WorkerPool(jobs) as pool:
+        yield pool, jobs
+
+
+@contextlib.contextmanager
+def connect_cluster(address: str) -> Iterator[tuple[futures.Executor, int]]:
+    """Provide the executor of a Dask scheduler with this package, and how many threads it has.
+
+    A scheduler can run code on its clients: name only one that you trust. Dask's own configuration
+    names the files of an encrypted connection.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise MissingExtraError(
+            '--dask needs dask.distributed; try: pip install "lbt-synth[dask]".', extra="dask"
+        ) from error
+    try:
+        client: Any = Client(address, timeout=_TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        text = " ".join(str(error).split()) or "no answer"
+        raise ProblemError(
+            f"no Dask scheduler answers at {address!r} ({text.rstrip('.')}). Expected an address "
+            "such as tcp://host:8786; start one with dask scheduler, and dask worker."
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_TIMEOUT_S)
+        except TimeoutError as error:
+            raise ProblemError(
+                f"the scheduler at {address} has no workers; start some with dask worker {address}."
+            ) from error
+        _require_versions(address, client)
+        yield client.get_executor(pure=False), sum(client.ncores().values())
+
+
+def _require_versions(address: str, client: Any) -> None:
+    """Refuse workers without this version, whose results would be others."""
+    hosts = client.get_versions(packages=["lbt_synth"])["workers"]
+    versions = {host["packages"].get("lbt_synth") or "none" for host in hosts.values()}
+    if versions != {lbt_synth.__version__}:
+        raise ProblemError(
+            f"all workers must have lbt_synth {lbt_synth.__version__}, as here; those of {address} "
+            f"have {', '.join(sorted(versions))}. Start them from the same environment."
+        )

@@ -158,6 +158,38 @@ class RobustnessMap:
     residual_nm: FloatArray  # (d, g, e): of the modes [nm rms]; nan where the loop is unstable
     stable: BoolArray  # (d, g): whether the loop is, which a frequency error does not change
 
+    def points(self, name: str) -> list[Facts]:
+        """Return a row for each point of the map of a file."""
+        axes = self.delay_errors_frames, self.sensor_gains, self.errors_hz
+        names = ("delay_error_frames", "sensor_gain", "error_hz")
+        return [
+            facts(
+                file=fact(name),
+                **{n: fact(float(axis[i])) for n, axis, i in zip(names, axes, place, strict=True)},
+                strehl=fact(float(strehl)),
+                residual_nm=fact(float(self.residual_nm[place])),
+                stable=fact(bool(self.stable[place[:2]])),
+            )
+            for place, strehl in np.ndenumerate(self.strehl)
+        ]
+
+    def worst_points(self, name: str, gain: int) -> Iterator[Facts]:
+        """Yield the worst frequency error for each delay error at one of the sensor gains."""
+        percent = {"unit": "%", "scale": 100, "format": ".2f"}
+        for i, delay in enumerate(self.delay_errors_frames):
+            stable, strehls = bool(self.stable[i, gain]), self.strehl[i, gain]
+            worst = int(np.argmin(strehls)) if stable else 0
+            centre = strehls[self.errors_hz == 0]
+            at_hz = self.errors_hz[worst] if stable else np.nan
+            yield facts(
+                file=fact(name, "file"),
+                delay_error=fact(delay, "delay error", unit="frames", format="+g"),
+                stable=fact(stable, "stable"),
+                centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **percent),
+                worst=fact(strehls[worst], "worst Strehl", **percent),
+                worst_hz=fact(at_hz, "at", unit="Hz", format="+.2f"),
+            )
+
 
 def robustness_map(
     design: Design,

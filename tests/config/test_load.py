@@ -162,10 +162,13 @@ def test_the_smallest_file_of_the_documentation(tmp_path):
     assert lbt.load_config(path).design("kalman").certificate.passed
 
 
-def test_there_is_a_template_of_each_telescope():
+def test_templates_and_examples_come_with_the_package():
     assert telescope_names() == list(NAMES)
     with pytest.raises(ProblemError, match="must be one of elt, gemini"):
         telescope_template("hale")
+    for name, text in example_files().items():
+        assert text == (ROOT / "examples" / name).read_text()
+    assert set(example_files()) == {path.name for path in (ROOT / "examples").glob("*.yaml")}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -193,9 +196,3 @@ def test_every_number_of_a_template_has_a_source_or_is_assumed(name):
     assert cited == sources
     for mark in re.findall(r"^# \[\d\] (.+(?:\n#     .+)*)", head, re.MULTILINE):
         assert "http" in mark or "eris_vib" in mark or "morfeo" in mark
-
-
-def test_the_examples_of_the_documentation_come_with_the_package():
-    for name, text in example_files().items():
-        assert text == (ROOT / "examples" / name).read_text()
-    assert set(example_files()) == {path.name for path in (ROOT / "examples").glob("*.yaml")}

@@ -48,7 +48,7 @@ def test_the_ends_of_the_front(plant, ends):
 
 def test_more_taps_never_do_worse_and_converge(plant, ends):
     bound = 1.05 * ends[0].gamma_least
-    rms = [lbt.mixed(plant, gamma=bound, taps=taps).rms for taps in (1, 4, 16, 32)]
+    rms = [lbt.mixed(plant, gamma=bound, taps=taps).rms for taps in (1, 4, 12, 16)]
     assert all(more <= fewer * (1 + 1e-7) for fewer, more in itertools.pairwise(rms))
     assert rms[2] / rms[3] - 1 < 2e-4
 

@@ -36,25 +36,17 @@ def test_a_printed_design_has_at_most_ten_lines_and_its_facts(config, design):
     assert shown["modulus margin"] == [f"{margins.modulus:.6g}"]
     count = len(design.certificate.checks)
     assert shown["certificate"] == [f"{count} of {count} checks passed"]
-    for method in ("kalman", "integrator", "lqg", "hinf"):
+    for method in ("kalman", "integrator"):
         lines = str(config.design(method)).splitlines()
         own = [line for line in lines if line.startswith(("  residual in its model", "  gain"))]
         assert len(own) == 1
         assert len(lines) <= 10
 
 
-def test_what_is_shown_of_odd_designs(design):
+def test_what_is_shown_of_a_failed_check_and_of_a_bare_problem(design):
     failed = replace(design.certificate.checks[0], value=2.0, limit=1.0)
     certificate = replace(design.certificate, checks=(failed,))
-    text = str(replace(design, certificate=certificate, assumptions=("the gain is 1",)))
-    assert f"failed: {failed.name}" in text
-    assert text.endswith("assumes: the gain is 1.")
-    slow, quick = (
-        replace(design.hardware, delay_frames=9.0),
-        lbt.integrator(design.hardware, gain=0.9),
-    )
-    assert not lbt.close_loop(slow, quick).is_stable
-    assert set(values(str(replace(quick, problem=slow)))) == {"gain", "certificate"}
+    assert f"failed: {failed.name}" in str(replace(design, certificate=certificate))
     walk = lbt.EstimationProblem(A=1.0, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     shown = values(str(lbt.kalman(walk)))  # without units or margins
     assert shown["estimation error, rms"] == ["1.27202"]  # the root of the golden ratio

@@ -134,7 +134,7 @@ def test_peaks_of_a_band_and_of_the_real_part_against_a_dense_grid(seed, n, m):
 
 
 @pytest.mark.parametrize("through", [0.0, 3.0])
-def test_the_norm_ofindependent_parts_is_the_largest_of_theirs(through):
+def test_the_norm_of_independent_parts_is_the_largest_of_theirs(through):
     """Two equal lags, a third one, a state that nothing moves, and a path without states."""
     poles, gains = [0.5, 0.8, 0.5, 0.99], [1.0, 0.3, 1.0, 0.0]
     B, D = np.diag([1.0, 1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 0.0, through])

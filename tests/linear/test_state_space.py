@@ -4,15 +4,12 @@ import control
 import numpy as np
 import pytest
 import scipy.signal
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support.periodic_problems import relative_distance
 from support.refusals import require_refusals
 from support.systems import random_system
 
 import lbt_synth as lbt
 from lbt_synth.linear.lyapunov import stationary_covariance
-from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.linear.state_space import balancing_scales, pointwise_response, stacked_response
 
 
@@ -56,19 +53,6 @@ def test_frequency_responses_of_defective_matrices(n):
     z = np.exp(2j * np.pi * frequency)
     response = system.frequency_response(frequency)[:, 0, 0]
     assert np.max(np.abs(response * (z - 0.9) ** n - 1)) < 1e-9
-
-
-@settings(max_examples=10)
-@given(seed=st.integers(0, 100_000), n=st.integers(1, 9), m=st.integers(1, 4), p=st.integers(1, 4))
-def test_many_points_and_few_points_agree(seed, n, m, p):
-    A, B, C, D = random_system(seed, n, m, p, 0.95)
-    system = lbt.linear.StateSpace(A=A, B=B, C=C, D=D)
-    frequency = np.linspace(0, 0.5, 101)
-    many = system.frequency_response(frequency)
-    few = np.concatenate([system.frequency_response(frequency[i : i + 1]) for i in range(101)])
-    assert np.allclose(many, few, rtol=1e-10, atol=1e-10 * np.abs(few).max())
-    sigma = np.linalg.svd(few, compute_uv=False)[:, 0]
-    assert np.allclose(spectral_norms(system.frequency_response(frequency)), sigma, rtol=1e-10)
 
 
 def test_a_pole_on_the_unit_circle_has_no_response():

@@ -131,17 +131,16 @@ def test_many_jitters_are_integrated_as_each_of_them():
 
 def test_wrong_input_is_refused():
     jitter = partial(lbt.strehl, imaging=CAMERA)
-    for call in (
-        lambda: jitter(np.eye(3)),
-        lambda: jitter([[1, 0], [0, -1]]),
-        lambda: jitter([[np.nan]]),
-        lambda: jitter([[1.0]], line_amplitudes_nm=[[np.inf]]),
-        lambda: jitter(np.zeros((3, 2, 2)), line_amplitudes_nm=np.zeros((2, 1, 2))),
-        lambda: series_strehl(np.zeros((10, 3)), CAMERA),
-        lambda: series_strehl(np.zeros(10), CAMERA),
-        lambda: series_strehl([[np.nan, 1]], CAMERA),
-        lambda: lbt.Imaging(diameter_m=8, other_modes=1.2),
-        lambda: lbt.Imaging(diameter_m=0),
-    ):
+    lines = np.zeros((2, 1, 2))
+    calls = [partial(jitter, wrong) for wrong in (np.eye(3), [[1, 0], [0, -1]], [[np.nan]])]
+    calls += [partial(jitter, [[1.0]], line_amplitudes_nm=[[np.inf]])]
+    calls += [partial(jitter, np.zeros((3, 2, 2)), line_amplitudes_nm=lines)]
+    series = np.zeros((10, 3)), np.zeros(10), [[np.nan, 1]]
+    calls += [partial(series_strehl, wrong, CAMERA) for wrong in series]
+    calls += [
+        partial(lbt.Imaging, diameter_m=8, other_modes=1.2),
+        partial(lbt.Imaging, diameter_m=0),
+    ]
+    for call in calls:
         with pytest.raises(lbt.errors.ProblemError):
             call()

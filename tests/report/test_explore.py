@@ -109,9 +109,9 @@ def test_performance_is_that_of_the_budget(start, first):
 
 def test_an_unstable_loop_has_no_numbers(start, first):
     shown = show_design(first.design, move(start, {"gain": 2.4}), start, 0.0)
-    for title in ("Rejection", "Noise", "Residual spectrum", "Strehl ratio"):
-        assert np.all(np.isnan(shown.curves[title][1]))
-    assert np.isnan([shown.residual_nm, shown.strehl]).all()
+    titles = ("Rejection", "Noise", "Residual spectrum", "Strehl ratio")
+    curves = [shown.curves[title][1] for title in titles]
+    assert np.isnan([shown.residual_nm, shown.strehl, *np.concatenate(curves)]).all()
 
 
 @pytest.fixture(scope="module")
@@ -175,11 +175,12 @@ def test_a_shift_moves_the_truth_alone(tmp_path, five):
 
 
 def test_the_loop_and_the_sky(tmp_path, five):
-    values = {"delay": 3.25, "gain": 0.5, "noise": 40.0, "seeing": 1.1, "wind": 31.0}
-    after = move(five, values)
-    assert (after.hardware.delay_frames, after.truth.sensor_gain) == (3.25, 0.5)
-    assert after.noise_nm == pytest.approx(40.0)
-    assert (after.atmosphere.seeing_arcsec, after.atmosphere.wind_speed_m_s) == (1.1, 31.0)
+    after = move(five, {"delay": 3.25, "gain": 0.5, "noise": 40.0, "seeing": 1.1, "wind": 31.0})
+    air = after.atmosphere
+    numbers = after.hardware.delay_frames, after.truth.sensor_gain, after.noise_nm
+    assert (*numbers, air.seeing_arcsec, air.wind_speed_m_s) == pytest.approx(
+        (3.25, 0.5, 40.0, 1.1, 31.0)
+    )
     content = change_key(("sensor",), {"noise_nm": [30.0, 40.0]})
     content["model"] |= {"turbulence": AR, "sensor_gain": 0.5}
     content["truth"] |= {"turbulence": "model", "sensor_gain": 0.25}
@@ -258,7 +259,6 @@ def test_a_slider_that_moves_is_a_new_design(page):
     curves = page["Rejection"].renderers[-1].data_source
     before = curves.data["y"][0]
     page["delay"].value = 3.0
-    assert page["verdict"].text == "Designing …"
     assert page.settle() == "Designing …"  # no verdict before it is released
     assert curves.data["name"] == ["Kalman", "old"]
     assert not np.array_equal(curves.data["y"][0], before)

@@ -77,14 +77,11 @@ def test_facts_leave_out_what_does_not_apply():
     assert table.rows[-2:] == (("limit", "9", "nm"), ("stable", "no", ""))
 
 
-def test_the_docstring_lists_the_columns():
+def test_rows_are_documented_frozen_and_compared_by_value():
     assert Loop.__doc__.startswith("One loop.\n\nAttributes\n----------\nname : str\n    Name of")
     assert "error_hz : float\n    Model less truth [Hz].\n" in Loop.__doc__
     assert "strehl : float\n    Strehl ratio.\n" in Loop.__doc__
     assert "design" not in [each.name for each in columns(Loop)]
-
-
-def test_rows_are_frozen_and_compared_by_value():
     assert dataclasses.replace(GOOD, design="another") == GOOD
     with pytest.raises(dataclasses.FrozenInstanceError):
         GOOD.gamma = 1.0

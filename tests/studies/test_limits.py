@@ -51,9 +51,6 @@ def test_bad_studies(config, lbt_designs):
     ):
         with pytest.raises(lbt.errors.ProblemError, match=words):
             call()
-
-
-def test_a_design_without_a_plant_has_no_limits():
     bare = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     assert not model_limits(lbt.kalman(bare))
 

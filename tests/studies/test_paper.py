@@ -77,9 +77,6 @@ def test_the_tables_as_planned(rows):
 
     assert frequencies("slow-v") == {40 - row.model_hz for row in TABLE_III}
     assert frequencies("kal") == {20.0}
-
-
-def test_seeds_are_shared_by_the_controllers(rows):
     for row, cases in rows:
         seeds = [case["setup"].seed for case in cases.values()]
         expected = [0, 1] if row.table == "II" or row.error_hz == 0 else [0]
@@ -162,9 +159,5 @@ def test_only_what_is_missing_runs_again(tmp_path, setup, runs):
     again = given.end_to_end_tables(setup, tmp_path, **options)
     assert (len(runs), sum(counted)) == (14, 24)
     assert [entry.values for entry in again] == [entry.values for entry in first]
-
-
-def test_runs_of_other_settings_are_not_mixed_in(tmp_path, setup, runs):
-    given.end_to_end_tables(setup, tmp_path, seeds=[0], tables=["II"])
     with pytest.raises(OutputError, match="is of another study"):
         given.end_to_end_tables(replace(setup, gain=0.4), tmp_path, seeds=[0], tables=["II"])

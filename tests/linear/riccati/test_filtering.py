@@ -90,24 +90,6 @@ def test_the_bracket_is_closed(seed, n, q, l):
     assert riccati.gamma <= kalman.gamma * (1 + 1e-9)
 
 
-@settings(max_examples=5)
-@given(seed=st.integers(0, 10_000))
-def test_the_bracket_does_not_depend_on_the_units_of_states(seed):
-    rng = np.random.default_rng(seed)
-    problem = random_problem(rng, 4)
-    units = 10.0 ** rng.uniform(-5, 5, 4)
-    scaled = lbt.EstimationProblem(
-        A=problem.A * units[:, None] / units,
-        B=problem.B * units[:, None],
-        C=problem.C / units,
-        D=problem.D,
-        L=problem.L / units,
-    )
-    one, other = (lbt.hinf(p, route="riccati") for p in (problem, scaled))
-    assert other.gamma_least == pytest.approx(one.gamma_least, rel=1e-8)
-    assert other.gamma_infeasible == pytest.approx(one.gamma_infeasible, rel=1e-8)
-
-
 def slow_line(rate_hz, frequency_hz, damping, rms_nm, noise_nm):
     """One axis with AR1 turbulence and a line."""
     air = lbt.models.ARModel(coefficients=[0.9986], driving_rms_nm=22.7, frame_rate_hz=rate_hz)

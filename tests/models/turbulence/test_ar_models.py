@@ -19,13 +19,10 @@ SITE = {"seeing_arcsec": 0.8, "wind_speed_m_s": 20, "diameter_m": 8.22}
 RATE = 800.0
 
 
-def test_ar1_is_stationary_with_the_von_karman_variance(air):
+def test_models_of_the_lbt(air):
     model = lbt.models.ar1_turbulence(air, frame_rate_hz=800)
     assert model.rms_nm == pytest.approx(air.tilt_rms_nm, rel=1e-12)
     assert model.coefficients == pytest.approx([0.98860], abs=5e-6)  # the pole of Le Roux et al.
-
-
-def test_ar2_fit_of_the_lbt(air):
     model = lbt.models.ar2_turbulence(air, frame_rate_hz=800, noise_nm=15.5)
     assert model.coefficients == pytest.approx([1.997477, -0.997555], abs=2e-5)
 

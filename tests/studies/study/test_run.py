@@ -16,7 +16,6 @@ from support.studies import (
     make_folder,
     part_rows,
     read_table,
-    study_file,
 )
 
 import lbt_synth as lbt
@@ -245,9 +244,8 @@ BOTH = "{kalman: {design: kalman}, own: {design: kalman, for: sample}}"
 
 def agree(tmp_path, *, base, controllers, parameters, count=COUNT, **more):
     """Hold each column against the evaluation one by one; return the columns and failures."""
-    study = lbt.studies.load_study(
-        study_file(tmp_path, base=base, controllers=controllers, parameters=parameters, **more)
-    )
+    sections = {"controllers": controllers, "parameters": parameters}
+    study = load_small_study(tmp_path, base=base, **sections, **more)
     values = study.values(0, count)
     columns, failures = evaluate_samples(study, values, 0)
     single, failed = evaluate_samples(study, values, 0, together=False)
@@ -399,13 +397,8 @@ def test_every_number_of_a_configuration(tmp_path, path, value):
 
 
 def test_two_answers_stop_a_study(tmp_path, monkeypatch):
-    study = lbt.studies.load_study(
-        study_file(
-            tmp_path,
-            base=BASE,
-            controllers=FIXED,
-            parameters="{truth.sensor_gain: {uniform: [0.4, 1]}}",
-        )
+    study = load_small_study(
+        tmp_path, controllers=FIXED, parameters="{truth.sensor_gain: {uniform: [0.4, 1]}}"
     )
     real = evaluation.ensemble_residuals
 
