@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design import Design
-from lbt_synth.errors import LbtSynthError, ProblemError, SynthesisError
+from lbt_synth.errors import CertificateError, LbtSynthError, ProblemError, SynthesisError
 from lbt_synth.identification.auto import (
     GAINS_LIE,
     RecordedDesign,
@@ -133,6 +133,8 @@ def design_from_nights(
     ------
     ProblemError
         If there are less than two nights, or they are not of one loop.
+    CertificateError
+        If no design is stable on all nights.
     LbtSynthError
         As :func:`design_from_record`; the message begins with the name of the night.
 
@@ -197,7 +199,11 @@ def design_from_nights(
         notes[:0] = [note] * bool(note)
         designs[ALL] = replace(design, assumptions=(*assumed, *design.assumptions))
         residual_nm[ALL] = _residuals_nm(design, made)
-    return NightsDesign(nights=made, designs=designs, residual_nm=residual_nm, notes=tuple(notes))
+    best = NightsDesign(nights=made, designs=designs, residual_nm=residual_nm, notes=tuple(notes))
+    if best.worst(best.name)[0] == np.inf:
+        alone, _ = best.verdict
+        raise CertificateError(f"no design is stable on all nights. {alone} Leave a night out.")
+    return best
 
 
 def _residuals_nm(design: Design, nights: Mapping[str, RecordedDesign]) -> dict[str, float]:

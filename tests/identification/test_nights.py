@@ -10,7 +10,7 @@ import pytest
 from support.recorded_loops import RATE, slow, spliced_record
 
 import lbt_synth as lbt
-from lbt_synth.errors import ProblemError
+from lbt_synth.errors import CertificateError, ProblemError
 from lbt_synth.identification import LoopRecord, design_from_nights, nights
 from lbt_synth.identification.nights import ALL, NightsDesign, mean_plant
 from lbt_synth.models import TipTiltPlant, Vibration
@@ -195,6 +195,18 @@ def test_a_design_that_is_unstable_on_a_night_has_no_number() -> None:
     assert np.isnan(made.residual_nm["dim"]["bright"])
     assert made.worst("dim") == (np.inf, "bright")
     assert "that of dim is unstable on bright; that of bright leaves" in made.verdict[0]
+
+
+def test_nights_of_which_no_design_holds_all_are_refused(monkeypatch) -> None:
+    def away(design: lbt.Design, gains: np.ndarray) -> np.ndarray | None:
+        """Return a gain that is another one than that of the design."""
+        return None if np.allclose(gains, design.hardware.sensor) else gains[:, 0]
+
+    monkeypatch.setattr(nights, "unstable_gains", away)
+    records = {name: night(seed, *NIGHTS[name], frames=5000) for seed, name in enumerate("ab")}
+    with pytest.raises(CertificateError, match="no design is stable on all nights. The") as caught:
+        design_from_nights(records)
+    assert "that of b is unstable on a; that of a is unstable on b. Leave a" in str(caught.value)
 
 
 @pytest.mark.parametrize(
