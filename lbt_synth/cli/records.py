@@ -136,7 +136,8 @@ def run_auto(arguments: Namespace) -> Report:
         say_checks(design.certificate.checks),
         f"The loop has a modulus margin of {loop_margins(loop).modulus:.3f}.",
     ]
-    _add_design(report, design)
+    report.data |= {"certificate": design.certificate.passed, "assumptions": design.assumptions}
+    report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
     write_files(report, places, arguments, record, made.model, made)
     return report
 
@@ -185,15 +186,10 @@ def _run_nights(arguments: Namespace, gain: Path) -> Report:
         for name, residual_nm in made.residual_nm.items()
     ]
     report.add_rows("nights", "Residual by the model of each night", rows)
-    _add_design(report, design)
-    report.note_written(save_gain(gain, design))
-    return report
-
-
-def _add_design(report: Report, design: Design) -> None:
-    """Add the certificate of a design, and what it assumes."""
     report.data |= {"certificate": design.certificate.passed, "assumptions": design.assumptions}
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
+    report.note_written(save_gain(gain, design))
+    return report
 
 
 def _say_held_out(
