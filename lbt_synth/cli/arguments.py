@@ -63,6 +63,8 @@ _SHARED = """
   series
     file | | telemetry, or FITS, NPY, NPZ, CSV, HDF5, MATLAB or IDL with what a loop measured and
         commanded, or an open-loop series (identify: or a spectrum)
+    known
+  known
     reading
     > what is known beforehand
     --noise-nm | float nargs:+ | noise per frame of the sensor [nm], beside a spectrum without
@@ -70,8 +72,7 @@ _SHARED = """
     --most-lines | int =20 | most vibrations per axis
     >
     wavelength
-  record
-    series
+  judged
     --accept-record | switch | go on although the commands do not reach the measurements as given
     --no-figure | switch | write no figure beside the output (.png)
   accelerometers
@@ -172,14 +173,17 @@ _TABLE = """
     >
     -o --output | | file to write (.fits, .npz or .aot.fits)
   identify | records | Identify turbulence, vibrations, noise and sensor gain from a record.
-    record accelerometers
+    series judged accelerometers
     >
     -o --output | required | configuration to write (.yaml)
   auto | records | Go from a record to a gain file: identify, design, certify, test on unseen data.
-    record accelerometers
+    files | nargs:+ meta:file | a record, as of identify, or one of each of several nights for one
+        design that serves all of them
+    known judged accelerometers
     >
     --method | @record_methods | default: kalman, unless another quick one leaves less
-    -o --output | required | gain file (.fits or .npz); the configuration goes beside it (.yaml)
+    -o --output | required | gain file (.fits or .npz); the configuration of one record goes beside
+        it (.yaml)
   diagnose | records | Say what ran in a record, what is wrong, what it costs, and what to change.
     series
     gain | nargs:? | gain file (.fits or .npz) to try on the record

@@ -11,7 +11,7 @@ from lbt_synth import identification
 from lbt_synth.cli.arguments import given_options, refuse_options
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs, say_accelerometers
 from lbt_synth.cli.output import Report, say_checks
-from lbt_synth.cli.streams import count_progress
+from lbt_synth.cli.streams import count_progress, printable
 from lbt_synth.cli.telemetry import load_series, record_imaging, record_telescope, require_series
 from lbt_synth.config.write import RAISED, config_text, identified_config, require_writable_facts
 from lbt_synth.errors import LbtSynthError, ProblemError
@@ -24,7 +24,7 @@ from lbt_synth.identification.accelerometers.transfers import (
     accelerometer_transfers,
 )
 from lbt_synth.identification.commands.verdict import explain_commands
-from lbt_synth.identification.fit.identified_model import IdentifiedAxis, model_tables
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis, model_tables, say_count
 from lbt_synth.identification.records.record import LEAST_SECONDS, require_length
 from lbt_synth.loop import Imaging, loop_margins
 from lbt_synth.report.draw import save_figure
@@ -32,10 +32,11 @@ from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.page.html import require_page_names, write_page
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import row_table
+from lbt_synth.storage.rows import fact, facts, row_table
 from lbt_synth.storage.words import count_text
 
 if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not need
+    from lbt_synth.design import Design
     from lbt_synth.identification.auto import RecordedDesign
 
 
@@ -87,14 +88,16 @@ def _say_model(report: Report, model: IdentifiedModel, record: LoopRecord | Spec
             f"{count_text(len(lines), 'vibration')}, the strongest of "
             f"{nm_text(strongest.rms_nm, '.1f')} rms at {strongest.frequency_hz:.2f} Hz."
         )
-    report.verdict += [said, f"What the model does not explain {leaves}."]
+    report.verdict += [said, say_count(model), f"What the model does not explain {leaves}."]
 
 
 def run_auto(arguments: Namespace) -> Report:
     """Identify a loop, design its controller, test it on unseen data, write its gain file."""
     from lbt_synth.identification.auto import LEAST_SECONDS  # with it come the methods
 
-    gain = require_gain_name(arguments.output)
+    gain, arguments.file = require_gain_name(arguments.output), arguments.files[0]
+    if len(arguments.files) > 1:
+        return _run_nights(arguments, gain)
     places = find_places(arguments, gain=gain)
     record = require_series(read_record(arguments, LEAST_SECONDS), "auto tests its design on")
     choose_unit(arguments, record.diameter_m)
@@ -106,14 +109,13 @@ def run_auto(arguments: Namespace) -> Report:
             method=arguments.method,
             imaging=imaging,
             accept_record=arguments.accept_record,
-            command_scale_known="--command-scale" in record.read_with
-            or "--command-matrix" in record.read_with,
+            command_scale_known=_knows_scale(record),
             accelerations=values,
             channels=channels,
             progress=count,
             **identification_options(arguments, record),
         )
-    made = with_repair(record, made)
+    made = replace(made, design=_with_repairs(made.design, record))
     design, table = made.design, made.held_out
     report = Report(data={"source": str(arguments.file), "method": design.method})
     report.add_rows(
@@ -137,6 +139,56 @@ def run_auto(arguments: Namespace) -> Report:
     report.data |= {"certificate": design.certificate.passed, "assumptions": design.assumptions}
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
     write_files(report, places, arguments, record, made.model, made)
+    return report
+
+
+def _knows_scale(record: LoopRecord) -> bool:
+    """Whether the commands were read at a size that the user gave."""
+    return any(option in record.read_with for option in ("--command-scale", "--command-matrix"))
+
+
+def _run_nights(arguments: Namespace, gain: Path) -> Report:
+    """Design for several nights at once, and compare with the designs of each."""
+    of_one = ["accelerometers", "accelerometer_rate_hz", "acceleration_unit", "commands"]
+    refuse_options(arguments, [*of_one, "noise_nm", "wavelength_um"], "is for one record")
+    names = [printable(Path(path).name) for path in arguments.files]
+    if len(set(names)) != len(names):
+        raise ProblemError(f"each record must have a name of its own; got {', '.join(names)}.")
+    require_writable(gain, inputs=arguments.files)
+    nights = dict[str, LoopRecord]()
+    for name, path in zip(names, arguments.files, strict=True):
+        series = load_series(Namespace(**vars(arguments) | {"file": path}))
+        nights[name] = require_series(series, "auto tests its design on").bridged()
+    with count_progress(total=_STEPS * len(names), what="identifying and designing") as count:
+        made = identification.design_from_nights(
+            nights,
+            method=arguments.method,
+            progress=count,
+            accept_record=arguments.accept_record,
+            command_scale_known=all(map(_knows_scale, nights.values())),
+            lowest_line_hz=arguments.lowest_line_hz,
+            most_lines=arguments.most_lines,
+        )
+    choose_unit(arguments, nights[names[0]].diameter_m)
+    design = _with_repairs(made.design, *nights.values())
+    report = Report(
+        data={"sources": arguments.files, "written": made.name, "method": design.method},
+        verdict=[*made.verdict, say_checks(design.certificate.checks)],
+        notes=[marked_note(note) for note in made.notes],
+    )
+    words = {"unit": "nm", "format": ".1f", "missing": "unstable"}
+    rows = [
+        facts(
+            design=fact(name, "design of"),
+            **{night: fact(nm, night, **words) for night, nm in residual_nm.items()},
+            worst_ratio=fact(made.worst(name)[0], "variance / own, at worst", format=".3f"),
+        )
+        for name, residual_nm in made.residual_nm.items()
+    ]
+    report.add_rows("nights", "Residual by the model of each night", rows)
+    report.data |= {"certificate": design.certificate.passed, "assumptions": design.assumptions}
+    report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
+    report.note_written(save_gain(gain, design))
     return report
 
 
@@ -398,15 +450,13 @@ def _axis_record(axis: IdentifiedAxis) -> dict[str, Any]:
         "turbulence": asdict(axis.turbulence_fit)
         | {"coefficients": turbulence.coefficients, "driving_rms_nm": turbulence.driving_rms_nm},
         "vibrations": [asdict(line) for line in axis.parts],
-        **{name: getattr(axis, name) for name in shown},
+        **{name: getattr(axis, name) for name in (*shown, "over_fewer", "over_more")},
         "whiteness": {name: getattr(whiteness, name) for name in tests},
     }
 
 
-def with_repair(record: LoopRecord, made: RecordedDesign) -> RecordedDesign:
-    """Return what was made of a record, with the repair of its commands as an assumption."""
-    if not record.read_with:
-        return made
-    words = f"the commands of the record were read with {record.read_with}"
-    design = replace(made.design, assumptions=(words, *made.design.assumptions))
-    return replace(made, design=design)
+def _with_repairs(design: Design, *records: LoopRecord) -> Design:
+    """Return a design with the repairs of the commands of its records as assumptions."""
+    repairs = dict.fromkeys(record.read_with for record in records if record.read_with)
+    words = [f"the commands of the record were read with {options}" for options in repairs]
+    return replace(design, assumptions=(*words, *design.assumptions))

@@ -58,6 +58,7 @@ from lbt_synth.validation import FloatArray, choice, require_instance
 
 _DRIFT_SHARE = 0.3  # of the residual, that an offset may leave without a note
 LEAST_SECONDS = 2 * LEAST_RECORD_SECONDS  # usable: half of it has to show a model
+GAINS_LIE = "the sensor gain lies within"  # begins what a design assumes of it
 DELAY_ERROR = 0.1  # frames, by which every design of a record may be off
 _MOST_NOISE = 10  # octaves of noise, by which a filter trusts its sensor no more
 _MISFIT = 1.5  # factor by which a gain may be off where the model leaves something out
@@ -73,6 +74,7 @@ class RecordedDesign(Summarised):
     # residuals on the second half: what ran, a design from the first half, references
     held_out: PredictionTable
     name: str  # row of the design in held_out, the title of its method
+    gains: FloatArray  # (axes, 2): ends of the sensor gains that the record allows
     channels: tuple[ChannelValue, ...] = ()  # what each accelerometer is worth, if they are read
     notes: tuple[str, ...]  # warnings about the design
 
@@ -197,12 +199,14 @@ def design_from_record(
     if request.method.of_record:  # one penalty, that of the noise as it is, for all trials
         inputs["penalty"] = regress(record, model, channels=beside).penalty
     made_of = partial(design_inputs, record, model, **inputs)
+    allowed = allowed_gains(record, model) if finds_gain else None
     made, noise, price = design_for_gains(
         model,
         lambda noise: request.build(made_of(noise=noise)),
-        allowed_gains(record, model) if finds_gain else None,
+        allowed,
         command_scale_known=command_scale_known,
     )
+    known = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1)
     title, tested = request.method.title, held_out
     if noise > 1:
         one = {method: requests[method]}
@@ -219,6 +223,7 @@ def design_from_record(
         half_model=half,
         held_out=held_out,
         name=title,
+        gains=known if allowed is None else allowed,
         channels=channel_values(record, half, beside) if of_record and beside else (),
         notes=(
             *notes,
@@ -431,7 +436,7 @@ def design_for_gains(
     if allowed is not None:
         intervals = allowed
         sentence = (
-            f"the sensor gain lies within {_in_words(allowed)}, as the record and its model allow; "
+            f"{GAINS_LIE} {_in_words(allowed)}, as the record and its model allow; "
             "the loop is stable at all of these"
         )
         if command_scale_known:

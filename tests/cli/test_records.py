@@ -9,7 +9,7 @@ import pytest
 from support.commands import refuse_commands, run, run_done, run_json
 from support.diagnoses import given_design, line_record
 from support.night import GAIN, LINE_HZ, NOISE
-from support.recorded_loops import RATE
+from support.recorded_loops import RATE, spliced_record
 
 import lbt_synth as lbt
 from lbt_synth.identification.fit import whittle
@@ -31,6 +31,8 @@ def test_identify_writes_a_configuration_that_designs(tmp_path, capsys, recorded
     out = tmp_path / "model.yaml"
     text = run_done(capsys, "identify", recorded_night, "-o", out, "--wavelength-um", 1.65)
     assert text.startswith("1 vibration, the strongest of ")
+    told = r"tells 1 component from 0 by at most \d+ and from 2 by about \d+ units"
+    assert re.search(told, " ".join(text.split()))
     assert "\nVibrations\n" in text
     assert out.with_suffix(".png").stat().st_size > 10_000
     config = lbt.load_config(out)
@@ -127,6 +129,8 @@ def test_auto_tests_its_design_on_unseen_data(tmp_path, capsys, recorded_night, 
     assert rows["what ran"]["data_nm"] == pytest.approx(true * GAIN / gain, rel=0.05)
     assert data["gain_over_what_ran"]["residual_nm"][1] == kalman["data_nm"]
     assert (data["certificate"], data["method"]) == (True, "kalman")
+    assert data["axes"][0]["over_fewer"] > data["axes"][0]["over_more"] > 0
+    assert data["axes"][1]["over_fewer"] is None  # without a component
     assert data["units"]["data_error_nm"] == "nm"
     assert lbt.load_gain(out).certificate.passed
     assert lbt.load_config(data["model"]).plant.vibrations
@@ -143,6 +147,27 @@ def test_an_open_loop_series_and_one_axis(tmp_path, capsys, recorded_loop):
     assert "note: the Kalman filter stays: " in text
     assert lbt.load_config(tmp_path / "t.yaml").plant.hardware.modes == 1
     assert not (tmp_path / "t.png").exists()
+
+
+def test_several_nights_make_one_design_and_a_table(tmp_path, capsys) -> None:
+    for seed, hz in enumerate((29.0, 33.0)):
+        record = spliced_record((seed,), lines=((hz, 0.004, 60.0),), frames=9000)
+        file = tmp_path / f"night{seed}.npz"
+        np.savez(file, measurements=record.measurements, commands=record.commands)
+    files = [tmp_path / f"night{seed}.npz" for seed in range(2)]
+    words = ("auto", *files, *FACTS, "--sensor-gain", 0.6, "--command-scale", 1)
+    data = run_json(capsys, *words, "-o", tmp_path / "robust.fits")
+    assert (data["written"], data["certificate"]) == ("all nights", True)
+    table = {row["design"]: row for row in data["nights"]}
+    assert list(table) == ["night0.npz", "night1.npz", "all nights"]
+    ratio = (table["night0.npz"]["night1.npz"] / table["night1.npz"]["night1.npz"]) ** 2
+    assert table["night0.npz"]["worst_ratio"] == pytest.approx(ratio)
+    assert f"that of night0.npz leaves {ratio:.2f} times the variance" in data["verdict"][0]
+    assert data["units"]["night0.npz"] == "nm"
+    assert data["assumptions"][0].endswith("were read with --command-scale 1")
+    assert "night1.npz: the sensor gain is 0.6, as it was given" in data["assumptions"]
+    assert lbt.load_gain(tmp_path / "robust.fits").certificate.passed
+    assert sorted(tmp_path.iterdir()) == [*files, tmp_path / "robust.fits"]
 
 
 def test_a_gain_file_the_page_and_json(capsys, tmp_path):
@@ -187,6 +212,9 @@ def test_bad_requests_are_refused(tmp_path, capsys, monkeypatch, recorded_night,
         ("identify NIGHT -o m.yaml --obstruction 0.1", "give --diameter-m."),
         (f"auto short.npz -o t.fits {facts}", "4 s at 1000 Hz) in stretches of at least 256"),
         (f"auto {spectrum} -o t.fits", "got a spectrum"),
+        (f"auto short.npz NIGHT -o t.fits {facts}", "short.npz: the record needs 4000 usable"),
+        ("auto NIGHT NIGHT -o t.fits", "each record must have a name of its own; got "),
+        ("auto NIGHT short.npz --commands u -o t.fits", "--commands is for one record."),
         ("diagnose NIGHT --pdf a.pdf", "--pdf is the page of -o on paper; give -o, too."),
         (f"diagnose {spectrum}", "diagnose examines recorded series; "),
     ]

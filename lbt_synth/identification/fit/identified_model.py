@@ -8,7 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from lbt_synth.identification.fit.fitting import Search
+from lbt_synth.identification.fit.fitting import Search, required_evidence
+from lbt_synth.identification.fit.order_search import excess_bands
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram
 from lbt_synth.identification.fit.spectrum_model import BACKGROUND, CORNER, GAIN, SpectrumModel
 from lbt_synth.identification.fit.whittle import (
@@ -134,6 +135,11 @@ class IdentifiedAxis(Summarised):
     sensor_gain: float  # found or given
     sensor_gain_error: float | None  # None if it was given, or has no meaning
     sensor_gain_note: str  # where it comes from, and how well it is known
+    # log-likelihood beyond the price by which the model is above one with a component less, at most
+    # (the others are not fitted again; infinite without one), and above one with one more, about
+    # (what bands of frequencies lack)
+    over_fewer: float
+    over_more: float
     whiteness: Whiteness  # of the innovations
     # one-sided densities [nm^2/Hz] of the pseudo-open-loop measurement, (f,) each: periodogram,
     # model, and model without its narrow lines
@@ -243,6 +249,18 @@ class IdentifiedModel(Summarised):
         )
 
 
+def say_count(model: IdentifiedModel) -> str:
+    """Say how well the record tells the number of components, on the axis that tells it least."""
+    count = len(model.parts)
+    over = [(axis.over_fewer, axis.over_more) for axis in model.axes]
+    fewer, more = (min(values) for values in zip(*over, strict=True))
+    told = f"from {count - 1} by at most {fewer:.0f} and " * bool(count)
+    return (
+        f"The record tells {count_text(count, 'component')} {told}from {count + 1} by about "
+        f"{more:.0f} units of the log-likelihood beyond the price."
+    )
+
+
 def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> SpectrumModel:
     """Return the standard error of each parameter of a model."""
     return spectrum.unpack(np.sqrt(np.maximum(np.diag(covariance), 0)))
@@ -329,7 +347,12 @@ def describe_axis(
         corner_hz=corners[0],
         corner_error_hz=corners[1],
     )
+    required = (required_evidence(search, spectrum, i) for i in range(len(model.evidence)))
+    worth = [one - price for one, price in zip(model.evidence, required, strict=True)]
+    lacking = excess_bands(data, data.power(gain) / fitted, least=0.0, most=1)
     return IdentifiedAxis(
+        over_fewer=min(worth[1:], default=np.inf),
+        over_more=max(search.price - max((band[0] for band in lacking), default=0.0), 0.0),
         turbulence=turbulence,
         turbulence_fit=slow,
         parts=tuple(sorted(parts, key=lambda part: part.frequency_hz)),

@@ -277,7 +277,7 @@ def find_excesses(search: Search, spectrum: SpectrumModel) -> list[Excess]:
     data = search.data
     power, model = data.power(spectrum.background.gain), density(data, spectrum)
     excesses = []
-    for worth, *ends in _excess_bands(data, power / model, least=search.price, most=room):
+    for worth, *ends in excess_bands(data, power / model, least=search.price, most=room):
         component = _highest_excess(search, power, model, slice(*ends), _WIDEST)
         if search.place(component)[0] < search.lowest_line_hz:
             slow = search.component("slow", search.place(component)[0], _WIDEST, 1.0)
@@ -412,7 +412,7 @@ def _smooth_background(data: LoopPeriodogram, gain: float) -> LoopPeriodogram:
     )
 
 
-def _excess_bands(
+def excess_bands(
     data: LoopPeriodogram, ratio: FloatArray, *, least: float, most: int
 ) -> list[tuple[float, int, int]]:
     """Return the bands with the most significant excess of power over a model.

@@ -9,10 +9,12 @@ import pytest
 from support.recorded_loops import RATE, expected_periodogram, identify_series, integrator_loop
 
 import lbt_synth as lbt
-from lbt_synth.identification.fit.fitting import Search, add_evidence
+from lbt_synth.identification.fit.fitting import Search, add_evidence, cost, fit
 from lbt_synth.identification.fit.identified_model import (
+    IdentifiedAxis,
     describe_axis,
     hold_gain,
+    say_count,
     standard_errors,
     whiteness,
 )
@@ -127,3 +129,48 @@ def test_the_filter_of_a_drift_beside_turbulence() -> None:
     loop = lbt.close_loop(path, lbt.kalman(model.plant()).controller, sensor_gain=GAIN)
     least = lbt.loop.least_residual(path, truth).rms_nm
     assert lbt.residual_budget(loop, truth).rms_nm < 1.01 * least
+
+
+def weakest_lines(seed: int) -> tuple[Search, IdentifiedAxis]:
+    """Return an axis with lines of 30, 4 and some 2 nm, and what it was found by."""
+    lines = ((25.0, 0.01, 30.0), (60.0, 0.02, 4.0), (120.0, 0.02, 2.0 + seed))
+    y, c = integrator_loop(lines=lines, seed=seed)
+    axis = identify_series(y[:, 0], c[:, 0], sensor_gain=GAIN)
+    return Search(data=axis.data, gain=GAIN), axis
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_number_of_components_is_as_sure_as_other_fits_say(seed: int) -> None:
+    """Without each in turn, and with one more at many places, all parameters are fitted again."""
+    search, axis = weakest_lines(seed)
+    model = axis.fitted_model
+    spectrum, least = model.spectrum, cost(search, model)
+    fewer = min(cost(search, fit(search, spectrum.exchange(i))) for i in (1, 2, 3)) - least
+    assert 0.8 * axis.over_fewer < fewer < axis.over_fewer + 0.1
+    places = np.geomspace(5.0, 450.0, 40)
+    trials = (spectrum.add(search.component("line", f, 0.02, 1.0)) for f in places)
+    more = min(cost(search, model) for trial in trials if (model := fit(search, trial))) - least
+    assert axis.over_more == pytest.approx(more, abs=3.0)
+    assert 0 < axis.over_more < search.price
+
+
+def test_a_component_that_the_model_lacks_is_one_that_the_record_does_not_tell() -> None:
+    search, axis = weakest_lines(0)
+    lacking = add_evidence(search, fit(search, axis.fitted_model.spectrum.exchange(3)))
+    assert describe_axis(search, lacking, None, "").over_more == 0.0
+
+
+def test_the_number_of_components_is_said_of_the_axis_that_tells_it_least() -> None:
+    _, axis = weakest_lines(0)
+    sure = replace(axis, over_fewer=38.4, over_more=7.2)
+    model = lbt.identification.IdentifiedModel(
+        axes=(sure, replace(sure, parts=(), over_fewer=np.inf, over_more=2.9)),
+        frame_rate_hz=RATE,
+        delay_frames=2.0,
+    )
+    assert say_count(model) == (
+        "The record tells 3 components from 2 by at most 38 and from 4 by about 3 units of the "
+        "log-likelihood beyond the price."
+    )
+    alone = replace(model, axes=model.axes[1:])
+    assert say_count(alone).startswith("The record tells 0 components from 1 by about 3 units")
