@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 202,
     "public names": 145,
     "tuned constants": 494,
-    "lines of tests": 28475,
+    "lines of tests": 28478,
     "lines of benchmarks": 4018,
     "words of docs": 59781,
 }
