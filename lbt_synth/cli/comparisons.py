@@ -5,6 +5,7 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from lbt_synth.cli.loop_inputs import (
     named_difference_notes,
     say_limit,
 )
-from lbt_synth.cli.output import PERCENT, RMS, Report
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
@@ -27,14 +28,9 @@ from lbt_synth.loop.least_residual import limit_or_nan
 from lbt_synth.methods.registry import reference_methods
 from lbt_synth.report.designs import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_map_figure
-from lbt_synth.report.figures.studies import (
-    limits_figure,
-    mirror_figure,
-    modal_figure,
-    tradeoff_figure,
-)
+from lbt_synth.report.figures import studies as figures
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import Facts, fact, facts, row_table
+from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies.limits import LimitRow, LimitStudy, compare_modes, limits, say_residual
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, mirror_rows
@@ -56,7 +52,7 @@ def run_compare(arguments: Namespace) -> Report:
             f"{decibels:.2g} dB of sensor gain, either way."
         )
     caption = f"In the truth of {config.source.name}; {config.imaging.label}"
-    report.add_rows("designs", caption, rows, figure=lambda: limits_figure(study))
+    report.add_rows("designs", caption, rows, figure=partial(figures.limits_figure, study))
     report.notes += named_difference_notes(config, designs)
     return report
 
@@ -68,7 +64,7 @@ def _compared(design: Design, row: LimitRow, config: Config) -> Facts:
     cost = None if design.other_sensors else frame_cost(design).multiplications
     return facts(
         design=fact(row.design, "design"),
-        residual_nm=fact(row.residual_nm, "residual", missing="unstable", **RMS),
+        residual_nm=fact(row.residual_nm, "residual", missing="unstable", **NM),
         strehl=fact(row.strehl, "Strehl", **PERCENT),
         **margin_columns(margins),
         n_states=fact(design.controller.n_states, "states"),
@@ -109,7 +105,7 @@ def run_limits(arguments: Namespace) -> Report:
         study.rows,
         without=("above_band_limit_percent",) * (study.band is None),
         hidden=() if study.shift_hz.size else ("worst_nm",),
-        figure=lambda: limits_figure(study),
+        figure=partial(figures.limits_figure, study),
     )
     if study.band is not None and study.band_hz is not None:
         report.data |= {
@@ -150,9 +146,8 @@ def run_tradeoff(arguments: Namespace) -> Report:
     first, last, least = mixed[0], mixed[-1], points[0].design
     caption = "Trade-off of variance, norm and sensor gain"
     report = Report(tables=[row_table(f"{caption}, by the mixed filter", mixed)])
-    report.add_rows(
-        "points", caption, points, without=("design",), figure=lambda: tradeoff_figure(points)
-    )
+    figure = partial(figures.tradeoff_figure, points)
+    report.add_rows("points", caption, points, without=("design",), figure=figure)
     report.data |= {"gamma_least": least.gamma_least, "gamma_infeasible": least.gamma_infeasible}
     report.verdict = [
         f"Lowering the norm of the error from {nm_text(last.gamma, '.1f')} to "
@@ -193,7 +188,7 @@ def run_mirror(arguments: Namespace) -> Report:
         "rows",
         f"Designs on this mirror; {config.imaging.label}",
         rows,
-        figure=lambda: mirror_figure(shell, hardware, tolerance=arguments.tolerance),
+        figure=lambda: figures.mirror_figure(shell, hardware, tolerance=arguments.tolerance),
     )
     report.add_facts(
         "The mirror after a step of its command",
@@ -296,6 +291,6 @@ def run_modal(arguments: Namespace) -> Report:
         "rows",
         "By radial order, residuals over its modes",
         study.by_radial_order(),
-        figure=lambda: modal_figure(study.residual_nm, **shown),
+        figure=lambda: figures.modal_figure(study.residual_nm, **shown),
     )
     return report

@@ -31,6 +31,7 @@ from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import (
+    NM,
     Facts,
     column,
     fact,
@@ -305,7 +306,6 @@ class ModalStudy:
     def by_radial_order(self) -> list[Facts]:
         """Return a row for each radial order: root sums of squares over its modes."""
         radial, _ = noll_orders(self.noise_nm.size)
-        rms = {"unit": "nm", "format": ".1f"}
         rows = []
         for order in np.unique(radial):
             which = radial == order
@@ -318,11 +318,11 @@ class ModalStudy:
                 facts(
                     radial_order=fact(int(order), "radial order"),
                     modes=fact(int(which.sum()), "modes"),
-                    turbulence_nm=fact(turbulence_nm, "turbulence", **rms),
+                    turbulence_nm=fact(turbulence_nm, "turbulence", **NM),
                     noise_nm=fact(noise_nm, "noise per mode", unit="nm", format=".2f"),
                     gain=fact(float(self.gains[which].mean()), "mean gain", format=".3f"),
-                    optimised_nm=fact(optimised_nm, "optimised gains", **rms),
-                    kalman_nm=fact(kalman_nm, "Kalman", **rms),
+                    optimised_nm=fact(optimised_nm, "optimised gains", **NM),
+                    kalman_nm=fact(kalman_nm, "Kalman", **NM),
                 )
             )
         return rows

@@ -1,4 +1,4 @@
-"""What designs do where the loop is another: moved lines, gains, failing sensors, a mirror."""
+"""What designs do where the loop is another: moved lines, gains, delays, a mirror."""
 
 from __future__ import annotations
 
@@ -10,19 +10,17 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lbt_synth.config import Config
 from lbt_synth.design import Design, FilterDesign, hinf, integrator, kalman, lqg, mixed
 from lbt_synth.design.mixed import central_filter, require_taps
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.controller import as_controller
-from lbt_synth.loop import Imaging, close_loop, loop_margins, residual_budget, simulate
+from lbt_synth.loop import Imaging, close_loop, loop_margins
 from lbt_synth.loop.budget import ensemble_residuals
 from lbt_synth.loop.closed_loop import require_matching_controller
 from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
 from lbt_synth.loop.evaluator import textbook_matrices
-from lbt_synth.loop.simulation import Drop, Segment, Simulation, run_segments
 from lbt_synth.methods.registry import MIXED, record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import LoopHardware, SinusoidalVibration, TipTiltPlant, Truth, Vibration
@@ -30,6 +28,7 @@ from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import (
+    PERCENT,
     Facts,
     column,
     fact,
@@ -175,7 +174,6 @@ class RobustnessMap:
 
     def worst_points(self, name: str, gain: int) -> Iterator[Facts]:
         """Yield the worst frequency error for each delay error at one of the sensor gains."""
-        percent = {"unit": "%", "scale": 100, "format": ".2f"}
         for i, delay in enumerate(self.delay_errors_frames):
             stable, strehls = bool(self.stable[i, gain]), self.strehl[i, gain]
             worst = int(np.argmin(strehls)) if stable else 0
@@ -185,8 +183,8 @@ class RobustnessMap:
                 file=fact(name, "file"),
                 delay_error=fact(delay, "delay error", unit="frames", format="+g"),
                 stable=fact(stable, "stable"),
-                centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **percent),
-                worst=fact(strehls[worst], "worst Strehl", **percent),
+                centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **PERCENT),
+                worst=fact(strehls[worst], "worst Strehl", **PERCENT),
                 worst_hz=fact(at_hz, "at", unit="Hz", format="+.2f"),
             )
 
@@ -326,66 +324,6 @@ def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
     return read_only(np.array([number(value, name, **bounds) for value in axis]))
 
 
-def run_failures(
-    design: Design,
-    config: Config,
-    truth: Truth,
-    drops: Sequence[Drop],
-    *,
-    frames: int,
-    cases: int,
-    seed: int,
-) -> tuple[Simulation, list[tuple[Segment, Facts]]]:
-    """Run the loop of a configuration in which sensors fail, none after the end of the run.
-
-    Between failures and returns there is a segment, with a row that has its exact residual, too:
-    nan where the loop is unstable, a reading is frozen, or a vibration drifts.
-    """
-    rate = config.hardware.frame_rate_hz
-    hardware = replace(config.hardware, suite=require_hardware(design, "a run").suite)
-    simulation = simulate(
-        design,
-        truth,
-        hardware=hardware,
-        frames=frames,
-        cases=cases,
-        seed=seed,
-        settle_frames=config.settings.simulation.settle_frames,
-        drops=drops,
-    )
-    segments = run_segments(drops, frames / rate)
-    loop = design, hardware, truth, config.imaging
-    return simulation, [(segment, _segment_row(loop, simulation, segment)) for segment in segments]
-
-
-def _segment_row(loop: _Loop, simulation: Simulation, segment: Segment) -> Facts:
-    """Return what a loop leaves while some sensors fail, in a run and exactly."""
-    design, hardware, truth, imaging = loop
-    closed = close_loop(
-        hardware,
-        design.controllers[frozenset(segment.missing)],
-        sensor_gain=truth.sensor_gain,
-        blind=(*segment.missing, *segment.wrong),
-    )
-    # a frozen reading adds an offset of its own
-    exact = closed.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
-    rate = hardware.frame_rate_hz
-    first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
-    run = simulation.part(first, last)
-    exact_nm = residual_budget(closed, truth).rms_nm if exact else np.nan
-    ratio = float(np.mean(run.strehl(imaging))) if closed.is_stable else np.nan
-    rms, second = {"unit": "nm rms", "format": ".2f"}, {"unit": "s", "format": "g"}
-    return facts(
-        start_s=fact(segment.start_s, "from", **second),
-        end_s=fact(segment.end_s, "to", **second),
-        sensors=fact(segment.text or "none", "sensors that fail"),
-        residual_nm=fact(float(np.sqrt(np.mean(run.rms_nm**2))), "simulated", **rms),
-        exact_nm=fact(exact_nm, "exact, once settled", **rms),
-        strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
-        stable=fact(closed.is_stable, "stable"),
-    )
-
-
 def mirror_rows(
     plant: TipTiltPlant,
     truth: Truth,
@@ -425,7 +363,7 @@ def _mirror_row(name: str, loop: _Loop) -> Facts:
         residual_nm=fact(
             numbers["residual_nm"], "residual", missing="unstable", unit="nm", format=".2f"
         ),
-        strehl=fact(numbers["strehl"], "Strehl", unit="%", scale=100, format=".2f"),
+        strehl=fact(numbers["strehl"], "Strehl", **PERCENT),
     )
 
 
