@@ -10,7 +10,7 @@ export OMP_NUM_THREADS ?= 1
 # what Python compiles once serves all processes of the tests
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test test-all lowest e2e browser study bench docs lint clean
+.PHONY: demo check test test-all lowest e2e browser study bench docs lint clean
 
 $(VENV)/.ready: pyproject.toml
 ifdef UV
@@ -56,6 +56,9 @@ lint: $(VENV)/.ready     ## style, types, import layers
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+check: lint              ## lint, and the tests of the modules that a change touches
+	$(BIN)/pytest -n 2 -q -x -m "not study and not e2e and not browser" $$($(BIN)/python .ci/touched-tests)
 
 test: lint               ## the whole default check
 	$(BIN)/pytest -n 2 --dist loadfile -m "not study and not e2e and not browser" --doctest-modules lbt_synth tests

@@ -1,6 +1,8 @@
 """Plants that many tests share."""
 
 import gc
+import re
+from dataclasses import replace
 
 import hypothesis
 import matplotlib as mpl
@@ -56,9 +58,37 @@ def air():
     return lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def config():
     return lbt.load_config(LBT_YAML)
+
+
+@pytest.fixture(scope="session")
+def lbt_designs(config):
+    """Three designs for that configuration."""
+    return {
+        "kalman": lbt.kalman(config.plant),
+        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati"),
+        "integrator": lbt.integrator(config.hardware, gain=0.5),
+    }
+
+
+@pytest.fixture(scope="session")
+def small_config(tmp_path_factory):
+    """The same loop with few errors, frames and cases."""
+    text = LBT_YAML.read_text().replace("frames: 8000", "frames: 1000")
+    few = "errors_hz: [-3.5, 3.5]\n  sensor_gains: [0.3, 0.5, 1.0, 1.3]"
+    file = tmp_path_factory.mktemp("small") / "small.yaml"
+    file.write_text(re.sub("errors_hz: .*", few, text.replace("cases: 4", "cases: 2")))
+    return lbt.load_config(file)
+
+
+@pytest.fixture(scope="session")
+def small_designs(small_config):
+    """A Kalman filter, an integrator, and one whose loop is unstable, by name."""
+    slow = lbt.integrator(small_config.hardware, gain=0.4)
+    wild = replace(slow, claims={"gain": 1.5})  # unstable at gains above 2/3
+    return {"kalman": lbt.kalman(small_config.plant), "slow": slow, "wild": wild}
 
 
 @pytest.fixture(scope="module")

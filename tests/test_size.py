@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 203,
     "public names": 145,
     "tuned constants": 494,
-    "lines of tests": 30019,
+    "lines of tests": 28548,
     "lines of benchmarks": 4018,
     "words of docs": 59781,
 }

@@ -393,23 +393,23 @@ def stacked_response(matrices: tuple[FloatArray, ...], z: ComplexArray) -> Compl
     A, B, C, D = matrices
     if len(A) == 1 and A.size:
         return schur_response(schur_form(StateSpace(A=A[0], B=B[0], C=C[0], D=D[0])), z)[:, None]
-    planes = np.zeros((*D.shape[1:], z.size, len(A)), dtype=np.complex128)
-    planes += np.moveaxis(D, 0, -1)[:, :, None]
-    out = np.moveaxis(planes, (0, 1), (2, 3))
+    planes = np.empty((len(A), D[0].size, z.size), dtype=np.complex128)
+    out = np.moveaxis(planes.reshape(*D.shape, z.size), (3, 0), (0, 1))
+    out[:] = D
     if not A.size:
         return out
     poles, vectors = np.linalg.eig(A)
     with np.errstate(all="ignore"):  # what is not finite fails the probes
         entries = solve_stack(vectors.astype(np.complex128), B.astype(np.complex128))
-        residues = np.einsum("kms,ksq->smqk", C @ vectors, entries)
-        for pole, residue in zip(poles.T, residues, strict=True):
-            planes += residue[:, :, None] * (1 / (z[:, None] - pole))
+        residues = np.einsum("kms,ksq->kmqs", C @ vectors, entries).reshape(*planes.shape[:2], -1)
+        for k, residue in enumerate(residues):
+            planes[k] += residue @ (1 / (z - poles[k, :, None]))
     probes = np.linspace(0, z.size - 1, 5).astype(np.int64)
     pencils = z[probes, None, None, None] * np.eye(A.shape[1]) - A
     direct = C @ np.linalg.solve(pencils, B.astype(np.complex128)) + D
     apart = np.max(np.abs(out[probes] - direct), axis=(0, 2, 3))
     agree = apart <= _AGREEMENT * np.max(np.abs(direct), axis=(0, 2, 3))
-    for k in np.flatnonzero(~agree):
+    for k in np.flatnonzero(~agree).tolist():
         out[:, k] = pointwise_response(StateSpace(A=A[k], B=B[k], C=C[k], D=D[k]), z)
     return out
 

@@ -243,7 +243,8 @@ def residual_of_parts(
             require_loop_rate(spectrum.frame_rate_hz, hardware)
     air, shot, shaken = np.zeros((3, k, 2, modes, modes))  # of means, and within
     for part in parts:
-        equal: dict[object, FloatArray] = {}  # what reaches equal parts alike is evaluated once
+        # what reaches equal parts alike is evaluated once, and no noise leaves nothing
+        equal: dict[object, FloatArray] = {b"": np.zeros(())}
         for some, inputs in zip(part.modes, part.measurements, strict=True):
             at = np.s_[:, :, some[:, None], some]
             factor = noise[:, inputs]

@@ -339,8 +339,7 @@ def period_roots(poles: ComplexArray, period: int) -> ComplexArray:
 
 def textbook_matrices(controllers: Sequence[Controller]) -> Matrices:
     """Return controllers of as many states as balanced ``A, B, C, D`` in textbook form."""
-    systems = [controller.to_statespace() for controller in controllers]
-    systems = [system.balanced() if system.n_states else system for system in systems]
+    systems = [controller.to_statespace().balanced() for controller in controllers]
     return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
 
 

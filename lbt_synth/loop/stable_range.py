@@ -53,7 +53,7 @@ _AT_ONCE = 32  # gains, whose loops are in memory together
 _FINER = 8  # parts into which a step is divided, again and again
 _ROUNDS = 13  # for a gain, to its rounding
 _RANK = 1e-12  # of a change, a singular value over the largest that counts as zero
-_REAL = 1e-9  # of a response, an imaginary part that counts as zero
+_REAL = 1e-9  # part of a response that counts as zero; angles [rad] as close are the same
 _DIVISION = 64  # of delays in which the delay margin is sought
 _DELAY_ROUNDS = 6
 _LONGEST = 100  # delay up to which it is sought [frames]
@@ -213,6 +213,7 @@ def crossings(T: StateSpace, *, real_part: float | None = None) -> tuple[FloatAr
         ends = middle[turns], middle[turns + 1]
         crossed = find_root(excess_at, ends, tolerances={"xatol": 1e-15, "xrtol": 0.0}).x
     places = np.sort(np.concatenate([angles[zero], crossed]))
+    places = places[np.diff(places, prepend=-1.0) > _REAL]  # z and 1 / z differ by rounding
     return places, response(places)
 
 
@@ -310,7 +311,7 @@ def circle_norm(loop: ClosedLoop, *, low: float, high: float) -> float:
     if not centred.is_stable:
         return np.inf
     S = centred.path("noise", "reading")
-    T = replace(S, C=-S.C, D=np.eye(len(S.D)) - S.D)
+    T = replace(S, D=S.D - np.eye(len(S.D)))  # its negative has the same norm
     return (high - low) / (2 * middle) * hinf_norm(T).upper
 
 

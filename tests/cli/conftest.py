@@ -1,19 +1,16 @@
 """Files that the tests of several commands read."""
 
 import pytest
-from support.exports import lbt_config, lbt_designs
 from support.night import GAIN, simulated_night
 
 import lbt_synth as lbt
 
 
 @pytest.fixture(scope="session")
-def gains(tmp_path_factory):
+def gains(lbt_designs, tmp_path_factory):
     """Gain files of three designs for the LBT, by their names."""
     folder = tmp_path_factory.mktemp("gains")
-    designs = {name: lbt_designs()[name] for name in ("kalman", "hinf")}
-    designs["integrator"] = lbt.integrator(lbt_config().hardware, gain=0.5)
-    return {name: lbt.save_gain(folder / f"{name}.fits", d) for name, d in designs.items()}
+    return {name: lbt.save_gain(folder / f"{name}.fits", d) for name, d in lbt_designs.items()}
 
 
 @pytest.fixture(scope="session")

@@ -69,7 +69,7 @@ def test_it_serves_until_it_is_interrupted(tmp_path):
         finally:
             process.send_signal(signal.SIGINT)
         try:
-            out, error = process.communicate(timeout=20)
+            out, error = process.communicate(timeout=60)
         finally:
             process.kill()  # else the test would wait for ever
     assert "<title>Explore lbt.yaml</title>" in text

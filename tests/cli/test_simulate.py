@@ -62,7 +62,7 @@ def test_the_commands_simulate_it_or_refuse(tmp_path, capsys):
 
 @pytest.fixture
 def config_file(tmp_path):
-    return write_config(tmp_path, SEVERAL_SENSORS + "robustness: {errors_hz: [0]}\n")
+    return write_config(tmp_path, SEVERAL_SENSORS)
 
 
 def test_sensors_that_fail_on_the_way(tmp_path, capsys, config_file, sensors_file):

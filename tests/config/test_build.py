@@ -23,7 +23,6 @@ from support.several_sensors import write_config as write_sensors
 import lbt_synth as lbt
 from lbt_synth.errors import ConfigError
 from lbt_synth.models import SinusoidalVibration
-from lbt_synth.studies.robustness import mirror_rows
 
 SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
 LINES = [
@@ -140,7 +139,6 @@ def test_a_line_may_drift(tmp_path):
         ("kind: sinusoid\n end_hz: 23", "end_hz goes with kind: drift, and only"),
         ("kind: sinusoid\n damping: 0.1", "damping goes with kind: resonance"),
         ("kind: drift\n end_hz: 500\n duration_s: 60", r"\[0\].end_hz: must lie below"),
-        ("kind: drift\n end_hz: -3\n duration_s: 60", "greater than or equal to 0.001"),
     ],
 )
 def test_wrong_keys_of_a_line_are_refused(tmp_path, keys, words):
@@ -153,14 +151,10 @@ def test_priors_of_a_configuration(tmp_path):
     for keys, lines in (({"spread_hz": 1.0}, 5), ({"spread_hz": 0.5, "lines": 2}, 2)):
         plant = lbt.load_config(write_vibration(tmp_path, **keys)).plant
         expected = lbt.models.spread_plant(plain, half_width_hz=keys["spread_hz"], lines=lines)
-        assert len(plant.vibrations) == 2 * lines
         np.testing.assert_allclose(plant.A, expected.A, rtol=1e-13)
         np.testing.assert_allclose(plant.B, expected.B, rtol=1e-11)
     for keys, text in (
         ({"lines": 3}, r"vibrations\[0\]: lines goes with spread_hz, and only with it"),
-        ({"spread_hz": 20.0}, r"model.vibrations\[0\].spread_hz: the half width must be below 20"),
-        ({"spread_hz": -1.0}, "greater than or equal to 0.001"),
-        ({"spread_hz": 1.0, "lines": 65}, "less than or equal to 64"),
         ({"frequency_hz": 399.0, "spread_hz": 9.0}, r"vibrations\[0\].spread_hz: .*Nyquist"),
     ):
         with pytest.raises(ConfigError, match=text):
@@ -172,10 +166,6 @@ def test_the_example_has_a_mirror_for_design_and_loop(tmp_path):
     assert config.hardware.mirror is config.plant.hardware.mirror
     step = config.hardware.mirror.step_response()
     assert 3e-3 < step.settling_s < 6e-3
-    rows = {r.design: r for r in mirror_rows(config.plant, config.truth, config.imaging)}
-    assert not rows["kalman, settled mirror"].stable
-    assert rows["lqg"].strehl > 0.8
-    assert rows["lqg"].residual_nm < 0.3 * rows["kalman, real positions"].residual_nm
     gains = "    proportional_per_s2: 4.0e5\n    derivative_per_s: 800.0\n"
     head, rest = SLOW_YAML.read_text().split("    bandwidth_hz: 100.0")
     (tmp_path / "a.yaml").write_text(head + gains + rest[rest.index("    sampling_hz") :])
@@ -192,7 +182,6 @@ BANDWIDTH, GAIN = "    bandwidth_hz: 100.0", "    proportional_per_s2: 4.0e5"
         (BANDWIDTH, "    bandwith_hz: 100.0", "did you mean bandwidth_hz"),
         (BANDWIDTH, GAIN, "exactly one of bandwidth_hz, derivative_per_s"),
         (BANDWIDTH, f"{GAIN}\n    derivative_per_s: 800.0", "damping goes with bandwidth_hz"),
-        (BANDWIDTH, "    bandwidth_hz: 10.0", "mirror.local_loop: bandwidth_hz must be"),
         ("frame_rate_hz: 800.0", "frame_rate_hz: 990.0", "986.30137 and 1000 Hz"),
         ("delay_samples: 1", "delay_samples: 1.5", "mirror.local_loop.delay_samples"),
     ],
@@ -258,27 +247,17 @@ def test_a_file_describes_its_sensors(sensors_config, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("rate_hz: 500", "rate_hz: 300", "whole multiple"),
-        ("delay_frames: 2.5", "delay_frames: 1", "at least 1.5"),
-        ("channels: [m1, m2]", "channels: [m1, m1]", "different names"),
         ("channels: [m1, m2]", "channels: [m1, wavefront]", "different names"),
         ("channels: [m1, m2]", "channels: [m1]", "names the channel 'm2'"),
         ("noise_m_s2: 2.0e-4", "noise_nm: 2", "goes with kind: wavefront"),
         (", noise_nm: 20}", "}", "exactly one of noise_nm, noise_m_s2, covariance"),
         ("channels: [m1, m2], ", "", "channels is missing"),
         ("{rate_hz: 500, delay", "{rate: 500, delay", "unknown key sensors.slow.rate"),
-        ("  slow: {rate_hz: 500,", "  wavefront: {rate_hz: 500,", "none of them 'wavefront'"),
     ],
 )
 def test_mistakes_of_sensors_are_named(tmp_path, old, new, said):
     with pytest.raises(ConfigError, match=said):
         load_sensors(tmp_path, old, new)
-
-
-def test_a_prediction_further_ahead_has_all_sensors_later(sensors_config):
-    hardware = sensors_config.plant.ahead(2).hardware
-    assert hardware.delay_frames == 3
-    assert [sensor.delay_frames for sensor in hardware.suite.sensors] == [3.0, 2.0]
 
 
 def test_methods_for_the_own_sensor_leave_the_others_out(sensors_config):

@@ -34,22 +34,17 @@ UNSTABLE = {"kind": "ar", "coefficients": [1.2], "driving_rms_nm": 1.0}
 ONE_KEY = [  # what is set, or taken away, and what is said of it
     ("telescope.diameter_mm", 8220, "did you mean diameter_m?"),
     ("loop.frame_rate_khz", 0.8, "did you mean frame_rate_hz?"),
-    ("model.vibrations[0].rms_um", 1, "did you mean"),
     ("weather", {}, "known are"),
     ("loop.frame_rate_hz", ..., "is missing"),
     ("atmosphere", ..., "is missing"),
     ("model.turbulence.kind", "ar9", "ar9"),
     ("model.vibrations", [], "leave the key out"),
-    ("model.vibrations[0].rms_mas", -80, "greater than or equal to 0.0001"),
-    ("model.vibrations[0].damping", 0, "greater than"),
     ("model.vibrations[0].frequency_hz", 500, "Nyquist"),
     ("truth.vibrations[0].frequency_hz", 500, "Nyquist"),
     ("loop.delay_frames", 0.5, "greater than or equal to 1"),
     ("loop.delay_frames", "2", "valid number"),
     ("loop.delay_frames", True, "valid number"),
     ("loop.frame_rate_hz", float("nan"), "finite number"),
-    ("imaging.other_modes_strehl", 1.2, "less than or equal"),
-    ("design.gamma_ratio", 0.9, "greater than or equal to 1"),
     ("version", 2, "1"),
     ("version", True, "valid integer"),
 ]
@@ -84,9 +79,6 @@ def test_other_texts_are_refused(tmp_path):
         ("version: 1\nversion: 1\n", "duplicate key"),
         ("a: !!python/object:os.system x\n", odd),
         ("\x00", odd),
-        ("version: 2021-13-45\n", odd),
-        ("version: !!float abc\n", odd),
-        ("version: " + "9" * 5000 + "\n", odd),
         ("a: " + "[" * 1000, odd),
         ("# " + "x" * 2**17, "it is larger than 128 kB"),
         ("version: 1\nsensor: &a [*a]\n", "sensor"),
@@ -124,16 +116,12 @@ LEAVE_OUT = "one axis: leave axis and direction_deg out"
 MISFITS = [
     # lists of another length, or of other things
     ({"sensor": {"noise_nm": [1.0]}}, "sensor.noise_nm", r"one per measurement \(2\); got 1"),
-    ({"sensor": {"noise_nm": []}}, "sensor.noise_nm", "at least 1 item"),
     ({"sensor": {"noise_nm": [1.0, -1.0]}}, "sensor.noise_nm[1]", "greater than or equal to 0.001"),
-    ({"sensor": {"noise_nm": "15"}}, "sensor.noise_nm", "valid number"),
     ({"model": {"turbulence": [AR]}}, "model.turbulence", r"one per axis \(2\); got 1"),
-    ({"model": {"turbulence": []}}, "model.turbulence", "at least 1 item"),
     ({"model": {"turbulence": [AR, UNSTABLE]}}, f"{SECOND}s", "must be stationary"),
     ({"model": {"turbulence": [AR, {**AR, "coefficient": 1}]}}, SECOND, "mean coefficients"),
     ({"model": {"sensor_gain": [1.0, 1.0, 1.0]}}, "model.sensor_gain", "got 3"),
     ({"truth": {"sensor_gain": [1.0, 0.9]}}, "truth.sensor_gain", "valid number"),
-    ({"truth": {"vibrations": "same"}}, "truth.vibrations", "model"),
     (
         {
             "sensor": {"noise_nm": [1.0, 2.0, 3.0], "matrix": [[1, 0], [0, 1], [1, 1]]},
@@ -143,7 +131,6 @@ MISFITS = [
         "3 for 2 axes",
     ),
     # one axis
-    ({"loop": {"axes": 3}}, "loop.axes", "less than or equal to 2"),
     ({"sensor": {"matrix": [[1, 0], [0, 1]]}, **ONE}, "sensor.matrix", "1 columns .*; got 2"),
     ({**line_in("model", axis="tilt", rms_nm=30.0), **ONE}, "model.vibrations[0]", LEAVE_OUT),
     ({**line_in("truth", direction_deg=3.0, rms_nm=9.0), **ONE}, "truth.vibrations[0]", LEAVE_OUT),
@@ -172,17 +159,16 @@ def test_the_smallest_file_of_the_documentation(tmp_path):
     page = (ROOT / "docs" / "configuration.md").read_text()
     path = tmp_path / "page.yaml"
     path.write_text(page.split("```yaml\n")[1].split("```")[0])
-    config = lbt.load_config(path)
-    design = lbt.kalman(config.plant)
-    loop = lbt.close_loop(config.hardware, design.controller)
-    budget = lbt.residual_budget(loop, config.truth, frame_means=True)
-    assert budget.rms_nm == pytest.approx(design.rms, rel=1e-8)
+    assert lbt.load_config(path).design("kalman").certificate.passed
 
 
-def test_there_is_a_template_of_each_telescope():
+def test_templates_and_examples_come_with_the_package():
     assert telescope_names() == list(NAMES)
     with pytest.raises(ProblemError, match="must be one of elt, gemini"):
         telescope_template("hale")
+    for name, text in example_files().items():
+        assert text == (ROOT / "examples" / name).read_text()
+    assert set(example_files()) == {path.name for path in (ROOT / "examples").glob("*.yaml")}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -190,14 +176,12 @@ def test_a_template_makes_certified_filters(tmp_path, name):
     path = tmp_path / "t.yaml"
     path.write_text(telescope_template(name))
     config = lbt.load_config(path)
-    design = lbt.kalman(config.plant)
-    assert design.certificate.passed
-    assert lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati").certificate.passed
-    residual, baseline = (
-        lbt.residual_budget(lbt.close_loop(config.hardware, each.controller), config.truth).rms_nm
-        for each in (design, config.design("integrator"))
-    )
+    designs = config.design("kalman"), config.design("integrator")
+    loops = [lbt.close_loop(config.hardware, design.controller) for design in designs]
+    residual, baseline = (lbt.residual_budget(loop, config.truth).rms_nm for loop in loops)
     assert residual < 0.6 * baseline
+    robust = lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati")
+    assert all(design.certificate.passed for design in (*designs, robust))
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "lbt"])
@@ -212,9 +196,3 @@ def test_every_number_of_a_template_has_a_source_or_is_assumed(name):
     assert cited == sources
     for mark in re.findall(r"^# \[\d\] (.+(?:\n#     .+)*)", head, re.MULTILINE):
         assert "http" in mark or "eris_vib" in mark or "morfeo" in mark
-
-
-def test_the_examples_of_the_documentation_come_with_the_package():
-    for name, text in example_files().items():
-        assert text == (ROOT / "examples" / name).read_text()
-    assert set(example_files()) == {path.name for path in (ROOT / "examples").glob("*.yaml")}

@@ -5,58 +5,21 @@ import pytest
 import scipy.linalg
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.plants import lbt_axis_plant, random_problem, with_own_noise
+from support.plants import random_problem, with_own_noise
 from support.random_plants import random_plant
-from support.uneven_axes import QUICK, RATE, SLOW
+from support.refusals import require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import estimator_form
-from lbt_synth.loop.least_residual import least_residual
 
 SEEDS = st.integers(0, 10_000)
 
 
-def test_kalman_against_a_long_recursion_and_by_sdp(axis_plant):
-    """The textbook time-varying filter runs until it stands still."""
-    p = axis_plant
-    P = np.zeros((4, 4))
-    for _ in range(20_000):
-        gain = p.A @ P @ p.C.T / (p.C @ P @ p.C.T + p.R)
-        P = p.A @ P @ p.A.T + p.Q - gain @ (p.C @ P @ p.A.T)
-    design, sdp = lbt.kalman(p), lbt.kalman(p, route="sdp")
-    assert np.allclose(design.gain_predictor, gain, rtol=1e-8)
-    assert np.allclose(sdp.gain_predictor, gain, rtol=1e-6)
+def test_kalman_by_sdp(axis_plant):
+    design, sdp = lbt.kalman(axis_plant), lbt.kalman(axis_plant, route="sdp")
+    assert np.allclose(sdp.gain_predictor, design.gain_predictor, rtol=1e-6)
     assert sdp.rms == pytest.approx(design.rms, rel=1e-9)
     assert sdp.solver.route == "sdp"
-
-
-def test_kalman_gains_with_correlated_noise():
-    problem = random_problem(np.random.default_rng(8), 3, 2)
-    P = scipy.linalg.solve_discrete_are(problem.A.T, problem.C.T, problem.Q, problem.R, s=problem.S)
-    innovation = problem.C @ P @ problem.C.T + problem.R
-    predictor = (problem.A @ P @ problem.C.T + problem.S) @ np.linalg.inv(innovation)
-    design = lbt.kalman(problem)
-    assert np.allclose(design.gain_predictor, predictor, rtol=1e-8)
-
-
-def test_the_plant_of_uneven_axes_is_two_plants():
-    def plant(turbulence, noise, gain, **modes):
-        known = {"frame_rate_hz": RATE, "noise_nm": noise, "sensor_gain": gain, **modes}
-        return lbt.tip_tilt_plant(turbulence=turbulence, **known)
-
-    both = plant([SLOW, QUICK], [15.5, 6.0], [0.9, 0.7])
-    np.testing.assert_array_equal(both.hardware.sensor, np.diag([0.9, 0.7]))
-    np.testing.assert_allclose(both.R, np.diag([15.5, 6.0]) ** 2, rtol=1e-14)
-    alone = [
-        lbt.kalman(plant(SLOW, 15.5, 0.9, modes=1)),
-        lbt.kalman(plant(QUICK, 6.0, 0.7, modes=1)),
-    ]
-    alone_nm = [design.rms for design in alone]
-    assert lbt.kalman(both).rms == pytest.approx(np.hypot(*alone_nm), rel=1e-9)
-    limit = least_residual(both.hardware, both)
-    means = limit.variance_nm2 - limit.within_nm2
-    np.testing.assert_allclose(np.sqrt(means), alone_nm, rtol=1e-6)
 
 
 @settings(max_examples=10)
@@ -94,37 +57,14 @@ def test_fixed_lag_smoothing():
     assert errors == sorted(errors)
 
 
-def test_correlated_noise_is_refused_beyond_one_frame():
+def test_wrong_horizons():
     p = random_problem(np.random.default_rng(0), 3)
     assert lbt.kalman(p.ahead(0)).certificate.passed
-    with pytest.raises(ProblemError, match="prediction of 2 samples needs .* uncorrelated"):
-        lbt.kalman(p.ahead(2))
-
-
-@pytest.mark.parametrize("frames", [1.0, "1", None, True, 101, -101])
-def test_wrong_horizons(frames):
-    with pytest.raises(ProblemError, match="frames must be"):
-        lbt.kalman(WALK.ahead(frames))
-
-
-@pytest.mark.parametrize(("horizon", "delay"), [(0, 2.5), (1, 2.0), (2, 3.0)])
-def test_the_known_input_is_taken_out_exactly(horizon, delay):
-    """Whatever the commands, the estimate is the same to rounding."""
-    plant = lbt_axis_plant(modes=2, delay_frames=delay).ahead(horizon)
-    estimator, taps = estimator_form(lbt.kalman(plant)), plant.hardware.mirror_taps
-    rng, frames = np.random.default_rng(0), 400
-    commands = 1e3 * rng.standard_normal((frames, 2))
-    phase = np.cumsum(rng.standard_normal((frames, 2)), axis=0)
-    # y(k) = phase(k-1) - N sum_i taps_i u(k-1-i): the commands that frame k-1 has seen
-    corrections = np.zeros((frames, 2))
-    for i, tap in enumerate(taps):
-        corrections[1 + i :] += tap * commands[: frames - 1 - i]
-    free, past = np.zeros((2, frames, 2))
-    free[1:], past[1:] = phase[:-1], commands[:-1]
-    with_commands, without = estimator.start(), estimator.start()
-    for k in range(frames):
-        one = with_commands.step(free[k] - corrections[k], past[k])
-        assert np.max(np.abs(one - without.step(free[k], np.zeros(2)))) < 1e-7
+    correlated = "prediction of 2 samples needs .* uncorrelated"
+    rows = [(lambda: lbt.kalman(p.ahead(2)), ProblemError, correlated)]
+    wrong = (1.0, "1", None, True, 101, -101)
+    rows += [(lambda k=frames: WALK.ahead(k), ProblemError, "frames must be") for frames in wrong]
+    require_refusals(rows)
 
 
 def plain_residual(plant, P):

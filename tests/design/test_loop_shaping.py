@@ -169,8 +169,11 @@ def test_what_makes_no_sense_is_refused():
 
 
 @pytest.fixture(scope="module")
-def example():
-    return lbt.load_config(EXAMPLE).design("robust")
+def example(tmp_path_factory):
+    """The example with 40 functions in place of 60: the design takes half as long."""
+    path = tmp_path_factory.mktemp("robust") / "fewer.yaml"
+    path.write_text(EXAMPLE.read_text().replace("    loss:", "    functions: 40\n    loss:"))
+    return lbt.load_config(path).design("robust")
 
 
 def test_the_example_holds_at_every_row_and_sensor_gain(example):
@@ -226,33 +229,10 @@ def test_a_fraction_of_the_delay_costs_what_lies_between_whole_ones():
     for delay in (2, 2.49, 3):
         path = replace(config.hardware, delay_frames=delay)
         plant = replace(config.plant, hardware=path)
-        known = {"turbulence": config.truth.turbulence, "functions": 40, "states": None}
+        known = {"turbulence": config.truth.turbulence, "functions": 30, "states": None}
         design = lbt.robust(plant, bands=[line], **known)
         loop = lbt.close_loop(path, design.controller)
         residuals.append(lbt.residual_budget(loop, config.truth).rms_nm)
         assert lbt.loop_margins(loop).delay_frames > 1
     assert residuals == sorted(residuals)
     assert residuals[-1] < 1.05 * residuals[0]
-
-
-def test_demands_hold_together():
-    """Loops of any gain and delay inside both; with either alone 2.7 % of them were unstable."""
-    air = ARModel(coefficients=[0.99], driving_rms_nm=25.0, frame_rate_hz=1000)
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=1000, delay_frames=2.5, turbulence=air, noise_nm=8.0, modes=1
-    )
-    lines = [
-        VibrationBand(low_hz=f - 1, high_hz=f + 1, rms_nm=rms)
-        for f, rms in ((13.2, 150), (47, 60), (86, 30))
-    ]
-    known = {"sensor_gain": (0.75, 1.333), "delay_error_frames": 0.2}
-    design = lbt.robust(plant, bands=lines, functions=40, states=None, **known)
-    rng = np.random.default_rng(0)
-    corners = [(g, d) for g in (0.75, 1.333) for d in (2.3, 2.5, 2.7)]
-    inside = zip(rng.uniform(0.75, 1.333, 300), rng.uniform(2.3, 2.7, 300), strict=True)
-    for gain, delay in [*corners, *inside]:
-        path = replace(plant.hardware, delay_frames=delay)
-        assert lbt.close_loop(path, design.controller, sensor_gain=gain).is_stable
-    checks = [c for c in design.certificate.checks if c.name.startswith("loop change by")]
-    assert len(checks) == 4  # the corners: no whole delay lies between
-    assert all(check.passed for check in checks)

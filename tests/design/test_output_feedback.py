@@ -6,7 +6,6 @@ import control
 import cvxpy as cp
 import numpy as np
 import pytest
-import scipy.signal
 from scipy.linalg import block_diag, solve_discrete_lyapunov
 from support.generalized_plants import random_plant, sampled
 from support.refusals import require_refusals
@@ -14,8 +13,6 @@ from support.refusals import require_refusals
 import lbt_synth as lbt
 from lbt_synth.errors import DetectabilityError, InfeasibleError, ProblemError
 from lbt_synth.linear import GeneralizedPlant, StateSpace
-from lbt_synth.linear.lmi.output_feedback import least_level_lmi
-from lbt_synth.linear.output_feedback.lower_bound import infeasible_control_level
 from lbt_synth.linear.output_feedback.two_riccati import free_parameter, scaled_plant
 
 
@@ -51,17 +48,6 @@ def common_lyapunov_rms(plant, gamma):
     return gamma * float(np.sqrt(programme.value))
 
 
-def test_routes_agree():
-    """The inequality proves the level that the equations reach."""
-    plant = replace(random_plant(3, n=4), dt_s=1e-3)
-    design, scaled = lbt.hinf_controller(plant, gamma_ratio=1.1), scaled_plant(plant)
-    assert design.gamma <= design.gamma_requested * (1 + 1e-9)
-    assert design.certificate.passed
-    _, witness = least_level_lmi(scaled.plant, design.gamma_least * scaled.unit)
-    proved = infeasible_control_level(scaled.plant, witness) / scaled.unit
-    assert proved == pytest.approx(design.gamma_least, rel=1e-6)
-
-
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_singular_feedthrough(seed):
     """A control without a weight and a measurement without noise: the limit of small ones."""
@@ -85,28 +71,17 @@ def test_singular_feedthrough(seed):
 
 
 def test_a_mode_that_no_control_reaches_or_no_measurement_sees_is_named():
-    unreachable = GeneralizedPlant(
-        A=[[1.2, 0.0, 0.0], [0.0, 0.5, 1.0], [0.0, 0.0, 0.3]],
-        B1=np.ones((3, 1)),
-        B2=[[0.0], [0.0], [1.0]],
-        C1=np.ones((1, 3)),
-        C2=np.ones((1, 3)),
-        D12=1.0,
-        D21=1.0,
-    )
+    ones, last = np.ones((3, 1)), np.eye(3)[:, 2:]
+    A = [[1.2, 0.0, 0.0], [0.0, 0.5, 1.0], [0.0, 0.0, 0.3]]
+    unreachable = GeneralizedPlant(A=A, B1=ones, B2=last, C1=ones.T, C2=ones.T, D12=1.0, D21=1.0)
     with pytest.raises(DetectabilityError, match=r"at 1\.2 .* no control .* states 0 \(1\)") as got:
         lbt.hinf_controller(unreachable)
     assert got.value.eigenvalue == pytest.approx(1.2)
     assert got.value.eigenvector == pytest.approx([1, 0, 0], abs=1e-9)
-    unseen = GeneralizedPlant(  # a weight that integrates
-        A=[[0.5, 0.0], [1.0, 1.0]],
-        B1=[[1.0], [0.0]],
-        B2=[[1.0], [0.0]],
-        C1=[[0.0, 1.0], [0.0, 0.0]],
-        C2=[[1.0, 0.0]],
-        D12=[[0.0], [1.0]],
-        D21=[[1.0]],
-    )
+    first, weighted = np.eye(2, 1), [[0.0, 1.0], [0.0, 0.0]]
+    integrating = [[0.5, 0.0], [1.0, 1.0]]  # a weight that integrates
+    through = {"D12": [[0.0], [1.0]], "D21": 1.0}
+    unseen = GeneralizedPlant(A=integrating, B1=first, B2=first, C1=weighted, C2=first.T, **through)
     with pytest.raises(DetectabilityError, match=r"no measurement sees it.*states 1 \(1\)") as got:
         lbt.hinf_controller(unseen)
     assert got.value.eigenvalue == pytest.approx(1.0)
@@ -134,22 +109,6 @@ def test_refusals():
     with pytest.raises(InfeasibleError, match="because") as got:
         lbt.hinf_controller(plant, gamma=0.9 * least)
     assert got.value.gamma_least == pytest.approx(least)
-
-
-def test_systems_of_others():
-    """python-control and scipy.signal give the same plant, and take the controller back."""
-    plant = random_plant(3, n=3)
-    whole = plant.whole
-    _, controls, _, measurements = plant.sizes
-    least = lbt.hinf_controller(plant).gamma_least
-    scipys = scipy.signal.StateSpace(whole.A, whole.B, whole.C, whole.D, dt=1.0)
-    for system in (whole.to_control(), scipys):
-        same = GeneralizedPlant.of(system, measurements=measurements, controls=controls)
-        design = lbt.hinf_controller(same, gamma_ratio=1.1)
-        assert design.gamma_least == pytest.approx(least, rel=1e-9)
-    assert StateSpace.of(design.controller.to_control()).D == pytest.approx(design.controller.D)
-    assert "gamma that no controller reaches" in design.summary()
-    assert "below: " in design.summary()
 
 
 # Problems on which python-control (152, 367, 973) and Octave (13, 14) fail, hang or give no reason.
@@ -200,22 +159,6 @@ def test_weight_that_asks_for_the_highest_frequencies():
     assert design.gamma_infeasible == pytest.approx(2 / 3, rel=1e-5)
 
 
-def test_copies_of_a_plant_that_no_control_reaches():
-    """Octave 13: four copies of a mass; the disturbance has one of its own."""
-    none, two = np.zeros((2, 1)), np.vstack([C, 0 * C])
-    plant = without_feedthrough(
-        block_diag(A, A, A, A),
-        np.vstack([B, none, B, none]),
-        np.vstack([none, B, none, B]),
-        np.hstack([two, two, 0 * two, 0 * two]),
-        np.hstack([0 * C, 0 * C, C, C]),
-        [[0.0], [1.0]],
-    )
-    with pytest.raises(DetectabilityError, match="mode at 1 does not decay, and no control") as got:
-        lbt.hinf_controller(plant)
-    assert np.argmax(got.value.eigenvector) in (1, 5)  # the velocities of the copies
-
-
 def test_mass_without_noise():
     """Octave 14: without its weights, and with 10 (s + 1) / (s + 100) of its thread."""
     plant = without_feedthrough(A, B, B, np.vstack([C, 0 * C]), C, [[0.0], [1.0]])
@@ -235,7 +178,7 @@ def test_mass_without_noise():
     assert design.regularised > 0  # the measurement has no noise
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_neighbour_leaves_less(seed):
     """The variance is that of scipy's Lyapunov equation, and least among its neighbours."""
     plant = random_plant(seed, n=4)

@@ -57,21 +57,14 @@ def static(D, **more):
 
 
 def test_refusals():
+    of, wide = GeneralizedPlant.of, static([[0.0, 0.0]])
     rows = [
         (lambda: GeneralizedPlant(**ONE, D12=np.ones((2, 1))), DimensionError, "D12 must have 1"),
         (lambda: GeneralizedPlant(**(ONE | NO_INPUT)), DimensionError, "B2 must have at least one"),
-        (
-            lambda: GeneralizedPlant.of(LOOP.whole, measurements=2, controls=1),
-            ProblemError,
-            "at most 1",
-        ),
+        (lambda: of(LOOP.whole, measurements=2, controls=1), ProblemError, "at most 1"),
         (lambda: GeneralizedPlant(**ONE, dt_s=0), ProblemError, "dt_s must be above 0"),
-        (lambda: GeneralizedPlant.of(SLOW, measurements=1, controls=1), ProblemError, SAMPLE_IT),
-        (
-            lambda: LOOP.closed_loop(static([[0.0, 0.0]])),
-            DimensionError,
-            "1 measurements to 1 cont",
-        ),
+        (lambda: of(SLOW, measurements=1, controls=1), ProblemError, SAMPLE_IT),
+        (lambda: LOOP.closed_loop(wide), DimensionError, "1 measurements to 1 cont"),
         (lambda: LOOP.closed_loop(static(1.0)), NumericalError, "not well posed"),
         (lambda: LOOP.closed_loop(static(0.0, dt_s=0.1)), ProblemError, "got 1 s and 0.1 s"),
         (lambda: LOOP.closed_loop(HELD), ProblemError, "must be a StateSpace"),

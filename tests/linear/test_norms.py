@@ -27,7 +27,7 @@ def test_against_slycot(seed, n, m, p, radius):
     assert float(norm) == pytest.approx(expected, rel=1e-8)
     assert norm.lower <= expected * (1 + 1e-9)
     assert norm.upper >= expected * (1 - 1e-9)
-    assert norm.lower <= norm.value <= norm.upper <= norm.lower * (1 + 1e-10)
+    assert norm.lower <= norm.value <= norm.upper <= norm.lower * (1 + 5e-11)
 
 
 SHIFT = np.eye(3, k=1), np.eye(3)[:, -1:]
@@ -43,6 +43,7 @@ SHIFT = np.eye(3, k=1), np.eye(3)[:, -1:]
         (([[0.5]], [[0.0]], [[1.0]], [[0.0]]), 0, 0),
         (([[0.5]], [[0.0]], [[1.0]], [[-3.0]]), 3, 1e-12),
         (control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01), 2, 1e-9),
+        (([[0.0]], [[1.0]], [[[3.0]], [[1.0]]], [[0.0]]), 3, 1e-12),  # of a period of two
         (  # a peak that units hid
             ([[0.7, 0.6], [-0.1, 0.9]], [[1e4], [-1e5]], [[-0.8e-5, 0.4e-5]], [[0]]),
             4.48499,
@@ -57,6 +58,8 @@ def test_closed_forms(system, expected, rel):
 def test_norms_of_matrices_of_any_size():
     for size in (5e-324, 1e-310, 1e-150, 1e300):
         assert spectral_norms(np.full((1, 2, 2), complex(size)))[0] == 2 * size
+    beside = np.stack([np.eye(2), np.full((2, 2), np.nan), np.full((2, 2), np.inf)])
+    np.testing.assert_array_equal(spectral_norms(beside + 0j), [1, np.nan, np.nan])
 
 
 def test_unstable_systems_have_no_norm():
@@ -65,14 +68,17 @@ def test_unstable_systems_have_no_norm():
     assert caught.value.spectral_radius == 1.5
 
 
-BLIND = lbt.linear.StateSpace(A=[[0.5]], B=[[1.0]], C=np.zeros((0, 1)), D=np.zeros((0, 1)))
+DEAF = lbt.linear.StateSpace(
+    A=np.zeros((2, 2, 2)), B=np.zeros((2, 0)), C=np.ones((1, 2)), D=np.zeros((1, 0))
+)
 WALK = lbt.linear.StateSpace(A=[[1.0]], B=[[1.0]], C=[[1.0]], D=[[0.0]])
 
 
 def test_refusals():
     rows = [
         (lambda: lbt.hinf_norm("system"), lbt.errors.ProblemError, "got str"),
-        (lambda: lbt.hinf_norm(BLIND), lbt.errors.DimensionError, "1 inputs and 0 outputs"),
+        (lambda: lbt.hinf_norm(DEAF), lbt.errors.DimensionError, "0 inputs and 1 outputs"),
+        (lambda: largest_real_part(WALK), lbt.errors.UnstableLoopError, "a pole of modulus 1"),
         (lambda: band_norm(WALK, 0, 0.5), lbt.errors.NumericalError, "at 0 Hz is not finite"),
     ]
     require_refusals(rows)
@@ -107,12 +113,6 @@ def test_units_of_states_change_nothing(seed, n, scale):
     units = 10.0 ** np.random.default_rng(seed).uniform(-6, 6, n)
     turned = (A * units[:, None] / units, B * units[:, None], C / units, D)
     assert float(lbt.hinf_norm(turned)) == pytest.approx(expected, rel=1e-9)
-    frequency = np.linspace(0, 0.5, 201)
-    plain = lbt.linear.StateSpace(A=A, B=B, C=C, D=D).frequency_response(frequency)
-    scaled = lbt.linear.StateSpace(A=turned[0], B=turned[1], C=turned[2], D=D).frequency_response(
-        frequency
-    )
-    assert np.allclose(scaled, plain, rtol=1e-9, atol=1e-9 * np.abs(plain).max())
 
 
 @settings(max_examples=15)
@@ -134,7 +134,7 @@ def test_peaks_of_a_band_and_of_the_real_part_against_a_dense_grid(seed, n, m):
 
 
 @pytest.mark.parametrize("through", [0.0, 3.0])
-def test_the_norm_ofindependent_parts_is_the_largest_of_theirs(through):
+def test_the_norm_of_independent_parts_is_the_largest_of_theirs(through):
     """Two equal lags, a third one, a state that nothing moves, and a path without states."""
     poles, gains = [0.5, 0.8, 0.5, 0.99], [1.0, 0.3, 1.0, 0.0]
     B, D = np.diag([1.0, 1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 0.0, through])

@@ -23,13 +23,12 @@ from support.sensor_loops import (
 )
 from support.sensor_loops import LINES as SHAKES
 from support.sensor_loops import SLOW as OTHER
-from support.uneven_axes import RATE, SLOW, TABLE
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError, UnstableLoopError
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop.budget import residual_budget
-from lbt_synth.models import Accelerometer, PositionLoop, Truth, WavefrontSensor
+from lbt_synth.models import Accelerometer, Motion, PositionLoop, Truth, WavefrontSensor
 
 # Loops in continuous time, run in small steps from their equations, without the package's.
 # The camera sees the phase less the mirror in the middle of each step.
@@ -218,49 +217,6 @@ def test_a_measured_spectrum_against_brute_force():
     assert budget.within_nm**2 == pytest.approx(expected, rel=1e-5)
 
 
-def test_parts_of_the_budget_add_up():
-    plant = lbt_axis_plant(modes=2)
-    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant).controller)
-    truth = Truth(
-        turbulence=plant.turbulence[0],
-        noise_nm=15.5,
-        vibrations=(
-            lbt.models.SinusoidalVibration(frequency_hz=19, rms_nm=50),
-            lbt.Vibration(frequency_hz=31, damping=0.01, rms_nm=20, direction=(0, 1)),
-        ),
-    )
-    b = lbt.residual_budget(loop, truth)
-    names = ("turbulence", "vibration", "noise", "within")
-    assert b.rms_nm**2 == pytest.approx(sum(getattr(b, f"{name}_nm") ** 2 for name in names))
-    assert np.allclose(b.total_nm2, sum(getattr(b, f"{name}_nm2") for name in names))
-    lines = sum(np.real(np.outer(a, a.conj())) / 2 for a in b.line_amplitudes_nm)
-    assert np.allclose(b.gaussian_nm2, b.total_nm2 - lines)
-
-
-def test_coupled_axes_against_the_frequency_response():
-    """A loop that mixes the axes: the sum of |S e_i|^2 S_i by brute force."""
-    path = lbt.LoopHardware(
-        frame_rate_hz=RATE, sensor_matrix=[[1.0, 0.2], [-0.1, 0.7]], influence_matrix=np.eye(2)
-    )
-    controller = lbt.integrator(lbt.LoopHardware(frame_rate_hz=RATE), gain=0.3).controller
-    loop = lbt.close_loop(path, controller)
-    truth = Truth(turbulence=[SLOW, TABLE], noise_nm=[3.0, 9.0])
-    f = (np.arange(100_000) + 0.5) * RATE / 2 / 100_000
-    S, N = loop.sensitivity(f), loop.path("noise", "residual").frequency_response(f)
-    density = np.stack([SLOW.psd(f), TABLE.psd(f)], axis=-1)
-    white = np.array([3.0, 9.0]) ** 2 / (RATE / 2)
-    share = np.sinc(f / RATE)[:, None] ** np.array([0, 2])  # a process is one of means
-    seen = density * share
-    want = np.einsum("fij,fj,fkj->ik", S, seen, S.conj()).real * (f[1] - f[0])
-    noise = np.einsum("fij,j,fkj->ik", N, white, N.conj()).real * (f[1] - f[0])
-    budget = lbt.residual_budget(loop, truth)
-    np.testing.assert_allclose(budget.turbulence_nm2, want, rtol=1e-5, atol=1e-3)
-    np.testing.assert_allclose(budget.noise_nm2, noise, rtol=1e-5, atol=1e-4)
-    moving = density * (np.sinc(f / RATE)[:, None] ** np.array([-2, 0]) - share)
-    within = np.diag(moving.sum(axis=0) * (f[1] - f[0]))
-    np.testing.assert_allclose(budget.within_nm2, within, rtol=1e-5, atol=1e-4)
-
-
 @pytest.mark.parametrize(("delay", "gain", "mirror", "sensor"), predictions.CASES)
 def test_the_budget_of_a_model_is_that_of_its_truth(delay, gain, mirror, sensor):
     plant = predictions.a_plant(delay=delay, gain=gain, mirror=mirror, sensor=sensor)
@@ -443,6 +399,19 @@ def test_a_loop_of_two_sensors_has_what_a_run_in_small_steps_leaves(delay):
     budget = lbt.residual_budget(loop, truth)
     expected = 100**2 * power_of_two_sensors(plant, controller, 62.5, (0.6, 0.8))
     np.testing.assert_allclose(budget.vibration_nm2 + budget.within_nm2, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("changes", [{"delay_frames": 2.49}, {"mirror": SHELL}])
+def test_a_line_that_channels_hardly_see_is_one_that_they_do_not(changes):
+    """One is a sampled oscillator, the other an autoregressive process: alike with no damping."""
+    line = lbt.Vibration(frequency_hz=60, damping=1e-5, rms_nm=300, direction=(3, 4))
+    _, loop = closed(example_plant((FAST,), **changes))
+    seen, unseen = (
+        lbt.residual_budget(loop, Truth(turbulence=None, vibrations=(line,), motions=(motion,)))
+        for motion in ({"m1": Motion(size=1e-9)}, {})
+    )
+    np.testing.assert_allclose(seen.random_vibration_nm2, unseen.random_vibration_nm2, rtol=1e-4)
+    np.testing.assert_allclose(seen.within_nm2, unseen.within_nm2, rtol=1e-4)
 
 
 PATH = lbt.LoopHardware(frame_rate_hz=800)

@@ -5,35 +5,12 @@ import re
 import numpy as np
 import pytest
 from support.lqg import shell
-from support.plants import ROOT, lbt_axis_plant
+from support.plants import ROOT
 
 import lbt_synth as lbt
 from lbt_synth.loop.closed_loop import youla_controller
 
 SHELL = shell(70, delay_samples=2)
-
-
-@pytest.mark.parametrize("gain", [0.2, 1.5])
-def test_error_transfer_of_the_lbt(gain):
-    """Error ``E = (1-h)/(1-(1-g) h)``, noise ``-z^-1 H/(1-(1-g) h)``, h = z^-2 H."""
-    plant = lbt_axis_plant()
-    design = lbt.kalman(plant)
-    loop = lbt.close_loop(plant.hardware, design.controller, sensor_gain=gain)
-    f = np.geomspace(0.1, 399, 60)
-    z = np.exp(2j * np.pi * f / 800)
-    closed = plant.A - design.gain_predictor @ plant.C
-    H = np.array(
-        [
-            v * (plant.L @ np.linalg.solve(v * np.eye(4) - closed, design.gain_predictor))[0, 0]
-            for v in z
-        ]
-    )
-    h = H / z**2
-    assert np.allclose(loop.sensitivity(f)[:, 0, 0], (1 - h) / (1 - (1 - gain) * h), rtol=1e-8)
-    noise = -(H / z) / (1 - (1 - gain) * h)
-    assert np.allclose(
-        loop.path("noise", "residual").frequency_response(f)[:, 0, 0], noise, rtol=1e-8
-    )
 
 
 def test_the_page_says_where_the_settled_design_becomes_unstable(config):

@@ -131,30 +131,10 @@ def test_a_bump_shakes_each_loop_as_it_shakes_one(kalman):
 def test_a_mirror_with_dynamics(kalman):
     shell = PositionLoop.from_bandwidth(natural_frequency_hz=50, damping=0.5, bandwidth_hz=300)
     design = lbt.kalman(plant(mirror=shell))
-    w = weather(6, seed=4)
-    w["gains"] = np.linspace(0.5, 1, 6)
+    w = weather(3, seed=4)
+    w["gains"] = np.linspace(0.5, 1, 3)
     found = ensemble_residuals(design.controller, design.hardware, ensemble_of(w, turbulence=AIR))
     agree(found, design, w, lambda i: AIR)
-
-
-@pytest.mark.parametrize(
-    ("wind", "leak", "outer"),
-    [
-        ([0.01, 0.3, 3.4, 22.0, 95.0], 0.95, None),
-        ([9.4, 12.0, 21.9, 32.2], 1.0, 200.0),
-    ],
-)
-def test_slow_and_fast_winds_together(wind, leak, outer):
-    """With a leak the slowest parts of the spectrum remain, to the flat end of Kolmogorov's."""
-    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
-    controller = lbt.Controller(A=leak, B=0.3, C=1.0, D=0.0, dt_s=1 / RATE)
-    air = replace(AIR, outer_scale_m=outer)
-    flows = replace(air, wind_speed_m_s=wind)
-    found = ensemble_residuals(controller, path, LoopEnsemble(turbulence=flows))
-    loop = lbt.close_loop(path, controller)
-    for speed, residual in zip(wind, found.turbulence_nm, strict=True):
-        truth = lbt.Truth(turbulence=replace(air, wind_speed_m_s=speed))
-        assert residual == pytest.approx(lbt.residual_budget(loop, truth).turbulence_nm, rel=1e-6)
 
 
 @pytest.mark.parametrize(("delay", "distance"), [(2.3, 1e-7), (3.0, 1e-3), (4.7, 1e-5)])
@@ -194,23 +174,14 @@ def test_a_sinusoid_at_a_pole_of_the_controller_is_gone():
     line = EnsembleVibration(frequency_hz=[RATE / 4, RATE / 4 + 1], rms_nm=100.0, direction=(1.0,))
     ensemble = LoopEnsemble(sensor_gain=[0.9, 0.9], vibrations=[line])
     found = ensemble_residuals(controller, path, ensemble, frame_means=True)
-    left = np.abs(found.line_amplitudes_nm)
-    assert left[0, 0, 0] < 1e-9
-    truth = lbt.Truth(
-        turbulence=None,
-        sensor_gain=0.9,
-        vibrations=(
-            SinusoidalVibration(frequency_hz=RATE / 4 + 1, rms_nm=100.0, direction=(1.0,)),
-        ),
-    )
-    loop = lbt.close_loop(path, controller, sensor_gain=0.9)
-    budget = lbt.residual_budget(loop, truth, frame_means=True)
-    assert left[1, 0, 0] == pytest.approx(np.abs(budget.line_amplitudes_nm)[0, 0], rel=1e-9)
+    assert np.abs(found.line_amplitudes_nm)[0, 0, 0] < 1e-9
     # the commands turn by a quarter from frame to frame: the camera sees what lies between
     seen = ensemble_residuals(controller, path, ensemble)
     assert np.all(seen.rms_nm > 0.3 * 100)
-    moving = lbt.residual_budget(loop, truth)
-    assert seen.rms_nm[1] == pytest.approx(moving.rms_nm, rel=1e-9)
+    beside = SinusoidalVibration(frequency_hz=RATE / 4 + 1, rms_nm=100.0, direction=(1.0,))
+    truth = lbt.Truth(turbulence=None, sensor_gain=0.9, vibrations=(beside,))
+    loop = lbt.close_loop(path, controller, sensor_gain=0.9)
+    assert seen.rms_nm[1] == pytest.approx(lbt.residual_budget(loop, truth).rms_nm, rel=1e-9)
 
 
 def test_a_loop_is_split_into_parts(kalman, coupled):

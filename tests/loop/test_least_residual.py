@@ -7,7 +7,6 @@ from scipy.linalg import toeplitz
 from support.limits import RATE, Anonymous, ar, path, variance
 from support.lqg import shell
 from support.refusals import require_refusals
-from support.uneven_axes import LOOPS, QUICK, SLOW
 
 import lbt_synth as lbt
 from lbt_synth.design.result import model_limits
@@ -184,22 +183,6 @@ def test_more_measurements_than_modes():
     )
 
 
-def test_equal_models_may_be_turned_into_each_other():
-    """Two models of the same numbers are one turbulence: a vibration across them decouples."""
-    both, _ = LOOPS
-    again = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=60.0, frame_rate_hz=RATE)
-    line = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=(1, 1))
-    one = lbt.loop.least_residual(both, lbt.Truth(turbulence=SLOW, vibrations=[line], noise_nm=5))
-    two = lbt.loop.least_residual(
-        both, lbt.Truth(turbulence=[SLOW, again], vibrations=[line], noise_nm=5)
-    )
-    assert two.rms_nm == pytest.approx(one.rms_nm, rel=1e-12)
-    with pytest.raises(lbt.errors.ProblemError, match="a limit needs modes that decouple"):
-        lbt.loop.least_residual(
-            both, lbt.Truth(turbulence=[SLOW, QUICK], vibrations=[line], noise_nm=5)
-        )
-
-
 @pytest.mark.parametrize(
     ("delay", "noise", "model"),
     [(1.5, 10.0, ar(0.9)), (2.01, 0.2, ar(1.5, -0.8)), (2.75, 0.2, ar(1.7, -0.75))],
@@ -230,55 +213,34 @@ SLANTED, UPRIGHT = (
     lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=5, direction=d) for d in ((1, 1), (1, 0))
 )
 OTHER_RATE = lbt.models.ARModel(coefficients=[0.9], driving_rms_nm=1, frame_rate_hz=500)
-
-
-def shaken(hardware, *lines):
-    return variance(hardware, **CALM, vibrations=lines)
-
-
-MOVING = path(mirror=shell(100))
-SUITE = lbt.models.SensorSuite(
-    sensors=(lbt.models.WavefrontSensor(name="second", rate_hz=RATE, delay_frames=2, noise_nm=3.0),)
-)
+SECOND = lbt.models.WavefrontSensor(name="second", rate_hz=RATE, delay_frames=2, noise_nm=3.0)
 
 
 def test_refusals():
-    late = coupled_plant(delay_frames=2.4)
-    uneven, two = np.diag([1.0, 2.0]), path(modes=2)
+    late, strong = coupled_plant(delay_frames=2.4), ar(0.9, driving=1e10)
+    beside = path(suite=lbt.models.SensorSuite(sensors=(SECOND,)))
+
+    def least(*lines, on=None, **changes):
+        return lambda: variance(on or path(), **(CALM | changes), vibrations=lines)
+
+    def on(**facts):
+        return least(SLANTED, on=path(**facts))
+
+    own = "loop's own sensor; got others"
     rows = [
-        (lambda: shaken(path(sensor_matrix=[[1.0, 1.0]])), ProblemError, "got rank 1 for 2"),
-        (lambda: shaken(path(influence_matrix=[[1.0], [1.0]])), ProblemError, "reach every mode"),
-        (lambda: shaken(two, SLANTED, UPRIGHT), ProblemError, "that decouple.*Turn the directions"),
-        (
-            lambda: shaken(path(sensor_matrix=uneven), SLANTED),
-            ProblemError,
-            "principal axes of the",
-        ),
-        (lambda: shaken(path(), UPRIGHT), DimensionError, "must have 1 components"),
-        (
-            lambda: variance(path(), turbulence=OTHER_RATE, noise_nm=1.0),
-            ProblemError,
-            "the loop's 800 Hz; got 500",
-        ),
-        (
-            lambda: variance(path(), turbulence=ar(0.9, driving=1e10), noise_nm=1e-155),
-            ProblemError,
-            "a size that sensors have",
-        ),
-        (
-            lambda: least_residual(late.hardware, late),
-            CoupledModesError,
-            "modes that decouple",
-        ),
-        (
-            lambda: variance(path(suite=SUITE), **CALM),
-            ProblemError,
-            "loop's own sensor; got others",
-        ),
-        (lambda: variance(MOVING, **CALM), ProblemError, "got dynamics"),
-        (lambda: variance(path(2.6), **CALM), ProblemError, "at most a half beyond whole frames"),
+        (on(sensor_matrix=[[1.0, 1.0]]), ProblemError, "got rank 1 for 2"),
+        (on(influence_matrix=[[1.0], [1.0]]), ProblemError, "reach every mode"),
+        (on(sensor_matrix=np.diag([1.0, 2.0])), ProblemError, "principal axes of the"),
+        (least(SLANTED, UPRIGHT, on=path(modes=2)), ProblemError, "that decouple.*Turn the dir"),
+        (least(UPRIGHT), DimensionError, "must have 1 components"),
+        (least(turbulence=OTHER_RATE), ProblemError, "the loop's 800 Hz; got 500"),
+        (least(turbulence=strong, noise_nm=1e-155), ProblemError, "a size that sensors have"),
+        (lambda: least_residual(late.hardware, late), CoupledModesError, "modes that decouple"),
+        (least(on=beside), ProblemError, own),
+        (least(on=path(mirror=shell(100))), ProblemError, "got dynamics"),
+        (least(on=path(2.6)), ProblemError, "at most a half beyond whole frames"),
     ]
+    wrong = (lambda f: -np.ones(f.shape), lambda f: f * np.nan, lambda f: np.ones(3))
+    words = r"Anonymous.psd does not"
+    rows += [(least(turbulence=Anonymous(psd)), ProblemError, words) for psd in wrong]
     require_refusals(rows)
-    for psd in (lambda f: -np.ones(f.shape), lambda f: f * np.nan, lambda f: np.ones(3)):
-        with pytest.raises(ProblemError, match=r"Anonymous.psd does not"):
-            variance(path(), turbulence=Anonymous(psd), noise_nm=1.0)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.sensor_loops import example_plant
 
 import lbt_synth as lbt
 from lbt_synth.loop.margins import broken_loops
@@ -18,7 +19,7 @@ def broken(gain, *, delay=2, modes=1, **path):
     return broken_loops(lbt.close_loop(hardware, lbt.integrator(hardware, gain=gain).controller))
 
 
-@pytest.mark.parametrize(("delay", "gain"), [(1, 0.4), (3, 0.1)])
+@pytest.mark.parametrize(("delay", "gain"), [(1, 1.2), (3, 0.1)])
 def test_an_integrator_has_the_crossings_of_its_closed_form(delay, gain):
     """``L = g z^-d / (1 - z^-1)``: a gain of g / (2 sin(w/2)), a phase of -90 + (1/2 - d) w."""
     (response,) = broken(gain, delay=delay)
@@ -112,6 +113,10 @@ def test_a_response_that_vanishes_has_no_phase_there():
 
 
 def test_marginal_and_unstable_loops_have_no_residual():
+    direct = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
+    for gain, stable in ((1.1e-9, True), (0.9e-9, False)):  # the pole is 1 - gain
+        integrator = lbt.Controller(A=1.0, B=gain, C=1.0, D=0.0, dt_s=1 / 800)
+        assert lbt.close_loop(direct, integrator).is_stable is stable
     path = lbt.LoopHardware(frame_rate_hz=800, modes=1)
     truth = lbt.Truth(turbulence=None, noise_nm=1.0)
     for gain, word in ((1.0, "marginally stable"), (1.5, "unstable")):
@@ -128,6 +133,12 @@ def test_marginal_and_unstable_loops_have_no_residual():
         with pytest.raises(lbt.errors.UnstableLoopError):
             lbt.simulate(controller, truth, hardware=path, frames=10)
         assert np.all(np.isnan(lbt.loop.stable_sensor_gains(path, controller)))
+    plant = example_plant()
+    loop = lbt.close_loop(plant.hardware, lbt.kalman(plant))
+    with pytest.raises(
+        lbt.errors.ProblemError, match="broken loop needs a period of 1; got one of 4"
+    ):
+        broken_loops(loop)
 
 
 def test_margins_of_an_integrator_against_hand_computation():
@@ -217,6 +228,15 @@ def test_a_loop_is_stable_at_its_delay_margin_and_not_beyond(delay, gain):
     assert not stable(1.01 * margin)
 
 
+@pytest.mark.parametrize(("delay", "pole"), [(1.5, -0.5), (2.0, -0.5)])
+def test_a_loop_that_needs_its_delay_has_an_early_margin(delay, pole):
+    """``z (z - a) + g ((1 - f) z + f)`` of a delay 1 + f has the root -1 at a fraction f."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, delay_frames=delay, modes=1)
+    law = lbt.Controller(A=pole, B=0.9, C=1.0, D=0.0, dt_s=1 / RATE)
+    margins = lbt.loop_margins(lbt.close_loop(path, law))
+    assert margins.early_frames == pytest.approx(delay - 1 - (0.9 - 1 - pole) / 1.8, rel=1e-6)
+
+
 def test_a_delay_margin_may_be_longer_than_any_delay():
     """A slow loop bears more delay than a loop is made with; of a slow mirror the mean counts."""
     shell = lbt.models.PositionLoop.from_bandwidth(
@@ -229,3 +249,6 @@ def test_a_delay_margin_may_be_longer_than_any_delay():
     limit = 0.5 + np.pi / (4 * np.arcsin(0.03 / 2))  # delay at which the gain is the limit
     assert mean + margin == pytest.approx(limit, abs=0.1)
     assert margin > 20
+    path = replace(path, mirror=None)  # beyond 100 frames none is sought
+    slow = replace(slow, B=[[2 * np.sin(np.pi / (2 * (2 * 101 - 1)))]])
+    assert lbt.loop_margins(lbt.close_loop(path, slow)).delay_frames == np.inf

@@ -2,19 +2,15 @@
 
 from dataclasses import replace
 
-import cvxpy as cp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.lqg import shell
 from support.plants import lbt_axis_plant
-from support.rational import is_positive_definite, rational
 from support.sensor_loops import example_plant
 
 import lbt_synth as lbt
-from lbt_synth.linear.lyapunov import stationary_covariance
-from lbt_synth.loop.closed_loop import checked_loop_matrices
 from lbt_synth.loop.stable_range import (
     CIRCLE_LIMIT,
     FRAGILE_DB,
@@ -115,37 +111,6 @@ def test_an_integrator_of_two_frames_against_its_closed_form(low, high):
     least = 4 * a * cosine**2 - 2 * (1 + a) * cosine + 1 + (1 - a) ** 2
     expected = r * a / np.sqrt(least)
     assert circle_norm(integrator_loop(2), low=low, high=high) == pytest.approx(expected, rel=1e-9)
-
-
-def common_lyapunov(A, B):
-    """Largest ``t`` with ``P - A'PA >= t``, ``P - B'PB >= t`` and ``tr P = n``, and that P."""
-    n = len(A)
-    P, t = cp.Variable((n, n), symmetric=True), cp.Variable()
-    rests = [P - M.T @ P @ M - t * np.eye(n) for M in (A, B)]
-    bounds = [(rest + rest.T) / 2 >> 0 for rest in rests]
-    problem = cp.Problem(cp.Maximize(t), [*bounds, P >> 0, cp.trace(P) == n])
-    problem.solve(solver=cp.CLARABEL)
-    return float(t.value), P.value
-
-
-@pytest.mark.parametrize("design", [lbt.kalman, lambda p: lbt.hinf(p, gamma_ratio=1.2)])
-def test_a_common_lyapunov_function_exists_inside_and_none_beyond(design):
-    """The matrix inequality knows nothing of frequencies; its P is checked without rounding."""
-    plant = lbt_axis_plant()
-    loop = lbt.close_loop(plant.hardware, design(plant))
-    moving = moving_gain(loop)
-    A0, A1, *_ = checked_loop_matrices(plant.hardware, loop.controller)
-    size = np.sqrt(np.diag(stationary_covariance(A0 + A1, np.eye(len(A0)))))
-    A0, A1 = (A * size / size[:, None] for A in (A0, A1))
-    for share, proved in ((0.99, True), (1.01, False)):
-        low, high = moving.moving_low**share, moving.moving_high**share
-        assert (circle_norm(loop, low=low, high=high) < CIRCLE_LIMIT) == proved
-        ends = [A0 + gain * A1 for gain in (low, high)]
-        decrease, P = common_lyapunov(*ends)
-        assert (decrease > 0) == proved
-        exact = rational((P + P.T) / 2)
-        rests = [exact - rational(A).T @ exact @ rational(A) for A in ends]
-        assert all(map(is_positive_definite, (exact, *rests))) == proved
 
 
 def test_the_moving_gain_lies_in_the_constant_one_and_axes_count_one_by_one():

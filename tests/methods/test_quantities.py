@@ -1,20 +1,17 @@
 """Every number of a configuration has limits, at which it is computed or refused."""
 
 import contextlib
-import copy
 from typing import get_args
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
-from ruamel.yaml import YAML
-from support.configs import write_config
-from support.plants import LBT_YAML
+from support.configs import GOOD, change_key, numbers_of, write_config
 
 import lbt_synth as lbt
+from lbt_synth.config.samples import parse_path
 from lbt_synth.config.schema import FileSection
 
-EXAMPLE = YAML(typ="safe", pure=True).load(LBT_YAML.read_text())
 FROM_ZERO = """
     obstruction read_noise_electrons damping proportional_per_s2 derivative_per_s feed_forward
     delay_samples frequency_error_hz phase_margin_deg modulus_margin leak
@@ -53,40 +50,22 @@ def test_every_number_of_the_schema_has_limits():
         assert least > 1e-13 or is_signed or (least == 0 and name in FROM_ZERO.split()), path
 
 
-def numbers(content, path=()):
-    """Yield the paths of the numbers of a configuration."""
-    items = content.items() if isinstance(content, dict) else enumerate(content)
-    for key, value in items:
-        if isinstance(value, dict | list):
-            yield from numbers(value, (*path, key))
-        elif isinstance(value, int | float):
-            yield (*path, key)
-
-
-def changed(path, value):
-    out = here = copy.deepcopy(EXAMPLE)
-    for step in path[:-1]:
-        here = here[step]
-    here[path[-1]] = value
-    return out
-
-
 def limits(path):
     """Yield the limits that the messages name where a number is far too small or too large."""
     for value in (-(10**12), 10**12, -1e12, 1e12):
         try:
-            FileSection.model_validate(changed(path, value))
+            FileSection.model_validate(change_key(path, value))
         except ValidationError as error:
             for name, limit in error.errors()[0].get("ctx", {}).items():
                 yield limit + {"gt": 1e-6, "lt": -1e-6}.get(name, 0)
 
 
 @settings(max_examples=10)
-@given(place=st.sampled_from([*numbers(EXAMPLE)]), data=st.data())
+@given(place=st.sampled_from([parse_path(path) for path, _ in numbers_of(GOOD)]), data=st.data())
 def test_a_loop_is_computed_at_the_limits(tmp_path_factory, place, data):
     """A configuration with a number at its limit gives numbers, or is refused."""
     value = data.draw(st.sampled_from([*limits(place)]))
-    file = write_config(tmp_path_factory.mktemp("limits"), changed(place, value))
+    file = write_config(tmp_path_factory.mktemp("limits"), change_key(place, value))
     with contextlib.suppress(lbt.LbtSynthError):
         config = lbt.load_config(file)
         design, gain = config.design("kalman"), config.truth.sensor_gain

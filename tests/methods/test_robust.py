@@ -86,6 +86,10 @@ def test_the_robust_design_of_an_identified_system(tmp_path):
     content["model"]["turbulence"] = [AR, OTHER]
     with pytest.raises(ConfigError, match="hold under one turbulence for all axes"):
         design(bands=robust["bands"], command_step_nm=500.0)
+    content["loop"]["axes"] = 1
+    content["model"] = {"turbulence": AR}
+    with pytest.raises(ProblemError, match=r"design\.robust\.bands\[0\]\.axis: this loop has 1"):
+        design(bands=[band | {"rms_nm": 9.0, "axis": "tip"}])
 
 
 def a_plant_with_lines(*lines, more=()):
@@ -106,12 +110,11 @@ def test_a_plant_alone_has_a_band_around_each_line():
     assert design.certificate.passed
     lines = lbt.close_loop(plant.hardware, design.controller).path("phase", "residual")
     assert abs(lines.frequency_response([20.0])[0, 0, 0]) < 0.2
-
-
-def test_the_strongest_lines_of_a_plant_have_bands():
-    lines = [(10.0 * k, 10.0 + k) for k in range(1, 10)]
-    section = PlantInputs(plant=a_plant_with_lines(*lines)).method_section("robust")
+    many = a_plant_with_lines(*((10.0 * k, 10.0 + k) for k in range(1, 10)))
+    section = PlantInputs(plant=many).method_section("robust")  # of the strongest
     assert [round(band.rms_nm) for band in section.bands] == [14, 15, 16, 17, 18, 19]
+    with pytest.raises(ProblemError, match="the plant has none"):
+        design_request("robust", {}).build(PlantInputs(plant=a_plant_with_lines()))
 
 
 def a_plant_with_a_wide_resonance() -> TipTiltPlant:
@@ -146,48 +149,25 @@ def test_a_band_that_covers_a_wide_resonance_takes_its_place():
         assert len(design.specifications[0].terms) == terms
 
 
-def test_a_plant_without_lines_has_no_robust_design():
-    with pytest.raises(ProblemError, match="the plant has none"):
-        design_request("robust", {}).build(PlantInputs(plant=a_plant_with_lines()))
-
-
-def test_bands_have_an_axis_and_the_damping_of_the_model(small, tmp_path):
-    section = """
-  robust:
-    bands:
-      - {low_hz: 16.0, high_hz: 20.0, rms_nm: 100, axis: tip}
-      - {low_hz: 30.0, high_hz: 33.0, rms_nm: 50, axis: tilt, damping: 0.03}
-      - {low_hz: 60.0, high_hz: 70.0, rms_nm: 20}
-    functions: 8
-    states: null
-"""
-    model = (
-        "    kind: ar2",
-        (
-            "    kind: ar2\n  vibrations:\n"
-            "    - {axis: both, frequency_hz: 18.0, damping: 0.01, rms_nm: 100}\n"
-            "    - {axis: tip, frequency_hz: 31.0, damping: 0.02, rms_nm: 100}"
-        ),
+def test_bands_have_an_axis_and_the_damping_of_the_model(tmp_path):
+    edges = [(16.0, 20.0, {"axis": "tip"}), (30.0, 33.0, {"axis": "tilt", "damping": 0.03})]
+    edges += [(60.0, 70.0, {})]
+    wanted = [{"low_hz": low, "high_hz": high, "rms_nm": 50.0} | more for low, high, more in edges]
+    line = {"axis": "both", "frequency_hz": 18.0, "damping": 0.01, "rms_nm": 100.0}
+    content = minimal_config(
+        model={"vibrations": [line, line | {"axis": "tip", "frequency_hz": 31.0}]},
+        design={"robust": {"bands": wanted, "functions": 8, "states": None}},
     )
-    design = lbt.load_config(small(section, model=model)).design("robust")
+    design = lbt.load_config(write_config(tmp_path, content)).design("robust")
     bands = [
         [(term.low_hz, term.damping) for term in spec.terms[1:]] for spec in design.specifications
     ]
     assert bands == [[(16.0, 0.01), (60.0, 0.0)], [(30.0, 0.03), (60.0, 0.0)]]
 
 
-def test_a_band_of_one_axis_is_refused_where_there_is_one(tmp_path):
-    band = {"low_hz": 16.0, "high_hz": 20.0, "rms_nm": 9.0, "axis": "tip"}
-    content = minimal_config(loop={"axes": 1}, design={"robust": {"bands": [band]}})
-    content["model"].pop("vibrations")
-    with pytest.raises(ProblemError, match=r"design\.robust\.bands\[0\]\.axis: this loop has 1"):
-        lbt.load_config(write_config(tmp_path, content)).design("robust")
-
-
 def worst_in_bands(config, design):
     """Return the worst variance with the resonances of the truth anywhere in their bands [nm^2]."""
     loop = lbt.close_loop(config.hardware, design.controller)
-
     total = lbt.residual_budget(loop, replace(config.truth, vibrations=())).rms_nm ** 2
     bands = config.method_section("robust").bands
     for line, band in zip(config.truth.vibrations, bands, strict=True):

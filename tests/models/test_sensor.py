@@ -9,18 +9,6 @@ def test_one_mas_is_a_quarter_of_the_diameter():
     assert lbt.models.nm_per_mas(8.22) == pytest.approx(9.963, abs=5e-4)
 
 
-def test_pyramid_noise_of_the_lbt():
-    noise = lbt.models.pyramid_tilt_noise_nm(
-        photons=50,
-        read_noise_electrons=8,
-        modulation_lambda_over_d=4,
-        subapertures=704,
-        wavelength_um=0.75,
-        diameter_m=8.22,
-    )
-    assert noise == pytest.approx(15.5, abs=0.05)
-
-
 def test_bad_modal_noise_is_refused():
     with pytest.raises(lbt.errors.ProblemError, match="tilt_noise_nm"):
         lbt.models.pyramid_modal_noise_nm(0, modes=3, modulation_lambda_over_d=4)

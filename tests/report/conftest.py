@@ -3,7 +3,6 @@
 import pytest
 from support.browser import chromium
 from support.pages import HOSTILE, whole_page
-from support.plants import LBT_YAML
 from support.study_pages import page_of, results
 
 import lbt_synth as lbt
@@ -11,15 +10,11 @@ from lbt_synth.report.page.html import page_html
 
 
 @pytest.fixture(scope="session")
-def pages(tmp_path_factory):
+def pages(small_config, small_designs, tmp_path_factory):
     """Addresses of a real report, a study, and a page with every kind of mark and hostile names."""
-    folder = tmp_path_factory.mktemp("browser")
-    config = lbt.load_config(LBT_YAML)
-    designs = {
-        "kalman": lbt.kalman(config.plant),
-        "integrator with a rather long name of its file": lbt.integrator(config.hardware, gain=0.4),
-    }
-    page = lbt.report.design_page(config, designs)
+    folder, (kalman, slow, _) = tmp_path_factory.mktemp("browser"), small_designs.values()
+    designs = {"kalman": kalman, "integrator with a rather long name of its file": slow}
+    page = lbt.report.design_page(small_config, designs)
     lbt.report.write_page(page, folder / "report.html")
     (folder / "study.html").write_bytes(page_html(page_of(results())))
     (folder / "marks.html").write_bytes(page_html(whole_page()))

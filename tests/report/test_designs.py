@@ -1,13 +1,10 @@
 """The report of designs: its numbers are those of the library, and its page has them all."""
 
 import hashlib
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.configs import with_errors
-from support.design_reports import SMALL, three_designs, words_of
 from support.pages import Reader
 
 import lbt_synth as lbt
@@ -21,75 +18,52 @@ from lbt_synth.report.designs import (
     verdict,
 )
 from lbt_synth.report.draw import figure_series
-from lbt_synth.report.page.html import page_html
-from lbt_synth.studies.limits import limits
+from lbt_synth.report.page.html import Notice, page_html
+from lbt_synth.storage.tables import Table
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    place = tmp_path_factory.mktemp("report")
-    (place / "small.yaml").write_text(SMALL)
-    return place
+def report(small_config, small_designs):
+    return design_report(small_config, small_designs)
 
 
 @pytest.fixture(scope="module")
-def config(folder):
-    return lbt.load_config(folder / "small.yaml")
+def page(report):
+    return report_page(report, {})
 
 
 @pytest.fixture(scope="module")
-def few(folder):
-    """The same with few errors and gains, for what does not depend on them."""
-    text = with_errors(SMALL, -2, 2)
-    (folder / "few.yaml").write_text(re.sub(r"sensor_gains: .*", "sensor_gains: [0.5, 1.0]", text))
-    return lbt.load_config(folder / "few.yaml")
+def text(page):
+    return page_html(page).decode()
 
 
-@pytest.fixture(scope="module")
-def designs(config):
-    return three_designs(config)
+def words_of(report):
+    """All texts of the page of a report but those of its charts."""
+    blocks = report_page(report, {}).blocks
+    texts = [getattr(block, "text", block) for block in blocks if type(block) in (str, Notice)]
+    tables = [block for block in blocks if isinstance(block, Table)]
+    return " ".join(texts + [c.text for table in tables for row in table.cells() for c in row])
 
 
-@pytest.fixture(scope="module")
-def report(config, designs):
-    return design_report(config, designs)
-
-
-@pytest.fixture(scope="module")
-def text(report, folder):
-    lbt.report.write_page(report_page(report, {}), folder / "a.html")
-    return (folder / "a.html").read_text()
-
-
-def test_the_numbers_are_those_of_the_library(report, config, designs):
-    study = limits(
-        designs,
-        config.hardware,
-        config.truth,
-        config.imaging,
-        errors_hz=config.settings.robustness.errors_hz,
-    )
-    (rejections,) = (c.figure for c in report_page(report, {}).charts if c.key == "sigma")
-    for one, limit in zip(report.assessments, study.rows, strict=True):
+def test_the_numbers_are_those_of_the_library(report, page, small_config):
+    config, axes = small_config, {"errors_hz": [-1.75, 0.0], "sensor_gains": [0.5, 1.0]}
+    (rejections,) = (c.figure for c in page.charts if c.key == "sigma")
+    for one in report.stable:
         row = one.limits
-        assert row.residual_nm == pytest.approx(limit.residual_nm, rel=1e-9, nan_ok=True)
-        assert row.above_limit_percent == pytest.approx(limit.above_limit_percent, nan_ok=True)
-        if not one.stable:
-            continue
         loop = lbt.close_loop(config.hardware, one.design.controller)
         budget = lbt.residual_budget(loop, config.truth)
         assert row.residual_nm == pytest.approx(budget.rms_nm, rel=1e-9)
+        above = row.residual_nm / report.limits.limit.rms_nm - 1
+        assert row.above_limit_percent == pytest.approx(100 * above)
         assert row.strehl == pytest.approx(lbt.strehl(budget, config.imaging), rel=1e-9)
         assert one.margins == lbt.loop_margins(loop)
         low, high = lbt.loop.stable_sensor_gains(config.hardware, one.design.controller)
         assert one.sensor_gains == pytest.approx((low, high), rel=1e-9)
-        found = lbt.studies.robustness_map(
-            one.design, config.truth, config.imaging, errors_hz=[-2.0, 0.0], sensor_gains=[0.5, 1.0]
-        )
-        at = [int(np.flatnonzero(one.map.errors_hz == e)[0]) for e in (-2.0, 0.0)]
-        gains = [int(np.flatnonzero(one.map.sensor_gains == g)[0]) for g in (0.5, 1.0)]
-        assert one.map.strehl[0][np.ix_(gains, at)] == pytest.approx(found.strehl[0], rel=1e-9)
-        assert one.worst_strehl == one.map.strehl[0, gains[1]].min()
+        points = lbt.studies.robustness_map(one.design, config.truth, config.imaging, **axes)
+        places = (np.searchsorted(getattr(one.map, key), axes[key]) for key in reversed(axes))
+        cut = one.map.strehl[0][np.ix_(*places)]
+        assert cut == pytest.approx(points.strehl[0], rel=1e-9)
+        assert one.worst_strehl == one.map.strehl[0, one.map.sensor_gains == 1.0].min()
         series = next(
             s for s in figure_series(rejections) if (s.name, "phase" in s.panel) == (one.name, True)
         )
@@ -98,31 +72,24 @@ def test_the_numbers_are_those_of_the_library(report, config, designs):
     kalman = report.assessments[0]
     row = design_facts(report, kalman)
     assert (row.gamma, row.estimation_rms) == (kalman.design.gamma, kalman.design.rms)
-    assert kalman.checks == designs["kalman"].recertify().checks
+    assert kalman.checks == kalman.design.recertify().checks
 
 
-def test_errors_that_would_leave_the_band_are_left_out(config):
+def test_errors_that_would_leave_the_band_are_left_out(small_config):
     line = lbt.models.SinusoidalVibration(frequency_hz=2.0, rms_nm=10)
-    low = replace(config, truth=replace(config.truth, vibrations=(line,)))
+    low = replace(small_config, truth=replace(small_config.truth, vibrations=(line,)))
     errors = frequency_errors(low)
     assert -2.0 < errors[0] < -1.0
     assert errors[-1] == 3.5
-    assert np.all(np.diff(errors) > 0)
-    assert frequency_errors(config)[[0, -1]].tolist() == [-3.5, 3.5]
+    assert frequency_errors(small_config) == pytest.approx(np.linspace(-3.5, 3.5, 9))
 
 
-def test_a_design_that_was_tampered_with_fails(config, designs):
-    kalman = designs["kalman"]
-    wrong = replace(
-        kalman,
-        gain_predictor=1.1 * np.asarray(kalman.gain_predictor),
-        certificate=Certificate(
-            checks=(Check(name="believe me", value=0, limit=1, computed_by="none"),),
-            gamma=1.0,
-            rms_per_output=np.ones(2),
-        ),
-    )
-    one = design_report(config, {"wrong": wrong}).assessments[0]
+def test_a_design_that_was_tampered_with_fails(small_config, small_designs):
+    kalman, believed = small_designs["kalman"], Check("believe me", 0, 1, "none")
+    certificate = Certificate(checks=(believed,), gamma=1.0, rms_per_output=np.ones(2))
+    gain = 1.1 * np.asarray(kalman.gain_predictor)
+    wrong = replace(kalman, gain_predictor=gain, certificate=certificate)
+    one = design_report(small_config, {"wrong": wrong}).assessments[0]
     assert not one.certified
     assert "believe me" not in [check.name for check in one.checks]
 
@@ -135,120 +102,86 @@ def test_the_verdict_is_made_of_the_numbers(report):
     worst = {one.name: 100 * one.worst_strehl for one in (kalman, slow)}
     best = max(worst, key=worst.get)
     assert f"{best} keeps the highest Strehl ratio at worst, {worst[best]:.1f} %, if" in words
-    assert len(re.split(r"(?<=[a-z%]\.) |(?<=them\.) ", words)) <= 3
     table = {row[0]: row[1:] for row in summary_table(report).rows if len(row) > 1}
     assert table["worst Strehl ratio [%]"] == (*(f"{v:.2f}" for v in worst.values()), "-")
-    assert "ertificates that do NOT hold: wild." in words
+    assert words.endswith("UNSTABLE in this loop: wild; certificates that do NOT hold: wild.")
 
 
 def test_an_unstable_loop_is_named_loudly(report, text):
     wild = report.assessments[2]
-    assert not wild.stable
     assert wild.loop.spectral_radius > 1
-    assert wild.budget is None
-    assert wild.margins is None
+    assert (wild.stable, wild.budget, wild.margins) == (False, None, None)
     # an integrator of 1.5 in two frames is stable below 1 / 1.5
     assert wild.sensor_gains == pytest.approx((0.0, 2 / 3), abs=1e-6)
     assert not wild.certified  # its loop at the assumed gain, recomputed
-    reader = Reader(text)
-    notices = [a for a in reader.named("p") if "bad" in (a.get("class") or "")]
+    notices = [a for a in Reader(text).named("p") if "bad" in (a.get("class") or "")]
     assert len(notices) == 2
     assert "wild is UNSTABLE in the loop of this configuration" in text
-    assert "The certificate of wild fails: spectral radius of the closed loop" in text
-    assert "UNSTABLE in this loop: wild; certificates that do NOT hold: wild." in verdict(report)
     assert text.count("wild: unstable") > 3
 
 
-def test_a_limit_of_nothing_is_no_limit(config, designs):
-    still = lbt.Truth(turbulence=None, noise_nm=config.truth.noise_nm)
-    report = design_report(replace(config, truth=still), {"slow": designs["slow"]})
+def test_a_limit_of_nothing_is_no_limit(small_config, small_designs):
+    still = lbt.Truth(turbulence=None, noise_nm=small_config.truth.noise_nm)
+    config = replace(small_config, truth=still)
+    report = design_report(config, {"slow": small_designs["slow"]})
     assert report.limits.limit.rms_nm == 0
     assert "above the limit" not in words_of(report)
-    assert "passed, 1 check " in words_of(report) + " "
 
 
-def test_the_page_is_complete(text, report, config):
-    reader = Reader(text)
-    titles = " ".join(reader.texts["h2"] + reader.texts["h3"])
-    for word in (
-        "Summary",
-        "Estimation error, rejection and noise",
-        "Loop gain and margins",
-        "Residual over the frequency error",
-        "Step response",
-        "Certificates",
-        "Files and versions",
-    ):
-        assert word in titles
-    for heading in (
-        "method, computed by",
-        "Strehl ratio, exact [%]",
-        "modulus margin",
-        "states of the controller",
-        "stable real sensor gains",
-        "certificate, recomputed",
-    ):
-        assert heading in reader.texts["th"]
-    kalman = report.assessments[0]
+def test_the_page_is_complete(text, report, small_config):
+    reader, kalman = Reader(text), report.assessments[0]
     cells = reader.texts["td"]
     assert f"{kalman.limits.residual_nm:.1f}" in cells
     assert f"{100 * kalman.limits.strehl:.2f}" in cells
-    assert hashlib.sha256(config.source.read_bytes()).hexdigest() in cells
+    assert hashlib.sha256(small_config.source.read_bytes()).hexdigest() in cells
     assert lbt.__version__ in cells
-    assert "# The adaptive optics of the Large Binocular Telescope" in reader.texts["code"][0]
-    assert reader.texts["code"][0] == SMALL
+    assert reader.texts["code"][0] == small_config.source.read_text()
     assert len(text) < 5e6
-    for figure in reader.named("figure"):
-        assert figure["id"] in {a["href"][1:] for a in reader.named("a")}
+    links = {a["href"][1:] for a in reader.named("a")}
+    assert {figure["id"] for figure in reader.named("figure")} <= links
 
 
-def test_a_truth_without_vibrations(config, designs):
-    calm = replace(config, truth=replace(config.truth, vibrations=()))
-    report = design_report(calm, {"slow": designs["slow"]})
+def test_a_truth_without_vibrations(small_config, small_designs):
+    calm = replace(small_config, truth=replace(small_config.truth, vibrations=()))
+    report = design_report(calm, {"slow": small_designs["slow"]})
     assert report.errors_hz.tolist() == [0.0]
-    page = report_page(report, {}, "calm")
-    assert [chart.key for chart in page.charts] == ["sigma", "bode", "step"]
-    assert page.title == "calm"
+    assert [chart.key for chart in report_page(report, {}).charts] == ["sigma", "bode", "step"]
     assert verdict(report).startswith("slow leaves ")
 
 
-def test_nothing_stable_is_needed(config, designs):
-    report = design_report(config, {"wild": designs["wild"]})
-    text = words_of(report)
+def test_nothing_stable_is_needed(small_config, small_designs):
+    report = design_report(small_config, {"wild": small_designs["wild"]})
     charts = report_page(report, {}).charts
     assert [chart.key for chart in charts] == ["map"]  # none of them is empty
     honest = replace(report.assessments[0], checks=())
     assert "passed, but they are about the loops that the designs were made for" in verdict(
         replace(report, assessments=(honest,))
     )
-    assert "No loop is stable, so none has a rejection" in text
     assert " leaves " not in verdict(report)
 
 
-def test_a_certificate_that_cannot_be_computed(few, monkeypatch):
-    slow = lbt.integrator(few.hardware, gain=0.4)
+def test_a_certificate_that_cannot_be_computed(small_config, small_designs, monkeypatch):
+    slow = small_designs["slow"]
 
     def broken(self):
         raise lbt.errors.NumericalError("the norm did not settle.")
 
     monkeypatch.setattr(type(slow), "recertify", broken)
-    report = design_report(few, {"slow": slow})
+    report = design_report(small_config, {"slow": slow})
     assert not report.assessments[0].certified
-    text = words_of(report)
-    assert "The certificate of slow fails: the norm did not settle." in text
-    assert "slow: not computed: the norm did not settle." in text
-    assert "NOT COMPUTED" in text
+    words = words_of(report)
+    assert "The certificate of slow fails: the norm did not settle." in words
+    assert "NOT COMPUTED" in words
 
 
 def test_one_page_has_designs_of_several_sensors_and_of_one(
-    sensors_design, sensors_file, sensors_config
+    sensors_design, sensors_file, sensors_config, monkeypatch
 ):
+    monkeypatch.setattr("lbt_synth.studies.limits._GRID", 3)  # points of a curve
     designs = {"both": sensors_design, "own": lbt.integrator(sensors_config.hardware, gain=0.3)}
-    files = {"both": sensors_file}
     report = design_report(sensors_config, designs)
-    page = report_page(report, files)
+    page = report_page(report, {"both": sensors_file})
     text = page_html(page).decode()
-    assert "both: When sensors fail" in text
     for source in (sensors_file, sensors_config.source):
         assert hashlib.sha256(source.read_bytes()).hexdigest() in text
     both, own = report.assessments

@@ -1,7 +1,6 @@
-"""The page of a study: what it says, and what it must not depend on."""
+"""The pages of a study and of a diagnosis: what they say, and what they must not depend on."""
 
 import hashlib
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,12 +24,14 @@ def page():
     return page_of(results())
 
 
-def blocks(page, kind):
-    return [block for block in page.blocks if type(block) is kind]
-
-
 def table(page, start):
-    return next(t for t in blocks(page, Table) if t.caption.startswith(start))
+    return next(b for b in page.blocks if isinstance(b, Table) and b.caption.startswith(start))
+
+
+def replay_command(page):
+    """Return the listing of commands that replay the worst samples."""
+    listings = (block for block in page.blocks if isinstance(block, tuple))
+    return next(listing for caption, listing in listings if "replay" in caption)
 
 
 def without_charts(page):
@@ -42,79 +43,47 @@ def without_charts(page):
     return replace(page, sections=sections)
 
 
-def text(cell):
+def cell_text(cell):
     return cell.text if isinstance(cell, Cell) else cell
 
 
 def test_what_is_wrong_is_said_first(page):
-    first = page.blocks
-    assert [type(block) for block in first[:3]] == [Notice, Notice, str]
-    unstable = np.sum(results()["sharp.stable"] == 0) / 3
-    assert first[1].text == f"sharp is unstable in {unstable:.2f} % of the samples."
-    assert "frail 6" in first[0].text
-    assert all(block.tone == "bad" for block in first[:2])
-
-
-def test_a_study_that_is_not_complete_says_so():
-    columns = {name: values[:100] for name, values in results().items()}
-    first = page_of(columns).blocks[0]
-    assert isinstance(first, Notice)
-    assert first.tone == "bad"
-    assert "100 of 300 samples" in first.text
-
-
-def test_the_leader_is_named_by_each_measure(page):
-    columns = results()
-    words = next(block for block in page.blocks if isinstance(block, str))
-    steady = columns["steady.strehl"]
+    failed, unstable, words = page.blocks[:3]
+    percent = np.sum(results()["sharp.stable"] == 0) / 3
+    assert unstable.text == f"sharp is unstable in {percent:.2f} % of the samples."
+    assert "frail 6" in failed.text
+    assert (failed.tone, unstable.tone) == ("bad", "bad")
+    steady = results()["steady.strehl"]
     assert f"Strehl ratios: highest mean, steady {100 * steady.mean():.1f} %" in words
     low = 100 * np.percentile(steady, 5)
     assert f"highest 5th percentile, steady {low:.1f} %. That of steady depends most on" in words
+    columns = {name: values[:100] for name, values in results().items()}
+    first = page_of(columns).blocks[0]
+    assert (first.tone, "100 of 300 samples" in first.text) == ("bad", True)
 
 
 def test_failures_are_listed_and_counted(page):
-    found = table(page, "Evaluations that failed")
-    assert len(found.rows) == 10
-    assert found.caption.endswith("the first 10, and 5 more")
+    failures = table(page, "Evaluations that failed")
+    assert len(failures.rows) == 10
+    assert failures.caption.endswith("the first 10, and 5 more")
     html = page_html(without_charts(page)).decode()
     assert "&lt;b&gt;no&lt;/b&gt; design in row 20" in html
     assert "<b>no</b>" not in html
-    assert "<script>" not in html
 
 
 def test_worst_rows_come_with_the_command_that_replays_them(page):
     rows = table(page, "Worst samples of sharp").rows
-    assert all(text(row[1]) == "unstable" for row in rows)
-    commands = next(
-        text for caption, text in blocks(page, tuple) if "replay" in caption
-    ).splitlines()
-    assert commands[1] == f"lbt-synth study night.yaml -o out --row {text(rows[0][0])}"
-
-
-def test_every_section_has_content_and_every_chart_its_words(page):
-    assert list(page.sections) == [
-        "Summary",
-        "What was sampled",
-        "Controllers",
-        "What the Strehl ratio depends on",
-        "Worst samples",
-        "How to read the figures",
-        "Files and versions",
-    ]
-    keys = [chart.key for chart in page.charts]
-    assert keys == [
-        "distribution",
-        "map-1",
-        "map-2",
-        "map-3",
-    ]
+    assert all(cell_text(row[1]) == "unstable" for row in rows)
+    command = f"lbt-synth study night.yaml -o out --row {cell_text(rows[0][0])}"
+    assert replay_command(page).splitlines()[1] == command
+    other = page_of(results(), study=replace(night(), source=Path("my {b}.yaml")))
+    assert "lbt-synth study 'my {b}.yaml' -o out --row " in replay_command(other)
 
 
 @pytest.mark.parametrize("n", [1, 21])
 def test_few_samples_make_a_page_all_the_same(n):
     columns = {name: values[:n] for name, values in results().items()}
-    html = page_html(page_of(columns))
-    assert b"nan" not in html
+    assert b"nan" not in page_html(page_of(columns))
 
 
 def test_nothing_evaluated_makes_a_page_without_figures():
@@ -124,16 +93,7 @@ def test_nothing_evaluated_makes_a_page_without_figures():
             columns[name] = np.full(30, np.nan)
     page = page_of(columns)
     assert page.sections["Summary"][-3] == "No controller was evaluated on any sample."
-    assert page_html(page)
-
-
-@pytest.mark.parametrize(
-    ("name", "words"), [("a{b}.yaml", "'a{b}.yaml'"), ("my night.yaml", "'my night.yaml'")]
-)
-def test_names_of_files_cannot_break_the_command(page, name, words):
-    found = page_of(results(), study=replace(night(), source=Path(name)))
-    commands = next(text for caption, text in blocks(found, tuple) if "replay" in caption)
-    assert f"lbt-synth study {words} -o out --row " in commands
+    assert page.charts == []
 
 
 @pytest.fixture(scope="module")
@@ -145,13 +105,9 @@ def test_a_page_from_a_study_file(study, tmp_path):
     values = study.values(0, 3)
     columns = dict(zip(study.parameter_names, values.T, strict=True))
     columns |= evaluate_samples(study, values, 0)[0] | {"row": np.arange(3)}
-    folder = tmp_path / "a folder"
-    folder.mkdir()
     statistics = study_statistics(columns, study.parameter_names, list(study.controllers))
-    page = lbt.report.study_page(study, columns, statistics, folder=folder)
-    files = lbt.report.write_page(page, folder / "summary.html")
-    assert [file.name for file in files] == ["summary.html"]
-    html = files[0].read_text(encoding="utf-8")
+    page = lbt.report.study_page(study, columns, statistics, folder=tmp_path / "a folder")
+    html = page_html(without_charts(page)).decode()
     for words in (
         "3 of 4096 samples",
         "normal, 20 with deviation 0.5, from 18, to 22",
@@ -176,26 +132,24 @@ def test_each_design_says_which_errors_it_survives(study):
         margins = lbt.loop_margins(lbt.close_loop(design.hardware, design))
         assert f"{name} {margins.survival}" in blocks
         warned = [block.text for block in blocks if getattr(block, "text", "").startswith(name)]
-        assert warned == [f"{name}: {text}" for text in margins.fragilities]
+        assert warned == [f"{name}: {words}" for words in margins.fragilities]
     assert "fast: a sensor gain that is off by 0.92 dB makes this loop unstable." in warned
 
 
 def test_the_size_does_not_grow_with_the_samples():
-    small, large = (len(page_html(page_of(results(n)))) for n in (4000, 200_000))
+    small, large = (len(page_html(page_of(results(n)))) for n in (4000, 20_000))
     assert small < large < 1.4 * small
     assert large < 1.5e6
 
 
-@pytest.mark.parametrize("n", [1, 5, 400, 401, 50_000])
+@pytest.mark.parametrize("n", [1, 400, 401, 50_000])
 def test_points_of_a_distribution_lie_on_it(n):
     values = np.round(np.random.default_rng(n).normal(size=n), 2)
     level, part = cumulative_points(values)
     assert len(level) <= 500
     assert np.all(np.diff(level) > 0)
-    expected = [np.mean(values <= each) for each in level]
-    np.testing.assert_allclose(part, expected)
-    assert part[-1] == 1
-    assert level[0] == values.min()
+    np.testing.assert_allclose(part, [np.mean(values <= bound) for bound in level])
+    assert (level[0], part[-1]) == (values.min(), 1)
 
 
 def test_a_map_has_the_mean_of_each_cell():
@@ -208,49 +162,28 @@ def test_a_map_has_the_mean_of_each_cell():
     assert np.isnan(sparse).any()  # a cell without samples
 
 
-@pytest.fixture(scope="module")
-def diagnosed():
-    return diagnosis_page(line_diagnosis())
-
-
-def test_sections_and_charts(diagnosed):
-    page = diagnosed
-    assert list(page.sections) == [
-        "Verdict",
-        "Record",
-        "Loop that ran",
-        "Disturbance",
-        "Files and versions",
-    ]
-    (spectra,) = page.charts
-    assert (spectra.key, len(spectra.figure.axes)) == ("identification", 3)
-    (table,) = (t for t in page.blocks if getattr(t, "caption", "").startswith("Residual on"))
-    names = [row.name for row in line_diagnosis().residuals]
-    assert [row[0] for row in table.rows] == names
-
-
-def test_files(tmp_path):
+def test_the_page_of_a_diagnosis(tmp_path):
     source = tmp_path / "night.npz"
     source.write_bytes(b"what was recorded")
-    (path,) = write_page(diagnosis_page(line_diagnosis(), [source]), tmp_path / "page.html")
-    headings = re.findall(r"<th scope=.col.[^>]*>([^<]*)<", path.read_text())
-    assert "± [nm]" in headings
-    assert not [heading for heading in headings if "+-" in heading]
-    text = path.read_text(encoding="utf-8")
-    reader = Reader(text)
+    page = diagnosis_page(line_diagnosis(), [source])
+    (spectra,) = page.charts
+    assert (spectra.key, len(spectra.figure.axes)) == ("identification", 3)
+    names = [row.name for row in line_diagnosis().residuals]
+    assert [row[0] for row in table(page, "Residual on").rows] == names
+    (path,) = write_page(page, tmp_path / "page.html")
+    reader = Reader(path.read_text(encoding="utf-8"))
+    assert "± [nm]" in reader.texts["th"]
     assert reader.texts["h1"] == ["Diagnosis of night.npz"]
-    assert hashlib.sha256(b"what was recorded").hexdigest() in text
-    (notice,) = (a for a in reader.named("p") if "good" in (a.get("class") or ""))
-    assert notice["class"] == "notice good"
+    assert hashlib.sha256(b"what was recorded").hexdigest() in reader.texts["td"]
+    notices = [a["class"] for a in reader.named("p") if "notice" in (a.get("class") or "")]
+    assert "notice good" in notices
+    assert "notice bad" not in notices
 
 
-def test_what_is_wrong_comes_first_and_loudly(tmp_path):
-    found = lbt.identification.diagnose(short_record(-1.0))
-    page = diagnosis_page(found)
-    first = page.blocks[0]
-    assert (first.tone, first.text) == (
-        "bad",
-        "The commands are not those that the mirror followed: they have the opposite sign.",
+def test_a_diagnosis_of_wrong_commands_is_loud():
+    page = diagnosis_page(lbt.identification.diagnose(short_record(-1.0)))
+    assert page.blocks[0] == Notice(
+        text="The commands are not those that the mirror followed: they have the opposite sign.",
+        tone="bad",
     )
     assert page.charts == []
-    assert list(page.sections)[:3] == ["Verdict", "Record", "Loop that ran"]

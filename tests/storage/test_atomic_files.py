@@ -59,7 +59,10 @@ def test_only_regular_files_are_replaced(tmp_path, write):
     assert sorted(os.listdir(tmp_path)) == before
 
 
-def test_a_name_may_be_as_long_as_the_system_takes(tmp_path):
+def test_a_name_may_be_long_and_an_error_of_the_content_is_its_own(tmp_path):
+    with pytest.raises(ProblemError, match="one of the content"), open_atomically(tmp_path / "out"):
+        raise ProblemError("one of the content")
+    assert os.listdir(tmp_path) == []
     assert write_atomically(tmp_path / ("a" * 255), b"all").read_bytes() == b"all"
 
 
@@ -91,12 +94,6 @@ def test_a_full_disk_leaves_the_older_file_and_nothing_else(tmp_path, monkeypatc
         write(path, b"new")
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["out"]
-
-
-def test_an_error_while_writing_is_not_taken_for_one_of_the_file(tmp_path):
-    with pytest.raises(ProblemError, match="one of the content"), open_atomically(tmp_path / "out"):
-        raise ProblemError("one of the content")
-    assert os.listdir(tmp_path) == []
 
 
 def test_one_at_a_time_holds_a_directory(tmp_path):

@@ -44,9 +44,6 @@ def test_an_array_is_its_shape_in_one_line():
     assert len(line) == 100
     assert line.endswith("...>")
     assert "\n" not in line
-
-
-def test_a_class_below_keeps_the_one_line():
     assert repr(Shown(values=np.eye(2))) == "<Shown: a & b>"
 
 

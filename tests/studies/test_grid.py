@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import time
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
@@ -48,13 +47,6 @@ def test_a_sweep_knows_what_is_missing(tmp_path):
     assert sweep.run(None, lambda rows: rows, part_rows=2)[1] == 0
 
 
-class Elsewhere(ThreadPoolExecutor):
-    """An executor that gets everything in bytes, as one of processes does."""
-
-    def submit(self, fn, *args):
-        return super().submit(*pickle.loads(pickle.dumps((fn, *args))))
-
-
 def test_a_part_is_believed_by_its_digest_alone(tmp_path):
     sweep = Sweep(folder=tmp_path, columns=("a",), rows=2, digest="d" * 64)
     sweep.write((0, 2), ({"a": np.ones(2)}, []), 0.5)
@@ -73,29 +65,17 @@ def test_a_part_is_believed_by_its_digest_alone(tmp_path):
         sweep.paths()
 
 
-def wrong(study, values, start):
-    return {"a": 1}
-
-
-def short(study, values, start):
-    return evaluate_quickly(study, values[:-1], start)
-
-
-def raises(study, values, start):
-    raise RuntimeError("no such thing.")
-
-
 @pytest.mark.parametrize(
-    ("function", "message"),
+    ("evaluate", "words"),
     [
-        (wrong, r"rows 0 to 3 have no result \(ValueError"),
-        (short, r"rows 0 to 3 have no result \(ValueError: 3 rows\)"),
-        (raises, r"rows 0 to 3 have no result \(RuntimeError: no such thing\)"),
+        (lambda *_: {"a": 1}, "ValueError"),
+        (lambda study, rows, start: evaluate_quickly(study, rows[1:], start), "ValueError: 3 rows"),
+        (lambda *_: 1 / 0, "ZeroDivisionError: division by zero"),
     ],
 )
-def test_evaluations_that_are_none(tmp_path, function, message):
-    with pytest.raises(NumericalError, match=message):
-        run_study(load_small_study(tmp_path), make_folder(tmp_path), evaluate=function)
+def test_evaluations_that_are_none(tmp_path, evaluate, words):
+    with pytest.raises(NumericalError, match=rf"rows 0 to 3 have no result \({words}"):
+        run_study(load_small_study(tmp_path), make_folder(tmp_path), evaluate=evaluate)
 
 
 def test_any_executor(tmp_path):
@@ -107,17 +87,18 @@ def test_any_executor(tmp_path):
 
 
 class Breaks(ThreadPoolExecutor):
-    """An executor that ends after some calls."""
+    """An executor that ends after three calls, with an error or without a word."""
 
-    calls = 0
-    kind = BrokenExecutor
+    def __init__(self, error):
+        super().__init__(1)
+        self.error, self.calls = error, 0
 
     def submit(self, fn, *args, **kwargs):
-        Breaks.calls += 1
-        if Breaks.calls <= 3:
+        self.calls += 1
+        if self.calls <= 3:
             return super().submit(fn, *args, **kwargs)
-        if self.kind is BrokenExecutor:
-            raise BrokenExecutor("it is gone")
+        if self.error:
+            raise self.error
         lost: Future = Future()
         lost.cancel()
         lost.set_running_or_notify_cancel()
@@ -125,14 +106,13 @@ class Breaks(ThreadPoolExecutor):
 
 
 @pytest.mark.parametrize(
-    ("kind", "message"),
-    [(BrokenExecutor, r"\(BrokenExecutor: it is gone\)"), (None, r"\(CancelledError\)")],
+    ("error", "message"),
+    [(BrokenExecutor("it is gone"), "BrokenExecutor: it is gone"), (None, "CancelledError")],
 )
-def test_an_executor_that_breaks_keeps_what_is_finished(tmp_path, kind, message):
+def test_an_executor_that_breaks_keeps_what_is_finished(tmp_path, error, message):
     study, folder = load_small_study(tmp_path, samples="300"), make_folder(tmp_path)
-    Breaks.calls, Breaks.kind = 0, kind
-    words = f"{message}.*start the study again.*it goes on from there"
-    with Breaks(1) as pool, pytest.raises(NumericalError, match=words):
+    words = rf"\({message}\).*start the study again.*it goes on from there"
+    with Breaks(error) as pool, pytest.raises(NumericalError, match=words):
         run_study(study, folder, executor=pool, evaluate=evaluate_quickly)
     assert 1 <= len(part_rows(folder)) <= 3
     run_study(study, folder, evaluate=evaluate_quickly)

@@ -11,11 +11,8 @@ from lbt_synth.report.figures.studies import limits_figure
 from lbt_synth.studies.limits import compare_in_truth, limits
 
 
-def test_study(config):
-    designs = {
-        "kalman": lbt.kalman(config.plant),
-        "hinf": lbt.hinf(config.plant, gamma_ratio=1.2, route="riccati"),
-    }
+def test_study(config, lbt_designs):
+    designs = {name: lbt_designs[name] for name in ("kalman", "hinf")}
     study = limits(designs, config.hardware, config.truth, config.imaging, errors_hz=[-3.5, 0, 3.5])
     assert study.band_hz == (16.5, 23.5)
     assert study.residual_nm.shape == (2, study.shift_hz.size)
@@ -26,10 +23,6 @@ def test_study(config):
         assert row.worst_nm == pytest.approx(
             study.band.rms_nm * (1 + row.above_band_limit_percent / 100)
         )
-    (axis,) = limits_figure(study).axes
-    assert axis.get_xlabel() == "frequency of the true vibration [Hz]"
-    assert axis.get_ylabel() == "residual [nm rms]"
-    assert len({str(line.get_linestyle()) for line in axis.get_lines()[:2]}) == 2
 
 
 def test_a_filter_of_several_sensors_has_no_distance_from_the_limit_of_one(
@@ -43,8 +36,8 @@ def test_a_filter_of_several_sensors_has_no_distance_from_the_limit_of_one(
     assert own.above_limit_percent > 0
 
 
-def test_bad_studies(config):
-    good, designs = (config.hardware, config.truth, config.imaging), {"k": lbt.kalman(config.plant)}
+def test_bad_studies(config, lbt_designs):
+    good, designs = (config.hardware, config.truth, config.imaging), {"k": lbt_designs["kalman"]}
     still = limits(designs, *good)
     assert still.band is None
     for call, words in (
@@ -58,16 +51,13 @@ def test_bad_studies(config):
     ):
         with pytest.raises(lbt.errors.ProblemError, match=words):
             call()
-
-
-def test_a_design_without_a_plant_has_no_limits():
     bare = lbt.EstimationProblem(A=0.9, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     assert not model_limits(lbt.kalman(bare))
 
 
-def test_a_design_of_another_making_keeps_its_name_beside_the_reference(config):
+def test_a_design_of_another_making_keeps_its_name_beside_the_reference(config, lbt_designs):
     slow = config.design("integrator", gain=0.1)
-    found = compare_in_truth({"kalman": slow, "best": config.design("kalman")}, config)
+    found = compare_in_truth({"kalman": slow, "best": lbt_designs["kalman"]}, config)
     assert [row.design for row in found.rows] == ["kalman", "best", "integrator", "hinf"]
     found = compare_in_truth({"kalman": slow}, config)
     assert [row.design for row in found.rows][1:] == ["integrator", "kalman (reference)", "hinf"]

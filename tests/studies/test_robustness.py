@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.figures import legend
-from support.plants import LBT_YAML, lbt_axis_plant
+from support.lqg import shell, slow_plant
 from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
@@ -13,6 +12,7 @@ from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.report.figures.studies import tradeoff_figure
 from lbt_synth.studies import robustness, robustness_map
+from lbt_synth.studies.robustness import mirror_rows
 
 
 def test_robustness_rows(config):
@@ -55,21 +55,6 @@ def sinusoid(frequency_hz=20.0, rms_nm=797.0, direction=(1.0, 0.0)):
     return SinusoidalVibration(frequency_hz=frequency_hz, rms_nm=rms_nm, direction=direction)
 
 
-@pytest.fixture(scope="module")
-def settings():
-    return lbt.load_config(LBT_YAML)
-
-
-@pytest.fixture(scope="module")
-def kalman(settings):
-    return lbt.kalman(settings.plant)
-
-
-@pytest.fixture(scope="module")
-def robust(settings):
-    return lbt.hinf(settings.plant, gamma_ratio=1.2, route="riccati")
-
-
 def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,), rel=1e-6):
     found = robustness_map(
         design, truth, imaging, errors_hz=errors, sensor_gains=gains, delay_errors_frames=delays
@@ -79,6 +64,8 @@ def assert_as_single(design, truth, imaging, errors, gains, delays=(0.0,), rel=1
         for j, gain in enumerate(gains):
             for k, error in enumerate(errors):
                 if not found.stable[i, j]:
+                    assert np.isnan(found.strehl[i, j]).all()
+                    assert np.isnan(found.residual_nm[i, j]).all()
                     with pytest.raises(lbt.errors.UnstableLoopError):
                         evaluate_point(design, truth, imaging, error, gain, delay)
                     continue
@@ -95,39 +82,37 @@ def test_delay_errors_whole_and_fractional(air):
     assert np.all(np.diff(found.strehl[:, 1, 0]) < 0)  # a later loop is a worse one
 
 
-def test_unstable_points_are_nan(robust, settings):
-    found = robustness_map(
-        robust, settings.truth, settings.imaging, errors_hz=[-1, 0], sensor_gains=[0.3, 1.0, 3.0]
-    )
+def test_unstable_points_are_nan(config, lbt_designs):
+    axes = [-1, 0], [0.3, 1.0, 3.0]
+    found = assert_as_single(lbt_designs["hinf"], config.truth, config.imaging, *axes)
     assert found.stable[0].tolist() == [False, True, False]
-    assert np.isnan(found.strehl[0, [0, 2]]).all()
-    assert np.isnan(found.residual_nm[0, [0, 2]]).all()
-    assert np.isfinite(found.strehl[0, 1]).all()
 
 
-def test_an_image_that_is_gone_has_no_strehl(robust, settings):
+def test_an_image_that_is_gone_has_no_strehl(config, lbt_designs):
+    robust = lbt_designs["hinf"]
     _, high = lbt.loop.stable_sensor_gains(robust.hardware, robust.controller)
     found = robustness_map(
-        robust, settings.truth, settings.imaging, errors_hz=[0], sensor_gains=[high * (1 - 1e-8)]
+        robust, config.truth, config.imaging, errors_hz=[0], sensor_gains=[high * (1 - 1e-8)]
     )
     assert found.stable.all()
     assert found.residual_nm.min() > 9e4
     assert found.strehl.max() == 0
 
 
-def test_each_line_moves_by_its_share(kalman, settings):
+def test_each_line_moves_by_its_share(config, lbt_designs):
     """Wind shake at 0.3 Hz stays where the line at 20 Hz moves by 3.5 Hz, or as is stated."""
     lines = (sinusoid(0.3, 400.0), sinusoid(20.0, 300.0))
 
     def residual(truth, error):
-        found = robustness_map(kalman, truth, settings.imaging, errors_hz=[error], sensor_gains=[1])
+        axes = {"errors_hz": [error], "sensor_gains": [1]}
+        found = robustness_map(lbt_designs["kalman"], truth, config.imaging, **axes)
         return float(found.residual_nm[0, 0, 0])
 
     def at(*frequencies):
         moved = [replace(line, frequency_hz=f) for line, f in zip(lines, frequencies, strict=True)]
-        return residual(replace(settings.truth, vibrations=tuple(moved)), 0.0)
+        return residual(replace(config.truth, vibrations=tuple(moved)), 0.0)
 
-    truth = replace(settings.truth, vibrations=lines)
+    truth = replace(config.truth, vibrations=lines)
     assert residual(truth, 3.5) == pytest.approx(at(0.3 * 23.5 / 20, 23.5), rel=1e-12)
     assert residual(truth, -3.5) == pytest.approx(at(0.3 * 16.5 / 20, 16.5), rel=1e-12)
     stated = replace(truth, frequency_errors_hz=(0.1, 2.0))
@@ -136,17 +121,17 @@ def test_each_line_moves_by_its_share(kalman, settings):
     assert residual(fixed, -3.5) == pytest.approx(at(0.3, 16.5), rel=1e-12)
 
 
-def test_the_lines_of_the_model_move_as_the_true_ones_near_them(settings):
+def test_the_lines_of_the_model_move_as_the_true_ones_near_them(config):
     model = [lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=50.0) for f in (0.31, 21.0)]
     plant = lbt.tip_tilt_plant(
-        frame_rate_hz=800, turbulence=settings.plant.turbulence[0], vibrations=model, noise_nm=15.5
+        frame_rate_hz=800, turbulence=config.plant.turbulence[0], vibrations=model, noise_nm=15.5
     )
     truth = replace(
-        settings.truth,
+        config.truth,
         vibrations=(sinusoid(0.3, 100.0), sinusoid(20.0, 100.0)),
         frequency_errors_hz=(0.0, 3.5),
     )
-    (row,) = robustness(plant, truth, settings.imaging, errors_hz=[2.0], methods=["kalman"])
+    (row,) = robustness(plant, truth, config.imaging, errors_hz=[2.0], methods=["kalman"])
     moved = lbt.kalman(retuned_plant(plant, [0.0, -2.0], hold="driving"))
     budget = lbt.residual_budget(lbt.close_loop(moved.hardware, moved.controller), truth)
     assert row.residual_nm == pytest.approx(budget.rms_nm, rel=1e-9)
@@ -154,29 +139,27 @@ def test_the_lines_of_the_model_move_as_the_true_ones_near_them(settings):
 
 WRONG = [
     ({"errors_hz": []}, "at least one number"),
-    ({"errors_hz": [[0.0]]}, "at least one number"),
-    ({"errors_hz": [np.nan]}, "finite"),
     ({"errors_hz": [1, 1]}, "each value once"),
     ({"errors_hz": [-20]}, "moves the one at 20 Hz to 0 Hz"),
     ({"errors_hz": [380]}, "between 0 and 400 Hz"),
     ({"sensor_gains": [0.5, 0]}, "sensor_gains must be above 0"),
-    ({"sensor_gains": "wide"}, "sensor_gains must be an array of numbers"),
     ({"delay_errors_frames": [-1.5]}, "delay_errors_frames must be at least -1"),
     ({"delay_errors_frames": [99]}, "together must lie between 1 and 20"),
 ]
 
 
 @pytest.mark.parametrize(("wrong", "text"), WRONG)
-def test_wrong_axes_are_refused(kalman, settings, wrong, text):
+def test_wrong_axes_are_refused(config, lbt_designs, wrong, text):
     axes = {"errors_hz": [0], "sensor_gains": [1]} | wrong
     with pytest.raises(lbt.errors.ProblemError, match=text):
-        robustness_map(kalman, settings.truth, settings.imaging, **axes)
+        robustness_map(lbt_designs["kalman"], config.truth, config.imaging, **axes)
 
 
-def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
+def test_designs_and_truths_that_have_no_map(config, lbt_designs, axis_plant):
+    kalman = lbt_designs["kalman"]
     walk = lbt.EstimationProblem(A=0.99, B=[[1.0, 0.0]], C=1.0, D=[[0.0, 1.0]], L=1.0)
     three = lbt.integrator(lbt.LoopHardware(frame_rate_hz=800, modes=3), gain=0.5)
-    still, shaken = lbt.Truth(turbulence=None), settings.truth
+    still, shaken = lbt.Truth(turbulence=None), config.truth
     for design, truth, error, words in (
         (lbt.kalman(walk), shaken, lbt.errors.ProblemError, "a map needs the design of a loop"),
         (kalman, still, lbt.errors.ProblemError, "needs a vibration in the truth"),
@@ -184,17 +167,12 @@ def test_designs_and_truths_that_have_no_map(kalman, axis_plant, settings):
         (three, still, lbt.errors.DimensionError, "got a loop of 3 modes"),
     ):
         with pytest.raises(error, match=words):
-            robustness_map(design, truth, settings.imaging, errors_hz=[0, 1], sensor_gains=[1])
+            robustness_map(design, truth, config.imaging, errors_hz=[0, 1], sensor_gains=[1])
 
 
-@pytest.fixture(scope="module")
-def plant():
-    return lbt_axis_plant()
-
-
-def test_the_front_of_the_lbt(plant):
+def test_the_front_of_the_lbt(axis_plant):
     """A norm close to its least costs sensor-gain robustness, whichever filter has it."""
-    points = list(lbt.studies.tradeoff(plant, points=3, taps=8))
+    points = list(lbt.studies.tradeoff(axis_plant, points=3, taps=8))
     for family in ("mixed", "central"):
         own = [point for point in points if point.family == family]
         gamma, rms, low = ([getattr(p, key) for p in own] for key in ("gamma", "rms", "gain_low"))
@@ -205,7 +183,12 @@ def test_the_front_of_the_lbt(plant):
     for mixed, central in zip(points[2:-2:2], points[3:-2:2], strict=True):
         assert mixed.rms < central.rms
         assert mixed.gain_low < central.gain_low  # it tolerates more, too
-    figure = tradeoff_figure(points)
-    assert len(figure.axes) == 2
-    assert legend(figure.axes[0])[0] == "least variance at this norm"
-    assert figure.axes[1].get_xlabel() == "H∞ norm of the estimation error [nm]"
+    assert tradeoff_figure(points).axes[1].get_xlabel() == "H∞ norm of the estimation error [nm]"
+
+
+def test_a_slow_mirror_needs_a_design_that_knows_it():
+    plant = slow_plant(2.0, shell())
+    truth = lbt.Truth(turbulence=plant.turbulence, vibrations=plant.vibrations, noise_nm=15.5)
+    rows = {row.design: row for row in mirror_rows(plant, truth, CAMERA)}
+    assert not rows["kalman, settled mirror"].stable
+    assert rows["lqg"].residual_nm < 0.7 * rows["kalman, real positions"].residual_nm

@@ -11,9 +11,9 @@ from lbt_synth.studies.runs import run_failures
 
 
 def test_each_segment_has_its_exact_residual(sensors_design, sensors_config):
-    drops = [Drop(unit="m1", start_s=8), Drop(unit="m2", start_s=16, reading="zero")]
+    drops = [Drop(unit="m1", start_s=3), Drop(unit="m2", start_s=6, reading="zero")]
     _, segments = run_failures(
-        sensors_design, sensors_config, sensors_config.truth, drops, frames=24_000, cases=6, seed=4
+        sensors_design, sensors_config, sensors_config.truth, drops, frames=9000, cases=6, seed=4
     )
     rows = [row for _, row in segments]
     assert [row.sensors for row in rows] == ["none", "m1", "m1, m2 (zero)"]

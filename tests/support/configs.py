@@ -38,6 +38,18 @@ def change_key(path, value):
     return out
 
 
+def numbers_of(section, path=""):
+    """Yield the path and the value of each number of a section."""
+    if isinstance(section, dict):
+        for key, value in section.items():
+            yield from numbers_of(value, f"{path}.{key}" if path else key)
+    elif isinstance(section, list):
+        for i, value in enumerate(section):
+            yield from numbers_of(value, f"{path}[{i}]")
+    elif isinstance(section, int | float):
+        yield path, section
+
+
 AR = {"kind": "ar", "coefficients": [0.99], "driving_rms_nm": 40.0}
 OTHER = {"kind": "ar", "coefficients": [1.6, -0.65], "driving_rms_nm": 25.0}
 SMALL = {

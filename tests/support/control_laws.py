@@ -38,7 +38,7 @@ class SteppedLaw:
         return applied.copy()
 
 
-def run_law(controller, *, frames=6000, seed=1, truth=TRUTH, hardware=PATH):
+def run_law(controller, *, frames=3000, seed=1, truth=TRUTH, hardware=PATH):
     """Measurements and commands of a loop, (frames, 2) each."""
     options = {"frames": frames, "seed": seed, "frame_means": True}
     run = lbt.simulate(controller, truth, hardware=hardware, **options)

@@ -100,6 +100,4 @@ CASES = [
 ]
 
 GOOD = np.random.default_rng(0).standard_normal((2000, 2))
-SPOILT = np.where(np.arange(2000)[:, None] == 77, np.nan, GOOD)
 PATH = lbt.LoopHardware(frame_rate_hz=RATE)
-STUCK = lbt.LoopHardware(frame_rate_hz=RATE, influence_matrix=[[1, 1], [1, 1]])

@@ -12,17 +12,6 @@ def rational(matrix) -> np.ndarray:
     return np.vectorize(Fraction, otypes=[object])(np.asarray(matrix))
 
 
-def is_positive_definite(matrix) -> bool:
-    """Eliminate without rounding: every pivot of a positive definite matrix is positive."""
-    rest = rational(matrix)
-    for j in range(len(rest)):
-        if rest[j, j] <= 0:
-            return False
-        column = rest[j + 1 :, j] / rest[j, j]
-        rest[j + 1 :, j + 1 :] = rest[j + 1 :, j + 1 :] - np.outer(column, rest[j, j + 1 :])
-    return True
-
-
 def exact_covariance(A, B):
     """Covariance of ``x+ = A x + B w`` by Gauss-Jordan elimination, (n, n) of fractions."""
     n = len(A)

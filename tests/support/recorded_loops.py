@@ -162,8 +162,8 @@ def _directed_record(
 
 
 def expected_periodogram(air: lbt.models.Spectrum, noise: float, gain: float) -> LoopPeriodogram:
-    """Return what the periodograms of a minute of an integrator's loop scatter about."""
-    f = np.arange(1, 30_000) / 60
+    """Return what the periodograms of half a minute of an integrator's loop scatter about."""
+    f = np.arange(1, 15_000) / 30
     parts = air.parts if isinstance(air, lbt.models.SumSpectrum) else (air,)
     seen = sum(p.psd(f) * np.sinc(f / RATE) ** (2 * isinstance(p, lbt.Atmosphere)) for p in parts)
     delay = np.exp(-2j * np.pi * f / RATE)

@@ -21,6 +21,7 @@ model:
     - {axis: tilt, frequency_hz: 33, damping: 0.01, rms_nm: 200,
        accelerometers: {m2: {motion_nm_per_nm: 1.5, phase_deg: 150}}}
 truth: {vibrations: model}
+robustness: {errors_hz: [2], sensor_gains: [0.5, 1]}
 simulation: {frames: 2000, cases: 2, settle_frames: 500}
 """
 

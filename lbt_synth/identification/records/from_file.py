@@ -285,7 +285,7 @@ def _join_commands(contents: Contents, path: Path) -> None:
     if not named:
         raise TelemetryError(f"{path} holds no commands.", path=path)
     named = _lay_beside(contents, other, named, path)
-    if len(named) > 1 and any(column.axis is None for column in named):
+    if any(column.axis is None for column in named):
         named = number_axes(named)
     columns = [column for column in contents.columns if column.role != "commands"]
     if not any(column.role in ("measurements", "open_loop") for column in columns):

@@ -4,8 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 from scipy.signal import lfilter
 from support.modal import RATE, integrator_residuals, integrator_run, path_of
@@ -13,7 +11,6 @@ from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.design.modal import modal_gains, modal_gains_from_telemetry
-from lbt_synth.design.modal.gains import _minimise
 from lbt_synth.errors import DimensionError, NonFiniteError, NumericalError, ProblemError
 from lbt_synth.models import ARModel, PositionLoop, TabulatedSpectrum
 
@@ -35,10 +32,10 @@ def best_integrator(path, truth):
         loop = lbt.close_loop(path, controller, sensor_gain=truth.sensor_gain)
         return lbt.residual_budget(loop, truth).rms_nm if loop.is_stable else 1e6 * gain
 
-    grid = np.geomspace(0.001, 2, 40) / truth.sensor_gain
+    grid = np.geomspace(0.001, 2, 20) / truth.sensor_gain
     place = int(np.argmin([residual(gain) for gain in grid]))  # there may be two minima
     bounds = grid[place - 1], grid[place + 1]
-    best = minimize_scalar(residual, bounds=bounds, method="bounded", options={"xatol": 1e-9})
+    best = minimize_scalar(residual, bounds=bounds, method="bounded", options={"xatol": 1e-7})
     return best.x, best.fun
 
 
@@ -106,22 +103,6 @@ def test_a_quiet_sensor_is_limited_by_stability():
     assert np.allclose(gains.rms_nm, residuals, rtol=1e-6)
 
 
-@settings(max_examples=10)
-@given(a=st.floats(0.02, 0.9), b=st.floats(0.01, 10), delta=st.floats(0, 1))
-def test_minimum_between_the_points(a, b, delta):
-    """A function with the pole that residuals have is minimised without knowing it."""
-    h, highest = np.geomspace(1e-4, 0.9999, 161), 0.999
-
-    def function(x):
-        return (b + (np.log(x) - np.log(a)) ** 2) * (1 + delta * x) / (1 - x)
-
-    place, value = _minimise(h, function(h)[None], 1.0, np.array([highest]))
-    bounds, options = (np.log(1e-4), np.log(highest)), {"xatol": 1e-10}
-    best = minimize_scalar(lambda log: function(np.exp(log)), bounds=bounds, options=options)
-    assert value[0] == pytest.approx(best.fun, rel=1e-9)
-    assert place[0] == pytest.approx(np.exp(best.x), rel=1e-4)
-
-
 @pytest.mark.parametrize(("bandwidth", "delay"), [(60.0, 2.4), (250.0, 2)])
 def test_a_slow_mirror_has_its_own_gains(bandwidth, delay):
     shell = PositionLoop.from_bandwidth(
@@ -147,7 +128,7 @@ def test_a_slow_mirror_has_its_own_gains(bandwidth, delay):
     total = ar_series([0.99], 10.0, 8, 20_000, rng)
     noise = 5.0 * rng.standard_normal(total.shape)
     series = integrator_run(np.full(8, gains.gains[0] / 2), total, noise, **known)
-    seen = modal_gains_from_telemetry(*series, noise_nm=5.0, **known)
+    seen = modal_gains_from_telemetry(*series, noise_nm=5.0, segment_frames=64, **known)
     assert np.mean(seen.gains) == pytest.approx(gains.gains[0], rel=0.05)
     assert np.mean(seen.rms_nm) == pytest.approx(gains.rms_nm[0], rel=0.02)
 
@@ -257,18 +238,6 @@ def test_scatter_is_not_turbulence(pole, driving, noise, frames, modes):
     # where the noise is put plays no part in the choice of the gain
     guessed = modal_gains_from_telemetry(*series, hardware=path_of())
     assert np.quantile(np.abs(guessed.gains / gains.gains - 1), 0.9) < 5e-3
-
-
-def test_a_steep_spectrum_does_not_leak():
-    """Most of the turbulence lies below the periodogram's first frequency, 3 Hz."""
-    rng = np.random.default_rng(3)
-    exact = modal_gains(air_of(0.9999, 1.0), noise_nm=2.0, hardware=path_of())
-    total = ar_series([0.9999], 1.0, 6, 40_000, rng)
-    series = integrator_run(np.full(6, 0.2), total, 2.0 * rng.standard_normal(total.shape))
-    known = {"hardware": path_of(), "noise_nm": 2.0, "segment_frames": 256}
-    gains = modal_gains_from_telemetry(*series, **known)
-    assert np.mean(gains.gains) == pytest.approx(exact.gains[0], rel=0.02)
-    assert np.mean(gains.rms_nm) == pytest.approx(exact.rms_nm[0], rel=0.02)
 
 
 def test_residuals_are_at_least_the_propagated_noise():

@@ -1,7 +1,6 @@
 """Mixed controllers: steps written out, loops, refusals."""
 
 import numpy as np
-import pytest
 from support.effort import count_calls
 from support.modal import path_of, some_air, tip_tilt_filter
 from support.refusals import require_refusals
@@ -78,18 +77,15 @@ def test_bad_mixed_controllers_are_refused():
     )
 
 
-@pytest.mark.parametrize(
-    ("y", "error", "words"),
-    [
-        ([1.0], DimensionError, r"y must have shape \(2,\)"),
-        ([np.nan, 1.0], NonFiniteError, "The state is as before"),
-        ("a", ProblemError, "array of numbers"),
-        (["1.0", "2.0"], ProblemError, "array of numbers"),
-        ([1j, 1j], ProblemError, "real"),
-    ],
-)
-def test_bad_measurements_leave_the_state_alone(y, error, words):
+def test_bad_measurements_leave_the_state_alone():
     mixed = MixedController(gains=[1.0, 1.0])
     mixed.step([1.0, 2.0])
-    require_refusals([(lambda: mixed.step(y), error, words)])
+    rows = [
+        (lambda: mixed.step([1.0]), DimensionError, r"y must have shape \(2,\)"),
+        (lambda: mixed.step([np.nan, 1.0]), NonFiniteError, "The state is as before"),
+        (lambda: mixed.step("a"), ProblemError, "array of numbers"),
+        (lambda: mixed.step(["1.0", "2.0"]), ProblemError, "array of numbers"),
+        (lambda: mixed.step([1j, 1j]), ProblemError, "real"),
+    ]
+    require_refusals(rows)
     assert mixed.step([0.0, 0.0]).tolist() == [1.0, 2.0]

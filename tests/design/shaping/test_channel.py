@@ -5,8 +5,7 @@ import pytest
 from support.shaping import RATE
 
 import lbt_synth as lbt
-from lbt_synth.design.loop_shaping import controller_from_parameters
-from lbt_synth.design.shaping.channel import Channel, SingleModeLoop, laguerre_basis, mode_loop
+from lbt_synth.design.shaping.channel import Channel, laguerre_basis, mode_loop
 
 
 @pytest.mark.parametrize("pole", [0.0, -0.3, 0.95])
@@ -57,20 +56,3 @@ def test_the_residual_of_holds_is_what_the_image_has_beyond_its_floor(delay, sen
     noise = np.abs(channel.residual_noise_rows(f) @ coefficients / denominator)
     response = held_loop.path("noise", "residual").frequency_response(f)[:, 0, 0]
     np.testing.assert_allclose(noise, np.abs(response), rtol=1e-9)
-
-
-@pytest.mark.parametrize("sensor_gain", [1.0, 0.7])
-def test_a_mode_of_a_loop_is_its_own_loop(sensor_gain):
-    path = lbt.LoopHardware(
-        frame_rate_hz=RATE,
-        sensor_matrix=[[1.0, 0.3], [-0.2, 0.9], [0.4, 0.0]],
-        influence_matrix=[[0.8, 0.1, 0.0], [0.0, 0.5, 0.4]],
-    )
-    basis = laguerre_basis(3, 0.5, dt_s=path.dt_s)
-    parameters = tuple(basis.parameter(np.array(c)) for c in ([0.5, 0.3, -0.1], [0.2, 0.1, 0.3]))
-    controller, f = controller_from_parameters(path, parameters), [1.0, 40.0, 333.0]
-    for mode, parameter in enumerate(parameters):
-        whole = SingleModeLoop(hardware=path, controller=controller, mode=mode).at(sensor_gain)
-        alone = mode_loop(path, parameter).at(sensor_gain)
-        responses = [loop.system.frequency_response(f) for loop in (whole, alone)]
-        np.testing.assert_allclose(*responses, atol=1e-12)

@@ -30,6 +30,7 @@ DEMANDS = [
     LoopErrors(low=1.0, high=1.5),
     Bound(response="complementary", at_most=2.5, low_hz=100, high_hz=400),
     LoopErrors(delay_frames=0.3),
+    LoopErrors(low=0.75, high=1.333, delay_frames=0.2),
     CommandRms(at_most_nm=30, turbulence=SLOW, noise_nm=NOISE),
     CommandRms(at_most_nm=30, turbulence=SLOW, noise_nm=NOISE, rate=True),
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.control_laws import ordinary_loop
+from support.refusals import refused
 from support.wrong_commands import FAULTS, record, wrong_record
 
 import lbt_synth as lbt
@@ -70,7 +71,6 @@ def test_repairs_that_are_refused() -> None:
 
     for call, why in (
         (lambda: CommandRepair(sign=(2,)), "command_sign must be 1 or -1"),
-        (lambda: CommandRepair(scale=(0.0,)), "command_scale must be above 0"),
         (lambda: CommandRepair(scale=(1.0, -2.0)), "command_scale must be above 0"),
         (lambda: CommandRepair(matrix=(1.0, np.nan, 0.0, 1.0)), "command_matrix"),
         (lambda: CommandRepair(scale=(5.0, 4.0)).turn(1), "command_scale must be one number, or 1"),
@@ -79,5 +79,4 @@ def test_repairs_that_are_refused() -> None:
         (lambda: repair(one, matrix=(1.0, 0.0, 0.0, 1.0)), "must have 1 numbers"),
         (lambda: repair(open_loop, sign=(-1,)), "open loop"),
     ):
-        with pytest.raises(lbt.errors.ProblemError, match=why):
-            call()
+        refused(call, lbt.errors.ProblemError, why)

@@ -83,30 +83,26 @@ def drawn_from(whole: np.ndarray) -> Search:
     return replace(search, data=replace(search.data, measured=whole * chance))
 
 
-def bump_of(density_nm2_hz: np.ndarray) -> SpectrumModel:
-    """Return what is found of a density beside turbulence and noise."""
-    search = empty_search()
-    truth = white_noise().add(search.component("turbulence", 1.0, 0.5, 3000.0))
-    return find_components(drawn_from(density(search.data, truth) + density_nm2_hz)).spectrum
-
-
-def test_a_smooth_bump_is_one_component() -> None:
+def test_smooth_bumps_and_resonances_are_one_component_each() -> None:
     """One 8 Hz wide was five lines, with errors of 0.1 Hz each; a line stays beside it."""
-    f = empty_search().data.frequency_hz
+    search = empty_search()
+    f = search.data.frequency_hz
+    air = white_noise().add(search.component("turbulence", 1.0, 0.5, 3000.0))
     smooth = 2.0 * np.exp(-4 * np.log(2) * ((f - 40) / 8) ** 2)
-    (bump,) = bump_of(smooth).lines
+    line = 20 / np.pi * 0.05 / ((f - 41) ** 2 + 0.05**2)
+
+    def lines_beside_air(density_nm2_hz: np.ndarray) -> tuple:
+        return find_components(
+            drawn_from(density(search.data, air) + density_nm2_hz)
+        ).spectrum.lines
+
+    (bump,) = lines_beside_air(smooth)
     assert bump.sections > 1
     assert np.exp(bump.log_power) == pytest.approx(2.0 * 8 * 1.0645, rel=0.1)
-    line = 20 / np.pi * 0.05 / ((f - 41) ** 2 + 0.05**2)
-    assert sorted(c.sections > 1 for c in bump_of(smooth + line).lines) == [False, True]
-
-
-def test_a_resonance_is_no_bump() -> None:
-    search = empty_search()
-    wide = search.component("line", 40.0, 0.1, 400.0)
-    truth = white_noise().add(search.component("turbulence", 1.0, 0.5, 3000.0), wide)
-    (found,) = find_components(drawn_search(truth, 0)).spectrum.lines
-    assert found.sections == 1
+    assert sorted(c.sections > 1 for c in lines_beside_air(smooth + line)) == [False, True]
+    truth = air.add(search.component("line", 40.0, 0.1, 400.0))
+    (resonance,) = find_components(drawn_search(truth, 0)).spectrum.lines
+    assert resonance.sections == 1
 
 
 def test_turbulence_is_not_taken_for_a_resonance() -> None:

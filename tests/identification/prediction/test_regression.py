@@ -11,6 +11,7 @@ from support.structures import structure
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError
+from lbt_synth.identification import loop_record
 from lbt_synth.identification.accelerometers.readings import channels_beside
 from lbt_synth.identification.prediction.comparison import WITHOUT, compare_designs
 from lbt_synth.identification.prediction.regression import (
@@ -27,17 +28,26 @@ from lbt_synth.loop import close_loop
 
 @cache
 def vibrating():
-    """A structure of few modes with three channels, the first half of a run and its model."""
-    seen = structure(41, seconds=20, modes=(5, 5), channels=(3, 3))
+    """A structure of three modes with three channels, the first half of a run and its model."""
+    seen = structure(6, seconds=20, modes=(3, 3), channels=(3, 3))
     record = seen.record(0, len(seen.phase) // 2)
     return seen, record, lbt.identify(record, sensor_gain=1.0)
 
 
+def beside_record():
+    seen, record, _ = vibrating()
+    return channels_beside(record, seen.readings[: record.frames])
+
+
 @cache
 def regression(*, channels: bool):
-    seen, record, model = vibrating()
-    beside = channels_beside(record, seen.readings[: record.frames]) if channels else None
-    return regress(record, model, channels=beside)
+    _, record, model = vibrating()
+    return regress(record, model, channels=beside_record() if channels else None)
+
+
+@cache
+def predictor(*, channels: bool):
+    return regression(channels=channels).design()
 
 
 def left_nm2(design, controller=None, *, silent: tuple[int, ...] = ()):
@@ -73,16 +83,14 @@ def test_moments_are_those_of_the_products(runs) -> None:
 
 def test_channels_that_see_a_structure_are_worth_what_is_claimed() -> None:
     """The claims are of the second half of the record; the judge is a run after it."""
-    seen, record, model = vibrating()
-    kalman = lbt.kalman(model.plant())
-    alone, fused = (regression(channels=channels).design() for channels in (False, True))
-    base = left_nm2(kalman)
+    _, record, model = vibrating()
+    alone, fused = (predictor(channels=channels) for channels in (False, True))
+    base = left_nm2(lbt.kalman(model.plant()))
     assert left_nm2(alone) < 1.02 * base
     assert left_nm2(fused) < 0.6 * base
     assert fused.other_sensors == ("channel1", "channel2", "channel3")
     half = lbt.identify(split_halves(record)[0], sensor_gain=1.0)
-    beside = channels_beside(record, seen.readings[: record.frames])
-    table, _ = compare_designs(record, half, {"predictor": {}}, channels=beside)
+    table, _ = compare_designs(record, half, {"predictor": {}}, channels=beside_record())
     title = "least-squares predictor"
     claimed_nm = table[title].replayed_nm
     assert claimed_nm**2 == pytest.approx(left_nm2(fused), rel=0.2)
@@ -93,7 +101,7 @@ def test_channels_that_see_a_structure_are_worth_what_is_claimed() -> None:
     loops = [close_loop(fused.hardware, k) for k in (fused.controller, fallback)]
     assert loops[0].spectral_radius == pytest.approx(loops[1].spectral_radius, rel=1e-9)
     # and what each is worth, by the moments of the unseen half alone
-    for place, row in enumerate(channel_values(record, half, beside)):
+    for place, row in enumerate(channel_values(record, half, beside_record())):
         assert row.channel == f"channel{place + 1}"
         assert row.without_nm > 0.98 * claimed_nm
         dead = np.sqrt(left_nm2(fused, silent=(place,)))
@@ -104,9 +112,8 @@ def test_the_filter_gives_the_sum_of_squares_of_the_moments() -> None:
     """The loop, its reduction apart, leaves of the record what the regression says."""
     seen, record, model = vibrating()
     fit = regression(channels=True)
-    signals = range(len(fit.scales))
-    coefficients = fit.solve(signals, fit.penalty, fit.whole)
-    design = fit.design()
+    coefficients = fit.solve(range(len(fit.scales)), fit.penalty, fit.whole)
+    design = predictor(channels=True)
     loop = close_loop(design.hardware, design.controller)
     z = record.pseudo_open_loop(model.sensor_gains)
     runs = record.stretches()
@@ -119,7 +126,6 @@ def test_the_filter_gives_the_sum_of_squares_of_the_moments() -> None:
 
 def test_a_fit_adds_its_coefficients_over_the_frames() -> None:
     """None where a penalty holds them all; else what two halves of a record lose to each other."""
-    _, record, _ = vibrating()
     fit = regression(channels=True)
     assert fit.fit_share(1e30) == pytest.approx(0, abs=1e-9)
     penalty, signals = 1e-6, range(len(fit.scales))
@@ -132,38 +138,33 @@ def test_a_fit_adds_its_coefficients_over_the_frames() -> None:
     least = fit.whole.left(fit.solve(signals, penalty, fit.whole))
     half = replace(fit, parts=fit.parts[:3])
     assert np.mean(apart) == pytest.approx(2 * half.fit_share(penalty) * least, rel=0.3)
-    design = lbt.design_from_record(record, sensor_gain=1.0, method="predictor").design
-    assert 0 < design.claims["fit_share"] < 0.1
+    assert 0 < predictor(channels=True).claims["fit_share"] < 0.1
 
 
 def test_a_large_penalty_leaves_the_filter_of_the_model() -> None:
-    _, _, model = vibrating()
     stiff = regression(channels=True).design(1e12)
-    kalman = lbt.kalman(model.plant())
+    kalman = lbt.kalman(vibrating()[2].plant())
     assert left_nm2(stiff) == pytest.approx(left_nm2(kalman), rel=0.02)
 
 
 def test_more_noise_is_trusted_less() -> None:
     """The command of white noise falls, and the residual rises."""
     _, record, model = vibrating()
-    calm, usual = (regress(record, model, noise=factor).design() for factor in (8.0, 1.0))
+    calm, usual = regress(record, model, noise=8.0).design(), predictor(channels=False)
     assert max(calm.claims["command_rms"]) < 0.8 * max(usual.claims["command_rms"])
     assert left_nm2(calm) > left_nm2(usual)
     assert noisier(model, 8.0).axes[0].noise_nm == 8 * model.axes[0].noise_nm
 
 
 def test_gains_and_delays_that_are_not_whole() -> None:
-    """A process of second order in a loop of 2.4 frames and a gain of 0.6: no more than its model.
-
-    While a command holds it leaves what the limit is, and no more than the filter of the model.
-    """
+    """While a command holds it leaves what the limit is, and no more than the model's filter."""
     line = lbt.Vibration(frequency_hz=40, damping=0.05, rms_nm=100, direction=(1,))
     fast = lbt.models.ARModel(coefficients=[0.95], driving_rms_nm=20.0, frame_rate_hz=1000)
     truth = lbt.Truth(turbulence=fast, vibrations=(line,), noise_nm=10.0, sensor_gain=0.6)
     path = lbt.LoopHardware(frame_rate_hz=1000, modes=1, delay_frames=2.4)
     ran = lbt.integrator(path, gain=0.3).controller
     run = lbt.simulate(ran, truth, hardware=path, frames=40_000, frame_means=True)
-    record = lbt.identification.loop_record(
+    record = loop_record(
         run.measurements[0], run.commands[0], frame_rate_hz=1000, delay_frames=2.4, unit="nm"
     )
     model = lbt.identify(record, sensor_gain=0.6)

@@ -62,6 +62,7 @@ def test_telemetry_of_ours(tmp_path, name):
     assert np.array_equal(seen.measurements, run.measurements[0])
     assert np.array_equal(seen.mirror_taps, path.mirror_taps)
     assert seen.source == str(file)
+    assert not any("of another program" in note for note in seen.notes)
     assert lbt.load_record(file, axes=[1]).axes == 1
     with pytest.raises(ProblemError, match=f"{name}: .*neither columns nor commands"):
         lbt.load_record(file, columns={"measurements": 0})
@@ -113,6 +114,9 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     other = lbt.load_record(path, frame_rate_hz=1000, delay_frames=3, diameter_m=8.4)
     assert (other.frame_rate_hz, other.delay_frames, other.diameter_m) == (1000.0, 3.0, 8.4)
     assert "delay_frames 3 was given, in place of 2.5 by DELAYFRM of HDU 0" in other.notes
+    for change, contradicts in ((5e-7, False), (1.5e-6, True)):
+        notes = lbt.load_record(path, frame_rate_hz=(1 + change) * RATE).notes
+        assert any("was given, in place of" in note for note in notes) is contradicts
     # a delay of unknown unit is not taken
     unsure = hdus(tmp_path / "b.fits", image("Y", y, "nm"), image("U", u, "nm"), DELAY=0.002)
     seen = lbt.load_record(unsure, frame_rate_hz=RATE)
@@ -137,7 +141,9 @@ def test_units_must_be_given(tmp_path, series):
     mixed = write_csv(tmp_path / "c.csv", ["pol0_nm", "pol1_um"], y.T)
     pixels = hdus(tmp_path / "d.fits", image("POL", y, "pixel"), FPS=RATE)
     angle = hdus(tmp_path / "e.fits", image("POL", y, "arcsec"), FPS=RATE)
+    np.savez(tmp_path / "f.npz", pol0_nm=y[:, 0], pol1_nm=y[1:, 1])
     for file, words in (
+        (tmp_path / "f.npz", "pol0_nm and pol1_nm must be equally long; got 59 and 60 rows"),
         (mixed, "pol0_nm, pol1_um must all have the same unit; got nm, um"),
         (pixels, "unit must be one of nm.*got 'pixel'"),
         (angle, r"e\.fits: nothing tells the telescope.*give diameter_m"),
@@ -232,21 +238,24 @@ TIMES = np.arange(60) / RATE + 0.02
 LAID = {  # clocks of measurements and commands, and which command each row has
     "row by row": ({}, {}, np.arange(60)),
     "counters": ({"frame": np.arange(10, 70)}, {"frame": np.arange(60)}, np.arange(10, 70)),
-    "times": ({"time_s": TIMES}, {"time_ms": 1e3 * TIMES + 0.1}, np.arange(60)),
+    "times": ({"time_s": TIMES}, {"time_ms": 1e3 * (TIMES - 0.4 / RATE)}, np.arange(60)),
     "later": ({"time_s": TIMES}, {"time_s": TIMES + 5 / RATE}, np.arange(-5, 55)),
 }
 
 
 @pytest.mark.parametrize("by", LAID)
 def test_commands_of_another_file_are_laid_beside_the_measurements(tmp_path, series, by):
-    y, u = series[0][:, 0], series[1][:, 0]
+    """Axes have the order of their columns, unless the names tell another."""
+    y, u = series
     clock, other, row = LAID[by]
-    mine, theirs = csv(tmp_path / "y.csv", **clock, y=y), csv(tmp_path / "u.csv", **other, u=u)
+    names = {"u1": u[:, 1], "u0": u[:, 0]} if by == "later" else {"p": u[:, 0], "q": u[:, 1]}
+    mine = csv(tmp_path / "y.csv", **clock, p=y[:, 0], q=y[:, 1])
+    theirs = csv(tmp_path / "u.csv", **other, **names)
     seen = lbt.load_record(mine, commands=theirs, frame_rate_hz=RATE, unit="nm", delay_frames=2)
     there = (row >= 0) & (row < 60)
-    assert np.array_equal(seen.measurements[:, 0], y)
+    assert np.array_equal(seen.measurements, y)
     assert np.array_equal(seen.commanded, there)
-    assert np.array_equal(seen.commands[there, 0], u[row[there]])
+    assert np.array_equal(seen.commands[there], u[row[there]])
     assert f"commands are from {theirs}" in seen.notes
     words = f"commands were laid beside the measurements by {next(iter(other), '')}: "
     assert any(f"{words}{there.sum()} of 60 rows" in note for note in seen.notes) is bool(other)

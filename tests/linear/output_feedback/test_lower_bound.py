@@ -1,7 +1,5 @@
 """What a witness proves, and what it does not."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support.generalized_plants import random_plant
@@ -26,18 +24,6 @@ def test_no_controller_is_better_than_proved(seed):
         )
         witness = ControlWitness(unseen=unseen, unmoved=unmoved, reason="drawn")
         assert infeasible_control_level(plant, witness) < least * (1 + 1e-9)
-
-
-def test_perturbed_witness_proves_less():
-    plant = random_plant(4, D22=False)
-    design = lbt.hinf_controller(plant)
-    rng = np.random.default_rng(0)
-    unseen = design.witness.unseen
-    noise = 0.1 * np.abs(unseen.states).max() * rng.normal(size=unseen.states.shape)
-    moved = replace(unseen, states=unseen.states + noise)
-    proved = infeasible_control_level(plant, replace(design.witness, unseen=moved))
-    assert proved < design.gamma_infeasible
-    assert infeasible_control_level(plant, design.witness) > 0.999999 * design.gamma_infeasible
 
 
 def test_nothing_is_proved_by_nothing():

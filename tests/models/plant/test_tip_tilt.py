@@ -107,22 +107,13 @@ def test_full_form_is_the_papers():
     a = np.array([line.ar_model(800).coefficients for line in lines])
     A1, minus_A2 = np.diag(a[:, 0]), np.diag(a[:, 1])
     I, Z = np.eye(2), np.zeros((2, 2))
-    expected = np.block(
-        [
-            [A1, minus_A2, Z, Z, Z],
-            [I, Z, Z, Z, Z],
-            [Z, Z, 0.98 * I, Z, Z],
-            [I, Z, I, Z, Z],
-            [Z, Z, Z, Z, Z],
-        ]
-    )
-    assert np.array_equal(full.A, expected)
+    lines, air, seen = [A1, minus_A2, Z, Z, Z], [Z, Z, 0.98 * I, Z, Z], [I, Z, I, Z, Z]
+    assert np.array_equal(full.A, np.block([lines, [I, Z, Z, Z, Z], air, seen, [Z] * 5]))
     assert np.all(np.linalg.eigvals(minus_A2) < 0)
     assert np.array_equal(full.B_known, np.vstack([Z, Z, Z, Z, I]))
     assert np.array_equal(full.L, np.hstack([I, Z, I, Z, Z]))
-    assert np.allclose(
-        full.C, np.hstack([sensor @ m for m in (Z, Z, Z, I, -influence)]), rtol=1e-15
-    )
+    C = np.hstack([sensor @ m for m in (Z, Z, Z, I, -influence)])
+    assert np.allclose(full.C, C, rtol=1e-15)
     assert not np.any(full.D_known)
 
 
@@ -172,19 +163,13 @@ def test_one_line_at_the_centre_is_the_plant_itself(plant):
 
 
 def test_priors_that_cannot_be(plant):
-    common = {
-        "frame_rate_hz": RATE,
-        "turbulence": plant.turbulence[0],
-        "noise_nm": 15.5,
-        "modes": 1,
-    }
-    line = plant.vibrations[0].retuned(399.0, frame_rate_hz=RATE)
-    none, fast = (lbt.tip_tilt_plant(vibrations=v, **common) for v in (None, [line]))
-    for wrong, arguments, text in (
+    parts = {"turbulence": plant.turbulence[0], "noise_nm": 15.5, "modes": 1}
+    none, fast = lbt.tip_tilt_plant(frame_rate_hz=RATE, **parts), retuned_plant(plant, 379.0)
+    for wrong, arguments, words in (
         (none, {"half_width_hz": 1.0}, "needs a plant with a vibration"),
         (plant, {"half_width_hz": 20.0}, "half_width_hz must be below 20; got 20. All"),
         (plant, {"half_width_hz": 1.0, "lines": 65}, "lines must be at most 64"),
         (fast, {"half_width_hz": 9.0}, "below the Nyquist frequency"),
     ):
-        with pytest.raises(lbt.errors.ProblemError, match=text):
+        with pytest.raises(lbt.errors.ProblemError, match=words):
             lbt.models.spread_plant(wrong, **arguments)

@@ -110,14 +110,14 @@ def test_designs_without_a_loop_are_refused():
             draw(kind)({})
 
 
-def test_a_sigma_plot_names_an_unstable_loop(designs):
-    _, rejection, noise = draw("sigma")(designs, sensor_gain=0.4).axes
+def test_a_sigma_plot_names_an_unstable_loop(lbt_designs):
+    _, rejection, noise = draw("sigma")(lbt_designs, sensor_gain=0.4).axes
     assert "0.4 times the sensor gain" in rejection.get_title(loc="left")
     for axis in (rejection, noise):
-        assert "H-infinity: unstable" in legend(axis)
+        assert "hinf: unstable" in legend(axis)
         curves = {line.get_label(): len(line.get_xdata()) for line in axis.get_lines()}
-        assert curves["H-infinity: unstable"] == 0
-        assert curves["Kalman"] > 100
+        assert curves["hinf: unstable"] == 0
+        assert curves["kalman"] > 100
 
 
 @pytest.mark.parametrize("near", [28, 60])

@@ -65,8 +65,8 @@ def test_labels_do_not_overlap(wanted):
         assert places == pytest.approx(wanted)
 
 
-def test_a_simulation_has_the_spectrum_of_the_transfer_functions(config):
-    design = lbt.kalman(config.plant)
+def test_a_simulation_has_the_spectrum_of_the_transfer_functions(config, lbt_designs):
+    design = lbt_designs["kalman"]
     run = lbt.simulate(
         design.controller, config.truth, hardware=config.hardware, frames=4000, cases=2
     )

@@ -105,21 +105,14 @@ def test_controllers(tmp_path):
     assert (c.method.name, c.given) == ("hinf", {"gamma_ratio": 1.5})
     assert list(study.designed) == ["b", "d"]
     origins = [section.text for section in study.settings.controllers.values()]
-    assert origins[0] == "gains/a.fits"
-    assert origins[1:3] == [
+    assert origins[:3] == [
+        "gains/a.fits",
         "kalman for the configuration",
         "hinf (gamma_ratio 1.5) for each sample",
     ]
     assert d.gain == integrator(study.config.hardware, truth=study.config.truth).gain
-    assert study.result_columns[:7] == (
-        "a.strehl",
-        "a.residual_nm",
-        "a.turbulence_nm",
-        "a.vibration_nm",
-        "a.noise_nm",
-        "a.within_nm",
-        "a.stable",
-    )
+    columns = "strehl residual_nm turbulence_nm vibration_nm noise_nm within_nm stable"
+    assert study.result_columns[:7] == tuple(f"a.{name}" for name in columns.split())
     assert study.columns[:2] == ("row", ONE)
     assert [path.name for path in study.inputs] == ["study.yaml", "base.yaml", "a.fits"]
 
@@ -142,16 +135,11 @@ def test_the_digest_is_of_what_decides_the_results(tmp_path):
 REFUSALS = r"""
 samplse: 5 => unknown key samplse; did you mean samples => samplse
 samples: => the key samples is missing => samples
-samples: 0 => samples: input should be greater than or equal to 1; got 0 => samples
-results: csv => unknown key results; known are config => results
 ONE: {unifrom: [1, 2]} => unknown key parameters\.truth\.vibrations\[0\]\.rms_nm\.unifrom; did you mean uniform => parameters.truth.vibrations[0].rms_nm.unifrom
 ONE: {uniform: [2, 1]} => must be \[low, high\]; got \[2, 1\]
-ONE: {uniform: [1, .inf]} => finite
 ONE: {fixed: 1, list: [2]} => expected a number or exactly one
-ONE: {normal: {mean: 1, deviation: 0}} => deviation: input should be gr
 ONE: {normal: {mean: 1, deviation: 1, low: 3, high: 2}} => low must be below high
 parameters: {'truth.vibration[0].rms_nm': 5} => no vibration there; did you mean vibrations
-parameters: {'truth.vibrations[1].rms_nm': 5} => no 1 there; it is a list of 1 entry, from \[0\]
 parameters: {truth.vibrations.rms_nm: 5} => no rms_nm there; it is a list of 1
 parameters: {truth.turbulence: 5} => is not set in the configuration
 parameters: {truth: 5} => must lead to a number; got a dict
@@ -159,22 +147,15 @@ parameters: {'a b': 5} => is no path in a configuration
 parameters: {error.delay: 5} => error.delay_frames and error.noise_factor; got error.delay
 parameters: {error.noise_factor: {fixed: 1, also: ['truth.vibrations[0].rms_nm']}} => leave also out
 ONE: {fixed: 1, also: [sensor.noise_nm]}, sensor.noise_nm: 3 => is given twice
-ONE: {fixed: 1, also: ['truth.vibrations[0].rms_nm']} => is given twice
 ONE: {uniform: [0, 5]} => parameters\.truth.*rms_nm at 0: .*greater than
 parameters: {'truth.vibrations[0].frequency_hz': {list: [20, 30, 401]}} => at 401: .*below the Nyquist
 parameters: {error.delay_frames: {uniform: [-1.5, 0]}} => at -1.5: .*the real loop.*at least 1
-parameters: {error.noise_factor: -1} => the real loop.*at least 0
-controllers: {9a: {design: kalman}} => 9a
 controllers: {a: {design: kalman}, A: {design: lqg}} => differs by more than its case => controllers.A
 controllers: {row_3: {design: kalman}} => names that begin with row_ => controllers.row_3
 controllers: {sensor: {design: kalman}} & parameters: {sensor.noise_nm: 4} => both a parameter and a result => controllers.sensor
-controllers: {a: {}} => expected exactly one of design, file => controllers.a
 controllers: {a: {design: kalmn}} => controllers\.a\.design: method must be one of .*Did you mean kalman\? => controllers.a.design
-controllers: {a: {file: a.fits, for: sample}} => for goes with design
 controllers: {a: {design: kalman, gain: 0.5}} => gain goes with method integrator
-controllers: {a: {design: robust}} => controllers.a: .*design.robust is missing => design.robust
 parameters: {loop.frame_rate_hz: {list: [700, 800, 900]}} => controllers.slow, parameters.loop.frame_rate_hz at 700: the controller must run at
-config: "a\0.yaml" => cannot read .*null byte
 parameters: {simulation.frames: {uniform: [200, 400]}} => it is an integer, which takes a list => parameters.simulation.frames
 """
 
