@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from lbt_synth.identification.commands.coarse_spectrum import (
     _segments,
@@ -43,10 +44,7 @@ def test_the_contrast_of_white_noise_lies_between_its_bounds() -> None:
 
 
 def test_the_right_correction_is_found_with_its_gain() -> None:
-    slow = np.zeros(FRAMES)
-    w = 20 * white(4)[:, 0]
-    for k in range(1, FRAMES):
-        slow[k] = 0.99 * slow[k - 1] + w[k]
+    slow = lfilter([20], [1, -0.99], white(4)[:, 0])
     noise = 5 * white(5)[:, 0]
     y, u = np.zeros((2, FRAMES))
     for k in range(2, FRAMES):

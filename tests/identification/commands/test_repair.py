@@ -50,17 +50,6 @@ def test_the_matrix_of_a_repair_is_applied_in_the_order_of_its_fields() -> None:
     )
 
 
-def test_words_name_what_is_wrong() -> None:
-    both = CommandRepair(shift_frames=-2, sign=(1, -1), scale=(1.0, 2.0), delay_frames=3.0)
-    assert both.words() == [
-        "they are recorded 2 frames late",
-        "axis 1 has the opposite sign",
-        "the total delay is 3 frames",
-        "those of axis 1 are 2 times too small",
-    ]
-    assert CommandRepair(scale=(0.001,)).words() == ["they are 1000 times too large"]
-
-
 def test_repairs_that_are_refused() -> None:
     y, u = ordinary_loop()
     one = record(y[:, :1], u[:, :1])

@@ -69,30 +69,27 @@ def test_a_part_of_the_turbulence_without_power_is_none() -> None:
 
 
 def test_errors_at_a_held_gain_are_those_of_a_free_one() -> None:
+    """An ambiguous gain has its error, and moves the rest."""
     y, c = integrator_loop(lines=((45, 0.02, 25),), gain=0.2, frames=12_000)
-    free = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
+    free = identify_series(y[:, 0], c[:, 0])
     gain = {name: getattr(free, name) for name in ("sensor_gain", "sensor_gain_error")}
-    held = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE, **gain)
+    held = identify_series(y[:, 0], c[:, 0], **gain)
     assert held.noise_error_nm == pytest.approx(free.noise_error_nm, rel=0.01)
     (one,), (other,) = free.lines, held.lines
     assert other.rms_error_nm == pytest.approx(one.rms_error_nm, rel=0.01)
     assert held.sensor_gain_error == pytest.approx(free.sensor_gain_error)
-
-
-def test_an_ambiguous_gain_has_that_error_and_moves_the_rest() -> None:
-    y, c = integrator_loop(lines=((40, 0.01, 30),))
-    axis = identify_series(y[:, 0], c[:, 0], frame_rate_hz=RATE)
-    search, model = Search(data=axis.data), axis.fitted_model
-    errors = standard_errors(model.spectrum, model.covariance)
-    more = hold_gain(search, model, [([0], 0.2)])
-    wider = standard_errors(model.spectrum, more.covariance)
-    assert wider.background.log_gain == pytest.approx(0.2, rel=1e-6)
-    assert wider.components[1].log_power > errors.components[1].log_power
+    model = free.fitted_model
+    wider = hold_gain(Search(data=free.data), model, [([0], 0.2)]).covariance
+    errors = [
+        standard_errors(model.spectrum, covariance) for covariance in (model.covariance, wider)
+    ]
+    assert errors[1].background.log_gain == pytest.approx(0.2, rel=1e-6)
+    assert errors[1].components[1].log_power > errors[0].components[1].log_power
 
 
 def test_white_noise_says_how_well_its_colour_shows() -> None:
     frames = 8192
-    axis = identify_series(np.random.default_rng(1).standard_normal(frames), frame_rate_hz=RATE)
+    axis = identify_series(np.random.default_rng(1).standard_normal(frames))
     assert axis.noise_correlation == 0
     assert axis.noise_correlation_error == pytest.approx(1 / np.sqrt(frames), rel=0.25)
 

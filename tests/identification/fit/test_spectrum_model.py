@@ -13,12 +13,10 @@ LINE = Component("line", -1.4, -3.9, 5.4)
 
 def test_parameters_keep_their_names_in_a_vector() -> None:
     spectrum = SpectrumModel((Background(-0.4, 3.4, 0.3, -2.1),), (TURBULENCE, LINE))
-    assert spectrum.unpack(spectrum.pack()) == spectrum
     named = spectrum.unpack(np.arange(10.0))
     assert named.background == Background(0, 1, 2, 3)
-    turbulence, line = named.components
-    assert (turbulence.log_frequency, turbulence.damping, turbulence.log_power) == (4, 5, 6)
-    assert (line.log_frequency, line.damping, line.log_power) == (7, 8, 9)
+    places = [(c.log_frequency, c.damping, c.log_power) for c in named.components]
+    assert places == [(4, 5, 6), (7, 8, 9)]
 
 
 def test_an_axis_shows_its_own_components_and_its_share_of_the_others() -> None:

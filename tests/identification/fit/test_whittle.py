@@ -84,9 +84,10 @@ def test_periodogram_of_a_sinusoid_is_the_taper() -> None:
         assert np.mean(data.power(1.0)[inside]) == pytest.approx(np.mean(model), rel=0.06)
 
 
-@pytest.mark.parametrize("width", [0.02, 0.3, 2.0, 12.0])
-def test_skirts_are_those_of_the_line_beyond_the_reach(width: float) -> None:
-    assert np.mean(log_smearing(width, SKIRT + np.arange(8))[0]) == pytest.approx(0, abs=0.02)
+def test_skirts_are_those_of_the_line_beyond_the_reach() -> None:
+    for width in (0.02, 0.3, 2.0, 12.0):
+        log_ratio = log_smearing(width, SKIRT + np.arange(8))[0]
+        assert np.mean(log_ratio) == pytest.approx(0, abs=0.02)
 
 
 def component(kind: str, hertz: float, log_odds: float, rms: float, **changes: object) -> Component:
@@ -248,14 +249,12 @@ def free(count: int) -> Priors:
     return Priors(centre=np.zeros(count), width=np.full(count, np.inf))
 
 
-def test_a_curved_valley_is_followed_to_its_end() -> None:
+def test_a_curved_valley_is_followed_to_its_end_and_a_fit_without_hope_is_given_up() -> None:
     for start in ([-1.2, 1.0], [3.0, -20.0]):
         found = scoring_minimum(rosenbrock, np.array(start), free(2), accuracy=1e-12)
         assert found is not None
         assert found[0] == pytest.approx([1, 1], abs=1e-4)
 
-
-def test_a_fit_that_cannot_reach_a_bound_is_given_up() -> None:
     def above(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         value, slope, matrix = rosenbrock(x)
         return value + 7.0, slope, matrix
@@ -268,13 +267,12 @@ def test_a_fit_that_cannot_reach_a_bound_is_given_up() -> None:
 def test_parameters_without_information_leave_the_steps_finite() -> None:
     # a component of no power has denormal information, and a step along it overflows
     scale = np.array([2.0, 1e-311, 1e-300, 1e-16])
-    priors = Priors(centre=np.zeros(4), width=np.full(4, np.inf))
 
     def bowl(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         value = 0.5 * float(scale @ (x - 1) ** 2) - 1e-9 * float(np.sum(x))
         return value, scale * (x - 1) - 1e-9, np.diag(scale)
 
-    found = scoring_minimum(bowl, np.array([5.0, 4.0, 3.0, 2.0]), priors)
+    found = scoring_minimum(bowl, np.array([5.0, 4.0, 3.0, 2.0]), free(4))
     assert found is not None
     assert np.all(np.isfinite(found[0]))
     assert found[0][0] == pytest.approx(1, abs=1e-3)
@@ -282,9 +280,7 @@ def test_parameters_without_information_leave_the_steps_finite() -> None:
 
 def test_a_minimum_beyond_a_bound_lies_on_it() -> None:
     """What else is free goes on: the valley's floor at x = 0.5 is y = 0.25."""
-    priors = Priors(
-        centre=np.zeros(2), width=np.full(2, np.inf), bounds=(-9.0, np.array([0.5, 9.0]))
-    )
+    priors = dataclasses.replace(free(2), bounds=(-9.0, np.array([0.5, 9.0])))
     found = scoring_minimum(rosenbrock, np.array([-1.2, 1.0]), priors, accuracy=1e-12)
     assert found is not None
     assert found[0] == pytest.approx([0.5, 0.25], abs=1e-6)

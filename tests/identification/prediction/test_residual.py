@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import partial
 
 import league
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.diagnoses import line_record
 from support.predictions import (
-    CAMERA,
     GOOD,
     PATH,
     RATE,
@@ -23,10 +23,10 @@ from support.predictions import (
     pseudo_open_loop,
     replayed_residual,
 )
+from support.refusals import require_refusals
 
 import lbt_synth as lbt
-from lbt_synth.identification import LoopRecord, loop_record
-from lbt_synth.identification.prediction.residual import estimate_residual, replay, settled_test
+from lbt_synth.identification.prediction.residual import estimate_residual, settled_test
 from lbt_synth.models import ARModel
 
 ONE_MODE = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
@@ -76,20 +76,6 @@ def test_the_standard_errors_are_those_of_many_nights():
     assert (backwards, error) == (-differences[-1], pytest.approx(paired_errors[-1], rel=1e-12))
 
 
-@pytest.mark.study
-def test_the_errors_of_a_pure_sinusoid_are_far_too_large():
-    """They are those of Gaussian series; the mean square of a sinusoid hardly scatters."""
-    rng, new = np.random.default_rng(7), lbt.integrator(ONE_MODE, gain=0.3).controller
-    seen, errors = [], []
-    for phase in rng.uniform(0, 2 * np.pi, 60):
-        line = np.sqrt(2) * 200 * np.sin(2 * np.pi * 20 * np.arange(6000) / RATE + phase)
-        z = (line + a_series(SWELL, 6000, rng) + 15.5 * rng.standard_normal(6000))[:, None]
-        found = replayed_residual(z, new, ONE_MODE, noise_nm=15.5)
-        seen.append(found.total_nm2)
-        errors.append(found.total_error_nm2)
-    assert 12 < np.sqrt(np.mean(np.square(errors))) / np.std(seen) < 20
-
-
 def test_the_noise_of_coupled_sensors_has_common_errors():
     """The noise is subtracted with each deviation a little larger, one at a time."""
     path = lbt.LoopHardware(frame_rate_hz=RATE, sensor_matrix=[[1, 0.9], [0.9, 1]])
@@ -130,18 +116,17 @@ def test_a_residual_far_below_zero_refutes_the_noise():
 
 def test_a_residual_below_its_noise_is_not_cut_off():
     signs = []
-    for seed in range(20):
+    for seed in range(10):
         z = 10 * np.random.default_rng(seed).standard_normal((800, 2))
         found = replayed_residual(z, idle(2), PATH, noise_nm=10.0)
         exact = np.sum(np.mean(z[400:] ** 2, axis=0)) - 200
         assert found.total_nm2 == pytest.approx(exact, abs=1e-9)
         assert abs(found.total_nm2) < 5 * found.total_error_nm2
-        negative = found.total_nm2 < 0
+        signs.append(negative := found.total_nm2 < 0)
         assert np.isnan(found.rms_nm) == np.isnan(found.rms_error_nm) == negative
         upper = max(found.total_nm2 + 2 * found.total_error_nm2, 0)
         assert found.upper_nm**2 == pytest.approx(upper)
-        signs.append(negative)
-    assert 4 < sum(signs) < 16  # there is nothing: either sign
+    assert 1 < sum(signs) < 9  # there is nothing: either sign
 
 
 @pytest.mark.parametrize(
@@ -241,31 +226,6 @@ def test_the_first_half_second_of_a_stretch_does_not_count(runs, test, kept):
     assert settled_test(tuple(runs), tuple(test), ONE_MODE) == tuple(kept)
 
 
-def test_replays_that_begin_in_a_record_cover_those_that_know_its_past():
-    """In a loop that forgets slowly, what its start adds is within the error of the residual."""
-    deviations, zero = [], np.zeros((1, 1))
-    loop = lbt.close_loop(ONE_MODE, lbt.integrator(ONE_MODE, gain=0.001).controller)
-    for seed in range(15):
-        z = a_series(SWELL, 20_000, np.random.default_rng(seed))[:, None]
-        knowing, late = (replay(loop, z, ((first, 20_000),))[12_400:] for first in (0, 12_000))
-        found = estimate_residual(late, ((12_400, 20_000),), zero, zero)
-        deviations.append((found.total_nm2 - np.mean(knowing**2)) / found.total_error_nm2)
-    assert np.mean(np.abs(deviations) < 1) > 2 / 3
-
-
-def test_a_residual_in_words():
-    zero = np.zeros((1, 1))
-    z = 10 * np.random.default_rng(0).standard_normal((4000, 1))
-    shown, hidden, refuted = (
-        estimate_residual(z, ((0, 4000),), noise * np.eye(1), zero) for noise in (50, 100, 150)
-    )
-    assert shown.text == f"{shown.rms_nm:.3g} +- {shown.rms_error_nm:.2g} nm"
-    assert hidden.text == f"at most {hidden.upper_nm:.2g} nm (the noise hides it)"
-    assert "more noise than the data" in refuted.text
-    assert 0 < hidden.strehl(CAMERA) <= 1
-    assert np.isnan(refuted.strehl(CAMERA))
-
-
 def test_the_future_changes_nothing_before_it():
     """Nor does what a replay begins with: it runs over the frames before the test."""
     z = np.random.default_rng(0).standard_normal((3000, 2)).cumsum(axis=0)
@@ -277,38 +237,24 @@ def test_the_future_changes_nothing_before_it():
     assert np.max(np.abs(one[1100:] - other[1100:])) > 500
 
 
-@cache
-def short_record() -> LoopRecord:
-    """Return one axis for 18 s, in the loop of an integrator."""
-    path = lbt.LoopHardware(frame_rate_hz=500, modes=1)
-    slow = ARModel(coefficients=[0.99], driving_rms_nm=4.0, frame_rate_hz=500)
-    line = lbt.Vibration(frequency_hz=40, damping=0.01, rms_nm=60, direction=(1.0,))
-    truth = lbt.Truth(turbulence=slow, vibrations=(line,), noise_nm=5.0, sensor_gain=0.8)
-    run = lbt.simulate(lbt.integrator(path, gain=0.3), truth, hardware=path, frames=9000)
-    known = {"frame_rate_hz": 500, "delay_frames": 2, "unit": "nm"}
-    return loop_record(run.measurements[0], run.commands[0], **known)
-
-
 def replayed(series=GOOD, path=PATH, **options):
     return replayed_residual(series, INTEGRATOR, path, **({"noise_nm": 1.0} | options))
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: replayed(noise_error_nm=-0.1), "noise_error_nm must be at least 0"),
-        (lambda: replayed(noise_error_nm=[1.0, 2.0, 3.0]), r"or one per measurement \(2\); got 3"),
-        (lambda: replayed(test=[(1950, 2000)]), "at least 400 frames beyond the first 400 .* 50"),
-        (
-            lambda: replayed(test=[(800, 2000)], stretches=[(0, 900), (900, 2000)]),
-            r"within the usable stretches; got \(800, 2000\) in \(0, 900\), \(900, 2000\)",
-        ),
-        (lambda: replayed().above(replayed(test=[(500, 2000)])), "on the same frames only"),
-    ],
-)
-def test_what_cannot_be_replayed_is_refused(call, message):
-    with pytest.raises(lbt.errors.ProblemError, match=message):
-        call()
+def test_what_cannot_be_replayed_is_refused():
+    torn = {"test": [(800, 2000)], "stretches": [(0, 900), (900, 2000)]}
+    within = r"within the usable stretches; got \(800, 2000\) in \(0, 900\), \(900, 2000\)"
+    short = "at least 400 frames beyond the first 400 .* 50"
+    sizes = r"or one per measurement \(2\); got 3"
+    later = replayed(test=[(500, 2000)])
+    rows = [
+        (partial(replayed, noise_error_nm=-0.1), "noise_error_nm must be at least 0"),
+        (partial(replayed, noise_error_nm=[1.0, 2.0, 3.0]), sizes),
+        (partial(replayed, test=[(1950, 2000)]), short),
+        (partial(replayed, **torn), within),
+        (lambda: replayed().above(later), "on the same frames only"),
+    ]
+    require_refusals((call, lbt.errors.ProblemError, words) for call, words in rows)
 
 
 def test_the_league_of_designs_and_rivals(monkeypatch, capsys):
@@ -316,8 +262,10 @@ def test_the_league_of_designs_and_rivals(monkeypatch, capsys):
     names = ("best integrator", "least squares, 32 taps", "Kalman")
     entries = {name: league.ENTRIES[name] for name in names}
     monkeypatch.setattr(league, "ENTRIES", entries)
-    short = replace(short_record(), measured=np.arange(9000) < 600)
-    league.play({"night": short_record(), "brief": short}, 2)
+    night = line_record()
+    league.play(
+        {"night": night, "brief": replace(night, measured=np.arange(night.frames) < 600)}, 2
+    )
     failure, _, heading, *rows = capsys.readouterr().out.splitlines()
     assert failure.startswith("brief is not in the table: ")
     assert heading.split()[-1] == "night"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def series():
     """Measurements and commands, (60, 2) each."""
     rng = np.random.default_rng(0)

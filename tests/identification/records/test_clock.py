@@ -1,10 +1,13 @@
 """Times and counters: missing and repeated frames, stated rates, rounded times."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.records import findings, noise
+from support.refusals import require_refusals
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import loop_record
@@ -14,32 +17,29 @@ RATE = 1000.0
 
 @pytest.mark.parametrize("by", ["times", "numbers", "both"])
 def test_missing_frames_become_holes(by):
-    y = np.random.default_rng(0).standard_normal((500, 2))
-    kept = np.delete(np.arange(500), [100, 101, 300])
-    clock = {}
+    y, kept = noise(500), np.delete(np.arange(500), [100, 101, 300])
+    clock = {} if by == "times" else {"frame_numbers": 7000 + kept}
     if by != "numbers":
         jitter = np.random.default_rng(1).uniform(-1e-4, 1e-4, len(kept))
         clock["times_s"] = 1.7e9 + kept / RATE + jitter
-    if by != "times":
-        clock["frame_numbers"] = 7000 + kept
     rate = RATE if by == "numbers" else None
     seen = loop_record(y[kept], frame_rate_hz=rate, unit="nm", **clock)
     assert np.flatnonzero(~seen.usable).tolist() == [100, 101, 300]
     assert seen.frames == 500
     assert seen.frame_rate_hz == pytest.approx(RATE, rel=1e-5)
-    assert np.array_equal(seen.measurements[seen.usable], y[kept])
+    assert np.array_equal(seen.measurements[seen.usable, 0], y[kept])
     assert findings(seen) == [("missing", "frames", None, 3, 100)]
     words = "the times lie 0.057 frames rms beside a regular grid"
     assert (words in seen.notes) is (by != "numbers")
 
 
 def test_rows_that_come_twice():
-    y = np.random.default_rng(0).standard_normal((100, 2))
+    y = noise(100)
     order = np.sort(np.concatenate([np.arange(100), [20, 20, 50]]))
     rows = y[order].copy()
     same = loop_record(rows, frame_rate_hz=RATE, frame_numbers=order, unit="nm")
     assert same.usable.all()
-    assert np.array_equal(same.measurements, y)
+    assert np.array_equal(same.measurements[:, 0], y)
     assert same.notes == ("3 rows of a time that had been recorded already were left out",)
     rows[np.flatnonzero(order == 50)[1]] += 1  # two stories of one frame
     torn = loop_record(rows, frame_rate_hz=RATE, times_s=order / RATE, unit="nm")
@@ -47,9 +47,8 @@ def test_rows_that_come_twice():
     assert findings(torn) == [("repeated", "frames", None, 1, 50)]
 
 
-@pytest.mark.parametrize(
-    ("clock", "words"),
-    [
+def test_clocks_that_are_refused():
+    rows = [
         ({}, "frame rate is not known; give frame_rate_hz"),
         ({"times_s": [0, 1, 2]}, r"times_s must have shape \(6,\)"),
         ({"times_s": [0, 1, 2, 1.5, 3, 4]}, "must not run backwards; got 2 and then 1.5 at row 3"),
@@ -63,12 +62,11 @@ def test_rows_that_come_twice():
         ({"frame_numbers": [0, 1, 2, 0, 1, 2], "frame_rate_hz": 2}, "frame_numbers must not run b"),
         ({"frame_numbers": [0, 1, 2, 2.5, 3, 4], "frame_rate_hz": 2}, "must be whole numbers"),
         ({"frame_rate_hz": 0}, "frame_rate_hz must be above 0"),
-    ],
-)
-def test_clocks_that_are_refused(clock, words):
-    y = np.random.default_rng(0).standard_normal((6, 1))
-    with pytest.raises(ProblemError, match=words):
-        loop_record(y, unit="nm", **clock)
+    ]
+    require_refusals(
+        (partial(loop_record, noise(6), unit="nm", **clock), ProblemError, words)
+        for clock, words in rows
+    )
 
 
 @pytest.mark.parametrize("frames", [None, np.arange(20_000)])  # by times alone, and by both
@@ -128,7 +126,8 @@ def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, q
 @pytest.mark.parametrize(
     ("rate", "lost", "step_s"),
     [
-        *((800, 2, 1e-3), (1003, 3, 1e-3), (1000, 0, 1.0), (1300, 0, 1.0)),
+        (800, 2, 1e-3),
+        (1000, 0, 1.0),
         (2000, 0, 1e-3),  # a step of two frames hides one
         (1000.1, 1, 1e-3),  # and so does one where the rate is not quite that of the times
     ],
@@ -136,12 +135,10 @@ def test_frames_are_laid_where_they_were_or_refused(rate, phase, lost, frames, q
 def test_stamps_that_may_hide_a_lost_frame_are_refused(rate, lost, step_s):
     kept = np.delete(np.arange(40_000), 17_000 + np.arange(lost))
     times = np.floor(kept / round(rate) / step_s + 1e-6) * step_s
+    known = {"frame_rate_hz": rate, "times_s": times, "unit": "nm"}
     with pytest.raises(ProblemError, match="cannot tell which frames are missing"):
-        loop_record(noise(len(kept)), frame_rate_hz=rate, times_s=times, unit="nm")
-    seen = loop_record(
-        noise(len(kept)), frame_rate_hz=rate, times_s=times, frame_numbers=kept, unit="nm"
-    )
-    assert seen.frames == 40_000
+        loop_record(noise(len(kept)), **known)
+    assert loop_record(noise(len(kept)), **known, frame_numbers=kept).frames == 40_000
 
 
 def test_one_step_of_two_may_be_rounding_or_a_frame_that_is_lost():
