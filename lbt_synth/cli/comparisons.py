@@ -32,8 +32,8 @@ from lbt_synth.report.figures import studies as figures
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.limits import LimitRow, LimitStudy, compare_modes, limits, say_residual
-from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, mirror_rows
+from lbt_synth.studies.limits import LimitRow, LimitStudy, limits, say_residual
+from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, compare_modes, mirror_rows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 

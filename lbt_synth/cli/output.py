@@ -233,13 +233,7 @@ def run_with_outputs(run: Callable[[Namespace], Report], arguments: Namespace) -
     return report
 
 
-def write_telemetry(
-    report: Report,
-    output: str,
-    telemetry: Telemetry,
-    *,
-    key: str,
-) -> None:
+def write_telemetry(report: Report, output: str, telemetry: Telemetry, *, key: str) -> None:
     """Write telemetry, and note in the report the file and what its format leaves out."""
     from lbt_synth.files import save_telemetry  # which few commands need
     from lbt_synth.files.telemetry.aot import lost_fields

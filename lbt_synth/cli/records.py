@@ -40,6 +40,7 @@ if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not
 
 
 _STEPS = 3  # that diagnose and auto count
+_EXAMINES = "diagnose examines"
 
 
 def run_identify(arguments: Namespace) -> Report:
@@ -113,7 +114,10 @@ def run_auto(arguments: Namespace) -> Report:
             progress=count,
             **identification_options(arguments, record),
         )
-    made = with_repair(record, made)
+    if record.read_with:
+        words = f"the commands of the record were read with {record.read_with}"
+        design = replace(made.design, assumptions=(words, *made.design.assumptions))
+        made = replace(made, design=design)
     design, table = made.design, made.held_out
     report = Report(data={"source": str(arguments.file), "method": design.method})
     report.add_rows(
@@ -187,10 +191,11 @@ def run_diagnose(arguments: Namespace) -> Report:
     elif arguments.pdf is not None:
         raise ProblemError("--pdf is the page of -o on paper; give -o, too.")
     designs = {} if arguments.gain is None else load_designs([arguments.gain])
-    both = _series(arguments)
+    both = require_series(load_series(arguments), _EXAMINES)
     choose_unit(arguments, both.diameter_m)
     live = live_axes(both)
-    record = both if len(live) in (0, both.axes) else _series(arguments, live)
+    some = len(live) not in (0, both.axes)
+    record = require_series(load_series(arguments, live), _EXAMINES) if some else both
     with count_progress(total=_STEPS, what="diagnosing") as count:
         diagnosis = identification.diagnose(
             record.bridged(),
@@ -224,12 +229,6 @@ def run_diagnose(arguments: Namespace) -> Report:
         page = diagnosis_page(diagnosis, files)
         report.note_files(write_page(page, arguments.output, pdf=arguments.pdf))
     return report
-
-
-def _series(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
-    """Load the record, or some of its axes."""
-    series = load_series(arguments, axes)
-    return require_series(series, "diagnose examines")
 
 
 def read_record(
@@ -401,12 +400,3 @@ def _axis_record(axis: IdentifiedAxis) -> dict[str, Any]:
         **{name: getattr(axis, name) for name in shown},
         "whiteness": {name: getattr(whiteness, name) for name in tests},
     }
-
-
-def with_repair(record: LoopRecord, made: RecordedDesign) -> RecordedDesign:
-    """Return what was made of a record, with the repair of its commands as an assumption."""
-    if not record.read_with:
-        return made
-    words = f"the commands of the record were read with {record.read_with}"
-    design = replace(made.design, assumptions=(words, *made.design.assumptions))
-    return replace(made, design=design)

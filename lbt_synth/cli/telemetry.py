@@ -46,11 +46,6 @@ def require_series(record: LoopRecord | SpectrumRecord, what: str) -> LoopRecord
     return record
 
 
-def is_read_anew(arguments: Namespace) -> bool:
-    """Return whether the command line says anything about how a record is read."""
-    return any(getattr(arguments, name) not in (None, False, 0) for name in _READING)
-
-
 def load_series(
     arguments: Namespace, axes: Sequence[int] | None = None
 ) -> LoopRecord | SpectrumRecord:
@@ -59,11 +54,7 @@ def load_series(
     if axes is not None:
         chosen = facts["axes"]
         facts["axes"] = list(axes) if chosen is None else [chosen[axis] for axis in axes]
-    record = load_record(
-        arguments.file,
-        columns=_parse_columns(arguments.columns),
-        **facts,
-    )
+    record = load_record(arguments.file, columns=_parse_columns(arguments.columns), **facts)
     repair = CommandRepair(
         increments=arguments.command_increments,
         shift_frames=arguments.command_shift_frames,
@@ -140,15 +131,13 @@ def run(arguments: Namespace) -> Report:
         named = given_options(arguments, "file", "commands")
         require_writable(output, inputs=list(named.values()))
     notes: list[str] = []
-    if is_telemetry(arguments.file) and not is_read_anew(arguments):
+    anew = any(getattr(arguments, name) not in (None, False, 0) for name in _READING)
+    if is_telemetry(arguments.file) and not anew:
         telemetry = load_telemetry(arguments.file)
     else:
         record = require_series(load_series(arguments), "telemetry holds")
         telemetry = telemetry_of_record(record)
-        notes = [
-            f"note: {record.summary()}",
-            *(f"note: {note}" for note in record.notes),
-        ]
+        notes = [f"note: {note}" for note in (record.summary(), *record.notes)]
     choose_unit(arguments, telemetry.diameter_m)
     report = _describe_telemetry(telemetry)
     report.data["file"] = arguments.file

@@ -1,8 +1,8 @@
-"""What designs do where the loop is another: moved lines, gains, delays, a mirror."""
+"""What designs do where the loop is another: moved lines, gains, delays, a mirror, many modes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, TypeAlias
@@ -10,8 +10,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lbt_synth.config import Config
 from lbt_synth.design import Design, FilterDesign, hinf, integrator, kalman, lqg, mixed
 from lbt_synth.design.mixed import central_filter, require_taps
+from lbt_synth.design.modal import modal_filters, modal_gains
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import EstimationProblem
@@ -23,11 +25,21 @@ from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
 from lbt_synth.loop.evaluator import textbook_matrices
 from lbt_synth.methods.registry import MIXED, record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
-from lbt_synth.models import LoopHardware, SinusoidalVibration, TipTiltPlant, Truth, Vibration
+from lbt_synth.models import (
+    LoopHardware,
+    SinusoidalVibration,
+    TipTiltPlant,
+    Truth,
+    Vibration,
+    modal_turbulence,
+    pyramid_modal_noise_nm,
+)
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.plant.tip_tilt import retuned_plant
+from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import (
+    NM,
     PERCENT,
     Facts,
     column,
@@ -448,4 +460,73 @@ def _front_point(family: str, design: FilterDesign, gamma_least: float) -> Facts
         gain_high=fact(margins.gain_high, "gain to", format=".3f"),
         modulus=fact(margins.modulus, "modulus margin", format=".3f"),
         design=fact(design),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModalStudy:
+    """What controllers leave of the turbulence in each of n modes."""
+
+    turbulence_nm: FloatArray  # (n,): what comes in [nm rms]
+    noise_nm: FloatArray  # (n,): per frame [nm]
+    gains: FloatArray  # (n,): of the integrators
+    residual_nm: Mapping[str, FloatArray]  # of integrators and of filters, (n,) [nm rms]
+
+    def by_radial_order(self) -> list[Facts]:
+        """Return a row for each radial order: root sums of squares over its modes."""
+        radial, _ = noll_orders(self.noise_nm.size)
+        rows = []
+        for order in np.unique(radial):
+            which = radial == order
+            turbulence_nm, optimised_nm, kalman_nm = (
+                float(np.linalg.norm(series[which]))
+                for series in (self.turbulence_nm, *self.residual_nm.values())
+            )
+            noise_nm = float(self.noise_nm[which][0])
+            rows.append(
+                facts(
+                    radial_order=fact(int(order), "radial order"),
+                    modes=fact(int(which.sum()), "modes"),
+                    turbulence_nm=fact(turbulence_nm, "turbulence", **NM),
+                    noise_nm=fact(noise_nm, "noise per mode", unit="nm", format=".2f"),
+                    gain=fact(float(self.gains[which].mean()), "mean gain", format=".3f"),
+                    optimised_nm=fact(optimised_nm, "optimised gains", **NM),
+                    kalman_nm=fact(kalman_nm, "Kalman", **NM),
+                )
+            )
+        return rows
+
+
+def compare_modes(config: Config, modes: int) -> ModalStudy:
+    """Compare integrators of the best gains with Kalman filters, for the first modes of a loop."""
+    hardware, sensor_gain = config.hardware, config.settings.model.sensor_gain
+    reason = "the turbulence of hundreds of modes is computed from it"
+    rate_hz = hardware.frame_rate_hz
+    air = modal_turbulence(config.require_atmosphere(reason), modes=modes, frame_rate_hz=rate_hz)
+    for key, value in (("sensor.noise_nm", config.noise_nm), ("model.sensor_gain", sensor_gain)):
+        if np.ndim(value):
+            config.refuse_key(key, "must be one number for hundreds of modes; got one per axis")
+    pyramid, noise_nm = config.settings.sensor.pyramid, np.full(modes, float(config.noise_nm))
+    if pyramid is not None:
+        modulation = pyramid.modulation_lambda_over_d
+        noise_nm = pyramid_modal_noise_nm(
+            float(config.noise_nm), modes=modes, modulation_lambda_over_d=modulation
+        )
+    lines = dict[int, list[Vibration]]()
+    for line in config.plant.vibrations:  # each axis by itself
+        for axis, share in enumerate(line.direction):
+            if abs(share) > 1e-9:  # more than rounding
+                tilted = replace(line, rms_nm=abs(share) * line.rms_nm, direction=(1.0,))
+                lines.setdefault(axis, []).append(tilted)
+    loop: dict[str, Any] = {"hardware": hardware, "noise_nm": noise_nm, "vibrations": lines}
+    loop["sensor_gain"] = config.sensor_gain
+    gains = modal_gains(air, **loop)
+    return ModalStudy(
+        turbulence_nm=air.rms_nm,
+        noise_nm=noise_nm,
+        gains=gains.gains,
+        residual_nm={
+            "integrators, optimised gains": gains.rms_nm,
+            "Kalman filters": modal_filters(air, **loop).rms_nm,
+        },
     )
