@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3130,
+    "cli": 3190,
     "config": 1634,
     "design": 6201,
     "files": 1244,
@@ -26,14 +26,14 @@ LINES = {
     "models": 3851,
     "report": 3328,
     "storage": 1027,
-    "studies": 3107,
+    "studies": 3139,
     "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 203,
     "public names": 145,
     "tuned constants": 494,
-    "lines of tests": 28266,
+    "lines of tests": 28578,
     "lines of benchmarks": 4018,
     "words of docs": 59781,
 }

@@ -123,7 +123,10 @@ _TABLE = """
     --origin | repeat meta:HOST:PORT | under which a tunnel reaches the page; repeatable
     -o --output | =. | directory that the page saves into (default: this one)
   limits | comparisons | Show how far designs are from the least residual of any linear controller.
-    unit config gains outputs
+    unit config gains
+    --frame-rates | float nargs:2 meta:LOW,HIGH | instead over the frame rate [Hz], for the file's
+        star: integrator, Kalman filter and limit
+    outputs
   robustness | comparisons | Map the Strehl ratio of gain files over an error of all vibration
         frequencies, the sensor gain and the delay.
     unit config gains+

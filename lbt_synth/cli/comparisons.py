@@ -10,13 +10,8 @@ from functools import partial
 import numpy as np
 
 from lbt_synth import studies
-from lbt_synth.cli.loop_inputs import (
-    load_designs,
-    load_shown,
-    margin_columns,
-    named_difference_notes,
-    say_limit,
-)
+from lbt_synth.cli import loop_inputs
+from lbt_synth.cli.loop_inputs import load_designs, load_shown, named_difference_notes
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import track_progress
 from lbt_synth.config import Config
@@ -25,16 +20,24 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.loop import least_residual, loop_margins
 from lbt_synth.loop.least_residual import limit_or_nan
-from lbt_synth.methods.registry import reference_methods
+from lbt_synth.methods.registry import design_title, reference_methods
 from lbt_synth.report.designs import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_map_figure
 from lbt_synth.report.figures import studies as figures
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.limits import LimitRow, LimitStudy, limits, say_residual
+from lbt_synth.studies.limits import (
+    LimitRow,
+    LimitStudy,
+    limits,
+    limits_at_rate,
+    say_residual,
+)
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, compare_modes, mirror_rows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
+
+_RATES = 34  # frame rates of a comparison, of which a table without --verbose has every third
 
 
 def run_compare(arguments: Namespace) -> Report:
@@ -66,7 +69,7 @@ def _compared(design: Design, row: LimitRow, config: Config) -> Facts:
         design=fact(row.design, "design"),
         residual_nm=fact(row.residual_nm, "residual", missing="unstable", **NM),
         strehl=fact(row.strehl, "Strehl", **PERCENT),
-        **margin_columns(margins),
+        **loop_inputs.margin_columns(margins),
         n_states=fact(design.controller.n_states, "states"),
         multiplications=fact(cost, "products per frame"),
     )
@@ -90,6 +93,8 @@ def _begin(designs: Mapping[str, Design], config: Config) -> tuple[Report, Limit
 def run_limits(arguments: Namespace) -> Report:
     """Compare designs with the least residual of any linear controller."""
     config = load_shown(arguments)
+    if arguments.frame_rates is not None:
+        return _limits_over_rates(config, arguments)
     files = load_designs(arguments.gains, config)
     designs = {
         method.name: config.design(
@@ -120,13 +125,54 @@ def run_limits(arguments: Namespace) -> Report:
             f"achieves {nm_text(study.band.achieved_nm, '.6g')})."
         )
     if study.limit is not None:
-        report.notes.append(say_limit(study.limit, config))
+        report.notes.append(loop_inputs.say_limit(study.limit, config))
     else:
         report.notes.append(
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
             "vibrations along principal axes of the sensor's noise."
         )
     report.notes += named_difference_notes(config, designs)
+    return report
+
+
+def _limits_over_rates(config: Config, arguments: Namespace) -> Report:
+    """Compare two methods with the limit at frame rates in an interval, for the same star."""
+    if arguments.gains:
+        raise ProblemError("--frame-rates designs at each rate; leave the gain files out.")
+    low, high = (number(rate, "--frame-rates", above=0) for rate in arguments.frame_rates)
+    if not low < high:
+        raise ProblemError(f"--frame-rates must be LOW below HIGH; got {low:g} {high:g}.")
+    rates, shell = np.geomspace(low, high, _RATES), config.hardware.mirror
+    if shell is not None:  # its local loop runs a whole number of samples per frame
+        rates = np.unique(shell.sampling_hz / np.maximum(np.round(shell.sampling_hz / rates), 1))
+    compared = (limits_at_rate(config, rate) for rate in rates.tolist())
+    rows = list(track_progress(compared, total=rates.size, what="frame rates"))
+    report, best, curves = Report(), list[str](), dict[str, FloatArray]()
+    for name in ("integrator", "kalman", "limit"):
+        cells = [(row.values[f"{name}_nm"], row.values[f"{name}_strehl"]) for row in rows]
+        residual_nm, ratio = np.array(cells).T
+        curves[name] = residual_nm
+        if np.isnan(residual_nm).all():  # unstable, or without a limit, at each rate
+            continue
+        place = int(np.nanargmin(residual_nm))
+        end = ", an end of the range," * (place in (0, rates.size - 1))
+        said = f"{nm_text(residual_nm[place], '.1f')} rms, Strehl ratio {100 * ratio[place]:.1f} %"
+        best.append(f"{rates[place]:.0f} Hz{end} for the {design_title(name)} ({said})")
+        report.data[f"best_{name}_hz"] = rates[place]
+    none = "none: all loops are unstable in the truth"
+    report.verdict.append(f"The best frame rate is {listing_text(best) or none}.")
+    report.add_rows(
+        "rows",
+        f"The same star at other frame rates; {config.imaging.label}",
+        rows,
+        figure=partial(figures.frame_rate_figure, rates, curves),
+    )
+    noise = "the noise is that of photons, its variance in proportion to the rate"
+    if config.settings.sensor.pyramid is not None:
+        noise = "the read noise of a frame stays"
+    delay = f"the delay stays {config.hardware.delay_frames:g} frames"
+    delay += "; no other sensor is read" * bool(config.other_sensors)
+    report.notes.append(f"assumes: the photons per second stay; {noise}; {delay}.")
     return report
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,14 +14,16 @@ from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
 from lbt_synth.design.result import without_units
+from lbt_synth.errors import NumericalError
 from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest, read_design, require_gain_name
+from lbt_synth.linear import estimator_form
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.methods.registry import design_title, option_names
 from lbt_synth.methods.request import design_request
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import fact_table, json_record, row_table
+from lbt_synth.storage.rows import fact, fact_table, facts, json_record, row_table
 
 
 def run_design(arguments: Namespace) -> Report:
@@ -52,10 +55,10 @@ def describe_design(report: Report, design: Design) -> None:
         "controller_spectral_radius": alone,
         "assumptions": design.assumptions,
     }
-    facts: list[Any] = [design.facts()]
+    records: list[Any] = [design.facts()]
     margins = []
     if design.hardware is not None:
-        facts.append(design.hardware.facts())
+        records.append(design.hardware.facts())
         if design.hardware.mirror is not None:
             settling_s = design.hardware.mirror.step_response().settling_s
             report.data["mirror"] = asdict(design.hardware.mirror) | {"settling_s": settling_s}
@@ -66,8 +69,8 @@ def describe_design(report: Report, design: Design) -> None:
     report.verdict = [*fragile, *(report.verdict or [_say_model(design)])]
     report.verdict += [f"It {one.survival}" for one in margins if not one.fragilities]
     report.verdict.append(say_checks(design.certificate.checks))
-    report.add_records(*facts)
-    printed = fact_table("Design", *facts, *margins)
+    report.add_records(*records)
+    printed = fact_table("Design", *records, *margins)
     report.tables.append(without_units(printed) if design.hardware is None else printed)
     report.notes += _loop_notes(design, alone)
     tables = design.tables()
@@ -90,15 +93,24 @@ def _say_model(design: Design) -> str:
     return f"{title} has {design.controller.n_states} states."
 
 
-def add_moving_gain(report: Report, design: Design) -> None:
-    """Add the intervals of a sensor gain that moves, for a design with a stable loop."""
-    from lbt_synth.loop.stable_range import moving_gain
+def add_moving_gains(report: Report, design: Design) -> None:
+    """Add what is proved of a moving gain and of clipping, for a design with a stable loop."""
+    from lbt_synth.loop.stable_range import moving_gain, stroke_ratio
 
     if design.hardware is None or design.other_sensors:
         return
     loop = close_loop(design.hardware, design)
     if loop.is_stable:
         report.add_facts("Sensor gain that moves", moving_gain(loop), key="moving_gain")
+        plain, estimator = stroke_ratio(design.hardware, design), None
+        with suppress(NumericalError):  # not every controller has that form
+            estimator = stroke_ratio(design.hardware, estimator_form(design))
+        clipped = facts(
+            plain=fact(plain, "proved in the plain form, up to", unit="strokes"),
+            estimator=fact(estimator, "  in the estimator form, up to", unit="strokes"),
+        )
+        caption = "Commands that are clipped; at most 10000 strokes are sought"
+        report.add_facts(caption, clipped, key="clipped_commands")
 
 
 def _loop_notes(design: Design, alone: float) -> list[str]:
@@ -126,7 +138,7 @@ def run_show(arguments: Namespace) -> Report:
     if design.configuration:
         add_truth(report, design, config_from_text(design.configuration, Path(arguments.gain)))
     describe_design(report, design)
-    add_moving_gain(report, design)
+    add_moving_gains(report, design)
     report.data |= {"file": arguments.gain, "digest": digest}
     report.notes += [
         f"proved: the certificate, computed again from this file of digest {digest}.",

@@ -46,9 +46,8 @@ def run_export(arguments: Namespace) -> Report:
     design = load_gain(arguments.gain)
     digest = file_sha256(arguments.gain, GainFileError)
     written = export(output, design, arguments.target, gain_digest=digest, **options)
-    report = Report(
-        data={"gain": arguments.gain, "gain_digest": digest, "target": arguments.target}
-    )
+    report = Report(data={"gain": arguments.gain, "gain_digest": digest})
+    report.data["target"] = arguments.target
     report.verdict.append(
         f"What {arguments.target} computes differs from the controller by {written.error:.2g} of "
         "the largest command."

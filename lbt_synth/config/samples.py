@@ -18,7 +18,7 @@ from lbt_synth.config.build import (
     turbulence_sections,
     vibration_numbers,
 )
-from lbt_synth.config.load import Config
+from lbt_synth.config.load import Config, build_config
 from lbt_synth.config.schema import FileSection
 from lbt_synth.errors import ConfigError, suggest_word
 from lbt_synth.loop.ensemble import EnsembleVibration, LoopEnsemble, ensemble_vibration
@@ -101,11 +101,34 @@ def _with_value(section: Any, keys: Keys, value: Any) -> Any:
     return section.model_copy(update={first: _with_value(getattr(section, first), rest, value)})
 
 
-def with_arrays(settings: FileSection, values: Mapping[Keys, FloatArray]) -> FileSection:
-    """Return settings with arrays (b,) for the numbers of samples that differ, unchecked."""
+def with_values(settings: FileSection, values: Mapping[Keys, Any]) -> FileSection:
+    """Return settings with other values, or arrays (b,) of samples that differ, unchecked."""
     for keys, numbers in values.items():
         settings = _with_value(settings, keys, numbers)
     return settings
+
+
+def at_frame_rate(config: Config, frame_rate_hz: float) -> Config:
+    """Return a configuration at another frame rate, of the same star: the photons per second stay.
+
+    The delay in frames stays, and a pyramid's read noise per frame. A noise in nm or mas counts as
+    that of photons, whose variance grows as the rate. Other sensors are left out.
+    """
+    settings, ratio = config.settings, frame_rate_hz / config.hardware.frame_rate_hz
+    if any(section.kind == "ar" for section in turbulence_sections(settings)):
+        raise ConfigError(
+            f"{config.source}: model.turbulence of kind ar is known at "
+            f"{config.hardware.frame_rate_hz:g} Hz alone. Give an atmosphere and kind ar1 or ar2.",
+            path="model.turbulence",
+        )
+    values: dict[Keys, Any] = {("loop", "frame_rate_hz"): frame_rate_hz, ("sensors",): None}
+    sensor = settings.sensor
+    if sensor.pyramid is not None:
+        values["sensor", "pyramid", "photons"] = sensor.pyramid.photons / ratio
+    else:
+        name = "noise_nm" if sensor.noise_mas is None else "noise_mas"
+        values["sensor", name] = (np.sqrt(ratio) * np.array(getattr(sensor, name))).tolist()
+    return build_config(with_values(settings, values), config.source)
 
 
 def array_keys(settings: FileSection) -> set[Keys]:
@@ -146,7 +169,7 @@ def build_ensemble(
     The configuration is that of one of them. Their real delays less those of the configuration, and
     their real noise over it, are (b,).
     """
-    settings, flows = with_arrays(config.settings, values), None
+    settings, flows = with_values(config.settings, values), None
     delay = settings.loop.delay_frames + delay_error_frames
     for extreme in (np.min(delay), np.max(delay)):
         replace(config.hardware, delay_frames=float(extreme))  # refuses what no loop has

@@ -218,6 +218,12 @@ class EstimatorForm:
         """Return A, B, C, D of the samples of its period, which is one."""
         return self.A[None], self.B[None], self.C[None], np.zeros((1, len(self.C), self.B.shape[1]))
 
+    def to_controller(self) -> Controller:
+        """Return the plain form, the same where all commands are applied."""
+        D = np.zeros((len(self.C), self.B.shape[1]))
+        A = self.A + self.applied @ self.C
+        return Controller(A=A, B=self.B, C=self.C, D=D, dt_s=self.dt_s, applied=self.applied)
+
     def start(self) -> RunningController:
         """Return a running copy with a zero state: ``step(y, applied) -> u`` sample by sample."""
         return RunningController(self, form="estimator")

@@ -8,6 +8,7 @@ doi:10.1007/978-1-84800-911-0.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
@@ -384,34 +385,43 @@ def schur_response(form: SchurForm, z: ComplexArray) -> ComplexArray:
     return out
 
 
-def stacked_response(matrices: tuple[FloatArray, ...], z: ComplexArray) -> ComplexArray:
-    """Transfer matrices (f, k, m, q) at points z of k balanced systems ``A, B, C, D``.
+def stacked_response(
+    matrices: tuple[FloatArray, ...],
+) -> Callable[[ComplexArray], ComplexArray]:
+    """Return the function from points z to transfer matrices (f, k, m, q) of balanced systems.
 
-    Several have partial fractions. Where those of one, whose eigenvectors are nearly dependent,
-    fail at some probes, its points are solved one by one.
+    Several ``A, B, C, D`` have partial fractions. Where those of one, whose eigenvectors are nearly
+    dependent, fail at some probes, its points are solved one by one.
     """
     A, B, C, D = matrices
     if len(A) == 1 and A.size:
-        return schur_response(schur_form(StateSpace(A=A[0], B=B[0], C=C[0], D=D[0])), z)[:, None]
-    planes = np.empty((len(A), D[0].size, z.size), dtype=np.complex128)
-    out = np.moveaxis(planes.reshape(*D.shape, z.size), (3, 0), (0, 1))
-    out[:] = D
+        form = schur_form(StateSpace(A=A[0], B=B[0], C=C[0], D=D[0]))
+        return lambda z: schur_response(form, z)[:, None]
     if not A.size:
-        return out
+        return lambda z: np.broadcast_to(D.astype(np.complex128), (z.size, *D.shape))
     poles, vectors = np.linalg.eig(A)
     with np.errstate(all="ignore"):  # what is not finite fails the probes
         entries = solve_stack(vectors.astype(np.complex128), B.astype(np.complex128))
-        residues = np.einsum("kms,ksq->kmqs", C @ vectors, entries).reshape(*planes.shape[:2], -1)
-        for k, residue in enumerate(residues):
-            planes[k] += residue @ (1 / (z - poles[k, :, None]))
-    probes = np.linspace(0, z.size - 1, 5).astype(np.int64)
-    pencils = z[probes, None, None, None] * np.eye(A.shape[1]) - A
-    direct = C @ np.linalg.solve(pencils, B.astype(np.complex128)) + D
-    apart = np.max(np.abs(out[probes] - direct), axis=(0, 2, 3))
-    agree = apart <= _AGREEMENT * np.max(np.abs(direct), axis=(0, 2, 3))
-    for k in np.flatnonzero(~agree).tolist():
-        out[:, k] = pointwise_response(StateSpace(A=A[k], B=B[k], C=C[k], D=D[k]), z)
-    return out
+        residues = np.einsum("kms,ksq->kmqs", C @ vectors, entries)
+        residues = residues.reshape(len(A), D[0].size, -1)
+
+    def respond(z: ComplexArray) -> ComplexArray:
+        planes = np.empty((len(A), D[0].size, z.size), dtype=np.complex128)
+        out = np.moveaxis(planes.reshape(*D.shape, z.size), (3, 0), (0, 1))
+        out[:] = D
+        with np.errstate(all="ignore"):
+            for k, residue in enumerate(residues):
+                planes[k] += residue @ (1 / (z - poles[k, :, None]))
+        probes = np.linspace(0, z.size - 1, 5).astype(np.int64)
+        pencils = z[probes, None, None, None] * np.eye(A.shape[1]) - A
+        direct = C @ np.linalg.solve(pencils, B.astype(np.complex128)) + D
+        apart = np.max(np.abs(out[probes] - direct), axis=(0, 2, 3))
+        agree = apart <= _AGREEMENT * np.max(np.abs(direct), axis=(0, 2, 3))
+        for k in np.flatnonzero(~agree).tolist():
+            out[:, k] = pointwise_response(StateSpace(A=A[k], B=B[k], C=C[k], D=D[k]), z)
+        return out
+
+    return respond
 
 
 def _repeating_response(

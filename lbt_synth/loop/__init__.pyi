@@ -6,5 +6,6 @@ from .least_residual import least_residual as least_residual
 from .margins import loop_margins as loop_margins
 from .simulation import simulate as simulate
 from .stable_range import stable_sensor_gains as stable_sensor_gains
+from .stable_range import stroke_ratio as stroke_ratio
 from .strehl import Imaging as Imaging
 from .strehl import strehl as strehl

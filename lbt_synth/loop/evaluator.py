@@ -84,21 +84,28 @@ class Evaluator:
             self, **{name: getattr(self, name)[which] for name in [*"ABCD", "roots", "start"]}
         )
 
-    def powers(self, f_hz: FloatArray, entry: FloatArray) -> FloatArray:
-        """Powers (2, n, n, f, k) that phases of unit density leave by an entry (k or 1, n, w)."""
-        f = f_hz / self.frame_rate_hz
-        mean: ComplexArray = np.zeros(1, dtype=np.complex128)
-        squares = np.zeros(1)
-        for weight, piece in self._pieces(f, entry):
-            mean = mean + weight * piece
-            squares = squares + weight * _power(piece)
-        of_mean = _power(mean)
-        within = squares - of_mean
-        if self.in_image:
-            rest = 1 - np.abs(self._holds.phase_means(f)) ** 2 @ self._holds.weights
-            along = np.moveaxis(entry @ transpose(entry), 0, -1)
-            within += along[:, :, None] * rest[:, None]
-        return np.array([of_mean, within])
+    def powers(self, entry: FloatArray) -> Callable[[FloatArray], FloatArray]:
+        """Return the powers (2, n, n, f, k) that phases of unit density leave, of frequencies [Hz].
+
+        They enter by an entry (k or 1, n, w).
+        """
+        weights, respond = self._holds.weights, self._pieces(entry)
+        along = np.moveaxis(entry @ transpose(entry), 0, -1)[:, :, None]
+
+        def powers(f_hz: FloatArray) -> FloatArray:
+            f = f_hz / self.frame_rate_hz
+            pieces = respond(f)
+            of_mean = _power(pieces[0] if len(pieces) == 1 else np.tensordot(weights, pieces, 1))
+            out = np.stack([of_mean, np.zeros_like(of_mean)])
+            if len(pieces) > 1:
+                squares = [w * _power(piece) for w, piece in zip(weights, pieces, strict=True)]
+                out[1] = np.sum(squares, axis=0) - of_mean
+            if self.in_image:
+                rest = 1 - np.abs(self._holds.phase_means(f)) ** 2 @ weights
+                out[1] += along * rest[:, None]
+            return out
+
+        return powers
 
     def of_density(
         self,
@@ -108,9 +115,10 @@ class Evaluator:
     ) -> FloatArray:
         """Return what phases of a density (f, k or 1) leave by an entry (k or 1, n, w)."""
         edges = np.union1d(graded_edges(self.roots.ravel()) * self.frame_rate_hz / 2, edges_hz)
+        powers = self.powers(entry)
 
         def weighted(f_hz: FloatArray) -> FloatArray:
-            return np.moveaxis(self.powers(f_hz, entry) * density(f_hz), (3, 4), (0, 1))
+            return np.moveaxis(powers(f_hz) * density(f_hz), (3, 4), (0, 1))
 
         return adaptive_integral(weighted, edges)
 
@@ -234,24 +242,32 @@ class Evaluator:
     def _holds(self) -> Hold:
         return STILL if self.hold is None else self.hold
 
-    def _pieces(self, f: FloatArray, entry: FloatArray) -> Iterator[tuple[float, ComplexArray]]:
-        """Yield the length of each piece of a hold, and what phases leave (n, w, f, k)."""
-        n, share = self.n_modes, np.sinc(f) if self.in_image else np.ones(f.size)
+    def _pieces(self, entry: FloatArray) -> Callable[[FloatArray], ComplexArray]:
+        """Return what phases leave in each piece of a hold, (g, n, w, f, k), of frequencies."""
+        n = self.n_modes
         entered = replace(self, B=self.B[..., :n] @ entry, D=self.D[..., :n] @ entry)
+        enters = np.moveaxis(entry, 0, -1)[:, :, None]
+        respond: Callable[[FloatArray], ComplexArray]
         if len(self.A) == self.phases:
-            response = entered.system().phase_response(f * self.frame_rate_hz)
+            one = entered.system()
+            respond = lambda f: one.phase_response(f * self.frame_rate_hz)  # noqa: E731
         else:
-            response = stacked_response(entered._matrices, np.exp(2j * np.pi * f))
-        rows = np.moveaxis(response, (2, 3), (0, 1)) * share[:, None]  # (g n, w, f, k)
-        rows = rows.reshape(-1, n, *rows.shape[1:])
-        if self.hold is None:
-            yield 1.0, rows[0]
-            return
-        # as seen from the middle of the frame, where the mean has its phase
-        late = np.exp(2j * np.pi * f[:, None] * (self.start - self.hold.start - 0.5))
-        means, enters = self.hold.phase_means(f), np.moveaxis(entry, 0, -1)[:, :, None]
-        for g, (weight, positions) in enumerate(zip(self.hold.weights, rows, strict=True)):
-            yield float(weight), (means[:, g, None] * enters) * late - positions
+            many = stacked_response(entered._matrices)
+            respond = lambda f: many(np.exp(2j * np.pi * f))  # noqa: E731
+
+        def pieces(f: FloatArray) -> ComplexArray:
+            rows = np.moveaxis(respond(f), (2, 3), (0, 1))  # (g n, w, f, k)
+            rows = rows.reshape(-1, n, *rows.shape[1:])
+            if self.in_image:
+                rows = rows * np.sinc(f)[:, None]
+            if self.hold is None:
+                return np.asarray(rows)
+            # as seen from the middle of the frame, where the mean has its phase
+            late = np.exp(2j * np.pi * f[:, None] * (self.start - self.hold.start - 0.5))
+            means = self.hold.phase_means(f).T[:, None, None, :, None]
+            return np.asarray(means * enters * late - rows)
+
+        return pieces
 
     def _at(self, f: FloatArray) -> ComplexArray:
         """Return the responses (k, r, n + q) of loops, each at its own frequency."""

@@ -18,6 +18,12 @@ the unit circle, where X is ``z^-1 (g M_d' - M_d)`` times what commands answer t
 sensor sees it. It does not while the Hermitian part of X lies above -1. ``M_d'`` is piecewise
 linear in ``d'``, so that a few loops stand for all of a box of gains and delays: X of any other is
 an average of theirs.
+
+A command v that is clipped at the stroke is applied as ``d(k) v`` with d(k) in ``[r, 1]``, while it
+asks for at most ``1 / r`` strokes. What is clipped off comes back through the loop as ``v = T_w (1
+- d) v``, and the loop stays stable, whatever d does, if the Hermitian part of ``T_w`` lies below
+``1 / (1 - r)`` (the circle criterion: H. K. Khalil, Nonlinear Systems, 3rd ed., section 7.1; in
+discrete time E. I. Jury, B. W. Lee, IEEE Trans. Autom. Control 9, 51 (1964)).
 """
 
 from __future__ import annotations
@@ -33,7 +39,7 @@ from numpy.polynomial.polynomial import polysub
 from scipy.optimize.elementwise import find_root
 
 from lbt_synth.linear import Controller, StateSpace, hinf_norm
-from lbt_synth.linear.controller import HasController, as_controller
+from lbt_synth.linear.controller import EstimatorForm, HasController, as_controller
 from lbt_synth.linear.matrix_functions import component_labels
 from lbt_synth.linear.norms import fold_angles, largest_real_part, popov_angles, square_parts
 from lbt_synth.linear.state_space import schur_form, schur_response
@@ -340,6 +346,72 @@ def moving_gain(loop: ClosedLoop) -> MovingGain:
         moving_low=low,
         moving_high=high,
     )
+
+
+def stroke_ratio(
+    hardware: LoopHardware,
+    controller: Controller | HasController | EstimatorForm,
+    *,
+    sensor_gain: float = 1.0,
+) -> float:
+    """Return how many times the stroke commands may ask for, with a loop that is proved stable.
+
+    The circle criterion proves no more, and says nothing of commands beyond.
+
+    Parameters
+    ----------
+    hardware : LoopHardware
+        Sensor, mirror and delay.
+    controller : Controller, Design or EstimatorForm
+        The plain form, which assumes that its commands are applied, or the one that is given those.
+    sensor_gain : float, optional
+        Real gain of the sensor relative to its matrix.
+
+    Returns
+    -------
+    float
+        The ratio, above 1; 1e4 where it is that or more.
+
+    Raises
+    ------
+    UnstableLoopError
+        If the loop is unstable where nothing is clipped.
+    ProblemError
+        If the controller reads other sensors, or the sizes clash.
+
+    Examples
+    --------
+    With a pole p, the loop of one frame ``x(k+1) = (p - g d(k)) x(k)`` needs ``d > (p - 1) / g``:
+
+    >>> import lbt_synth as lbt
+    >>> path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
+    >>> eager = lbt.Controller(A=1.1, B=0.5, C=1.0, D=0.0, dt_s=1 / 800)
+    >>> round(lbt.loop.stroke_ratio(path, eager), 4)  # 0.5 / 0.1
+    5.0
+    """
+    if isinstance(controller, EstimatorForm):
+        plain, fed_back = controller.to_controller(), controller.applied
+    else:
+        plain = as_controller(controller)
+        fed_back = np.zeros(plain.C.T.shape)
+    loop = close_loop(hardware.own_sensor_alone(), plain, sensor_gain=sensor_gain)
+    loop.require_stable()
+    level = largest_real_part(_answer_to_clipping(loop, fed_back)) / CIRCLE_LIMIT
+    return _WIDEST if level <= 1 else min(level / (level - 1), _WIDEST)
+
+
+def _answer_to_clipping(loop: ClosedLoop, fed_back: FloatArray) -> StateSpace:
+    """Return ``T_w``, from what is clipped off to commands, of which (n, m) are fed back."""
+    k, hardware = loop.controller, loop.hardware
+    mirror, influence = hardware.mirror_system.whole, hardware.influence
+    A, C, (n, m) = loop.system.A, loop.path("noise", "command").C, influence.shape
+    shown = np.zeros((len(A), m))  # what a unit of a command does to the mirror, and the residual
+    shown[k.n_states : -n], shown[-n:] = mirror.repeated(m)[1], -mirror.D * influence
+    state, answer = np.zeros((len(A), m)), k.C @ fed_back  # one frame later, where it is fed back
+    state[: k.n_states] = fed_back
+    A = np.block([[A, state + shown @ answer], [np.zeros((m, len(A) + m))]])
+    B, C, D = -np.vstack([shown, np.eye(m)]), np.hstack([C, answer]), np.zeros((m, m))
+    return StateSpace(A=A, B=B, C=C, D=D, dt_s=loop.system.dt_s)
 
 
 def loop_changes(

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import j0, j1
+from scipy.special import ive, j0, j1
 
 from lbt_synth.errors import DimensionError
 from lbt_synth.linear.quadrature import gauss_panels
@@ -33,6 +33,7 @@ from lbt_synth.validation import (
 
 _DIRECTIONS = 64  # of nodes in half a turn, for jitter of at most _TURNS
 _TURNS = 5.0  # of phase over the pupil; beyond them the nodes are made denser
+_FEW_TURNS = 1.0  # of phase over the pupil; below them half of the directions is as good
 _POINT_CHUNK = 200_000  # values of the integrand at once
 _MOST_TURNS = 160.0  # of phase over the pupil; the image is gone long before
 
@@ -149,12 +150,24 @@ def _integrated_otf(
 ) -> FloatArray:
     """Return Strehl ratios (p,) of jitters of a spread (p,), in turns of phase over the pupil."""
     fineness = np.ceil(np.log2(np.maximum(spread / _TURNS, 1.0))).astype(np.int64)
+    fineness[spread < _FEW_TURNS] = -1
     # |f.a|^2 and f'Sf are quadratic forms of f
     forms = _quadratic_form(np.real(np.einsum("psi,psj->psij", lines, lines.conj())))
     widths = _quadratic_form(covariance)
     out = np.empty(len(spread))
-    for level in np.unique(fineness).tolist():
-        members = np.flatnonzero(fineness == level)
+    still = ~np.any(lines, axis=(1, 2))
+    for level in np.unique(fineness[still]).tolist():
+        members = np.flatnonzero(still & (fineness == level))
+        radius, weight = _radial_otf(imaging.obstruction, level)
+        square = 2 * (np.pi * imaging.cycles_per_nm * radius) ** 2
+        xx, xy, yy = widths[members].T
+        # the mean of exp(-x cos) over all directions is I0(x)
+        turning = np.hypot((xx - yy) / 2, xy)
+        factor = ive(0, np.outer(turning, square))
+        factor *= np.exp(-np.outer((xx + yy) / 2 - turning, square))
+        out[members] = imaging.other_modes * np.minimum(factor @ weight, 1.0)
+    for level in np.unique(fineness[~still]).tolist():
+        members = np.flatnonzero(~still & (fineness == level))
         squares, weight = _weighted_otf(imaging.obstruction, level)
         squares = squares * imaging.cycles_per_nm**2
         step = max(1, _POINT_CHUNK // weight.size)
@@ -214,8 +227,8 @@ def _require_axes(size: int) -> None:
 
 
 @lru_cache(maxsize=32)
-def _weighted_otf(obstruction: float, fineness: int) -> tuple[FloatArray, FloatArray]:
-    """Nodes in half the plane, (fx^2, 2 fx fy, fy^2) [(D/lambda)^2], and OTF weights of sum 1."""
+def _radial_otf(obstruction: float, fineness: int) -> tuple[FloatArray, FloatArray]:
+    """Radii [D/lambda] and OTF weights of sum 1 of rings of the plane."""
     eps = obstruction
     kinks = {0.0, 0.02, 0.1, 0.3, eps, (1 - eps) / 2, (1 + eps) / 2, 1.0}
     edges = np.array(sorted(kinks))
@@ -223,10 +236,17 @@ def _weighted_otf(obstruction: float, fineness: int) -> tuple[FloatArray, FloatA
         edges = np.sort(np.concatenate([edges, (edges[1:] + edges[:-1]) / 2]))
     radius, weight = gauss_panels(edges, 12)
     weight = weight * radius * annular_otf(radius, eps)
-    directions = _DIRECTIONS << fineness
+    return radius, weight / weight.sum()
+
+
+@lru_cache(maxsize=32)
+def _weighted_otf(obstruction: float, fineness: int) -> tuple[FloatArray, FloatArray]:
+    """Nodes in half the plane, (fx^2, 2 fx fy, fy^2) [(D/lambda)^2], and OTF weights of sum 1."""
+    radius, weight = _radial_otf(obstruction, fineness)
+    directions = int(_DIRECTIONS * 2.0**fineness)
     angle = np.pi * (np.arange(directions) + 0.5) / directions
     fx, fy = np.outer(radius, np.cos(angle)).ravel(), np.outer(radius, np.sin(angle)).ravel()
-    weights = np.repeat(weight / (weight.sum() * angle.size), angle.size)
+    weights = np.repeat(weight / angle.size, angle.size)
     return np.stack([fx**2, 2 * fx * fy, fy**2]), weights
 
 

@@ -103,6 +103,9 @@ class RobustSection(Section):
         description="stable for delay errors up to this [frames], late or early, at every gain of "
         "sensor_gain (default: 0.1 where the mirror settles at once, else 0)",
     )
+    stroke_ratio: float | None = Field(
+        default=None, gt=1, le=1e4, description="stable with commands of that many strokes, clipped"
+    )
     command_stroke_nm: Nanometres | None = Field(
         default=None, description="largest rms of the commands [nm]"
     )
@@ -205,7 +208,7 @@ def _list_demands(
 ) -> list[Demand]:
     """Return the demands of the section, those on commands under the turbulence of the design."""
     from lbt_synth.design.loop_shaping import noise_per_mode
-    from lbt_synth.design.shaping import Bound, CommandRms
+    from lbt_synth.design.shaping import Bound, CommandRms, LoopErrors
     from lbt_synth.models.spectra import spectrum_key
 
     demands: list[Demand] = []
@@ -213,6 +216,15 @@ def _list_demands(
         gain = 1.0 if bound.sensor_gain is None else bound.sensor_gain / inputs.sensor_gain
         with name_key(f"{_KEY}.bounds[{i}]"):
             demands.append(Bound(**{**bound.model_dump(), "sensor_gain": gain}))
+    if section.stroke_ratio is not None:
+        influence = inputs.hardware.influence
+        if np.any(np.count_nonzero(influence, axis=1) != 1) or np.diff(influence.shape):
+            raise ConfigError(
+                f"{_KEY}.stroke_ratio: each command must move one axis alone, as a clipped one "
+                "would turn the others; got a mirror.influence_matrix that mixes them.",
+                path=f"{_KEY}.stroke_ratio",
+            )
+        demands.append(LoopErrors(low=1 / section.stroke_ratio, moving=True))
     commands_nm = {False: section.command_stroke_nm, True: section.command_step_nm}
     models = inputs.plant.turbulence
     for rate, at_most_nm in commands_nm.items():

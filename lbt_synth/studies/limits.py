@@ -10,13 +10,14 @@ from types import SimpleNamespace
 import numpy as np
 
 from lbt_synth.config import Config
+from lbt_synth.config.samples import at_frame_rate
 from lbt_synth.design import Design
-from lbt_synth.errors import LbtSynthError, ProblemError
-from lbt_synth.loop import ClosedLoop, Imaging, least_residual, residual_budget
+from lbt_synth.errors import LbtSynthError, ProblemError, refuse_config
+from lbt_synth.loop import ClosedLoop, Imaging, least_residual, residual_budget, strehl
 from lbt_synth.loop.band_limit import BandLimit, least_worst_residual
 from lbt_synth.loop.least_residual import ResidualLimit, above_percent, limit_or_none
 from lbt_synth.loop.margins import phase_margin_deg
-from lbt_synth.methods.registry import reference_methods
+from lbt_synth.methods.registry import INTEGRATOR, KALMAN, design_label, reference_methods
 from lbt_synth.models import (
     LoopHardware,
     SinusoidalVibration,
@@ -25,7 +26,12 @@ from lbt_synth.models import (
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import (
+    NM,
+    PERCENT,
+    Facts,
     column,
+    fact,
+    facts,
     fill_row,
     nm_column,
     percent_column,
@@ -198,6 +204,32 @@ def _residual_curve(
     moved = [still.with_frequency_error(float(shift)) for shift in (0.0, *shifts)]
     first, *others = (np.trace(residual_budget(loop, shaken).total_nm2) for shaken in moved)
     return np.asarray(np.sqrt(residual_nm**2 - first + np.array(others)))
+
+
+def limits_at_rate(config: Config, frame_rate_hz: float) -> Facts:
+    """Return what designs, and the limit, leave of the same star at another frame rate.
+
+    The Strehl ratio of the limit is that of a Gaussian motion; what there is not is nan.
+    """
+    with refuse_config(f"at {frame_rate_hz:.6g} Hz"):
+        here = at_frame_rate(config, frame_rate_hz)
+        designs = {m.name: here.design(m.name, **m.compared_options) for m in (INTEGRATOR, KALMAN)}
+        study = limits(designs, here.hardware, here.truth, here.imaging)
+    leaves = {row.design: (row.residual_nm, row.strehl) for row in study.rows}
+    leaves["limit"] = np.nan, np.nan
+    if study.limit is not None:
+        axes = study.limit.directions
+        covariance = axes.T @ (study.limit.variance_nm2[:, None] * axes)
+        leaves["limit"] = study.limit.rms_nm, strehl(covariance, here.imaging)
+    noise_nm = float(np.sqrt(np.mean(np.square(here.noise_nm))))
+    cells = {
+        "frame_rate_hz": fact(frame_rate_hz, "rate", unit="Hz", format=".0f"),
+        "noise_nm": fact(noise_nm, "noise", **NM),
+    }
+    for name, (residual_nm, ratio) in leaves.items():
+        cells[f"{name}_nm"] = fact(residual_nm, design_label(name), **NM)
+        cells[f"{name}_strehl"] = fact(ratio, "Strehl", **PERCENT)
+    return facts(**cells)
 
 
 def compare_in_truth(

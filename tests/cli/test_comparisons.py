@@ -9,11 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from support.commands import run
-from support.configs import with_errors
+from support.configs import GOOD, minimal_config, with_errors, write_config
 from support.plants import LBT_YAML, ROOT
 from support.robustness_maps import evaluate_point
 
 import lbt_synth as lbt
+from lbt_synth.cli import comparisons
+from lbt_synth.studies.limits import limits_at_rate
 
 CONFIG = str(LBT_YAML)
 SLOW_YAML = ROOT / "examples" / "lbt_slow_mirror.yaml"
@@ -65,6 +67,67 @@ def test_limits_command_without_vibrations_and_with_coupled_modes(tmp_path, caps
     )
     coupled.write_text(text.replace(line, more))
     assert "limit of this loop cannot be computed" in run(capsys, "limits", coupled)[1]
+
+
+def test_limits_over_the_frame_rate(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(comparisons, "_RATES", 15)
+    words = ("limits", CONFIG, "--frame-rates", 800, 1600)
+    status, out, _ = run(capsys, *words)
+    assert status == 0
+    assert out.startswith("The best frame rate is 1600 Hz, an end of the range, for the integrator")
+    assert "the photons per second stay; the read noise of a frame stays; the delay stays 2" in out
+    assert 10 < len(re.findall(r"^ +\d+ +\d+\.\d ", out, re.MULTILINE)) <= 12
+    data = written(capsys, tmp_path, *words)
+    rows = data["rows"]
+    assert [row["frame_rate_hz"] for row in rows] == pytest.approx(np.geomspace(800, 1600, 15))
+    assert rows[0] == pytest.approx(limits_at_rate(lbt.load_config(CONFIG), 800.0).values)
+    best = min(rows, key=lambda row: row["kalman_nm"])
+    assert data["best_kalman_hz"] == best["frame_rate_hz"]
+    assert f" {best['frame_rate_hz']:.0f} Hz for the Kalman filter (" in data["verdict"][0]
+
+
+def test_what_is_unstable_or_has_no_limit_has_no_best_frame_rate(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(comparisons, "_RATES", 2)
+    content = minimal_config(truth={"sensor_gain": 2.2, "vibrations": "model"})
+    content |= {"telescope": GOOD["telescope"], "atmosphere": GOOD["atmosphere"]}
+    content["model"]["turbulence"] = {"kind": "ar1"}
+    turned = {"direction_deg": 30.0, "frequency_hz": 31.0, "damping": 0.01, "rms_nm": 200.0}
+    content["model"]["vibrations"].append(turned)
+    words = ("limits", write_config(tmp_path, content), "--frame-rates", 700, 900)
+    data = json.loads(run(capsys, *words, "--json")[1])
+    assert data["rows"][0]["kalman_nm"] is data["rows"][0]["limit_nm"] is None
+    (verdict,) = data["verdict"]
+    assert re.match(r"The best frame rate is \d+ Hz, an end of the range, for the integr", verdict)
+    assert "Kalman" not in verdict
+    assert "limit" not in verdict
+    out = " ".join(run(capsys, *words)[1].split())
+    assert "the noise is that of photons, its variance in proportion to the rate" in out
+
+
+def test_frame_rates_are_those_of_the_mirrors_local_loop(capsys, monkeypatch):
+    monkeypatch.setattr(comparisons, "_RATES", 3)
+    out = run(capsys, "limits", SLOW_YAML, "--frame-rates", 700, 910, "--json")[1]
+    rates = np.array([row["frame_rate_hz"] for row in json.loads(out)["rows"]])
+    samples = lbt.load_config(SLOW_YAML).hardware.mirror.sampling_hz / rates
+    assert samples == pytest.approx(np.round(samples))
+    assert rates == pytest.approx([700, 798, 910], rel=0.01)
+
+
+def test_frame_rates_that_cannot_be_compared_are_refused(tmp_path, capsys, gains):
+    fixed = write_config(tmp_path, minimal_config())
+    for words, message in (
+        ((CONFIG, "--frame-rates", 900, 300), "--frame-rates must be LOW below HIGH; got 900 300"),
+        ((CONFIG, "--frame-rates", 0, 300), "--frame-rates must be above 0; got 0"),
+        ((CONFIG, "--frame-rates", 30, 300), "at 30 Hz: .*below the Nyquist frequency 15 Hz"),
+        ((CONFIG, gains["kalman"], "--frame-rates", 300, 900), "leave the gain files out"),
+        (
+            (fixed, "--frame-rates", 300, 900),
+            "kind ar is known at 800 Hz alone. Give an atmosphere",
+        ),
+    ):
+        status, out, error = run(capsys, "limits", *words)
+        assert (status, out) == (2, "")
+        assert re.search(message, error)
 
 
 def test_tradeoff(tmp_path, capsys):

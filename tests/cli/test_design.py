@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from support.plants import LBT_YAML, ROOT
 from support.robust_config import robust_writer
 
 import lbt_synth as lbt
-from lbt_synth.cli.design import describe_design
+from lbt_synth.cli.design import add_moving_gains, describe_design
 from lbt_synth.cli.output import Report
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.interop.c.export import frame_cost
@@ -76,7 +77,23 @@ def test_show_and_verify(capsys, gains):
         moving = data["moving_gain"]
         assert moving["constant_low"] < moving["moving_low"] < 1
         assert 1 < moving["moving_high"] < moving["constant_high"]
+        design = lbt.load_gain(gain)
+        forms = {"plain": design, "estimator": lbt.linear.estimator_form(design)}
+        ratios = {form: lbt.loop.stroke_ratio(design.hardware, law) for form, law in forms.items()}
+        assert data["clipped_commands"] == pytest.approx(ratios)
+        assert (1 < ratios["plain"] < 20) == (design.method == "kalman")
+        assert "proved in the plain form, up to" in text
         assert data["digest"] == load_with_digest(gain)[1]
+
+
+def test_a_controller_without_an_estimator_form_has_no_number_for_it():
+    zeros = {"A": [[0, 0], [1, 0]], "B": [[1], [0]], "C": [[0.05, 0.1]], "D": 0.0}  # at z = -2
+    law = lbt.Controller(**zeros, dt_s=1 / 800)
+    hardware = lbt.LoopHardware(frame_rate_hz=800, delay_frames=1, modes=1)
+    design = SimpleNamespace(hardware=hardware, controller=law, other_sensors=())
+    report = Report()
+    add_moving_gains(report, design)
+    assert report.data["clipped_commands"] == {"plain": 1e4, "estimator": None}
 
 
 def test_verification_that_fails_has_status_1(capsys, monkeypatch, gains):

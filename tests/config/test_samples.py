@@ -5,7 +5,7 @@ import pytest
 from support.plants import LBT_YAML
 
 import lbt_synth as lbt
-from lbt_synth.config.samples import array_keys, build_ensemble, parse_path, with_arrays
+from lbt_synth.config.samples import array_keys, build_ensemble, parse_path, with_values
 from lbt_synth.errors import ProblemError
 
 COUNT = 4
@@ -19,7 +19,7 @@ def ensemble_of(values, **errors):
 def test_arrays_leave_the_settings_as_they_are(config):
     keys, values = parse_path("model.vibrations[0].rms_mas"), np.array([1.0, 2.0, 3.0, 4.0])
     settings = config.settings
-    changed = with_arrays(settings, {keys: values})
+    changed = with_values(settings, {keys: values})
     assert changed.model.vibrations[0].rms_mas is values
     assert settings.model.vibrations[0].rms_mas == 80
     assert changed.truth is settings.truth

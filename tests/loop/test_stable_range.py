@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cvxpy as cp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -135,6 +136,136 @@ def test_intervals_are_of_the_sensor_gain_whatever_the_loop_has():
     assert [loop.is_stable for loop in loops] == [True] * 9 + [False] * 2
     with pytest.raises(lbt.errors.UnstableLoopError):
         moving_gain(integrator_loop(2, gain=1.5))
+
+
+def one_pole(pole, gain=0.5, *, delay_frames=1):
+    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=delay_frames, modes=1)
+    return path, lbt.Controller(A=pole, B=gain, C=1.0, D=0.0, dt_s=1 / 800)
+
+
+def strokes(hardware, controller, **gain):
+    """Ratios of the plain form and of the estimator form."""
+    forms = controller, lbt.linear.estimator_form(controller)
+    return [lbt.loop.stroke_ratio(hardware, form, **gain) for form in forms]
+
+
+@pytest.mark.parametrize(("pole", "gain"), [(1.01, 0.5), (1.1, 0.5), (1.3, 1.2), (1.6, 0.9)])
+def test_one_state_is_proved_exactly_where_no_clip_sets_it_free(pole, gain):
+    """``|p - g d| < 1`` at ``d = 1 / ratio`` is necessary and sufficient."""
+    assert lbt.loop.stroke_ratio(*one_pole(pole, gain)) == pytest.approx(
+        gain / (pole - 1), rel=2e-6 * gain / (pole - 1)
+    )
+
+
+@pytest.mark.parametrize(("pole", "gain"), [(1.0, 0.5), (1.0, 1.9), (0.9, 0.5), (1.1, 0.5)])
+def test_an_integrator_of_one_frame_bears_any_clip(pole, gain):
+    """Given what was applied, ``v(k) = (p - g) w(k-1)`` decays whatever is clipped."""
+    plain, estimator = strokes(*one_pole(pole, gain))
+    assert estimator == 1e4
+    assert (plain == 1e4) == (pole <= 1)
+
+
+def clip_peak(hardware, controller, sensor_gain):
+    """Largest ``T_w`` of both forms on a grid, by ``T_w = P / (1 + P)`` of the broken loop."""
+    f = np.linspace(0.01, hardware.frame_rate_hz / 2 - 0.01, 4001)
+    z = np.exp(2j * np.pi * f * hardware.dt_s)[:, None, None]
+    taps = hardware.mirror_taps
+    delay = sum(tap * z ** -(1.0 + i) for i, tap in enumerate(taps))
+    seen = sensor_gain * delay * (hardware.sensor @ hardware.influence)
+    form = lbt.linear.estimator_form(controller)
+    identity, peaks = np.eye(form.A.shape[0]), []
+    for A, L in ((controller.A, 0 * form.applied), (form.A, form.applied)):
+        state = z * np.linalg.inv(z * identity - A)
+        P = form.C @ state @ (form.B @ seen - L / z)
+        T = np.linalg.solve(np.eye(P.shape[1]) + P, P)
+        peaks.append(np.linalg.eigvalsh(T + T.conj().swapaxes(1, 2)).max() / 2)
+    return peaks
+
+
+@pytest.mark.parametrize("delay_frames", [1.0, 2.0, 2.4, 3.0])
+@pytest.mark.parametrize("influence", [np.eye(2), [[1.0, 0.3], [-0.2, 0.8]]])
+@pytest.mark.parametrize("mirror", [None, shell()])
+def test_what_a_clip_sees_is_the_loop_broken_at_the_command(delay_frames, influence, mirror):
+    hardware = lbt.LoopHardware(
+        frame_rate_hz=800, delay_frames=delay_frames, influence_matrix=influence, mirror=mirror
+    )
+    A, B, none = np.diag([1.05, 1.0]), np.diag([0.35, 0.25]), np.zeros((2, 2))
+    law = lbt.Controller(A=A, B=B, C=np.linalg.inv(influence), D=none, dt_s=1 / 800)
+    for gain in (0.6, 1.4) if mirror is None else (0.3, 0.5):
+        ratios = strokes(hardware, law, sensor_gain=gain)
+        for ratio, peak in zip(ratios, clip_peak(hardware, law, gain), strict=True):
+            expected = peak / (peak - 1) if peak > 1 + 1e-4 else 1e4
+            assert ratio == pytest.approx(expected, rel=1e-3)
+
+
+def common_lyapunov(A, B):
+    """Largest ``t`` with ``P - A'PA >= t``, ``P - B'PB >= t`` and ``tr P = n``."""
+    P, t = cp.Variable((len(A), len(A)), symmetric=True), cp.Variable()
+    rests = [P - M.T @ P @ M - t * np.eye(len(A)) for M in (A, B)]
+    bounds = [(rest + rest.T) / 2 >> 0 for rest in rests]
+    problem = cp.Problem(cp.Maximize(t), [*bounds, P >> 0, cp.trace(P) == len(A)])
+    return problem.solve(solver=cp.CLARABEL)
+
+
+def test_a_common_lyapunov_function_of_clips_exists_inside_and_none_beyond():
+    """``v(k) = d v(k-1) - g d v(k-3)`` of an integrator of three frames, given the last command."""
+    _, ratio = strokes(*one_pole(1.0, delay_frames=3))
+    assert 2 < ratio < 4
+    for factor, proved in ((0.99, True), (1.01, False)):
+        clips = [
+            np.array([[d, 0, -0.5 * d], [1, 0, 0], [0, 1, 0]]) for d in (1 / (factor * ratio), 1)
+        ]
+        assert (common_lyapunov(*clips) > 0) == proved
+
+
+def clipped_runs(design, kicks, *, estimator, frames=3000):
+    """Return the largest request and the residuals of loops of two frames, one a column of kicks.
+
+    The last loop runs in the simulation, too.
+    """
+    form = lbt.linear.estimator_form(design) if estimator else design.controller
+    phase = np.zeros((frames, kicks.shape[1]))
+    phase[: len(kicks)] = kicks
+    run, asked = form.start(), np.zeros(kicks.shape[1])
+    applied, residuals = (
+        np.zeros((frames + 1, kicks.shape[1])),
+        np.zeros((frames + 1, *asked.shape)),
+    )
+    for k in range(frames):
+        u = run.step(residuals[k][None], applied[k][None])
+        residuals[k + 1] = phase[k] - applied[k]  # the command of the frame before
+        applied[k + 1] = np.clip(u[0], -1, 1)
+        asked = np.maximum(asked, np.abs(u[0]))
+    met = lbt.loop.Disturbance(phase_nm=phase[:, -1:])
+    simulated = lbt.simulate(form, met, hardware=design.hardware, stroke=1.0)
+    assert simulated.commands[0, :, 0] == pytest.approx(applied[1:, -1], abs=1e-9)
+    return asked, np.abs(residuals[-1])
+
+
+def test_loops_that_ask_for_less_than_is_proved_come_back_and_some_beyond_do_not():
+    plant = lbt_axis_plant()
+    design, rng = lbt.kalman(plant), np.random.default_rng(0)
+    plain, estimator = strokes(plant.hardware, design)
+    low, _ = lbt.loop.stable_sensor_gains(plant.hardware, design)
+    assert 1 < plain < 1 / low
+    kicks = rng.standard_normal((60, 2000)) * np.geomspace(0.1, 60, 2000)
+    asked, last = clipped_runs(design, kicks, estimator=False)
+    clipped = (asked > 1.5) & (asked < plain)
+    assert np.count_nonzero(clipped) > 100
+    assert last[asked < plain].max() < 1e-6
+    assert np.count_nonzero(last > 0.9) > 10  # the residual is the stroke
+    assert estimator == 1e4
+    asked, last = clipped_runs(design, kicks, estimator=True)
+    assert asked.max() > 5 * plain
+    assert last.max() < 1e-6
+
+
+def test_only_stable_loops_that_read_their_own_sensor_have_a_ratio():
+    with pytest.raises(lbt.errors.UnstableLoopError):
+        lbt.loop.stroke_ratio(*one_pole(1.0, 1.5, delay_frames=2))
+    plant = example_plant()
+    with pytest.raises(lbt.errors.ProblemError, match="several sensors"):
+        lbt.loop.stroke_ratio(plant.hardware, lbt.kalman(plant))
 
 
 def test_a_loop_that_the_gain_does_not_touch_is_proved_for_all_gains():

@@ -46,6 +46,31 @@ def test_a_moving_gain_is_demanded_and_kept_in_the_file(small, tmp_path):
     assert "moving_gain" in str(caught.value)
 
 
+def test_clipped_commands_are_demanded_and_kept_in_the_file(small, tmp_path):
+    free, design = (
+        lbt.load_config(small(SMALL + section)).design("robust")
+        for section in ("", "    stroke_ratio: 5\n")
+    )
+    kept = lbt.load_gain(lbt.save_gain(tmp_path / "clipped.fits", design))
+    ratios = [lbt.loop.stroke_ratio(d.hardware, d) for d in (free, design, kept)]
+    assert ratios[0] < 4 < 5 <= ratios[1] == ratios[2] < 5.1
+    checks = [check.name for check in kept.recertify().checks]
+    assert "mode 1: circle criterion of a moving gain, 0.2 to 1" in checks
+
+
+def test_a_mirror_that_mixes_axes_has_no_demand_on_clipped_commands(tmp_path):
+    band = {"low_hz": 18.0, "high_hz": 22.0, "rms_nm": 100.0}
+    robust = {"bands": [band], "turbulence": "model", "functions": 8, "stroke_ratio": 5.0}
+    content = minimal_config(design={"robust": robust})
+    content["mirror"] = {"influence_matrix": [[1.0, 0.1], [0.0, 1.0]]}
+    with pytest.raises(ConfigError, match="each command must move one axis alone") as caught:
+        lbt.load_config(write_config(tmp_path, content)).design("robust")
+    assert caught.value.path == "design.robust.stroke_ratio"
+    content["design"]["robust"]["stroke_ratio"] = 1.0
+    with pytest.raises(ConfigError, match="stroke_ratio: input should be greater than 1"):
+        lbt.load_config(write_config(tmp_path, content))
+
+
 def test_every_demand_of_the_file_reaches_the_specification(small):
     section = """    delay_error_frames: 0.2
     command_stroke_nm: 900.0

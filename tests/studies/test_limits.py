@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from support.configs import minimal_config, write_config
+from support.configs import GOOD, minimal_config, write_config
 
 import lbt_synth as lbt
 from lbt_synth.config import Config
 from lbt_synth.design.result import model_limits
 from lbt_synth.report.figures.studies import limits_figure
-from lbt_synth.studies.limits import compare_in_truth, limits
+from lbt_synth.studies.limits import compare_in_truth, limits, limits_at_rate
 
 
 def test_study(config, lbt_designs):
@@ -131,3 +131,66 @@ def test_wind_shake_that_a_robust_design_is_not_told_of(tmp_path):
         f"the truth leaves {means_nm:.1f} nm in means over frames, where the design expects"
     )
     assert text.endswith("it has power that the design was not made for")
+
+
+PYRAMID = GOOD["sensor"]["pyramid"]
+
+
+@pytest.mark.parametrize("rate_hz", [350.0, 1700.0])
+@pytest.mark.parametrize(
+    "sensor",
+    [{"pyramid": PYRAMID}, {"noise_nm": 12.0}, {"noise_nm": [15.5, 9.0]}, {"noise_mas": 1.5}],
+)
+def test_another_frame_rate_is_that_of_a_file_with_it(tmp_path, sensor, rate_hz):
+    """The photons of a second are the same, and the variance of their noise goes as the rate."""
+    config = lbt.load_config(write_config(tmp_path, {**GOOD, "sensor": sensor}))
+    point = limits_at_rate(config, rate_hz)
+    ((key, value),) = sensor.items()
+    if key == "pyramid":
+        there = {**PYRAMID, "photons": PYRAMID["photons"] * 800 / rate_hz}
+    else:
+        there = (np.array(value) * np.sqrt(rate_hz / 800)).tolist()
+    loop = {**GOOD["loop"], "frame_rate_hz": rate_hz}
+    expected = lbt.load_config(
+        write_config(tmp_path, {**GOOD, "sensor": {key: there}, "loop": loop})
+    )
+    assert expected.hardware.delay_frames == 2
+    assert point.noise_nm == pytest.approx(np.sqrt(np.mean(np.square(expected.noise_nm))))
+    for name, options in (("integrator", {"phase_margin_deg": 45.0}), ("kalman", {})):
+        closed = lbt.close_loop(expected.hardware, expected.design(name, **options))
+        budget = lbt.residual_budget(closed, expected.truth)
+        alone = budget.rms_nm, lbt.strehl(budget, expected.imaging)
+        shown = point.values[f"{name}_nm"], point.values[f"{name}_strehl"]
+        assert shown == pytest.approx(alone, rel=1e-6)
+    assert point.limit_nm == pytest.approx(
+        lbt.loop.least_residual(expected.hardware, expected.truth).rms_nm
+    )
+    # of a motion that is small beside the image: exp(-sigma^2) on both axes
+    small = 0.845 * np.exp(-((2 * np.pi * 1e-3 * point.limit_nm / 2.2) ** 2))
+    assert point.kalman_strehl < point.limit_strehl == pytest.approx(small, rel=0.02)
+
+
+def test_other_sensors_are_left_out_and_coupled_modes_have_no_limit(tmp_path):
+    slow = {"kind": "wavefront", "rate_hz": 400.0, "delay_frames": 1.5, "noise_nm": 5.0}
+    several = lbt.load_config(write_config(tmp_path, {**GOOD, "sensors": {"slow": slow}}))
+    alone = lbt.load_config(write_config(tmp_path, GOOD))
+    assert several.other_sensors == "slow"
+    assert limits_at_rate(several, 700.0).values == limits_at_rate(alone, 700.0).values
+    shakes = {"kind": "resonance", "direction_deg": 30, "frequency_hz": 20, "damping": 0.01}
+    other = {"kind": "resonance", "axis": "tip", "frequency_hz": 31, "damping": 0.01}
+    lines = [{**shakes, "rms_mas": 80}, {**other, "rms_mas": 20}]
+    coupled = {**GOOD, "truth": {**GOOD["truth"], "vibrations": lines}}
+    point = limits_at_rate(lbt.load_config(write_config(tmp_path, coupled)), 500.0)
+    assert np.isnan([point.limit_nm, point.limit_strehl]).all()
+    assert point.kalman_nm < point.integrator_nm
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "message"),
+    [(30.0, r"at 30 Hz: .*below the Nyquist frequency 15 Hz"), (500.0, "at 500 Hz: .*kind ar is")],
+)
+def test_a_frame_rate_without_a_model_is_refused(tmp_path, rate_hz, message):
+    content = minimal_config() if rate_hz > 100 else GOOD
+    config = lbt.load_config(write_config(tmp_path, content))
+    with pytest.raises(lbt.errors.ConfigError, match=message):
+        limits_at_rate(config, rate_hz)

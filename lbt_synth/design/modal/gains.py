@@ -349,7 +349,7 @@ def _find_gains(
     last = np.full((2, gain.size), np.inf)  # gains and variances
     for _ in range(_HALVINGS):
         nodes, weights = gauss_panels(edges * rate / 2, _NODES)
-        rejection = loops.powers(nodes, np.ones((1, 1, 1))).sum(axis=(0, 1, 2)).T
+        rejection = loops.powers(np.ones((1, 1, 1)))(nodes).sum(axis=(0, 1, 2)).T
         rejection /= np.sinc(nodes / rate) ** 2  # the spectra are of means over frames
         if differenced:
             rejection /= 4 * np.sin(np.pi * nodes / rate) ** 2

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.specula.simulation import EndToEndRun
@@ -165,6 +166,17 @@ def limits_figure(study: LimitStudy, *, over_errors: bool = False) -> Figure:
         ):
             if limit is not None and limit.rms_nm > 0:
                 panel.axhline(factor * limit.rms_nm, label=label, linestyle=style, **GUIDE)
+    return panel.figure
+
+
+def frame_rate_figure(rates_hz: ArrayLike, residuals_nm: Mapping[str, FloatArray]) -> Figure:
+    """Draw residuals over the frame rate, by the names of designs and of the limit."""
+    with drawing([2.5]) as (panel,):
+        residual = ("residual", "nm rms")
+        _, factor = name_axes(panel, ("frame rate", "Hz"), residual, xscale="log", yscale="log")
+        for name, rms_nm in residuals_nm.items():
+            label = design_label(name)
+            draw_design(panel, [*map(design_label, residuals_nm)], label, rates_hz, factor * rms_nm)
     return panel.figure
 
 

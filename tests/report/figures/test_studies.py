@@ -8,6 +8,7 @@ from support.figures import legend
 
 import lbt_synth as lbt
 from lbt_synth.report.figures.studies import (
+    frame_rate_figure,
     limits_figure,
     modal_figure,
     robustness_figure,
@@ -15,6 +16,16 @@ from lbt_synth.report.figures.studies import (
 )
 from lbt_synth.studies import robustness, robustness_map
 from lbt_synth.studies.limits import limits
+
+
+def test_residuals_over_the_frame_rate_have_logarithmic_axes():
+    residuals_nm = {"integrator": np.array([900.0, 100.0]), "limit": np.array([140.0, 20.0])}
+    (axis,) = frame_rate_figure([200.0, 2000.0], residuals_nm).axes
+    assert legend(axis) == ["integrator", "limit"]
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("frame rate [Hz]", "residual [nm rms]")
+    assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
+    drawn = [line.get_ydata() for line in axis.get_lines()]
+    assert np.array_equal(drawn, list(residuals_nm.values()))
 
 
 def test_robustness_figure_draws_the_paper_beside(config):
