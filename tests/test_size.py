@@ -14,23 +14,23 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3301,
+    "cli": 3190,
     "config": 1634,
     "design": 6201,
     "files": 1244,
     "identification": 8875,
-    "interop": 3730,
+    "interop": 3687,
     "linear": 4829,
     "loop": 3963,
     "methods": 861,
     "models": 3851,
     "report": 3328,
     "storage": 1027,
-    "studies": 2926,
+    "studies": 3139,
     "errors, validation": 554,
 }
 COUNTS = {
-    "files of the package": 202,
+    "files of the package": 203,
     "public names": 145,
     "tuned constants": 494,
     "lines of tests": 28291,
