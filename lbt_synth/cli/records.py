@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lbt_synth import identification
+from lbt_synth import identification, studies
 from lbt_synth.cli.arguments import given_options, refuse_options
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs, say_accelerometers
 from lbt_synth.cli.output import Report, say_checks
@@ -160,7 +160,7 @@ def _run_nights(arguments: Namespace, gain: Path) -> Report:
         series = load_series(Namespace(**vars(arguments) | {"file": path}))
         nights[name] = require_series(series, "auto tests its design on").bridged()
     with count_progress(total=_STEPS * len(names), what="identifying and designing") as count:
-        made = identification.design_from_nights(
+        made = studies.design_from_nights(
             nights,
             method=arguments.method,
             progress=count,

@@ -2,7 +2,6 @@ from .auto import design_from_record as design_from_record
 from .diagnosis import diagnose as diagnose
 from .fit.identified_model import IdentifiedModel as IdentifiedModel
 from .fit.identify import identify as identify
-from .nights import design_from_nights as design_from_nights
 from .prediction.comparison import prediction_against_data as prediction_against_data
 from .records.from_file import load_record as load_record
 from .records.from_series import loop_record as loop_record

@@ -1,3 +1,4 @@
+from .nights import design_from_nights as design_from_nights
 from .robustness import robustness as robustness
 from .robustness import robustness_map as robustness_map
 from .robustness import tradeoff as tradeoff

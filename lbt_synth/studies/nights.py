@@ -151,7 +151,7 @@ def design_from_nights(
     ...     nights[f"{hz} Hz"] = lbt.identification.loop_record(
     ...         run.measurements[0], run.commands[0], frame_rate_hz=500, delay_frames=2, unit="nm"
     ...     )
-    >>> made = lbt.identification.design_from_nights(nights)
+    >>> made = lbt.studies.design_from_nights(nights)
     >>> made.name, made.worst("all nights")[0] < 1.2, made.worst("38 Hz")[0] > 2
     ('all nights', True, True)
     """
