@@ -16,7 +16,12 @@ from lbt_synth.design import Design, integrator
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
-from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedLine, IdentifiedModel
+from lbt_synth.identification.fit.identified_model import (
+    AXES,
+    DIFFERENT,
+    IdentifiedLine,
+    IdentifiedModel,
+)
 from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.prediction.comparison import (
     INTEGRATOR,
@@ -39,7 +44,6 @@ from lbt_synth.storage.rows import Facts, column, fact, facts, nm_column, table_
 from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import BoolArray, FloatArray, require_instance
 
-AXES = ("tip", "tilt")
 DEAD = "dead"
 _NOISIER = 3.0  # times the other axis, from frame to frame: turbulence and lines are more alike
 _WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel

@@ -361,7 +361,7 @@ def find_axis(search: Search, *, start: IdentifiedAxis | None = None) -> Identif
         return describe_axis(search, model, None, note)
     background = model.spectrum.background
     rivals = [rival.spectrum.background for rival in near]
-    fit_error = model.gain_error
+    fit_error = model.errors.background.log_gain
     error = max(fit_error, *(abs(rival.log_gain - background.log_gain) for rival in rivals))
     if error > fit_error:  # what the gain moves is as ambiguous
         model = hold_gain(search, model, [([0], error)])

@@ -122,7 +122,7 @@ def _is_clear(model: FittedModel) -> bool:
     """
     background, turbulence = model.spectrum.background, model.spectrum.components[0]
     narrow = all(c.is_narrow for c in model.spectrum.lines) and not background.colour
-    plausible = _is_plausible(background.gain) and model.gain_error < GAIN_STEP
+    plausible = _is_plausible(background.gain) and model.errors.background.log_gain < GAIN_STEP
     return narrow and plausible and turbulence.damping_ratio < _OVERDAMPED
 
 

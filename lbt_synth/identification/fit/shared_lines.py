@@ -23,7 +23,6 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedLine,
     describe_axis,
     hold_gain,
-    standard_errors,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import BACKGROUND, GAIN, Component, SpectrumModel
@@ -175,9 +174,7 @@ def _find_pairs(
     Its frequency agrees within errors, or the two overlap.
     """
     evidence = chain(*(model.evidence for model in models))
-    errors = chain(
-        *(standard_errors(model.spectrum, model.covariance).components for model in models)
-    )
+    errors = chain(*(model.errors.components for model in models))
     rows = [
         (worth, c, error.log_frequency)
         for worth, c, error in zip(evidence, components, errors, strict=True)
