@@ -1,4 +1,4 @@
-"""How far designs are from limits and reference designs in the truth, and modes by themselves."""
+"""How far designs are from the limits of performance, and from reference designs in the truth."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 
@@ -23,14 +22,12 @@ from lbt_synth.models import (
     LoopHardware,
     SinusoidalVibration,
     Truth,
-    Vibration,
-    modal_turbulence,
-    pyramid_modal_noise_nm,
 )
-from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import (
+    NM,
+    PERCENT,
     Facts,
     column,
     fact,
@@ -227,11 +224,11 @@ def limits_at_rate(config: Config, frame_rate_hz: float) -> Facts:
     noise_nm = float(np.sqrt(np.mean(np.square(here.noise_nm))))
     cells = {
         "frame_rate_hz": fact(frame_rate_hz, "rate", unit="Hz", format=".0f"),
-        "noise_nm": fact(noise_nm, "noise", unit="nm", format=".1f"),
+        "noise_nm": fact(noise_nm, "noise", **NM),
     }
     for name, (residual_nm, ratio) in leaves.items():
-        cells[f"{name}_nm"] = fact(residual_nm, design_label(name), unit="nm", format=".1f")
-        cells[f"{name}_strehl"] = fact(ratio, "Strehl", unit="%", scale=100, format=".2f")
+        cells[f"{name}_nm"] = fact(residual_nm, design_label(name), **NM)
+        cells[f"{name}_strehl"] = fact(ratio, "Strehl", **PERCENT)
     return facts(**cells)
 
 
@@ -317,75 +314,3 @@ def say_residual(name: str, row: LimitRow, limit: ResidualLimit | None) -> str:
         return f"{said}."
     least = nm_text(limit.rms_nm, ".1f")
     return f"{said}, {row.above_limit_percent:.0f} % above the {least} of the best linear one."
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ModalStudy:
-    """What controllers leave of the turbulence in each of n modes."""
-
-    turbulence_nm: FloatArray  # (n,): what comes in [nm rms]
-    noise_nm: FloatArray  # (n,): per frame [nm]
-    gains: FloatArray  # (n,): of the integrators
-    residual_nm: Mapping[str, FloatArray]  # of integrators and of filters, (n,) [nm rms]
-
-    def by_radial_order(self) -> list[Facts]:
-        """Return a row for each radial order: root sums of squares over its modes."""
-        radial, _ = noll_orders(self.noise_nm.size)
-        rms = {"unit": "nm", "format": ".1f"}
-        rows = []
-        for order in np.unique(radial):
-            which = radial == order
-            turbulence_nm, optimised_nm, kalman_nm = (
-                float(np.linalg.norm(series[which]))
-                for series in (self.turbulence_nm, *self.residual_nm.values())
-            )
-            noise_nm = float(self.noise_nm[which][0])
-            rows.append(
-                facts(
-                    radial_order=fact(int(order), "radial order"),
-                    modes=fact(int(which.sum()), "modes"),
-                    turbulence_nm=fact(turbulence_nm, "turbulence", **rms),
-                    noise_nm=fact(noise_nm, "noise per mode", unit="nm", format=".2f"),
-                    gain=fact(float(self.gains[which].mean()), "mean gain", format=".3f"),
-                    optimised_nm=fact(optimised_nm, "optimised gains", **rms),
-                    kalman_nm=fact(kalman_nm, "Kalman", **rms),
-                )
-            )
-        return rows
-
-
-def compare_modes(config: Config, modes: int) -> ModalStudy:
-    """Compare integrators of the best gains with Kalman filters, for the first modes of a loop."""
-    from lbt_synth.design.modal import modal_filters, modal_gains
-
-    hardware, sensor_gain = config.hardware, config.settings.model.sensor_gain
-    reason = "the turbulence of hundreds of modes is computed from it"
-    rate_hz = hardware.frame_rate_hz
-    air = modal_turbulence(config.require_atmosphere(reason), modes=modes, frame_rate_hz=rate_hz)
-    for key, value in (("sensor.noise_nm", config.noise_nm), ("model.sensor_gain", sensor_gain)):
-        if np.ndim(value):
-            config.refuse_key(key, "must be one number for hundreds of modes; got one per axis")
-    pyramid, noise_nm = config.settings.sensor.pyramid, np.full(modes, float(config.noise_nm))
-    if pyramid is not None:
-        modulation = pyramid.modulation_lambda_over_d
-        noise_nm = pyramid_modal_noise_nm(
-            float(config.noise_nm), modes=modes, modulation_lambda_over_d=modulation
-        )
-    lines = dict[int, list[Vibration]]()
-    for line in config.plant.vibrations:  # each axis by itself
-        for axis, share in enumerate(line.direction):
-            if abs(share) > 1e-9:  # more than rounding
-                tilted = replace(line, rms_nm=abs(share) * line.rms_nm, direction=(1.0,))
-                lines.setdefault(axis, []).append(tilted)
-    loop: dict[str, Any] = {"hardware": hardware, "noise_nm": noise_nm, "vibrations": lines}
-    loop["sensor_gain"] = config.sensor_gain
-    gains = modal_gains(air, **loop)
-    return ModalStudy(
-        turbulence_nm=air.rms_nm,
-        noise_nm=noise_nm,
-        gains=gains.gains,
-        residual_nm={
-            "integrators, optimised gains": gains.rms_nm,
-            "Kalman filters": modal_filters(air, **loop).rms_nm,
-        },
-    )
