@@ -33,7 +33,7 @@ from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _TINY = np.finfo(np.float64).tiny
-_NOTHING = "adds nothing"
+_USED, _NOTHING = "used", "adds nothing"
 _EXTRA = f"left out, because a design takes {MOST_UNITS - 1} channels"
 _INDEPENDENT = (1 - 5 * TAPER / 8) ** 2 / (1 - 93 * TAPER / 128)  # of tapered values
 _REACH = 20.0  # half widths of a line, or bins, from its centre to the edge of its band
@@ -85,8 +85,7 @@ class AccelerometerTransfers:
     @property
     def used(self) -> tuple[ChannelRow, ...]:
         """The channels that show a line."""
-        names = {row.channel for row in self.transfers if row.useful}
-        return tuple(row for row in self.channels if row.channel in names)
+        return tuple(row for row in self.channels if row.verdict == _USED)
 
     def loop_age(self, delay_frames: float) -> int:
         """Return the age of a reading in a loop of some delay: 1 where the clocks hide it."""
@@ -154,7 +153,7 @@ def accelerometer_transfers(
         counted = shown | ~shown.any(axis=1, keepdims=True)  # the lines it shows, or all
         level = np.sum(fits.noise * counted, axis=1) / np.sum(counted, axis=1)
         noise = np.sqrt(level * model.frame_rate_hz / 2).tolist()
-        verdicts = np.select([used.any(1), shown.any(1)], ["used", _EXTRA], _NOTHING).tolist()
+        verdicts = np.select([used.any(1), shown.any(1)], [_USED, _EXTRA], _NOTHING).tolist()
         rows = list(zip(read.names, noise, verdicts, strict=True))
         transfers = _transfer_rows(read.names, places, lines, fits, used)
     rows += [(name, np.nan, "dead") for name in read.dead]
@@ -226,10 +225,7 @@ def _transform(series: FloatArray, rate: float, inside: BoolArray) -> ComplexArr
 
 
 def _density(line: IdentifiedLine, frequency_hz: FloatArray, bin_hz: float) -> FloatArray:
-    """Return the density of a line that the taper widens, (f,) [nm^2/Hz].
-
-    The peak of a line narrower than a bin is that of its tapered power, nearly ``rms^2 / bin``.
-    """
+    """Return the density of a line that the taper widens, (f,) [nm^2/Hz]."""
     centre = line.frequency_hz
     width = line.damping * centre + bin_hz / np.pi
     squares = (centre**2 - frequency_hz**2) ** 2 + (2 * width * frequency_hz) ** 2
@@ -285,10 +281,7 @@ def _lay_and_fit(
     largest: int,
     limit: float,
 ) -> tuple[int, _Fits, float, float]:
-    """Lay readings beside the wavefront: with the likeliest shift, or as given if that is not sure.
-
-    Return by how many frames they were moved, the fits, and the shift with its standard error.
-    """
+    """Return by how many frames readings were moved, fits, and the shift with its error."""
     gains = np.array(model.sensor_gains)
     errors = np.array([axis.sensor_gain_error or 0.0 for axis in model.axes])
     series = record.pseudo_open_loop(gains)
@@ -314,7 +307,7 @@ def _lay_and_fit(
     lag = _likeliest_lag(bands, largest)
     fits = _fit_channels(beside(lag))
     late, error = _slope_shift(fits, limit)
-    if not abs(lag + late) > DIFFERENT * error:
+    if not abs(lag + late) > DIFFERENT * error:  # not sure: they stay as they were given
         return 0, _fit_channels(bands), lag + late if np.isfinite(error) else 0.0, error
     if round(late):
         lag += round(late)

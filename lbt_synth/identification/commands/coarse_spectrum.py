@@ -132,11 +132,8 @@ def _bands(frequency_hz: FloatArray, step: float) -> IntArray:
 
 
 def _shapes(square: FloatArray, lowest_hz: float, skirts: Sequence[FloatArray]) -> FloatArray:
-    """Return the shapes of noise, turbulence, wide resonances and skirts over the bands, (k, b).
-
-    Turbulence falls with slopes of -2, -4 and -6. Nothing but noise and the skirts of slower parts
-    has a place at high frequencies: there the corrections of a wrong guess show.
-    """
+    """Return the shapes of noise, turbulence, wide resonances and skirts over the bands, (k, b)."""
+    # nothing but noise and skirts has a place at high frequencies, where wrong corrections show
     corners = np.geomspace(lowest_hz, _FASTEST_HZ, 5)
     falls = [(1 + square / corner**2) ** -order for corner in corners for order in (1, 2, 3)]
     wide = [_resonance(square, centre, _SHAPE_DAMPING) for centre in _SHAPES_HZ]

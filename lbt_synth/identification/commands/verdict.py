@@ -242,10 +242,7 @@ def _unexplained(law: ControlLaw | None) -> str:
 def _note_law(
     delay_frames: float, lag: int, delays: Sequence[float], hiding: str
 ) -> tuple[str, ...]:
-    """Return what to look at in an accepted record whose law has a lag, or explains too little.
-
-    And which other delays explain it as well.
-    """
+    """Return what to look at in an accepted record: a lag, other delays, a law that leaves much."""
     late = (
         f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
         "real-time computer takes that long, the total delay of a new design is "
@@ -298,10 +295,7 @@ def list_repairs(
 def _choose(
     record: LoopRecord, law: ControlLaw | None, lag: int, known: tuple[float, float] | None
 ) -> tuple[CommandRepair, FloatArray, BoolArray, list[float]]:
-    """Return the repair that law and likelihood ask for, its gain, and which axes are unrelated.
-
-    And the delays a frame from the given one that coarse spectrum and fit leave open beside it.
-    """
+    """Return the likeliest repair, its gain, which axes are unrelated, and other likely delays."""
     fit_cost, delay_frames = cache(partial(_fit_cost, record)), record.hardware.delay_frames
     repairs = list_repairs(record.axes, delay_frames, law, lag)
     contrasts, gains = compare_repairs(record, repairs)
@@ -431,19 +425,14 @@ def _scale(
     gain: FloatArray,
     limits: tuple[float, float],
 ) -> FloatArray:
-    """Return the factors (axes,) of commands whose gains lie beyond the limits of another unit.
-
-    A sure law that runs at a plausible gain refutes commands that are too large: a gain that seems
-    too small is one that lines hide. One that seems too large by less than a hundred may be that of
-    wide resonances, unless quick fits of plausible gains are clearly less likely.
-    """
+    """Return the factors (axes,) of commands whose gains lie beyond the limits of another unit."""
     low, high = limits
     seeming = float(np.exp(np.mean(np.log(gain))))
     within = (gain >= low) & (gain <= high)
-    if seeming < low and law is not None and law.is_sure:
+    if seeming < low and law is not None and law.is_sure:  # lines hide a gain at which it runs
         usual = np.geomspace(*PLAUSIBLE_GAINS, 8)
         within |= could_have_run(repair, usual, record, law)
-    if high < seeming < _ANOTHER_UNIT * high:
+    if high < seeming < _ANOTHER_UNIT * high:  # wide resonances look like that
         tried = np.geomspace(low * _WRONG_GAIN**2, high / _WRONG_GAIN**2, 3).tolist()
         held = [_fit_cost(record, repair, guess) for guess in (*tried, seeming)]
         within |= min(held[:-1]) < held[-1] + CLEAR

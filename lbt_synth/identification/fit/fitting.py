@@ -313,10 +313,7 @@ def _overlapping(search: Search, spectrum: SpectrumModel, i: int) -> int | None:
 def _drop(
     data: LoopPeriodogram, spectrum: SpectrumModel, i: int, neighbour: int | None
 ) -> SpectrumModel | None:
-    """Return the model without a component, whose power a neighbour takes; None for turbulence.
-
-    A wide component may have taken the place of the noise: its white part then becomes noise.
-    """
+    """Return the model without a component, whose power a neighbour takes; None for turbulence."""
     if i == 0:
         return None
     if neighbour is not None:
@@ -324,12 +321,9 @@ def _drop(
         power = float(np.logaddexp(line.log_power, spectrum.components[i].log_power))
         return spectrum.exchange(neighbour, replace(line, log_power=power)).exchange(i)
     smaller, noise = spectrum.exchange(i), float(np.exp(spectrum.background.log_noise))
-    white = (
-        float(np.min(part_densities(data, spectrum, spectrum.components[i : i + 1])))
-        * data.frame_rate_hz
-        / 2
-    )
-    if white > noise:
+    alone = part_densities(data, spectrum, spectrum.components[i : i + 1])
+    white = float(np.min(alone)) * data.frame_rate_hz / 2
+    if white > noise:  # a wide component may have taken the place of the noise
         return smaller.with_background(log_noise=float(np.log(noise + white)))
     return smaller
 

@@ -203,18 +203,13 @@ def inverse_sensor(hardware: LoopHardware) -> FloatArray:
 
 
 def settled_test(runs: Stretches, test: Stretches, hardware: LoopHardware) -> Stretches:
-    """Return the frames of a test that count: not those of the first half second of a run.
+    """Return the frames of a test within runs that count: not those of the first half second.
 
-    Refuse a test outside of the runs, or one of less than half a second.
+    Refuse a test of less than half a second.
     """
     settle, kept = settle_frames(hardware), []
     for start, stop in test:
-        first = next((a for a, b in runs if a <= start and stop <= b), None)
-        if first is None:
-            raise ProblemError(
-                f"the test must lie within the usable stretches; got ({start}, {stop}) in "
-                f"{', '.join(map(str, runs))}."
-            )
+        first = next(a for a, b in runs if a <= start and stop <= b)
         if first + settle < stop:
             kept.append((max(start, first + settle), stop))
     if (frames := sum(stop - start for start, stop in kept)) < settle:

@@ -95,12 +95,7 @@ def _require_few_holes(frames: float, rows: int) -> None:
 
 
 def _frames_from_times(times: FloatArray, rate: float | None) -> IntArray:
-    """Return the frame of each row, from 0, by times.
-
-    Times on the grid of a stated rate are exact. Those that stay within a step to which they are
-    rounded, of less than a frame, are of complete rows. Others tell frames by their steps, unless
-    these are rounded.
-    """
+    """Return the frame of each row, from 0, by times, which are exact or rounded."""
     steps, complete = np.diff(times), np.arange(len(times))
     if np.ptp(steps) < SAME_FRAME * float(np.median(steps)):
         return complete  # whatever the rate is: that is compared afterwards

@@ -178,13 +178,7 @@ def _telemetry_record(
     mirror: PositionLoop | None,
     **stated: Any,
 ) -> LoopRecord:
-    """Make a record of tip and tilt; ``stated`` are facts, None where the telemetry has to tell.
-
-    Measurements become modes by the inverse of the interaction matrix, commands by the influence
-    matrix, where there are such. A matrix of gains alone, one for each mode, is no mixture: these
-    measurements stay as they were recorded, and the sensor gain of the record is what they show of
-    a unit of phase.
-    """
+    """Make a record of tip and tilt; ``stated`` are facts, None where the telemetry has to tell."""
     n, what = telemetry.modes, "modes"
     if (loops := telemetry.metadata.get("aot_loops")) is not None:
         what += f" of {telemetry.metadata['aot_loop']}, the one taken of the control loops {loops}"
@@ -252,7 +246,7 @@ def _inverse_response(seen: Telemetry) -> FloatArray | None:
             "coefficients. Multiply them by the reconstructor of the loop.",
             in_python="As Telemetry(measurements=slopes @ reconstructor.T).",
         )
-    if response is None or _is_gains(response, seen):
+    if response is None or _is_gains(response, seen):  # the record has a sensor gain of its own
         return None
     if q < n or np.linalg.cond(response) > _CONDITION:
         raise ProblemError(
