@@ -194,21 +194,20 @@ def given_controller(design: Design, model: IdentifiedModel) -> Controller:
     return replace(design.controller, dt_s=path.dt_s)
 
 
-def given_design_notes(name: str, design: Design, model: IdentifiedModel) -> list[str]:
+def given_design_notes(name: str, design: Design, model: IdentifiedModel) -> Iterator[str]:
     """Say how the loop of a given design differs from that of the record."""
-    notes = list[str]()
     if (path := design.hardware) is None:
-        return notes
+        return
     if path.sensor.shape == (path.modes, path.modes):
         for i, (axis, assumed) in enumerate(zip(model.axes, np.diag(path.sensor), strict=True)):
             error = axis.sensor_gain_error
             if error is not None and abs(assumed - axis.sensor_gain) > DIFFERENT * error:
-                notes.append(
+                yield (
                     f"{name} assumes a sensor gain of {assumed:.3f} on axis {i}; the record has "
                     f"{axis.sensor_gain:.3f} +- {error:.3f}"
                 )
     here = replace(model.hardware, sensor_matrix=path.sensor, influence_matrix=path.influence)
-    return [*notes, *(f"{name} was {text}" for text in loop_differences(path, here))]
+    yield from (f"{name} was {text}" for text in loop_differences(path, here))
 
 
 def disturbance_lines(model: IdentifiedModel) -> tuple[IdentifiedLine, ...]:
@@ -321,10 +320,6 @@ class Diagnosis:
         *state, residual = self.findings
         advice = next(finding.advice for finding in (*state, residual) if finding.advice)
         return " ".join(finding.sentence for finding in state), residual.sentence, advice
-
-    def row(self, name: str) -> PredictionRow | None:
-        """Return a row of the comparison, None where there is none."""
-        return None if self.comparison is None else self.comparison.row(name)
 
 
 def diagnose(
@@ -494,7 +489,7 @@ def _judge_loop(diagnosis: Diagnosis) -> Finding:
 
 def _residual_text(diagnosis: Diagnosis) -> str:
     """Say what the loop that ran leaves, from which measurement that follows, and of what it is."""
-    row = diagnosis.row(RAN)
+    row = next((row for row in diagnosis.residuals if row.name == RAN), None)
     ran = None if row is None else row.replayed
     parts = _parts_text(diagnosis, "best_nm" if ran is None else "running_nm")
     if row is None or ran is None:

@@ -184,12 +184,13 @@ def _explain(
         delay_frames=delay_frames + off if off else None,
         scale=_factors(scale),
     )
-    hidden = (gain / scale <= limits[0]) | (gain / scale >= limits[1])
+    large = gain / scale >= limits[1]
+    notes = _note_law(delay_frames, lag, delays, _unexplained(law), gain[large])
     return refuse(
         explanation=_name_repair(repair, gain),
         repair=repair,
-        gain=frozen_copy(np.where(hidden, np.nan, gain / scale)),
-        notes=() if repair.options else _note_law(delay_frames, lag, delays, _unexplained(law)),
+        gain=frozen_copy(np.where((gain / scale <= limits[0]) | large, np.nan, gain / scale)),
+        notes=() if repair.options else notes,
     )
 
 
@@ -240,9 +241,9 @@ def _unexplained(law: ControlLaw | None) -> str:
 
 
 def _note_law(
-    delay_frames: float, lag: int, delays: Sequence[float], hiding: str
+    delay_frames: float, lag: int, delays: Sequence[float], hiding: str, large: FloatArray
 ) -> tuple[str, ...]:
-    """Return what to look at in an accepted record: a lag, other delays, a law that leaves much."""
+    """Return what to look at in an accepted record: its lag, delay, law, and too large gains."""
     late = (
         f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
         "real-time computer takes that long, the total delay of a new design is "
@@ -254,7 +255,13 @@ def _note_law(
         f"warning: the record leaves the total delay open: {others} explain it as well as the "
         f"{delay_frames:g} frames that are given and taken"
     )
-    return (late,) * bool(lag) + (several,) * bool(delays) + (few,) * bool(hiding)
+    gains = " and ".join(f"{gain:.2g}" for gain in large)
+    small = (
+        f"warning: the sensor gain looks like {gains}, as if the commands were too small, and the "
+        "record does not tell. Check their unit (--command-scale), or raise the loop gain"
+    )
+    notes = {late: lag, several: delays, few: hiding, small: gains}
+    return tuple(note for note, holds in notes.items() if holds)
 
 
 def _doubt_law(law: ControlLaw) -> str:

@@ -142,9 +142,7 @@ class Search:
             rows += [gain, _NONE, colour, corner if axis.rolls_off else _FIXED]
         for c in spectrum.components:
             ratio = _NONE if c.axis is None and c.kind == "line" else _FIXED
-            rows += [self._frequency_prior(c), self._damping_prior(c), _NONE, ratio][
-                : spectrum.width
-            ]
+            rows += [*self._resonance_priors(c), _NONE, ratio][: spectrum.width]
         centre, width = np.array(rows).T
         priors = Priors(centre=centre, width=width)
         low, high = (np.full(centre.size, end) for end in priors.bounds)
@@ -163,18 +161,14 @@ class Search:
                 high[spectrum.place(i)] = self.log_angle(_FASTEST_HZ)
         return replace(priors, bounds=(low, high))
 
-    def _frequency_prior(self, component: Component) -> tuple[float, float]:
-        if component.kind == "drift":
-            return self.log_angle(2 * DRIFT_RATIO * DRIFT_HZ), _WIDTH
+    def _resonance_priors(self, component: Component) -> tuple[tuple[float, float], ...]:
+        """Return the priors of the frequency and the damping of a component."""
+        damping = _DAMPING[component.kind]
         if component.kind == "line":
-            return _NONE
-        return self.log_angle(1.0), _WIDTH
-
-    def _damping_prior(self, component: Component) -> tuple[float, float]:
-        """Return the prior, narrower where the taper of a density is not known."""
-        centre, width = _DAMPING[component.kind]
-        smoothed = component.kind == "line" and self.data.duration_s is None
-        return centre, 0.5 * width if smoothed else width
+            known = 1.0 if self.data.duration_s else 0.5  # the taper of the density
+            return _NONE, (damping[0], known * damping[1])
+        usual_hz = 2 * DRIFT_RATIO * DRIFT_HZ if component.kind == "drift" else 1.0
+        return (self.log_angle(usual_hz), _WIDTH), damping
 
     def place(self, component: Component) -> tuple[float, float]:
         """Return the frequency and the half width of a component [Hz], at least a bin wide."""
