@@ -125,12 +125,6 @@ def find_spectral_peaks(
     return is_peak, frequency_hz[tops], width * (frequency_hz[1] - frequency_hz[0])
 
 
-def _bands(frequency_hz: FloatArray, step: float) -> IntArray:
-    """Return where bands of at least one step begin among the frequencies."""
-    band = np.floor(np.cumsum(step / np.maximum(_BAND * frequency_hz, step)) - 1e-9)
-    return np.flatnonzero(np.diff(band, prepend=-np.inf) > 0)
-
-
 def _shapes(square: FloatArray, lowest_hz: float, skirts: Sequence[FloatArray]) -> FloatArray:
     """Return the shapes of noise, turbulence, wide resonances and skirts over the bands, (k, b)."""
     # nothing but noise and skirts has a place at high frequencies, where wrong corrections show
@@ -167,7 +161,7 @@ def coarse_axis(
         frame_rate_hz=frame_rate_hz,
     )
     bands = every.take(~is_peak)
-    bands = bands.merge(_bands(bands.frequency_hz, float(frequency_hz[1] - frequency_hz[0])))
+    bands = bands.merge(_BAND * bands.frequency_hz)
 
     def warp(f: FloatArray) -> FloatArray:  # as that of a sampled process [Hz^2]
         return half_angle_square(f, frame_rate_hz) * (frame_rate_hz / (2 * np.pi)) ** 2

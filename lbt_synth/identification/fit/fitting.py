@@ -178,7 +178,7 @@ class Search:
     def merge(self, spectrum: SpectrumModel) -> LoopPeriodogram:
         """Return means over groups of bins within which a model is nearly constant."""
         f, step = self.data.frequency_hz, self.data.step_hz
-        widths_hz = np.maximum(step, np.minimum(_FINE * f, _WIDEST_HZ))
+        widths_hz = np.minimum(_FINE * f, _WIDEST_HZ)
         for line in spectrum.lines:
             centre, half_width = self.place(line)
             fine = SKIRT if half_width < RESOLVED * step else _BINS
@@ -186,9 +186,8 @@ class Search:
             band = slice(*np.searchsorted(f, [centre - reach, centre + reach]))
             away = np.maximum(np.abs(f[band] - centre) - fine * step, 0)
             wide = _SHARE / line.sections * np.maximum(half_width, 2 * away)
-            widths_hz[band] = np.minimum(widths_hz[band], np.maximum(step, wide))
-        group = np.floor(np.cumsum(step / widths_hz) - 1e-9)
-        return self.data.merge(np.flatnonzero(np.diff(group, prepend=-np.inf) > 0))
+            widths_hz[band] = np.minimum(widths_hz[band], wide)
+        return self.data.merge(widths_hz)
 
 
 def fit(
@@ -199,11 +198,7 @@ def fit(
     margin: float = 0.0,
     accuracy: float = SEARCHED,
 ) -> FittedModel | None:
-    """Fit all parameters; None if no fit settles.
-
-    A fit is given up where its log-likelihood does not reach that of ``better_than`` minus a
-    margin.
-    """
+    """Fit all parameters; None if no fit settles within a margin of ``better_than``."""
     data, bound = search.merge(start), float("inf")
     if len(start.axes) == 1:  # a noise of nothing has no slope
         least = _SEED * float(np.min(density(data, start))) * data.frame_rate_hz / 2

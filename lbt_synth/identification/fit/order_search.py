@@ -148,10 +148,7 @@ def _cost_of_noise(search: Search, model: FittedModel) -> float:
 def find_components(
     search: Search, start: SpectrumModel | None = None, *, rounds: int = _MOST_ROUNDS
 ) -> FittedModel:
-    """Find the model of one axis: add components, prune them, and move lines.
-
-    A start from earlier data is polished only.
-    """
+    """Find the model of one axis: add components, prune, move lines; or polish an earlier model."""
     if start is not None and not search.finds_gain:
         start = start.with_background(log_gain=float(np.log(search.gain or 1.0)))
     model = _begin(search) if start is None else fitting.fit(search, start)

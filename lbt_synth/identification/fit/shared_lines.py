@@ -48,10 +48,7 @@ Pair = tuple[Component | None, Component | None]  # what is one resonance, on ei
 def couple_axes(
     record: LoopRecord, axes: Sequence[IdentifiedAxis], stretches: Stretches, lowest_line_hz: float
 ) -> tuple[list[IdentifiedAxis], tuple[IdentifiedLine, ...]]:
-    """Return two axes with what they share, and the shared resonances.
-
-    Axes that share nothing are returned as they are.
-    """
+    """Return two axes with what they share, if they do, and the shared resonances."""
     data = loop_periodogram(
         record.measurements,
         record.corrections(),

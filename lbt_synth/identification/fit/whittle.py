@@ -179,10 +179,7 @@ def _log_fall(
 def part_densities(
     data: LoopPeriodogram, spectrum: SpectrumModel, components: Sequence[Component] | None = None
 ) -> FloatArray:
-    """Return the density of each component of a spectrum along its direction, (c, f).
-
-    Others that might be in it may be given.
-    """
+    """Return the densities (c, f) of components along their directions: of all, or of others."""
     components = spectrum.components if components is None else components
     if not components:
         return np.zeros((0, data.frequency_hz.size))
@@ -471,10 +468,7 @@ def minimise(
 
 
 def observe_information(data: LoopPeriodogram, model: FittedModel, priors: Priors) -> FittedModel:
-    """Return a minimum with the second derivatives of L, by differences of its gradient.
-
-    Where they are not positive definite, the expected ones stay.
-    """
+    """Return a minimum with the second derivatives of L, by differences of its gradient."""
     free, theta = priors.free, model.spectrum.pack()
     _, gradient, _ = derivatives(data, model.spectrum)
     rows = []
@@ -482,7 +476,7 @@ def observe_information(data: LoopPeriodogram, model: FittedModel, priors: Prior
         moved = derivatives(data, model.spectrum.unpack(theta + step))[1]
         rows.append((moved - gradient)[free] / DIFFERENCE)
     exact = (np.array(rows) + np.transpose(rows)) / 2 + np.diag(1 / priors.width[free] ** 2)
-    if np.min(np.linalg.eigvalsh(exact)) <= 0:
+    if np.min(np.linalg.eigvalsh(exact)) <= 0:  # no minimum: the expected ones stay
         return model
     information = np.zeros_like(model.information)
     information[np.ix_(free, free)] = exact

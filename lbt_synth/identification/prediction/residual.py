@@ -203,10 +203,7 @@ def inverse_sensor(hardware: LoopHardware) -> FloatArray:
 
 
 def settled_test(runs: Stretches, test: Stretches, hardware: LoopHardware) -> Stretches:
-    """Return the frames of a test within runs that count: not those of the first half second.
-
-    Refuse a test of less than half a second.
-    """
+    """Return the frames of a test within runs that count: not those of the first half second."""
     settle, kept = settle_frames(hardware), []
     for start, stop in test:
         first = next(a for a, b in runs if a <= start and stop <= b)
@@ -248,10 +245,7 @@ def replay(
 
 
 def run_from_rest(path: StateSpace, driven: FloatArray, runs: Stretches, first: int) -> FloatArray:
-    """Return the outputs of a stable system, nan outside of runs.
-
-    Each run begins in the equilibrium for the mean of its first frames.
-    """
+    """Return the outputs of a system, nan outside of runs, which begin in its equilibrium."""
     constant = path.frequency_response([0.0])[0].real
     outputs = np.full((len(driven), len(path.C)), np.nan)
     for start, stop in runs:
