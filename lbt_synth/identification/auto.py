@@ -417,12 +417,11 @@ def design_for_gains(
 ) -> tuple[Design, float, str]:
     """Return a design that is stable at all sensor gains that a record allows, and its noise.
 
-    ``design`` makes one that assumes a multiple of the model's noise. Its first assumption says
-    which gains are possible. Commands that were recorded at half their size look like twice the
-    sensor gain, and no record can tell; so unless the scale of the commands is known, half of the
+    ``design`` makes one that assumes a multiple of the model's noise. Commands that were recorded
+    at half their size look like twice the sensor gain; so unless their scale is known, half of the
     gains are possible, and each axis may have those of both. Where the design is unstable at one of
-    them, or with a delay a tenth of a frame off, the one that assumes the least more noise and is
-    stable takes its place: the more noise, the less a filter trusts its sensor. A note says so.
+    them, or with a delay a tenth of a frame off, the one of least more noise that is stable takes
+    its place, and a note says so.
     """
     usual, assumed = design(1.0), list[str]()
     intervals = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1)

@@ -483,8 +483,8 @@ def _judge_loop(diagnosis: Diagnosis) -> Finding:
     narrow = bool(loop.modulus < _NARROW)
     if narrow:
         stable += f" but with a modulus margin of {loop.modulus:.2g} only"
-    tone: Literal["good", "note"] = "note" if narrow else "good"
-    return Finding(tone=tone, sentence=f"The record is sound: {law}{stable}.")
+    sentence = f"The record is sound: {law}{stable}."
+    return Finding(tone="note" if narrow else "good", sentence=sentence)
 
 
 def _residual_text(diagnosis: Diagnosis) -> str:
