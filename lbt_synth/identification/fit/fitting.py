@@ -163,12 +163,11 @@ class Search:
 
     def _resonance_priors(self, component: Component) -> tuple[tuple[float, float], ...]:
         """Return the priors of the frequency and the damping of a component."""
-        damping = _DAMPING[component.kind]
-        if component.kind == "line":
-            known = 1.0 if self.data.duration_s else 0.5  # the taper of the density
-            return _NONE, (damping[0], known * damping[1])
+        centre, width = _DAMPING[component.kind]
+        if component.kind == "line":  # half as wide where the taper of a density is not known
+            return _NONE, (centre, width if self.data.duration_s else 0.5 * width)
         usual_hz = 2 * DRIFT_RATIO * DRIFT_HZ if component.kind == "drift" else 1.0
-        return (self.log_angle(usual_hz), _WIDTH), damping
+        return (self.log_angle(usual_hz), _WIDTH), (centre, width)
 
     def place(self, component: Component) -> tuple[float, float]:
         """Return the frequency and the half width of a component [Hz], at least a bin wide."""

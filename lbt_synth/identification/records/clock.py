@@ -103,7 +103,7 @@ def _frames_from_times(times: FloatArray, rate: float | None) -> IntArray:
     _require_few_holes(float(times[-1] - times[0]) / period + 1, len(times))
     rounding, place = _quantum(times) / period, (times - times[0]) / period
     if rate is not None:
-        grid = np.round(place)
+        grid = np.round(place)  # of exact times
         if rounding < 1 + SAME_FRAME and np.max(np.abs(place - grid)) <= _EXACT:
             return np.asarray(grid, dtype=np.int64)
         slack = 1e-6 + 16 * float(np.spacing(np.max(np.abs(times)))) / period
