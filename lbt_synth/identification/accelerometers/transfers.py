@@ -33,7 +33,7 @@ from lbt_synth.storage.rows import column, table_row
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, IntArray
 
 _TINY = np.finfo(np.float64).tiny
-_USED, _NOTHING = "used", "adds nothing"
+_NOTHING = "adds nothing"
 _EXTRA = f"left out, because a design takes {MOST_UNITS - 1} channels"
 _INDEPENDENT = (1 - 5 * TAPER / 8) ** 2 / (1 - 93 * TAPER / 128)  # of tapered values
 _REACH = 20.0  # half widths of a line, or bins, from its centre to the edge of its band
@@ -85,7 +85,8 @@ class AccelerometerTransfers:
     @property
     def used(self) -> tuple[ChannelRow, ...]:
         """The channels that show a line."""
-        return tuple(row for row in self.channels if row.verdict == _USED)
+        names = {row.channel for row in self.transfers if row.useful}
+        return tuple(row for row in self.channels if row.channel in names)
 
     def loop_age(self, delay_frames: float) -> int:
         """Return the age of a reading in a loop of some delay: 1 where the clocks hide it."""
@@ -153,7 +154,7 @@ def accelerometer_transfers(
         counted = shown | ~shown.any(axis=1, keepdims=True)  # the lines it shows, or all
         level = np.sum(fits.noise * counted, axis=1) / np.sum(counted, axis=1)
         noise = np.sqrt(level * model.frame_rate_hz / 2).tolist()
-        verdicts = np.select([used.any(1), shown.any(1)], [_USED, _EXTRA], _NOTHING).tolist()
+        verdicts = np.select([used.any(1), shown.any(1)], ["used", _EXTRA], _NOTHING).tolist()
         rows = list(zip(read.names, noise, verdicts, strict=True))
         transfers = _transfer_rows(read.names, places, lines, fits, used)
     rows += [(name, np.nan, "dead") for name in read.dead]
