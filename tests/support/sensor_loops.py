@@ -131,9 +131,9 @@ def run_loop(plant, controller, total, added, *, sensor_gain=1.0, blind=(), stuc
                 y[:, own] = (stuck + 0 * y)[:, own]
             if k % periods[name]:
                 y[:, own] = 1e9
-        now = controller.phase(k)
-        state = state @ now.A.T + y @ now.B.T
-        command[k] = state @ now.C.T + y @ now.D.T
+        A, B, C, D = (stack[k % controller.period] for stack in controller.stacks())
+        state = state @ A.T + y @ B.T
+        command[k] = state @ C.T + y @ D.T
         correction = sum(taps[i] * command[k - i] for i in range(min(len(taps), k + 1)))
         residual[k] = total[k] - correction @ hardware.influence.T
     return residual

@@ -96,7 +96,8 @@ def _in_noise_units(problem: EstimationProblem) -> tuple[EstimationProblem, Floa
 def _over_a_period(problem: EstimationProblem) -> EstimationProblem:
     """Return the constant problem whose Kalman recursion over a sample is that over a period."""
     if problem.period == 1:
-        return problem.phase(0)
+        A, B, C, D = problem.read_parts(0)
+        return problem.bare(A=A, B=B, C=C, D=D, read=None)
     triples = (_kalman_triple(problem, t) for t in range(problem.period))
     A, G, H = reduce(_join_triples, triples)
     zero, identity = np.zeros_like(A), np.eye(len(A))
