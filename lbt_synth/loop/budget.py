@@ -12,7 +12,7 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.linear.quadrature import adaptive_integral, gauss_panels, graded_edges
-from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
+from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.loop.ensemble import (
     EnsembleVibration,
     LoopEnsemble,
@@ -37,6 +37,7 @@ from lbt_synth.models import (
     Truth,
     Vibration,
 )
+from lbt_synth.models.loop_hardware import require_loop_rate
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.sensor_suite import Motion, Motions, checked_motions
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density

@@ -13,7 +13,7 @@ from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.controller import HasController, as_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response
-from lbt_synth.models.plant.assembly import memory, other_exposures, own_exposure
+from lbt_synth.models.plant.assembly import sensor_memory
 from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.storage.rows import fact, fact_table, facts
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -204,13 +204,12 @@ def last_frame(sensor: FloatArray) -> Readings:
 def _readings_of_all(hardware: LoopHardware, blind: tuple[str, ...]) -> Readings:
     """Return the readings of all sensors of a loop, of which some follow nothing."""
     suite, rows = hardware.suite, hardware.suite.rows(hardware)
-    exposures = [own_exposure(hardware), *other_exposures(hardware)]
-    held = memory(exposures, hardware.modes, hardware.period)
-    others, own = np.zeros((2, hardware.period, hardware.n_readings, held.n_states))
-    others[:, : held.C.shape[1]] = held.C
+    A, B, C = sensor_memory(hardware, own=True)
+    others, own = np.zeros((2, hardware.period, hardware.n_readings, A.shape[1]))
+    others[:, : C.shape[1]] = C
     others[:, suite.marked(blind, hardware)] = 0.0
     own[:, rows[OWN_SENSOR]] = others[:, rows[OWN_SENSOR]]
-    return held.A, held.B, others - own, own
+    return A, B, others - own, own
 
 
 def require_matching_controller(hardware: LoopHardware, controller: Controller) -> None:
@@ -231,15 +230,6 @@ def require_matching_controller(hardware: LoopHardware, controller: Controller) 
         raise ProblemError(
             f"the controller must run at the loop's {hardware.frame_rate_hz:.6g} Hz; got one "
             f"designed for {1 / controller.dt_s:.6g} Hz. Design it for this frame rate."
-        )
-
-
-def require_loop_rate(frame_rate_hz: float, hardware: LoopHardware) -> None:
-    """Raise if a sampled disturbance does not have the loop's frame rate."""
-    if not np.isclose(frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9):
-        raise ProblemError(
-            f"a disturbance must be sampled at the loop's {hardware.frame_rate_hz:.6g} Hz; "
-            f"got {frame_rate_hz:.6g} Hz."
         )
 
 

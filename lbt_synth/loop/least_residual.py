@@ -21,8 +21,8 @@ from scipy.linalg import toeplitz
 from lbt_synth.errors import CoupledModesError, LbtSynthError, ProblemError
 from lbt_synth.linear.quadrature import RefinedPanels, graded_edges, refine_panels
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.models import ARModel, LoopHardware, Spectrum, TipTiltPlant, Truth, Vibration
+from lbt_synth.models.loop_hardware import require_loop_rate
 from lbt_synth.models.spectra import breakpoints_below, spectrum_density, spectrum_key
 from lbt_synth.models.vibration import checked_direction
 from lbt_synth.validation import FloatArray, frozen_copy, read_only, require_instance

@@ -14,8 +14,8 @@ from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
 from lbt_synth.loop import residual_budget
-from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.models import ARModel, LoopHardware, Vibration, tip_tilt_plant
+from lbt_synth.models.loop_hardware import require_loop_rate
 from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import (
     FloatArray,

@@ -321,9 +321,13 @@ def tip_tilt_plant(
 
 def assemble(parts: PlantParts) -> TipTiltPlant:
     """Assemble a plant from its parts."""
-    matrices = plant_matrices(parts)
+    A, B, C, D, L = plant_matrices(parts)
     return TipTiltPlant(
-        **{name: getattr(matrices, name) for name in "ABCDL"},
+        A=A,
+        B=B,
+        C=C,
+        D=D,
+        L=L,
         read=parts.hardware.suite.read(parts.hardware),
         dt_s=parts.hardware.dt_s,
         hardware=parts.hardware,
