@@ -198,16 +198,16 @@ def residual_budget(
         require_instance(truth, Truth)
     hardware, n = loop.hardware, loop.hardware.modes
     turbulence, vibrations, noise = truth.entering(hardware, sensor_gain=loop.sensor_gain)
-    motions = _motions(loop, truth.motions, len(vibrations))
+    motions: Motions = ({},) * len(vibrations)  # no channel is read
+    if loop.reads_others:
+        motions = checked_motions(truth.motions, hardware.suite, len(vibrations))
     rows = loop_evaluator(loop, in_image=not frame_means)
     lines, seen = [], np.zeros((2, n, n))
     for line, motion in zip(vibrations, motions, strict=True):
-        if not isinstance(line, Vibration):
-            lines.append(_one_line(loop, line, _seen_swing(loop, line, motion)))
-        elif _moved_rows(loop, motion):
+        if isinstance(line, Vibration) and _moved_rows(loop, motion):
             seen += _of_seen(loop, rows, line, motion)
         else:
-            lines.append(_one_line(loop, line))
+            lines.append(_one_line(loop, line, motion))
     budget = residual_of_parts(
         [rows],
         [(spectrum, np.array(modes, dtype=np.intp)) for spectrum, modes in turbulence],
@@ -218,13 +218,11 @@ def residual_budget(
     )
     # what repeats with the period turns one sinusoid into several
     amplitudes = np.fft.fft(budget.line_amplitudes_nm, axis=0) / rows.phases
-    return ResidualBudget(
-        turbulence_nm2=frozen_copy(budget.turbulence_nm2.mean(axis=0)),
-        noise_nm2=frozen_copy(budget.noise_nm2.mean(axis=0)),
-        random_vibration_nm2=frozen_copy(budget.random_vibration_nm2.mean(axis=0) + seen[0]),
-        within_nm2=frozen_copy(budget.within_nm2.mean(axis=0) + seen[1]),
-        line_amplitudes_nm=read_only(amplitudes.reshape(-1, n)),
-    )
+    means = {name: getattr(budget, name).mean(axis=0) for name in _COVARIANCES}
+    means["random_vibration_nm2"] += seen[0]
+    means["within_nm2"] += seen[1]
+    whole = {name: read_only(covariance) for name, covariance in means.items()}
+    return ResidualBudget(**whole, line_amplitudes_nm=read_only(amplitudes.reshape(-1, n)))
 
 
 def random_density(
@@ -359,12 +357,12 @@ def ensemble_residuals(
     """
     turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
     noise, n, p = ensemble.noise(hardware), hardware.modes, ensemble.loops
-    gains, delays = ensemble.gains(), ensemble.delays(hardware)
+    delays = hardware.delay_frames if ensemble.delay_frames is None else ensemble.delay_frames
     stable, groups = close_loops(
         matrices,
         hardware,
-        gains,
-        delays,
+        np.broadcast_to(ensemble.sensor_gain, (p,)),
+        np.broadcast_to(delays, (p,)),
         in_image=not frame_means,
         together=[np.any(line.direction, axis=0) for line in lines],
     )
@@ -409,12 +407,18 @@ def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
 
 
 def _one_line(
-    loop: ClosedLoop, line: Vibration | SinusoidalVibration, readings: ComplexArray | None = None
+    loop: ClosedLoop, line: Vibration | SinusoidalVibration, motion: Mapping[str, Motion]
 ) -> EnsembleVibration:
-    """Return a line as one loop meets it."""
-    along = checked_direction(line, loop.hardware)
-    conditions = replace(ensemble_vibration(line), direction=along, readings=readings)
-    return conditions.of_loops(1)
+    """Return a line as one loop meets it, with what channels read of a sinusoid."""
+    hardware, n = loop.hardware, loop.hardware.modes
+    readings = np.zeros(loop.system.B.shape[-1] - n, dtype=np.complex128)
+    sensors = {name: s for s in hardware.suite.accelerometers for name in s.channels}
+    for row, name in _moved_rows(loop, motion):
+        if name not in loop.blind:
+            swing = sensors[name].swing(motion[name], line.frequency_hz, hardware)
+            readings[row - n] = swing
+    along = checked_direction(line, hardware)
+    return replace(ensemble_vibration(line), direction=along, readings=readings).of_loops(1)
 
 
 def _of_seen(
@@ -463,13 +467,6 @@ def _driven(rows: Evaluator, process: StateSpace, entry: FloatArray) -> Evaluato
     return rows.driven(A, B, C, entry[None])
 
 
-def _motions(loop: ClosedLoop, motions: Motions, lines: int) -> Motions:
-    """Return which channels each line moves: none where the loop reads its own sensor alone."""
-    if not loop.reads_others:
-        return ({},) * lines
-    return checked_motions(motions, loop.hardware.suite, lines)
-
-
 def _moved_rows(loop: ClosedLoop, motion: Mapping[str, Motion]) -> list[tuple[int, str]]:
     """Return the inputs of a loop at which channels read a line, and the channels, in order."""
     if not loop.reads_others:
@@ -490,22 +487,6 @@ def _shaken(
     if not moved:
         return ar_process(line.ar_model(hardware.frame_rate_hz)), entry
     return seen_vibration(line, motion, hardware.suite.accelerometers, hardware), entry
-
-
-def _seen_swing(
-    loop: ClosedLoop, line: SinusoidalVibration, motion: Mapping[str, Motion]
-) -> ComplexArray:
-    """Return what the readings have of a sinusoid of unit amplitude, (q,)."""
-    hardware, n = loop.hardware, loop.hardware.modes
-    readings = np.zeros(loop.system.B.shape[-1] - n, dtype=np.complex128)
-    of_channel = {
-        name: sensor for sensor in hardware.suite.accelerometers for name in sensor.channels
-    }
-    for row, name in _moved_rows(loop, motion):
-        if name not in loop.blind:
-            swing = of_channel[name].swing(motion[name], line.frequency_hz, hardware)
-            readings[row - n] = swing
-    return readings
 
 
 def ar_process(model: ARModel) -> StateSpace:

@@ -296,7 +296,7 @@ def loop_matrices(
 
 
 def youla_controller(
-    hardware: LoopHardware, parameter: Controller, *, stored: bool = False
+    hardware: LoopHardware, parameter: Controller, *, sign: float = 1.0, stored: bool = False
 ) -> Controller:
     """Return the controller from y to u of a filter from the pseudo-open-loop ybar to u.
 
@@ -305,20 +305,9 @@ def youla_controller(
     Every controller that stabilises the loop is a stable filter from it to u, in which the closed
     loop is affine (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans. Autom. Control 21, 319
     (1976), doi:10.1109/TAC.1976.1101223). Readings of other sensors, which no command moves, may
-    follow ybar. Stored, the last command is a state of its own, whichever output it was.
+    follow ybar. Stored, the last command is a state of its own, whichever output it was. With the
+    sign -1 it is the filter of a controller.
     """
-    return _with_correction(hardware, parameter, 1.0, stored=stored)
-
-
-def youla_parameter(hardware: LoopHardware, controller: Controller) -> Controller:
-    """Return the filter from ybar to u of a controller: what :func:`youla_controller` undoes."""
-    return _with_correction(hardware, controller, -1.0, stored=False)
-
-
-def _with_correction(
-    hardware: LoopHardware, parameter: Controller, sign: float, *, stored: bool
-) -> Controller:
-    """Return a filter whose first inputs have the correction of its own commands added."""
     m, q, readings = hardware.n_commands, hardware.n_measurements, parameter.B.shape[1]
     if len(parameter.C) != m or readings < q:
         raise DimensionError(

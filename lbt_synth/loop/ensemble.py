@@ -50,29 +50,20 @@ class EnsembleVibration:
         set_fields(self, direction=frozen_copy(direction / length))
 
     @property
-    def per_loop(self) -> list[FloatArray]:
-        """The numbers that may be one for each loop."""
-        direction = [self.direction] if self.direction.ndim == 2 else []
-        numbers = (self.frequency_hz, self.rms_nm, self.damping)
-        return [value for value in numbers if np.ndim(value)] + direction
+    def numbers(self) -> dict[str, Any]:
+        """The numbers that it has, of which each may be one for each loop."""
+        names = ("frequency_hz", "rms_nm", "damping", "direction")
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
     def of_loops(self, p: int) -> EnsembleVibration:
         """Return it with all numbers (p,), and directions (p, n)."""
-        n = self.direction.shape[-1]
-        damping = None if self.damping is None else np.broadcast_to(self.damping, (p,))
-        return replace(
-            self,
-            frequency_hz=np.broadcast_to(self.frequency_hz, (p,)),
-            rms_nm=np.broadcast_to(self.rms_nm, (p,)),
-            damping=damping,
-            direction=np.broadcast_to(self.direction, (p, n)),
-        )
+        shapes = {"direction": (p, self.direction.shape[-1])}
+        stacks = {n: np.broadcast_to(v, shapes.get(n, (p,))) for n, v in self.numbers.items()}
+        return replace(self, **stacks)
 
     def take(self, rows: IntArray) -> EnsembleVibration:
         """Return that of some loops, where all numbers are (p,)."""
-        damping = None if self.damping is None else self.damping[rows]
-        numbers = {name: getattr(self, name)[rows] for name in ("frequency_hz", "rms_nm")}
-        return replace(self, direction=self.direction[rows], damping=damping, **numbers)
+        return replace(self, **{name: value[rows] for name, value in self.numbers.items()})
 
 
 def ensemble_vibration(vibration: Vibration | SinusoidalVibration) -> EnsembleVibration:
@@ -109,7 +100,8 @@ class LoopEnsemble:
             raise ProblemError(f"noise_nm must be at least 0; got {noise.min():.6g}.")
         set_fields(self, sensor_gain=positive(self.sensor_gain, "sensor_gain"), noise_nm=noise)
         values = [self.sensor_gain, self.noise_nm, self.delay_frames]
-        values += [value for line in self.vibrations for value in line.per_loop]
+        for line in self.vibrations:
+            values += [v for n, v in line.numbers.items() if np.ndim(v) > (n == "direction")]
         values += [v for air in self._turbulence_of(1) for v in _turbulence_numbers(air)]
         lengths = [len(value) for value in values if np.ndim(value)]
         set_fields(self, loops=max([self.loops, *lengths], default=1) or 1)
@@ -118,15 +110,6 @@ class LoopEnsemble:
         """Return the turbulence as it is per mode, or for each of some modes."""
         one = not isinstance(self.turbulence, Sequence)
         return (self.turbulence,) * modes if one else tuple(self.turbulence)
-
-    def delays(self, hardware: LoopHardware) -> FloatArray:
-        """Return the total delay of each loop [frames], (p,)."""
-        delay = hardware.delay_frames if self.delay_frames is None else self.delay_frames
-        return np.broadcast_to(delay, (self.loops,))
-
-    def gains(self) -> FloatArray:
-        """Return the sensor gain of each loop, (p,)."""
-        return np.broadcast_to(self.sensor_gain, (self.loops,))
 
     def noise(self, hardware: LoopHardware) -> FloatArray:
         """Return a factor of the covariance of the noise [nm], (p, q, w)."""
