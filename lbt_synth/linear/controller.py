@@ -106,7 +106,6 @@ class RunningController:
     """
 
     controller: Any  # a Controller, or an estimator form
-    form: str = "plain"  # or "estimator"
     fallbacks: Mapping[frozenset[str], Controller] = field(default_factory=dict)
     state: FloatArray = field(init=False)
     phase: int = field(init=False)  # of the next sample
@@ -143,7 +142,7 @@ class RunningController:
         measured = _signal(y, "y", B)
         state = self.state[:, None] if measured.ndim > self.state.ndim else self.state
         drive = B @ measured
-        if self.form == "estimator":
+        if isinstance(self.controller, EstimatorForm):
             last = C @ state if applied is None else _signal(applied, "applied", C.T)
             drive = drive + self.controller.applied @ last
         self.state = A @ state + drive
@@ -218,7 +217,7 @@ class EstimatorForm:
 
     def start(self) -> RunningController:
         """Return a running copy with a zero state: ``step(y, applied) -> u`` sample by sample."""
-        return RunningController(self, form="estimator")
+        return RunningController(self)
 
 
 def estimator_form(controller: Controller | HasController) -> EstimatorForm:

@@ -218,13 +218,9 @@ def require_matching_controller(hardware: LoopHardware, controller: Controller) 
     if reads_others(hardware, controller):
         q, period = hardware.n_readings, hardware.period
     if controller.D.shape[-2:] != (m, q) or controller.period != period:
-        wanted, got = (
-            "" if period == controller.period == 1 else f" in a period of {frames} frames"
-            for frames in (period, controller.period)
-        )
         raise DimensionError(
-            f"the controller must map {q} measurements to {m} commands{wanted}; got "
-            f"{controller.D.shape[-1]} to {controller.D.shape[-2]}{got}."
+            f"the controller must map {q} measurements to {m} commands in a period of {period}; "
+            f"got {controller.D.shape[-1]} to {controller.D.shape[-2]} in {controller.period}."
         )
     if not np.isclose(controller.dt_s, hardware.dt_s, rtol=1e-9):
         raise ProblemError(

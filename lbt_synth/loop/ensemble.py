@@ -57,8 +57,11 @@ class EnsembleVibration:
 
     def of_loops(self, p: int) -> EnsembleVibration:
         """Return it with all numbers (p,), and directions (p, n)."""
-        shapes = {"direction": (p, self.direction.shape[-1])}
-        stacks = {n: np.broadcast_to(v, shapes.get(n, (p,))) for n, v in self.numbers.items()}
+        one = {"direction": self.direction.shape[-1:]}  # the shape for one loop
+        stacks: dict[str, Any] = {
+            name: np.broadcast_to(value, (p, *one.get(name, ())))
+            for name, value in self.numbers.items()
+        }
         return replace(self, **stacks)
 
     def take(self, rows: IntArray) -> EnsembleVibration:

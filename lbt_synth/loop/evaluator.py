@@ -156,9 +156,8 @@ class Evaluator:
             return self.of_process(coefficients, np.atleast_1d(spectrum.driving_rms_nm), entry)
 
         def density(f_hz: FloatArray) -> FloatArray:
-            if isinstance(spectrum, Atmosphere) and spectrum.is_stack:
-                shapes, which, factor = spectrum.factored_psd(f_hz)
-                return np.asarray(shapes.T[:, which] * factor)
+            if isinstance(spectrum, Atmosphere) and np.ndim(spectrum.wind_speed_m_s):
+                return spectrum.psd(f_hz).T
             return spectrum_density(spectrum, f_hz)[:, None]
 
         return self.of_density(density, entry, breakpoints_below(spectrum, self.frame_rate_hz / 2))

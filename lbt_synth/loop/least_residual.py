@@ -243,7 +243,14 @@ def truth_modes(
             *(np.outer(along, along) for along in directions),
         ]
     )
-    frames, modes = _whole_frames(hardware, in_image=in_image), []
+    if hardware.mirror is not None:
+        raise ProblemError("a limit is known for a mirror that settles at once; got dynamics.")
+    if hardware.delay_frames % 1 > 0.5 and not in_image:  # a zero outside the unit circle
+        raise ProblemError(
+            "the limit of means over frames is known for at most a half beyond whole frames of "
+            f"delay; got {hardware.delay_frames:g}. Take that in the image."
+        )
+    frames, modes = int(hardware.delay_frames), []
     for axis in axes:
         parts = [next(spectrum for spectrum, some in air if np.sum(axis[some] ** 2) > 0.5)]
         sinusoids = []
@@ -263,18 +270,6 @@ def truth_modes(
         late = in_image and hardware.delay_frames > frames
         modes.append(mode.interpolated(hardware.delay_frames) if late else mode)
     return axes, modes
-
-
-def _whole_frames(hardware: LoopHardware, *, in_image: bool) -> int:
-    """Return the whole frames of delay of a loop whose limit is known."""
-    if hardware.mirror is not None:
-        raise ProblemError("a limit is known for a mirror that settles at once; got dynamics.")
-    if hardware.delay_frames % 1 > 0.5 and not in_image:  # a zero outside the unit circle
-        raise ProblemError(
-            "the limit of means over frames is known for at most a half beyond whole frames of "
-            f"delay; got {hardware.delay_frames:g}. Take that in the image."
-        )
-    return int(hardware.delay_frames)
 
 
 def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray:

@@ -107,31 +107,24 @@ class Truth(Summarised):
                     "vibrations must be Vibration or SinusoidalVibration; got "
                     f"{type(each).__name__}."
                 )
-        noise = one_or_each(self.noise_nm, "noise_nm", at_least=0)
+        noise, errors = one_or_each(self.noise_nm, "noise_nm", at_least=0), self.frequency_errors_hz
+        if errors is not None:
+            name, lines = "frequency_errors_hz", len(self.vibrations)
+            errors = tuple(number(error, name, at_least=0) for error in errors)
+            if len(errors) != lines:
+                raise DimensionError(f"{name} must be one per vibration ({lines}); got {errors}.")
         check_fields(
             self,
             turbulence=parts if isinstance(turbulence, Sequence) else turbulence,
             vibrations=tuple(self.vibrations),
             noise_nm=float(noise) if noise.ndim == 0 else noise,
-            frequency_errors_hz=self._checked_errors(),
+            frequency_errors_hz=errors,
             motions=tuple(self.motions) if any(self.motions) else ({},) * len(self.vibrations),
         )
 
     def _brief(self) -> str:
         lines = count_text(len(self.vibrations), "vibration")
         return f"{lines}, sensor gain {self.sensor_gain:.4g}"
-
-    def _checked_errors(self) -> tuple[float, ...] | None:
-        """Return the frequency errors, of which each vibration must have one."""
-        if self.frequency_errors_hz is None:
-            return None
-        errors = [number(e, "frequency_errors_hz", at_least=0) for e in self.frequency_errors_hz]
-        if len(errors) != len(self.vibrations):
-            raise DimensionError(
-                f"frequency_errors_hz must be one per vibration ({len(self.vibrations)}); got "
-                f"{len(errors)}."
-            )
-        return tuple(errors)
 
     @property
     def lines_hz(self) -> list[float]:

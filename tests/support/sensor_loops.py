@@ -35,7 +35,7 @@ SLOW = WavefrontSensor(
 def example_plant(sensors=(FAST, SLOW), *, lines=LINES, motions=MOTIONS, **changes):
     """Return a plant of two modes at 1 kHz; only the channels of its sensors move."""
     facts = {"turbulence": AIR, "noise_nm": 75.0, "delay_frames": 2} | changes
-    own = lbt.tip_tilt_plant(frame_rate_hz=RATE_HZ, vibrations=lines or None, **facts)
+    own = lbt.tip_tilt_plant(frame_rate_hz=RATE_HZ, vibrations=lines, **facts)
     suite = SensorSuite(sensors=sensors)
     moved = [{name: each[name] for name in each if name in suite.channels} for each in motions]
     return own.with_sensors(suite, tuple(moved))

@@ -188,7 +188,7 @@ def modal_filters(
         plant = tip_tilt_plant(
             frame_rate_hz=turbulence.frame_rate_hz,
             turbulence=turbulence.take(first),
-            vibrations=lines[first] or None,
+            vibrations=lines[first],
             noise_nm=float(noise[first]),
             delay_frames=hardware.delay_frames,
             sensor_gain=float(gain[first]),

@@ -27,7 +27,6 @@ from lbt_synth.linear.estimation_problem import (
 )
 from lbt_synth.linear.matrix_functions import (
     as_stack,
-    is_stable,
     nearest_powers_of_two,
     relative_distance,
     symmetrise,
@@ -245,7 +244,7 @@ class GammaEquation:
             onward = np.linalg.solve((identity + X @ G1).T, A1.T).T  # A (I + P W)^-1
             transition = onward @ transition
             X = symmetrise(onward @ X @ A1.T + H1)
-        if not is_stable(transition):
+        if not np.max(np.abs(np.linalg.eigvals(transition))) < 1:
             return LevelTrial(slack=-1.0)
         residual = relative_distance(self.least[0] + X, P[0])
         if slack <= 0:

@@ -66,7 +66,6 @@ def test_retuning_moves_only_the_vibration():
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({"vibrations": []}, "vibrations is empty"),
         ({"noise_nm": 0.0}, "noise_nm must be above 0"),
         ({"noise_nm": [[1.0, 2.0], [0.0, 1.0]]}, "noise_nm must be symmetric"),
         ({"noise_nm": [[1.0, 2.0], [2.0, 1.0]]}, "noise_nm must be positive definite"),
