@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, ClassVar, TypeGuard
+from typing import Any, ClassVar, TypeGuard, cast
 
 import numpy as np
 
@@ -50,8 +50,8 @@ from lbt_synth.linear.riccati.filtering import (
     kalman_riccati,
     meets_level,
 )
-from lbt_synth.loop import ClosedLoop, close_loop, residual_budget
-from lbt_synth.loop.budget import model_readings
+from lbt_synth.loop import ClosedLoop, close_loop
+from lbt_synth.loop.budget import model_covariances
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import Column, column, nm_column, table_row
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, set_fields
@@ -212,22 +212,30 @@ class FilterDesign(Design):
         return {frozenset(missing): k for missing, k in {(): self.controller, **others}.items()}
 
     def tables(self) -> tuple[RowTable, ...]:
-        """Return what becomes of the loop when sensors fail, and which failures it has to see."""
+        """Return what becomes of the loop when sensors fail."""
         if not reads_several(self.problem):
             return ()
         rows = failure_rows(self.problem, self.gain_predictor, self.fallbacks)
-        unseen = [row.missing for row in rows if row.must_switch]
-        warning = (
-            f"warning: unstable if these fail unseen: {'; '.join(unseen)}. The loop's "
-            "computer has to see such a failure, and take the fall-back filter."
-        )
-        notes = [
+        note = (
             "unseen: the readings are zero, or frozen, and the filter believes them: a reading "
             "that stays leaves an offset, which counts to the residual. Not read: the fall-back "
-            "filter of this file for the remaining sensors, with the same state.",
-            *[warning] * bool(unseen),
-        ]
-        return (RowTable(key="failures", title="When sensors fail", rows=rows, notes=notes),)
+            "filter of this file for the remaining sensors, with the same state."
+        )
+        return (RowTable(key="failures", title="When sensors fail", rows=rows, notes=[note]),)
+
+    def notes(self) -> list[str]:
+        """Return which failures the loop has to see, of which none holds another."""
+        fatal: list[tuple[str, ...]] = []
+        for missing in (fallback.missing for fallback in self.fallbacks):  # small ones first
+            loop = failed_loop(cast("TipTiltPlant", self.problem), self.gain_predictor, missing)
+            if not any({*fewer} <= {*missing} for fewer in fatal) and not loop.is_stable:
+                fatal.append(missing)
+        sets = "; ".join(" + ".join(missing) for missing in fatal)
+        warning = (
+            f"warning: unstable if these fail unseen, alone or with others: {sets}. The loop's "
+            "computer has to see such a failure, and take the fall-back filter."
+        )
+        return [warning] * bool(fatal)
 
     @property
     def poles(self) -> ComplexArray:
@@ -361,13 +369,18 @@ def failure_rows(
     The residual is the exact one of the loop where the plant's model is the truth. A frozen reading
     is that of a frame in which all sensors are read, and stays for ever.
     """
-    rows = []
-    readings = model_readings(failed_loop(plant, gains, ()), plant)
+    n, rows = plant.hardware.modes, []
+    readings = model_covariances(failed_loop(plant, gains, ()), plant)[0, n:, n:]
+
+    def left_nm(loop: ClosedLoop) -> float:
+        covariances = model_covariances(loop, plant)[:, :n, :n]
+        return float(np.sqrt(np.trace(covariances.mean(axis=0))))
+
     for fallback in fallbacks:
         unseen = failed_loop(plant, gains, fallback.missing)
         zero_nm = frozen_nm = None
         if unseen.is_stable:
-            zero_nm = residual_budget(unseen, plant, frame_means=True).rms_nm
+            zero_nm = left_nm(unseen)
             frozen_nm = float(np.hypot(zero_nm, _offset_nm(unseen, readings)))
         switched = failed_loop(plant, fallback.gains, fallback.missing)
         rows.append(
@@ -377,7 +390,7 @@ def failure_rows(
                 zero_nm=zero_nm,
                 frozen_nm=frozen_nm,
                 fallback_radius=switched.spectral_radius,
-                fallback_nm=residual_budget(switched, plant, frame_means=True).rms_nm,
+                fallback_nm=left_nm(switched),
                 must_switch=not unseen.is_stable,
             )
         )
