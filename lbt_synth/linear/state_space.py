@@ -394,9 +394,6 @@ def stacked_response(
     dependent, fail at some probes, its points are solved one by one.
     """
     A, B, C, D = matrices
-    if len(A) == 1 and A.size:
-        form = schur_form(StateSpace(A=A[0], B=B[0], C=C[0], D=D[0]))
-        return lambda z: schur_response(form, z)[:, None]
     if not A.size:
         return lambda z: np.broadcast_to(D.astype(np.complex128), (z.size, *D.shape))
     poles, vectors = np.linalg.eig(A)

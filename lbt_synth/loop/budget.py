@@ -18,7 +18,6 @@ from lbt_synth.loop.ensemble import (
     EnsembleVibration,
     LoopEnsemble,
     ensemble_vibration,
-    turbulence_rows,
 )
 from lbt_synth.loop.evaluator import (
     STILL,
@@ -31,6 +30,7 @@ from lbt_synth.loop.evaluator import (
 )
 from lbt_synth.models import (
     ARModel,
+    Atmosphere,
     LoopHardware,
     SinusoidalVibration,
     Spectrum,
@@ -41,7 +41,7 @@ from lbt_synth.models import (
 from lbt_synth.models.loop_hardware import require_loop_rate
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.sensor_suite import Motion, Motions, checked_motions
-from lbt_synth.models.spectra import breakpoints_below, spectrum_density
+from lbt_synth.models.spectra import breakpoints_below, spectrum_density, spectrum_groups
 from lbt_synth.models.vibration import checked_direction, sampled_lines
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact, fact_table, facts
@@ -211,7 +211,7 @@ def residual_budget(
             lines.append(_one_line(loop, line, motion))
     budget = residual_of_parts(
         [rows],
-        [(spectrum, np.array(modes, dtype=np.intp)) for spectrum, modes in turbulence],
+        turbulence,
         lines,
         _noise_factor(loop, noise)[None],
         hardware=hardware,
@@ -235,7 +235,7 @@ def random_density(
     """
     n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
     turbulence, vibrations, noise = truth.entering(loop.hardware, sensor_gain=loop.sensor_gain)
-    origins = [(spectrum, np.eye(n)[:, list(modes)]) for spectrum, modes in turbulence]
+    origins = [(spectrum, np.eye(n)[:, modes]) for spectrum, modes in turbulence]
     for line in vibrations:
         if isinstance(line, Vibration):
             along = np.sinc(line.frequency_hz / rate) * checked_direction(line, loop.hardware)
@@ -285,7 +285,7 @@ def residual_spectrum(
 
 def residual_of_parts(
     parts: Sequence[Evaluator],
-    turbulence: Sequence[tuple[Spectrum, IntArray]],
+    turbulence: Sequence[tuple[Spectrum, list[int]]],
     lines: Sequence[EnsembleVibration],
     noise: FloatArray,
     *,
@@ -349,6 +349,13 @@ def residual_of_parts(
     )
 
 
+def _of_loops(turbulence: Spectrum, rows: IntArray) -> Spectrum:
+    """Return the turbulence of some loops."""
+    if isinstance(turbulence, Atmosphere | ARModel) and turbulence.count > 1:
+        return turbulence.take(rows)
+    return turbulence
+
+
 def ensemble_residuals(
     matrices: Matrices, hardware: LoopHardware, ensemble: LoopEnsemble, *, frame_means: bool = False
 ) -> ResidualBudget:
@@ -356,8 +363,9 @@ def ensemble_residuals(
 
     Unstable loops leave nan.
     """
-    turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
     noise, n, p = ensemble.noise(hardware), hardware.modes, ensemble.loops
+    turbulence = spectrum_groups(ensemble.turbulence_of(n))
+    lines = ensemble.lines(hardware)
     delays = hardware.delay_frames if ensemble.delay_frames is None else ensemble.delay_frames
     stable, groups = close_loops(
         matrices,
@@ -380,7 +388,7 @@ def ensemble_residuals(
             rows = loops[some]
             budget = residual_of_parts(
                 [part.take(some) for part in parts],
-                [(turbulence_rows(spectrum, rows), modes) for spectrum, modes in turbulence],
+                [(_of_loops(air, rows), modes) for air, modes in turbulence],
                 [line.take(rows) for line in lines],
                 noise[rows],
                 hardware=hardware,

@@ -10,14 +10,10 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import (
-    ARModel,
-    Atmosphere,
     LoopHardware,
     SinusoidalVibration,
-    Spectrum,
     Vibration,
 )
-from lbt_synth.models.spectra import spectrum_key
 from lbt_synth.models.vibration import require_below_nyquist
 from lbt_synth.validation import (
     ComplexArray,
@@ -105,11 +101,11 @@ class LoopEnsemble:
         values = [self.sensor_gain, self.noise_nm, self.delay_frames]
         for line in self.vibrations:
             values += [v for n, v in line.numbers.items() if np.ndim(v) > (n == "direction")]
-        values += [v for air in self._turbulence_of(1) for v in _turbulence_numbers(air)]
         lengths = [len(value) for value in values if np.ndim(value)]
-        set_fields(self, loops=max([self.loops, *lengths], default=1) or 1)
+        counts = [getattr(air, "count", 1) for air in self.turbulence_of(1)]
+        set_fields(self, loops=max([1, self.loops, *lengths, *counts]))
 
-    def _turbulence_of(self, modes: int) -> tuple[Any, ...]:
+    def turbulence_of(self, modes: int) -> tuple[Any, ...]:
         """Return the turbulence as it is per mode, or for each of some modes."""
         one = not isinstance(self.turbulence, Sequence)
         return (self.turbulence,) * modes if one else tuple(self.turbulence)
@@ -122,36 +118,8 @@ class LoopEnsemble:
         noise = noise[:, None] if noise.ndim == 1 else noise
         return np.broadcast_to(noise, (self.loops, q))[..., None] * np.eye(q)
 
-    def groups(self, hardware: LoopHardware) -> list[tuple[Spectrum, IntArray]]:
-        """Return the turbulence with the modes that have it."""
-        airs = self._turbulence_of(hardware.modes)
-        keys = [spectrum_key(air) for air in airs]
-        kinds = {key: air for key, air in zip(keys, airs, strict=True) if air is not None}
-        return [
-            (air, np.flatnonzero([other == key for other in keys])) for key, air in kinds.items()
-        ]
-
     def lines(self, hardware: LoopHardware) -> list[EnsembleVibration]:
         """Return the vibrations with all their numbers (p,), and directions (p, n)."""
         for line in self.vibrations:
             require_below_nyquist(float(np.max(line.frequency_hz)), hardware.frame_rate_hz)
         return [line.of_loops(self.loops) for line in self.vibrations]
-
-
-def _turbulence_numbers(turbulence: Spectrum | None) -> list[FloatArray]:
-    """Return the arrays of a turbulence that have one entry per loop."""
-    if isinstance(turbulence, Atmosphere):
-        values = turbulence.seeing_arcsec, turbulence.wind_speed_m_s, turbulence.outer_scale_m
-        return [value for value in values if value is not None]
-    if isinstance(turbulence, ARModel) and turbulence.coefficients.ndim > 1:
-        return [*turbulence.coefficients.T, turbulence.driving_rms_nm]
-    return []
-
-
-def turbulence_rows(turbulence: Spectrum, rows: IntArray) -> Spectrum:
-    """Return the turbulence of some loops."""
-    if isinstance(turbulence, Atmosphere) and np.size(turbulence.wind_speed_m_s) > 1:
-        return turbulence.take(rows)
-    if isinstance(turbulence, ARModel) and turbulence.count > 1:
-        return turbulence.take(rows)
-    return turbulence

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
@@ -23,7 +23,7 @@ from lbt_synth.linear.quadrature import RefinedPanels, graded_edges, refine_pane
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.models import ARModel, LoopHardware, Spectrum, TipTiltPlant, Truth, Vibration
 from lbt_synth.models.loop_hardware import require_loop_rate
-from lbt_synth.models.spectra import breakpoints_below, spectrum_density, spectrum_key
+from lbt_synth.models.spectra import breakpoints_below, spectrum_density
 from lbt_synth.models.vibration import checked_direction
 from lbt_synth.validation import FloatArray, definite, frozen_copy, read_only, require_instance
 
@@ -221,13 +221,12 @@ def truth_modes(
         )
     n, rate = hardware.modes, hardware.frame_rate_hz
     noise = _noise_on_modes(hardware, noise_nm2)
-    kinds: dict[object, tuple[Spectrum | None, list[int]]] = {}
-    for spectrum, members in groups:  # modes with the same spectrum may be turned into each other
+    for spectrum, _ in groups:
         if isinstance(spectrum, ARModel):
             require_loop_rate(spectrum.frame_rate_hz, hardware)
-        kinds.setdefault(spectrum_key(spectrum), (spectrum, []))[1].extend(members)
-    calm = sorted(set(range(n)).difference(*(members for _, members in kinds.values())))
-    air = [*kinds.values(), *([(None, calm)] if calm else [])]
+    calm = sorted(set(range(n)).difference(*(members for _, members in groups)))
+    # modes with the same spectrum may be turned into each other
+    air = [*groups, *([(None, calm)] if calm else [])]
     lines = []
     for vibration in vibrations:
         along, means = checked_direction(vibration, hardware), vibration
@@ -424,12 +423,6 @@ def mode_limit(mode: ModeSpectrum) -> float:
 def above_percent(rms_nm: float, limit_nm: float) -> float:
     """Return how far a residual is above a limit [%]; nan where the limit is 0 or nan."""
     return 100 * (rms_nm / limit_nm - 1) if limit_nm > 0 else np.nan
-
-
-def limit_or_nan(limit: Callable[[], Any]) -> float:
-    """Return the least residual [nm rms], nan where it cannot be computed."""
-    found = limit_or_none(limit)
-    return np.nan if found is None else float(found.rms_nm)
 
 
 def limit_or_none(limit: Callable[[], T]) -> T | None:

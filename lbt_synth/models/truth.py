@@ -11,7 +11,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.sensor_suite import Motions
-from lbt_synth.models.spectra import ARModel, Spectrum, spectrum_key
+from lbt_synth.models.spectra import ARModel, Spectrum, spectrum_groups
 from lbt_synth.models.vibration import (
     SinusoidalVibration,
     TrueVibration,
@@ -31,7 +31,7 @@ from lbt_synth.validation import (
 
 # spectra with the modes that have them, vibrations, and a root of the covariance of the noise
 Entering: TypeAlias = tuple[
-    Sequence[tuple[Spectrum, tuple[int, ...]]],
+    Sequence[tuple[Spectrum, list[int]]],
     Sequence[Vibration | SinusoidalVibration],
     FloatArray,
 ]
@@ -209,16 +209,9 @@ class Truth(Summarised):
         lines = stationary_vibrations(self.vibrations)
         return self.turbulence_groups(hardware.modes), lines, noise
 
-    def turbulence_groups(self, modes: int) -> tuple[tuple[Spectrum, tuple[int, ...]], ...]:
-        """Return the different spectra, each with the modes that have it; other modes have none.
-
-        Equal AR models are one spectrum. Spectra for another number of modes are a DimensionError.
-        """
-        groups: dict[object, tuple[Spectrum, list[int]]] = {}
-        for mode, spectrum in enumerate(self.turbulence_per_mode(modes)):
-            if spectrum is not None:
-                groups.setdefault(spectrum_key(spectrum), (spectrum, []))[1].append(mode)
-        return tuple((spectrum, tuple(members)) for spectrum, members in groups.values())
+    def turbulence_groups(self, modes: int) -> list[tuple[Spectrum, list[int]]]:
+        """Return the different spectra, each with the modes that have it; other modes have none."""
+        return spectrum_groups(self.turbulence_per_mode(modes))
 
     def noise_per_measurement(self, measurements: int) -> FloatArray:
         """Return the standard deviation of the noise on each measurement, (q,) [nm].

@@ -27,7 +27,7 @@ from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.models.plant.assembly import PlantParts, known_states, plant_matrices
 from lbt_synth.models.sensor_suite import Motions, SensorSuite, noise_factor
-from lbt_synth.models.spectra import ARModel
+from lbt_synth.models.spectra import ARModel, spectrum_groups
 from lbt_synth.models.truth import Entering
 from lbt_synth.models.vibration import Vibration, spread_lines
 from lbt_synth.storage.words import count_text
@@ -186,8 +186,7 @@ class TipTiltPlant(EstimationProblem):
 
     def entering(self, hardware: LoopHardware, *, sensor_gain: float) -> Entering:
         """Return what enters any loop where the plant's model is the truth; see :class:`Truth`."""
-        turbulence = [(model, (mode,)) for mode, model in enumerate(self.turbulence)]
-        return turbulence, self.vibrations, self.own_noise_factor
+        return spectrum_groups(self.turbulence), self.vibrations, self.own_noise_factor
 
     def with_memory(self, taps: FloatArray) -> TipTiltPlant:
         """Add the past innovations of a filter as states; see :class:`EstimationProblem`."""

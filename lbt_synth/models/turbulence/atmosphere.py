@@ -107,6 +107,11 @@ class Atmosphere:
             values = {name: np.broadcast_to(value, shape) for name, value in values.items()}
         check_fields(self, **{n: v if v.ndim else float(v) for n, v in values.items()})
 
+    @property
+    def count(self) -> int:
+        """Number of layers."""
+        return np.size(self.wind_speed_m_s)
+
     def take(self, rows: IntArray) -> Atmosphere:
         """Return the layers of some loops."""
         arrays = {name: getattr(self, name) for name in _PER_LOOP}

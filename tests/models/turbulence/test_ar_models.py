@@ -171,4 +171,4 @@ def test_bad_arrays_are_refused():
     plant = lbt.tip_tilt_plant(frame_rate_hz=800, turbulence=air, noise_nm=1.0)
     assert [model.coefficients.item() for model in plant.turbulence] == [0.9, 0.8]
     truth = lbt.Truth(turbulence=air)
-    assert [modes for _, modes in truth.turbulence_groups(2)] == [(0,), (1,)]
+    assert [modes for _, modes in truth.turbulence_groups(2)] == [[0], [1]]
