@@ -235,7 +235,7 @@ class IdentifiedModel(Summarised):
             frame_rate_hz=self.frame_rate_hz,
             delay_frames=self.delay_frames,
             turbulence=[axis.turbulence for axis in self.axes],
-            vibrations=[part.vibration() for part in self.parts] or None,
+            vibrations=[part.vibration() for part in self.parts],
             noise_nm=np.diag([axis.noise_nm**2 for axis in self.axes]),
             sensor_matrix=np.diag(self.sensor_gains),
             mirror=self.mirror,
