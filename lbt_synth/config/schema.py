@@ -39,12 +39,6 @@ def exactly_one(*names: str) -> Any:
     return _rule(lambda section: "" if _count_given(section, names) == 1 else text)
 
 
-def at_most_one(*names: str) -> Any:
-    """Return the rule that a section has at most one of some keys."""
-    text = f"expected at most one of {', '.join(names)}"
-    return _rule(lambda section: "" if _count_given(section, names) < 2 else text)
-
-
 def goes_with(name: str, other: str) -> Any:
     """Return the rule that a key makes sense beside another one alone."""
     text = f"{other} goes with {name}, and only with it"
@@ -197,7 +191,13 @@ class _LineSection(Section):
         "accelerometer channels that move with it", None
     )
     _one_size = exactly_one("rms_nm", "rms_mas")
-    _one_direction = at_most_one("axis", "direction_deg")
+    _one_direction = _rule(
+        lambda section: (
+            "expected at most one of axis, direction_deg"
+            if _count_given(section, ("axis", "direction_deg")) > 1
+            else ""
+        )
+    )
 
 
 class VibrationSection(_LineSection):

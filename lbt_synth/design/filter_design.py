@@ -53,7 +53,7 @@ from lbt_synth.linear.riccati.filtering import (
 from lbt_synth.loop import ClosedLoop, close_loop, residual_budget
 from lbt_synth.loop.budget import model_readings
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.storage.rows import Column, column, nm_column, table_row
+from lbt_synth.storage.rows import Column, Facts, fact, facts
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, set_fields
 
 MOST_UNITS = 6  # sensors and channels of which every subset gets a filter
@@ -103,19 +103,6 @@ class Fallback:
 
     missing: tuple[str, ...]  # sensors and channels that are not read
     gains: FloatArray  # (n, q) or (N, n, q): predictor gains, zero for what is missing
-
-
-@table_row
-class FailureRow:
-    """A loop in which some sensors have failed."""
-
-    missing: str = column("sensors that fail")
-    unseen_radius: float = column("radius, unseen", format=".6f")
-    zero_nm: float | None = nm_column("residual, zeros", unit="nm rms", format=".1f")
-    frozen_nm: float | None = nm_column("residual, frozen", unit="nm rms", format=".1f")
-    fallback_radius: float = column("radius, not read", format=".6f")
-    fallback_nm: float = nm_column("residual, not read", unit="nm rms", format=".1f")
-    must_switch: bool = column("must be seen")
 
 
 def failure_sets(units: tuple[str, ...]) -> list[tuple[str, ...]]:
@@ -174,6 +161,7 @@ class FilterDesign(Design):
         Column(name="period", heading="common period", unit="frames"),
     )
     is_estimator: ClassVar[bool] = True
+    knows_mirror: ClassVar[bool] = False
 
     problem: EstimationProblem
     gain_predictor: FloatArray
@@ -189,14 +177,9 @@ class FilterDesign(Design):
         """Return the controller of the predictor gain."""
         return self.problem.controller(self.gain_predictor)
 
-    @property
-    def knows_mirror(self) -> bool:
-        """False: a filter counts on a mirror that settles."""
-        return False
-
-    def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
-        """System from w to the estimation error, of the design's own problem by default."""
-        return (problem or self.problem).error_system(self.gain_predictor)
+    def error_system(self) -> StateSpace:
+        """System from w to the estimation error."""
+        return self.problem.error_system(self.gain_predictor)
 
     def derived(self) -> dict[str, Any]:
         """Return residual and limit in the own model, or what holds with several sensors."""
@@ -331,15 +314,10 @@ def fallback_checks(problem: TipTiltPlant, fallbacks: tuple[Fallback, ...]) -> l
     worst = [
         max(part, key=lambda check: (not check.passed, check.value)) for part in (radii, apart)
     ]
-    return [*worst, _set_check(problem, fallbacks)]
-
-
-def _set_check(problem: TipTiltPlant, fallbacks: tuple[Fallback, ...]) -> Check:
-    """Check that there is one fall-back for each set of sensors that may fail."""
     sets = failure_sets(problem.hardware.suite.units)
-    missing = [fallback.missing for fallback in fallbacks]
-    value = float(missing != sets)
-    return Check("sets of failed sensors without a fall-back", value, 0.5, "comparison")
+    value = float([fallback.missing for fallback in fallbacks] != sets)
+    name = "sets of failed sensors without a fall-back"
+    return [*worst, Check(name, value, 0.5, "comparison")]
 
 
 def _fallback_distance(plant: TipTiltPlant, fallback: Fallback) -> float:
@@ -355,13 +333,13 @@ def _fallback_distance(plant: TipTiltPlant, fallback: Fallback) -> float:
 
 def failure_rows(
     plant: TipTiltPlant, gains: FloatArray, fallbacks: tuple[Fallback, ...]
-) -> tuple[FailureRow, ...]:
+) -> list[Facts]:
     """Return stability and residual of the loop for every set of sensors that fail.
 
     The residual is the exact one of the loop where the plant's model is the truth. A frozen reading
     is that of a frame in which all sensors are read, and stays for ever.
     """
-    rows = []
+    rows, radius, rms = [], {"format": ".6f"}, {"unit": "nm rms", "format": ".1f"}
     readings = model_readings(failed_loop(plant, gains, ()), plant)
     for fallback in fallbacks:
         unseen = failed_loop(plant, gains, fallback.missing)
@@ -370,18 +348,19 @@ def failure_rows(
             zero_nm = residual_budget(unseen, plant, frame_means=True).rms_nm
             frozen_nm = float(np.hypot(zero_nm, _offset_nm(unseen, readings)))
         switched = failed_loop(plant, fallback.gains, fallback.missing)
+        fallback_nm = residual_budget(switched, plant, frame_means=True).rms_nm
         rows.append(
-            FailureRow(
-                missing=" + ".join(fallback.missing),
-                unseen_radius=unseen.spectral_radius,
-                zero_nm=zero_nm,
-                frozen_nm=frozen_nm,
-                fallback_radius=switched.spectral_radius,
-                fallback_nm=residual_budget(switched, plant, frame_means=True).rms_nm,
-                must_switch=not unseen.is_stable,
+            facts(
+                missing=fact(" + ".join(fallback.missing), "sensors that fail"),
+                unseen_radius=fact(unseen.spectral_radius, "radius, unseen", **radius),
+                zero_nm=fact(zero_nm, "residual, zeros", **rms),
+                frozen_nm=fact(frozen_nm, "residual, frozen", **rms),
+                fallback_radius=fact(switched.spectral_radius, "radius, not read", **radius),
+                fallback_nm=fact(fallback_nm, "residual, not read", **rms),
+                must_switch=fact(not unseen.is_stable, "must be seen"),
             )
         )
-    return tuple(rows)
+    return rows
 
 
 def _offset_nm(loop: ClosedLoop, readings: FloatArray) -> float:

@@ -88,11 +88,6 @@ class IntegratorLaw:
         check_fields(self)
 
     @property
-    def is_pure(self) -> bool:
-        """Whether it is one integrator without leak or zero."""
-        return (self.leak, self.integrators, self.zero_hz) == (1.0, 1, None)
-
-    @property
     def demands(self) -> dict[str, float]:
         """The margins that are demanded, by the name of their field."""
         named = {name: getattr(self, name) for name in ("phase_margin_deg", "modulus_margin")}
@@ -190,7 +185,8 @@ class IntegratorDesign(Design):
     @property
     def integrator_gain(self) -> float | None:
         """The gain, if there is neither leak nor zero nor a second integrator."""
-        return self.gain if self.law.is_pure else None
+        is_pure = self.claims.keys().isdisjoint(("leak", "integrators", "zero_hz"))
+        return self.gain if is_pure else None
 
     def make_controller(self) -> Controller:
         """Return the controller of the law and its gain."""

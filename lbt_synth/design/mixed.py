@@ -18,7 +18,6 @@ from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import EstimationProblem, StateSpace, hinf_norm
-from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.linear.riccati.filtering import FilterRiccati, gamma_riccati, kalman_riccati
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number, require_instance
@@ -121,10 +120,7 @@ def _complete_base(
     length: int,
     bound: float,
 ) -> tuple[FloatArray, SolverReport]:
-    """Find the taps on the innovations of a base filter, and say how.
-
-    Frequencies are added until the norm holds between them, too.
-    """
+    """Find the taps on the innovations of a base filter, and say how."""
     from lbt_synth.linear.lmi.mixed import InnovationProgramme
 
     programme = InnovationProgramme.from_predictor(problem, base.gain_predictor, taps=length)
@@ -163,7 +159,9 @@ def _mixed_design(
     extended = problem.with_memory(taps)
     size, q = taps.shape[1], base.gain_predictor.shape[1]
     gain = _extend_gain(base.gain_predictor, size // q)
-    witness = least.witness and _padded(least.witness, size)
+    witness = least.witness
+    if witness is not None:  # the further states are zero
+        witness = replace(witness, states=frozen_copy(np.pad(witness.states, ((0, size), (0, 0)))))
     proved = proved_level(extended, witness)
     return filter_design(
         extended,
@@ -174,12 +172,6 @@ def _mixed_design(
         witness=witness,
         **claims,
     )
-
-
-def _padded(witness: Witness, size: int) -> Witness:
-    """Return a witness of a problem with further states, which are zero."""
-    padding = np.zeros((size, witness.states.shape[1]))
-    return replace(witness, states=frozen_copy(np.vstack([witness.states, padding])))
 
 
 def _extend_gain(gain_predictor: FloatArray, length: int) -> FloatArray:

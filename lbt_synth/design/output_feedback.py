@@ -76,8 +76,7 @@ def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
     """Check that the witness proves the level."""
     design = evidence.design
     scaled = scaled_plant(design.problem)
-    proved = infeasible_control_level(scaled.plant, design.witness) / scaled.unit
-    above = level / max(proved, 1e-300) - 1
+    above = level / max(_proved(scaled, design.witness), 1e-300) - 1
     how = "pairs that no measurement shows and no control moves"
     name = "infeasible level over the level proved, less 1"
     yield Check(name, above, INFEASIBLE_TOLERANCE, how)
@@ -294,8 +293,11 @@ class _Bracket(NamedTuple):
         proofs = [max(((_proved(scaled, x), x) for x in candidates), key=lambda proof: proof[0])]
         level, closed = proofs[0]
         if level < least * (1 - _LOOSE) and size <= LARGEST_LMI:
+            from lbt_synth.linear.lmi.output_feedback import least_level_lmi
+
             with suppress(NumericalError):
-                proofs.append(_inequality_proof(scaled, solution.gamma))
+                _, dual = least_level_lmi(scaled.plant, solution.gamma)
+                proofs.append((_proved(scaled, dual), dual))
         proved, witness = max(proofs, key=lambda proof: proof[0])
         if level > _LESS * least:  # an inequality gives no reason in words
             witness = replace(witness, reason=closed.reason)
@@ -322,14 +324,6 @@ class _Bracket(NamedTuple):
 def _proved(scaled: ScaledPlant, witness: ControlWitness) -> float:
     """Return the level of the plant that a witness proves infeasible."""
     return infeasible_control_level(scaled.plant, witness) / scaled.unit
-
-
-def _inequality_proof(scaled: ScaledPlant, level: float) -> tuple[float, ControlWitness]:
-    """Return the level that the dual of the matrix inequalities proves, and the proof."""
-    from lbt_synth.linear.lmi.output_feedback import least_level_lmi
-
-    _, witness = least_level_lmi(scaled.plant, level)
-    return _proved(scaled, witness), witness
 
 
 def _least_controller(

@@ -129,7 +129,9 @@ def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
     """Design the controller; the section's sensor gains are real, the design's are relative."""
     from lbt_synth.design.loop_shaping import robust
 
-    section: RobustSection | None = inputs.method_section(ROBUST.name)
+    section: RobustSection | None = inputs.defaults.get(ROBUST.name)
+    if not inputs.defaults:  # there is no configuration
+        section = _plant_section(inputs.plant)
     if section is None:
         raise ConfigError(
             f"the key {_KEY} is missing: the robust design needs its bands at least. "
@@ -176,7 +178,7 @@ def _build_bands(inputs: DesignInputs, section: RobustSection) -> list[list[Vibr
     """Return the bands, one list per mode."""
     from lbt_synth.design.shaping import VibrationBand
 
-    modes = inputs.hardware.modes
+    modes = inputs.plant.hardware.modes
     bands: list[list[VibrationBand]] = [[] for _ in range(modes)]
     for i, band in enumerate(section.bands):
         key = f"{_KEY}.bands[{i}]"
@@ -187,20 +189,15 @@ def _build_bands(inputs: DesignInputs, section: RobustSection) -> list[list[Vibr
             )
         ends = {"low_hz": band.low_hz, "high_hz": band.high_hz}
         for mode in range(modes) if axis is None else (axis,):
-            damping = _model_damping(inputs, band, mode) if band.damping is None else band.damping
+            dampings = (  # of the model's vibrations in the band
+                line.damping
+                for line in inputs.plant.vibrations
+                if band.low_hz <= line.frequency_hz <= band.high_hz and line.direction[mode]
+            )
+            damping = max(dampings, default=0.0) if band.damping is None else band.damping
             with name_key(key):
                 bands[mode].append(VibrationBand(**ends, rms_nm=rms_nm, damping=damping))
     return bands
-
-
-def _model_damping(inputs: DesignInputs, band: BandSection, mode: int) -> float:
-    """Return the largest damping of the model's vibrations of a mode in a band, 0 without one."""
-    dampings = (
-        line.damping
-        for line in inputs.plant.vibrations
-        if band.low_hz <= line.frequency_hz <= band.high_hz and line.direction[mode]
-    )
-    return max(dampings, default=0.0)
 
 
 def _list_demands(
@@ -217,7 +214,7 @@ def _list_demands(
         with name_key(f"{_KEY}.bounds[{i}]"):
             demands.append(Bound(**{**bound.model_dump(), "sensor_gain": gain}))
     if section.stroke_ratio is not None:
-        influence = inputs.hardware.influence
+        influence = inputs.plant.hardware.influence
         if np.any(np.count_nonzero(influence, axis=1) != 1) or np.diff(influence.shape):
             raise ConfigError(
                 f"{_KEY}.stroke_ratio: each command must move one axis alone, as a clipped one "
@@ -237,7 +234,8 @@ def _list_demands(
                 "out, or give one model.",
                 path=_KEY,
             )
-        noise_nm = float(max(noise_per_mode(inputs.hardware, inputs.plant.own_sensor_alone().R)))
+        alone = inputs.plant.own_sensor_alone()
+        noise_nm = float(max(noise_per_mode(alone.hardware, alone.R)))
         turbulence = models[0] if spectrum is None else spectrum
         demands.append(
             CommandRms(at_most_nm=at_most_nm, rate=rate, turbulence=turbulence, noise_nm=noise_nm)

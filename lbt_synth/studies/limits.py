@@ -129,7 +129,11 @@ def limits(
     if not errors:
         raise ProblemError("errors_hz must hold at least one error; got none.")
     vibrations = stationary_vibrations(truth.vibrations)
-    shifts = _frequency_shifts(truth, errors)
+    shifts = np.zeros(0)  # the range of errors, the errors and 0 among them
+    if vibrations:
+        zero = [0.0] if min(errors) <= 0 <= max(errors) else []
+        grid = np.linspace(min(errors), max(errors), _GRID)
+        shifts = np.unique(np.concatenate([grid, errors, zero]) + 0.0)
     alone = hardware.own_sensor_alone()
     limit = limit_or_none(lambda: least_residual(alone, truth))
     band = band_hz = None
@@ -185,16 +189,6 @@ def _limit_row(
         "stable": loop.is_stable,
     }
     return fill_row(LimitRow, SimpleNamespace(**numbers), design, **row), curve
-
-
-def _frequency_shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
-    """Return the shifts over the range of errors, the errors and 0 among them."""
-    if not truth.vibrations:
-        return np.zeros(0)
-    moved = np.array(errors_hz)
-    grid = np.linspace(moved.min(), moved.max(), _GRID)
-    inside = [0.0] if moved.min() <= 0 <= moved.max() else []
-    return np.asarray(np.unique(np.concatenate([grid, moved, inside]) + 0.0))
 
 
 def _residual_curve(
@@ -359,9 +353,11 @@ def compare_modes(config: Config, modes: int) -> ModalStudy:
     from lbt_synth.design.modal import modal_filters, modal_gains
 
     hardware, sensor_gain = config.hardware, config.settings.model.sensor_gain
-    reason = "the turbulence of hundreds of modes is computed from it"
+    if config.atmosphere is None:
+        reason = "the turbulence of hundreds of modes is computed from it"
+        config.refuse_key("atmosphere", f"is missing: {reason}")
     rate_hz = hardware.frame_rate_hz
-    air = modal_turbulence(config.require_atmosphere(reason), modes=modes, frame_rate_hz=rate_hz)
+    air = modal_turbulence(config.atmosphere, modes=modes, frame_rate_hz=rate_hz)
     for key, value in (("sensor.noise_nm", config.noise_nm), ("model.sensor_gain", sensor_gain)):
         if np.ndim(value):
             config.refuse_key(key, "must be one number for hundreds of modes; got one per axis")

@@ -12,7 +12,7 @@ from scipy.stats import kstwobign
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedModel
-from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import ClosedLoop, close_loop
@@ -259,8 +259,9 @@ def _draw_flags(axes: Axes, axis: IdentifiedAxis) -> None:
     places = spread_labels(across, _FLAG_IN / width_in)
     tie = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "relpos": (0.5, 0.0)}
     for line, point, place in zip(axis.lines, zip(x, y, strict=True), places, strict=True):
+        label = f"{line.frequency_hz:.2f} Hz, {nm_text(line.rms_nm)}"
         axes.annotate(
-            _line_text(line),
+            label + ("" if line.direction is None else f", {line.direction_deg:.0f}°"),
             xy=point,
             xytext=(float(place), 0.985),
             textcoords="axes fraction",
@@ -296,12 +297,6 @@ def _average_bands(
         np.minimum.reduceat(density, edges),
         np.maximum.reduceat(density, edges),
     )
-
-
-def _line_text(line: IdentifiedLine) -> str:
-    """Return frequency and rms of a line on its axis, and the direction if both axes share it."""
-    along = "" if line.direction is None else f", {line.direction_deg:.0f}°"
-    return f"{line.frequency_hz:.2f} Hz, {nm_text(line.rms_nm)}{along}"
 
 
 def _draw_cumulative(axes: Axes, axis: IdentifiedAxis, residuals: dict[str, FloatArray]) -> None:
