@@ -17,7 +17,7 @@ FORBIDDEN = {
     "files/telemetry/new_format.py": ("aotpy", "Only files.telemetry.aot imports aotpy"),
     "files/telemetry/new_archive.py": (
         "h5py",
-        "Only identification.records.contents imports h5py",
+        "Only storage.array_file imports h5py",
     ),
     "studies/study/new_pool.py": ("distributed", "Only studies.grid imports distributed"),
     "report/page/new_chart.py": ("bokeh", "Only report.explore imports bokeh"),

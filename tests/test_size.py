@@ -14,28 +14,28 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3301,
-    "config": 1634,
-    "design": 6201,
-    "files": 1244,
-    "identification": 8875,
-    "interop": 3730,
-    "linear": 4829,
-    "loop": 3963,
-    "methods": 861,
-    "models": 3851,
-    "report": 3328,
-    "storage": 1027,
-    "studies": 2926,
+    "cli": 3277,
+    "config": 1631,
+    "design": 6021,
+    "files": 1252,
+    "identification": 9037,
+    "interop": 3687,
+    "linear": 4844,
+    "loop": 4132,
+    "methods": 791,
+    "models": 3858,
+    "report": 3267,
+    "storage": 1060,
+    "studies": 3316,
     "errors, validation": 554,
 }
 COUNTS = {
-    "files of the package": 202,
-    "public names": 145,
-    "tuned constants": 494,
-    "lines of tests": 28291,
+    "files of the package": 204,
+    "public names": 147,
+    "tuned constants": 498,
+    "lines of tests": 29139,
     "lines of benchmarks": 4018,
-    "words of docs": 59781,
+    "words of docs": 62270,
 }
 
 

@@ -265,7 +265,12 @@ _CHOICES = {  # what an argument may be: a tuple, or the function that returns i
     "telescopes": "lbt_synth.config.load:telescope_names",
     "record_methods": "lbt_synth.methods.registry:record_methods",
 }
-_TYPES: Mapping[str, type[Any]] = {"int": int, "float": float}
+_WORDS: Mapping[str, dict[str, Any]] = {  # how an argument is read, and what argparse is given
+    "int": {"type": int},
+    "float": {"type": float},
+    "switch": {"action": "store_true"},
+    "required": {"required": True},
+}
 # how scripts of shtab complete names of files
 _FILES = {"bash": "_shtab_compgen_files", "zsh": "_files", "fish": "(__fish_complete_path)"}
 
@@ -299,14 +304,10 @@ def _keywords(how: str, text: str) -> dict[str, Any]:
     default = None
     for word in how.split():
         key, _, value = word.partition(":")
-        if word in _TYPES:
-            keywords["type"] = _TYPES[word]
-        elif word == "switch":
-            keywords["action"] = "store_true"
+        if word in _WORDS:
+            keywords |= _WORDS[word]
         elif word == "repeat":
             keywords |= {"action": "append", "default": []}
-        elif word == "required":
-            keywords["required"] = True
         elif word.startswith("="):
             default = word[1:]
         elif word.startswith("@"):

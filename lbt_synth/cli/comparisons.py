@@ -5,18 +5,14 @@ from __future__ import annotations
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 
 import numpy as np
 
 from lbt_synth import studies
-from lbt_synth.cli.loop_inputs import (
-    load_designs,
-    load_shown,
-    margin_columns,
-    named_difference_notes,
-    say_limit,
-)
-from lbt_synth.cli.output import PERCENT, RMS, Report
+from lbt_synth.cli import loop_inputs
+from lbt_synth.cli.loop_inputs import load_designs, load_shown, named_difference_notes
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import track_progress
 from lbt_synth.config import Config
 from lbt_synth.design import Design
@@ -27,25 +23,17 @@ from lbt_synth.loop.least_residual import limit_or_nan
 from lbt_synth.methods.registry import INTEGRATOR, KALMAN, design_title, reference_methods
 from lbt_synth.report.designs import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_map_figure
-from lbt_synth.report.figures.studies import (
-    frame_rate_figure,
-    limits_figure,
-    mirror_figure,
-    modal_figure,
-    tradeoff_figure,
-)
+from lbt_synth.report.figures import studies as figures
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import Facts, fact, facts, row_table
+from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies.limits import (
-    LimitRow,
     LimitStudy,
-    compare_modes,
     limits,
     limits_at_rate,
     say_residual,
 )
-from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, mirror_rows
+from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, compare_modes, mirror_rows
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 _RATES = 34  # frame rates of a comparison, of which a table without --verbose has every third
@@ -66,21 +54,21 @@ def run_compare(arguments: Namespace) -> Report:
             f"{decibels:.2g} dB of sensor gain, either way."
         )
     caption = f"In the truth of {config.source.name}; {config.imaging.label}"
-    report.add_rows("designs", caption, rows, figure=lambda: limits_figure(study))
+    report.add_rows("designs", caption, rows, figure=partial(figures.limits_figure, study))
     report.notes += named_difference_notes(config, designs)
     return report
 
 
-def _compared(design: Design, row: LimitRow, config: Config) -> Facts:
+def _compared(design: Design, row: Facts, config: Config) -> Facts:
     """Return the line of a design: what it leaves, what its loop survives, and what it costs."""
     loop = design.close(config.hardware, sensor_gain=config.truth.sensor_gain)
     margins = loop_margins(loop) if row.stable and not loop.reads_others else None
     cost = None if design.other_sensors else frame_cost(design).multiplications
     return facts(
         design=fact(row.design, "design"),
-        residual_nm=fact(row.residual_nm, "residual", missing="unstable", **RMS),
+        residual_nm=fact(row.residual_nm, "residual", missing="unstable", **NM),
         strehl=fact(row.strehl, "Strehl", **PERCENT),
-        **margin_columns(margins),
+        **loop_inputs.margin_columns(margins),
         n_states=fact(design.controller.n_states, "states"),
         multiplications=fact(cost, "products per frame"),
     )
@@ -121,7 +109,7 @@ def run_limits(arguments: Namespace) -> Report:
         study.rows,
         without=("above_band_limit_percent",) * (study.band is None),
         hidden=() if study.shift_hz.size else ("worst_nm",),
-        figure=lambda: limits_figure(study),
+        figure=partial(figures.limits_figure, study),
     )
     if study.band is not None and study.band_hz is not None:
         report.data |= {
@@ -136,7 +124,7 @@ def run_limits(arguments: Namespace) -> Report:
             f"achieves {nm_text(study.band.achieved_nm, '.6g')})."
         )
     if study.limit is not None:
-        report.notes.append(say_limit(study.limit, config))
+        report.notes.append(loop_inputs.say_limit(study.limit, config))
     else:
         report.notes.append(
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
@@ -176,7 +164,7 @@ def _limits_over_rates(config: Config, arguments: Namespace) -> Report:
         "rows",
         f"The same star at other frame rates; {config.imaging.label}",
         rows,
-        figure=lambda: frame_rate_figure(rates, curves),
+        figure=partial(figures.frame_rate_figure, rates, curves),
     )
     noise = "the noise is that of photons, its variance in proportion to the rate"
     if config.settings.sensor.pyramid is not None:
@@ -203,9 +191,8 @@ def run_tradeoff(arguments: Namespace) -> Report:
     first, last, least = mixed[0], mixed[-1], points[0].design
     caption = "Trade-off of variance, norm and sensor gain"
     report = Report(tables=[row_table(f"{caption}, by the mixed filter", mixed)])
-    report.add_rows(
-        "points", caption, points, without=("design",), figure=lambda: tradeoff_figure(points)
-    )
+    figure = partial(figures.tradeoff_figure, points)
+    report.add_rows("points", caption, points, without=("design",), figure=figure)
     report.data |= {"gamma_least": least.gamma_least, "gamma_infeasible": least.gamma_infeasible}
     report.verdict = [
         f"Lowering the norm of the error from {nm_text(last.gamma, '.1f')} to "
@@ -246,7 +233,7 @@ def run_mirror(arguments: Namespace) -> Report:
         "rows",
         f"Designs on this mirror; {config.imaging.label}",
         rows,
-        figure=lambda: mirror_figure(shell, hardware, tolerance=arguments.tolerance),
+        figure=lambda: figures.mirror_figure(shell, hardware, tolerance=arguments.tolerance),
     )
     report.add_facts(
         "The mirror after a step of its command",
@@ -349,6 +336,6 @@ def run_modal(arguments: Namespace) -> Report:
         "rows",
         "By radial order, residuals over its modes",
         study.by_radial_order(),
-        figure=lambda: modal_figure(study.residual_nm, **shown),
+        figure=lambda: figures.modal_figure(study.residual_nm, **shown),
     )
     return report

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -20,7 +19,6 @@ from lbt_synth.files import save_gain
 from lbt_synth.files.gain_file.store import load_with_digest, read_design, require_gain_name
 from lbt_synth.linear import estimator_form
 from lbt_synth.loop import close_loop, loop_margins
-from lbt_synth.loop.margins import LoopMargins
 from lbt_synth.methods.registry import design_title, option_names
 from lbt_synth.methods.request import design_request
 from lbt_synth.storage.atomic_files import require_writable
@@ -67,7 +65,8 @@ def describe_design(report: Report, design: Design) -> None:
         if not design.other_sensors:
             margins = [loop_margins(close_loop(design.hardware, design))]
             report.data["margins"] = json_record(*margins)
-    report.verdict = [*_say_fragility(margins), *(report.verdict or [_say_model(design)])]
+    fragile = [f"{text[0].upper()}{text[1:]}" for one in margins for text in one.fragilities]
+    report.verdict = [*fragile, *(report.verdict or [_say_model(design)])]
     report.verdict += [f"It {one.survival}" for one in margins if not one.fragilities]
     report.verdict.append(say_checks(design.certificate.checks))
     report.add_records(*records)
@@ -80,10 +79,6 @@ def describe_design(report: Report, design: Design) -> None:
     for table in tables:
         report.add_rows(table.key, table.title, table.rows)
     report.add_rows("checks", "Certificate", design.certificate.checks)
-
-
-def _say_fragility(margins: Sequence[LoopMargins]) -> list[str]:
-    return [f"{text[0].upper()}{text[1:]}" for one in margins for text in one.fragilities]
 
 
 def _say_model(design: Design) -> str:

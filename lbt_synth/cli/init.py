@@ -26,30 +26,30 @@ _USUAL = "generic"  # the telescope of which nothing is known
 
 def run(arguments: Namespace) -> Report:
     """Write a configuration of a telescope with its schema, or all examples."""
-    report = Report()
+    telescope = arguments.telescope or _USUAL
     if arguments.examples:
         folder = Path(arguments.output or "examples")
         contents = {folder / name: text for name, text in sorted(example_files().items())}
-        _refuse_taken(contents, force=arguments.force)
-        make_directory(folder)
-        report.note_files(write_together({at: text.encode() for at, text in contents.items()}))
-        return report
-    telescope = arguments.telescope or _USUAL
-    output = arguments.output or f"{telescope}.yaml"
-    file = require_ending(output, "a configuration", (".yaml", ".yml"))
-    schema = file.with_name(_SCHEMA)
-    require_writable(file, schema)
-    contents = {
-        file: f"# yaml-language-server: $schema={_SCHEMA}\n{telescope_template(telescope)}",
-        schema: json.dumps(config_schema(), indent=1) + "\n",
-    }
+    else:
+        output = arguments.output or f"{telescope}.yaml"
+        file = require_ending(output, "a configuration", (".yaml", ".yml"))
+        schema = file.with_name(_SCHEMA)
+        require_writable(file, schema)
+        contents = {
+            file: f"# yaml-language-server: $schema={_SCHEMA}\n{telescope_template(telescope)}",
+            schema: json.dumps(config_schema(), indent=1) + "\n",
+        }
     _refuse_taken(contents, force=arguments.force)
+    report = Report()
+    if arguments.examples:
+        make_directory(folder)
+    else:
+        method = default_method()
+        report.verdict.append(
+            f"Next, put in your own numbers; then lbt-synth design {file} --method {method} "
+            f"-o {file.with_name(f'{file.stem}_{method}.fits')} makes a controller."
+        )
     report.note_files(write_together({at: text.encode() for at, text in contents.items()}))
-    method = default_method()
-    report.verdict.append(
-        f"Next, put in your own numbers; then lbt-synth design {file} --method {method} "
-        f"-o {file.with_name(f'{file.stem}_{method}.fits')} makes a controller."
-    )
     return report
 
 

@@ -190,11 +190,12 @@ def add_truth(
 
 def margin_columns(margins: LoopMargins | None) -> dict[str, tuple[Any, Column]]:
     """Return the facts of what a loop survives, alone; None where it is unstable."""
-    names = ("delay_frames", "early_frames", "modulus")
-    late, early, modulus = (getattr(margins, name, None) for name in names)
-    less, more = (None, None) if margins is None else margins.gain_errors_db
-    frames = {"unit": "frames", "format": ".2f"}
-    decibels = {"unit": "dB", "format": ".1f"}
+    late, early, modulus, gains = (
+        getattr(margins, name, None)
+        for name in ("delay_frames", "early_frames", "modulus", "gain_errors_db")
+    )
+    less, more = gains or (None, None)
+    frames, decibels = ({"unit": u, "format": f} for u, f in (("frames", ".2f"), ("dB", ".1f")))
     return {
         "delay_frames": fact(late, "late by", **frames),
         "early_frames": fact(early, "early by", **frames),

@@ -8,7 +8,7 @@ import os
 import shutil
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
@@ -40,9 +40,6 @@ _WRITTEN = "written: "
 _URGENT = ("assumes", "warning", "note")
 _URGENT_LINES = 8
 _WORDS = ("unit", "method", "computed by", "origin")  # columns of words are flush left
-# how the facts of commands print a Strehl ratio, and a residual
-PERCENT: Mapping[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}
-RMS: Mapping[str, Any] = {"unit": "nm", "format": ".1f"}
 
 
 @dataclass(kw_only=True)
@@ -236,13 +233,7 @@ def run_with_outputs(run: Callable[[Namespace], Report], arguments: Namespace) -
     return report
 
 
-def write_telemetry(
-    report: Report,
-    output: str,
-    telemetry: Telemetry,
-    *,
-    key: str,
-) -> None:
+def write_telemetry(report: Report, output: str, telemetry: Telemetry, *, key: str) -> None:
     """Write telemetry, and note in the report the file and what its format leaves out."""
     from lbt_synth.files import save_telemetry  # which few commands need
     from lbt_synth.files.telemetry.aot import lost_fields

@@ -53,16 +53,11 @@ def run_plot(arguments: Namespace) -> Report:
             f"no loop is stable at {gain:g} times the sensor gain that its design assumes, and "
             "there is nothing to draw; lbt-synth show prints the factors that are stable."
         )
+    names = ("panel", "curve", "heading", "x", "y")
     report.rows = [
-        facts(
-            panel=fact(curve.panel),
-            curve=fact(curve.name),
-            heading=fact(curve.heading),
-            x=fact(x),
-            y=fact(y),
-        )
-        for curve in curves
-        for x, y in zip(curve.x, curve.y.tolist(), strict=True)
+        facts(**dict(zip(names, map(fact, (c.panel, c.name, c.heading, x, y)), strict=True)))
+        for c in curves
+        for x, y in zip(c.x, c.y.tolist(), strict=True)
     ]
     report.data["curves"] = [asdict(curve) for curve in curves]
     return report

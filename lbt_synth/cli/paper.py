@@ -12,7 +12,7 @@ import numpy as np
 
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs, load_shown
-from lbt_synth.cli.output import PERCENT, Report
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import count_progress, track_progress
 from lbt_synth.cli.study import run_in_parts
 from lbt_synth.design import Design, FilterDesign
@@ -24,15 +24,12 @@ from lbt_synth.interop.specula.simulation import EndToEndRun, mix_controller, un
 from lbt_synth.methods.registry import design_label, design_title
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import loop_figure
-from lbt_synth.report.figures.studies import (
-    end_to_end_figure,
-    end_to_end_table_figure,
-    robustness_figure,
-)
+from lbt_synth.report.figures import studies as figures
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
 from lbt_synth.storage.display_unit import nm_text, own_display_unit
 from lbt_synth.storage.input_files import file_sha256
 from lbt_synth.storage.rows import (
+    PERCENT,
     Facts,
     csv_rows,
     fact,
@@ -44,90 +41,79 @@ from lbt_synth.storage.rows import (
 )
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.paper import (
-    DIAMETER_M,
-    TABLE_II,
-    TABLE_III,
-    PaperRow,
-    all_cases,
-    end_to_end_tables,
-    modal_row,
-    paper_filters,
-    parameter_rows,
-    plan_cases,
-    plan_rows,
-    rms_difference,
-    rms_modal_difference,
-    table_entry,
-)
+from lbt_synth.studies import paper as published
 from lbt_synth.studies.robustness import RobustnessRow
 from lbt_synth.validation import integer
-
-_ROWS = 3 * len(TABLE_II) + 2 * len(TABLE_III)  # of both tables and their controllers
 
 
 def run_paper(arguments: Namespace) -> Report:
     """Compute and write the tables and figures of the paper."""
-    choose_unit(arguments, DIAMETER_M)
+    choose_unit(arguments, published.DIAMETER_M)
     folder = make_directory(arguments.output)
-    rows = [
-        (row, modal_row(row)) for row in track_progress(plan_rows(), total=_ROWS, what="tables")
-    ]
+    total = 3 * len(published.TABLE_II) + 2 * len(published.TABLE_III)  # with their controllers
+    plan = track_progress(published.plan_rows(), total=total, what="tables")
+    rows = [(row, published.modal_row(row)) for row in plan]
     tables = {
-        number: [table_entry(*pair) for pair in rows if pair[0].table == number]
+        number: [published.table_entry(*pair) for pair in rows if pair[0].table == number]
         for number in ("II", "III")
     }
     methods = dict.fromkeys(entry.method for entry in tables["III"])
-    columns = {m: rms_difference([e for e in tables["III"] if e.method == m]) for m in methods}
-    filters = paper_filters()
-    with own_display_unit():  # JSON stays in nm
-        parameters = parameter_rows()
-    names = ("name", "value", "origin")
+    columns = {
+        method: published.rms_difference([e for e in tables["III"] if e.method == method])
+        for method in methods
+    }
+    filters = published.paper_filters()
+    with own_display_unit():  # JSON and CSV stay in nm
+        parameters = published.parameter_rows()
     report = Report(
         data={
             **{f"table_{n.lower()}": [json_record(e) for e in tables[n]] for n in tables},
             "table_iii_rms_points": columns,
             "hinf_gamma_ratio": filters[1].gamma_requested / filters[1].gamma_least,
-            "parameters": [dict(zip(names, row, strict=True)) for row in parameters],
+            "parameters": [
+                dict(zip(("name", "value", "origin"), row, strict=True)) for row in parameters
+            ],
         },
         verdict=[
             f"Table III, {design_title(method)}: {points:.2f} points rms from the paper."
             for method, points in columns.items()
         ],
+        tables=[
+            row_table(f"Table {number}: Strehl ratio [%] at 2.2 um", tables[number])
+            for number in ("III", "II")
+        ],
     )
-    for number, entries in reversed(tables.items()):
-        caption = f"Table {number}: Strehl ratio [%] at 2.2 um"
-        report.tables.append(row_table(caption, entries))
-    report.add_table("Parameters", ("parameter", "value", "origin"), parameter_rows())
-    report.note_files(_write_paper(folder, rows, filters))
+    headings = ("parameter", "value", "origin")
+    report.add_table("Parameters", headings, published.parameter_rows())
+    contents = {f"table_{n.lower()}.csv": csv_rows(entries) for n, entries in tables.items()}
+    contents["parameters.csv"] = csv_bytes(headings, parameters)
+    files = [write_atomically(folder / name, content) for name, content in contents.items()]
+    modal = [modal for row, modal in rows if row.table == "III"]
+    report.note_files([*files, *_draw_paper(folder, modal, filters)])
     return report
 
 
-def _write_paper(
-    folder: Path,
-    rows: list[tuple[PaperRow, RobustnessRow]],
-    filters: tuple[FilterDesign, FilterDesign],
+def _draw_paper(
+    folder: Path, rows: list[RobustnessRow], filters: tuple[FilterDesign, FilterDesign]
 ) -> list[Path]:
-    """Write tables, figures and gain files of the comparison."""
-    files = []
-    for table, name in (("II", "table_ii.csv"), ("III", "table_iii.csv")):
-        content = csv_rows([table_entry(*pair) for pair in rows if pair[0].table == table])
-        files.append(write_atomically(folder / name, content))
-    with own_display_unit():  # CSV stays in nm
-        parameters = csv_bytes(("parameter", "value", "origin"), parameter_rows())
-    files.append(write_atomically(folder / "parameters.csv", parameters))
-    published = {
-        name: [(e.error_hz, getattr(e, name)) for e in TABLE_III if e.error_hz is not None]
-        for name in (design.method for design in filters)
+    """Write figures and gain files of the comparison."""
+    points = {
+        design.method: [
+            (entry.error_hz, getattr(entry, design.method))
+            for entry in published.TABLE_III
+            if entry.error_hz is not None
+        ]
+        for design in filters
     }
     labelled = {design_label(design.method): design for design in filters}
-    for name, figure in (
-        ("robustness", robustness_figure([m for row, m in rows if row.table == "III"], published)),
-        ("sigma", loop_figure(labelled, "sigma", unit_weights=True)),
-    ):
-        files += [save_figure(figure, folder / f"{name}{ending}") for ending in (".png", ".pdf")]
-    names = ("paper_kalman.fits", "paper_hinf.fits")
-    return files + [save_gain(folder / n, one) for n, one in zip(names, filters, strict=True)]
+    drawn = {
+        "robustness": figures.robustness_figure(rows, points),
+        "sigma": loop_figure(labelled, "sigma", unit_weights=True),
+    }
+    return [
+        *(save_figure(drawn[n], folder / f"{n}{end}") for n in drawn for end in (".png", ".pdf")),
+        *(save_gain(folder / f"paper_{design.method}.fits", design) for design in filters),
+    ]
 
 
 _LEAST_GAIN = 0.01  # optical gain of tip and tilt; less is what a saturated pyramid shows
@@ -178,7 +164,7 @@ def run_end_to_end(arguments: Namespace) -> Report:
     recorded = _telemetry(loop_run, design, gain)
     report.note_files(
         [
-            save_figure(end_to_end_figure(loop_run), figure_file),
+            save_figure(figures.end_to_end_figure(loop_run), figure_file),
             save_telemetry(telemetry_file, recorded),
         ]
     )
@@ -269,18 +255,18 @@ def _run_tables(arguments: Namespace) -> Report:
         "row_seeds": range(setup.seed, setup.seed + arguments.row_seeds),
         "tables": arguments.tables,
     }
-    total = len(all_cases(plan_cases(setup, designs, **plan)))
+    total = len(published.all_cases(published.plan_cases(setup, designs, **plan)))
     make_directory(folder)
     case_folder = folder / "cases"
     with run_in_parts(arguments, case_folder, total=total, what="runs") as engine:
-        table = end_to_end_tables(setup, case_folder, designs, **plan, **engine)
+        table = published.end_to_end_tables(setup, case_folder, designs, **plan, **engine)
     printed = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
     files = [write_atomically(folder / _TABLE_FILES[n][0], csv_rows(printed[n])) for n in printed]
     if "III" in printed:
-        figure = end_to_end_table_figure(table)
+        figure = figures.end_to_end_table_figure(table)
         files += [save_figure(figure, folder / name) for name in _TABLE_FILES["III"][1:]]
     methods = dict.fromkeys(entry.method for entry in printed.get("III", ()))
-    differences = {method: rms_modal_difference(table, method) for method in methods}
+    differences = {method: published.rms_modal_difference(table, method) for method in methods}
     report = Report(
         data={
             "entries": [json_record(entry) for entry in table],

@@ -41,6 +41,7 @@ if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not
 
 
 _STEPS = 3  # that diagnose and auto count
+_EXAMINES = "diagnose examines"
 
 
 def run_identify(arguments: Namespace) -> Report:
@@ -239,10 +240,11 @@ def run_diagnose(arguments: Namespace) -> Report:
     elif arguments.pdf is not None:
         raise ProblemError("--pdf is the page of -o on paper; give -o, too.")
     designs = {} if arguments.gain is None else load_designs([arguments.gain])
-    both = _series(arguments)
+    both = require_series(load_series(arguments), _EXAMINES)
     choose_unit(arguments, both.diameter_m)
     live = live_axes(both)
-    record = both if len(live) in (0, both.axes) else _series(arguments, live)
+    some = len(live) not in (0, both.axes)
+    record = require_series(load_series(arguments, live), _EXAMINES) if some else both
     with count_progress(total=_STEPS, what="diagnosing") as count:
         diagnosis = identification.diagnose(
             record.bridged(),
@@ -276,12 +278,6 @@ def run_diagnose(arguments: Namespace) -> Report:
         page = diagnosis_page(diagnosis, files)
         report.note_files(write_page(page, arguments.output, pdf=arguments.pdf))
     return report
-
-
-def _series(arguments: Namespace, axes: list[int] | None = None) -> LoopRecord:
-    """Load the record, or some of its axes."""
-    series = load_series(arguments, axes)
-    return require_series(series, "diagnose examines")
 
 
 def read_record(

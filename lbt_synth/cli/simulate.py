@@ -6,38 +6,35 @@ import re
 from argparse import Namespace
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from lbt_synth.cli.arguments import given_options, refuse_options
 from lbt_synth.cli.loop_inputs import load_designs, load_shown, loop_difference_notes
-from lbt_synth.cli.output import PERCENT, RMS, Report, write_telemetry
+from lbt_synth.cli.output import Report, write_telemetry
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
 from lbt_synth.files import telemetry_from_simulation
 from lbt_synth.files.telemetry.store import require_telemetry_name
-from lbt_synth.linear import estimator_form
-from lbt_synth.loop import ClosedLoop, Imaging, residual_budget, simulate, strehl
-from lbt_synth.loop.budget import ResidualBudget, residual_spectrum
-from lbt_synth.loop.simulation import READINGS, Drop, Segment, Simulation, settling_frames
+from lbt_synth.loop import ClosedLoop
+from lbt_synth.loop.budget import residual_spectrum
+from lbt_synth.loop.simulation import READINGS, Drop, Segment, Simulation
 from lbt_synth.models import Truth
 from lbt_synth.report.figures.records import sensor_failure_figure, simulation_figure
 from lbt_synth.storage.array_file import fits_bytes
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.input_files import file_sha256
-from lbt_synth.storage.rows import Facts, fact, facts
+from lbt_synth.storage.rows import Facts
 from lbt_synth.storage.words import count_text
-from lbt_synth.studies.robustness import run_failures
+from lbt_synth.studies.runs import DesignRun, run_design
 
 _TIME = r"(\d+\.?\d*)s?"
 _DROP = re.compile(rf"([^@]+)@{_TIME}(?:\.\.{_TIME})?(?::({'|'.join(READINGS)}))?")
 _SPECTRUM_STEP_HZ = 0.2  # at which MASTSEL 1.5 reads a spectrum for TIPTOP; P3 1.6 takes half of it
 _AFTER_S = 5.0  # that a run lasts beyond the last event, if --frames is not given
-# a line of the table, the runs, the parts between failures of sensors, and what to say
-_Run: TypeAlias = tuple[Facts, Simulation, list[tuple[Segment, Facts]], list[str]]
 
 
 def parse_drop(text: str) -> Drop:
@@ -111,72 +108,24 @@ def tiptop_spectrum(loop: ClosedLoop, truth: Truth) -> bytes:
     return fits_bytes(cards, {}, primary_data=rows)
 
 
-def _run(arguments: Namespace, name: str, design: Design, truth: Truth, config: Config) -> _Run:
+def _run(
+    arguments: Namespace, name: str, design: Design, truth: Truth, config: Config
+) -> DesignRun:
     """Run the loop of a gain file."""
     drops = _parse_drops(arguments, name, design)
-    loop = design.close(config.hardware, sensor_gain=truth.sensor_gain)
     differences = loop_difference_notes(config, design)
+    how: dict[str, Any] = _choose_sizes(arguments, config, drops)
+    how |= {"drops": drops, "stroke": arguments.stroke}
+    how["estimates"] = arguments.form == "estimator"
     try:
-        loop.require_stable()
+        run = run_design(name, design, truth, config, **how)
     except UnstableLoopError as error:
         why = " ".join([str(error), *differences])
-        raise UnstableLoopError(why, spectral_radius=loop.radius_per_frame) from error
-    sizes: dict[str, Any] = _choose_sizes(arguments, config, drops)
-    usual, notes = config.settings.simulation.settle_frames, list[str]()
-    segments: list[tuple[Segment, Facts]] = []
-    if design.other_sensors:
-        simulation, segments = run_failures(design, config, truth, drops, **sizes)
-        notes.append("note: the exact answer is with all sensors.")
-    else:  # the same settling for all controllers, so that one seed is one weather
-        settle = max(usual, settling_frames(loop.radius_per_frame))
-        form = estimator_form(design) if arguments.form == "estimator" else design.controller
-        sizes |= {"settle_frames": settle, "stroke": arguments.stroke}
-        simulation = simulate(form, truth, hardware=config.hardware, **sizes)
-        if settle > usual:
-            notes.append(
-                f"note: this loop settles for {settle} frames, not {usual}; its random series are "
-                "not those of a faster loop with the same seed. Raise simulation.settle_frames."
-            )
-    clipped = None
-    if arguments.stroke is not None:
-        reached = np.any(np.abs(simulation.commands) >= arguments.stroke, axis=2)
-        clipped = float(np.mean(reached))
-        notes.append(
-            f"note: the mirror clipped the commands of {clipped:.2%} of the frames; the exact "
-            "answer has no limit of the stroke."
-        )
-    exact = None if truth.drifts else residual_budget(loop, truth)
-    row = _describe(name, simulation, exact, clipped, config.imaging)
-    return row, simulation, segments, notes + differences
+        raise UnstableLoopError(why, spectral_radius=error.spectral_radius) from error
+    return run._replace(notes=[*(f"note: {note}" for note in run.notes), *differences])
 
 
-def _describe(
-    name: str,
-    simulation: Simulation,
-    exact: ResidualBudget | None,
-    clipped: float | None,
-    imaging: Imaging,
-) -> Facts:
-    """Return the line of a gain file, with the exact answer unless a vibration drifts."""
-    strehls, rms_nm = simulation.strehl(imaging), simulation.rms_nm
-    residual_nm = exact_ratio = None
-    if exact is not None:
-        residual_nm, exact_ratio = exact.rms_nm, strehl(exact, imaging)
-    command_rms = float(np.sqrt(np.sum(np.mean(simulation.commands**2, axis=(0, 1)))))
-    return facts(
-        design=fact(name, "design"),
-        residual_simulated_nm=fact(float(np.sqrt(np.mean(rms_nm**2))), "residual", **RMS),
-        residual_exact_nm=fact(residual_nm, "exact", **RMS),
-        strehl_simulated=fact(float(np.mean(strehls)), "Strehl", **PERCENT),
-        strehl_exact=fact(exact_ratio, "exact", **PERCENT),
-        command_rms=fact(command_rms, "commands", unit="nm", format=".1f"),
-        clipped=fact(clipped),
-        cases_residual_nm=fact(rms_nm.tolist(), unit="nm"),
-        cases_strehl=fact(strehls.tolist()),
-    )
-
-
-def _describe_runs(runs: Sequence[_Run], truth: Truth, config: Config) -> Report:
+def _describe_runs(runs: Sequence[DesignRun], truth: Truth, config: Config) -> Report:
     """Return a line for each gain file, and the parts between failures of a single one."""
     rows, (_, first, segments, _) = [row for row, *_ in runs], runs[0]
     cases, frames = first.residual_nm.shape[:2]

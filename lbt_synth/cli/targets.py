@@ -3,34 +3,28 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from lbt_synth.cli.arguments import given_options, option_name
 from lbt_synth.cli.loop_inputs import choose_unit, load_design
-from lbt_synth.cli.output import PERCENT, Report, say_checks
+from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.cli.telemetry import load_series, record_imaging, require_series
-from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError
 from lbt_synth.files import load_gain
-from lbt_synth.identification import LoopRecord
 from lbt_synth.identification.records.record import require_length
 from lbt_synth.interop import export
 from lbt_synth.interop.c.export import frame_cost
-from lbt_synth.interop.pipeline import rehearse, target_named, target_names
-from lbt_synth.loop import Imaging
-from lbt_synth.loop.disturbances import Disturbance
-from lbt_synth.loop.strehl import series_strehl
+from lbt_synth.interop.pipeline import target_named, target_names
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.report.figures.records import simulation_figure
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.input_files import file_sha256
-from lbt_synth.storage.rows import Facts, fact, facts
+from lbt_synth.storage.rows import fact, facts
 from lbt_synth.storage.words import listing_text
-from lbt_synth.validation import FloatArray
+from lbt_synth.studies.runs import rehearse_record
 
 _OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps")
 _FEWEST = 256  # frames of a record: a loop needs some to settle, and some to compare
@@ -52,9 +46,8 @@ def run_export(arguments: Namespace) -> Report:
     design = load_gain(arguments.gain)
     digest = file_sha256(arguments.gain, GainFileError)
     written = export(output, design, arguments.target, gain_digest=digest, **options)
-    report = Report(
-        data={"gain": arguments.gain, "gain_digest": digest, "target": arguments.target}
-    )
+    report = Report(data={"gain": arguments.gain, "gain_digest": digest})
+    report.data["target"] = arguments.target
     report.verdict.append(
         f"What {arguments.target} computes differs from the controller by {written.error:.2g} of "
         "the largest command."
@@ -85,27 +78,12 @@ def run_rehearse(arguments: Namespace) -> Report:
     record = require_series(load_series(arguments), "a rehearsal runs on").bridged()
     require_length(record, frames=_FEWEST, seconds=0)
     choose_unit(arguments, record.diameter_m)
-    imaging, gains = record_imaging(arguments, record), _assumed_gains(design, record)
-    start, stop = max(record.stretches(), key=lambda pair: pair[1] - pair[0])
-    phase_nm = record.pseudo_open_loop(gains)[start:stop]
-    hardware = replace(record.hardware, sensor_matrix=np.diag(gains))
-    rehearsal = rehearse(
-        design,
-        target,
-        Disturbance(phase_nm=phase_nm, frame_means=True),
-        hardware=hardware,
-        stroke=arguments.stroke,
+    imaging = record_imaging(arguments, record)
+    rehearsal, rows, hardware, frames = rehearse_record(
+        design, record, target, imaging, stroke=arguments.stroke
     )
-    rows = []
-    for name, run in ((f"in {target}", rehearsal.target), ("design", rehearsal.design)):
-        series = run.residual_nm[0], run.image_nm2[0], run.commands[0]
-        rows.append(_describe(name, *series, imaging, rehearsal.clipped_frames(run)))
-    if record.commands is not None:
-        settled = slice(start + rehearsal.settle_frames, stop)
-        residual_nm, commands = record.measurements[settled] / gains, record.commands[settled]
-        rows.append(_describe("what ran", residual_nm, residual_nm**2, commands, imaging, None))
     leaves = [f"{nm_text(row.residual_nm, '.1f')} rms ({row.name})" for row in rows]
-    source = f"{stop - start} frames of {Path(arguments.file).name}"
+    source = f"{frames} frames of {Path(arguments.file).name}"
     report = Report(data={"gain": arguments.gain, "target": target})
     report.verdict = [f"On {source}: {listing_text(leaves)}.", say_checks(rehearsal.checks)]
     title = f"{design.method} in {target}"
@@ -135,43 +113,3 @@ def run_rehearse(arguments: Namespace) -> Report:
     if design.hardware is not None:
         report.notes += [f"note: {text}" for text in loop_differences(design.hardware, hardware)]
     return report
-
-
-def _describe(
-    name: str,
-    residual_nm: FloatArray,
-    squares_nm2: FloatArray,
-    commands: FloatArray,
-    imaging: Imaging,
-    clipped: int | None,
-) -> Facts:
-    """Return the row of one loop on the series, from its residual and squares (frames, axes)."""
-    axes = np.sqrt(np.mean(squares_nm2, axis=0)).tolist()
-    second, ratio = axes[1] if len(axes) == 2 else None, None
-    if len(axes) <= 2:
-        within_nm2 = np.mean(squares_nm2 - residual_nm**2, axis=0)
-        ratio = series_strehl(residual_nm, imaging, within_nm2=within_nm2)
-    rms = {"unit": "nm rms", "format": ".1f"}
-    largest_nm = float(np.max(np.abs(commands)))
-    return facts(
-        name=fact(name, "loop"),
-        first_nm=fact(axes[0], "first axis", **rms),
-        second_nm=fact(second, "second axis", **rms),
-        residual_nm=fact(float(np.linalg.norm(axes)), "residual", **rms),
-        strehl=fact(ratio, "Strehl", **PERCENT),
-        largest_command_nm=fact(largest_nm, "largest command", unit="nm", format=".1f"),
-        clipped_frames=fact(clipped, "clipped frames"),
-    )
-
-
-def _assumed_gains(design: Design, record: LoopRecord) -> FloatArray:
-    """Return the sensor gain of each axis: the stated one, else the one that a design assumes."""
-    sensor = np.eye(record.axes) if design.hardware is None else design.hardware.sensor
-    gains = np.diag(sensor)
-    if sensor.shape != (record.axes, record.axes) or not np.array_equal(sensor, np.diag(gains)):
-        raise ProblemError(
-            f"a rehearsal on a record takes a measurement for each of its {record.axes} axes; the "
-            f"gain file assumes a sensor matrix {sensor.tolist()}. Design for the axes of the "
-            "record."
-        )
-    return record.known_gains(record.stated_gain) if record.stated_gain else gains

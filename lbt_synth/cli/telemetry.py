@@ -46,11 +46,6 @@ def require_series(record: LoopRecord | SpectrumRecord, what: str) -> LoopRecord
     return record
 
 
-def is_read_anew(arguments: Namespace) -> bool:
-    """Return whether the command line says anything about how a record is read."""
-    return any(getattr(arguments, name) not in (None, False, 0) for name in _READING)
-
-
 def load_series(
     arguments: Namespace, axes: Sequence[int] | None = None
 ) -> LoopRecord | SpectrumRecord:
@@ -131,7 +126,8 @@ def run(arguments: Namespace) -> Report:
         named = given_options(arguments, "file", "commands")
         require_writable(output, inputs=list(named.values()))
     notes: list[str] = []
-    if is_telemetry(arguments.file) and not is_read_anew(arguments):
+    anew = any(getattr(arguments, name) not in (None, False, 0) for name in _READING)
+    if is_telemetry(arguments.file) and not anew:
         telemetry = load_telemetry(arguments.file, loop=arguments.loop)
     else:
         record = require_series(load_series(arguments), "telemetry holds")

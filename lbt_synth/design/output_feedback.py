@@ -45,6 +45,7 @@ from lbt_synth.linear.output_feedback.two_riccati import (
 )
 from lbt_synth.validation import integer, number
 
+_certify_loop = partial(certify_error, stability="spectral radius of the closed loop")
 # a controller in the units of the plant as given, and the checks of its loop
 _CheckedLoop: TypeAlias = tuple[StateSpace, Certificate]
 
@@ -447,10 +448,6 @@ def _quietest(scaled: ScaledPlant, equations: TwoRiccati, gamma: float, taps: in
             break
         frequency_hz = np.unique(np.append(frequency_hz, peak.peak_frequency_hz))
     return controller
-
-
-def _certify_loop(loop: StateSpace) -> Certificate:
-    return certify_error(loop, stability="spectral radius of the closed loop")
 
 
 def _checked_loop(scaled: ScaledPlant, controller: StateSpace) -> _CheckedLoop:

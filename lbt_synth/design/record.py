@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design.certificate import Certificate
-from lbt_synth.design.filter_design import Fallback
 from lbt_synth.design.plain import from_plain, to_plain
 from lbt_synth.design.result import Design, SolverReport
 from lbt_synth.linear import Controller, EstimationProblem
@@ -107,10 +106,9 @@ def _pack(name: str, value: Any) -> DesignRecord:
             places = enumerate(value, 1)
             arrays = {f"YOULA{i}_{key}": getattr(one, key) for i, one in places for key in "ABC"}
             return DesignRecord(arrays)
-        case (Fallback(), *_):
-            gains = np.stack([fallback.gains for fallback in value])
-            missing = [list(fallback.missing) for fallback in value]
-            return DesignRecord({name.upper(): gains}, {name: missing})
+        case dict():  # of fall-backs
+            gains = {name.upper(): np.stack([*value.values()])} if value else {}
+            return DesignRecord(gains, {name: list(map(list, value))})
         case _:
             return DesignRecord(meta={name: to_plain(value)})
 
@@ -135,12 +133,11 @@ def _unpack(name: str, kind: str, record: DesignRecord) -> Any:
                 D = np.zeros((len(C), B.shape[1]))
                 parameters.append(Controller(A=A, B=B, C=C, D=D, dt_s=meta["dt_s"]))
             return tuple(parameters)
-        case "tuple[Fallback, ...]":
+        case "Fallbacks":
             gains = arrays[name.upper()] if meta[name] else ()
             if len(gains) != len(meta[name]):
                 raise ValueError(f"{name.upper()} must be {len(meta[name])} filters")
-            pairs = zip(meta[name], gains, strict=True)
-            return tuple(Fallback(missing=tuple(m), gains=frozen_copy(g)) for m, g in pairs)
+            return dict(zip(map(tuple, meta[name]), map(frozen_copy, gains), strict=True))
         case "tuple[float, ...]":
             return tuple(number(value, name, above=0) for value in meta[name])
         case _:

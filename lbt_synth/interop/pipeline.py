@@ -231,14 +231,16 @@ def export(
             status="arithmetic",
         )
     checks = _proved(program, pairs, error)
-    _require_proved(target, precision, checks, error, program.hint)
+    failed = next((check for check in checks if not check.passed), None)
+    if failed is not None or not np.isfinite(error):
+        raise _failure(f"{target} ({precision} precision)", failed, error, program.hint)
     remarks = [program.remark(part.design, held) for part, held in pairs]
     notes = list(dict.fromkeys(filter(None, remarks)))
     if program.contents:
         make_directory(place, parents=False)
     settings |= {"modes": count, "notes": notes, **program.facts(file_numbers, **settings)}
-    settings |= {"precision": precision}
-    kept = {name: settings[name] for name in sorted(settings) if settings[name] is not None}
+    settings["precision"] = precision
+    kept = {name: value for name, value in sorted(settings.items()) if value is not None}
     certificate = _certificate(files, target, checks, gain_digest, kept)
     return Exported(
         files=write_together(dict((*files.items(), *certificate.items()))),
@@ -307,11 +309,7 @@ def _designs_of_modes(
         several = other_gain is not None or (mixed and modal)
         controlled = require_modal(design) if several else len(design.controller.C)
         parts = [ModeDesign(design, tuple(range(controlled)))]
-    count = controlled if modes is None else integer(modes, "modes", at_least=1)
-    if count < controlled:
-        raise ProblemError(
-            f"modes must be at least {controlled}, those of the design; got {count}."
-        )
+    count = controlled if modes is None else integer(modes, "modes", at_least=controlled)
     if other_gain is not None:
         if count == controlled:
             raise ProblemError(
@@ -350,22 +348,14 @@ def _designs_of_mixture(control: MixedController) -> list[ModeDesign]:
     return designs
 
 
-def _require_proved(
-    target: str, precision: str, checks: Sequence[Check], error: float, hint: str
-) -> None:
-    """Refuse what fails in the arithmetic of a target, with its value and what to try instead."""
-    failed = next((check for check in checks if not check.passed), None)
-    if failed is None and np.isfinite(error):
-        return
+def _failure(arithmetic: str, failed: Check | None, error: float, hint: str) -> NumericalError:
+    """Return what fails in the arithmetic of a target, with its value and what to try instead."""
     what, value = f"the commands grow beyond all numbers within {FRAMES} frames", error
     if failed is not None:
         what, value = f"{failed.name} is {failed.value:.6g}, limit {failed.limit:.6g}", failed.value
-    raise NumericalError(
-        f"the loop must keep what its design promises in the arithmetic of {target} ({precision} "
-        f"precision); {what}. {hint}",
-        status="arithmetic",
-        residual=value,
-    )
+    keep = "the loop must keep what its design promises in the arithmetic of"
+    text = f"{keep} {arithmetic}; {what}. {hint}"
+    return NumericalError(text, status="arithmetic", residual=value)
 
 
 def _is_same(one: Any, other: Any) -> bool:
@@ -389,15 +379,13 @@ def _proved(
     checks: list[Check] = []
     controlled = sum(len(part.modes) for part, _ in pairs)
     for part, numbers in pairs:
+        alone = len(part.modes) < controlled
+        modes = f" ({name_modes(np.array(part.modes))})" if alone else ""
         proof = list(prove_written(part.design, program.computed(part.design, numbers)))
         if part.design.other_sensors:
             how = "a run in which each sensor is missing for a while"
-            name = "commands in a rehearsal, difference"
-            proof.append(Check(name, error, LOSS, how))
-        if len(part.modes) < controlled:
-            modes = name_modes(np.array(part.modes))
-            proof = [replace(check, name=f"{check.name} ({modes})") for check in proof]
-        checks += proof
+            proof.append(Check("commands in a rehearsal, difference", error, LOSS, how))
+        checks += (replace(check, name=f"{check.name}{modes}") for check in proof)
     return tuple(checks)
 
 

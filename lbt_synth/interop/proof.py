@@ -145,7 +145,8 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
     """Check stability, residual, modulus margin and demands of a loop over its sensor gains."""
     controller = written.controllers[frozenset()]
     low, high = proved_gains(design, hardware)
-    gains = gains_between(low, high)
+    count = 2 + int(np.log(high / low) / np.log(_STEP))
+    gains = np.append(np.geomspace(low, high, count), 1.0)
     radius = float(np.max(radii_by_gain(hardware, controller)(gains)))
     name = f"spectral radius at sensor gains {low:.4g} to {high:.4g}"
     checks = [Check(name, radius, 1 - STABILITY_MARGIN, f"eigenvalues at {gains.size} gains")]
@@ -159,12 +160,6 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
     after += change(1.0) if change else 0.0
     checks.append(Check("modulus margin, loss", float(after / before) - 1, LOSS, "level sets"))
     return checks + _demand_checks(design, other, change)
-
-
-def gains_between(low: float, high: float) -> FloatArray:
-    """Return sensor gains in steps of 1 %, and a gain of 1."""
-    count = 2 + int(np.log(high / low) / np.log(_STEP))
-    return np.append(np.geomspace(low, high, count), 1.0)
 
 
 def proved_gains(design: Design, hardware: LoopHardware) -> tuple[float, float]:
@@ -197,7 +192,10 @@ def _residual_check(design: Design, hardware: LoopHardware, written: Written, ga
     before = mode_variances(design, loops[0], slice(n))
     change, how = written.residual_change_nm, "Lyapunov equations, level sets"
     how += ", and what is left out" if change else ""
-    outputs = mode_variances(design, _with_signals(loops[1], written.signals), slice(None))
+    system, rows = loops[1].system, np.eye(written.signals, loops[1].system.n_states)
+    D = np.vstack([system.D, np.zeros((len(rows), system.D.shape[1]))])
+    seen = replace(loops[1], system=replace(system, C=np.vstack([system.C, rows]), D=D))
+    outputs = mode_variances(design, seen, slice(None))
     sizes, after = np.sqrt(np.abs(outputs)), outputs[:n]  # below zero is the size of its rounding
     rounding_nm2 = np.zeros(n)
     if written.variance is not None and written.entry is not None:
@@ -210,13 +208,6 @@ def _residual_check(design: Design, hardware: LoopHardware, written: Written, ga
     if written.variance is not None:
         how += f"; rounding at most {share:.1e} of it"
     return Check(f"residual at sensor gain {gain:g}, loss", loss, LOSS, how)
-
-
-def _with_signals(loop: ClosedLoop, count: int) -> ClosedLoop:
-    """Append the first states of a loop, which are the controller's, to its outputs."""
-    s = loop.system
-    C, D = np.eye(count, s.n_states), np.zeros((count, s.D.shape[1]))
-    return replace(loop, system=replace(s, C=np.vstack([s.C, C]), D=np.vstack([s.D, D])))
 
 
 def mode_variances(design: Design, loop: ClosedLoop, rows: slice) -> FloatArray:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from lbt_synth.design.loop_shaping import ShapedDesign
     from lbt_synth.design.shaping import VibrationBand
     from lbt_synth.design.shaping.demands import Demand
-    from lbt_synth.models import Spectrum, TipTiltPlant, Vibration
+    from lbt_synth.models import Spectrum, TipTiltPlant
 
 Axis: TypeAlias = Literal["tip", "tilt", "both"]
 _KEY = "design.robust"
@@ -150,8 +150,14 @@ def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
         arguments["sensor_gain"] = (low / assumed, high / assumed)
     if section.scenarios is not None:
         arguments["scenarios"] = tuple(gain / assumed for gain in section.scenarios)
+    spectrum = None if section.turbulence == "model" else inputs.atmosphere
+    if section.turbulence == "frozen_flow" and spectrum is None:
+        raise ConfigError(
+            f"the key atmosphere is missing: {_KEY}.turbulence: frozen_flow is its spectrum. Give "
+            f"it, or {_KEY}.turbulence: model.",
+            path="atmosphere",
+        )
     with name_key(_KEY):
-        spectrum = _choose_spectrum(inputs, section)
         return robust(
             inputs.plant.own_sensor_alone(),
             bands=_build_bands(inputs, section),
@@ -159,19 +165,6 @@ def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
             demands=_list_demands(inputs, section, spectrum),
             **arguments,
         )
-
-
-def _choose_spectrum(inputs: DesignInputs, section: RobustSection) -> Spectrum | None:
-    """Return the spectrum of the turbulence, None for that of the model."""
-    if section.turbulence == "model" or (section.turbulence is None and inputs.atmosphere is None):
-        return None
-    if inputs.atmosphere is None:
-        raise ConfigError(
-            f"the key atmosphere is missing: {_KEY}.turbulence: frozen_flow is its spectrum. Give "
-            f"it, or {_KEY}.turbulence: model.",
-            path="atmosphere",
-        )
-    return inputs.atmosphere
 
 
 def _build_bands(inputs: DesignInputs, section: RobustSection) -> list[list[VibrationBand]]:
@@ -255,7 +248,10 @@ def _plant_section(plant: TipTiltPlant) -> RobustSection:
     for line in sorted(lines[:_MOST_BANDS], key=lambda line: line.frequency_hz):
         half = max(_BAND * line.frequency_hz, line.damping * line.frequency_hz)
         low, high = max(line.frequency_hz - half, 0.0), min(line.frequency_hz + half, nyquist_hz)
-        axis, rms_nm, damping = _axis(line), line.rms_nm, line.damping
+        axes = line.direction if len(line.direction) == 2 else (1.0, 1.0)
+        shaken = [name for name, mode in _AXES.items() if axes[mode]]
+        axis: Axis = shaken[0] if len(shaken) == 1 else "both"
+        rms_nm, damping = line.rms_nm, line.damping
         last = bands[-1] if bands else None
         if last is not None and low <= last.high_hz:
             bands.pop()
@@ -269,14 +265,6 @@ def _plant_section(plant: TipTiltPlant) -> RobustSection:
     if not bands:
         raise ProblemError("a robust controller is for vibrations; the plant has none.")
     return RobustSection(bands=bands, functions=_PLANT_FUNCTIONS, states=None)
-
-
-def _axis(line: Vibration) -> Axis:
-    """Return the axis that a line of two axes shakes."""
-    if len(line.direction) != 2:
-        return "both"
-    shaken = [name for name, mode in _AXES.items() if line.direction[mode]]
-    return shaken[0] if len(shaken) == 1 else "both"
 
 
 ROBUST = Method(

@@ -38,7 +38,7 @@ from lbt_synth.storage.rows import Facts, columns, fact, facts, row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import robustness_map
-from lbt_synth.studies.limits import LimitRow, LimitStudy, compare_in_truth, say_residual
+from lbt_synth.studies.limits import LimitStudy, compare_in_truth, say_residual
 from lbt_synth.studies.robustness import RobustnessMap
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
@@ -49,7 +49,7 @@ class DesignAssessment:
 
     design: Design
     loop: ClosedLoop  # with the real sensor gain
-    limits: LimitRow  # name, residual, Strehl ratio, and how far they are from the limits
+    limits: Facts  # name, residual, Strehl ratio, and how far they are from the limits
     # None where the loop is unstable: the exact residual, and, None for several sensors, too, the
     # margins at the real sensor gain
     budget: ResidualBudget | None
@@ -66,7 +66,7 @@ class DesignAssessment:
     @property
     def name(self) -> str:
         """Its name in the report."""
-        return self.limits.design
+        return str(self.limits.design)
 
     @property
     def stable(self) -> bool:
@@ -85,7 +85,7 @@ class DesignAssessment:
 
 
 def assess_design(
-    design: Design, limits: LimitRow, config: Config, errors_hz: FloatArray
+    design: Design, limits: Facts, config: Config, errors_hz: FloatArray
 ) -> DesignAssessment:
     """Assess a design in the loop of a configuration, over frequency errors (e,)."""
     hardware, truth = config.hardware, config.truth

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, BinaryIO
@@ -149,6 +150,54 @@ def read_numpy(content: bytes) -> dict[str, npt.NDArray[Any]]:
             return {name: np.asarray(arrays[name]) for name in arrays.files}
     except Exception as error:  # zip, zlib and NumPy each raise their own kinds
         raise ValueError(f"its NumPy arrays are broken: {error_reason(error)}") from error
+
+
+def read_matlab(content: bytes) -> dict[str, Any]:
+    """Read the variables of MATLAB before version 7.3, which is HDF5; structures are mappings."""
+    from scipy.io import loadmat
+
+    stream: Any = io.BytesIO(content)  # which its types do not know
+    return dict(loadmat(stream, simplify_cells=True))
+
+
+def read_idl(content: bytes) -> dict[str, Any]:
+    """Read the variables of IDL, whose first axis is the last one here."""
+    from scipy.io import readsav
+
+    with tempfile.NamedTemporaryFile(suffix=".sav") as file, ignore_warnings():
+        file.write(content)
+        file.flush()
+        return dict(readsav(file.name, python_dict=True))
+
+
+def is_hdf5(content: bytes) -> bool:
+    """Whether content begins as HDF5 does, or behind a block of 512 bytes, as of MATLAB 7.3."""
+    return b"\x89HDF\r\n\x1a\n" in content[:1024]
+
+
+def read_hdf5(content: bytes) -> dict[str, Any]:
+    """Read data sets by their paths, empty if in another file, and attributes behind ``@``."""
+    try:
+        import h5py
+    except ImportError as error:
+        raise ValueError('it needs h5py: pip install "lbt-synth[hdf5]"') from error
+    out: dict[str, Any] = {}
+
+    def add(path: str, item: Any) -> None:
+        for key, value in item.attrs.items():
+            out[f"{path}@{key}"] = value.decode() if isinstance(value, bytes) else value
+        if not isinstance(item, h5py.Dataset) or path[0] == "#":  # of MATLAB's cells
+            return
+        is_elsewhere, kind = item.external or item.is_virtual, item.attrs.get("MATLAB_class")
+        series = np.empty(0) if is_elsewhere else item[()]
+        if kind is not None:  # its columns come first
+            series = series.T if kind != b"char" else "".join(map(chr, np.ravel(series)))
+        out[path] = series
+
+    with h5py.File(io.BytesIO(content)) as file:
+        add("", file)
+        file.visititems(add)  # which follows no links
+    return out
 
 
 def _require_small(archive: ZipFile) -> None:

@@ -16,6 +16,8 @@ from lbt_synth.storage.display_unit import shown_format, shown_unit
 from lbt_synth.storage.tables import Table, csv_bytes
 
 Row = TypeVar("Row")
+NM: Mapping[str, Any] = {"unit": "nm", "format": ".1f"}  # how a residual is printed
+PERCENT: Mapping[str, Any] = {"unit": "%", "scale": 100, "format": ".2f"}  # and a Strehl ratio
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,12 +69,12 @@ def column(
 
 def nm_column(heading: str, **printing: Any) -> Any:
     """Return a column of nanometres, with one decimal."""
-    return column(heading, **{"unit": "nm", "format": ".1f", **printing})
+    return column(heading, **{**NM, **printing})
 
 
 def percent_column(heading: str, **printing: Any) -> Any:
     """Return a column of ratios that tables show in percent, with two decimals."""
-    return column(heading, **{"unit": "%", "scale": 100, "format": ".2f", **printing})
+    return column(heading, **{**PERCENT, **printing})
 
 
 @dataclass_transform(

@@ -1,11 +1,11 @@
-"""What designs do where the loop is another: moved lines, gains, failing sensors, a mirror."""
+"""What designs do where the loop is another: moved lines, gains, delays, a mirror, many modes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,23 +13,34 @@ from numpy.typing import ArrayLike
 from lbt_synth.config import Config
 from lbt_synth.design import Design, FilterDesign, hinf, integrator, kalman, lqg, mixed
 from lbt_synth.design.mixed import central_filter, require_taps
+from lbt_synth.design.modal import modal_filters, modal_gains
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.controller import as_controller
-from lbt_synth.loop import Imaging, close_loop, loop_margins, residual_budget, simulate
+from lbt_synth.loop import Imaging, close_loop, loop_margins
 from lbt_synth.loop.budget import ensemble_residuals
 from lbt_synth.loop.closed_loop import require_matching_controller
 from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
 from lbt_synth.loop.evaluator import textbook_matrices
-from lbt_synth.loop.simulation import Drop, Segment, Simulation, run_segments
 from lbt_synth.methods.registry import MIXED, record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
-from lbt_synth.models import LoopHardware, SinusoidalVibration, TipTiltPlant, Truth, Vibration
+from lbt_synth.models import (
+    LoopHardware,
+    SinusoidalVibration,
+    TipTiltPlant,
+    Truth,
+    Vibration,
+    modal_turbulence,
+    pyramid_modal_noise_nm,
+)
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.plant.tip_tilt import retuned_plant
+from lbt_synth.models.turbulence.ar_models import noll_orders
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import (
+    NM,
+    PERCENT,
     Facts,
     column,
     fact,
@@ -51,7 +62,6 @@ from lbt_synth.validation import (
     require_instance,
 )
 
-_Loop: TypeAlias = tuple[Design, LoopHardware, Truth, Imaging]
 FAMILIES = (MIXED.name, "central")
 _CROWDING = 1.5  # above 1, points are denser near the least norm
 
@@ -173,7 +183,6 @@ class RobustnessMap:
 
     def worst_points(self, name: str, gain: int) -> Iterator[Facts]:
         """Yield the worst frequency error for each delay error at one of the sensor gains."""
-        percent = {"unit": "%", "scale": 100, "format": ".2f"}
         for i, delay in enumerate(self.delay_errors_frames):
             stable, strehls = bool(self.stable[i, gain]), self.strehl[i, gain]
             worst = int(np.argmin(strehls)) if stable else 0
@@ -183,8 +192,8 @@ class RobustnessMap:
                 file=fact(name, "file"),
                 delay_error=fact(delay, "delay error", unit="frames", format="+g"),
                 stable=fact(stable, "stable"),
-                centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **percent),
-                worst=fact(strehls[worst], "worst Strehl", **percent),
+                centre=fact(centre[0] if centre.size else np.nan, "Strehl at 0 Hz", **PERCENT),
+                worst=fact(strehls[worst], "worst Strehl", **PERCENT),
                 worst_hz=fact(at_hz, "at", unit="Hz", format="+.2f"),
             )
 
@@ -324,66 +333,6 @@ def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
     return read_only(np.array([number(value, name, **bounds) for value in axis]))
 
 
-def run_failures(
-    design: Design,
-    config: Config,
-    truth: Truth,
-    drops: Sequence[Drop],
-    *,
-    frames: int,
-    cases: int,
-    seed: int,
-) -> tuple[Simulation, list[tuple[Segment, Facts]]]:
-    """Run the loop of a configuration in which sensors fail, none after the end of the run.
-
-    Between failures and returns there is a segment, with a row that has its exact residual, too:
-    nan where the loop is unstable, a reading is frozen, or a vibration drifts.
-    """
-    rate = config.hardware.frame_rate_hz
-    hardware = replace(config.hardware, suite=require_hardware(design, "a run").suite)
-    simulation = simulate(
-        design,
-        truth,
-        hardware=hardware,
-        frames=frames,
-        cases=cases,
-        seed=seed,
-        settle_frames=config.settings.simulation.settle_frames,
-        drops=drops,
-    )
-    segments = run_segments(drops, frames / rate)
-    loop = design, hardware, truth, config.imaging
-    return simulation, [(segment, _segment_row(loop, simulation, segment)) for segment in segments]
-
-
-def _segment_row(loop: _Loop, simulation: Simulation, segment: Segment) -> Facts:
-    """Return what a loop leaves while some sensors fail, in a run and exactly."""
-    design, hardware, truth, imaging = loop
-    closed = close_loop(
-        hardware,
-        design.controllers[frozenset(segment.missing)],
-        sensor_gain=truth.sensor_gain,
-        blind=(*segment.missing, *segment.wrong),
-    )
-    # a frozen reading adds an offset of its own
-    exact = closed.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
-    rate = hardware.frame_rate_hz
-    first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
-    run = simulation.part(first, last)
-    exact_nm = residual_budget(closed, truth).rms_nm if exact else np.nan
-    ratio = float(np.mean(run.strehl(imaging))) if closed.is_stable else np.nan
-    rms, second = {"unit": "nm rms", "format": ".2f"}, {"unit": "s", "format": "g"}
-    return facts(
-        start_s=fact(segment.start_s, "from", **second),
-        end_s=fact(segment.end_s, "to", **second),
-        sensors=fact(segment.text or "none", "sensors that fail"),
-        residual_nm=fact(float(np.sqrt(np.mean(run.rms_nm**2))), "simulated", **rms),
-        exact_nm=fact(exact_nm, "exact, once settled", **rms),
-        strehl=fact(ratio, "Strehl", unit="%", scale=100, format=".2f"),
-        stable=fact(closed.is_stable, "stable"),
-    )
-
-
 def mirror_rows(
     plant: TipTiltPlant,
     truth: Truth,
@@ -415,7 +364,7 @@ def mirror_rows(
             design=fact(name, "design"),
             stable=fact(closed.is_stable),
             residual_nm=fact(numbers["residual_nm"], "residual", **rms),
-            strehl=fact(numbers["strehl"], "Strehl", unit="%", scale=100, format=".2f"),
+            strehl=fact(numbers["strehl"], "Strehl", **PERCENT),
         )
         rows.append(row)
     return tuple(rows)
@@ -499,3 +448,74 @@ def tradeoff(
                 modulus=fact(margins.modulus, "modulus margin", format=".3f"),
                 design=fact(design),
             )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModalStudy:
+    """What controllers leave of the turbulence in each of n modes."""
+
+    turbulence_nm: FloatArray  # (n,): what comes in [nm rms]
+    noise_nm: FloatArray  # (n,): per frame [nm]
+    gains: FloatArray  # (n,): of the integrators
+    residual_nm: Mapping[str, FloatArray]  # of integrators and of filters, (n,) [nm rms]
+
+    def by_radial_order(self) -> list[Facts]:
+        """Return a row for each radial order: root sums of squares over its modes."""
+        radial, _ = noll_orders(self.noise_nm.size)
+        rows = []
+        for order in np.unique(radial):
+            which = radial == order
+            turbulence_nm, optimised_nm, kalman_nm = (
+                float(np.linalg.norm(series[which]))
+                for series in (self.turbulence_nm, *self.residual_nm.values())
+            )
+            noise_nm = float(self.noise_nm[which][0])
+            rows.append(
+                facts(
+                    radial_order=fact(int(order), "radial order"),
+                    modes=fact(int(which.sum()), "modes"),
+                    turbulence_nm=fact(turbulence_nm, "turbulence", **NM),
+                    noise_nm=fact(noise_nm, "noise per mode", unit="nm", format=".2f"),
+                    gain=fact(float(self.gains[which].mean()), "mean gain", format=".3f"),
+                    optimised_nm=fact(optimised_nm, "optimised gains", **NM),
+                    kalman_nm=fact(kalman_nm, "Kalman", **NM),
+                )
+            )
+        return rows
+
+
+def compare_modes(config: Config, modes: int) -> ModalStudy:
+    """Compare integrators of the best gains with Kalman filters, for the first modes of a loop."""
+    hardware, sensor_gain = config.hardware, config.settings.model.sensor_gain
+    if config.atmosphere is None:
+        reason = "the turbulence of hundreds of modes is computed from it"
+        config.refuse_key("atmosphere", f"is missing: {reason}")
+    rate_hz = hardware.frame_rate_hz
+    air = modal_turbulence(config.atmosphere, modes=modes, frame_rate_hz=rate_hz)
+    for key, value in (("sensor.noise_nm", config.noise_nm), ("model.sensor_gain", sensor_gain)):
+        if np.ndim(value):
+            config.refuse_key(key, "must be one number for hundreds of modes; got one per axis")
+    pyramid, noise_nm = config.settings.sensor.pyramid, np.full(modes, float(config.noise_nm))
+    if pyramid is not None:
+        modulation = pyramid.modulation_lambda_over_d
+        noise_nm = pyramid_modal_noise_nm(
+            float(config.noise_nm), modes=modes, modulation_lambda_over_d=modulation
+        )
+    lines = dict[int, list[Vibration]]()
+    for line in config.plant.vibrations:  # each axis by itself
+        for axis, share in enumerate(line.direction):
+            if abs(share) > 1e-9:  # more than rounding
+                tilted = replace(line, rms_nm=abs(share) * line.rms_nm, direction=(1.0,))
+                lines.setdefault(axis, []).append(tilted)
+    loop: dict[str, Any] = {"hardware": hardware, "noise_nm": noise_nm, "vibrations": lines}
+    loop["sensor_gain"] = config.sensor_gain
+    gains = modal_gains(air, **loop)
+    return ModalStudy(
+        turbulence_nm=air.rms_nm,
+        noise_nm=noise_nm,
+        gains=gains.gains,
+        residual_nm={
+            "integrators, optimised gains": gains.rms_nm,
+            "Kalman filters": modal_filters(air, **loop).rms_nm,
+        },
+    )

@@ -1,6 +1,7 @@
 """The commands compare, limits, tradeoff, mirror, robustness and modal."""
 
 import csv
+import importlib
 import json
 import re
 from types import SimpleNamespace
@@ -225,7 +226,8 @@ def test_modal_knows_the_local_loop(tmp_path, capsys, monkeypatch):
     """Gains and filters of a slow mirror are those of loops with that mirror."""
     calls = []
     gains = lambda _, **loop: calls.append(loop) or some  # noqa: E731
-    monkeypatch.setattr("lbt_synth.studies.limits.modal_gains", gains)
+    module = importlib.import_module("lbt_synth.studies.robustness")
+    monkeypatch.setattr(module, "modal_gains", gains)
     config, line = lbt.load_config(SLOW_YAML), lbt.load_config(SLOW_YAML).plant.vibrations[0]
     assert config.hardware.mirror is not None
     air = lbt.models.modal_turbulence(config.atmosphere, modes=2, frame_rate_hz=800)

@@ -32,7 +32,7 @@ def written(tmp_path_factory):
     drawn, said, folder = [], io.StringIO(), tmp_path_factory.mktemp("paper")
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(said):
         draw = lambda *rows: drawn.append(robustness_figure(*rows)) or drawn[-1]  # noqa: E731
-        patch.setattr(paper, "robustness_figure", draw)
+        patch.setattr(paper.figures, "robustness_figure", draw)
         assert main(["paper", "-o", str(folder), "--unit", "mas", "--verbose"]) == 0
     return folder, said.getvalue(), drawn[0]
 

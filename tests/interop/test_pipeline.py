@@ -13,6 +13,7 @@ from scipy.io import loadmat
 from support.compiled import Compiled
 from support.exports import relative
 from support.recorded_runs import recorded_run
+from support.refusals import require_refusals
 from support.sensor_loops import SLOW, example_plant
 
 import lbt_synth as lbt
@@ -261,34 +262,47 @@ def test_no_target_writes_one_of_ten_thousand(tmp_path, chunk):
     assert all(written_stable(tmp_path, seeds).values())
 
 
-@pytest.mark.parametrize("file", FILES)
-def test_what_no_format_takes(tmp_path, designs, file):
-    target = tmp_path / file
-
-    def export(path, design, **options):
-        return lbt.interop.export(path, design, FILES[file], **options)
-
-    with pytest.raises(lbt.errors.ProblemError, match="expected a Design; got int"):
-        export(target, 3)
+def test_what_is_no_export_is_refused(tmp_path, designs, slow):
+    """Whatever the target, an option of another one, and what makes no matrix or no rehearsal."""
     failed = lbt.design.Check(name="rms", value=2.0, limit=1.0, computed_by="guess")
-    with pytest.raises(lbt.errors.CertificateError, match="this one failed: rms") as caught:
-        export(
-            target,
-            replace(
-                designs["integrator"],
-                certificate=lbt.design.Certificate(
-                    checks=(failed,), gamma=np.nan, rms_per_output=np.zeros(0)
-                ),
-            ),
+    certificate = lbt.design.Certificate(checks=(failed,), gamma=np.nan, rms_per_output=np.zeros(0))
+    bad = replace(slow, certificate=certificate)
+
+    def write(file, design=slow, target=None, **options):
+        target = target or FILES.get(file, "dao")
+        return lambda: lbt.interop.export(tmp_path / file, design, target, **options)
+
+    problem, output = lbt.errors.ProblemError, lbt.errors.OutputError
+    rows = [
+        row
+        for file in FILES
+        for row in (
+            (write(file, 3), problem, "expected a Design; got int"),
+            (write(file, bad), lbt.errors.CertificateError, "this one failed: rms"),
+            (write(f"nowhere/{file}", target=FILES[file]), output, "cannot write"),
+            (write(f"{file}x", target=FILES[file]), output, "must end in"),
         )
-    assert caught.value.failed == ("rms",)
-    for digest in ("AB" * 32, "ab" * 32 + "\n"):
-        with pytest.raises(lbt.errors.ProblemError, match="64 hexadecimal digits"):
-            export(target, designs["integrator"], gain_digest=digest)
-    with pytest.raises(lbt.errors.OutputError, match="must end in"):
-        export(tmp_path / "k.txt", designs["integrator"])
-    with pytest.raises(lbt.errors.OutputError, match="cannot write"):
-        export(tmp_path / "nowhere" / file, designs["integrator"])
+    ]
+    digit = "64 hexadecimal digits"
+    rows += [
+        (write("k.c", gain_digest=sha), problem, digit) for sha in ("AB" * 32, "ab" * 32 + "\n")
+    ]
+    for target, option in (("dao", "form"), ("matlab", "modes"), ("c", "steps")):
+        words = f"{option} is no option of target"
+        rows.append((write("k", target=target, **{option: 3}), problem, words))
+    wild = MixedController(filter=designs["kalman"], gains=[0.0, 0.0, 1.5])
+    bare = MixedController(filter=designs["kalman"].controller, gains=[0.0, 0.0, 0.5])
+    alone, any_error = MixedController(gains=[0.5]), lbt.errors.LbtSynthError
+    rows += [
+        (write("k", target="fpga"), problem, "target must be one of c, cacao"),
+        (write("k.npy", MixedController(gains=[0.5, 0.3])), any_error, "got NoneType"),
+        (write("k.npy", wild), any_error, "gain|stable"),
+        (write("k.npy", bare), any_error, "must be a certified design"),
+        (write("k.npy", other_gain=0.3), any_error, "other_gain needs modes, the number"),
+        (write("k.npy", other_gain=-0.3, modes=3), any_error, "above 0"),
+        (write("k.npy", alone, other_gain=0.3), any_error, "other_gain goes with a design"),
+    ]
+    require_refusals(rows)
     assert not list(tmp_path.iterdir())
 
 
@@ -336,15 +350,6 @@ def test_a_sensor_gain_of_each_axis_is_in_the_numbers(tmp_path, designs, name):
             for run in (written.start(np.inf), design.controller.start())
         ]
         assert np.std(runs[0] - runs[1]) < 1e-2 * np.std(runs[1])
-
-
-def test_an_option_goes_with_its_target(tmp_path, designs):
-    for target, option in (("dao", "form"), ("matlab", "modes"), ("c", "steps")):
-        with pytest.raises(lbt.errors.ProblemError, match=f"{option} is no option of target"):
-            lbt.interop.export(tmp_path / "k", designs["integrator"], target, **{option: 3})
-    with pytest.raises(lbt.errors.ProblemError, match="target must be one of c, cacao"):
-        lbt.interop.export(tmp_path / "k", designs["integrator"], "fpga")
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", target_names())
@@ -452,12 +457,17 @@ def test_a_loop_that_the_target_makes_unstable_is_named(tmp_path, slow, monkeypa
 def test_what_cannot_be_rehearsed_is_refused(slow):
     several = lbt.kalman(example_plant((SLOW,)))
     series, strong = (Disturbance(phase_nm=PHASE, sensor_gain=gain) for gain in (1.0, 4.0))
-    for given, error, words in (
-        ((slow, "dao", strong), lbt.errors.UnstableLoopError, None),
-        ((several, "c", series), lbt.errors.ProblemError, "got one of several sensors"),
-    ):
-        with pytest.raises(error, match=words):
-            rehearse(*given, hardware=PATH)
+
+    def run(*given):
+        return lambda: rehearse(*given, hardware=PATH)
+
+    words = "got one of several sensors"
+    require_refusals(
+        [
+            (run(slow, "dao", strong), lbt.errors.UnstableLoopError, None),
+            (run(several, "c", series), lbt.errors.ProblemError, words),
+        ]
+    )
 
 
 AIR = lbt.models.ARModel(coefficients=[0.98], driving_rms_nm=20.0, frame_rate_hz=800)
@@ -597,19 +607,3 @@ def test_pyrtc_gets_the_gain_of_all_others_and_its_proof(tmp_path, designs):
     with pytest.raises(lbt.errors.ProblemError, match="one design, for the first modes"):
         lbt.interop.export(tmp_path / "no", control, "pyrtc")
     assert not (tmp_path / "no").exists()
-
-
-def test_what_makes_no_matrix_is_refused(tmp_path, designs):
-    def refused(control, match, **options):
-        with pytest.raises(lbt.errors.LbtSynthError, match=match):
-            lbt.interop.export(tmp_path / "k.npy", control, "dao", **options)
-
-    refused(MixedController(gains=[0.5, 0.3]), "got NoneType")
-    wild = MixedController(filter=designs["kalman"], gains=[0.0, 0.0, 1.5])
-    refused(wild, "gain|stable")
-    bare = MixedController(filter=designs["kalman"].controller, gains=[0.0, 0.0, 0.5])
-    refused(bare, "must be a certified design")
-    refused(designs["kalman"], "other_gain needs modes, the number", other_gain=0.3)
-    refused(designs["kalman"], "above 0", other_gain=-0.3, modes=3)
-    refused(MixedController(gains=[0.5]), "other_gain goes with a design", other_gain=0.3)
-    assert not list(tmp_path.iterdir())

@@ -43,15 +43,12 @@ def lbt_config():
 def lbt_designs():
     config = lbt_config()
 
-    def prior(lines):
-        return lbt.kalman(lbt.models.spread_plant(config.plant, half_width_hz=3.5, lines=lines))
-
+    spread = lbt.models.spread_plant(config.plant, half_width_hz=3.5, lines=3)
     return {
         "kalman": lbt.kalman(config.plant),
         "hinf": lbt.hinf(config.plant, gamma_ratio=1.2),
         "integrator": lbt.integrator(config.hardware, truth=config.truth),
-        "prior": prior(15),
-        "turned": turn_states(prior(3)),
+        "turned": turn_states(lbt.kalman(spread)),
     }
 
 

@@ -6,10 +6,8 @@ Names of structures and groups stand before those of their arrays, as in ``rec.y
 
 from __future__ import annotations
 
-import io
 import re
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import groupby
@@ -27,15 +25,13 @@ from lbt_synth.identification.records.columns import (
     parse_column,
     recognise_fact,
 )
-from lbt_synth.storage.array_file import error_reason, open_fits, read_numpy
+from lbt_synth.storage import array_file
 from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.storage.warning_filters import ignore_warnings
 from lbt_synth.validation import choice, integer, sequence
 
 FITS = (".fits", ".fit", ".fts")
 _DELIMITERS = (";", "\t", ",", "|")  # else blanks
-_HDF5 = b"\x89HDF\r\n\x1a\n"  # behind a block of 512 bytes in files of MATLAB 7.3
 # the roles that make a record: of a closed loop, of an open one, of a spectrum
 _KINDS = (("measurements", "commands"), ("open_loop",), ("density", "frequency"))
 CLOCKS = ("frame_numbers", "times")
@@ -112,7 +108,7 @@ def read_contents(path: Path) -> Contents:
             raise
         except Exception as error:  # foreign bytes: the decoders raise whatever they like
             raise TelemetryError(
-                f"cannot read {path} as {ending}: {error_reason(error)}.", path=path
+                f"cannot read {path} as {ending}: {array_file.error_reason(error)}.", path=path
             ) from error
     return out
 
@@ -131,16 +127,15 @@ def _add_named(
     out: Contents, name: str, value: Any, *, group: str = "", unit: str | None = None
 ) -> None:
     """Add an array, all that is in a structure, or a single number or text that is a fact."""
+    if isinstance(value, np.ndarray) and value.dtype.names:
+        value = {key: value[key] for key in value.dtype.names}
     if isinstance(value, Mapping):
         for key, member in value.items():
             if not key.startswith("__"):  # as MATLAB's own names do
                 _add_named(out, key, member, group=f"{group}{name}." if name else group)
         return
     array, fact = np.asarray([] if isinstance(value, list) else value), recognise_fact(name)
-    if array.dtype.names:
-        fields = {key: array[key] for key in array.dtype.names}
-        _add_named(out, name, fields, group=group)
-    elif array.size == 1 and isinstance(item := array.item(), np.ndarray):  # as IDL nests them
+    if array.size == 1 and isinstance(item := array.item(), np.ndarray):  # as IDL nests them
         _add_named(out, name, item, group=group)
     elif array.size == 1 and fact is not None:
         out.add_fact(fact, item.decode() if isinstance(item, bytes) else item, f"{group}{name}")
@@ -151,59 +146,26 @@ def _add_named(
 
 
 def _read_matlab(out: Contents, content: bytes) -> None:
-    """Add the variables of MATLAB; files of version 7.3 are HDF5."""
-    from scipy.io import loadmat
-
-    if _HDF5 in content[:1024]:
+    if array_file.is_hdf5(content):
         _read_hdf5(out, content)
     else:
-        stream: Any = io.BytesIO(content)  # which its types do not know
-        _add_named(out, "", loadmat(stream, simplify_cells=True))
-
-
-def _read_idl(out: Contents, content: bytes) -> None:
-    """Add the variables of IDL, whose first axis is the last one here."""
-    from scipy.io import readsav
-
-    with tempfile.NamedTemporaryFile(suffix=".sav") as file, ignore_warnings():
-        file.write(content)
-        file.flush()
-        _add_named(out, "", readsav(file.name, python_dict=True))
+        _add_named(out, "", array_file.read_matlab(content))
 
 
 def _read_hdf5(out: Contents, content: bytes) -> None:
-    """Add the data sets and attributes of HDF5; what is in other files is not opened."""
-    try:
-        import h5py
-    except ImportError as error:
-        raise TelemetryError('it needs h5py: pip install "lbt-synth[hdf5]".') from error
-
-    def add(path: str, item: Any) -> None:
-        unit, (group, slash, name) = None, path.rpartition("/")
-        for key, value in item.attrs.items():
-            if (fact := recognise_fact(key)) == "unit":
-                unit = str(value)
-            elif fact is not None:
-                _add_named(out, key, value, group=path and f"{path}@")
-        if not isinstance(item, h5py.Dataset) or path[0] == "#":  # of MATLAB's cells
-            return
-        if item.external or item.is_virtual:
-            out.notes.append(f"{path} is in another file; it was left out")
-            return
-        series, kind = item[()], item.attrs.get("MATLAB_class")
-        if kind is not None:  # its columns come first
-            series = series.T if kind != b"char" else "".join(map(chr, np.ravel(series)))
-        _add_named(out, name, series, group=group + slash, unit=unit)
-
-    with h5py.File(io.BytesIO(content)) as file:
-        add("", file)
-        file.visititems(add)  # which follows no links
+    """Add data sets, and attributes that are facts."""
+    values = array_file.read_hdf5(content)
+    for path, value in values.items():
+        group, sign, name = path.rpartition("@" if "@" in path else "/")
+        if sign != "@" or recognise_fact(name) not in (None, "unit"):
+            unit = values.get(f"{path}@unit", values.get(f"{path}@units"))
+            _add_named(out, name, value, group=group + sign, unit=unit)
 
 
 def _read_fits(out: Contents, content: bytes) -> None:
     from astropy.io import fits
 
-    with open_fits(content, uint=False) as units:  # gaps of shifted integers become NaN
+    with array_file.open_fits(content, uint=False) as units:  # gaps of shifted integers become NaN
         for place, unit in enumerate(units):
             name = unit.name if unit.name and unit.name != "PRIMARY" else ""
             for card in unit.header.cards:
@@ -276,15 +238,15 @@ def _add_comment(out: Contents, comment: str) -> None:
             out.add_fact(fact, value, f"the comment {key}")
 
 
-_READERS = {
+_READERS: dict[str, Callable[[Contents, bytes], None]] = {
     **dict.fromkeys(FITS, _read_fits),
     **dict.fromkeys(
-        (".npy", ".npz"), lambda out, content: _add_named(out, "", read_numpy(content))
+        (".npy", ".npz"), lambda out, content: _add_named(out, "", array_file.read_numpy(content))
     ),
     **dict.fromkeys((".csv", ".tsv", ".txt", ".dat"), _read_text),
     **dict.fromkeys((".h5", ".hdf5"), _read_hdf5),
     ".mat": _read_matlab,
-    ".sav": _read_idl,
+    ".sav": lambda out, content: _add_named(out, "", array_file.read_idl(content)),
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +115,7 @@ def _write(
     environment.filters |= {
         "constant": lambda value: _exact_constant(value, single=terms.single),
         "count": count_text,
-        "lines": _fill_lines,
+        "lines": lambda texts: textwrap.indent(textwrap.fill(", ".join(texts)), "    "),
     }
     header = place.with_suffix(".h")
     values = {
@@ -155,11 +155,6 @@ def _exact_constant(value: float, *, single: bool) -> str:
     return (value.hex() if value else "0.0") + ("f" if single else "")
 
 
-def _fill_lines(values: Iterable[str]) -> str:
-    """Return entries of an array, indented, over as many lines as they need."""
-    return textwrap.indent(textwrap.fill(", ".join(values)), "    ")
-
-
 def _described(terms: SourceTerms) -> dict[str, Any]:
     """Return what the comments, the header and the branches of the template need."""
     (n, q, m), form = terms.sizes, "plain: x(k+1) = A x(k) + B y(k), u(k) = C x(k+1) + D y(k)"
@@ -172,9 +167,7 @@ def _described(terms: SourceTerms) -> dict[str, Any]:
         "q": q,
         "m": m,
         "form": form,
-        "masked": terms.masked,
-        "tabled": terms.tabled,
-        "applied": terms.applied,
+        **{name: getattr(terms, name) for name in ("masked", "tabled", "applied")},
         "estimates": terms.gains[NONE].shape[1],
         "period": len(terms.read),
         "frame_s": terms.dt_s,
@@ -293,12 +286,9 @@ def _read(files: Mapping[Path, bytes], like: SourceTerms) -> SourceTerms:
 
 def _facts(terms: SourceTerms, **_: Any) -> dict[str, Any]:
     """Return what the certificate says of the source."""
-    form: dict[str, Any] = {"form": "estimator" if terms.applied else "plain"}
-    if terms.tabled:
-        form["period"] = len(terms.read)
-    if terms.masked:
-        form["sensors"] = list(terms.rows)
-    return form
+    form = {"form": "estimator" if terms.applied else "plain"}
+    period = {"period": len(terms.read)} if terms.tabled else {}
+    return form | period | ({"sensors": list(terms.rows)} if terms.masked else {})
 
 
 TARGET = Target(

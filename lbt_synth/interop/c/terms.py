@@ -170,7 +170,7 @@ def _filter_terms(design: Any) -> SourceTerms:
     transition[:, :, :s], transition[:, :, s:] = full.A, full.B_known
     predicted = np.zeros((plant.period, plant.n_measurements, s + m))
     predicted[:, :, :s], predicted[:, :, s:] = full.C, full.D_known
-    filters = {(): design.gain_predictor} | {f.missing: f.gains for f in design.fallbacks}
+    filters = {(): design.gain_predictor, **design.fallbacks}
     states = design.controller.stacks()[2][0]
     return SourceTerms(
         transition=transition,
@@ -327,7 +327,10 @@ def read_source(text: str, like: SourceTerms) -> SourceTerms:
     code = _COMMENT.sub("", text)
     code = re.sub(r"state->x\[(\d+)\](?! =)", r"n\1", code)
     code = re.sub(r"\by\[(\d+)\]", r"y\1", code)
-    tables = {name: _numbers(body) for name, body in _TABLE.findall(code)}
+    tables = {
+        name: np.array([float.fromhex(v) if "x" in v else float(v) for v in _NUMBER.findall(body)])
+        for name, body in _TABLE.findall(code)
+    }
     (s, q, m), period = like.sizes, len(like.read)
     factors = {"c": tables.get("c", np.zeros(0)), "v": np.zeros((period, 0))}
     if "varying" in tables:
@@ -355,11 +358,6 @@ def read_source(text: str, like: SourceTerms) -> SourceTerms:
         command=np.delete(command[0], np.s_[s : s + m], axis=1),
         read=read,
     )
-
-
-def _numbers(text: str) -> FloatArray:
-    texts = _NUMBER.findall(text)
-    return np.array([float.fromhex(v) if "x" in v else float(v) for v in texts])
 
 
 def _read_gains(

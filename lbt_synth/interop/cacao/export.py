@@ -163,8 +163,16 @@ class PredictiveFilter:
 
     def fewest_steps(self, loss: float) -> int:
         """Return the steps after which what is cut off costs at most that part of the residual."""
-        enough, high = partial(self._is_enough, loss=loss), 1
-        while not enough(high):
+
+        def is_enough(steps: int) -> bool:
+            norm = self.cut_norm(steps)
+            return (norm <= loss and self.small_gain(norm) < 1) and all(
+                self.residual_nm(gain, norm) <= _ROOM * loss * least_nm
+                for gain, (_, least_nm) in self.sizes_nm.items()
+            )
+
+        high = 1
+        while not is_enough(high):
             high *= 2
             if high > _LONGEST:
                 raise NumericalError(
@@ -174,14 +182,7 @@ class PredictiveFilter:
                     status="steps",
                     residual=_LONGEST,
                 )
-        return bisect_left(range(high), True, lo=high // 2 + 1, key=enough)
-
-    def _is_enough(self, steps: int, loss: float) -> bool:
-        norm = self.cut_norm(steps)
-        return (norm <= loss and self.small_gain(norm) < 1) and all(
-            self.residual_nm(gain, norm) <= _ROOM * loss * least_nm
-            for gain, (_, least_nm) in self.sizes_nm.items()
-        )
+        return bisect_left(range(high), True, lo=high // 2 + 1, key=is_enough)
 
     def cut_norm(self, steps: int, taps: FloatArray | None = None) -> float:
         """Bound the norm of what is cut off after some steps, and what taps are rounded by."""
@@ -259,13 +260,10 @@ def predictive_filter(design: Design) -> PredictiveFilter:
 def _round(designs: Sequence[Design], *, steps: int | None, **_: Any) -> list[_Numbers]:
     """Return the matrix of each design, all of the same length."""
     filters = [predictive_filter(design) for design in designs]
-    if steps is None:
-        count = max(2, *(one.fewest_steps(LOSS) for one in filters))
-    else:
-        count = integer(steps, "steps", at_least=2)
+    fewest = max(2, *(one.fewest_steps(LOSS) for one in filters)) if steps is None else steps
+    count = integer(fewest, "steps", at_least=2)
     delay = filters[0].hardware.delay_frames
-    cubes = (-one.taps(count).swapaxes(0, 1).astype(np.float32) for one in filters)
-    return [(cube, delay) for cube in cubes]
+    return [(-one.taps(count).swapaxes(0, 1).astype(np.float32), delay) for one in filters]
 
 
 def _as_computed(design: Design, numbers: _Numbers) -> Written:

@@ -124,18 +124,16 @@ def specula_version() -> str:
     from importlib.metadata import PackageNotFoundError, version
 
     try:
-        found = version("specula")
-    except PackageNotFoundError as error:
+        installed = version("specula")
+    except PackageNotFoundError:
+        installed = "none"
+    if not installed.startswith(f"{_SUPPORTED}."):
         raise MissingExtraError(
-            'end-to-end simulation needs SPECULA: pip install "lbt-synth[e2e]".', extra="e2e"
-        ) from error
-    if not found.startswith(f"{_SUPPORTED}."):
-        raise MissingExtraError(
-            f"end-to-end simulation needs SPECULA {_SUPPORTED}; got {found}. "
+            f"end-to-end simulation needs SPECULA {_SUPPORTED}; got {installed}. "
             'Try pip install "lbt-synth[e2e]".',
             extra="e2e",
         )
-    return found
+    return installed
 
 
 def _specula(name: str) -> Any:

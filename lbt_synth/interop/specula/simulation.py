@@ -161,15 +161,18 @@ def accompany_filter(design: Design, setup: EndToEndSetup) -> AccompaniedFilter:
             " Give sensors, and accelerometers of each vibration, in the configuration."
         )
     missing = frozenset(unread_sensors(design))
-    settle = setup.settle_frames
-    size = {"frames": settle + setup.frames, "cases": 1, "zero_frame": settle}
-    rng = np.random.default_rng(setup.seed)
+    size, rng = _run_size(setup), np.random.default_rng(setup.seed)
     _, lines = draw_phase(shaken, hardware, rng=rng, oscillators=True, frame_means=True, **size)
     (own_rng,) = rng.spawn(1)
     others = draw_others(shaken, hardware, lines, own_rng, **size)
     return AccompaniedFilter(
         controller=design.controllers[missing], others=others[0], hardware=hardware
     )
+
+
+def _run_size(setup: EndToEndSetup) -> dict[str, int]:
+    settle = setup.settle_frames
+    return {"frames": settle + setup.frames, "cases": 1, "zero_frame": settle}
 
 
 def mix_controller(setup: EndToEndSetup, filter: Any) -> MixedController:  # noqa: A002
@@ -258,20 +261,12 @@ and 2 frames; got one for 1000 Hz and 2 frames. Design it from this configuratio
     require_instance(setup, EndToEndSetup)
     if not isinstance(controller, MixedController):
         controller = mix_controller(setup, controller)
-    settle = setup.settle_frames
-    phase, _ = draw_phase(
-        setup.shaken,
-        setup.hardware,
-        frames=settle + setup.frames,
-        cases=1,
-        rng=np.random.default_rng(setup.seed),
-        zero_frame=settle,
-        frame_means=True,
-        oscillators=True,
-    )
+    how: dict[str, Any] = {**_run_size(setup), "frame_means": True, "oscillators": True}
+    rng = np.random.default_rng(setup.seed)
+    phase, _ = draw_phase(setup.shaken, setup.hardware, rng=rng, **how)
     calibration = calibrate(setup) if calibration is None else calibration
     optics = Optics(setup, calibration.modes, air=True)
-    fields = _run_frames(optics, calibration, controller, phase[0], settle, progress)
+    fields = _run_frames(optics, calibration, controller, phase[0], progress)
     return EndToEndRun(setup=setup, **fields, psf_pixel_mas=optics.psf_pixel_mas)
 
 
@@ -280,11 +275,10 @@ def _run_frames(
     calibration: Calibration,
     controller: SteppedController,
     tilts: FloatArray,
-    settle: int,
     progress: Callable[[int], None] | None,
 ) -> dict[str, FloatArray]:
     """Run all frames; return the series and the mean image after those that settle."""
-    modes, kept = calibration.modes, len(tilts) - settle
+    modes, settle, kept = calibration.modes, optics.setup.settle_frames, optics.setup.frames
     inverse, n = calibration.reconstructor, len(calibration.modes.shapes)
     out = {name: np.empty((kept, n)) for name in ("measurements", "commands", "residual_nm")}
     strehl, others = np.empty(kept), np.empty(kept)

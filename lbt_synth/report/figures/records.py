@@ -166,7 +166,7 @@ def identification_figure(
     with drawing(heights, columns=n, axes=axes) as panels:
         for i, axis in enumerate(model.axes):
             name = f"{_NAMES[i]}: " if n == len(_NAMES) else ""
-            _draw_spectrum(panels[i], axis, name + _noise_text(axis))
+            _draw_spectrum(panels[i], axis, name)
             densities = {name: each[i] for name, each in residuals.items()}
             _draw_cumulative(panels[n + i], axis, densities)
             _draw_innovations(panels[2 * n + i], axis)
@@ -216,15 +216,12 @@ def _noise_density(axis: IdentifiedAxis) -> float:
     return 2 / axis.data.frame_rate_hz * (axis.noise_nm / axis.sensor_gain) ** 2
 
 
-def _noise_text(axis: IdentifiedAxis) -> str:
+def _draw_spectrum(axes: Axes, axis: IdentifiedAxis, name: str) -> None:
+    """Draw the periodogram with its fit, and leave room for the names of lines."""
     gain = f"{axis.sensor_gain:.3g}"
     if axis.sensor_gain_error is not None:
         gain = f"{axis.sensor_gain:.3f} ± {axis.sensor_gain_error:.3f}"
-    return f"noise {nm_text(axis.noise_nm)}, gain {gain}"
-
-
-def _draw_spectrum(axes: Axes, axis: IdentifiedAxis, title: str) -> None:
-    """Draw the periodogram with its fit, and leave room for the names of lines."""
+    title = f"{name}noise {nm_text(axis.noise_nm)}, gain {gain}"
     f, density = axis.frequency_hz, ("density", "nm²/Hz")
     _, factor = name_axes(axes, FREQUENCY, density, title, xscale="log", yscale="log")
     centres, smooth, least, most = _average_bands(f, axis.density_nm2_hz)

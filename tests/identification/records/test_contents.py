@@ -265,7 +265,8 @@ def written(folder, form, y, u):
     elif form == "h5":
         write_hdf5(path, {"night/y": y, "night/u": u}, **FACTS)
         with h5py.File(path, "a") as file:
-            file["night/y"].attrs["unit"] = file["night/u"].attrs["units"] = "nm"
+            file["night/y"].attrs["unit"] = "nm"
+            file["night/u"].attrs["units"] = np.bytes_("nm")
     elif form == "mat":
         scipy.io.savemat(path, {"rec": {**arrays, **FACTS, "unit": "nm"}})
     elif form == "mat 7.3":
@@ -373,11 +374,8 @@ def test_what_is_in_another_file_is_not_opened(tmp_path, series):
         file.create_dataset("raw", y.shape, dtype="f8", external=raw)
     contents = read_contents(path)
     assert contents.columns == []
-    said = [
-        "raw is in another file; it was left out",
-        "virtual is in another file; it was left out",
-    ]
-    assert contents.notes == said
+    left_out = "is no series of real numbers; it was left out"
+    assert contents.notes == [f"raw {left_out}", f"virtual {left_out}"]
 
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning")
@@ -394,7 +392,7 @@ def test_without_h5py_it_says_what_to_install(tmp_path, series, monkeypatch):
     path = write_hdf5(tmp_path / "a.h5", {"pol": series[0]})
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(
-        TelemetryError, match=r'a\.h5: it needs h5py: pip install "lbt-synth\[hdf5\]"'
+        TelemetryError, match=r'a\.h5 as \.h5: it needs h5py: pip install "lbt-synth\[hdf5\]"'
     ):
         lbt.load_record(path)
 

@@ -50,11 +50,11 @@ def test_the_source_is_what_was_proved(exported, designs, name, precision):
     assert (beside["form"], beside["precision"]) == ("estimator", precision)
     form = estimator_form(design)
     found = read_source(written.files[0].read_text(), source_terms(design, form="estimator"))
-    exact = np.hstack([form.A, form.applied]).astype(KINDS[precision])
+    n, kind = len(form.A), KINDS[precision]
+    exact = np.hstack([form.A, form.applied]).astype(kind)
     assert np.array_equal(found.transition[0], exact)
-    assert np.array_equal(found.gains[frozenset()][0], form.B.astype(KINDS[precision]))
-    n = len(form.A)
-    assert np.array_equal(found.command[:, :n], form.C.astype(KINDS[precision]))
+    assert np.array_equal(found.gains[frozenset()][0], form.B.astype(kind))
+    assert np.array_equal(found.command[:, :n], form.C.astype(kind))
     assert not found.command[:, n:].any()
 
 
@@ -143,6 +143,7 @@ def test_other_gains_fail(sensors_design, terms, missing, factor, failed):
     assert all(check.passed for check in checks if others in check.name)
 
 
+@pytest.mark.usefixtures("short_rehearsal")
 def test_the_rehearsal_sees_each_filter(sensors_design, terms):
     assert rehearsal_error(sensors_design, RunningSource(terms)) < 1e-11
     for missing in [(), ("wavefront",), ("slow",), ("m1",), ("m2",)]:

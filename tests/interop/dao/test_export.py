@@ -38,6 +38,8 @@ BALANCE = 1e-13  # of a coefficient
 def test_the_matrix_holds_the_controller(tmp_path, designs, name):
     design = designs[name]
     written = lbt.interop.export(tmp_path / "K_mat.npy", design, "dao", modes=5)
+    beside = json.loads(written.files[1].read_text())
+    assert (beside["order"], beside["modes"], beside["notes"]) == (20, 5, [])
     matrix = np.load(written.files[0])
     assert (matrix.dtype, matrix.shape) == (np.float32, (41, 5))
     assert matrix.flags.c_contiguous
@@ -56,12 +58,6 @@ def test_the_matrix_holds_the_controller(tmp_path, designs, name):
         assert np.all(np.abs(found - exact) <= 1.001 * allowed + 1e-12 * np.abs(exact))
         assert relative(found, exact) < 1e-3  # so little of the whole
     assert written.error < 1e-4
-
-
-def test_the_certificate_has_the_order(tmp_path, designs):
-    written = lbt.interop.export(tmp_path / "k.npy", designs["kalman"], "dao", order=6)
-    beside = json.loads(written.files[1].read_text())
-    assert (beside["order"], beside["modes"], beside["notes"]) == (6, 2, [])
 
 
 def test_a_design_that_single_precision_breaks_is_refused_with_the_number(tmp_path, loaded):

@@ -16,6 +16,7 @@ from support.pyrtc_systems import (
     synthetic,
 )
 from support.recorded_runs import recorded_run
+from support.refusals import require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.interop.pyrtc import plugin
@@ -175,25 +176,20 @@ def test_further_modes_have_an_integrator_and_all_are_clipped(gains):
 
 
 def test_what_does_not_fit_is_refused(gains):
-    slow, lazy = (
-        {"gain_file": gains / "integrator.fits"},
-        GainFilePredictor(1, gain_file=gains / "lazy.fits"),
-    )
-    for call, words in (
-        (lambda: GainFilePredictor(2, 3, **slow), "predictor.delay_frames must be 2, that of"),
-        (lambda: GainFilePredictor(1, **slow), "must control at least the 2 modes of"),
-        (
-            lambda: GainFilePredictor(2, other_gain=-0.5, **slow),
-            "predictor.other_gain must be at least 0",
-        ),
-        (
-            lambda: GainFilePredictor(2, command_limit=0, **slow),
-            "predictor.command_limit must be above 0",
-        ),
-        (lambda: lazy.fit(np.zeros((9000, 1))), "does not change while the loop runs"),
-    ):
-        with pytest.raises(lbt.errors.ProblemError, match=words):
-            call()
+    slow = {"gain_file": gains / "integrator.fits"}
+    lazy = GainFilePredictor(1, gain_file=gains / "lazy.fits")
+    problem = lbt.errors.ProblemError
+    rows = [
+        (lambda n=n, more=more: GainFilePredictor(*n, **more, **slow), problem, words)
+        for n, more, words in (
+            ((2, 3), {}, "predictor.delay_frames must be 2, that of"),
+            ((1,), {}, "must control at least the 2 modes of"),
+            ((2,), {"other_gain": -0.5}, "predictor.other_gain must be at least 0"),
+            ((2,), {"command_limit": 0}, "predictor.command_limit must be above 0"),
+        )
+    ]
+    rows.append((lambda: lazy.fit(np.zeros((9000, 1))), problem, "not change while the loop runs"))
+    require_refusals(rows)
     assert not lazy.fitted
     with pytest.raises(lbt.errors.CertificateError, match="closed loop"):
         GainFilePredictor(3, other_gain=1.5, **slow)
