@@ -15,18 +15,18 @@ GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3277,
-    "config": 1631,
-    "design": 6021,
+    "config": 1625,
+    "design": 5971,
     "files": 1252,
     "identification": 9037,
     "interop": 3687,
     "linear": 4844,
     "loop": 4132,
-    "methods": 791,
+    "methods": 789,
     "models": 3858,
-    "report": 3267,
+    "report": 3264,
     "storage": 1060,
-    "studies": 3316,
+    "studies": 3313,
     "errors, validation": 554,
 }
 COUNTS = {

@@ -167,13 +167,9 @@ def _examine_error(error: StateSpace, stability: str) -> tuple[Certificate, Floa
 
 
 def _examine_variance(error: StateSpace) -> tuple[FloatArray, FloatArray, tuple[Check, ...]]:
-    """Return covariance and variances of an error driven by white noise, with their checks.
-
-    A root of the covariance gives the variances as sums of squares, in which nothing cancels; what
-    is left is rounding of the outputs.
-    """
+    """Return covariance and variances of an error driven by white noise, with their checks."""
     A, B, C, D = error.A, error.B, error.C, error.D
-    root = stationary_root(A, B)
+    root = stationary_root(A, B)  # by which variances are sums of squares: nothing cancels
     variances = output_variances(C, D, root)
     adjoint = output_variances(B.T, D.T, stationary_root(A.T, C.T))
     P, after = root @ root.T, np.hstack([A @ root, B])

@@ -332,10 +332,7 @@ def integrator_gain_limit(hardware: LoopHardware, law: IntegratorLaw = PURE) -> 
 
 
 def _allowed_gains(hardware: LoopHardware, law: IntegratorLaw, trials: FloatArray) -> FloatArray:
-    """Return logarithms of gains that keep the demands of a law: the trials and both ends.
-
-    Of several intervals it is the one with the largest gains.
-    """
+    """Return logarithms of the largest gains that keep a law's demands: trials and both ends."""
 
     def excess(log_gain: float) -> float:
         """Return the least margin over its demand, less 1 and what rounding may take."""
@@ -429,10 +426,7 @@ def _least_residual(
 def _least_between(
     values: Callable[[FloatArray], FloatArray], low: float, high: float
 ) -> tuple[float, float]:
-    """Return where values are least between two points, and the value.
-
-    It is the vertex of their Chebyshev polynomial, on an interval where that has converged.
-    """
+    """Return where values are least between two points, and the value, by Chebyshev polynomials."""
     for _ in range(_ROUNDS):
         points = (low + high) / 2 + (high - low) / 2 * _NODES
         there = values(points)

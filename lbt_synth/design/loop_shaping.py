@@ -116,7 +116,13 @@ def shape(
     size = integer(functions, "functions", at_least=1, at_most=400)
     common = number(pole, "pole", at_least=0, below=1)
     tolerance = number(loss, "loss", at_least=0)
-    require_separable(hardware)
+    for name in ("sensor", "influence"):
+        response, n = getattr(hardware, name), hardware.modes
+        if (rank := np.linalg.matrix_rank(response)) < n:
+            raise DimensionError(
+                f"{name}_matrix must have rank {n}, one for each mode, for a loop that is shaped "
+                f"mode by mode; got {response.shape} of rank {rank}."
+            )
     single = hardware.single_mode()
     stored = single.mirror_system.whole.n_states
     order = None if states is None else integer(states, "states", at_least=stored + 1) - stored
@@ -324,19 +330,6 @@ class ShapedDesign(Design):
         return Evidence(design=self, certificate=replace(UNCERTIFIED, checks=tuple(checks)))
 
 
-def require_separable(hardware: LoopHardware) -> None:
-    """Refuse a loop whose modes cannot be controlled one by one."""
-    n = hardware.modes
-    named = {"sensor_matrix": hardware.sensor, "influence_matrix": hardware.influence}
-    for name, response in named.items():
-        rank = np.linalg.matrix_rank(response)
-        if rank < n:
-            raise DimensionError(
-                f"{name} must have rank {n}, one for each mode, for a loop that is shaped mode by "
-                f"mode; got {response.shape} of rank {rank}."
-            )
-
-
 def noise_per_mode(hardware: LoopHardware, covariance: FloatArray) -> FloatArray:
     """Return the deviation of each mode's noise, (n,), from the covariance of the measurements."""
     back = np.linalg.pinv(hardware.sensor)
@@ -434,13 +427,14 @@ def robust(
         raise ProblemError("moving_gain needs the interval in which it moves; give sensor_gain.")
     if late or (low, high) != (1, 1):
         fixed.append(LoopErrors(low=low, high=high, delay_frames=late, moving=moving_gain))
-    deviations = noise_per_mode(plant.hardware, plant.R)
+    deviations = noise_per_mode(plant.hardware, plant.R).tolist()
+    # modes that differ by rounding are equal, and solved once
+    deviations = [next(d for d in deviations if abs(d - nm) <= 1e-9 * nm) for nm in deviations]
     specifications = []
-    each = zip(deviations.tolist(), plant.turbulence, lines, strict=True)
+    each = zip(deviations, plant.turbulence, lines, strict=True)
     for mode, (noise_nm, model, own) in enumerate(each):
         spectrum, wide = model if turbulence is None else turbulence, _uncovered(plant, mode, own)
-        # but for rounding, so that equal modes have one specification
-        air = ResidualVariance(turbulence=spectrum, noise_nm=float(f"{noise_nm:.9g}"))
+        air = ResidualVariance(turbulence=spectrum, noise_nm=noise_nm)
         # the spectrum of a resonance is known as that of turbulence is
         rate_hz = plant.hardware.frame_rate_hz
         models = (line.ar_model(rate_hz) for line in wide)

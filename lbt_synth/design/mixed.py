@@ -6,7 +6,6 @@ It completes a central H-infinity filter, chosen by the norm that it achieves.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
@@ -106,7 +105,20 @@ def mixed(
     if not problem.reads_all:  # no impulse response: the least variance among central filters
         return _central_design(base, least, method="mixed", bound=bound)
     taps_of_base, solver = _complete_base(problem, base, length, bound)
-    return _mixed_design(problem, base, taps_of_base, least, solver=solver, gamma_requested=bound)
+    extended, witness = problem.with_memory(taps_of_base), least.witness
+    if witness is not None:  # the further states are zero
+        padding = (0, extended.n_states - problem.n_states), (0, 0)
+        witness = replace(witness, states=frozen_copy(np.pad(witness.states, padding)))
+    return filter_design(
+        extended,
+        _extend_gain(base.gain_predictor, length),
+        method="mixed",
+        solver=solver,
+        gamma_least=least.gamma_least,
+        gamma_infeasible=min(least.gamma_infeasible, proved_level(extended, witness)),
+        gamma_requested=bound,
+        witness=witness,
+    )
 
 
 def require_taps(taps: int) -> int:
@@ -145,32 +157,6 @@ def _complete_base(
         f"of its programme; expected {_EXCESS:g}. Try another number of taps.",
         status="frequencies",
         residual=excess,
-    )
-
-
-def _mixed_design(
-    problem: EstimationProblem,
-    base: FilterDesign | FilterRiccati,
-    taps: FloatArray,
-    least: FilterDesign,
-    **claims: Any,
-) -> FilterDesign:
-    """Make the design of a completed base and certify it."""
-    extended = problem.with_memory(taps)
-    size, q = taps.shape[1], base.gain_predictor.shape[1]
-    gain = _extend_gain(base.gain_predictor, size // q)
-    witness = least.witness
-    if witness is not None:  # the further states are zero
-        witness = replace(witness, states=frozen_copy(np.pad(witness.states, ((0, size), (0, 0)))))
-    proved = proved_level(extended, witness)
-    return filter_design(
-        extended,
-        gain,
-        method="mixed",
-        gamma_least=least.gamma_least,
-        gamma_infeasible=min(least.gamma_infeasible, proved),
-        witness=witness,
-        **claims,
     )
 
 
@@ -218,10 +204,7 @@ def _central_design(
 def _central_member(
     problem: EstimationProblem, least: FilterDesign, bound: float
 ) -> FilterDesign | FilterRiccati:
-    """Return the central filter whose norm just meets a bound.
-
-    The central filters go from that of the least gamma to the Kalman filter, and their norms rise.
-    """
+    """Return the central filter whose norm just meets a bound; norms rise to that of Kalman."""
     start = kalman_riccati(problem)
     filters: dict[float, FilterDesign | FilterRiccati] = {0.0: least}
     excesses = {0.0: least.gamma - bound}

@@ -175,11 +175,7 @@ def _design_h2(scaled: ScaledPlant, equations: TwoRiccati, share: float) -> Cont
 
 
 def _least_rms(equations: TwoRiccati) -> float:
-    """Return the least standard deviation of z.
-
-    ``|z|^2`` is the cost with known state and disturbance, plus that of the distance of the
-    control from ``F x + F0 w``, of which the measurements leave an error.
-    """
+    """Return the least standard deviation of z: with known state, and of the control's error."""
     P, control, estimation = equations.plant, equations.control, equations.estimation
     F, F0, Y = control.feedback, control.feedforward, estimation.least
     seen = F @ Y @ P.C2.T + F0 @ P.D21.T
@@ -465,12 +461,9 @@ def _first_certified(
     plant: GeneralizedPlant,
     synthesise: Callable[[ScaledPlant, TwoRiccati, float], ControllerDesign],
 ) -> ControllerDesign:
-    """Return the design of the first equations that lead to one, the plant's own or next to it.
-
-    Equations are singular where a control costs nothing or a measurement has no noise. Where
-    perfect control leaves rounding alone, no norm can be certified either. What was added may be
-    what is left: a smaller share is taken where it leaves less.
-    """
+    """Return the design of the first equations that lead to one, the plant's own or next to it."""
+    # equations are singular where a control costs nothing or a measurement has no noise; what was
+    # added may be what is left: a smaller share is taken where it leaves less
     scaled = scaled_plant(plant)
     refusal: ValueError | SynthesisError
     for share in _SHARES:

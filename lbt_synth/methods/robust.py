@@ -237,10 +237,8 @@ def _list_demands(
 
 
 def _plant_section(plant: TipTiltPlant) -> RobustSection:
-    """Return bands around the strongest lines of a plant, those that overlap as one.
-
-    Wide resonances need no band, and would swallow those of the lines.
-    """
+    """Return bands around the strongest lines of a plant, those that overlap as one."""
+    # wide resonances need no band, and would swallow those of the lines
     narrow = [line for line in plant.vibrations if line.damping <= WIDE_DAMPING]
     lines = sorted(narrow or plant.vibrations, key=lambda line: -line.rms_nm)
     nyquist_hz = plant.hardware.frame_rate_hz / 2

@@ -159,10 +159,7 @@ def _summary_blocks(
 
 
 def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, LoopMargins]:
-    """Return the margins of the designs of a study in the loops that they were made for.
-
-    A controller that is designed for each sample has none, nor has one of several sensors.
-    """
+    """Return the margins of designs for the whole study, of one sensor, in their own loops."""
     loops = {
         name: close_loop(design.hardware, design)
         for name in (controller.controller for controller in statistics.controllers)

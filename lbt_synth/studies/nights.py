@@ -248,10 +248,7 @@ def mean_plant(plants: Sequence[TipTiltPlant], weights: Sequence[float]) -> TipT
 
 
 def _merge(lines: Sequence[Vibration]) -> list[Vibration]:
-    """Return lines, with one for those that nearly are.
-
-    They have one direction, none is twice as wide, and they are nearer than its half width.
-    """
+    """Return lines, with one for those of a direction that are nearer than their half widths."""
     merged = list[Vibration]()
     for line in sorted(lines, key=lambda one: (one.direction, one.sections, one.frequency_hz)):
         last = merged[-1] if merged else line
