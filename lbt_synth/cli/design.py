@@ -73,11 +73,8 @@ def describe_design(report: Report, design: Design) -> None:
     printed = fact_table("Design", *records, *margins)
     report.tables.append(without_units(printed) if design.hardware is None else printed)
     report.notes += _loop_notes(design, alone)
-    tables = design.tables()
-    report.notes += [*design.notes(), *(note for table in tables for note in table.notes)]
+    report.notes += design.notes()
     report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
-    for table in tables:
-        report.add_rows(table.key, table.title, table.rows)
     report.add_rows("checks", "Certificate", design.certificate.checks)
 
 
@@ -138,6 +135,9 @@ def run_show(arguments: Namespace) -> Report:
     if design.configuration:
         add_truth(report, design, config_from_text(design.configuration, Path(arguments.gain)))
     describe_design(report, design)
+    for table in design.tables():
+        report.add_rows(table.key, table.title, table.rows)
+        report.notes += table.notes
     add_moving_gains(report, design)
     report.data |= {"file": arguments.gain, "digest": digest}
     report.notes += [

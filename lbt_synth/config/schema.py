@@ -15,6 +15,7 @@ from lbt_synth.models.vibration import MOST_SECTIONS
 
 Matrix: TypeAlias = list[list[q.Entry]]
 _TAGS = (q.ONE, q.EACH)  # in the places of mistakes
+_TWO_DIRECTIONS = "expected at most one of axis, direction_deg"
 _SECTIONS = "how many equal resonances in series it is: a bump of steep flanks has 2 to 4"
 
 
@@ -192,11 +193,7 @@ class _LineSection(Section):
     )
     _one_size = exactly_one("rms_nm", "rms_mas")
     _one_direction = _rule(
-        lambda section: (
-            "expected at most one of axis, direction_deg"
-            if _count_given(section, ("axis", "direction_deg")) > 1
-            else ""
-        )
+        lambda line: _TWO_DIRECTIONS * (None not in (line.axis, line.direction_deg))
     )
 
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Any, ClassVar, TypeAlias, TypeGuard
+from typing import Any, ClassVar, TypeAlias, TypeGuard, cast
 
 import numpy as np
 
@@ -50,8 +50,8 @@ from lbt_synth.linear.riccati.filtering import (
     kalman_riccati,
     meets_level,
 )
-from lbt_synth.loop import ClosedLoop, close_loop, residual_budget
-from lbt_synth.loop.budget import model_readings
+from lbt_synth.loop import ClosedLoop, close_loop
+from lbt_synth.loop.budget import model_covariances
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import Column, Facts, fact, facts
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, set_fields
@@ -193,22 +193,30 @@ class FilterDesign(Design):
         return {frozenset(): self.controller, **others}
 
     def tables(self) -> tuple[RowTable, ...]:
-        """Return what becomes of the loop when sensors fail, and which failures it has to see."""
+        """Return what becomes of the loop when sensors fail."""
         if not reads_several(self.problem):
             return ()
         rows = failure_rows(self.problem, self.gain_predictor, self.fallbacks)
-        unseen = [row.missing for row in rows if row.must_switch]
-        warning = (
-            f"warning: unstable if these fail unseen: {'; '.join(unseen)}. The loop's "
-            "computer has to see such a failure, and take the fall-back filter."
-        )
-        notes = [
+        note = (
             "unseen: the readings are zero, or frozen, and the filter believes them: a reading "
             "that stays leaves an offset, which counts to the residual. Not read: the fall-back "
-            "filter of this file for the remaining sensors, with the same state.",
-            *[warning] * bool(unseen),
-        ]
-        return (RowTable(key="failures", title="When sensors fail", rows=rows, notes=notes),)
+            "filter of this file for the remaining sensors, with the same state."
+        )
+        return (RowTable(key="failures", title="When sensors fail", rows=rows, notes=[note]),)
+
+    def notes(self) -> list[str]:
+        """Return which failures the loop has to see, of which none holds another."""
+        fatal: list[tuple[str, ...]] = []
+        for missing in self.fallbacks:  # small ones first
+            loop = failed_loop(cast("TipTiltPlant", self.problem), self.gain_predictor, missing)
+            if not any({*fewer} <= {*missing} for fewer in fatal) and not loop.is_stable:
+                fatal.append(missing)
+        sets = "; ".join(" + ".join(missing) for missing in fatal)
+        warning = (
+            f"warning: unstable if these fail unseen, alone or with others: {sets}. The loop's "
+            "computer has to see such a failure, and take the fall-back filter."
+        )
+        return [warning] * bool(fatal)
 
     @property
     def poles(self) -> ComplexArray:
@@ -333,16 +341,21 @@ def failure_rows(plant: TipTiltPlant, gains: FloatArray, fallbacks: Fallbacks) -
     The residual is the exact one of the loop where the plant's model is the truth. A frozen reading
     is that of a frame in which all sensors are read, and stays for ever.
     """
-    rows, radius, rms = [], {"format": ".6f"}, {"unit": "nm rms", "format": ".1f"}
-    readings = model_readings(failed_loop(plant, gains, ()), plant)
+    n, rows, rms = plant.hardware.modes, [], {"unit": "nm rms", "format": ".1f"}
+    radius = {"format": ".6f"}
+    readings = model_covariances(failed_loop(plant, gains, ()), plant)[0, n:, n:]
+
+    def left_nm(loop: ClosedLoop) -> float:
+        covariances = model_covariances(loop, plant)[:, :n, :n]
+        return float(np.sqrt(np.trace(covariances.mean(axis=0))))
+
     for missing, fallback_gains in fallbacks.items():
         unseen = failed_loop(plant, gains, missing)
         zero_nm = frozen_nm = None
         if unseen.is_stable:
-            zero_nm = residual_budget(unseen, plant, frame_means=True).rms_nm
+            zero_nm = left_nm(unseen)
             frozen_nm = float(np.hypot(zero_nm, _offset_nm(unseen, readings)))
         switched = failed_loop(plant, fallback_gains, missing)
-        fallback_nm = residual_budget(switched, plant, frame_means=True).rms_nm
         rows.append(
             facts(
                 missing=fact(" + ".join(missing), "sensors that fail"),
@@ -350,7 +363,7 @@ def failure_rows(plant: TipTiltPlant, gains: FloatArray, fallbacks: Fallbacks) -
                 zero_nm=fact(zero_nm, "residual, zeros", **rms),
                 frozen_nm=fact(frozen_nm, "residual, frozen", **rms),
                 fallback_radius=fact(switched.spectral_radius, "radius, not read", **radius),
-                fallback_nm=fact(fallback_nm, "residual, not read", **rms),
+                fallback_nm=fact(left_nm(switched), "residual, not read", **rms),
                 must_switch=fact(not unseen.is_stable, "must be seen"),
             )
         )

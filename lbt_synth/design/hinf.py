@@ -146,7 +146,7 @@ def _design(
         central = gamma_riccati(problem, requested, start=start)
         if central is None:
             raise InfeasibleError(
-                f"the gamma-Riccati equation has no stabilising solution at gamma = "
+                "the gamma-Riccati equation has no stabilising solution at gamma = "
                 f"{requested:.9g}. Try a larger gamma.",
                 gamma=requested,
             )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
@@ -392,19 +393,29 @@ def ensemble_residuals(
     return ResidualBudget(**whole, line_amplitudes_nm=amplitudes, stable=read_only(stable))
 
 
-def model_readings(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
-    """Return the covariance (q, q) of all readings in the first frame of a period."""
+def model_covariances(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
+    """Return covariances of mean residual and all readings in a plant, at each phase, (N, n+q, .).
+
+    All processes of the plant drive the loop as one.
+    """
     _, _, C, D = loop.system.stacks()
-    every = replace(loop_evaluator(loop, in_image=False), C=C, D=D)
-    n, factor = loop.hardware.modes, _noise_factor(loop, plant.own_noise_factor)
-    parts = [replace(every, B=every.B[..., n:] @ factor, D=D[..., n:] @ factor)]
-    for mode, model in enumerate(plant.turbulence):
-        entry = np.eye(loop.system.B.shape[-1])[:, [mode]]
-        parts.append(_driven(every, ar_process(model), entry))
-    for line, motion in zip(plant.vibrations, plant.motions, strict=True):
-        parts.append(_driven(every, *_shaken(loop, line, motion)))
-    first = -plant.n_measurements
-    return np.asarray(sum(part.output_covariances()[0, first:, first:] for part in parts))
+    n, p = loop.hardware.modes, plant.n_measurements
+    rows = [*range(n), *range(C.shape[1] - p, C.shape[1])]
+    every = replace(loop_evaluator(loop, in_image=False), C=C[:, rows], D=D[:, rows])
+    turbulence = [ar_process(model) for model in plant.turbulence]
+    shaken = [_shaken(loop, *pair) for pair in zip(plant.vibrations, plant.motions, strict=True)]
+    processes = [*turbulence, *(process for process, _ in shaken)]
+    entries = [np.eye(loop.system.B.shape[-1])[:, : len(turbulence)], *(e for _, e in shaken)]
+    stacks = zip(*(_phases_of(every, process) for process in processes), strict=True)
+    A, B, C = (np.array([block_diag(*one) for one in zip(*kind, strict=True)]) for kind in stacks)
+    driven = every.driven(A, B, C, np.hstack(entries)[None])
+    factor = _noise_factor(loop, plant.own_noise_factor)
+    noise, direct = every.B[..., n:] @ factor, every.D[..., n:] @ factor
+    below = np.zeros((len(noise), A.shape[1], noise.shape[2]))
+    drive = np.concatenate([driven.B, np.concatenate([noise, below], axis=1)], axis=2)
+    return replace(
+        driven, B=drive, D=np.concatenate([driven.D, direct], axis=2)
+    ).output_covariances()
 
 
 def _one_line(
@@ -458,8 +469,13 @@ def _of_seen(
 
 def _driven(rows: Evaluator, process: StateSpace, entry: FloatArray) -> Evaluator:
     """Return a loop from the drives of a process, whose phases are those of the loop."""
+    return rows.driven(*_phases_of(rows, process), entry[None])
+
+
+def _phases_of(rows: Evaluator, process: StateSpace) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return A, B and C of a process at each phase of a loop."""
     A, B, C, _ = (stack[np.arange(rows.phases) % process.period] for stack in process.stacks())
-    return rows.driven(A, B, C, entry[None])
+    return A, B, C
 
 
 def _motions(loop: ClosedLoop, motions: Motions, lines: int) -> Motions:

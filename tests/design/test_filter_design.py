@@ -23,7 +23,7 @@ import lbt_synth as lbt
 from lbt_synth.design.filter_design import failed_loop, failure_rows, failure_sets, make_fallbacks
 from lbt_synth.errors import InfeasibleError, ProblemError
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.loop.budget import model_readings, residual_budget
+from lbt_synth.loop.budget import model_covariances, residual_budget
 from lbt_synth.models import Accelerometer, SensorSuite, WavefrontSensor
 
 NORMS = {
@@ -197,7 +197,8 @@ def test_rows_are_what_runs_leave():
             assert residual_nm == pytest.approx(np.sqrt(np.trace(sum(left))), rel=1e-7)
             assert row.fallback_nm <= residual_nm * (1 + 1e-9)
     # a reading that stays leaves an offset: a run for each independent part of the readings
-    stuck = np.linalg.cholesky(model_readings(failed_loop(plant, gains, ()), plant)).T
+    readings = model_covariances(failed_loop(plant, gains, ()), plant)[0, 2:, 2:]
+    stuck = np.linalg.cholesky(readings).T
     still = np.zeros((400, len(stuck), 2)), np.zeros((400, *stuck.shape))
     for row, missing in zip(rows[:3], fallbacks, strict=False):
         known = {"blind": missing, "stuck": stuck}
@@ -210,8 +211,10 @@ def test_rows_are_what_runs_leave():
 def test_readings_are_residual_and_noise():
     plant, gains, _ = designed((FAST,))
     loop = failed_loop(plant, gains, ())
-    readings = model_readings(loop, plant)
+    covariances = model_covariances(loop, plant)
+    readings = covariances[0, 2:, 2:]
     left = residual_budget(loop, plant, frame_means=True).total_nm2
+    np.testing.assert_allclose(covariances[:, :2, :2].mean(axis=0), left, rtol=1e-9)
     np.testing.assert_allclose(readings[:2, :2], left + 75**2 * np.eye(2), rtol=1e-9)
     power = np.diag(FAST.noise_m_s2).copy()
     for line, motion in zip(plant.vibrations, plant.motions, strict=True):
