@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3277,
+    "cli": 3270,
     "config": 1622,
     "design": 5971,
     "files": 1252,
@@ -26,7 +26,7 @@ LINES = {
     "models": 3858,
     "report": 3264,
     "storage": 1060,
-    "studies": 3313,
+    "studies": 3262,
     "errors, validation": 554,
 }
 COUNTS = {

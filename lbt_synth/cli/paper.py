@@ -42,7 +42,6 @@ from lbt_synth.storage.rows import (
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import paper as published
-from lbt_synth.studies.robustness import RobustnessRow
 from lbt_synth.validation import integer
 
 
@@ -57,11 +56,7 @@ def run_paper(arguments: Namespace) -> Report:
         number: [published.table_entry(*pair) for pair in rows if pair[0].table == number]
         for number in ("II", "III")
     }
-    methods = dict.fromkeys(entry.method for entry in tables["III"])
-    columns = {
-        method: published.rms_difference([e for e in tables["III"] if e.method == method])
-        for method in methods
-    }
+    columns = published.rms_differences(tables["III"], "ours", "paper")
     filters = published.paper_filters()
     with own_display_unit():  # JSON and CSV stay in nm
         parameters = published.parameter_rows()
@@ -94,7 +89,7 @@ def run_paper(arguments: Namespace) -> Report:
 
 
 def _draw_paper(
-    folder: Path, rows: list[RobustnessRow], filters: tuple[FilterDesign, FilterDesign]
+    folder: Path, rows: list[Facts], filters: tuple[FilterDesign, FilterDesign]
 ) -> list[Path]:
     """Write figures and gain files of the comparison."""
     points = {
@@ -250,23 +245,24 @@ def _run_tables(arguments: Namespace) -> Report:
     for count in ("seeds", "row_seeds", "jobs"):
         integer(getattr(arguments, count), option_name(count), at_least=1)
     specula_version()
-    plan: dict[str, Any] = {
-        "seeds": range(setup.seed, setup.seed + arguments.seeds),
-        "row_seeds": range(setup.seed, setup.seed + arguments.row_seeds),
-        "tables": arguments.tables,
-    }
-    total = len(published.all_cases(published.plan_cases(setup, designs, **plan)))
+    planned = published.plan_cases(
+        setup,
+        designs,
+        seeds=range(setup.seed, setup.seed + arguments.seeds),
+        row_seeds=range(setup.seed, setup.seed + arguments.row_seeds),
+        tables=arguments.tables,
+    )
+    total = len(published.all_cases(planned))
     make_directory(folder)
     case_folder = folder / "cases"
     with run_in_parts(arguments, case_folder, total=total, what="runs") as engine:
-        table = published.end_to_end_tables(setup, case_folder, designs, **plan, **engine)
+        table = published.end_to_end_tables(setup, planned, case_folder, **engine)
     printed = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
     files = [write_atomically(folder / _TABLE_FILES[n][0], csv_rows(printed[n])) for n in printed]
     if "III" in printed:
         figure = figures.end_to_end_table_figure(table)
         files += [save_figure(figure, folder / name) for name in _TABLE_FILES["III"][1:]]
-    methods = dict.fromkeys(entry.method for entry in printed.get("III", ()))
-    differences = {method: published.rms_modal_difference(table, method) for method in methods}
+    differences = published.rms_differences(printed.get("III", []), "strehl", "modal")
     report = Report(
         data={
             "entries": [json_record(entry) for entry in table],
