@@ -152,15 +152,6 @@ def _segment_row(
     )
 
 
-class RecordRehearsal(NamedTuple):
-    """The loop of a record in the arithmetic of a target, beside the design and what ran."""
-
-    rehearsal: Rehearsal
-    rows: list[Facts]  # one a loop
-    hardware: LoopHardware  # of the record, with the sensor gains that are assumed
-    frames: int  # of the stretch that was run
-
-
 def rehearse_record(
     design: Design,
     record: LoopRecord,
@@ -168,8 +159,12 @@ def rehearse_record(
     imaging: Imaging,
     *,
     stroke: float | None = None,
-) -> RecordRehearsal:
-    """Rehearse a design on the longest stretch of a record that has no gap."""
+) -> tuple[Rehearsal, list[Facts], LoopHardware]:
+    """Rehearse a design on the longest stretch of a record that has no gap.
+
+    A row for the target, the design and what ran comes with it, and the loop of the record with the
+    sensor gains that are assumed.
+    """
     gains = _assumed_gains(design, record)
     start, stop = max(record.stretches(), key=lambda pair: pair[1] - pair[0])
     phase_nm = record.pseudo_open_loop(gains)[start:stop]
@@ -184,7 +179,7 @@ def rehearse_record(
         settled = slice(start + rehearsal.settle_frames, stop)
         residual_nm, commands = record.measurements[settled] / gains, record.commands[settled]
         rows.append(_loop_row("what ran", residual_nm, residual_nm**2, commands, imaging, None))
-    return RecordRehearsal(rehearsal, rows, hardware, stop - start)
+    return rehearsal, rows, hardware
 
 
 def _loop_row(
