@@ -139,7 +139,7 @@ def exact_plant(it: Case) -> lbt.models.TipTiltPlant:
         frame_rate_hz=rate,
         delay_frames=2,
         turbulence=turbulence,
-        vibrations=lines or None,
+        vibrations=lines,
         noise_nm=truth.noise_nm,
         sensor_gain=truth.sensor_gain,
         modes=1,

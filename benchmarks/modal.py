@@ -11,7 +11,7 @@ import numpy as np
 from harness import seconds
 
 import lbt_synth as lbt
-from lbt_synth.models.turbulence.ar_models import noll_orders
+from lbt_synth.models.turbulence.ar_models import radial_orders
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.studies import modal_figure
 
@@ -28,7 +28,7 @@ def main() -> None:
     output = parser.parse_args().output
     air = lbt.Atmosphere(seeing_arcsec=0.8, outer_scale_m=22, wind_speed_m_s=20, diameter_m=8.22)
     modes = lbt.models.modal_turbulence(air, modes=MODES, frame_rate_hz=RATE_HZ)
-    radial, _ = noll_orders(MODES)
+    radial = radial_orders(MODES)
     noise = lbt.models.pyramid_modal_noise_nm(15.5, modes=MODES, modulation_lambda_over_d=4)
     path = lbt.LoopHardware(frame_rate_hz=RATE_HZ)
     known = {"hardware": path, "noise_nm": noise}

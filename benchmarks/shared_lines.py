@@ -98,7 +98,7 @@ def exact_plant(truth: lbt.Truth) -> lbt.models.TipTiltPlant:
     return lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
         turbulence=turbulence,
-        vibrations=list(truth.vibrations) or None,
+        vibrations=truth.vibrations,
         noise_nm=truth.noise_nm,
         sensor_gain=truth.sensor_gain,
     )

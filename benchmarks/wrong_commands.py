@@ -223,7 +223,7 @@ def good_law(
         plant = lbt.tip_tilt_plant(
             frame_rate_hz=rate,
             turbulence=slow,
-            vibrations=lines or None,
+            vibrations=lines,
             noise_nm=noise,
             sensor_matrix=sensor * one,
         )

@@ -19,7 +19,7 @@ from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.c.export import frame_cost
 from lbt_synth.loop import least_residual, loop_margins
-from lbt_synth.loop.least_residual import limit_or_nan
+from lbt_synth.loop.least_residual import limit_or_none
 from lbt_synth.methods.registry import INTEGRATOR, KALMAN, design_title, reference_methods
 from lbt_synth.report.designs import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_map_figure
@@ -208,7 +208,8 @@ def run_mirror(arguments: Namespace) -> Report:
     rows = mirror_rows(
         plant, config.truth, config.imaging, command_weight=config.settings.design.command_weight
     )
-    limit_nm = limit_or_nan(lambda: least_residual(hardware, config.truth))
+    limit = limit_or_none(lambda: least_residual(hardware, config.truth))
+    limit_nm = np.nan if limit is None else limit.rms_nm
     least = "least residual of any linear controller in the truth"
     ms = {"unit": "ms", "scale": 1e3}
     frames = step.settling_s / hardware.dt_s

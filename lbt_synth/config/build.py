@@ -240,7 +240,7 @@ def build_plant(
         frame_rate_hz=settings.loop.frame_rate_hz,
         delay_frames=settings.loop.delay_frames,
         turbulence=_build_turbulence(settings, atmosphere, noise_nm),
-        vibrations=[line for *_, spread in lines for line in spread] or None,
+        vibrations=[line for *_, spread in lines for line in spread],
         noise_nm=noise_nm,
         sensor_matrix=settings.sensor.matrix,
         influence_matrix=settings.mirror.influence_matrix,

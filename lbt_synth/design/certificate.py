@@ -13,7 +13,7 @@ from lbt_synth.linear import EstimationProblem, StateSpace, hinf_norm
 from lbt_synth.linear.infeasibility_proof import Witness, infeasible_level
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.linear.norms import spectral_norms
-from lbt_synth.linear.riccati.filtering import kalman_gains, kalman_riccati
+from lbt_synth.linear.riccati.filtering import kalman_gain, kalman_riccati
 from lbt_synth.loop import ClosedLoop
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN
 from lbt_synth.storage.rows import Column, column, row_table
@@ -138,7 +138,7 @@ def variance_distance(
     problem: EstimationProblem, gain_predictor: FloatArray, covariances: FloatArray
 ) -> float:
     """Return how far gains are from those that error covariances (N, n, n) make, relative."""
-    optimal = np.stack([kalman_gains(problem, t, P)[0] for t, P in enumerate(covariances)])
+    optimal = np.stack([kalman_gain(problem, t, P) for t, P in enumerate(covariances)])
     gains = np.reshape(gain_predictor, optimal.shape)
     size = float(np.max(np.linalg.norm(optimal, 2, axis=(1, 2))))
     apart = float(np.max(np.linalg.norm(gains - optimal, 2, axis=(1, 2))))

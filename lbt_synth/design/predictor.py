@@ -29,7 +29,7 @@ from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.block_filtering import filter_series
 from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import close_loop
-from lbt_synth.loop.closed_loop import youla_controller, youla_parameter
+from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.storage.rows import Column, column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy
@@ -170,7 +170,7 @@ def regression_filter(
     base's correction, of the pseudo-open-loop measurement and of the channels; the newest first.
     """
     taps, n, signals = coefficients.shape
-    own = youla_parameter(hardware, base)
+    own = youla_controller(hardware, base, sign=-1.0)
     back, out = np.linalg.pinv(hardware.sensor), hardware.projector
     q, c = hardware.n_measurements, signals - 2 * n
     into = coefficients.reshape(taps * n, signals)

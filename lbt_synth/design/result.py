@@ -20,7 +20,7 @@ from lbt_synth.loop import (
     stable_sensor_gains,
 )
 from lbt_synth.loop.closed_loop import reads_others
-from lbt_synth.loop.least_residual import above_percent, least_residual, limit_or_nan
+from lbt_synth.loop.least_residual import above_percent, least_residual, limit_or_none
 from lbt_synth.models import LoopHardware, TipTiltPlant
 from lbt_synth.storage.rows import Column, Facts, fact_table
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -328,7 +328,8 @@ def model_limits(design: Design) -> Mapping[str, float | None]:
         return {}
     loop = close_loop(plant.hardware, design.controller)
     residual_nm = residual_budget(loop, plant).rms_nm if loop.is_stable else np.nan
-    limit_nm = limit_or_nan(lambda: least_residual(plant.hardware, plant))
+    limit = limit_or_none(lambda: least_residual(plant.hardware, plant))
+    limit_nm = np.nan if limit is None else limit.rms_nm
     values = residual_nm, limit_nm, above_percent(residual_nm, limit_nm)
     return {column.name: value for column, value in zip(MODEL_LIMITS, values, strict=True)}
 

@@ -24,7 +24,7 @@ from lbt_synth.loop.budget import residual_budget
 from lbt_synth.loop.closed_loop import STABILITY_MARGIN, youla_controller
 from lbt_synth.loop.disturbances import Disturbance
 from lbt_synth.loop.simulation import Drop, SteppedController, simulate
-from lbt_synth.loop.stable_range import radii_by_gain
+from lbt_synth.loop.stable_range import affine_radii, parts_by_gain
 from lbt_synth.models import ARModel, LoopHardware
 from lbt_synth.validation import FloatArray
 
@@ -147,7 +147,7 @@ def _prove_loop(design: Design, hardware: LoopHardware, written: Written) -> lis
     low, high = proved_gains(design, hardware)
     count = 2 + int(np.log(high / low) / np.log(_STEP))
     gains = np.append(np.geomspace(low, high, count), 1.0)
-    radius = float(np.max(radii_by_gain(hardware, controller)(gains)))
+    radius = float(np.max(affine_radii(parts_by_gain(hardware, controller), gains)))
     name = f"spectral radius at sensor gains {low:.4g} to {high:.4g}"
     checks = [Check(name, radius, 1 - STABILITY_MARGIN, f"eigenvalues at {gains.size} gains")]
     if not checks[0].passed:

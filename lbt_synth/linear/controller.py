@@ -81,14 +81,6 @@ class Controller(LinearSystem):
             parts = {name: getattr(self, name) for name in "ABCD"}
             self._set_phases(1, **parts, applied=applied)
 
-    def phase(self, t: int) -> Controller:
-        """Return the controller of a phase, t mod N, as if it were that of all."""
-        A, B, C, D = (stack[t % self.period] for stack in self.stacks())
-        applied = self.applied
-        if applied is not None and self.period > 1:
-            applied = applied[t % self.period]
-        return Controller(A=A, B=B, C=C, D=D, dt_s=self.dt_s, applied=applied)
-
     def to_statespace(self) -> StateSpace:
         """Return the same input-output map in the textbook (current-state) form."""
         return StateSpace(
@@ -114,7 +106,6 @@ class RunningController:
     """
 
     controller: Any  # a Controller, or an estimator form
-    form: str = "plain"  # or "estimator"
     fallbacks: Mapping[frozenset[str], Controller] = field(default_factory=dict)
     state: FloatArray = field(init=False)
     phase: int = field(init=False)  # of the next sample
@@ -151,7 +142,7 @@ class RunningController:
         measured = _signal(y, "y", B)
         state = self.state[:, None] if measured.ndim > self.state.ndim else self.state
         drive = B @ measured
-        if self.form == "estimator":
+        if isinstance(self.controller, EstimatorForm):
             last = C @ state if applied is None else _signal(applied, "applied", C.T)
             drive = drive + self.controller.applied @ last
         self.state = A @ state + drive
@@ -226,7 +217,7 @@ class EstimatorForm:
 
     def start(self) -> RunningController:
         """Return a running copy with a zero state: ``step(y, applied) -> u`` sample by sample."""
-        return RunningController(self, form="estimator")
+        return RunningController(self)
 
 
 def estimator_form(controller: Controller | HasController) -> EstimatorForm:
@@ -258,12 +249,14 @@ def estimator_form(controller: Controller | HasController) -> EstimatorForm:
     """
     plain = as_controller(controller)
     delayed = _with_command_state(plain) if np.any(plain.D) else plain
-    applied = _conditioning_gain(delayed) if delayed.applied is None else delayed.applied
+    applied, entry = delayed.applied, delayed.B
+    if applied is None:
+        applied = delayed.A @ entry @ np.linalg.pinv(delayed.C @ entry)
     A = delayed.A - applied @ delayed.C
     terms = np.abs(delayed.A) + np.abs(applied) @ np.abs(delayed.C)
     form = EstimatorForm(
         A=frozen_copy(np.where(np.abs(A) > _ROUNDED * terms, A, 0.0)),
-        B=delayed.B,
+        B=entry,
         applied=frozen_copy(applied),
         C=delayed.C,
         dt_s=delayed.dt_s,
@@ -289,9 +282,3 @@ def _with_command_state(controller: Controller) -> Controller:
         D=np.zeros_like(D),
         dt_s=controller.dt_s,
     )
-
-
-def _conditioning_gain(controller: Controller) -> FloatArray:
-    """Return L (n, m) of the conditioning technique."""
-    A, B, C = controller.A, controller.B, controller.C
-    return np.asarray(A @ B @ np.linalg.pinv(C @ B))

@@ -26,10 +26,6 @@ class Fractions:
     steering: ComplexArray | None  # (F, n): slopes of the denominators; None if they are all 1
     worst: bool  # the largest instead of the sum
 
-    def numerators(self, c: FloatArray) -> FloatArray:
-        """Squares of the numerators at coefficients c, (F,)."""
-        return np.asarray(np.sum(np.abs(self.centres + self.rows @ c) ** 2, axis=1))
-
     def denominators(self, c: FloatArray) -> ComplexArray:
         """Denominators before they are squared, (F,)."""
         if self.steering is None:
@@ -43,7 +39,8 @@ class Fractions:
 
     def values(self, c: FloatArray) -> FloatArray:
         """Value of each fraction at coefficients c, (F,)."""
-        return np.asarray(self.numerators(c) / np.abs(self.denominators(c)) ** 2)
+        squares = np.sum(np.abs(self.centres + self.rows @ c) ** 2, axis=1)
+        return np.asarray(squares / np.abs(self.denominators(c)) ** 2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

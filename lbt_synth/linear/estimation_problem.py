@@ -145,17 +145,6 @@ class EstimationProblem(LinearSystem):
         rows = self.read[phase]
         return (A, B, C, D) if rows.all() else (A, B, C[rows], D[rows])
 
-    def phase(self, t: int) -> EstimationProblem:
-        """Return the problem of a phase, with the measurements that are read in it.
-
-        Where nothing is read, there is a measurement of nothing but noise.
-        """
-        A, B, C, D = self.read_parts(t)
-        if len(C) == 0:
-            B, C = np.pad(B, ((0, 0), (0, 1))), np.zeros((1, self.n_states))
-            D = np.eye(1, B.shape[1], B.shape[1] - 1)
-        return self.bare(A=A, B=B, C=C, D=D, read=None)
-
     def bare(self, **changes: Any) -> EstimationProblem:
         """Return the problem of these matrices alone, with some of them changed."""
         names = ("A", "B", "C", "D", "L", "read", "dt_s")
@@ -184,7 +173,7 @@ class EstimationProblem(LinearSystem):
         The columns of ``[B; D]`` are divided by their norms, so that the disturbances of
         the generalised plant act with identity weights.
         """
-        self.require_one_phase("a scaling of disturbances", "phase(t).with_unit_weights()")
+        self.require_one_phase("a scaling of disturbances", "one without")
         size = np.linalg.norm(np.vstack([self.B, self.D]), axis=0)
         size = np.where(size > 0, size, 1.0)
         return self.bare(B=self.B / size, D=self.D / size)

@@ -117,7 +117,13 @@ class GeneralizedPlant(Summarised):
         p, m = G.D.shape
         q = integer(measurements, "measurements", at_least=1, at_most=p - 1)
         r = integer(controls, "controls", at_least=1, at_most=m - 1)
-        return cls(**_partition(G, p - q, m - r), dt_s=G.dt_s)
+        A, (B1, B2) = G.A, np.split(G.B, [m - r], axis=1)
+        C1, C2 = np.split(G.C, [p - q])
+        (D11, D12), (D21, D22) = (
+            np.split(rows, [m - r], axis=1) for rows in np.split(G.D, [p - q])
+        )
+        parts = {"A": A, "B1": B1, "B2": B2, "C1": C1, "C2": C2}
+        return cls(**parts, D11=D11, D12=D12, D21=D21, D22=D22, dt_s=G.dt_s)
 
     @property
     def whole(self) -> StateSpace:
@@ -133,11 +139,6 @@ class GeneralizedPlant(Summarised):
         parts = {name: getattr(self, other).T for name, other in turned.items()}
         return GeneralizedPlant(**parts, dt_s=self.dt_s)
 
-    def with_whole(self, system: StateSpace) -> GeneralizedPlant:
-        """Return the plant of another system with the same partition."""
-        m1, _, p1, _ = self.sizes
-        return GeneralizedPlant(**_partition(system, p1, m1), dt_s=system.dt_s)
-
     def closed_loop(self, controller: StateSpace) -> StateSpace:
         """Return the system from w to z with ``u = K y``, for K from y (p2) to u (m2).
 
@@ -152,7 +153,11 @@ class GeneralizedPlant(Summarised):
             raise DimensionError(
                 f"the controller must map {p2} measurements to {m2} controls; got D {K.D.shape}."
             )
-        require_same_period(self.dt_s, K)
+        if K.dt_s != self.dt_s:
+            raise ProblemError(
+                f"plant and controller must have one sampling period; got {self.dt_s:.6g} s and "
+                f"{K.dt_s:.6g} s."
+            )
         x, w, y = len(self.A), self.B1.shape[1], invert_well_posed(self.D22, K.D)
         # y = loop (C2 x + D21 w + D22 C xk)
         measured = y @ np.hstack([self.C2, self.D22 @ K.C, self.D21])
@@ -170,14 +175,6 @@ class GeneralizedPlant(Summarised):
         return replace(K, A=rows[:, :n], B=rows[:, n:], C=error[:, :n], D=error[:, n:])
 
 
-def require_same_period(dt_s: float, system: StateSpace) -> None:
-    """Refuse a system with another sampling period than the plant's."""
-    if system.dt_s != dt_s:
-        raise ProblemError(
-            f"all systems must have one sampling period; got {dt_s:.6g} s and {system.dt_s:.6g} s."
-        )
-
-
 def invert_well_posed(D22: FloatArray, D: FloatArray) -> FloatArray:
     """Return ``(I - D22 D)^-1``, (p2, p2); refuse a singular one, in any units of y."""
     loop, (units, _) = matrix_balance(np.eye(len(D22)) - D22 @ D, permute=False, separate=True)
@@ -190,11 +187,3 @@ def invert_well_posed(D22: FloatArray, D: FloatArray) -> FloatArray:
             status="ill posed",
         )
     return np.asarray(units[:, None] * np.linalg.inv(loop) / units)
-
-
-def _partition(system: StateSpace, p1: int, m1: int) -> dict[str, Any]:
-    """Parts of a system whose first p1 outputs are errors, first m1 inputs disturbances."""
-    A, B, C, D = system.A, system.B, system.C, system.D
-    parts = {"A": A, "B1": B[:, :m1], "B2": B[:, m1:], "C1": C[:p1], "C2": C[p1:]}
-    parts |= {"D11": D[:p1, :m1], "D12": D[:p1, m1:]}
-    return parts | {"D21": D[p1:, :m1], "D22": D[p1:, m1:]}

@@ -44,11 +44,6 @@ def solve_stack(matrices: npt.NDArray[Entry], right: npt.NDArray[Entry]) -> npt.
         return out
 
 
-def is_stable(A: FloatArray) -> bool:
-    """Return whether all eigenvalues of a matrix (n, n) lie inside the unit circle."""
-    return bool(np.max(np.abs(np.linalg.eigvals(A))) < 1)
-
-
 def relative_distance(array: FloatArray, other: FloatArray) -> float:
     """Return the norm of the difference of two arrays over that of the other."""
     return float(np.linalg.norm(array - other)) / max(float(np.linalg.norm(other)), 1e-300)

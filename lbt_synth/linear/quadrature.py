@@ -21,12 +21,12 @@ def gauss_panels(edges: FloatArray, order: int) -> tuple[FloatArray, FloatArray]
     return nodes.ravel(), weights.ravel()
 
 
-_legendre_rule = cache(np.polynomial.legendre.leggauss)
+legendre_rule = cache(np.polynomial.legendre.leggauss)
 
 
 def panel_rule(low: FloatArray, high: FloatArray, order: int) -> tuple[FloatArray, FloatArray]:
     """Nodes and weights (panels, order) of panels that need not touch."""
-    x, w = _legendre_rule(order)
+    x, w = legendre_rule(order)
     half, middle = (high - low)[:, None] / 2, (high + low)[:, None] / 2
     return middle + half * x, half * w
 

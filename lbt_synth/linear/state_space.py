@@ -210,11 +210,6 @@ class StateSpace(LinearSystem):
         """The spectral radius of a period as a factor per sample."""
         return float(self.spectral_radius ** (1 / self.period))
 
-    def phase(self, t: int) -> StateSpace:
-        """Return the system of a phase, t mod N, as if it were that of all."""
-        A, B, C, D = (stack[t % self.period] for stack in self.stacks())
-        return StateSpace(A=A, B=B, C=C, D=D, dt_s=self.dt_s)
-
     def lifted(self) -> StateSpace:
         """Return the system over a period: inputs and outputs of all phases side by side."""
         if self.period == 1:
@@ -275,15 +270,20 @@ class StateSpace(LinearSystem):
             return self.frequency_response(frequency_hz)[:, None]
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
-        (p, m), N, whole = self.D.shape[-2:], self.period, self.lifted()
-        schur = complex_schur(whole.A)
-        step = max(1, _CHUNK // max(p, self.n_states, 1))
+        (p, m), n, N, whole = self.D.shape[-2:], self.n_states, self.period, self.lifted()
+        T, U = complex_schur(whole.A)
+        B = (U.conj().T @ whole.B).reshape(n, N, m)
+        D, step = whole.D.reshape(N * p, N, m), max(1, _CHUNK // max(p, n, 1))
         out = np.empty((z.size, N, p, m), dtype=np.complex128)
-        for j in range(m):  # the input of a period is one of its columns times z^0, z^1, ...
-            column = replace(whole, B=whole.B[:, j::m], D=whole.D[:, j::m])
-            for start in range(0, z.size, step):
-                part = slice(start, start + step)
-                out[part, :, :, j] = _repeating_response(column, schur, z[part], N)
+        for start in range(0, z.size, step):
+            part = slice(start, start + step)
+            turns = z[part, None] ** np.arange(N)  # of the input of a period, and of its output
+            for j in range(m):
+                x = turns @ B[:, :, j].T  # the state at phase 0 repeats as z^N: solve for it
+                for i in range(n - 1, -1, -1):
+                    x[:, i] = (x[:, i] + x[:, i + 1 :] @ T[i, i + 1 :]) / (z[part] ** N - T[i, i])
+                y = (x @ U.T) @ whole.C.T + turns @ D[:, :, j].T
+                out[part, :, :, j] = y.reshape(-1, N, p) / turns[:, :, None]
         return out
 
     def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:
@@ -394,9 +394,6 @@ def stacked_response(
     dependent, fail at some probes, its points are solved one by one.
     """
     A, B, C, D = matrices
-    if len(A) == 1 and A.size:
-        form = schur_form(StateSpace(A=A[0], B=B[0], C=C[0], D=D[0]))
-        return lambda z: schur_response(form, z)[:, None]
     if not A.size:
         return lambda z: np.broadcast_to(D.astype(np.complex128), (z.size, *D.shape))
     poles, vectors = np.linalg.eig(A)
@@ -423,19 +420,6 @@ def stacked_response(
     return respond
 
 
-def _repeating_response(
-    whole: StateSpace, schur: tuple[ComplexArray, ComplexArray], z: ComplexArray, N: int
-) -> ComplexArray:
-    """Return y(t) z^-t of each phase for the input z^k of a system over a period, (f, N, p)."""
-    T, U = schur
-    turns = z[:, None] ** np.arange(N)
-    x = (turns @ whole.B.T) @ U.conj()  # the state at phase 0 repeats as z^N: solve for it
-    for i in range(whole.n_states - 1, -1, -1):
-        x[:, i] = (x[:, i] + x[:, i + 1 :] @ T[i, i + 1 :]) / (z**N - T[i, i])
-    out = (x @ U.T) @ whole.C.T + turns @ whole.D.T
-    return np.asarray(out.reshape(len(z), N, -1) / turns[:, :, None])
-
-
 def _system_parts(system: Any) -> tuple[Any, Any, Any, Any, float]:
     """Return A, B, C, D and the sampling period [s] of a discrete system; refuse anything else.
 
@@ -457,16 +441,9 @@ def _system_parts(system: Any) -> tuple[Any, Any, Any, Any, float]:
             f"tuple (A, B, C, D); got {type(system).__name__}."
         )
     dt = system.dt if hasattr(system, "dt") else getattr(system, "dt_s", 0)
-    # scipy writes None in continuous time, python-control where the period is not given
-    period = _period(0 if library == "scipy" and dt is None else dt)
-    return system.A, system.B, system.C, system.D, period
-
-
-def _period(dt: Any) -> float:
-    if dt is None or dt is True:
-        return 1.0
-    if dt == 0:
+    if dt == 0 or (library == "scipy" and dt is None):  # which python-control has for no period
         raise ProblemError(
             f"the system must be in discrete time; got a continuous one (dt = 0). {SAMPLE_FIRST}"
         )
-    return float(dt)
+    period = 1.0 if dt is None or dt is True else float(dt)
+    return system.A, system.B, system.C, system.D, period

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lbt_synth.errors import DimensionError, NumericalError, ProblemError
+from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels
 from lbt_synth.loop.least_residual import ModeSpectrum, Prediction, mode_limit, truth_modes
 from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import checked_direction
-from lbt_synth.validation import FloatArray, frozen_copy, number
+from lbt_synth.validation import FloatArray, frozen_copy
 
 _PANELS = 128  # at least so many over the band
 _ORDER = 10
@@ -42,8 +42,6 @@ class BandLimit:
     # parts them
     achieved_nm: float
     variance_nm2: FloatArray  # (n,): the limit by direction, that of the sinusoid included [nm^2]
-    # (n, n): directions over the modes, one per row, along which the loop decouples
-    directions: FloatArray
     frequency_hz: FloatArray  # (f,): frequencies in the band [Hz]
     # (f,): probability of each, of the density that is hardest to reject; the sum is 1
     weight: FloatArray
@@ -67,7 +65,12 @@ def least_worst_residual(
     the upper end. Other sinusoids count as in :func:`least_residual`.
     """
     nyquist = hardware.frame_rate_hz / 2
-    low, high = _checked_band(band_hz, nyquist)
+    low, high = band_hz
+    if not 0 < low < high < nyquist:
+        raise ProblemError(
+            f"band_hz must increase between 0 and the Nyquist frequency {nyquist:.6g} Hz; got "
+            f"{low:.6g} to {high:.6g} Hz. For a known frequency, see least_residual."
+        )
     axis = tuple(np.ravel(direction))
     line = SinusoidalVibration(frequency_hz=high, rms_nm=rms_nm, direction=axis)
     along = checked_direction(line, hardware)
@@ -86,26 +89,9 @@ def least_worst_residual(
         rms_nm=float(np.sqrt(variance.sum())),
         achieved_nm=float(np.sqrt(variance.sum() + upper - lower)),
         variance_nm2=frozen_copy(variance),
-        directions=frozen_copy(directions),
         frequency_hz=frozen_copy(x * nyquist),
         weight=frozen_copy(weight),
     )
-
-
-def _checked_band(band_hz: tuple[float, float], nyquist_hz: float) -> tuple[float, float]:
-    try:
-        low, high = band_hz
-    except (TypeError, ValueError) as error:
-        text = f"band_hz must be two frequencies, the lowest and the highest; got {band_hz!r}."
-        raise DimensionError(text) from error
-    low = number(low, "band_hz[0]", above=0)
-    high = number(high, "band_hz[1]", above=0)
-    if not low < high < nyquist_hz:
-        raise ProblemError(
-            f"band_hz must increase and stay below the Nyquist frequency {nyquist_hz:.6g} Hz; got "
-            f"{low:.6g} to {high:.6g} Hz. For a known frequency, see least_residual."
-        )
-    return low, high
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,12 +13,11 @@ from lbt_synth.errors import ProblemError
 from lbt_synth.linear import StateSpace
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.linear.quadrature import adaptive_integral, gauss_panels, graded_edges
-from lbt_synth.loop.closed_loop import ClosedLoop, require_loop_rate
+from lbt_synth.loop.closed_loop import ClosedLoop
 from lbt_synth.loop.ensemble import (
     EnsembleVibration,
     LoopEnsemble,
     ensemble_vibration,
-    turbulence_rows,
 )
 from lbt_synth.loop.evaluator import (
     STILL,
@@ -31,6 +30,7 @@ from lbt_synth.loop.evaluator import (
 )
 from lbt_synth.models import (
     ARModel,
+    Atmosphere,
     LoopHardware,
     SinusoidalVibration,
     Spectrum,
@@ -38,9 +38,10 @@ from lbt_synth.models import (
     Truth,
     Vibration,
 )
+from lbt_synth.models.loop_hardware import require_loop_rate
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.sensor_suite import Motion, Motions, checked_motions
-from lbt_synth.models.spectra import breakpoints_below, spectrum_density
+from lbt_synth.models.spectra import breakpoints_below, spectrum_density, spectrum_groups
 from lbt_synth.models.vibration import checked_direction, sampled_lines
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import fact, fact_table, facts
@@ -198,19 +199,19 @@ def residual_budget(
         require_instance(truth, Truth)
     hardware, n = loop.hardware, loop.hardware.modes
     turbulence, vibrations, noise = truth.entering(hardware, sensor_gain=loop.sensor_gain)
-    motions = _motions(loop, truth.motions, len(vibrations))
+    motions: Motions = ({},) * len(vibrations)  # no channel is read
+    if loop.reads_others:
+        motions = checked_motions(truth.motions, hardware.suite, len(vibrations))
     rows = loop_evaluator(loop, in_image=not frame_means)
     lines, seen = [], np.zeros((2, n, n))
     for line, motion in zip(vibrations, motions, strict=True):
-        if not isinstance(line, Vibration):
-            lines.append(_one_line(loop, line, _seen_swing(loop, line, motion)))
-        elif _moved_rows(loop, motion):
+        if isinstance(line, Vibration) and _moved_rows(loop, motion):
             seen += _of_seen(loop, rows, line, motion)
         else:
-            lines.append(_one_line(loop, line))
+            lines.append(_one_line(loop, line, motion))
     budget = residual_of_parts(
         [rows],
-        [(spectrum, np.array(modes, dtype=np.intp)) for spectrum, modes in turbulence],
+        turbulence,
         lines,
         _noise_factor(loop, noise)[None],
         hardware=hardware,
@@ -218,13 +219,11 @@ def residual_budget(
     )
     # what repeats with the period turns one sinusoid into several
     amplitudes = np.fft.fft(budget.line_amplitudes_nm, axis=0) / rows.phases
-    return ResidualBudget(
-        turbulence_nm2=frozen_copy(budget.turbulence_nm2.mean(axis=0)),
-        noise_nm2=frozen_copy(budget.noise_nm2.mean(axis=0)),
-        random_vibration_nm2=frozen_copy(budget.random_vibration_nm2.mean(axis=0) + seen[0]),
-        within_nm2=frozen_copy(budget.within_nm2.mean(axis=0) + seen[1]),
-        line_amplitudes_nm=read_only(amplitudes.reshape(-1, n)),
-    )
+    means = {name: getattr(budget, name).mean(axis=0) for name in _COVARIANCES}
+    means["random_vibration_nm2"] += seen[0]
+    means["within_nm2"] += seen[1]
+    whole = {name: read_only(covariance) for name, covariance in means.items()}
+    return ResidualBudget(**whole, line_amplitudes_nm=read_only(amplitudes.reshape(-1, n)))
 
 
 def random_density(
@@ -236,7 +235,7 @@ def random_density(
     """
     n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
     turbulence, vibrations, noise = truth.entering(loop.hardware, sensor_gain=loop.sensor_gain)
-    origins = [(spectrum, np.eye(n)[:, list(modes)]) for spectrum, modes in turbulence]
+    origins = [(spectrum, np.eye(n)[:, modes]) for spectrum, modes in turbulence]
     for line in vibrations:
         if isinstance(line, Vibration):
             along = np.sinc(line.frequency_hz / rate) * checked_direction(line, loop.hardware)
@@ -286,7 +285,7 @@ def residual_spectrum(
 
 def residual_of_parts(
     parts: Sequence[Evaluator],
-    turbulence: Sequence[tuple[Spectrum, IntArray]],
+    turbulence: Sequence[tuple[Spectrum, list[int]]],
     lines: Sequence[EnsembleVibration],
     noise: FloatArray,
     *,
@@ -350,6 +349,13 @@ def residual_of_parts(
     )
 
 
+def _of_loops(turbulence: Spectrum, rows: IntArray) -> Spectrum:
+    """Return the turbulence of some loops."""
+    if isinstance(turbulence, Atmosphere | ARModel) and turbulence.count > 1:
+        return turbulence.take(rows)
+    return turbulence
+
+
 def ensemble_residuals(
     matrices: Matrices, hardware: LoopHardware, ensemble: LoopEnsemble, *, frame_means: bool = False
 ) -> ResidualBudget:
@@ -357,14 +363,15 @@ def ensemble_residuals(
 
     Unstable loops leave nan.
     """
-    turbulence, lines = ensemble.groups(hardware), ensemble.lines(hardware)
     noise, n, p = ensemble.noise(hardware), hardware.modes, ensemble.loops
-    gains, delays = ensemble.gains(), ensemble.delays(hardware)
+    turbulence = spectrum_groups(ensemble.turbulence_of(n))
+    lines = ensemble.lines(hardware)
+    delays = hardware.delay_frames if ensemble.delay_frames is None else ensemble.delay_frames
     stable, groups = close_loops(
         matrices,
         hardware,
-        gains,
-        delays,
+        np.broadcast_to(ensemble.sensor_gain, (p,)),
+        np.broadcast_to(delays, (p,)),
         in_image=not frame_means,
         together=[np.any(line.direction, axis=0) for line in lines],
     )
@@ -381,7 +388,7 @@ def ensemble_residuals(
             rows = loops[some]
             budget = residual_of_parts(
                 [part.take(some) for part in parts],
-                [(turbulence_rows(spectrum, rows), modes) for spectrum, modes in turbulence],
+                [(_of_loops(air, rows), modes) for air, modes in turbulence],
                 [line.take(rows) for line in lines],
                 noise[rows],
                 hardware=hardware,
@@ -419,12 +426,18 @@ def model_covariances(loop: ClosedLoop, plant: TipTiltPlant) -> FloatArray:
 
 
 def _one_line(
-    loop: ClosedLoop, line: Vibration | SinusoidalVibration, readings: ComplexArray | None = None
+    loop: ClosedLoop, line: Vibration | SinusoidalVibration, motion: Mapping[str, Motion]
 ) -> EnsembleVibration:
-    """Return a line as one loop meets it."""
-    along = checked_direction(line, loop.hardware)
-    conditions = replace(ensemble_vibration(line), direction=along, readings=readings)
-    return conditions.of_loops(1)
+    """Return a line as one loop meets it, with what channels read of a sinusoid."""
+    hardware, n = loop.hardware, loop.hardware.modes
+    readings = np.zeros(loop.system.B.shape[-1] - n, dtype=np.complex128)
+    sensors = {name: s for s in hardware.suite.accelerometers for name in s.channels}
+    for row, name in _moved_rows(loop, motion):
+        if name not in loop.blind:
+            swing = sensors[name].swing(motion[name], line.frequency_hz, hardware)
+            readings[row - n] = swing
+    along = checked_direction(line, hardware)
+    return replace(ensemble_vibration(line), direction=along, readings=readings).of_loops(1)
 
 
 def _of_seen(
@@ -478,13 +491,6 @@ def _phases_of(rows: Evaluator, process: StateSpace) -> tuple[FloatArray, FloatA
     return A, B, C
 
 
-def _motions(loop: ClosedLoop, motions: Motions, lines: int) -> Motions:
-    """Return which channels each line moves: none where the loop reads its own sensor alone."""
-    if not loop.reads_others:
-        return ({},) * lines
-    return checked_motions(motions, loop.hardware.suite, lines)
-
-
 def _moved_rows(loop: ClosedLoop, motion: Mapping[str, Motion]) -> list[tuple[int, str]]:
     """Return the inputs of a loop at which channels read a line, and the channels, in order."""
     if not loop.reads_others:
@@ -505,22 +511,6 @@ def _shaken(
     if not moved:
         return ar_process(line.ar_model(hardware.frame_rate_hz)), entry
     return seen_vibration(line, motion, hardware.suite.accelerometers, hardware), entry
-
-
-def _seen_swing(
-    loop: ClosedLoop, line: SinusoidalVibration, motion: Mapping[str, Motion]
-) -> ComplexArray:
-    """Return what the readings have of a sinusoid of unit amplitude, (q,)."""
-    hardware, n = loop.hardware, loop.hardware.modes
-    readings = np.zeros(loop.system.B.shape[-1] - n, dtype=np.complex128)
-    of_channel = {
-        name: sensor for sensor in hardware.suite.accelerometers for name in sensor.channels
-    }
-    for row, name in _moved_rows(loop, motion):
-        if name not in loop.blind:
-            swing = of_channel[name].swing(motion[name], line.frequency_hz, hardware)
-            readings[row - n] = swing
-    return readings
 
 
 def ar_process(model: ARModel) -> StateSpace:

@@ -13,7 +13,7 @@ from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.linear.controller import HasController, as_controller
 from lbt_synth.models import LoopHardware
 from lbt_synth.models.mirror.frame_rate_system import Response
-from lbt_synth.models.plant.assembly import memory, other_exposures, own_exposure
+from lbt_synth.models.plant.assembly import sensor_memory
 from lbt_synth.models.sensor_suite import OWN_SENSOR
 from lbt_synth.storage.rows import fact, fact_table, facts
 from lbt_synth.storage.summaries import Summarised, Summary
@@ -204,13 +204,12 @@ def last_frame(sensor: FloatArray) -> Readings:
 def _readings_of_all(hardware: LoopHardware, blind: tuple[str, ...]) -> Readings:
     """Return the readings of all sensors of a loop, of which some follow nothing."""
     suite, rows = hardware.suite, hardware.suite.rows(hardware)
-    exposures = [own_exposure(hardware), *other_exposures(hardware)]
-    held = memory(exposures, hardware.modes, hardware.period)
-    others, own = np.zeros((2, hardware.period, hardware.n_readings, held.n_states))
-    others[:, : held.C.shape[1]] = held.C
+    A, B, C = sensor_memory(hardware, own=True)
+    others, own = np.zeros((2, hardware.period, hardware.n_readings, A.shape[1]))
+    others[:, : C.shape[1]] = C
     others[:, suite.marked(blind, hardware)] = 0.0
     own[:, rows[OWN_SENSOR]] = others[:, rows[OWN_SENSOR]]
-    return held.A, held.B, others - own, own
+    return A, B, others - own, own
 
 
 def require_matching_controller(hardware: LoopHardware, controller: Controller) -> None:
@@ -219,27 +218,14 @@ def require_matching_controller(hardware: LoopHardware, controller: Controller) 
     if reads_others(hardware, controller):
         q, period = hardware.n_readings, hardware.period
     if controller.D.shape[-2:] != (m, q) or controller.period != period:
-        wanted, got = (
-            "" if period == controller.period == 1 else f" in a period of {frames} frames"
-            for frames in (period, controller.period)
-        )
         raise DimensionError(
-            f"the controller must map {q} measurements to {m} commands{wanted}; got "
-            f"{controller.D.shape[-1]} to {controller.D.shape[-2]}{got}."
+            f"the controller must map {q} measurements to {m} commands in a period of {period}; "
+            f"got {controller.D.shape[-1]} to {controller.D.shape[-2]} in {controller.period}."
         )
     if not np.isclose(controller.dt_s, hardware.dt_s, rtol=1e-9):
         raise ProblemError(
             f"the controller must run at the loop's {hardware.frame_rate_hz:.6g} Hz; got one "
             f"designed for {1 / controller.dt_s:.6g} Hz. Design it for this frame rate."
-        )
-
-
-def require_loop_rate(frame_rate_hz: float, hardware: LoopHardware) -> None:
-    """Raise if a sampled disturbance does not have the loop's frame rate."""
-    if not np.isclose(frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9):
-        raise ProblemError(
-            f"a disturbance must be sampled at the loop's {hardware.frame_rate_hz:.6g} Hz; "
-            f"got {frame_rate_hz:.6g} Hz."
         )
 
 
@@ -306,7 +292,7 @@ def loop_matrices(
 
 
 def youla_controller(
-    hardware: LoopHardware, parameter: Controller, *, stored: bool = False
+    hardware: LoopHardware, parameter: Controller, *, sign: float = 1.0, stored: bool = False
 ) -> Controller:
     """Return the controller from y to u of a filter from the pseudo-open-loop ybar to u.
 
@@ -315,20 +301,9 @@ def youla_controller(
     Every controller that stabilises the loop is a stable filter from it to u, in which the closed
     loop is affine (D. C. Youla, H. A. Jabr, J. J. Bongiorno, IEEE Trans. Autom. Control 21, 319
     (1976), doi:10.1109/TAC.1976.1101223). Readings of other sensors, which no command moves, may
-    follow ybar. Stored, the last command is a state of its own, whichever output it was.
+    follow ybar. Stored, the last command is a state of its own, whichever output it was. With the
+    sign -1 it is the filter of a controller.
     """
-    return _with_correction(hardware, parameter, 1.0, stored=stored)
-
-
-def youla_parameter(hardware: LoopHardware, controller: Controller) -> Controller:
-    """Return the filter from ybar to u of a controller: what :func:`youla_controller` undoes."""
-    return _with_correction(hardware, controller, -1.0, stored=False)
-
-
-def _with_correction(
-    hardware: LoopHardware, parameter: Controller, sign: float, *, stored: bool
-) -> Controller:
-    """Return a filter whose first inputs have the correction of its own commands added."""
     m, q, readings = hardware.n_commands, hardware.n_measurements, parameter.B.shape[1]
     if len(parameter.C) != m or readings < q:
         raise DimensionError(

@@ -10,14 +10,10 @@ import numpy as np
 
 from lbt_synth.errors import ProblemError
 from lbt_synth.models import (
-    ARModel,
-    Atmosphere,
     LoopHardware,
     SinusoidalVibration,
-    Spectrum,
     Vibration,
 )
-from lbt_synth.models.spectra import spectrum_key
 from lbt_synth.models.vibration import require_below_nyquist
 from lbt_synth.validation import (
     ComplexArray,
@@ -50,29 +46,23 @@ class EnsembleVibration:
         set_fields(self, direction=frozen_copy(direction / length))
 
     @property
-    def per_loop(self) -> list[FloatArray]:
-        """The numbers that may be one for each loop."""
-        direction = [self.direction] if self.direction.ndim == 2 else []
-        numbers = (self.frequency_hz, self.rms_nm, self.damping)
-        return [value for value in numbers if np.ndim(value)] + direction
+    def numbers(self) -> dict[str, Any]:
+        """The numbers that it has, of which each may be one for each loop."""
+        names = ("frequency_hz", "rms_nm", "damping", "direction")
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
     def of_loops(self, p: int) -> EnsembleVibration:
         """Return it with all numbers (p,), and directions (p, n)."""
-        n = self.direction.shape[-1]
-        damping = None if self.damping is None else np.broadcast_to(self.damping, (p,))
-        return replace(
-            self,
-            frequency_hz=np.broadcast_to(self.frequency_hz, (p,)),
-            rms_nm=np.broadcast_to(self.rms_nm, (p,)),
-            damping=damping,
-            direction=np.broadcast_to(self.direction, (p, n)),
-        )
+        one = {"direction": self.direction.shape[-1:]}  # the shape for one loop
+        stacks: dict[str, Any] = {
+            name: np.broadcast_to(value, (p, *one.get(name, ())))
+            for name, value in self.numbers.items()
+        }
+        return replace(self, **stacks)
 
     def take(self, rows: IntArray) -> EnsembleVibration:
         """Return that of some loops, where all numbers are (p,)."""
-        damping = None if self.damping is None else self.damping[rows]
-        numbers = {name: getattr(self, name)[rows] for name in ("frequency_hz", "rms_nm")}
-        return replace(self, direction=self.direction[rows], damping=damping, **numbers)
+        return replace(self, **{name: value[rows] for name, value in self.numbers.items()})
 
 
 def ensemble_vibration(vibration: Vibration | SinusoidalVibration) -> EnsembleVibration:
@@ -109,24 +99,16 @@ class LoopEnsemble:
             raise ProblemError(f"noise_nm must be at least 0; got {noise.min():.6g}.")
         set_fields(self, sensor_gain=positive(self.sensor_gain, "sensor_gain"), noise_nm=noise)
         values = [self.sensor_gain, self.noise_nm, self.delay_frames]
-        values += [value for line in self.vibrations for value in line.per_loop]
-        values += [v for air in self._turbulence_of(1) for v in _turbulence_numbers(air)]
+        for line in self.vibrations:
+            values += [v for n, v in line.numbers.items() if np.ndim(v) > (n == "direction")]
         lengths = [len(value) for value in values if np.ndim(value)]
-        set_fields(self, loops=max([self.loops, *lengths], default=1) or 1)
+        counts = [getattr(air, "count", 1) for air in self.turbulence_of(1)]
+        set_fields(self, loops=max([1, self.loops, *lengths, *counts]))
 
-    def _turbulence_of(self, modes: int) -> tuple[Any, ...]:
+    def turbulence_of(self, modes: int) -> tuple[Any, ...]:
         """Return the turbulence as it is per mode, or for each of some modes."""
         one = not isinstance(self.turbulence, Sequence)
         return (self.turbulence,) * modes if one else tuple(self.turbulence)
-
-    def delays(self, hardware: LoopHardware) -> FloatArray:
-        """Return the total delay of each loop [frames], (p,)."""
-        delay = hardware.delay_frames if self.delay_frames is None else self.delay_frames
-        return np.broadcast_to(delay, (self.loops,))
-
-    def gains(self) -> FloatArray:
-        """Return the sensor gain of each loop, (p,)."""
-        return np.broadcast_to(self.sensor_gain, (self.loops,))
 
     def noise(self, hardware: LoopHardware) -> FloatArray:
         """Return a factor of the covariance of the noise [nm], (p, q, w)."""
@@ -136,36 +118,8 @@ class LoopEnsemble:
         noise = noise[:, None] if noise.ndim == 1 else noise
         return np.broadcast_to(noise, (self.loops, q))[..., None] * np.eye(q)
 
-    def groups(self, hardware: LoopHardware) -> list[tuple[Spectrum, IntArray]]:
-        """Return the turbulence with the modes that have it."""
-        airs = self._turbulence_of(hardware.modes)
-        keys = [spectrum_key(air) for air in airs]
-        kinds = {key: air for key, air in zip(keys, airs, strict=True) if air is not None}
-        return [
-            (air, np.flatnonzero([other == key for other in keys])) for key, air in kinds.items()
-        ]
-
     def lines(self, hardware: LoopHardware) -> list[EnsembleVibration]:
         """Return the vibrations with all their numbers (p,), and directions (p, n)."""
         for line in self.vibrations:
             require_below_nyquist(float(np.max(line.frequency_hz)), hardware.frame_rate_hz)
         return [line.of_loops(self.loops) for line in self.vibrations]
-
-
-def _turbulence_numbers(turbulence: Spectrum | None) -> list[FloatArray]:
-    """Return the arrays of a turbulence that have one entry per loop."""
-    if isinstance(turbulence, Atmosphere):
-        values = turbulence.seeing_arcsec, turbulence.wind_speed_m_s, turbulence.outer_scale_m
-        return [value for value in values if value is not None]
-    if isinstance(turbulence, ARModel) and turbulence.coefficients.ndim > 1:
-        return [*turbulence.coefficients.T, turbulence.driving_rms_nm]
-    return []
-
-
-def turbulence_rows(turbulence: Spectrum, rows: IntArray) -> Spectrum:
-    """Return the turbulence of some loops."""
-    if isinstance(turbulence, Atmosphere) and np.size(turbulence.wind_speed_m_s) > 1:
-        return turbulence.take(rows)
-    if isinstance(turbulence, ARModel) and turbulence.count > 1:
-        return turbulence.take(rows)
-    return turbulence

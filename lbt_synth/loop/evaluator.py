@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -155,9 +156,8 @@ class Evaluator:
             return self.of_process(coefficients, np.atleast_1d(spectrum.driving_rms_nm), entry)
 
         def density(f_hz: FloatArray) -> FloatArray:
-            if isinstance(spectrum, Atmosphere) and spectrum.is_stack:
-                shapes, which, factor = spectrum.factored_psd(f_hz)
-                return np.asarray(shapes.T[:, which] * factor)
+            if isinstance(spectrum, Atmosphere) and np.ndim(spectrum.wind_speed_m_s):
+                return spectrum.psd(f_hz).T
             return spectrum_density(spectrum, f_hz)[:, None]
 
         return self.of_density(density, entry, breakpoints_below(spectrum, self.frame_rate_hz / 2))
@@ -384,9 +384,13 @@ def close_loops(
         for modes, measurements, controllers, sensor, influence in parts:
             one = len(controllers[0]) == 1
             controllers = controllers if one else tuple(matrix[rows] for matrix in controllers)
-            closed = _interpolated_loops(
-                controllers, mirrors, sensor, influence, sensor_gains[rows], fraction
+            path = partial(loop_matrices, readings=last_frame(sensor), influence=influence)
+            ends = [path(*controllers, mirror=mirror) for mirror in mirrors]
+            share, gain = fraction[:, None, None], sensor_gains[rows, None, None]
+            A0, A1, B, C0, C1, D = (
+                one + share * (two - one) for one, two in zip(*ends, strict=True)
             )
+            closed = A0 + gain * A1, B, C0 + gain * C1, D
             poles = np.linalg.eigvals(closed[0]).astype(np.complex128)
             stable[rows] &= _are_stable(poles)
             part = _evaluator(
@@ -405,24 +409,6 @@ def close_loops(
             evaluators.append(part)
         groups.append((rows, evaluators))
     return stable, groups
-
-
-def _interpolated_loops(
-    controllers: Matrices,
-    mirrors: tuple[Response, Response],
-    sensor: FloatArray,
-    influence: FloatArray,
-    gains: FloatArray,
-    fraction: FloatArray,
-) -> Matrices:
-    """Close loops (k, ., .) whose mirrors are ``(1 - fraction) first + fraction second``."""
-    ends = [
-        loop_matrices(*controllers, mirror=mirror, readings=last_frame(sensor), influence=influence)
-        for mirror in mirrors
-    ]
-    share, gain = fraction[:, None, None], gains[:, None, None]
-    A0, A1, B, C0, C1, D = (one + share * (two - one) for one, two in zip(*ends, strict=True))
-    return A0 + gain * A1, B, C0 + gain * C1, D
 
 
 def split_into_parts(

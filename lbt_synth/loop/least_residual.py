@@ -12,20 +12,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
-from scipy.linalg import toeplitz
+from scipy.linalg import solve_triangular, toeplitz
 
 from lbt_synth.errors import CoupledModesError, LbtSynthError, ProblemError
 from lbt_synth.linear.quadrature import RefinedPanels, graded_edges, refine_panels
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.models import ARModel, LoopHardware, Spectrum, TipTiltPlant, Truth, Vibration
-from lbt_synth.models.spectra import breakpoints_below, spectrum_density, spectrum_key
+from lbt_synth.models.loop_hardware import require_loop_rate
+from lbt_synth.models.spectra import breakpoints_below, spectrum_density
 from lbt_synth.models.vibration import checked_direction
-from lbt_synth.validation import FloatArray, frozen_copy, read_only, require_instance
+from lbt_synth.validation import FloatArray, definite, frozen_copy, read_only, require_instance
 
 T = TypeVar("T")
 POINTS = 16  # samples on each side of one between two samples
@@ -69,10 +69,8 @@ class Interpolation:
         ``|P|^2 (R - R^2 / Phi)``. All but the finite sums over powers up to 0 cancels.
         """
         p, first = self.weights, self.first
-        inverse = np.zeros(coefficients.size)  # of 1 / (1 + f_1 x + ...)
-        inverse[0] = 1.0
-        for n in range(1, inverse.size):
-            inverse[n] = -coefficients[1 : n + 1] @ inverse[n - 1 :: -1][:n]
+        steps = toeplitz(coefficients, 0 * coefficients)
+        inverse = solve_triangular(steps, np.eye(1, p.size)[0], lower=True)  # of 1 / (1 + f_1 x ..)
         powers = first + np.arange(p.size)
         forward = np.array([p[i:] @ coefficients[: p.size - i] for i in range(p.size)])
         backward = np.array([p[: i + 1] @ inverse[i::-1] for i in range(p.size)])
@@ -223,19 +221,12 @@ def truth_modes(
         )
     n, rate = hardware.modes, hardware.frame_rate_hz
     noise = _noise_on_modes(hardware, noise_nm2)
-    rank = np.linalg.matrix_rank(hardware.influence)
-    if rank < n:
-        raise ProblemError(
-            "the mirror must reach every mode: an influence matrix with full row rank; got rank "
-            f"{rank} for {n} modes. Leave out the modes that it cannot correct."
-        )
-    kinds: dict[object, tuple[Spectrum | None, list[int]]] = {}
-    for spectrum, members in groups:  # modes with the same spectrum may be turned into each other
+    for spectrum, _ in groups:
         if isinstance(spectrum, ARModel):
             require_loop_rate(spectrum.frame_rate_hz, hardware)
-        kinds.setdefault(spectrum_key(spectrum), (spectrum, []))[1].extend(members)
-    calm = sorted(set(range(n)).difference(*(members for _, members in kinds.values())))
-    air = [*kinds.values(), *([(None, calm)] if calm else [])]
+    calm = sorted(set(range(n)).difference(*(members for _, members in groups)))
+    # modes with the same spectrum may be turned into each other
+    air = [*groups, *([(None, calm)] if calm else [])]
     lines = []
     for vibration in vibrations:
         along, means = checked_direction(vibration, hardware), vibration
@@ -251,7 +242,14 @@ def truth_modes(
             *(np.outer(along, along) for along in directions),
         ]
     )
-    frames, modes = _whole_frames(hardware, in_image=in_image), []
+    if hardware.mirror is not None:
+        raise ProblemError("a limit is known for a mirror that settles at once; got dynamics.")
+    if hardware.delay_frames % 1 > 0.5 and not in_image:  # a zero outside the unit circle
+        raise ProblemError(
+            "the limit of means over frames is known for at most a half beyond whole frames of "
+            f"delay; got {hardware.delay_frames:g}. Take that in the image."
+        )
+    frames, modes = int(hardware.delay_frames), []
     for axis in axes:
         parts = [next(spectrum for spectrum, some in air if np.sum(axis[some] ** 2) > 0.5)]
         sinusoids = []
@@ -273,36 +271,19 @@ def truth_modes(
     return axes, modes
 
 
-def _whole_frames(hardware: LoopHardware, *, in_image: bool) -> int:
-    """Return the whole frames of delay of a loop whose limit is known."""
-    if hardware.mirror is not None:
-        raise ProblemError("a limit is known for a mirror that settles at once; got dynamics.")
-    if hardware.delay_frames % 1 > 0.5 and not in_image:  # a zero outside the unit circle
-        raise ProblemError(
-            "the limit of means over frames is known for at most a half beyond whole frames of "
-            f"delay; got {hardware.delay_frames:g}. Take that in the image."
-        )
-    return int(hardware.delay_frames)
-
-
 def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray:
     """Covariance (n, n) of the best unbiased estimate of the modes from one measurement."""
-    sensor, n = hardware.sensor, hardware.modes
-    rank = np.linalg.matrix_rank(sensor)
-    if rank < n:
-        raise ProblemError(
-            "the sensor must see every mode: a sensor matrix with full column rank; got rank "
-            f"{rank} for {n} modes. Leave out the modes that it does not see."
-        )
-    try:
-        size = float(np.max(np.abs(noise_nm2))) or 1.0
-        factor = np.linalg.cholesky(noise_nm2 / size)
-    except np.linalg.LinAlgError as error:
-        raise ProblemError(
-            "the noise must have a positive definite covariance; got a singular one. Add a little "
-            "noise to each measurement."
-        ) from error
-    white = np.linalg.solve(factor, sensor)
+    n = hardware.modes
+    rows = ("sensor", "see", hardware.sensor), ("mirror", "reach", hardware.influence)
+    for part, verb, matrix in rows:
+        if (rank := np.linalg.matrix_rank(matrix)) < n:
+            raise ProblemError(
+                f"the {part} must {verb} every mode; got a matrix of rank {rank} for {n} modes. "
+                f"Leave out the modes that it does not {verb}."
+            )
+    size = float(np.max(np.abs(noise_nm2))) or 1.0
+    covariance = definite(noise_nm2 / size, "the covariance of the noise on all measurements")
+    white = np.linalg.solve(np.linalg.cholesky(covariance), hardware.sensor)
     return np.asarray(size * np.linalg.inv(white.T @ white))
 
 
@@ -442,12 +423,6 @@ def mode_limit(mode: ModeSpectrum) -> float:
 def above_percent(rms_nm: float, limit_nm: float) -> float:
     """Return how far a residual is above a limit [%]; nan where the limit is 0 or nan."""
     return 100 * (rms_nm / limit_nm - 1) if limit_nm > 0 else np.nan
-
-
-def limit_or_nan(limit: Callable[[], Any]) -> float:
-    """Return the least residual [nm rms], nan where it cannot be computed."""
-    found = limit_or_none(limit)
-    return np.nan if found is None else float(found.rms_nm)
 
 
 def limit_or_none(limit: Callable[[], T]) -> T | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -108,10 +109,9 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
 
     sensitivities = _own_sensitivities(loop)
     grid, responses = _refine_turns(broken, np.union1d(nodes, uniform))
-    columns = range(responses.shape[1])
-    alike = [
-        next(i for i in columns if _is_same(response, responses[:, i])) for response in responses.T
-    ]
+    near = partial(np.allclose, rtol=_SAME, atol=_SAME)
+    seen = 1 / (1 + responses.T)  # sensitivities, by which two loops are equal
+    alike = [next(i for i, one in enumerate(seen) if near(one, own)) for own in seen]
     return tuple(
         BrokenLoop(
             measurements=tuple(i for i, first in enumerate(alike) if first == index),
@@ -176,11 +176,6 @@ def _refine_turns(
 def phase_margin_deg(loop: ClosedLoop) -> float:
     """Return the least phase margin of a stable loop [deg]; inf without a gain crossing."""
     return min((point.phase_deg for point in gain_crossings(loop)), default=np.inf)
-
-
-def _is_same(one: ComplexArray, other: ComplexArray) -> bool:
-    """Whether two responses are equal, by their sensitivities."""
-    return bool(np.allclose(1 / (1 + one), 1 / (1 + other), rtol=_SAME, atol=_SAME))
 
 
 @table_row

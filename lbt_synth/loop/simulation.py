@@ -22,7 +22,7 @@ from lbt_synth.loop.closed_loop import ClosedLoop, close_loop, reads_others
 from lbt_synth.loop.disturbances import Disturbance, draw_disturbance
 from lbt_synth.loop.strehl import Imaging, series_strehl
 from lbt_synth.models import LoopHardware, Truth
-from lbt_synth.models.plant.assembly import memory, other_exposures, own_exposure
+from lbt_synth.models.plant.assembly import sensor_memory
 from lbt_synth.storage.summaries import Summarised
 from lbt_synth.validation import FloatArray, choice, frozen_copy, integer, number, require_instance
 
@@ -328,11 +328,10 @@ def _step(
         return np.concatenate(runs)
     (cases, frames, n), m, suite = total.shape, hardware.n_commands, hardware.suite
     rows, read = suite.rows(hardware), suite.read(hardware)
-    held = memory([own_exposure(hardware), *other_exposures(hardware)], n, len(read))
-    seen = held.C.copy()
+    A, B, seen = sensor_memory(hardware, own=True)
     seen[:, : hardware.n_measurements] *= disturbance.sensor_gain
     wavefront = read[:, : seen.shape[1]]
-    state, y = np.zeros((held.n_states, cases)), np.zeros((noise.shape[2], cases))
+    state, y = np.zeros((A.shape[1], cases)), np.zeros((noise.shape[2], cases))
     out = np.zeros((cases, frames, n + m + len(y)))
     wrong: Mapping[str, str] = {}
     missing: tuple[str, ...] = ()
@@ -359,7 +358,7 @@ def _step(
         nonlocal state
         t = k % len(read)
         residual = total[:, k].T - hardware.influence @ correction.reshape(m, -1)
-        state = held.A[t] @ state + held.B[t] @ residual
+        state = A[t] @ state + B[t] @ residual
         out[:, k, :n], out[:, k, n : n + m], out[:, k, n + m :] = residual.T, command.T, y.T
 
     taps, shape = hardware.mirror_taps, (m, cases) if together else (m,)

@@ -77,13 +77,6 @@ _HALVINGS = 12  # of a range: to 0.03 % of a frame, and to 0.1 % of an end of ga
 _LEVEL = 1 - 1e-6  # of the real part, below which one is proved to stay
 
 
-def radii_by_gain(
-    hardware: LoopHardware, controller: Controller | HasController
-) -> Callable[[FloatArray], FloatArray]:
-    """Return the function from many sensor gains (g,) to the loop's spectral radii (g,)."""
-    return partial(affine_radii, parts_by_gain(hardware, controller))
-
-
 def parts_by_gain(
     hardware: LoopHardware, controller: Controller | HasController
 ) -> list[AffinePart]:
@@ -223,9 +216,7 @@ def crossings(T: StateSpace, *, real_part: float | None = None) -> tuple[FloatAr
 def stepped_range(
     radii: Callable[[FloatArray], FloatArray], nominal: float = 1.0
 ) -> tuple[float, float]:
-    """Return the interval around a gain in which radii (g,) of gains (g,) are below 1."""
-    if not radii(np.array([nominal]))[0] < 1:
-        return np.nan, np.nan
+    """Return the interval around a stable gain in which radii (g,) of gains (g,) are below 1."""
     count = int(np.ceil(np.log(_WIDEST) / np.log(_STEP)))
     ends = []
     for ratio, open_end in ((1 / _STEP, 0.0), (_STEP, np.inf)):
@@ -453,7 +444,9 @@ def errors_together(loop: ClosedLoop) -> float:
     hardware = loop.hardware
     if hardware.mirror is not None:
         return float("nan")
-    parts = square_parts(_answer_to_noise(loop))
+    commands, seen = loop.path("noise", "command"), loop.sensor_gain * hardware.sensor
+    caused = seen @ hardware.influence  # what the sensor sees of the commands that noise causes
+    parts = square_parts(replace(commands, C=caused @ commands.C, D=caused @ commands.D))
 
     def is_proved(scale: float) -> bool:
         factor, late = 10 ** (scale * FRAGILE_DB / 20), scale * FRAGILE_FRAMES
@@ -473,10 +466,3 @@ def _largest_proved(proves: Callable[[float], bool], most: float) -> float:
         middle = (low + high) / 2
         low, high = (middle, high) if proves(middle) else (low, middle)
     return low
-
-
-def _answer_to_noise(loop: ClosedLoop) -> StateSpace:
-    """Return the system from the noise to what the sensor sees of the commands it causes."""
-    hardware, commands = loop.hardware, loop.path("noise", "command")
-    seen = loop.sensor_gain * hardware.sensor @ hardware.influence
-    return replace(commands, C=seen @ commands.C, D=seen @ commands.D)

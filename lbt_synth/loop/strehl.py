@@ -156,30 +156,29 @@ def _integrated_otf(
     widths = _quadratic_form(covariance)
     out = np.empty(len(spread))
     still = ~np.any(lines, axis=(1, 2))
-    for level in np.unique(fineness[still]).tolist():
-        members = np.flatnonzero(still & (fineness == level))
-        radius, weight = _radial_otf(imaging.obstruction, level)
-        square = 2 * (np.pi * imaging.cycles_per_nm * radius) ** 2
-        xx, xy, yy = widths[members].T
-        # the mean of exp(-x cos) over all directions is I0(x)
-        turning = np.hypot((xx - yy) / 2, xy)
-        factor = ive(0, np.outer(turning, square))
-        factor *= np.exp(-np.outer((xx + yy) / 2 - turning, square))
-        out[members] = imaging.other_modes * np.minimum(factor @ weight, 1.0)
-    for level in np.unique(fineness[~still]).tolist():
-        members = np.flatnonzero(~still & (fineness == level))
+    for level, is_still in sorted(set(zip(fineness.tolist(), still.tolist(), strict=True))):
+        members = np.flatnonzero((fineness == level) & (still == is_still))
+        if is_still:
+            radius, weight = _radial_otf(imaging.obstruction, level)
+            square = 2 * (np.pi * imaging.cycles_per_nm * radius) ** 2
+            xx, xy, yy = widths[members].T
+            # the mean of exp(-x cos) over all directions is I0(x)
+            turning = np.hypot((xx - yy) / 2, xy)
+            factor = ive(0, np.outer(turning, square))
+            factor *= np.exp(-np.outer((xx + yy) / 2 - turning, square))
+            out[members] = factor @ weight
+            continue
         squares, weight = _weighted_otf(imaging.obstruction, level)
         squares = squares * imaging.cycles_per_nm**2
         step = max(1, _POINT_CHUNK // weight.size)
         for start in range(0, len(members), step):
             part = members[start : start + step]
             factor = np.exp(-2 * np.pi**2 * (widths[part] @ squares))
-            for line in range(lines.shape[1]):
-                if np.any(forms[part, line]):
-                    turns_squared = np.maximum(forms[part, line] @ squares, 0)
-                    factor = factor * j0(2 * np.pi * np.sqrt(turns_squared))
-            out[part] = imaging.other_modes * np.minimum(factor @ weight, 1.0)
-    return out
+            for form in forms[part].swapaxes(0, 1):
+                if np.any(form):
+                    factor = factor * j0(2 * np.pi * np.sqrt(np.maximum(form @ squares, 0)))
+            out[part] = factor @ weight
+    return imaging.other_modes * np.minimum(out, 1.0)
 
 
 def _quadratic_form(matrices: FloatArray) -> FloatArray:

@@ -209,7 +209,7 @@ def _list_demands(
     """Return the demands of the section, those on commands under the turbulence of the design."""
     from lbt_synth.design.loop_shaping import noise_per_mode
     from lbt_synth.design.shaping import Bound, CommandRms, LoopErrors
-    from lbt_synth.models.spectra import spectrum_key
+    from lbt_synth.models.spectra import spectrum_groups
 
     demands: list[Demand] = []
     for i, bound in enumerate(section.bounds):
@@ -230,7 +230,7 @@ def _list_demands(
     for rate, at_most_nm in commands_nm.items():
         if at_most_nm is None:
             continue
-        if spectrum is None and len({spectrum_key(model) for model in models}) > 1:
+        if spectrum is None and len(spectrum_groups(models)) > 1:
             raise ConfigError(
                 f"{_KEY}: bounds on the commands hold under one turbulence for all axes, but "
                 "model.turbulence has one per axis. Leave command_stroke_nm and command_step_nm "

@@ -189,6 +189,15 @@ class LoopHardware(Summarised):
         )
 
 
+def require_loop_rate(frame_rate_hz: float, hardware: LoopHardware) -> None:
+    """Raise if a sampled disturbance does not have the loop's frame rate."""
+    if not np.isclose(frame_rate_hz, hardware.frame_rate_hz, rtol=1e-9):
+        raise ProblemError(
+            f"a disturbance must be sampled at the loop's {hardware.frame_rate_hz:.6g} Hz; "
+            f"got {frame_rate_hz:.6g} Hz."
+        )
+
+
 def loop_differences(own: LoopHardware, here: LoopHardware) -> list[str]:
     """Say how the loop that a design was made for differs from the loop that it runs in."""
     notes = []

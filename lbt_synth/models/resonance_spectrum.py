@@ -18,11 +18,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
 
+from lbt_synth.linear.quadrature import legendre_rule
 from lbt_synth.validation import FloatArray
 
 PARAMETERS = 3  # of a component: log frequency, log damping, log variance
@@ -105,7 +106,7 @@ def series_variance(
 
     The substitution ``w = frequency (1 + damping tan x)`` makes the integrand smooth.
     """
-    nodes, weights = _gauss_rule()
+    nodes, weights = legendre_rule(_NODES)
     width = damping * frequency
     low, high = math.atan(-1 / damping), math.atan((math.pi - frequency) / width)
     x = low + (high - low) * (nodes + 1) / 2
@@ -116,12 +117,6 @@ def series_variance(
     variance = float(np.sum(share))
     by_frequency, by_damping = (sections * slopes[0] @ share / variance).tolist()
     return variance, (by_frequency, by_damping)
-
-
-@cache
-def _gauss_rule() -> tuple[FloatArray, FloatArray]:
-    """Return nodes and weights of Gauss and Legendre, which cost more than their use."""
-    return np.polynomial.legendre.leggauss(_NODES)
 
 
 def section_drives(frequency: float, damping: float, sections: int) -> FloatArray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lbt_synth.models.turbulence.ar_models import noll_orders
+from lbt_synth.models.turbulence.ar_models import radial_orders
 from lbt_synth.models.turbulence.atmosphere import ARCSEC_RAD
 from lbt_synth.validation import FloatArray, frozen_copy, number, one_or_each
 
@@ -149,5 +149,5 @@ def pyramid_modal_noise_nm(
     """
     tilt = number(tilt_noise_nm, "tilt_noise_nm", above=0)
     modulation = number(modulation_lambda_over_d, "modulation_lambda_over_d", above=0)
-    radial, _ = noll_orders(modes)
+    radial = radial_orders(modes)
     return frozen_copy(tilt * np.maximum(2 / (radial + 1), 1 / max(modulation, 1.0)))

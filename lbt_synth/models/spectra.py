@@ -318,12 +318,17 @@ def breakpoints_below(spectrum: Spectrum, limit_hz: float) -> FloatArray:
     return points[(points > 0) & (points < limit_hz)]
 
 
-def spectrum_key(spectrum: Spectrum | None) -> object:
-    """Return a key that equal spectra share: the numbers of an AR model, else its identity."""
-    if isinstance(spectrum, ARModel):
-        return (
-            spectrum.coefficients.tobytes(),
-            np.asarray(spectrum.driving_rms_nm).tobytes(),
-            spectrum.frame_rate_hz,
-        )
-    return id(spectrum)
+def spectrum_groups(spectra: Sequence[Spectrum | None]) -> list[tuple[Spectrum, list[int]]]:
+    """Return the different spectra of some modes, each with the modes that have it.
+
+    AR models of the same numbers are one spectrum; modes without a spectrum are left out.
+    """
+    groups: dict[object, tuple[Spectrum, list[int]]] = {}
+    for mode, spectrum in enumerate(spectra):
+        key: object = id(spectrum)
+        if isinstance(spectrum, ARModel):
+            numbers = spectrum.coefficients.tobytes(), np.asarray(spectrum.driving_rms_nm).tobytes()
+            key = *numbers, spectrum.frame_rate_hz
+        if spectrum is not None:
+            groups.setdefault(key, (spectrum, []))[1].append(mode)
+    return list(groups.values())

@@ -11,7 +11,7 @@ import numpy as np
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.sensor_suite import Motions
-from lbt_synth.models.spectra import ARModel, Spectrum, spectrum_key
+from lbt_synth.models.spectra import ARModel, Spectrum, spectrum_groups
 from lbt_synth.models.vibration import (
     SinusoidalVibration,
     TrueVibration,
@@ -31,7 +31,7 @@ from lbt_synth.validation import (
 
 # spectra with the modes that have them, vibrations, and a root of the covariance of the noise
 Entering: TypeAlias = tuple[
-    Sequence[tuple[Spectrum, tuple[int, ...]]],
+    Sequence[tuple[Spectrum, list[int]]],
     Sequence[Vibration | SinusoidalVibration],
     FloatArray,
 ]
@@ -107,31 +107,24 @@ class Truth(Summarised):
                     "vibrations must be Vibration or SinusoidalVibration; got "
                     f"{type(each).__name__}."
                 )
-        noise = one_or_each(self.noise_nm, "noise_nm", at_least=0)
+        noise, errors = one_or_each(self.noise_nm, "noise_nm", at_least=0), self.frequency_errors_hz
+        if errors is not None:
+            name, lines = "frequency_errors_hz", len(self.vibrations)
+            errors = tuple(number(error, name, at_least=0) for error in errors)
+            if len(errors) != lines:
+                raise DimensionError(f"{name} must be one per vibration ({lines}); got {errors}.")
         check_fields(
             self,
             turbulence=parts if isinstance(turbulence, Sequence) else turbulence,
             vibrations=tuple(self.vibrations),
             noise_nm=float(noise) if noise.ndim == 0 else noise,
-            frequency_errors_hz=self._checked_errors(),
+            frequency_errors_hz=errors,
             motions=tuple(self.motions) if any(self.motions) else ({},) * len(self.vibrations),
         )
 
     def _brief(self) -> str:
         lines = count_text(len(self.vibrations), "vibration")
         return f"{lines}, sensor gain {self.sensor_gain:.4g}"
-
-    def _checked_errors(self) -> tuple[float, ...] | None:
-        """Return the frequency errors, of which each vibration must have one."""
-        if self.frequency_errors_hz is None:
-            return None
-        errors = [number(e, "frequency_errors_hz", at_least=0) for e in self.frequency_errors_hz]
-        if len(errors) != len(self.vibrations):
-            raise DimensionError(
-                f"frequency_errors_hz must be one per vibration ({len(self.vibrations)}); got "
-                f"{len(errors)}."
-            )
-        return tuple(errors)
 
     @property
     def lines_hz(self) -> list[float]:
@@ -216,16 +209,9 @@ class Truth(Summarised):
         lines = stationary_vibrations(self.vibrations)
         return self.turbulence_groups(hardware.modes), lines, noise
 
-    def turbulence_groups(self, modes: int) -> tuple[tuple[Spectrum, tuple[int, ...]], ...]:
-        """Return the different spectra, each with the modes that have it; other modes have none.
-
-        Equal AR models are one spectrum. Spectra for another number of modes are a DimensionError.
-        """
-        groups: dict[object, tuple[Spectrum, list[int]]] = {}
-        for mode, spectrum in enumerate(self.turbulence_per_mode(modes)):
-            if spectrum is not None:
-                groups.setdefault(spectrum_key(spectrum), (spectrum, []))[1].append(mode)
-        return tuple((spectrum, tuple(members)) for spectrum, members in groups.values())
+    def turbulence_groups(self, modes: int) -> list[tuple[Spectrum, list[int]]]:
+        """Return the different spectra, each with the modes that have it; other modes have none."""
+        return spectrum_groups(self.turbulence_per_mode(modes))
 
     def noise_per_measurement(self, measurements: int) -> FloatArray:
         """Return the standard deviation of the noise on each measurement, (q,) [nm].

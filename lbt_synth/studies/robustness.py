@@ -36,7 +36,7 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.plant.tip_tilt import retuned_plant
-from lbt_synth.models.turbulence.ar_models import noll_orders
+from lbt_synth.models.turbulence.ar_models import radial_orders
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
 from lbt_synth.storage.rows import (
     NM,
@@ -474,7 +474,7 @@ class ModalStudy:
 
     def by_radial_order(self) -> list[Facts]:
         """Return a row for each radial order: root sums of squares over its modes."""
-        radial, _ = noll_orders(self.noise_nm.size)
+        radial = radial_orders(self.noise_nm.size)
         rows = []
         for order in np.unique(radial):
             which = radial == order

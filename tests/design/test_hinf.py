@@ -128,7 +128,7 @@ def test_many_states_take_the_equation_by_default():
     slow = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=800)
     for count, route in ((0, "lmi"), (2, "lmi"), (9, "riccati")):
         plant = lbt.tip_tilt_plant(
-            frame_rate_hz=800, turbulence=slow, vibrations=lines[:count] or None, noise_nm=15.0
+            frame_rate_hz=800, turbulence=slow, vibrations=lines[:count], noise_nm=15.0
         )
         design = lbt.hinf(plant, gamma_ratio=1.2)
         assert design.solver.route == route

@@ -70,7 +70,7 @@ def test_it_is_never_above_kalman_in_the_image(mirror):
 @pytest.mark.parametrize("delay", [1.35, 2.49, 3.0])
 def test_the_pieces_leave_what_the_camera_sees_but_for_what_nobody_follows(delay):
     """The model between two frames is straight: any residual exceeds its own by about the same."""
-    plant = slow_plant(delay, shell(), vibrations=None)
+    plant = slow_plant(delay, shell(), vibrations=())
     designs = lbt.lqg(plant), lbt.lqg(plant, command_weight=0.1), lbt.kalman(plant)
     residuals = [model_rms(plant, design.controller) for design in designs]
     excess = [
@@ -134,7 +134,7 @@ def test_the_other_designs_take_a_moving_mirror():
 
 def test_shaping_takes_a_moving_mirror_and_refuses_its_delay_errors():
     slow = ARModel(coefficients=[0.99], driving_rms_nm=40.0, frame_rate_hz=800)
-    plant = slow_plant(2.0, shell(300.0), vibrations=None, turbulence=slow, noise_nm=20.0)
+    plant = slow_plant(2.0, shell(300.0), vibrations=(), turbulence=slow, noise_nm=20.0)
     terms = [ResidualVariance(turbulence=slow, noise_nm=20.0)]
 
     def shape(demand):
@@ -155,7 +155,7 @@ def test_refusals():
     design, path = lbt.lqg(plant), plant.hardware
     flat = slow_plant(2.0, shell(), modes=2, influence_matrix=[[1.0], [0.5]])
     bare = lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1)
-    quiet = slow_plant(2.25, shell(), vibrations=None)
+    quiet = slow_plant(2.25, shell(), vibrations=())
     rows = lbt.Truth(turbulence=None), lbt.Imaging(diameter_m=8)
     settled = lbt.LoopHardware(frame_rate_hz=800)
     need = "plant must be a TipTiltPlant"

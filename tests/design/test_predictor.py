@@ -16,11 +16,11 @@ from lbt_synth.design.predictor import (
     regression_filter,
 )
 from lbt_synth.errors import CertificateError, ProblemError
-from lbt_synth.loop.closed_loop import youla_controller, youla_parameter
+from lbt_synth.loop.closed_loop import youla_controller
 
 
 def test_a_parameter_undoes_its_controller() -> None:
-    back = youla_controller(PATH, youla_parameter(PATH, BASE))
+    back = youla_controller(PATH, youla_controller(PATH, BASE, sign=-1.0))
     y = np.random.default_rng(0).standard_normal((50, 2))
     runs = [controller.start() for controller in (BASE, back)]
     first, second = (np.array([run.step(row) for row in y]) for run in runs)
@@ -31,7 +31,7 @@ def test_the_filter_is_the_sum_that_the_coefficients_say() -> None:
     """In the time domain: base, its past corrections, past measurements and channels."""
     b, series = coefficients(7), readings(frames=60)
     run = regression_filter(PATH, BASE, b).start()
-    own = youla_parameter(PATH, BASE).start()
+    own = youla_controller(PATH, BASE, sign=-1.0).start()
     commands = np.array([run.step(row) for row in series])
     base = np.array([own.step(row[:2]) for row in series])
     z = series[:, :2] @ np.linalg.inv(PATH.sensor).T

@@ -57,7 +57,7 @@ def random_design(rng):
         delay_frames=delay,
         turbulence=slow,
         noise_nm=noise,
-        vibrations=lines or None,
+        vibrations=lines,
         modes=modes,
     )
     if kind == "hinf":

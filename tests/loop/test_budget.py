@@ -151,10 +151,10 @@ def power_of_two_sensors(plant, controller, frequency_hz, along, *, frames=480):
         y[rows["wavefront"]] = hardware.sensor @ held_mean(means, k, 1, 1)
         if k % period == 0:
             y[rows[slow.name]] = slow.sensor_matrix @ held_mean(means, k, age, period)
-        now = controller.phase(k)
-        state = now.A @ state + now.B @ y
+        A, B, C, D = (stack[k % controller.period] for stack in controller.stacks())
+        state = A @ state + B @ y
         begin = k * STEPS + late
-        position[begin : begin + STEPS] = hardware.influence @ (now.C @ state + now.D @ y)
+        position[begin : begin + STEPS] = hardware.influence @ (C @ state + D @ y)
         times = k + (np.arange(STEPS) + 0.5) / STEPS
         wave = np.exp(2j * np.pi * frequency_hz / rate * times)[:, None] * np.asarray(along)
         residual = wave - position[k * STEPS : (k + 1) * STEPS]

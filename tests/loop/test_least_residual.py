@@ -228,7 +228,11 @@ def test_refusals():
 
     own = "loop's own sensor; got others"
     rows = [
-        (on(sensor_matrix=[[1.0, 1.0]]), ProblemError, "got rank 1 for 2"),
+        (
+            on(sensor_matrix=[[1.0, 1.0]]),
+            ProblemError,
+            "see every mode; got a matrix of rank 1 for 2",
+        ),
         (on(influence_matrix=[[1.0], [1.0]]), ProblemError, "reach every mode"),
         (on(sensor_matrix=np.diag([1.0, 2.0])), ProblemError, "principal axes of the"),
         (least(SLANTED, UPRIGHT, on=path(modes=2)), ProblemError, "that decouple.*Turn the dir"),

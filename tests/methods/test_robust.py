@@ -122,7 +122,7 @@ def a_plant_with_lines(*lines, more=()):
     shakes = [
         lbt.Vibration(frequency_hz=f, damping=0.01, rms_nm=rms, direction=(1,)) for f, rms in lines
     ]
-    known = {"turbulence": air, "vibrations": [*shakes, *more] or None, "noise_nm": 15.5}
+    known = {"turbulence": air, "vibrations": [*shakes, *more], "noise_nm": 15.5}
     return lbt.tip_tilt_plant(frame_rate_hz=800, modes=1, **known)
 
 

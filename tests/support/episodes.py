@@ -8,7 +8,7 @@ import numpy as np
 
 from lbt_synth.linear import estimator_form
 from lbt_synth.loop.simulation import settling_frames
-from lbt_synth.loop.stable_range import radii_by_gain
+from lbt_synth.loop.stable_range import affine_radii, parts_by_gain
 
 QUIET, LONGEST = 200, 400  # frames before an episode, and of one at most
 KINDS = ("clipped", "open", "held")
@@ -29,7 +29,7 @@ class Episodes:
     @classmethod
     def draw(cls, design, count, rng, gains):
         found = np.sort(rng.uniform(*gains, count))
-        radii = radii_by_gain(design.hardware, design.controller)(found)
+        radii = affine_radii(parts_by_gain(design.hardware, design.controller), found)
         return cls(
             gains=found,
             kinds=rng.integers(len(KINDS), size=count),

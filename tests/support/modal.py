@@ -40,7 +40,7 @@ def single_plant(air, mode, lines, noise, gain, **path):
     return lbt.tip_tilt_plant(
         frame_rate_hz=RATE,
         turbulence=air.take(mode),
-        vibrations=list(lines) or None,
+        vibrations=lines,
         noise_nm=float(noise),
         sensor_gain=float(gain),
         modes=1,

@@ -35,7 +35,7 @@ SLOW = WavefrontSensor(
 def example_plant(sensors=(FAST, SLOW), *, lines=LINES, motions=MOTIONS, **changes):
     """Return a plant of two modes at 1 kHz; only the channels of its sensors move."""
     facts = {"turbulence": AIR, "noise_nm": 75.0, "delay_frames": 2} | changes
-    own = lbt.tip_tilt_plant(frame_rate_hz=RATE_HZ, vibrations=lines or None, **facts)
+    own = lbt.tip_tilt_plant(frame_rate_hz=RATE_HZ, vibrations=lines, **facts)
     suite = SensorSuite(sensors=sensors)
     moved = [{name: each[name] for name in each if name in suite.channels} for each in motions]
     return own.with_sensors(suite, tuple(moved))
@@ -131,9 +131,9 @@ def run_loop(plant, controller, total, added, *, sensor_gain=1.0, blind=(), stuc
                 y[:, own] = (stuck + 0 * y)[:, own]
             if k % periods[name]:
                 y[:, own] = 1e9
-        now = controller.phase(k)
-        state = state @ now.A.T + y @ now.B.T
-        command[k] = state @ now.C.T + y @ now.D.T
+        A, B, C, D = (stack[k % controller.period] for stack in controller.stacks())
+        state = state @ A.T + y @ B.T
+        command[k] = state @ C.T + y @ D.T
         correction = sum(taps[i] * command[k - i] for i in range(min(len(taps), k + 1)))
         residual[k] = total[k] - correction @ hardware.influence.T
     return residual

@@ -28,10 +28,9 @@ from lbt_synth.design.integrator import PURE, TRIED_GAINS, integrator_gain_limit
 from lbt_synth.design.modal.stack import Vibrations, lines_per_mode, number_per_mode
 from lbt_synth.errors import DimensionError, NumericalError, ProblemError
 from lbt_synth.linear.quadrature import gauss_panels, graded_edges
-from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.loop.evaluator import close_loops, textbook_matrices
 from lbt_synth.models import ARModel, LoopHardware, Spectrum
-from lbt_synth.models.loop_hardware import past_corrections
+from lbt_synth.models.loop_hardware import past_corrections, require_loop_rate
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.validation import (
     BoolArray,

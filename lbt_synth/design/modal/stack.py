@@ -14,8 +14,8 @@ from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, LbtSynthError, ProblemError
 from lbt_synth.loop import residual_budget
-from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.models import ARModel, LoopHardware, Vibration, tip_tilt_plant
+from lbt_synth.models.loop_hardware import require_loop_rate
 from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import (
     FloatArray,
@@ -188,7 +188,7 @@ def modal_filters(
         plant = tip_tilt_plant(
             frame_rate_hz=turbulence.frame_rate_hz,
             turbulence=turbulence.take(first),
-            vibrations=lines[first] or None,
+            vibrations=lines[first],
             noise_nm=float(noise[first]),
             delay_frames=hardware.delay_frames,
             sensor_gain=float(gain[first]),

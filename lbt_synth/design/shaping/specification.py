@@ -22,8 +22,8 @@ from lbt_synth.errors import ProblemError, UnstableLoopError
 from lbt_synth.linear import Controller
 from lbt_synth.linear.convex_functions import Constraint, Function
 from lbt_synth.loop import close_loop
-from lbt_synth.loop.closed_loop import require_loop_rate
 from lbt_synth.models import ARModel, LoopHardware, Spectrum
+from lbt_synth.models.loop_hardware import require_loop_rate
 from lbt_synth.validation import sequence, set_fields
 
 _COUPLED = 1e-9  # residual of a mode for a unit of another, above which a controller couples them

@@ -152,7 +152,7 @@ def minimize(
     programme = ConicProgramme(size + sum(part.worst for part in function))
     for constraint in constraints:
         _constrain(programme, constraint, origin)
-    linear, roots = _Model(programme, origin, scale).expression(function)
+    linear, roots = _state(programme, function, origin, scale)
     x, (status, _) = programme.minimize(linear, 2 * roots.T @ roots)
     return origin + x[:size] if status in USABLE else None, status
 
@@ -183,38 +183,28 @@ def minimize_relaxation(
     return np.where(rigid, 0.0, x[size:])
 
 
-class _Model:
-    """Convex models of functions of a step from an origin, over their scale.
+def _state(
+    programme: ConicProgramme, function: Function, origin: FloatArray, scale: float
+) -> tuple[FloatArray, FloatArray]:
+    """State a convex model of a function of a step from an origin, over its scale.
 
-    Each is ``linear x + |roots x|^2`` plus a constant, in all unknowns x: step, then levels.
+    It is ``linear x + |roots x|^2`` plus a constant, (x,) and (k, x), in all unknowns x: the step,
+    then a level for each part of which the largest counts: its square bounds all fractions.
     """
-
-    def __init__(self, programme: ConicProgramme, origin: FloatArray, scale: float) -> None:
-        self.programme, self.origin, self.scale = programme, origin, scale
-        self.level = origin.size  # the next unknown
-
-    def expression(self, function: Function) -> tuple[FloatArray, FloatArray]:
-        """Return the linear part, (x,), and the roots, (k, x), of a function."""
-        models = [self._worst(part) if part.worst else self._sum(part) for part in function]
-        linear, roots = zip(*models, strict=True)
-        return np.sum(linear, axis=0), np.concatenate(roots)
-
-    def _sum(self, function: Fractions) -> tuple[FloatArray, FloatArray]:
-        """Model the sum of all fractions to second order."""
-        gradient, hessian = _second_order(function, self.origin)
-        pad = self.programme.size - self.origin.size
-        root = semidefinite_root(hessian / self.scale).T
-        return np.pad(gradient / self.scale, (0, pad)), np.pad(root, ((0, 0), (0, pad)))
-
-    def _worst(self, function: Fractions) -> tuple[FloatArray, FloatArray]:
-        """Bound all fractions by the square of a level, a new unknown."""
-        level = np.zeros(self.programme.size)
-        level[self.level] = 1.0
-        self.level += 1
-        values, slopes, _ = _expand(function, self.origin)
-        unit = 1 / np.sqrt(self.scale)
-        _bound_norms(self.programme, values * unit, slopes * unit, level, 0.0)
-        return np.zeros(self.programme.size), level[None]
+    linear, roots, n = np.zeros(programme.size), [], origin.size
+    level = iter(np.eye(programme.size)[n:])
+    for part in function:
+        if part.worst:
+            values, slopes, _ = _expand(part, origin)
+            unit, bound = 1 / np.sqrt(scale), next(level)
+            _bound_norms(programme, values * unit, slopes * unit, bound, 0.0)
+            roots.append(bound[None])
+        else:
+            gradient, hessian = _second_order(part, origin)
+            linear[:n] += gradient / scale
+            root = semidefinite_root(hessian / scale).T
+            roots.append(np.pad(root, ((0, 0), (0, programme.size - n))))
+    return linear, np.concatenate(roots)
 
 
 def _expand(

@@ -62,7 +62,6 @@ class _Balanced:
         return FilterRiccati(
             P=frozen_copy(self.basis @ P @ self.basis.T),
             gain_predictor=frozen_copy(gain),
-            gain_filter=frozen_copy(self.basis @ gain_filter @ self.whitening),
             status=run[0],
             iterations=run[1],
         )

@@ -272,17 +272,16 @@ def central_controller(
     """
     X, Y = np.asarray(X), np.asarray(Y)
     try:
-        best = _best_control(plant, X, Y, gamma)
-        injection = _injection(*best)
+        A, B1, C2, D21, F, F0, Z = _best_control(plant, X, Y, gamma)
+        innovation = D21 @ D21.T + C2 @ Z @ C2.T
+        seen = np.vstack([A, F]) @ Z @ C2.T + np.vstack([B1, F0]) @ D21.T
+        state, control = np.split(_solve(innovation, seen.T).T, [len(A)])  # gains of it
     except np.linalg.LinAlgError as error:
         raise NumericalError(
             f"the level {gamma:.9g} has no controller to working accuracy: {error}. Try a larger "
             "gamma.",
             status="central controller",
         ) from error
-    A, _, C2, _, F, _, _ = best
-    n = len(A)
-    state, control = injection[:n], injection[n:]
     C, D = control @ C2 - F, -control
     observer = StateSpace(
         A=A - state @ C2 + plant.B2 @ C, B=state + plant.B2 @ D, C=C, D=D, dt_s=plant.dt_s
@@ -311,21 +310,6 @@ def _best_control(
         *(A + B1 @ worst, B1 @ unit, plant.C2 + D21 @ worst, D21 @ unit),
         *(law[:, :n], law[:, n:], (Z + Z.T) / 2),
     )
-
-
-def _injection(
-    A: FloatArray,
-    B1: FloatArray,
-    C2: FloatArray,
-    D21: FloatArray,
-    F: FloatArray,
-    F0: FloatArray,
-    Z: FloatArray,
-) -> FloatArray:
-    """Gains of the innovation into the state (n, p2) and into the best control (m2, p2)."""
-    innovation = D21 @ D21.T + C2 @ Z @ C2.T
-    seen = np.vstack([A, F]) @ Z @ C2.T + np.vstack([B1, F0]) @ D21.T
-    return _solve(innovation, seen.T).T
 
 
 def with_seen_controls(controller: StateSpace, D22: FloatArray) -> StateSpace:
@@ -452,7 +436,7 @@ def scaled_plant(plant: GeneralizedPlant) -> ScaledPlant:
         D12=z * plant.D12,
         D21=w * plant.D21,
     )
-    P = P.with_whole(P.whole.balanced())
+    P = GeneralizedPlant.of(P.whole.balanced(), measurements=len(P.C2), controls=P.B2.shape[1])
     controls, measurements = _units(P.B2, P.D12), _units(P.C2.T, P.D21.T)
     y = measurements[:, None]
     scaled = replace(

@@ -27,7 +27,6 @@ from lbt_synth.linear.estimation_problem import (
 )
 from lbt_synth.linear.matrix_functions import (
     as_stack,
-    is_stable,
     nearest_powers_of_two,
     relative_distance,
     symmetrise,
@@ -50,10 +49,9 @@ class FilterRiccati:
     # (n, n) or (N, n, n): covariance of the prediction error (Kalman), or its H-infinity
     # counterpart
     P: FloatArray
-    # (n, q) or (N, n, q): gains of the measurement and the time update together, and of the
-    # measurement update alone; zero for what is not read
+    # (n, q) or (N, n, q): gains of the measurement and the time update together; zero for what is
+    # not read
     gain_predictor: FloatArray
-    gain_filter: FloatArray
     iterations: int  # number of doublings, or of steps of the solver
     status: str  # the route that gave P, or what the solver reports; no certificate uses it
 
@@ -80,9 +78,9 @@ def kalman_riccati(problem: EstimationProblem) -> FilterRiccati:
     require_detectable(constant)
     dare = solve_dare(constant.A.T, constant.C.T, constant.Q, constant.R, constant.S)
     covariances = dare.X[None] if problem.period == 1 else _settle_phases(scaled, dare.X)
-    gains = np.stack([kalman_gains(scaled, t, P) for t, P in enumerate(covariances)], axis=1)
+    gains = np.stack([kalman_gain(scaled, t, P) for t, P in enumerate(covariances)])
     if problem.period == 1:
-        gains[0, 0][:, problem.read[0]] = dare.gain_feedback.T  # refined in extended precision
+        gains[0][:, problem.read[0]] = dare.gain_feedback.T  # refined in extended precision
     return _filter_of(covariances, gains / units, dare.iterations, dare.route)
 
 
@@ -96,7 +94,8 @@ def _in_noise_units(problem: EstimationProblem) -> tuple[EstimationProblem, Floa
 def _over_a_period(problem: EstimationProblem) -> EstimationProblem:
     """Return the constant problem whose Kalman recursion over a sample is that over a period."""
     if problem.period == 1:
-        return problem.phase(0)
+        A, B, C, D = problem.read_parts(0)
+        return problem.bare(A=A, B=B, C=C, D=D, read=None)
     triples = (_kalman_triple(problem, t) for t in range(problem.period))
     A, G, H = reduce(_join_triples, triples)
     zero, identity = np.zeros_like(A), np.eye(len(A))
@@ -105,12 +104,11 @@ def _over_a_period(problem: EstimationProblem) -> EstimationProblem:
 
 
 def _filter_of(P: FloatArray, gains: FloatArray, iterations: int, status: str) -> FilterRiccati:
-    """Return the solution of P (N, n, n) and gains (2, N, n, q), whose only phase is squeezed."""
+    """Return the solution of P (N, n, n) and gains (N, n, q), whose only phase is squeezed."""
     phases = 0 if len(P) == 1 else slice(None)
     return FilterRiccati(
         P=frozen_copy(P[phases]),
-        gain_predictor=frozen_copy(gains[0][phases]),
-        gain_filter=frozen_copy(gains[1][phases]),
+        gain_predictor=frozen_copy(gains[phases]),
         iterations=iterations,
         status=status,
     )
@@ -124,12 +122,12 @@ def _settle_phases(problem: EstimationProblem, P: FloatArray) -> FloatArray:
     covariances = np.empty_like(problem.A)
     for t in range(problem.period):
         covariances[t] = P
-        gain = kalman_gains(problem, t, P)[0]
+        gain = kalman_gain(problem, t, P)
         error, drive = problem.A[t] - gain @ problem.C[t], problem.B[t] - gain @ problem.D[t]
         P = symmetrise(error @ P @ error.T + drive @ drive.T)
     change, last = 1.0, np.inf
     while 0 < change < last / 2:
-        gains = np.stack([kalman_gains(problem, t, P)[0] for t, P in enumerate(covariances)])
+        gains = np.stack([kalman_gain(problem, t, P) for t, P in enumerate(covariances)])
         error_system = problem.error_system(gains)
         if not error_system.spectral_radius < 1:
             change = np.inf
@@ -163,14 +161,13 @@ def _kalman_triple(problem: EstimationProblem, t: int) -> _Triple:
     return A, symmetrise(C.T @ np.linalg.solve(D @ D.T, C)), B @ B.T
 
 
-def kalman_gains(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArray:
-    """Return the gains of predictor and filter (2, n, q) at a phase, for their covariance P."""
+def kalman_gain(problem: EstimationProblem, t: int, P: FloatArray) -> FloatArray:
+    """Return the gain of the predictor (n, q) at a phase, for its covariance P."""
     A, B, C, D = problem.read_parts(t)
     innovation = C @ P @ C.T + D @ D.T
-    out = np.zeros((2, problem.n_states, problem.n_measurements))
+    out = np.zeros((problem.n_states, problem.n_measurements))
     rows = problem.read[t % problem.period]
-    out[0][:, rows] = np.linalg.solve(innovation, (A @ P @ C.T + B @ D.T).T).T
-    out[1][:, rows] = np.linalg.solve(innovation, C @ P).T
+    out[:, rows] = np.linalg.solve(innovation, (A @ P @ C.T + B @ D.T).T).T
     return out
 
 
@@ -213,8 +210,9 @@ class GammaEquation:
         self.samples = []  # A, filtered covariance, F and C'R^-1 C of each phase
         for t, P in enumerate(self.least):
             A, information, _ = _kalman_triple(self.problem, t)
-            rows, C = self.problem.read[t], self.problem.read_parts(t)[2]
-            keep = np.eye(len(A)) - kalman_gains(self.problem, t, P)[1][:, rows] @ C
+            _, _, C, D = self.problem.read_parts(t)
+            gain_filter = np.linalg.solve(C @ P @ C.T + D @ D.T, C @ P).T
+            keep = np.eye(len(A)) - gain_filter @ C
             self.samples.append((A, symmetrise(keep @ P), keep, information))
 
     def trial(self, gamma: float) -> LevelTrial:
@@ -246,7 +244,7 @@ class GammaEquation:
             onward = np.linalg.solve((identity + X @ G1).T, A1.T).T  # A (I + P W)^-1
             transition = onward @ transition
             X = symmetrise(onward @ X @ A1.T + H1)
-        if not is_stable(transition):
+        if not np.max(np.abs(np.linalg.eigvals(transition))) < 1:
             return LevelTrial(slack=-1.0)
         residual = relative_distance(self.least[0] + X, P[0])
         if slack <= 0:
@@ -268,8 +266,8 @@ class GammaEquation:
                 status="residual",
                 residual=residual,
             )
-        gains = np.stack([_central_gains(problem, t, gamma, p) for t, p in enumerate(P)], axis=1)
-        if not problem.error_system(gains[0]).spectral_radius < 1:
+        gains = np.stack([_central_gain(problem, t, gamma, p) for t, p in enumerate(P)])
+        if not problem.error_system(gains).spectral_radius < 1:
             return None
         gains = self.units * gains / self.noise_units
         covariances = self.units * P * self.units.T
@@ -291,20 +289,19 @@ class GammaEquation:
         return refined.X, float(refined.residuals[0])
 
 
-def _central_gains(problem: EstimationProblem, t: int, gamma: float, P: FloatArray) -> FloatArray:
-    """Return the gains of predictor and filter (2, n, q) of the central filter at a phase.
+def _central_gain(problem: EstimationProblem, t: int, gamma: float, P: FloatArray) -> FloatArray:
+    """Return the gain of the predictor (n, q) of the central filter at a phase.
 
-    They are the first block column of ``P outputs' Re^-1``, with Re the indefinite covariance of
-    the innovations of y and of z / gamma: Pt itself may be unbounded.
+    That of the filter is the first block column of ``P outputs' Re^-1``, with Re the indefinite
+    covariance of the innovations of y and of z / gamma: Pt itself may be unbounded.
     """
     _, _, C, D = problem.read_parts(t)
     A, _, injection = decorrelate(problem, t)
     outputs = np.vstack([C, problem.L / gamma])
     innovations = outputs @ P @ outputs.T + block_diag(D @ D.T, -np.eye(len(problem.L)))
     gain_filter = np.linalg.solve(innovations, outputs @ P)[: len(C)].T
-    out = np.zeros((2, problem.n_states, problem.n_measurements))
-    rows = problem.read[t % problem.period]
-    out[0][:, rows], out[1][:, rows] = A @ gain_filter + injection, gain_filter
+    out = np.zeros((problem.n_states, problem.n_measurements))
+    out[:, problem.read[t % problem.period]] = A @ gain_filter + injection
     return out
 
 

@@ -55,12 +55,6 @@ class Response:
         A, B, C = (np.asarray(np.kron(part, np.eye(count)), dtype=np.float64) for part in parts)
         return A, B, C
 
-    @property
-    def zeros(self) -> ComplexArray:
-        """Zeros in z, those at the origin included; D must not vanish."""
-        inverse = self.A - np.outer(self.B, self.C) / self.D
-        return np.linalg.eigvals(inverse).astype(np.complex128)
-
     def impulse(self, frames: int) -> FloatArray:
         """Impulse response over a number of frames."""
         out, state = np.zeros(frames), self.B

@@ -8,18 +8,25 @@ wavefront sensors, and of the channels, in this order.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.models.loop_hardware import LoopHardware
+from lbt_synth.errors import DimensionError
+from lbt_synth.models.loop_hardware import LoopHardware, require_loop_rate
 from lbt_synth.models.plant.seen_vibration import seen_vibration
 from lbt_synth.models.resonance_spectrum import coefficient_rows, section_drives
 from lbt_synth.models.sensor_suite import WHOLE, Motions, checked_motions, period_frames
 from lbt_synth.models.spectra import ARModel
 from lbt_synth.models.vibration import Vibration, checked_direction
 from lbt_synth.validation import FloatArray, set_fields
+
+# of a system of N phases, A (N, h, h), B (N, h, n) and C (N, q, h), which may have no state
+Memory: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
+# A, B, C, D, L; with other sensors A and C are stacks of one for each phase
+PlantMatrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -33,18 +40,14 @@ class PlantParts:
     motions: Motions = ()  # of the channels that each vibration moves; of none by default
 
     def __post_init__(self) -> None:
-        n, rate = self.hardware.modes, self.hardware.frame_rate_hz
+        n = self.hardware.modes
         if len(self.turbulence) != n or any(m.coefficients.ndim > 1 for m in self.turbulence):
             raise DimensionError(
                 f"turbulence must be one ARModel, or one per mode ({n}); got "
                 f"{sum(model.count for model in self.turbulence)}."
             )
         for model in self.turbulence:
-            if not np.isclose(model.frame_rate_hz, rate, rtol=1e-9):
-                raise ProblemError(
-                    f"the turbulence model must be sampled at the frame rate {rate:.6g} Hz; got "
-                    f"{model.frame_rate_hz:.6g} Hz."
-                )
+            require_loop_rate(model.frame_rate_hz, self.hardware)
         for line in self.vibrations:
             checked_direction(line, self.hardware)
         lines = len(self.vibrations)
@@ -73,71 +76,33 @@ def held_frames(hardware: LoopHardware) -> int:
     return max(int(np.ceil(hardware.delay_frames)), 2) - 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Exposure:
-    """Readings of a sensor: the mean of a signal over a period, some frames ago."""
-
-    response: FloatArray  # (q, n)
-    age_frames: float  # of the oldest frame that a reading averages
-    period: int  # frames from one reading to the next; readings are in frames 0, period, ...
-
-
-def own_exposure(hardware: LoopHardware) -> Exposure:
-    """Return the readings of the loop's own sensor: the residual of the last frame."""
-    return Exposure(response=hardware.sensor, age_frames=1.0, period=1)
-
-
-def other_exposures(hardware: LoopHardware) -> list[Exposure]:
-    """Return the readings of the other wavefront sensors of a loop."""
-    return [
-        Exposure(
-            response=sensor.response(hardware.modes),
-            age_frames=sensor.age_frames(hardware),
-            period=period_frames(sensor, hardware),
-        )
-        for sensor in hardware.suite.wavefront
-    ]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Memory:
-    """System from a signal to the readings of sensors, of samples before, at each phase."""
-
-    A: FloatArray  # (N, h, h); nothing is remembered where there is no sensor, h = 0
-    B: FloatArray  # (N, h, n)
-    C: FloatArray  # (N, q, h)
-
-    @property
-    def n_states(self) -> int:
-        """Number of states."""
-        return int(self.A.shape[2])
-
-
-def memory(exposures: list[Exposure], modes: int, period: int) -> Memory:
+def sensor_memory(hardware: LoopHardware, *, own: bool = False, ahead: int = 0) -> Memory:
     """Return the system from a signal s(k) (n,) to the readings in frame k, of s before k.
 
-    An exposure ends in frame e with the mean of the frames since the last end; the sum of a period
-    that has begun and the readings that wait are its states. Where an exposure ends within a frame,
-    that frame counts for both exposures, in part.
+    They are those of the other wavefront sensors, older by some frames, and before them those of
+    the loop's own. An exposure ends in frame e with the mean of the frames since the last end; the
+    sum of a period that has begun and the readings that wait are its states. Where an exposure ends
+    within a frame, that frame counts for both exposures, in part.
     """
-    blocks = [_exposure_memory(exposure, modes, period) for exposure in exposures]
-    states = [block[0].shape[1] for block in blocks]
-    rows = [block[2].shape[1] for block in blocks]
-    A, B = np.zeros((period, sum(states), sum(states))), np.zeros((period, sum(states), modes))
-    C = np.zeros((period, sum(rows), sum(states)))
-    x = y = 0
-    for (a, b, c), n, q in zip(blocks, states, rows, strict=True):
-        A[:, x : x + n, x : x + n], B[:, x : x + n], C[:, y : y + q, x : x + n] = a, b, c
-        x, y = x + n, y + q
-    return Memory(A=A, B=B, C=C)
+    modes, period = hardware.modes, hardware.period
+    blocks = [(np.zeros((period, 0, 0)), np.zeros((period, 0, modes)), np.zeros((period, 0, 0)))]
+    if own:
+        blocks.append(_exposure_memory(hardware.sensor, 1.0, 1, period))
+    for sensor in hardware.suite.wavefront:
+        age = sensor.age_frames(hardware) + ahead
+        frames = period_frames(sensor, hardware)
+        blocks.append(_exposure_memory(sensor.response(modes), age, frames, period))
+    A, B, C = zip(*blocks, strict=True)
+    return block_diag(*A), np.concatenate(B, axis=1), block_diag(*C)
 
 
-def _exposure_memory(
-    exposure: Exposure, modes: int, period: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return A, B, C of the memory of one sensor, with states [sum, newest reading, older...]."""
-    frames, age = exposure.period, int(np.floor(exposure.age_frames + WHOLE))
-    late = exposure.age_frames - age  # by which the exposure ends before its last frame does
+def _exposure_memory(response: FloatArray, age_frames: float, frames: int, period: int) -> Memory:
+    """Return the memory of one sensor (q, n), with states [sum, newest reading, older...].
+
+    The oldest frame that a reading averages has an age, and readings are in frames 0, frames, ...
+    """
+    modes, age = response.shape[1], int(np.floor(age_frames + WHOLE))
+    late = age_frames - age  # by which the exposure ends before its last frame does
     late = 0.0 if late < WHOLE else late
     held = 1 + (age - frames) // frames  # readings that wait when one is taken
     sums = int(frames > 1 or late > 0)  # states before the readings
@@ -152,8 +117,8 @@ def _exposure_memory(
                 A[t, 1, 0], B[t, 0] = 1.0, late / frames
         else:
             A[t], B[t, :sums] = np.eye(size), 1 / frames
-    C = np.zeros((len(exposure.response), size * modes))
-    C[:, -modes:] = exposure.response
+    C = np.zeros((len(response), size * modes))
+    C[:, -modes:] = response
     identity = np.eye(modes)
     stack = np.broadcast_to(C, (period, *C.shape))
     return np.asarray(np.kron(A, identity)), np.asarray(np.kron(B[:, :, None], identity)), stack
@@ -166,33 +131,22 @@ def known_states(hardware: LoopHardware) -> tuple[FloatArray, FloatArray, FloatA
     remembered are those before k - 1, and the reading adds the one of k - 1. The measurements are
     those of all sensors.
     """
-    waiting = memory(other_exposures(hardware), hardware.modes, hardware.period)
+    A_w, B_w, C_w = sensor_memory(hardware)
     mirror = hardware.mirror_system.whole
     A_m, B_m, C_m = mirror.repeated(hardware.n_commands)
     position, direct = hardware.influence @ C_m, mirror.D * hardware.influence
-    period, v, w = len(waiting.A), len(A_m), waiting.n_states
+    (period, w, _), v = A_w.shape, len(A_m)
     last = np.roll(np.arange(period), 1)  # the phase before
     A, B = np.zeros((period, v + w, v + w)), np.zeros((period, v + w, hardware.n_commands))
     A[:, :v, :v], B[:, :v] = A_m, B_m
-    A[:, v:, v:], A[:, v:, :v] = waiting.A[last], waiting.B[last] @ position
-    B[:, v:] = waiting.B[last] @ direct
-    q0, q1 = hardware.n_measurements, waiting.C.shape[1]
+    A[:, v:, v:], A[:, v:, :v] = A_w[last], B_w[last] @ position
+    B[:, v:] = B_w[last] @ direct
+    q0, q1 = hardware.n_measurements, C_w.shape[1]
     C = np.zeros((period, hardware.n_readings, v + w))
     D = np.zeros((period, hardware.n_readings, hardware.n_commands))
-    C[:, :q0, :v], C[:, q0 : q0 + q1] = -hardware.sensor @ position, -waiting.C @ A[:, v:]
-    D[:, :q0], D[:, q0 : q0 + q1] = -hardware.sensor @ direct, -waiting.C @ B[:, v:]
+    C[:, :q0, :v], C[:, q0 : q0 + q1] = -hardware.sensor @ position, -C_w @ A[:, v:]
+    D[:, :q0], D[:, q0 : q0 + q1] = -hardware.sensor @ direct, -C_w @ B[:, v:]
     return A, B, C, D
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PlantMatrices:
-    """Matrices of a plant; with other sensors A and C are stacks of one for each phase."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    L: FloatArray
 
 
 def plant_matrices(parts: PlantParts) -> PlantMatrices:
@@ -224,13 +178,8 @@ def _own_matrices(parts: PlantParts) -> PlantMatrices:
     C = np.zeros((q, size))
     C[:, size - n :] = hardware.sensor
     late = held_frames(hardware) + 1 - hardware.delay_frames  # weight of the frame before
-    return PlantMatrices(
-        A=A,
-        B=B,
-        C=C,
-        D=np.hstack([np.zeros((q, p + n)), parts.noise_factor]),
-        L=(1 - late) * total + late * np.eye(n, size, k=tot),
-    )
+    D, L = np.hstack([np.zeros((q, p + n)), parts.noise_factor]), (1 - late) * total
+    return A, B, C, D, L + late * np.eye(n, size, k=tot)
 
 
 def _section_states(parts: PlantParts) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -270,56 +219,49 @@ def _with_other_sensors(alone: PlantMatrices, parts: PlantParts) -> PlantMatrice
     hardware, period = parts.hardware, parts.hardware.period
     # the plant's state is that of the frame in which u(k) acts: older readings by so many frames
     ahead = held_frames(hardware) - 1
-    late = [
-        replace(exposure, age_frames=exposure.age_frames + ahead)
-        for exposure in other_exposures(hardware)
-    ]
-    waiting = memory(late, hardware.modes, period)
-    shaken = _shaken_plant(alone, parts, ahead)
+    A_w, B_w, C_w = sensor_memory(hardware, ahead=ahead)
+    A_s, B_s, C_s, to_own = _shaken_plant(alone, parts, ahead)
     newest = 2 * parts.sections + parts.order * hardware.modes
-    total = alone.A[newest : newest + hardware.modes]  # total(k) from x(k): it is held in x(k+1)
-    n, w = shaken.A.shape[1], waiting.n_states
-    to_own = np.hstack([shaken.to_own, np.zeros((len(alone.A), w))])
+    own_A, _, own_C, _, own_L = alone
+    total = own_A[newest : newest + hardware.modes]  # total(k) from x(k): it is held in x(k+1)
+    n, w = len(B_s), A_w.shape[1]
+    to_own = np.hstack([to_own, np.zeros((len(to_own), w))])
     A = np.zeros((period, n + w, n + w))
-    A[:, :n, :n], A[:, n:, n:] = shaken.A, waiting.A
-    A[:, n:] += waiting.B @ (total @ to_own)
-    q0, q1, q2 = len(alone.C), waiting.C.shape[1], len(shaken.C)
+    A[:, :n, :n], A[:, n:, n:] = A_s, A_w
+    A[:, n:] += B_w @ (total @ to_own)
+    q0, q1, q2 = len(own_C), C_w.shape[1], len(C_s)
     C = np.zeros((period, q0 + q1 + q2, n + w))
-    C[:, :q0], C[:, q0 : q0 + q1, n:], C[:, q0 + q1 :, :n] = alone.C @ to_own, waiting.C, shaken.C
+    C[:, :q0], C[:, q0 : q0 + q1, n:], C[:, q0 + q1 :, :n] = own_C @ to_own, C_w, C_s
     noise = hardware.suite.noise_factor(parts.noise_factor, hardware.modes)
-    drives = shaken.B.shape[1]
+    drives = B_s.shape[1]
     B, D = np.zeros((n + w, drives + len(noise))), np.zeros((len(noise), drives + len(noise)))
-    B[:n, :drives], D[:, drives:] = shaken.B, noise
-    return PlantMatrices(A=A, B=B, C=C, D=D, L=alone.L @ to_own)
+    B[:n, :drives], D[:, drives:] = B_s, noise
+    return A, B, C, D, own_L @ to_own
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _ShakenPlant:
-    """A plant whose vibrations are those that accelerometers see, where they see them."""
+def _shaken_plant(
+    alone: PlantMatrices, parts: PlantParts, ahead: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Put the oscillators that accelerometers see in the place of their vibrations.
 
-    A: FloatArray  # (N, n, n)
-    B: FloatArray  # (n, w): from white noise, without that of sensors
-    C: FloatArray  # (c, n): what channels read
-    to_own: FloatArray  # (n0, n): to the states of the loop's own plant, older samples left out
-
-
-def _shaken_plant(alone: PlantMatrices, parts: PlantParts, ahead: int) -> _ShakenPlant:
-    """Put the oscillators that accelerometers see in the place of their vibrations."""
+    Return A (N, n, n), B (n, w) without the noise of sensors, C (c, n) of the channels, and the map
+    (n0, n) to the states of the loop's own plant, older samples left out.
+    """
     hardware, motions, suite = parts.hardware, parts.motions, parts.hardware.suite
-    q0, period = len(alone.C), hardware.period
+    (own_A, own_B, own_C, _, _), period = alone, hardware.period
     seen = [j for j, motion in enumerate(motions) if motion]
     lines = [
         seen_vibration(parts.vibrations[j], motions[j], suite.accelerometers, hardware, ahead=ahead)
         for j in seen
     ]
-    kept = np.delete(np.arange(len(alone.A)), [*seen, *(parts.sections + j for j in seen)])
-    drives = np.delete(np.arange(alone.B.shape[1] - q0), seen)
+    kept = np.delete(np.arange(len(own_A)), [*seen, *(parts.sections + j for j in seen)])
+    drives = np.delete(np.arange(own_B.shape[1] - len(own_C)), seen)
     size, width = len(kept) + sum(s.n_states for s in lines), len(drives)
-    to_own, C = np.zeros((len(alone.A), size)), np.zeros((len(suite.channels), size))
+    to_own, C = np.zeros((len(own_A), size)), np.zeros((len(suite.channels), size))
     to_own[kept, : len(kept)] = np.eye(len(kept))
     A = np.zeros((period, size, size))
     B = np.zeros((size, width + sum(s.B.shape[-1] for s in lines)))
-    B[: len(kept), :width] = alone.B[np.ix_(kept, drives)]
+    B[: len(kept), :width] = own_B[np.ix_(kept, drives)]
     row = len(kept)
     for j, line in zip(seen, lines, strict=True):
         line_A, line_B, line_C, _ = line.stacks()
@@ -330,5 +272,5 @@ def _shaken_plant(alone: PlantMatrices, parts: PlantParts, ahead: int) -> _Shake
         channels = [i for i, name in enumerate(suite.channels) if name in motions[j]]
         C[channels, states] = line_C[0, 1:]
         row, width = states.stop, width + moved
-    A[:, : len(kept)] = alone.A[kept] @ to_own
-    return _ShakenPlant(A=A, B=B, C=C, to_own=to_own)
+    A[:, : len(kept)] = own_A[kept] @ to_own
+    return A, B, C, to_own

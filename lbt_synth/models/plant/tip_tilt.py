@@ -27,7 +27,7 @@ from lbt_synth.models.loop_hardware import LoopHardware
 from lbt_synth.models.mirror.position_loop import PositionLoop
 from lbt_synth.models.plant.assembly import PlantParts, known_states, plant_matrices
 from lbt_synth.models.sensor_suite import Motions, SensorSuite, noise_factor
-from lbt_synth.models.spectra import ARModel
+from lbt_synth.models.spectra import ARModel, spectrum_groups
 from lbt_synth.models.truth import Entering
 from lbt_synth.models.vibration import Vibration, spread_lines
 from lbt_synth.storage.words import count_text
@@ -63,16 +63,12 @@ class FullForm:
         The past command u(k-1) is ``to_command x_hat(k | k-1)`` and needs no state of its own. The
         known input has no error, so that the gain is over the reduced state, (r, q).
         """
-        gain = self._padded(gain_predictor)
+        known = self.n_states - gain_predictor.shape[-2]
+        gain = np.pad(gain_predictor, [(0, 0)] * (gain_predictor.ndim - 2) + [(0, known), (0, 0)])
         applied = self.B_known - gain @ self.D_known
         A = self.A - gain @ self.C + applied @ to_command
         D = np.zeros((len(to_command), gain.shape[-1]))
         return Controller(A=A, B=gain, C=to_command, D=D, dt_s=self.dt_s, applied=applied)
-
-    def _padded(self, gain: FloatArray) -> FloatArray:
-        """Return a gain over the reduced state as one over all states."""
-        shape = (*gain.shape[:-2], self.n_states - gain.shape[-2], gain.shape[-1])
-        return np.concatenate([gain, np.zeros(shape)], axis=-2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -190,8 +186,7 @@ class TipTiltPlant(EstimationProblem):
 
     def entering(self, hardware: LoopHardware, *, sensor_gain: float) -> Entering:
         """Return what enters any loop where the plant's model is the truth; see :class:`Truth`."""
-        turbulence = [(model, (mode,)) for mode, model in enumerate(self.turbulence)]
-        return turbulence, self.vibrations, self.own_noise_factor
+        return spectrum_groups(self.turbulence), self.vibrations, self.own_noise_factor
 
     def with_memory(self, taps: FloatArray) -> TipTiltPlant:
         """Add the past innovations of a filter as states; see :class:`EstimationProblem`."""
@@ -231,7 +226,7 @@ def tip_tilt_plant(
     frame_rate_hz: float,
     turbulence: ARModel | Sequence[ARModel],
     noise_nm: ArrayLike,
-    vibrations: Sequence[Vibration] | None = None,
+    vibrations: Sequence[Vibration] = (),
     delay_frames: float = 2.0,
     sensor_matrix: ArrayLike | None = None,
     influence_matrix: ArrayLike | None = None,
@@ -251,7 +246,7 @@ def tip_tilt_plant(
         Standard deviation of the measurement noise per frame, one for all measurements or one
         per measurement [nm], or its covariance [nm^2].
     vibrations : sequence of Vibration, optional
-        The vibrations; None for a plant without any.
+        The vibrations; none by default.
     delay_frames : float, optional
         Total delay of the loop [frames], at least 1, fractions allowed. For a
         fractional delay the estimated signal is interpolated between two frames.
@@ -301,11 +296,6 @@ def tip_tilt_plant(
     if np.any(gains != 1):
         sensor = np.reshape(gains, (-1, 1)) * hardware.sensor
         hardware = replace(hardware, sensor_matrix=sensor)
-    if vibrations is not None and not tuple(vibrations):
-        raise ProblemError(
-            "vibrations is empty; expected at least one Vibration, or None (leave it out) "
-            "for a plant without vibrations."
-        )
     models = turbulence.separate() if isinstance(turbulence, ARModel) else tuple(turbulence)
     if isinstance(turbulence, ARModel) and turbulence.coefficients.ndim == 1:
         models *= hardware.modes
@@ -313,7 +303,7 @@ def tip_tilt_plant(
         PlantParts(
             hardware=hardware,
             turbulence=models,
-            vibrations=tuple(vibrations or ()),
+            vibrations=tuple(vibrations),
             noise_factor=noise_factor(noise_nm, hardware.n_measurements),
         )
     )
@@ -321,9 +311,13 @@ def tip_tilt_plant(
 
 def assemble(parts: PlantParts) -> TipTiltPlant:
     """Assemble a plant from its parts."""
-    matrices = plant_matrices(parts)
+    A, B, C, D, L = plant_matrices(parts)
     return TipTiltPlant(
-        **{name: getattr(matrices, name) for name in "ABCDL"},
+        A=A,
+        B=B,
+        C=C,
+        D=D,
+        L=L,
         read=parts.hardware.suite.read(parts.hardware),
         dt_s=parts.hardware.dt_s,
         hardware=parts.hardware,

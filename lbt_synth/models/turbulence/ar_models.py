@@ -164,22 +164,11 @@ def _unpack(p: FloatArray, rate: float) -> tuple[float, float]:
     return 2 * np.pi * float(np.exp(p[0])) / rate, float(1 / (1 + np.exp(-p[1])))
 
 
-def noll_orders(modes: int) -> tuple[IntArray, IntArray]:
-    """Radial and azimuthal orders (modes,) of the first Zernike modes after piston.
-
-    They are in Noll's order, j = 2 to ``modes + 1``; the azimuthal order is not negative.
-    """
+def radial_orders(modes: int) -> IntArray:
+    """Radial orders (modes,) of the first Zernike modes after piston, in Noll's order."""
     count = integer(modes, "modes", at_least=1)
-    radial: list[int] = []
-    azimuthal: list[int] = []
-    n = 0
-    while len(radial) < count:
-        n += 1
-        for m in range(n % 2, n + 1, 2):
-            twice = 1 if m == 0 else 2
-            radial += [n] * twice
-            azimuthal += [m] * twice
-    return read_only(np.array(radial[:count])), read_only(np.array(azimuthal[:count]))
+    orders = np.arange(1, int(np.sqrt(2 * count)) + 2)  # of which n has n + 1 modes
+    return read_only(np.repeat(orders, orders + 1)[:count])
 
 
 @lru_cache(maxsize=32)
@@ -249,7 +238,7 @@ def modal_turbulence(atmosphere: Atmosphere, *, modes: int, frame_rate_hz: float
     [0.9886, 0.9829, 0.8089]
     """
     require_instance(atmosphere, Atmosphere)
-    radial, _ = noll_orders(modes)
+    radial = radial_orders(modes)
     rate = number(frame_rate_hz, "frame_rate_hz", above=0)
     poles = pole(atmosphere.wind_speed_m_s, atmosphere.diameter_m, rate, radial)
     variances = zernike_variances(atmosphere, int(radial[-1]))[radial - 1]

@@ -108,9 +108,9 @@ class Atmosphere:
         check_fields(self, **{n: v if v.ndim else float(v) for n, v in values.items()})
 
     @property
-    def is_stack(self) -> bool:
-        """Whether there is one layer for each loop."""
-        return np.ndim(self.wind_speed_m_s) > 0
+    def count(self) -> int:
+        """Number of layers."""
+        return np.size(self.wind_speed_m_s)
 
     def take(self, rows: IntArray) -> Atmosphere:
         """Return the layers of some loops."""
@@ -141,29 +141,22 @@ class Atmosphere:
         frequency that is negative or not finite raises a ProblemError.
         """
         frequency = real_array(frequency_hz, "frequency_hz")
-        shapes, which, factors = self.factored_psd(frequency.ravel())
-        density = shapes[which] * factors[:, None]
-        return np.asarray(density.reshape((*np.shape(self.wind_speed_m_s), *frequency.shape)))
-
-    def factored_psd(self, frequency_hz: FloatArray) -> tuple[FloatArray, IntArray, FloatArray]:
-        """Shapes (u, f) of the spectra, which of them each loop has, and its factor, (p,) each.
-
-        Spectra of the same wind and outer scale have one shape.
-        """
-        if np.any(frequency_hz < 0):
-            raise ProblemError(f"frequency_hz must be at least 0; got {np.min(frequency_hz)}.")
+        if np.any(frequency < 0):
+            raise ProblemError(f"frequency_hz must be at least 0; got {np.min(frequency)}.")
         crossing_s = np.atleast_1d(self.diameter_m / self.wind_speed_m_s)
         # pairs as complex numbers, which are sorted several times faster
         unique, which = np.unique(crossing_s + 1j * self.scale_ratio, return_inverse=True)
         with np.errstate(divide="ignore"):
-            x = np.log(frequency_hz) + np.log(unique.real[:, None])
+            x = np.log(frequency.ravel()) + np.log(unique.real[:, None])
         values, ratios = np.empty(x.shape), np.unique(unique.imag)
         # a polynomial over an octave needs as many tables
         spline_of = tilt_spline if len(ratios) <= _TERMS else _interpolated_spline
         for ratio in ratios:
             rows = unique.imag == ratio
             values[rows] = _log_density(spline_of(float(ratio), self.obstruction), x[rows])
-        return np.exp(values), which.reshape(-1), tilt_strength_nm2(self) * crossing_s
+        factors = tilt_strength_nm2(self) * crossing_s
+        density = np.exp(values)[which.reshape(-1)] * factors[:, None]
+        return np.asarray(density.reshape((*np.shape(self.wind_speed_m_s), *frequency.shape)))
 
 
 def kolmogorov_constant_nm2(air: Atmosphere) -> Any:

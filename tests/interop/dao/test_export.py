@@ -29,7 +29,7 @@ from lbt_synth.interop.dao.export import (
 from lbt_synth.interop.proof import _rounding_left, prove_written
 from lbt_synth.linear.norms import band_norm
 from lbt_synth.loop.disturbances import draw_disturbance
-from lbt_synth.loop.stable_range import radii_by_gain
+from lbt_synth.loop.stable_range import affine_radii, parts_by_gain
 
 BALANCE = 1e-13  # of a coefficient
 
@@ -294,7 +294,7 @@ def test_residuals_are_those_of_the_design(case, shaped):
 def test_radius_is_that_of_the_loop(case, shaped):
     loop, c = case
     gains = np.append(np.geomspace(0.5, 1.2, 25), 1.0)
-    expected = np.max(radii_by_gain(shaped.hardware, shaped.controller)(gains))
+    expected = np.max(affine_radii(parts_by_gain(shaped.hardware, shaped.controller), gains))
     assert loop.radius(c) == pytest.approx(expected, rel=1e-6)
     assert (loop.low, loop.high) == (0.5, 1.2)
 

@@ -34,7 +34,6 @@ def test_a_measurement_that_is_not_read_is_left_out():
     for masked, own in pairs:
         np.testing.assert_array_equal(masked.P, own.P)
         np.testing.assert_array_equal(masked.gain_predictor[:, rows], own.gain_predictor)
-        np.testing.assert_array_equal(masked.gain_filter[:, rows], own.gain_filter)
         assert not masked.gain_predictor[:, 1].any()
     assert gamma_riccati(partial, 0.5 * some[0]) is None
 
@@ -145,12 +144,11 @@ def test_kalman_filter_of_the_lifted_problem(seed):
     lifted = kalman_riccati(lifted_problem(problem))
     assert relative_distance(solution.P[0], lifted.P) < 1e-9
     assert not np.any(solution.gain_predictor.transpose(0, 2, 1)[~problem.read])
-    assert not np.any(solution.gain_filter.transpose(0, 2, 1)[~problem.read])
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_the_gain_of_the_measurement_update_without_correlation(seed):
-    """Then the predictor's gain is that of the filter, and a step of the plant."""
+def test_the_gain_without_correlation_by_the_covariance_that_a_level_widens(seed):
+    """It is ``A Pt C'(R + C Pt C')^-1``, with P itself for the Kalman filter."""
     problem = random_periodic_problem(seed)
     q = problem.n_measurements
     alone = replace(problem, B=problem.B * (np.arange(problem.B.shape[-1]) < problem.n_states))
@@ -158,8 +156,16 @@ def test_the_gain_of_the_measurement_update_without_correlation(seed):
     alone = replace(alone, D=noise)
     start = kalman_riccati(alone)
     high = lbt.hinf_norm(alone.error_system(start.gain_predictor)).upper
-    for solution in (start, gamma_riccati(alone, 1.2 * high, start=start)):
-        assert relative_distance(alone.A @ solution.gain_filter, solution.gain_predictor) < 1e-9
+    level, L = 1.2 * high, alone.L
+    for gamma, solution in ((np.inf, start), (level, gamma_riccati(alone, level, start=start))):
+        expected = np.zeros_like(solution.gain_predictor)
+        for t, P in enumerate(solution.P):
+            A, _, C, D = alone.read_parts(t)
+            room = np.eye(len(L)) - L @ P @ L.T / gamma**2
+            wide = P + P @ L.T @ np.linalg.solve(room, L @ P) / gamma**2
+            gain = A @ wide @ C.T @ np.linalg.inv(C @ wide @ C.T + D @ D.T)
+            expected[t][:, alone.read[t]] = gain
+        assert relative_distance(solution.gain_predictor, expected) < 1e-9
 
 
 @pytest.mark.parametrize("seed", range(0, 12, 4))

@@ -12,8 +12,8 @@ from support.sensor_loops import AIR, FAST, MOTIONS, SLOW, example_plant, held_m
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear.riccati.filtering import kalman_riccati
-from lbt_synth.models import Accelerometer, Motion, SensorSuite
-from lbt_synth.models.plant.assembly import Exposure, memory
+from lbt_synth.models import Accelerometer, Motion, SensorSuite, WavefrontSensor
+from lbt_synth.models.plant.assembly import sensor_memory
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 
 SEEING = Accelerometer(
@@ -28,18 +28,26 @@ SEEING = Accelerometer(
 def test_a_reading_is_the_mean_of_its_exposure(age, period, common):
     signal = np.random.default_rng(0).standard_normal((200, 2))
     response = np.array([[1.0, 0.5], [0.0, 2.0], [1.0, -1.0]])
-    exposure = Exposure(response=response, age_frames=float(age), period=period)
-    held, compared = memory([exposure], 2, common), 0
-    x = np.zeros(held.n_states)
+    sensor = WavefrontSensor(
+        name="other",
+        rate_hz=800 / period,
+        delay_frames=(age + 1) / period,
+        noise_nm=1.0,
+        sensor_matrix=response,
+    )
+    rare = replace(SEEING, rate_hz=800 / common, delay_frames=2)
+    path = lbt.LoopHardware(frame_rate_hz=800, suite=SensorSuite(sensors=(sensor, rare)))
+    (A, B, C), compared = sensor_memory(path), 0
+    x = np.zeros(A.shape[1])
     for k, s in enumerate(signal):
         t = k % common
         if k % period == 0 and k > age:
             expected = response @ held_mean(signal, k, age, period)
-            np.testing.assert_allclose(held.C[t] @ x, expected, atol=1e-12)
+            np.testing.assert_allclose(C[t] @ x, expected, atol=1e-12)
             compared += 1
-        x = held.A[t] @ x + held.B[t] @ s
+        x = A[t] @ x + B[t] @ s
     assert compared > 5
-    assert held.n_states <= 2 * (2 + age // period)
+    assert len(x) <= 2 * (2 + age // period)
 
 
 @pytest.mark.parametrize("delay", [1, 2.4])
