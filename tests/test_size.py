@@ -18,7 +18,7 @@ LINES = {
     "config": 1660,
     "design": 6201,
     "files": 1261,
-    "identification": 9037,
+    "identification": 8845,
     "interop": 3687,
     "linear": 4844,
     "loop": 4132,

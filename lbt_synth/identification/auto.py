@@ -240,12 +240,9 @@ def _say_price(price: str, now: PredictionRow | None, before: PredictionRow | No
 
 
 def _claims(table: PredictionTable, title: str, saved: float) -> dict[str, float]:
-    """Return what a predictor claims: what that of the first half leaves, where it is above 0.
-
-    Of its measured variance, a share is saved: a fit of all frames has smaller errors.
-    """
+    """Return what a predictor claims: what that of the first half leaves, where it is above 0."""
     claims, alone = dict[str, float](), table.row(f"{title}{WITHOUT}")
-    if (row := table.row(title)) and row.replayed:
+    if (row := table.row(title)) and row.replayed:  # a fit of all frames has smaller errors
         left_nm2 = row.replayed.total_nm2 - saved * row.replayed.measured_nm2
         error_nm2 = row.replayed.total_error_nm2
         if left_nm2 > 0:
@@ -375,17 +372,13 @@ def _running_gains(record: LoopRecord) -> tuple[float, float]:
     law = fit_control_law(record)
     if law is None or law.kind == "none" or law.lag_frames < 0:
         return POSSIBLE_GAINS
-    gains = _gains_between(*POSSIBLE_GAINS)
+    least, most = POSSIBLE_GAINS
+    gains = np.geomspace(least, most, int(np.ceil(np.log(most / least) / GAIN_STEP)) + 1)
     ran = [could_have_run(CommandRepair(), [gain], record, law) for gain in gains]
     if not any(ran):
         return POSSIBLE_GAINS
     beside = np.convolve(ran, [1, 1, 1], "same") > 0  # the limit is between two gains
     return float(gains[beside][0]), float(gains[beside][-1])
-
-
-def _gains_between(start: float, end: float) -> FloatArray:
-    """Return gains from one to another, both of them included."""
-    return np.geomspace(start, end, int(np.ceil(abs(np.log(end / start)) / GAIN_STEP)) + 1)
 
 
 def unstable_gains(design: Design, gains: FloatArray) -> FloatArray | None:
@@ -424,12 +417,11 @@ def design_for_gains(
 ) -> tuple[Design, float, str]:
     """Return a design that is stable at all sensor gains that a record allows, and its noise.
 
-    ``design`` makes one that assumes a multiple of the model's noise. Its first assumption says
-    which gains are possible. Commands that were recorded at half their size look like twice the
-    sensor gain, and no record can tell; so unless the scale of the commands is known, half of the
+    ``design`` makes one that assumes a multiple of the model's noise. Commands that were recorded
+    at half their size look like twice the sensor gain; so unless their scale is known, half of the
     gains are possible, and each axis may have those of both. Where the design is unstable at one of
-    them, or with a delay a tenth of a frame off, the one that assumes the least more noise and is
-    stable takes its place: the more noise, the less a filter trusts its sensor. A note says so.
+    them, or with a delay a tenth of a frame off, the one of least more noise that is stable takes
+    its place, and a note says so.
     """
     usual, assumed = design(1.0), list[str]()
     intervals = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1)

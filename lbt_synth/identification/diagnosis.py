@@ -6,7 +6,7 @@ errors; the model says only how the variance of one divides among the parts of t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -16,7 +16,12 @@ from lbt_synth.design import Design, integrator
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.identification.commands.control_law import ControlLaw, law_controller
 from lbt_synth.identification.commands.verdict import CommandVerdict, explain_commands
-from lbt_synth.identification.fit.identified_model import DIFFERENT, IdentifiedLine, IdentifiedModel
+from lbt_synth.identification.fit.identified_model import (
+    AXES,
+    DIFFERENT,
+    IdentifiedLine,
+    IdentifiedModel,
+)
 from lbt_synth.identification.fit.identify import identify
 from lbt_synth.identification.prediction.comparison import (
     INTEGRATOR,
@@ -32,14 +37,13 @@ from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, loop_margins, residual_budget
 from lbt_synth.loop.stable_range import stable_sensor_gains
 from lbt_synth.methods.registry import METHODS, default_method, reference_methods
-from lbt_synth.models import TipTiltPlant, Truth
+from lbt_synth.models import Truth
 from lbt_synth.models.loop_hardware import loop_differences
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts, column, fact, facts, nm_column, table_row
 from lbt_synth.storage.words import listing_text
 from lbt_synth.validation import BoolArray, FloatArray, require_instance
 
-AXES = ("tip", "tilt")
 DEAD = "dead"
 _NOISIER = 3.0  # times the other axis, from frame to frame: turbulence and lines are more alike
 _WHOLE = ("noisy", "drifting", "scatter changes")  # what concerns the whole channel
@@ -126,7 +130,7 @@ def _judge_channel(
 def law_facts(law: ControlLaw) -> Facts:
     """Return a control law in words."""
     is_none = law.kind == "none"
-    leak = ", ".join(dict.fromkeys(f"{pole:.5g}" for pole in law.leak if np.isfinite(pole)))
+    leak = ", ".join(dict.fromkeys(f"{pole:.5g}" for pole in abs(law.poles[:, :1]).ravel()))
     none = "none: the commands do not follow from the measurements"
     axes = "" if is_none or len(law.gain) == 1 else law.axes_kind
     unexplained = 0.0 if law.exact else law.residual
@@ -138,7 +142,7 @@ def law_facts(law: ControlLaw) -> Facts:
         leak=fact(leak, "pole nearest 1"),
         lag_frames=fact(law.lag_frames, "late", unit="frames"),
         residual=fact(unexplained, "unexplained", unit="%", scale=100, format=".2g"),
-        coherence=fact(law.coherence),
+        coherence=fact(float(np.mean(law.axis_coherence))),
     )
 
 
@@ -190,21 +194,20 @@ def given_controller(design: Design, model: IdentifiedModel) -> Controller:
     return replace(design.controller, dt_s=path.dt_s)
 
 
-def given_design_notes(name: str, design: Design, model: IdentifiedModel) -> list[str]:
+def given_design_notes(name: str, design: Design, model: IdentifiedModel) -> Iterator[str]:
     """Say how the loop of a given design differs from that of the record."""
-    notes = list[str]()
     if (path := design.hardware) is None:
-        return notes
+        return
     if path.sensor.shape == (path.modes, path.modes):
         for i, (axis, assumed) in enumerate(zip(model.axes, np.diag(path.sensor), strict=True)):
             error = axis.sensor_gain_error
             if error is not None and abs(assumed - axis.sensor_gain) > DIFFERENT * error:
-                notes.append(
+                yield (
                     f"{name} assumes a sensor gain of {assumed:.3f} on axis {i}; the record has "
                     f"{axis.sensor_gain:.3f} +- {error:.3f}"
                 )
     here = replace(model.hardware, sensor_matrix=path.sensor, influence_matrix=path.influence)
-    return [*notes, *(f"{name} was {text}" for text in loop_differences(path, here))]
+    yield from (f"{name} was {text}" for text in loop_differences(path, here))
 
 
 def disturbance_lines(model: IdentifiedModel) -> tuple[IdentifiedLine, ...]:
@@ -230,13 +233,10 @@ class CostRow:
 
 
 def disturbance_costs(
-    plant: TipTiltPlant,
-    lines: Sequence[IdentifiedLine],
-    running: Controller | None,
-    best: Controller,
+    model: IdentifiedModel, running: Controller | None, best: Controller
 ) -> tuple[CostRow, ...]:
     """Return a row per part of the disturbance, the most costly first, and one of all."""
-    ran, designed = (_costs(plant, lines, controller) for controller in (running, best))
+    ran, designed = (_costs(model, controller) for controller in (running, best))
     costs = ran or designed
     *parts, everything = costs
     order = [*sorted(parts, key=lambda name: -costs[name]), everything]
@@ -246,15 +246,14 @@ def disturbance_costs(
     )
 
 
-def _costs(
-    plant: TipTiltPlant, lines: Sequence[IdentifiedLine], controller: Controller | None
-) -> dict[str, float]:
+def _costs(model: IdentifiedModel, controller: Controller | None) -> dict[str, float]:
     """Return the rms that each part leaves, and last that of all [nm]; none of no stable loop."""
+    plant = model.plant()
     if controller is None or not (loop := close_loop(plant.hardware, controller)).is_stable:
         return {}
     budget = residual_budget(loop, plant, frame_means=True)
     parts = {"turbulence": 0.0, "measurement noise": float(np.trace(budget.noise_nm2))}
-    for line in lines:  # two of one frequency are one part
+    for line in disturbance_lines(model):  # two of one frequency are one part
         alone = Truth(turbulence=None, vibrations=(line.vibration(),))
         rms_nm = residual_budget(loop, alone, frame_means=True).rms_nm
         parts[line_name(line)] = parts.get(line_name(line), 0.0) + rms_nm**2
@@ -321,10 +320,6 @@ class Diagnosis:
         *state, residual = self.findings
         advice = next(finding.advice for finding in (*state, residual) if finding.advice)
         return " ".join(finding.sentence for finding in state), residual.sentence, advice
-
-    def row(self, name: str) -> PredictionRow | None:
-        """Return a row of the comparison, None where there is none."""
-        return None if self.comparison is None else self.comparison.row(name)
 
 
 def diagnose(
@@ -424,11 +419,9 @@ def _compare(
     given: Mapping[str, Controller],
     options: Mapping[str, Any],
 ) -> Diagnosis:
-    """Add residuals on the second half, the best design there, and costs, by a model of the first.
-
-    Its sensor gain is that of the whole record, because a half shows it less well.
-    """
+    """Add residuals on the second half, the best design, and costs, by a model of the first."""
     record, imaging = diagnosis.record, diagnosis.imaging
+    # a half shows the sensor gain less well
     fixed = {"start": model, "sensor_gain": list(model.sensor_gains)}
     half = identify(split_halves(record)[0], **{**options, **fixed})
     more = [m for m in METHODS.values() if m.plant_section is not None or m.of_record]
@@ -440,9 +433,8 @@ def _compare(
     designs[INTEGRATOR] = integrator(plant.hardware, truth=plant)  # the comparison has it
     residuals = {row.name: row.replayed.total_nm2 for row in table.entries if row.replayed}
     best = min(designs, key=lambda name: residuals[name])
-    chosen, lines = designs[best], disturbance_lines(half)
-    costs = disturbance_costs(half.plant(), lines, running, chosen.controller)
-    return replace(diagnosis, comparison=table, best=best, best_design=chosen, costs=costs)
+    costs = disturbance_costs(half, running, designs[best].controller)
+    return replace(diagnosis, comparison=table, best=best, best_design=designs[best], costs=costs)
 
 
 def _find_faults(diagnosis: Diagnosis) -> Iterator[Finding]:
@@ -491,13 +483,13 @@ def _judge_loop(diagnosis: Diagnosis) -> Finding:
     narrow = bool(loop.modulus < _NARROW)
     if narrow:
         stable += f" but with a modulus margin of {loop.modulus:.2g} only"
-    tone: Literal["good", "note"] = "note" if narrow else "good"
-    return Finding(tone=tone, sentence=f"The record is sound: {law}{stable}.")
+    sentence = f"The record is sound: {law}{stable}."
+    return Finding(tone="note" if narrow else "good", sentence=sentence)
 
 
 def _residual_text(diagnosis: Diagnosis) -> str:
     """Say what the loop that ran leaves, from which measurement that follows, and of what it is."""
-    row = diagnosis.row(RAN)
+    row = next((row for row in diagnosis.residuals if row.name == RAN), None)
     ran = None if row is None else row.replayed
     parts = _parts_text(diagnosis, "best_nm" if ran is None else "running_nm")
     if row is None or ran is None:

@@ -36,14 +36,15 @@ def test_a_good_record(good):
     assert (names[0], names[-1]) == (RAN, LIMIT)
     assert {INTEGRATOR, good.best, "robust controller", "mine"} < set(names)
     # the law that was found promises what the record shows
-    assert abs(good.row(RAN).deviations) < 4
-    least = min(good.row(name).replayed_nm for name in names if name not in (RAN, LIMIT, "mine"))
-    assert good.row(good.best).replayed_nm == pytest.approx(least, rel=0.05)
+    assert abs(good.comparison[RAN].deviations) < 4
+    least = min(
+        good.comparison[name].replayed_nm for name in names if name not in (RAN, LIMIT, "mine")
+    )
+    assert good.comparison[good.best].replayed_nm == pytest.approx(least, rel=0.05)
     assert lbt.close_loop(good.model.hardware, good.best_design.controller).is_stable
-    assert good.row("nothing") is None
     # a design that was given
     mine = given_design()
-    assert good.row("mine").replayed_nm > 3 * mine.rms
+    assert good.comparison["mine"].replayed_nm > 3 * mine.rms
     (assumption,) = (note for note in good.notes if note.startswith("mine "))
     low, high = (float(end) for end in good.loop.stable_gains.split(" to "))
     assert low < good.model.sensor_gains[0] < high
@@ -95,7 +96,7 @@ def test_an_open_loop():
     found = diagnose(loop_record(line_record().pseudo_open_loop(0.6)[2:4500], **LOOP))
     assert found.law is None
     assert found.loop.stable_gains == ""
-    assert found.row(RAN) is None
+    assert found.comparison.row(RAN) is None
     assert np.isnan(found.costs[-1].running_nm)
     assert found.costs[-1].best_nm > 0
 
@@ -128,7 +129,7 @@ def verdict_with(rows):
 
 def scaled(name, factor):
     """Return a row of the comparison whose residual is larger by a factor."""
-    row = line_diagnosis().row(name)
+    row = line_diagnosis().comparison[name]
     powers = {"measured_nm": 1, "noise_nm2": 2, "covariance_nm2": 2, "error_nm4": 4}
     residual = row.replayed
     parts = {key: factor**power * getattr(residual, key) for key, power in powers.items()}
@@ -139,7 +140,7 @@ def test_sentences_of_a_good_record(good):
     """All residuals are those on unseen data; of the model there are shares of a variance."""
     state, residual, advice = good.verdict
     assert state.startswith("The record is sound: an integrator of gain 0.2 ran, stable at")
-    ran, best, slow = (good.row(name).replayed for name in (RAN, good.best, INTEGRATOR))
+    ran, best, slow = (good.comparison[name].replayed for name in (RAN, good.best, INTEGRATOR))
     assert residual.startswith(f"It leaves {ran.text} on unseen data (")
     start, stop = ran.stretches[0]
     y = line_record().measurements[start:stop]
@@ -154,14 +155,14 @@ def test_sentences_of_a_good_record(good):
     words = f"First change the controller: the {good.best} leaves {best.text} on unseen data"
     assert advice.startswith(words)
     assert advice.endswith(f". The best integrator leaves {slow.text}.")
-    assert good.costs[-1].running_nm == pytest.approx(good.row(RAN).model_nm, rel=1e-6)
-    assert good.costs[-1].best_nm == pytest.approx(good.row(good.best).model_nm, rel=1e-6)
+    assert good.costs[-1].running_nm == pytest.approx(good.comparison[RAN].model_nm, rel=1e-6)
+    assert good.costs[-1].best_nm == pytest.approx(good.comparison[good.best].model_nm, rel=1e-6)
 
 
 def test_what_is_advised(good):
-    residual = verdict_with({RAN: replace(good.row(RAN), model_nm=500.0)})[1]
+    residual = verdict_with({RAN: replace(good.comparison[RAN], model_nm=500.0)})[1]
     assert residual.endswith("; the data contradict the model, which expects 500 nm.")
-    name, best = good.best, good.row(good.best)
+    name, best = good.best, good.comparison[good.best]
     text = best.replayed.text
     same = f"Change nothing: of all that was tried the {name} leaves least, {text}."
     assert verdict_with({RAN: best})[2] == same

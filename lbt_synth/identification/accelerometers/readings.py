@@ -180,14 +180,9 @@ def _on_own_clock(
     contents: Contents, values: FloatArray, rate_hz: float | None, frame_rate_hz: float
 ) -> tuple[FloatArray, float, list[str]]:
     """Return readings without jumps in time, NaN where rows are missing, and their rate."""
-    in_file = contents.facts.get("frame_rate_hz", {}).values()
-    stated = set(in_file) if rate_hz is None else {rate_hz}
-    if len(stated) > 1:
-        raise ProblemError(
-            "the file of the accelerometers gives several rates: "
-            f"{', '.join(f'{rate:g}' for rate in sorted(stated))} Hz. Give accelerometer_rate_hz."
-        )
-    own_hz = number(stated.pop(), "accelerometer_rate_hz", above=0) if stated else None
+    own_hz = contents.find_fact("frame_rate_hz", rate_hz)
+    if own_hz is not None:
+        own_hz = number(own_hz, "accelerometer_rate_hz", above=0)
     clocks = {column.role: column for column in contents.columns if column.role in CLOCKS}
     times, counter = clocks.get("times"), clocks.get("frame_numbers")
     if times is None and counter is None:

@@ -226,10 +226,7 @@ def _transform(series: FloatArray, rate: float, inside: BoolArray) -> ComplexArr
 
 
 def _density(line: IdentifiedLine, frequency_hz: FloatArray, bin_hz: float) -> FloatArray:
-    """Return the density of a line that the taper widens, (f,) [nm^2/Hz].
-
-    The peak of a line narrower than a bin is that of its tapered power, nearly ``rms^2 / bin``.
-    """
+    """Return the density of a line that the taper widens, (f,) [nm^2/Hz]."""
     centre = line.frequency_hz
     width = line.damping * centre + bin_hz / np.pi
     squares = (centre**2 - frequency_hz**2) ** 2 + (2 * width * frequency_hz) ** 2
@@ -285,10 +282,7 @@ def _lay_and_fit(
     largest: int,
     limit: float,
 ) -> tuple[int, _Fits, float, float]:
-    """Lay readings beside the wavefront: with the likeliest shift, or as given if that is not sure.
-
-    Return by how many frames they were moved, the fits, and the shift with its standard error.
-    """
+    """Return by how many frames readings were moved, fits, and the shift with its error."""
     gains = np.array(model.sensor_gains)
     errors = np.array([axis.sensor_gain_error or 0.0 for axis in model.axes])
     series = record.pseudo_open_loop(gains)
@@ -314,7 +308,7 @@ def _lay_and_fit(
     lag = _likeliest_lag(bands, largest)
     fits = _fit_channels(beside(lag))
     late, error = _slope_shift(fits, limit)
-    if not abs(lag + late) > DIFFERENT * error:
+    if not abs(lag + late) > DIFFERENT * error:  # not sure: they stay as they were given
         return 0, _fit_channels(bands), lag + late if np.isfinite(error) else 0.0, error
     if round(late):
         lag += round(late)

@@ -125,28 +125,19 @@ def find_spectral_peaks(
     return is_peak, frequency_hz[tops], width * (frequency_hz[1] - frequency_hz[0])
 
 
-def _bands(frequency_hz: FloatArray, step: float) -> IntArray:
-    """Return where bands of at least one step begin among the frequencies."""
-    band = np.floor(np.cumsum(step / np.maximum(_BAND * frequency_hz, step)) - 1e-9)
-    return np.flatnonzero(np.diff(band, prepend=-np.inf) > 0)
-
-
-def _shapes(square: FloatArray, lowest_hz: float, skirts: Sequence[FloatArray]) -> FloatArray:
-    """Return the shapes of noise, turbulence, wide resonances and skirts over the bands, (k, b).
-
-    Turbulence falls with slopes of -2, -4 and -6. Nothing but noise and the skirts of slower parts
-    has a place at high frequencies: there the corrections of a wrong guess show.
-    """
+def _shapes(square: FloatArray, lowest_hz: float, skirts: FloatArray) -> FloatArray:
+    """Return the shapes of noise, turbulence, wide resonances and skirts over the bands, (k, b)."""
+    # nothing but noise and skirts has a place at high frequencies, where wrong corrections show
     corners = np.geomspace(lowest_hz, _FASTEST_HZ, 5)
     falls = [(1 + square / corner**2) ** -order for corner in corners for order in (1, 2, 3)]
-    wide = [_resonance(square, centre, _SHAPE_DAMPING) for centre in _SHAPES_HZ]
+    wide = _resonance(square, _SHAPES_HZ, _SHAPE_DAMPING)
     shapes = np.array([np.ones_like(square), *falls, *wide, *skirts])
     return np.asarray(shapes / np.max(shapes, axis=1, keepdims=True))
 
 
-def _resonance(square: FloatArray, centre_hz: FloatArray | float, damping: float) -> FloatArray:
-    """Return the spectrum of a second-order process, 1 at low frequencies."""
-    centre = np.asarray(centre_hz) ** 2
+def _resonance(square: FloatArray, centre_hz: FloatArray, damping: float) -> FloatArray:
+    """Return the spectra of second-order processes, (k, b), 1 at low frequencies."""
+    centre = centre_hz[:, None] ** 2
     return np.asarray(centre**2 / ((square - centre) ** 2 + 4 * damping**2 * centre * square))
 
 
@@ -170,7 +161,7 @@ def coarse_axis(
         frame_rate_hz=frame_rate_hz,
     )
     bands = every.take(~is_peak)
-    bands = bands.merge(_bands(bands.frequency_hz, float(frequency_hz[1] - frequency_hz[0])))
+    bands = bands.merge(_BAND * bands.frequency_hz)
 
     def warp(f: FloatArray) -> FloatArray:  # as that of a sampled process [Hz^2]
         return half_angle_square(f, frame_rate_hz) * (frame_rate_hz / (2 * np.pi)) ** 2
@@ -179,7 +170,7 @@ def coarse_axis(
     # of its peak stands for one between them
     places = np.concatenate([lines - width, lines + width])
     square, centres = warp(bands.frequency_hz), np.sqrt(warp(places[places > 0]))
-    skirts = [_resonance(square, centre, _LINE_DAMPING) for centre in centres]
+    skirts = _resonance(square, centres, _LINE_DAMPING)
     return bands, every.take(is_peak), _shapes(square, frequency_hz[0], skirts)
 
 

@@ -98,16 +98,6 @@ class ControlLaw:
         return classify_matrix(self.gain)[0]
 
     @property
-    def coherence(self) -> float:
-        """Return the part of what past commands leave that a law explains (axes,), unbiased."""
-        return float(np.mean(self.axis_coherence))
-
-    @property
-    def leak(self) -> FloatArray:
-        """Size of the pole nearest 1 of each axis, (axes,); (0,) of a law without memory."""
-        return np.asarray(np.abs(self.poles[:, :1]).ravel())
-
-    @property
     def exact(self) -> bool:
         """Whether the law leaves nothing but rounding."""
         return self.kind != "none" and self.residual < _EXACT

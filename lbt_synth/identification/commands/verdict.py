@@ -184,12 +184,13 @@ def _explain(
         delay_frames=delay_frames + off if off else None,
         scale=_factors(scale),
     )
-    hidden = (gain / scale <= limits[0]) | (gain / scale >= limits[1])
+    large = gain / scale >= limits[1]
+    notes = _note_law(delay_frames, lag, delays, _unexplained(law), gain[large])
     return refuse(
         explanation=_name_repair(repair, gain),
         repair=repair,
-        gain=frozen_copy(np.where(hidden, np.nan, gain / scale)),
-        notes=() if repair.options else _note_law(delay_frames, lag, delays, _unexplained(law)),
+        gain=frozen_copy(np.where((gain / scale <= limits[0]) | large, np.nan, gain / scale)),
+        notes=() if repair.options else notes,
     )
 
 
@@ -240,12 +241,9 @@ def _unexplained(law: ControlLaw | None) -> str:
 
 
 def _note_law(
-    delay_frames: float, lag: int, delays: Sequence[float], hiding: str
+    delay_frames: float, lag: int, delays: Sequence[float], hiding: str, large: FloatArray
 ) -> tuple[str, ...]:
-    """Return what to look at in an accepted record whose law has a lag, or explains too little.
-
-    And which other delays explain it as well.
-    """
+    """Return what to look at in an accepted record: its lag, delay, law, and too large gains."""
     late = (
         f"warning: the commands follow measurements {count_text(lag, 'frame')} earlier. If the "
         "real-time computer takes that long, the total delay of a new design is "
@@ -257,7 +255,13 @@ def _note_law(
         f"warning: the record leaves the total delay open: {others} explain it as well as the "
         f"{delay_frames:g} frames that are given and taken"
     )
-    return (late,) * bool(lag) + (several,) * bool(delays) + (few,) * bool(hiding)
+    gains = " and ".join(f"{gain:.2g}" for gain in large)
+    small = (
+        f"warning: the sensor gain looks like {gains}, as if the commands were too small, and the "
+        "record does not tell. Check their unit (--command-scale), or raise the loop gain"
+    )
+    notes = {late: lag, several: delays, few: hiding, small: gains}
+    return tuple(note for note, holds in notes.items() if holds)
 
 
 def _doubt_law(law: ControlLaw) -> str:
@@ -298,10 +302,7 @@ def list_repairs(
 def _choose(
     record: LoopRecord, law: ControlLaw | None, lag: int, known: tuple[float, float] | None
 ) -> tuple[CommandRepair, FloatArray, BoolArray, list[float]]:
-    """Return the repair that law and likelihood ask for, its gain, and which axes are unrelated.
-
-    And the delays a frame from the given one that coarse spectrum and fit leave open beside it.
-    """
+    """Return the likeliest repair, its gain, which axes are unrelated, and other likely delays."""
     fit_cost, delay_frames = cache(partial(_fit_cost, record)), record.hardware.delay_frames
     repairs = list_repairs(record.axes, delay_frames, law, lag)
     contrasts, gains = compare_repairs(record, repairs)
@@ -431,19 +432,14 @@ def _scale(
     gain: FloatArray,
     limits: tuple[float, float],
 ) -> FloatArray:
-    """Return the factors (axes,) of commands whose gains lie beyond the limits of another unit.
-
-    A sure law that runs at a plausible gain refutes commands that are too large: a gain that seems
-    too small is one that lines hide. One that seems too large by less than a hundred may be that of
-    wide resonances, unless quick fits of plausible gains are clearly less likely.
-    """
+    """Return the factors (axes,) of commands whose gains lie beyond the limits of another unit."""
     low, high = limits
     seeming = float(np.exp(np.mean(np.log(gain))))
     within = (gain >= low) & (gain <= high)
-    if seeming < low and law is not None and law.is_sure:
+    if seeming < low and law is not None and law.is_sure:  # lines hide a gain at which it runs
         usual = np.geomspace(*PLAUSIBLE_GAINS, 8)
         within |= could_have_run(repair, usual, record, law)
-    if high < seeming < _ANOTHER_UNIT * high:
+    if high < seeming < _ANOTHER_UNIT * high:  # wide resonances look like that
         tried = np.geomspace(low * _WRONG_GAIN**2, high / _WRONG_GAIN**2, 3).tolist()
         held = [_fit_cost(record, repair, guess) for guess in (*tried, seeming)]
         within |= min(held[:-1]) < held[-1] + CLEAR

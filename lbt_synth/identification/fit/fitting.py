@@ -142,9 +142,7 @@ class Search:
             rows += [gain, _NONE, colour, corner if axis.rolls_off else _FIXED]
         for c in spectrum.components:
             ratio = _NONE if c.axis is None and c.kind == "line" else _FIXED
-            rows += [self._frequency_prior(c), self._damping_prior(c), _NONE, ratio][
-                : spectrum.width
-            ]
+            rows += [*self._resonance_priors(c), _NONE, ratio][: spectrum.width]
         centre, width = np.array(rows).T
         priors = Priors(centre=centre, width=width)
         low, high = (np.full(centre.size, end) for end in priors.bounds)
@@ -163,18 +161,13 @@ class Search:
                 high[spectrum.place(i)] = self.log_angle(_FASTEST_HZ)
         return replace(priors, bounds=(low, high))
 
-    def _frequency_prior(self, component: Component) -> tuple[float, float]:
-        if component.kind == "drift":
-            return self.log_angle(2 * DRIFT_RATIO * DRIFT_HZ), _WIDTH
-        if component.kind == "line":
-            return _NONE
-        return self.log_angle(1.0), _WIDTH
-
-    def _damping_prior(self, component: Component) -> tuple[float, float]:
-        """Return the prior, narrower where the taper of a density is not known."""
+    def _resonance_priors(self, component: Component) -> tuple[tuple[float, float], ...]:
+        """Return the priors of the frequency and the damping of a component."""
         centre, width = _DAMPING[component.kind]
-        smoothed = component.kind == "line" and self.data.duration_s is None
-        return centre, 0.5 * width if smoothed else width
+        if component.kind == "line":  # half as wide where the taper of a density is not known
+            return _NONE, (centre, width if self.data.duration_s else 0.5 * width)
+        usual_hz = 2 * DRIFT_RATIO * DRIFT_HZ if component.kind == "drift" else 1.0
+        return (self.log_angle(usual_hz), _WIDTH), (centre, width)
 
     def place(self, component: Component) -> tuple[float, float]:
         """Return the frequency and the half width of a component [Hz], at least a bin wide."""
@@ -184,7 +177,7 @@ class Search:
     def merge(self, spectrum: SpectrumModel) -> LoopPeriodogram:
         """Return means over groups of bins within which a model is nearly constant."""
         f, step = self.data.frequency_hz, self.data.step_hz
-        widths_hz = np.maximum(step, np.minimum(_FINE * f, _WIDEST_HZ))
+        widths_hz = np.minimum(_FINE * f, _WIDEST_HZ)
         for line in spectrum.lines:
             centre, half_width = self.place(line)
             fine = SKIRT if half_width < RESOLVED * step else _BINS
@@ -192,9 +185,8 @@ class Search:
             band = slice(*np.searchsorted(f, [centre - reach, centre + reach]))
             away = np.maximum(np.abs(f[band] - centre) - fine * step, 0)
             wide = _SHARE / line.sections * np.maximum(half_width, 2 * away)
-            widths_hz[band] = np.minimum(widths_hz[band], np.maximum(step, wide))
-        group = np.floor(np.cumsum(step / widths_hz) - 1e-9)
-        return self.data.merge(np.flatnonzero(np.diff(group, prepend=-np.inf) > 0))
+            widths_hz[band] = np.minimum(widths_hz[band], wide)
+        return self.data.merge(widths_hz)
 
 
 def fit(
@@ -205,11 +197,7 @@ def fit(
     margin: float = 0.0,
     accuracy: float = SEARCHED,
 ) -> FittedModel | None:
-    """Fit all parameters; None if no fit settles.
-
-    A fit is given up where its log-likelihood does not reach that of ``better_than`` minus a
-    margin.
-    """
+    """Fit all parameters; None if no fit settles within a margin of ``better_than``."""
     data, bound = search.merge(start), float("inf")
     if len(start.axes) == 1:  # a noise of nothing has no slope
         least = _SEED * float(np.min(density(data, start))) * data.frame_rate_hz / 2
@@ -313,10 +301,7 @@ def _overlapping(search: Search, spectrum: SpectrumModel, i: int) -> int | None:
 def _drop(
     data: LoopPeriodogram, spectrum: SpectrumModel, i: int, neighbour: int | None
 ) -> SpectrumModel | None:
-    """Return the model without a component, whose power a neighbour takes; None for turbulence.
-
-    A wide component may have taken the place of the noise: its white part then becomes noise.
-    """
+    """Return the model without a component, whose power a neighbour takes; None for turbulence."""
     if i == 0:
         return None
     if neighbour is not None:
@@ -324,12 +309,9 @@ def _drop(
         power = float(np.logaddexp(line.log_power, spectrum.components[i].log_power))
         return spectrum.exchange(neighbour, replace(line, log_power=power)).exchange(i)
     smaller, noise = spectrum.exchange(i), float(np.exp(spectrum.background.log_noise))
-    white = (
-        float(np.min(part_densities(data, spectrum, spectrum.components[i : i + 1])))
-        * data.frame_rate_hz
-        / 2
-    )
-    if white > noise:
+    alone = part_densities(data, spectrum, spectrum.components[i : i + 1])
+    white = float(np.min(alone)) * data.frame_rate_hz / 2
+    if white > noise:  # a wide component may have taken the place of the noise
         return smaller.with_background(log_noise=float(np.log(noise + white)))
     return smaller
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -38,6 +38,7 @@ from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray, frozen_copy
 
+AXES = ("tip", "tilt")  # names of two axes
 Kind = Literal["line", "broad", "turbulence"]
 DIFFERENT = 3.0  # standard errors beyond which two values differ: chance 0.3 %
 UNRESOLVED = 0.01  # half width times duration: narrower than that, a line looks like a sinusoid
@@ -261,11 +262,6 @@ def say_count(model: IdentifiedModel) -> str:
     )
 
 
-def standard_errors(spectrum: SpectrumModel, covariance: FloatArray) -> SpectrumModel:
-    """Return the standard error of each parameter of a model."""
-    return spectrum.unpack(np.sqrt(np.maximum(np.diag(covariance), 0)))
-
-
 def hold_gain(
     search: Search, model: FittedModel, errors: Sequence[tuple[Sequence[int], float]]
 ) -> FittedModel:
@@ -288,14 +284,15 @@ def hold_gain(
     return replace(model, information=invert_information(covariance))
 
 
-def _colour_error(search: Search, spectrum: SpectrumModel) -> float:
+def _colour_error(search: Search, model: FittedModel) -> float:
     """Return the standard error that the colour of white noise would have if it were fitted."""
+    spectrum = model.spectrum
     information = derivatives(search.merge(spectrum), spectrum)[2]
     priors = search.priors(spectrum.with_background(colour=1.0))
     fixed = np.setdiff1d(np.arange(priors.width.size), priors.free)
     information[fixed] = information[:, fixed] = 0
     information[priors.free, priors.free] += 1 / priors.width[priors.free] ** 2
-    return standard_errors(spectrum, invert_information(information)).background.colour
+    return replace(model, information=information).errors.background.colour
 
 
 def describe_axis(
@@ -315,13 +312,11 @@ def describe_axis(
     """
     data, spectrum = search.data, model.spectrum
     background, rate = spectrum.background, data.frame_rate_hz
-    gain, covariance = background.gain, model.covariance
-    errors = standard_errors(spectrum, covariance)
+    gain, errors = background.gain, model.errors.background
     densities = part_densities(data, spectrum)
     fitted = density(data, spectrum)
     first, *resonances = [
-        _describe_line(search, model, i, errors, covariance, densities[i], fitted)
-        for i in range(len(spectrum.components))
+        _describe_line(search, model, i, part, fitted) for i, part in enumerate(densities)
     ]
     for i, (direction, error) in enumerate(directions, start=len(resonances) - len(directions)):
         resonances[i] = replace(resonances[i], direction=direction, direction_error_deg=error)
@@ -332,20 +327,17 @@ def describe_axis(
     innovation = float(np.exp(0.5 * np.mean(np.log(fitted * rate / 2))))
     noise = max(float(np.exp(background.log_noise / 2)), _LEAST_NOISE * innovation)
     correlation = float(np.tanh(background.colour))
-    colour = errors.background.colour if background.colour else _colour_error(search, spectrum)
+    colour = errors.colour if background.colour else _colour_error(search, model)
     parts = [resonance for resonance in resonances if resonance.rms_nm * gain > _LEAST_PART * noise]
     corner = float(np.exp(background.log_corner)) / data.angle_s
-    corners = (
-        (corner, corner * errors.background.log_corner) if background.rolls_off else (None,) * 2
-    )
     turbulence = _turbulence_process(_nearest_process(search, spectrum), rate)
     slow = replace(
         first,
         kind="turbulence",
         rms_nm=turbulence.rms_nm,
         rms_error_nm=turbulence.rms_nm * first.rms_error_nm / first.rms_nm,
-        corner_hz=corners[0],
-        corner_error_hz=corners[1],
+        corner_hz=corner if background.rolls_off else None,
+        corner_error_hz=corner * errors.log_corner if background.rolls_off else None,
     )
     required = (required_evidence(search, spectrum, i) for i in range(len(model.evidence)))
     worth = [one - price for one, price in zip(model.evidence, required, strict=True)]
@@ -357,7 +349,7 @@ def describe_axis(
         turbulence_fit=slow,
         parts=tuple(sorted(parts, key=lambda part: part.frequency_hz)),
         noise_nm=noise,
-        noise_error_nm=min(noise * errors.background.log_noise / 2, innovation),
+        noise_error_nm=min(noise * errors.log_noise / 2, innovation),
         noise_correlation=correlation,
         noise_correlation_error=max(colour_error, (1 - correlation**2) * colour),
         sensor_gain=gain,
@@ -374,17 +366,11 @@ def describe_axis(
 
 
 def _describe_line(
-    search: Search,
-    model: FittedModel,
-    i: int,
-    errors: SpectrumModel,
-    covariance: FloatArray,
-    density: FloatArray,
-    fitted: FloatArray,
+    search: Search, model: FittedModel, i: int, density: FloatArray, fitted: FloatArray
 ) -> IdentifiedLine:
     """Return the resonance of component i, given its density and that of all, (f,) each."""
     data, spectrum = search.data, model.spectrum
-    line, error = spectrum.components[i], errors.components[i]
+    line, error = spectrum.components[i], model.errors.components[i]
     natural, damping = _without_fast_pole(line.frequency, line.damping_ratio)
     frequency = natural / data.angle_s
     damping_error = damping * line.damping_slope * error.damping
@@ -393,7 +379,7 @@ def _describe_line(
     if not resolved:
         damping = damping_error = finest
     rms = float(np.exp(line.log_power / 2)) / spectrum.background.gain
-    by_gain = spectrum.unpack(covariance[GAIN])  # covariances with the gain
+    by_gain = spectrum.unpack(model.covariance[GAIN])  # covariances with the gain
     variance = by_gain.background.log_gain - by_gain.components[i].log_power
     variance += error.log_power**2 / 4
     height = float(np.interp(frequency, data.frequency_hz, density))
@@ -417,12 +403,10 @@ def _describe_line(
 
 
 def _without_fast_pole(frequency: float, damping: float) -> tuple[float, float]:
-    """Return frequency and damping ratio with the faster of two real poles where it still shows.
-
-    The frequency is an angle per frame. Nearly the same spectrum, but no coefficient of 1e-100.
-    """
+    """Return frequency and damping ratio with the faster of two real poles where it still shows."""
     if damping <= 1:
         return frequency, damping
+    # nearly the same spectrum, but no coefficient of 1e-100
     root = float(np.sqrt(damping**2 - 1))
     slow, fast = frequency / (damping + root), min(frequency * (damping + root), _FASTEST)
     natural = float(np.sqrt(slow * fast))
@@ -430,15 +414,12 @@ def _without_fast_pole(frequency: float, damping: float) -> tuple[float, float]:
 
 
 def _nearest_process(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
-    """Return the turbulence as a process of the third order, the nearest by its likelihood.
-
-    The noise, the wide resonances and the gain stay; narrow lines do not matter.
-    """
+    """Return the turbulence as the process of third order that is nearest by its likelihood."""
     if not spectrum.background.rolls_off:
         return spectrum
     alone = replace(spectrum, components=spectrum.components[:1])
     data = search.merge(alone)
-    wide = (c for c in spectrum.components[1:] if not c.is_narrow)
+    wide = (c for c in spectrum.components[1:] if not c.is_narrow)  # narrow ones do not matter
     held = density(data, spectrum.alone(*wide))
     seen, zero = density(data, alone) + held, np.zeros_like(held)
     fitted = replace(data, measured=seen, crossed=zero, corrected=zero)
@@ -495,22 +476,16 @@ class VibrationRow:
     origin: str = column("origin")
 
 
-def axis_names(count: int) -> list[str]:
-    """Return what tables call each axis."""
-    return ["tip", "tilt"] if count == 2 else ["-"] * count
-
-
 def model_tables(model: IdentifiedModel) -> list[Table]:
     """Return turbulence, noise and sensor of each axis, and the vibrations if there are any."""
-    names = axis_names(len(model.axes))
+    names = AXES if len(model.axes) == len(AXES) else ("-",)
     background = Table(
         caption="Turbulence, noise and sensor",
         headings=("quantity", "axis", "value", "error", "unit"),
         rows=tuple(
-            (quantity, name, *_shown_cells(value, digits, error, unit))
+            (quantity, name, *cells)
             for name, axis in zip(names, model.axes, strict=True)
-            for quantity, value, digits, error, unit in _background(axis)
-            if value is not None
+            for quantity, *cells in _background(axis)
         ),
         words=(4,),
     )
@@ -528,19 +503,10 @@ def model_tables(model: IdentifiedModel) -> list[Table]:
     return [background, *([row_table("Vibrations", lines)] if lines else [])]
 
 
-def _shown_cells(value: float, digits: str, error: float | None, unit: str) -> tuple[str, str, str]:
-    """Return the cells of a value, its error and its unit."""
-    name, factor = shown_unit(unit)
-    size = None if error is None else factor * error
-    return cell_text(factor * value, shown_format(digits, factor)), cell_text(size, ".2g"), name
-
-
-def _background(
-    axis: IdentifiedAxis,
-) -> tuple[tuple[str, float | None, str, float | None, str], ...]:
-    """Return each quantity, its value, how it is written, its standard error and its unit."""
+def _background(axis: IdentifiedAxis) -> Iterator[tuple[str, ...]]:
+    """Yield the cells of each quantity: its name, its value, its standard error and its unit."""
     slow, correlation = axis.turbulence_fit, axis.noise_correlation or None
-    return (
+    for quantity, value, digits, error, unit in (
         ("turbulence, rms", slow.rms_nm, ".1f", slow.rms_error_nm, "nm"),
         ("turbulence, frequency", slow.frequency_hz, ".4g", slow.frequency_error_hz, "Hz"),
         ("turbulence, damping", slow.damping, ".3g", slow.damping_error, ""),
@@ -548,4 +514,9 @@ def _background(
         ("noise per frame", axis.noise_nm, ".3f", axis.noise_error_nm, "nm"),
         ("noise, correlation", correlation, ".3f", axis.noise_correlation_error, ""),
         ("sensor gain", axis.sensor_gain, ".4f", axis.sensor_gain_error, ""),
-    )
+    ):
+        if value is not None:
+            name, factor = shown_unit(unit)
+            size = None if error is None else factor * error
+            shown = cell_text(factor * value, shown_format(digits, factor))
+            yield quantity, shown, cell_text(size, ".2g"), name

@@ -123,16 +123,13 @@ def identify(
     """
     options: dict[str, Any] = {"lowest_line_hz": lowest_line_hz, "most_lines": most_lines}
     of_series = {"sensor_gain": sensor_gain, "start": start}
-    of_spectra = {
-        "noise_nm": noise_nm,
-        "frame_rate_hz": frame_rate_hz,
-        "delay_frames": delay_frames,
-    }
+    loop = {"frame_rate_hz": frame_rate_hz, "delay_frames": delay_frames}
     if isinstance(record, SpectrumRecord):
         if names := [name for name, value in of_series.items() if value is not None]:
             raise ProblemError(f"{names[0]} is for series of a loop; a spectrum is of the phase.")
-        return _identify_spectra(record, frame_rate_hz, delay_frames, noise_nm, options)
+        return _identify_spectra(record, noise_nm, options, **loop)
     require_instance(record, LoopRecord)
+    of_spectra = {"noise_nm": noise_nm, **loop}
     if names := [name for name, value in of_spectra.items() if value is not None]:
         raise ProblemError(f"{names[0]} is for spectra; a series has its own.")
     if start is not None:
@@ -166,10 +163,7 @@ def identify(
 
 
 def _cut_at_jumps(corrections: FloatArray, stretches: Stretches) -> tuple[Stretches, list[str]]:
-    """Return stretches without the places where corrections go on elsewhere, and a note.
-
-    No spectrum has jumps, and a fit would choose a sensor gain at which they do not show.
-    """
+    """Return stretches without the places where corrections go on elsewhere, and a note."""
     change = np.abs(np.diff(corrections, axis=0))
     inside = np.zeros(len(change), dtype=np.bool_)
     for start, stop in stretches:
@@ -196,15 +190,11 @@ def _cut_at_jumps(corrections: FloatArray, stretches: Stretches) -> tuple[Stretc
 def _pool_gains(
     axes: list[IdentifiedAxis], options: dict[str, Any]
 ) -> tuple[list[IdentifiedAxis], str]:
-    """Fit the axes again with the mean of their gains, if they agree; options are of a search.
-
-    An axis that leaves its gain open takes that of the other. What is known of a gain beforehand
-    counts once. Where the gains scatter by more than their errors, the error of the mean is scaled
-    by ``sqrt(chi^2 / (n - 1))`` (Particle Data Group, doi:10.1093/ptep/ptac097, section 5.2.2).
-    """
+    """Fit the axes again with the mean of their gains, if they agree; options are of a search."""
     gains = np.array([axis.sensor_gain for axis in axes])
     errors = np.array([axis.sensor_gain_error for axis in axes], dtype=float)
     log, weight = np.log(gains), (gains / errors) ** 2
+    # an axis that leaves its gain open takes that of the other
     weight[errors > OPEN_GAIN * gains] *= bool(np.all(errors > OPEN_GAIN * gains))
     mean = float(np.sum(weight * log) / np.sum(weight))
     if np.any(weight * (log - mean) ** 2 > DIFFERENT**2):
@@ -213,7 +203,9 @@ def _pool_gains(
             f"warning: the axes have different sensor gains, {values}: the commands of one may be "
             "recorded at another size (--command-scale takes a factor for each axis)"
         )
+    # Particle Data Group, doi:10.1093/ptep/ptac097, section 5.2.2: errors times sqrt(chi^2/(n-1))
     scatter = float(np.sum(weight * (log - mean) ** 2)) / (len(axes) - 1)
+    # what is known of a gain beforehand counts once
     precision = float(np.sum(weight)) - (len(axes) - 1) / GAIN_ERROR**2
     gain = float(np.exp(mean))
     error = float(np.sqrt(max(scatter, 1.0) / max(precision, 1 / GAIN_ERROR**2)))
@@ -264,10 +256,11 @@ def _find_doubts(axes: Sequence[IdentifiedAxis], most_lines: int) -> Iterator[st
 
 def _identify_spectra(
     record: SpectrumRecord,
-    frame_rate_hz: float | None,
-    delay_frames: float | None,
     noise_nm: float | Sequence[float] | None,
     options: dict[str, Any],
+    *,
+    frame_rate_hz: float | None,
+    delay_frames: float | None,
 ) -> IdentifiedModel:
     """Identify each spectrum, between 0 and the Nyquist frequency of the loop."""
     rate = frame_rate_hz if frame_rate_hz is not None else record.frame_rate_hz
@@ -276,9 +269,7 @@ def _identify_spectra(
             "the frame rate of the loop is needed to sample a spectrum's processes; got a record "
             "without one. Give frame_rate_hz."
         )
-    stated = None
-    if noise_nm is not None:
-        stated = each_of(noise_nm, "noise_nm", record.axes, above=0).tolist()
+    stated = None if noise_nm is None else each_of(noise_nm, "noise_nm", record.axes, above=0)
     inside = (record.frequency_hz > 0) & (record.frequency_hz < rate / 2)
     f, densities = record.frequency_hz[inside], record.density_nm2_hz[inside].T
     if f.size < 32:
@@ -315,12 +306,10 @@ def _identify_spectra(
         )
         search = Search(data=data, gain=1.0, **options)
         model = add_evidence(search, find_components(search))
-        axes.append(describe_axis(search, model, None, "1: of a spectrum it has no meaning"))
-    if stated is not None:
-        axes = [
-            replace(axis, noise_nm=noise, noise_error_nm=0.0)
-            for axis, noise in zip(axes, stated, strict=True)
-        ]
+        axis = describe_axis(search, model, None, "1: of a spectrum it has no meaning")
+        if stated is not None:
+            axis = replace(axis, noise_nm=float(stated[i]), noise_error_nm=0.0)
+        axes.append(axis)
     return IdentifiedModel(
         axes=tuple(axes),
         frame_rate_hz=rate,
@@ -330,17 +319,14 @@ def _identify_spectra(
 
 
 def _estimate_averages(density: FloatArray) -> float | None:
-    """Return how many periodograms were averaged in a density, by its scatter about a curve.
-
-    The logarithm of a mean of n has the variance ``1 / n + 1 / (2 n^2)``, nearly. None above what
-    anybody averages: otherwise each misfit would count as evidence for a line.
-    """
+    """Return how many periodograms were averaged in a density, by its scatter about a curve."""
     log = np.log(density)
     # a second difference at a distance hardly sees a curve, and not what neighbours share
     bend = log[6:] - 2 * log[3:-3] + log[:-6]
     variance = (MAD * float(np.median(np.abs(bend - np.median(bend))))) ** 2 / 6
-    if variance < 1 / _MOST_AVERAGES:
+    if variance < 1 / _MOST_AVERAGES:  # each misfit would count as evidence for a line
         return None
+    # of the logarithm of a mean of n it is 1 / n + 1 / (2 n^2), nearly
     return float((1 + np.sqrt(1 + 2 * variance)) / (2 * variance))
 
 
@@ -361,7 +347,7 @@ def find_axis(search: Search, *, start: IdentifiedAxis | None = None) -> Identif
         return describe_axis(search, model, None, note)
     background = model.spectrum.background
     rivals = [rival.spectrum.background for rival in near]
-    fit_error = model.gain_error
+    fit_error = model.errors.background.log_gain
     error = max(fit_error, *(abs(rival.log_gain - background.log_gain) for rival in rivals))
     if error > fit_error:  # what the gain moves is as ambiguous
         model = hold_gain(search, model, [([0], error)])

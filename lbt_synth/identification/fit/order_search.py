@@ -115,14 +115,10 @@ def _rivals(search: Search, spectrum: SpectrumModel) -> Iterator[FittedModel]:
 
 
 def _is_clear(model: FittedModel) -> bool:
-    """Whether nothing could explain another gain than that of a model.
-
-    A plausible gain is clear that is well known beside narrow lines, white noise and turbulence
-    that is not overdamped.
-    """
+    """Whether nothing could explain another gain than that of a model."""
     background, turbulence = model.spectrum.background, model.spectrum.components[0]
     narrow = all(c.is_narrow for c in model.spectrum.lines) and not background.colour
-    plausible = _is_plausible(background.gain) and model.gain_error < GAIN_STEP
+    plausible = _is_plausible(background.gain) and model.errors.background.log_gain < GAIN_STEP
     return narrow and plausible and turbulence.damping_ratio < _OVERDAMPED
 
 
@@ -131,13 +127,10 @@ def _is_plausible(gain: float) -> bool:
 
 
 def _cost_beside(search: Search, rival: FittedModel, best: FittedModel) -> float:
-    """Return what a rival of a plausible gain costs more, if a parameter costs 1 as in Akaike's.
-
-    It may have one component more: with several, some gain explains all spectra.
-    """
+    """Return what a rival of a plausible gain costs more, if a parameter costs 1 as in Akaike's."""
     more = len(rival.spectrum.components) - len(best.spectrum.components)
     if more > 1 or not _is_plausible(rival.spectrum.background.gain):
-        return float("inf")
+        return float("inf")  # with several more, some gain explains all spectra
     costs = [
         fitting.cost(search, model)
         - fitting.total_price(search, model.spectrum) * (1 - 1 / search.parameter_price)
@@ -155,10 +148,7 @@ def _cost_of_noise(search: Search, model: FittedModel) -> float:
 def find_components(
     search: Search, start: SpectrumModel | None = None, *, rounds: int = _MOST_ROUNDS
 ) -> FittedModel:
-    """Find the model of one axis: add components, prune them, and move lines.
-
-    A start from earlier data is polished only.
-    """
+    """Find the model of one axis: add components, prune, move lines; or polish an earlier model."""
     if start is not None and not search.finds_gain:
         start = start.with_background(log_gain=float(np.log(search.gain or 1.0)))
     model = _begin(search) if start is None else fitting.fit(search, start)
@@ -210,11 +200,7 @@ def _trials(search: Search, spectrum: SpectrumModel, moves: bool) -> Iterator[Sp
 
 
 def _begin(search: Search) -> FittedModel | None:
-    """Fit the background and the clear lines.
-
-    The gain is held until the lines and a drift are there: one that is free while these are missing
-    runs away to what explains them.
-    """
+    """Fit the background and the clear lines, with the gain held until these and a drift stand."""
     gain = TYPICAL_GAIN if search.finds_gain else search.gain or 1.0
     held = replace(search, gain=gain)
     model = fit_background(held, gain)
@@ -232,10 +218,7 @@ def _begin(search: Search) -> FittedModel | None:
 
 
 def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
-    """Return the model with a drift, and turbulence beside it and its lines, where both fit best.
-
-    Overdamped turbulence has taken the place of a drift, and a slow part that of the turbulence.
-    """
+    """Return the model with a drift and turbulence beside its lines, where both fit best."""
     data, background = search.merge(spectrum), spectrum.background
     slow = [c for c in spectrum.components if c.kind not in ("line", "drift")]
     lines = [c for c in spectrum.components if c.kind == "line"]
@@ -243,7 +226,7 @@ def _add_drift(search: Search, spectrum: SpectrumModel) -> SpectrumModel:
     # the density of a drift of variance P above its corner is 2 P corner / (pi f^2)
     powers = noise * np.square(_CROSSINGS_HZ) * np.pi / (2 * fitting.DRIFT_HZ)
     drifts = [search.drift(fitting.DRIFT_HZ, power) for power in powers.tolist()]
-    drifts += [
+    drifts += [  # whose place overdamped turbulence has taken, as slow parts that of turbulence
         search.drift(search.place(c)[0] / (2 * c.damping_ratio), float(np.exp(c.log_power)))
         for c in slow
         if c.damping_ratio > _OVERDAMPED
@@ -289,10 +272,7 @@ def find_excesses(search: Search, spectrum: SpectrumModel) -> list[Excess]:
 
 
 def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
-    """Yield models with one bump in the place of neighbouring lines, or of a wide resonance.
-
-    The highest of the lines may stand upon a bump of the others.
-    """
+    """Yield models with one bump in the place of neighbouring lines, or of a wide resonance."""
     components, data = spectrum.components, search.merge(spectrum)
     least = contrast(data, spectrum)
     lines = [i for i, c in enumerate(components) if c.kind == "line" and c.damping_ratio < _WIDEST]
@@ -311,7 +291,7 @@ def _bumps(search: Search, spectrum: SpectrumModel) -> Iterator[SpectrumModel]:
             if search.place(first)[1] < fitting.RESOLVED * search.data.step_hz:
                 continue
             counts = {first.sections - 1, first.sections + 1} & set(range(1, MOST_SECTIONS + 1))
-        elif len(cluster) > 2:
+        elif len(cluster) > 2:  # the highest may stand upon a bump of the others
             heights = [components[i].log_power - components[i].damping for i in cluster]
             groups.append([i for i in cluster if i != cluster[int(np.argmax(heights))]])
         for group, sections in product(groups, sorted(counts)):

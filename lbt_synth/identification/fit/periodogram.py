@@ -96,8 +96,11 @@ class LoopPeriodogram:
         first, second = self.power(gains[:, None])
         return np.array([[first, crossed], [crossed, second]])
 
-    def merge(self, starts: IntArray) -> LoopPeriodogram:
-        """Return the means over groups of neighbours that begin at these indices."""
+    def merge(self, widths_hz: FloatArray) -> LoopPeriodogram:
+        """Return the means over groups of neighbours of these widths (f,), or single ones."""
+        step = self.step_hz
+        group = np.floor(np.cumsum(step / np.maximum(step, widths_hz)) - 1e-9)
+        starts = np.flatnonzero(np.diff(group, prepend=-np.inf) > 0)
         size = np.diff(np.append(starts, len(self.frequency_hz)))
         means = self._map(lambda values: np.add.reduceat(values, starts, axis=-1) / size)
         return replace(means, count=np.add.reduceat(self.count, starts))

@@ -23,7 +23,6 @@ from lbt_synth.identification.fit.identified_model import (
     IdentifiedLine,
     describe_axis,
     hold_gain,
-    standard_errors,
 )
 from lbt_synth.identification.fit.periodogram import LoopPeriodogram, loop_periodogram
 from lbt_synth.identification.fit.spectrum_model import BACKGROUND, GAIN, Component, SpectrumModel
@@ -49,10 +48,7 @@ Pair = tuple[Component | None, Component | None]  # what is one resonance, on ei
 def couple_axes(
     record: LoopRecord, axes: Sequence[IdentifiedAxis], stretches: Stretches, lowest_line_hz: float
 ) -> tuple[list[IdentifiedAxis], tuple[IdentifiedLine, ...]]:
-    """Return two axes with what they share, and the shared resonances.
-
-    Axes that share nothing are returned as they are.
-    """
+    """Return two axes with what they share, if they do, and the shared resonances."""
     data = loop_periodogram(
         record.measurements,
         record.corrections(),
@@ -127,12 +123,9 @@ def _replace(spectrum: SpectrumModel, pair: Pair, shared: Component) -> Spectrum
 def _find_common(
     data: LoopPeriodogram, spectrum: SpectrumModel, parts: Sequence[int]
 ) -> tuple[float, float]:
-    """Return what the axes have in common in components, and what that adds to the log-likelihood.
-
-    It is the excess of the cross-spectrum over that of the model, relative to the geometric mean of
-    the densities of the components.
-    """
+    """Return what axes have in common in components, and what that adds to the log-likelihood."""
     densities = part_densities(data, spectrum, [spectrum.components[i] for i in parts])
+    # the excess of the cross-spectrum over the model's, by the geometric mean of both densities
     line, matrix = np.sqrt(densities[0] * densities[-1]), spectral_matrix(data, spectrum)
     weight = data.count * line / (matrix[0, 0] * matrix[1, 1])
     slope = float(np.sum(weight * (data.matrix(spectrum.gains)[0, 1] - matrix[0, 1])))
@@ -141,11 +134,7 @@ def _find_common(
 
 
 def _share_turbulence(search: Search, apart: SpectrumModel) -> FittedModel | None:
-    """Return the fit with turbulence along a direction beside that of the axes; None if too little.
-
-    It begins with what the axes have in common. Its direction is that of the rms of the axes:
-    beside turbulence of the same spectrum the data show no other.
-    """
+    """Return the fit with turbulence that the axes share beside their own; None if too little."""
     slow = [i for i, c in enumerate(apart.components) if c.kind == "turbulence"]
     coherence, evidence = _find_common(search.merge(apart), apart, slow)
     if evidence < search.price:
@@ -156,7 +145,7 @@ def _share_turbulence(search: Search, apart: SpectrumModel) -> FittedModel | Non
     components = [
         c.shift(0.0, 0.0, log_rest) if c.kind == "turbulence" else c for c in apart.components
     ]
-    shared = replace(
+    shared = replace(  # along the rms of the axes: beside turbulence, data show no other direction
         first.shift(0.0, 0.0, float(np.log(common))),
         kind="slow",
         axis=None,
@@ -170,14 +159,9 @@ def _share_turbulence(search: Search, apart: SpectrumModel) -> FittedModel | Non
 def _find_pairs(
     search: Search, models: Sequence[FittedModel], components: Sequence[Component]
 ) -> list[Pair]:
-    """Return each resonance, the clearest first, and that of the other axis which may be the same.
-
-    Its frequency agrees within errors, or the two overlap.
-    """
+    """Return each resonance, the clearest first, and the one of the other axis it may be."""
     evidence = chain(*(model.evidence for model in models))
-    errors = chain(
-        *(standard_errors(model.spectrum, model.covariance).components for model in models)
-    )
+    errors = chain(*(model.errors.components for model in models))
     rows = [
         (worth, c, error.log_frequency)
         for worth, c, error in zip(evidence, components, errors, strict=True)
@@ -202,11 +186,7 @@ def _find_pairs(
 
 
 def _share(search: Search, spectrum: SpectrumModel, pair: Pair) -> Component | None:
-    """Return a resonance along a direction in the place of a pair; None if it is not worth a fit.
-
-    The ratio of the amplitudes is that of the pair, or what the other axis has in common with a
-    line of one axis.
-    """
+    """Return a resonance along a direction in the place of a pair; None where it adds little."""
     names = [None if c is None else c.name for c in pair]
     places = [i for i, c in enumerate(spectrum.components) if c.name in names]
     data = search.merge(spectrum)
@@ -249,9 +229,8 @@ def _describe_axis(
     shown = FittedModel(
         spectrum=seen,
         contrast=contrast(alone.data, seen),
-        information=invert_information(
-            rows @ model.covariance @ rows.T
-        ),  # the other axis left open
+        # with the other axis left open
+        information=invert_information(rows @ model.covariance @ rows.T),
         evidence=(float("inf"), *evidence),
     )
     error = alone.sensor_gain_error

@@ -37,6 +37,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg.lapack import dposv
@@ -74,7 +75,7 @@ _WITHIN = 0.99  # of the radius: a longer step ends at it
 HOPE = 4.0  # times what is seen before a fit, it may still gain
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FittedModel:
     """A minimum of the likelihood."""
 
@@ -83,15 +84,15 @@ class FittedModel:
     information: FloatArray  # (p, p): second derivatives of L; 0 for what was fixed
     evidence: tuple[float, ...] = ()  # what each component adds to the log-likelihood
 
-    @property
+    @cached_property
     def covariance(self) -> FloatArray:
         """Covariance of the packed parameters, the inverse of the information, (p, p)."""
         return invert_information(self.information)
 
-    @property
-    def gain_error(self) -> float:
-        """Standard error of the logarithm of the sensor gain of the first axis."""
-        return float(np.sqrt(max(self.covariance[GAIN, GAIN], 0.0)))
+    @cached_property
+    def errors(self) -> SpectrumModel:
+        """Standard error of each parameter."""
+        return self.spectrum.unpack(np.sqrt(np.maximum(np.diag(self.covariance), 0)))
 
 
 def log_smearing(
@@ -142,10 +143,7 @@ def _smear(
     density: FloatArray,
     slopes: FloatArray | None = None,
 ) -> None:
-    """Let the taper smear narrow lines, in place.
-
-    The densities are (c, f), the slopes by log frequency and log damping (c, 2, f).
-    """
+    """Smear narrow lines by the taper: in place, densities (c, f) and log slopes (c, 2, f)."""
     if data.duration_s is None:
         return
     periods, lines = data.frequency_hz * data.duration_s, []
@@ -172,21 +170,16 @@ def _smear(
 def _log_fall(
     data: LoopPeriodogram, log_corner: float, order: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the roll-off of turbulence as frames show it, a logarithm, and its slope, (f,).
-
-    The mean over a frame takes ``sinc^2`` of the phase. A process of finite order is one of means.
-    """
+    """Return the roll-off of turbulence as frames show it, a logarithm, and its slope, (f,)."""
     fall, slope = log_roll_off(float(np.exp(log_corner)), order, data.half_angle_square)
+    # a frame shows the mean of the phase; a process of finite order is one of means
     return fall if order == 1 else fall + data.log_frame_mean, slope
 
 
 def part_densities(
     data: LoopPeriodogram, spectrum: SpectrumModel, components: Sequence[Component] | None = None
 ) -> FloatArray:
-    """Return the density of each component of a spectrum along its direction, (c, f).
-
-    Others that might be in it may be given.
-    """
+    """Return the densities (c, f) of components along their directions: of all, or of others."""
     components = spectrum.components if components is None else components
     if not components:
         return np.zeros((0, data.frequency_hz.size))
@@ -246,10 +239,7 @@ def _whiten(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _vector(matrices: FloatArray) -> FloatArray:
-    """Return the symmetric parts of matrices (..., n, n, f) as vectors (..., m, f).
-
-    The product of two vectors is the trace of the product of their matrices.
-    """
+    """Return matrices (..., n, n, f) as vectors (..., m, f), whose products are their traces."""
     if matrices.shape[-2] == 1:
         return np.asarray(matrices[..., 0, :, :])
     between = np.sqrt(0.5) * (matrices[..., 0, 1, :] + matrices[..., 1, 0, :])
@@ -413,11 +403,7 @@ def scoring_minimum(
 def _best_step(
     curvature: FloatArray, gradient: FloatArray, radius: float
 ) -> tuple[FloatArray, float, float]:
-    """Return the step (p,) that minimises a quadratic form within a radius, and two gains.
-
-    The first is that of the minimum without a radius, the second that of this step. The curvature
-    (p, p) counts by its absolute value.
-    """
+    """Return the best step (p,) within a radius, and the gains of a full step and of this one."""
     newton, info = dposv(curvature, -gradient)[1:]
     if info == 0 and float(np.linalg.norm(newton)) <= radius:
         gain = -0.5 * float(gradient @ newton)
@@ -482,10 +468,7 @@ def minimise(
 
 
 def observe_information(data: LoopPeriodogram, model: FittedModel, priors: Priors) -> FittedModel:
-    """Return a minimum with the second derivatives of L, by differences of its gradient.
-
-    Where they are not positive definite, the expected ones stay.
-    """
+    """Return a minimum with the second derivatives of L, by differences of its gradient."""
     free, theta = priors.free, model.spectrum.pack()
     _, gradient, _ = derivatives(data, model.spectrum)
     rows = []
@@ -493,7 +476,7 @@ def observe_information(data: LoopPeriodogram, model: FittedModel, priors: Prior
         moved = derivatives(data, model.spectrum.unpack(theta + step))[1]
         rows.append((moved - gradient)[free] / DIFFERENCE)
     exact = (np.array(rows) + np.transpose(rows)) / 2 + np.diag(1 / priors.width[free] ** 2)
-    if np.min(np.linalg.eigvalsh(exact)) <= 0:
+    if np.min(np.linalg.eigvalsh(exact)) <= 0:  # no minimum: the expected ones stay
         return model
     information = np.zeros_like(model.information)
     information[np.ix_(free, free)] = exact

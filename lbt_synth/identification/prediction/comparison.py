@@ -229,13 +229,10 @@ def design_inputs(
     penalty: float | None = None,
 ) -> PlantInputs:
     """Return what a method makes a design of: a model with more noise, its record and channels."""
-
-    def predict() -> Design:
-        past = regress(record, model, channels=channels, noise=noise)
-        return past.design(penalty)
-
-    plant = noisier(model, noise).plant()
-    return PlantInputs(plant=plant, predict=predict)
+    return PlantInputs(
+        plant=noisier(model, noise).plant(),
+        predict=lambda: regress(record, model, channels=channels, noise=noise).design(penalty),
+    )
 
 
 def compare_designs(

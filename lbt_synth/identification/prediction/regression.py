@@ -154,10 +154,13 @@ class Regression:
                 weights[np.ix_(rows, rows)] += scale[place] ** 2
         return weights
 
-    def _factor(self, weights: FloatArray, moments: Moments) -> tuple[FloatArray, bool]:
-        """Return the factor of the squares of signals with a penalty, for :func:`cho_solve`."""
+    def _factor(
+        self, signals: Sequence[int], penalty: float, moments: Moments
+    ) -> tuple[FloatArray, tuple[FloatArray, bool]]:
+        """Return the matrix of a penalty of signals, and the factor of their squares with it."""
+        weights = penalty * moments.frames * self._weights(signals)
         try:
-            return cho_factor(moments.squares + weights)
+            return weights, cho_factor(moments.squares + weights)
         except np.linalg.LinAlgError:
             raise NumericalError(
                 "the past readings of a record depend on each other; expected some noise in them.",
@@ -166,8 +169,7 @@ class Regression:
 
     def solve(self, signals: Sequence[int], penalty: float, moments: Moments) -> FloatArray:
         """Return the coefficients of some signals, (taps m, n), for moments of these."""
-        weights = penalty * moments.frames * self._weights(signals)
-        return np.asarray(cho_solve(self._factor(weights, moments), moments.products))
+        return np.asarray(cho_solve(self._factor(signals, penalty, moments)[1], moments.products))
 
     def fit_share(self, penalty: float) -> float:
         """Return by which share of what it leaves the filter of all signals is worse unseen.
@@ -175,8 +177,8 @@ class Regression:
         Its effective number of coefficients over the frames: what their errors add (H. Akaike, Ann.
         Inst. Statist. Math. 21, 243 (1969), doi:10.1007/BF02532251).
         """
-        weights = penalty * self.whole.frames * self._weights(range(len(self.scales)))
-        inverse = cho_solve(self._factor(weights, self.whole), np.eye(len(weights)))
+        weights, factor = self._factor(range(len(self.scales)), penalty, self.whole)
+        inverse = cho_solve(factor, np.eye(len(weights)))
         return float(len(weights) - np.sum(inverse * weights)) / self.whole.frames
 
     @cached_property

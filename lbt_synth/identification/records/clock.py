@@ -95,12 +95,7 @@ def _require_few_holes(frames: float, rows: int) -> None:
 
 
 def _frames_from_times(times: FloatArray, rate: float | None) -> IntArray:
-    """Return the frame of each row, from 0, by times.
-
-    Times on the grid of a stated rate are exact. Those that stay within a step to which they are
-    rounded, of less than a frame, are of complete rows. Others tell frames by their steps, unless
-    these are rounded.
-    """
+    """Return the frame of each row, from 0, by times, which are exact or rounded."""
     steps, complete = np.diff(times), np.arange(len(times))
     if np.ptp(steps) < SAME_FRAME * float(np.median(steps)):
         return complete  # whatever the rate is: that is compared afterwards
@@ -108,7 +103,7 @@ def _frames_from_times(times: FloatArray, rate: float | None) -> IntArray:
     _require_few_holes(float(times[-1] - times[0]) / period + 1, len(times))
     rounding, place = _quantum(times) / period, (times - times[0]) / period
     if rate is not None:
-        grid = np.round(place)
+        grid = np.round(place)  # of exact times
         if rounding < 1 + SAME_FRAME and np.max(np.abs(place - grid)) <= _EXACT:
             return np.asarray(grid, dtype=np.int64)
         slack = 1e-6 + 16 * float(np.spacing(np.max(np.abs(times)))) / period

@@ -28,7 +28,7 @@ from lbt_synth.identification.records.columns import (
 from lbt_synth.storage import array_file
 from lbt_synth.storage.atomic_files import require_ending
 from lbt_synth.storage.input_files import read_bytes
-from lbt_synth.validation import choice, integer, sequence
+from lbt_synth.validation import choice, integer, number, sequence
 
 FITS = (".fits", ".fit", ".fts")
 _DELIMITERS = (";", "\t", ",", "|")  # else blanks
@@ -60,6 +60,21 @@ class Contents:
                 self.notes.append(f"{where} was not taken for {fact}: {value!r} is no number")
                 return
         self.facts.setdefault(fact, {})[where] = value
+
+    def find_fact(self, name: str, stated: Any) -> Any:
+        """Return what the call states, else what the file has; refuse two values of a file."""
+        places = self.facts.get(name, {})
+        values = {where: number(value, f"{where} ({name})") for where, value in places.items()}
+        listing = ", ".join(f"{value:.9g} by {where}" for where, value in values.items())
+        if stated is None and len(set(values.values())) > 1:
+            raise ProblemError(f"the file gives {name} twice: {listing}. Choose one in the call.")
+        if stated is None and values:
+            stated = next(iter(values.values()))
+            self.notes.append(f"{name} {listing}")
+            return int(stated) if name == "averages" else stated
+        if values and not np.allclose([*values.values()], number(stated, name), rtol=1e-6, atol=0):
+            self.notes.append(f"{name} {stated:.9g} was given, in place of {listing}")
+        return stated
 
     def add_array(
         self, name: str, values: npt.NDArray[Any], unit: str | None = None, *, group: str = ""
@@ -300,8 +315,8 @@ def _find_columns(contents: Contents, wanted: Any) -> list[Column]:
         same = [column for column in columns if column.name.strip().lower() == name]
         same = same or [column for column in columns if column.name.lower().startswith(f"{name}[")]
     else:
-        number = integer(wanted, "a number of columns", at_least=0)
-        same = columns[number : number + 1]
+        place = integer(wanted, "a number of columns", at_least=0)
+        same = columns[place : place + 1]
     if not same:
         raise ProblemError(
             f"there is no column {wanted!r}; the file has {len(columns)}, from 0: "

@@ -49,8 +49,6 @@ def equal_runs(series: FloatArray, good: BoolArray) -> IntArray:
 
 def find_stuck(series: FloatArray, good: BoolArray) -> BoolArray:
     """Find frames of a value that is held for longer than chance or quantisation hold it."""
-    if not good.any():
-        return np.zeros(len(series), dtype=np.bool_)
     stretches = equal_runs(series, good)
     lengths = stretches[:, 1] - stretches[:, 0]
     # the chance that a value is held on: a slow series in steps stays on a level longer than its

@@ -45,7 +45,7 @@ from lbt_synth.identification.records.record import LoopRecord, SpectrumRecord
 from lbt_synth.models import PositionLoop
 from lbt_synth.storage.array_file import read_cards
 from lbt_synth.storage.input_files import LARGEST_TEXT_BYTES, open_input
-from lbt_synth.validation import FloatArray, number
+from lbt_synth.validation import FloatArray
 
 _TELEMETRY_CARDS = ("LBTTELEM", "AOT-VERS")  # of this package, and of the AOT standard
 _TELEMETRY_ARRAYS = {"META", "MEASURE"}
@@ -178,13 +178,7 @@ def _telemetry_record(
     mirror: PositionLoop | None,
     **stated: Any,
 ) -> LoopRecord:
-    """Make a record of tip and tilt; ``stated`` are facts, None where the telemetry has to tell.
-
-    Measurements become modes by the inverse of the interaction matrix, commands by the influence
-    matrix, where there are such. A matrix of gains alone, one for each mode, is no mixture: these
-    measurements stay as they were recorded, and the sensor gain of the record is what they show of
-    a unit of phase.
-    """
+    """Make a record of tip and tilt; ``stated`` are facts, None where the telemetry has to tell."""
     n, what = telemetry.modes, "modes"
     if (loops := telemetry.metadata.get("aot_loops")) is not None:
         what += f" of {telemetry.metadata['aot_loop']}, the one taken of the control loops {loops}"
@@ -252,7 +246,7 @@ def _inverse_response(seen: Telemetry) -> FloatArray | None:
             "coefficients. Multiply them by the reconstructor of the loop.",
             in_python="As Telemetry(measurements=slopes @ reconstructor.T).",
         )
-    if response is None or _is_gains(response, seen):
+    if response is None or _is_gains(response, seen):  # the record has a sensor gain of its own
         return None
     if q < n or np.linalg.cond(response) > _CONDITION:
         raise ProblemError(
@@ -360,7 +354,7 @@ def _build_loop(
     if stated["averages"] is not None:
         raise ProblemError("averages are only for a spectrum; got a record of series.")
     (role, columns), commands = next(iter(roles.items())), roles.get("commands")
-    facts = {name: _find_fact(contents, name, stated[name]) for name in _FACTS}
+    facts = {name: contents.find_fact(name, stated[name]) for name in _FACTS}
     units = {role: _find_unit(columns, unit, contents)}
     if commands is not None:
         units["commands"] = (
@@ -415,22 +409,6 @@ def _require_facts(
         raise ProblemError(f"nothing tells {'; '.join(missing)}.", **volts)
 
 
-def _find_fact(contents: Contents, name: str, stated: Any) -> Any:
-    """Return what the call states, else what the source has; refuse two values of a source."""
-    places = contents.facts.get(name, {})
-    values = {where: number(value, f"{where} ({name})") for where, value in places.items()}
-    listing = ", ".join(f"{value:.9g} by {where}" for where, value in values.items())
-    if stated is None and len(set(values.values())) > 1:
-        raise ProblemError(f"the file gives {name} twice: {listing}. Choose one in the call.")
-    if stated is None and values:
-        stated = next(iter(values.values()))
-        contents.notes.append(f"{name} {listing}")
-        return int(stated) if name == "averages" else stated
-    if values and not np.allclose([*values.values()], number(stated, name), rtol=1e-6, atol=0):
-        contents.notes.append(f"{name} {stated:.9g} was given, in place of {listing}")
-    return stated
-
-
 def _find_unit(
     columns: Sequence[Column], stated: str | None, contents: Contents, option: str = "unit"
 ) -> str:
@@ -468,7 +446,7 @@ def _build_spectrum(
     """Make a record of densities; ``stated`` are facts, None where the source has to tell."""
     densities, (frequency,) = roles["density"], roles["frequency"]
     names = ("frame_rate_hz", "diameter_m", "averages")
-    facts = {name: _find_fact(contents, name, stated[name]) for name in names}
+    facts = {name: contents.find_fact(name, stated[name]) for name in names}
     density_unit = _find_unit(densities, unit, contents)
     _require_facts(roles, {"density": density_unit}, facts, "spectrum")
     _, power, factor = nm_unit(density_unit, diameter_m=facts["diameter_m"], kind="spectrum")

@@ -33,6 +33,13 @@ def test_readings_of_any_rate_lie_on_the_frames(tmp_path):
             load_readings(tmp_path / "a.npy", RATE, rate_hz=rate_hz)
 
 
+def test_a_file_of_two_rates_is_asked_for_one(tmp_path):
+    file = write(tmp_path / "two.csv", "# fs = 1000\n# loop_rate = 500\na,b", *shaking(RATE, 50).T)
+    with pytest.raises(ProblemError, match="twice: 1000 by the comment fs, 500 by the comment"):
+        load_readings(file, RATE)
+    assert len(load_readings(file, RATE, rate_hz=RATE)[1]) == 50
+
+
 def test_faster_readings_are_averaged():
     own = 9.81 + np.random.default_rng(0).standard_normal((3 * 500, 2))
     np.testing.assert_allclose(

@@ -210,6 +210,17 @@ def test_what_a_law_leaves_unexplained_is_said() -> None:
         assert any("of their changes unexplained" in sentence for sentence in words)
 
 
+def test_a_weak_loop_leaves_the_unit_of_its_commands_open():
+    """Quick fits of plausible gains are nearly as likely as one of 7: it is said, not refused."""
+    path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+    law, air = lbt.integrator(path, gain=0.1).controller, replace(TRUTH, vibrations=())
+    y, u = run_law(law, truth=air, hardware=path, frames=6000)
+    verdicts = [explain_commands(record(y, factor * u)) for factor in (1.0, 0.1)]
+    assert all(verdict.accepted for verdict in verdicts)
+    warned = [["as if the commands were too small" in n for n in v.notes] for v in verdicts]
+    assert [any(row) for row in warned] == [False, True]
+
+
 def test_gains_far_above_plausible_ones_are_another_unit():
     for gains, errors, options in (
         ([1.6, 1.62], [0.02, 0.02], "--command-scale 2"),

@@ -250,8 +250,6 @@ def replayed(series=GOOD, path=PATH, **options):
 
 
 def test_what_cannot_be_replayed_is_refused():
-    torn = {"test": [(800, 2000)], "stretches": [(0, 900), (900, 2000)]}
-    within = r"within the usable stretches; got \(800, 2000\) in \(0, 900\), \(900, 2000\)"
     short = "at least 400 frames beyond the first 400 .* 50"
     sizes = r"or one per measurement \(2\); got 3"
     later = replayed(test=[(500, 2000)])
@@ -259,7 +257,6 @@ def test_what_cannot_be_replayed_is_refused():
         (partial(replayed, noise_error_nm=-0.1), "noise_error_nm must be at least 0"),
         (partial(replayed, noise_error_nm=[1.0, 2.0, 3.0]), sizes),
         (partial(replayed, test=[(1950, 2000)]), short),
-        (partial(replayed, **torn), within),
         (lambda: replayed().above(later), "on the same frames only"),
     ]
     require_refusals((call, lbt.errors.ProblemError, words) for call, words in rows)
