@@ -14,26 +14,26 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3278,
-    "config": 1660,
-    "design": 6201,
-    "files": 1261,
+    "cli": 3277,
+    "config": 1622,
+    "design": 5971,
+    "files": 1252,
     "identification": 8845,
     "interop": 3687,
     "linear": 4748,
     "loop": 3945,
-    "methods": 873,
+    "methods": 789,
     "models": 3752,
-    "report": 3327,
-    "storage": 1079,
-    "studies": 3420,
+    "report": 3264,
+    "storage": 1060,
+    "studies": 3313,
     "errors, validation": 554,
 }
 COUNTS = {
     "files of the package": 204,
     "public names": 147,
-    "tuned constants": 499,
-    "lines of tests": 29152,
+    "tuned constants": 498,
+    "lines of tests": 29139,
     "lines of benchmarks": 4018,
     "words of docs": 62270,
 }

@@ -28,7 +28,6 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies.limits import (
-    LimitRow,
     LimitStudy,
     limits,
     limits_at_rate,
@@ -60,7 +59,7 @@ def run_compare(arguments: Namespace) -> Report:
     return report
 
 
-def _compared(design: Design, row: LimitRow, config: Config) -> Facts:
+def _compared(design: Design, row: Facts, config: Config) -> Facts:
     """Return the line of a design: what it leaves, what its loop survives, and what it costs."""
     loop = design.close(config.hardware, sensor_gain=config.truth.sensor_gain)
     margins = loop_margins(loop) if row.stable and not loop.reads_others else None

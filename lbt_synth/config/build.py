@@ -118,14 +118,6 @@ def measurement_noise_nm(settings: FileSection) -> float | FloatArray:
     )
 
 
-def _gains_per_measurement(settings: FileSection) -> FloatArray:
-    """Return the sensor gains that the design assumes, one per measurement, (q,)."""
-    assumed, count = settings.model.sensor_gain, count_measurements(settings)
-    if isinstance(assumed, list):
-        return frozen_copy(_require_length(assumed, count, "model.sensor_gain", "measurement"))
-    return frozen_copy(np.full(count, assumed))
-
-
 def reference_gain(settings: FileSection) -> float:
     """Return the assumed gain with which a single number is compared: the mean of the gains."""
     return float(np.mean(settings.model.sensor_gain))
@@ -235,7 +227,9 @@ def build_plant(
     settings: FileSection, atmosphere: models.Atmosphere | None, noise_nm: float | FloatArray
 ) -> models.TipTiltPlant:
     """Build the plant of the design, with all its sensors."""
-    lines = model_lines(settings)
+    lines, gain = model_lines(settings), settings.model.sensor_gain
+    if isinstance(gain, list):
+        _require_length(gain, count_measurements(settings), "model.sensor_gain", "measurement")
     plant = models.tip_tilt_plant(
         frame_rate_hz=settings.loop.frame_rate_hz,
         delay_frames=settings.loop.delay_frames,
@@ -244,7 +238,7 @@ def build_plant(
         noise_nm=noise_nm,
         sensor_matrix=settings.sensor.matrix,
         influence_matrix=settings.mirror.influence_matrix,
-        sensor_gain=_gains_per_measurement(settings),
+        sensor_gain=gain,
         modes=count_axes(settings),
         mirror=_build_mirror(settings.mirror.local_loop),
     )

@@ -25,7 +25,8 @@ from lbt_synth.config.build import (
 from lbt_synth.config.schema import FileSection, describe_error
 from lbt_synth.errors import ConfigError, FileError, ProblemError, name_file
 from lbt_synth.loop import Imaging
-from lbt_synth.methods.request import DesignRequest, design_request, refuse_without_record
+from lbt_synth.methods.method import DesignInputs
+from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
 from lbt_synth.storage.array_file import error_reason
 from lbt_synth.storage.input_files import read_bytes
@@ -90,11 +91,6 @@ class Config(Summarised):
         return self.plant.hardware
 
     @property
-    def design_defaults(self) -> dict[str, Any]:
-        """Options of methods of synthesis that the file gives, or their defaults."""
-        return dict(self.settings.design)
-
-    @property
     def errors_hz(self) -> list[float]:
         """Frequency errors of studies: those of the file, or of what it says of its vibrations."""
         errors_hz = self.settings.robustness.errors_hz
@@ -108,18 +104,6 @@ class Config(Summarised):
         most = min(_MOST_ERROR_HZ, _USUAL_ERROR * max(lines), room / 2)
         most = most if stated is None else max(stated)
         return [most * step for step in _ERROR_STEPS] if most else [0.0]
-
-    def method_section(self, name: str) -> Any:
-        """Return the section ``design.<name>`` of a method, None if there is none."""
-        return getattr(self.settings.design, name, None)
-
-    def record_design(self) -> Design:
-        """Raise ProblemError: a configuration is no record."""
-        refuse_without_record()
-
-    def size_nm(self, entry: Any, key: str) -> float:
-        """Return the size of an entry with ``rms_nm`` or ``rms_mas`` [nm rms wavefront]."""
-        return vibration_rms_nm(entry, self.settings, key)
 
     def design(self, method: str | DesignRequest, **options: Any) -> Design:
         """Design a controller for the configuration.
@@ -153,7 +137,15 @@ class Config(Summarised):
         """
         request = design_request(method, options) if isinstance(method, str) else method
         with name_file(self.source):
-            design = request.build(self)
+            inputs = DesignInputs(
+                plant=self.plant,
+                truth=self.truth,
+                atmosphere=self.atmosphere,
+                sensor_gain=self.sensor_gain,
+                defaults=dict(self.settings.design),
+                size_nm=lambda entry, key: vibration_rms_nm(entry, self.settings, key),
+            )
+            design = request.build(inputs)
         said = design.assumptions
         if self.other_sensors and not design.other_sensors:
             said = (*said, f"the loop's own sensor is read alone, without {self.other_sensors}")
@@ -168,12 +160,6 @@ class Config(Summarised):
     def text(self) -> str:
         """What the file gives, as JSON; :func:`config_from_text` reads it."""
         return self.settings.model_dump_json(exclude_unset=True)
-
-    def require_atmosphere(self, reason: str) -> Atmosphere:
-        """Return the atmosphere; raise ConfigError with the reason if the file has none."""
-        if self.atmosphere is None:
-            self.refuse_key("atmosphere", f"is missing: {reason}")
-        return self.atmosphere
 
     def refuse_key(self, key: str, why: str) -> NoReturn:
         """Raise ConfigError for a key of the file, in the words after its name."""

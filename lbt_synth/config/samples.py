@@ -28,11 +28,7 @@ from lbt_synth.validation import FloatArray
 
 Keys = tuple[str | int, ...]  # the path of a number, such as ("truth", "vibrations", 0, "rms_nm")
 _KEY = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[[0-9]{1,6}\])*)")
-_WEATHER = (
-    "seeing_arcsec",
-    "wind_speed_m_s",
-    "outer_scale_m",
-)  # that loops may differ in
+_WEATHER = ("seeing_arcsec", "wind_speed_m_s", "outer_scale_m")  # that loops may differ in
 _LINE = ("frequency_hz", "damping", "rms_nm", "rms_mas")
 _PYRAMID = ("photons", "read_noise_electrons", "modulation_lambda_over_d")
 
@@ -174,7 +170,10 @@ def build_ensemble(
     for extreme in (np.min(delay), np.max(delay)):
         replace(config.hardware, delay_frames=float(extreme))  # refuses what no loop has
     if settings.true_turbulence == "frozen_flow":
-        flows = _frozen_flows(settings, config.atmosphere)
+        air: Any = settings.atmosphere
+        weather = {name: getattr(air, name) for name in _WEATHER}
+        if differing := {name: values for name, values in weather.items() if np.ndim(values)}:
+            flows = replace(cast(Atmosphere, config.atmosphere), **differing)
     noise = np.asarray(measurement_noise_nm(settings))
     if not isinstance(settings.sensor.noise_nm, list):
         noise = noise[..., None]
@@ -201,13 +200,3 @@ def _ensemble_vibrations(config: Config, settings: FileSection) -> list[Ensemble
         one = section.spread_hz is None
         vibrations += [EnsembleVibration(**numbers)] if one else map(ensemble_vibration, spread)
     return vibrations
-
-
-def _frozen_flows(settings: FileSection, atmosphere: Atmosphere | None) -> Atmosphere | None:
-    """Return the frozen flows of the samples, None if the weather does not differ."""
-    air = settings.atmosphere
-    if air is None or atmosphere is None:
-        return None
-    weather = {name: getattr(air, name) for name in _WEATHER}
-    differing = {name: values for name, values in weather.items() if np.ndim(values)}
-    return replace(atmosphere, **differing) if differing else None

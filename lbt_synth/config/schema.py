@@ -15,6 +15,7 @@ from lbt_synth.models.vibration import MOST_SECTIONS
 
 Matrix: TypeAlias = list[list[q.Entry]]
 _TAGS = (q.ONE, q.EACH)  # in the places of mistakes
+_TWO_DIRECTIONS = "expected at most one of axis, direction_deg"
 _SECTIONS = "how many equal resonances in series it is: a bump of steep flanks has 2 to 4"
 
 
@@ -37,12 +38,6 @@ def exactly_one(*names: str) -> Any:
     """Return the rule that a section has exactly one of some keys."""
     text = f"expected exactly one of {', '.join(names)}"
     return _rule(lambda section: "" if _count_given(section, names) == 1 else text)
-
-
-def at_most_one(*names: str) -> Any:
-    """Return the rule that a section has at most one of some keys."""
-    text = f"expected at most one of {', '.join(names)}"
-    return _rule(lambda section: "" if _count_given(section, names) < 2 else text)
 
 
 def goes_with(name: str, other: str) -> Any:
@@ -197,7 +192,9 @@ class _LineSection(Section):
         "accelerometer channels that move with it", None
     )
     _one_size = exactly_one("rms_nm", "rms_mas")
-    _one_direction = at_most_one("axis", "direction_deg")
+    _one_direction = _rule(
+        lambda line: _TWO_DIRECTIONS * (None not in (line.axis, line.direction_deg))
+    )
 
 
 class VibrationSection(_LineSection):

@@ -38,7 +38,16 @@ def config_text(settings: FileSection, comments: Mapping[str, str] | None = None
     of their lines; that of ``""`` heads the file, and may have several lines.
     """
     content, comments = settings.model_dump(exclude_unset=True), comments or {}
-    text = _dump(_commented(content, "", comments), comments.get("", ""))
+    document = _commented(content, "", comments)
+    for key in list(document)[1:]:  # sections stand apart
+        document.yaml_set_comment_before_after_key(key, before="\n")
+    if head := comments.get("", ""):
+        document.yaml_set_start_comment(head)
+    yaml, stream = YAML(), io.StringIO()
+    yaml.indent(mapping=2, sequence=4, offset=2)
+    yaml.width = _LONGEST_LINE
+    yaml.dump(document, stream)
+    text = stream.getvalue()
     try:
         again = FileSection.model_validate(YAML(typ="safe", pure=True).load(text))
     except (YAMLError, ValueError) as error:
@@ -78,19 +87,6 @@ def _commented(value: Any, path: str, comments: Mapping[str, str]) -> Any:
     if not (value and isinstance(value[0], dict)):
         entries.fa.set_flow_style()
     return entries
-
-
-def _dump(document: CommentedMap, head: str) -> str:
-    """Return the YAML of a document, its sections apart, below the lines of a heading."""
-    for key in list(document)[1:]:
-        document.yaml_set_comment_before_after_key(key, before="\n")
-    if head:
-        document.yaml_set_start_comment(head)
-    yaml, text = YAML(), io.StringIO()
-    yaml.indent(mapping=2, sequence=4, offset=2)
-    yaml.width = _LONGEST_LINE
-    yaml.dump(document, text)
-    return text.getvalue()
 
 
 def identified_config(

@@ -25,7 +25,6 @@ ORIGIN_TOLERANCE = 1e-5  # of a filter from that of its equation, and of a bound
 RESIDUAL_TOLERANCE = 1e-8  # of a Lyapunov equation
 INFEASIBLE_TOLERANCE = 1e-9  # of a level beside what is proved of it
 LEVEL_SETS = "level sets on the symplectic pencil"
-BY_DISTURBANCES = "disturbances that no measurement shows"
 _GRID = 513  # frequencies from 0 to the Nyquist frequency
 _NOTHING = 1e-14  # part of a system's size that counts as rounding
 _TINY = 1e-300  # keeps a quotient finite where the denominator is zero
@@ -96,10 +95,7 @@ class Certificate(Summarised):
         return float(np.sqrt(np.sum(self.rms_per_output**2)))
 
     def require(self, hint: str = "") -> Certificate:
-        """Return the certificate itself, or raise CertificateError with the checks that failed.
-
-        The hint says what to try, and ends the message.
-        """
+        """Return the certificate itself; raise CertificateError with what failed, and a hint."""
         failed = [check for check in self.checks if not check.passed]
         if failed:
             listing = "; ".join(f"{c.name} {c.value:.12g}, limit {c.limit:.12g}" for c in failed)
@@ -171,13 +167,9 @@ def _examine_error(error: StateSpace, stability: str) -> tuple[Certificate, Floa
 
 
 def _examine_variance(error: StateSpace) -> tuple[FloatArray, FloatArray, tuple[Check, ...]]:
-    """Return covariance and variances of an error driven by white noise, with their checks.
-
-    A root of the covariance gives the variances as sums of squares, in which nothing cancels; what
-    is left is rounding of the outputs.
-    """
+    """Return covariance and variances of an error driven by white noise, with their checks."""
     A, B, C, D = error.A, error.B, error.C, error.D
-    root = stationary_root(A, B)
+    root = stationary_root(A, B)  # by which variances are sums of squares: nothing cancels
     variances = output_variances(C, D, root)
     adjoint = output_variances(B.T, D.T, stationary_root(A.T, C.T))
     P, after = root @ root.T, np.hstack([A @ root, B])
@@ -219,7 +211,7 @@ def certify_infeasible(problem: EstimationProblem, level: float, witness: Witnes
     """Check that a witness proves a level, to a relative 1e-9; a level of 0 claims nothing."""
     above = level / max(proved_level(problem, witness), _TINY) - 1
     name = "infeasible level over the level proved, less 1"
-    return Check(name, above, INFEASIBLE_TOLERANCE, BY_DISTURBANCES)
+    return Check(name, above, INFEASIBLE_TOLERANCE, "disturbances that no measurement shows")
 
 
 def stability_check(name: str, loop: ClosedLoop) -> Check:

@@ -8,11 +8,11 @@ are one case.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
-from typing import Any, ClassVar, TypeGuard, cast
+from typing import Any, ClassVar, TypeAlias, TypeGuard, cast
 
 import numpy as np
 
@@ -53,7 +53,7 @@ from lbt_synth.linear.riccati.filtering import (
 from lbt_synth.loop import ClosedLoop, close_loop
 from lbt_synth.loop.budget import model_covariances
 from lbt_synth.models import TipTiltPlant
-from lbt_synth.storage.rows import Column, column, nm_column, table_row
+from lbt_synth.storage.rows import Column, Facts, fact, facts
 from lbt_synth.validation import BoolArray, ComplexArray, FloatArray, frozen_copy, set_fields
 
 MOST_UNITS = 6  # sensors and channels of which every subset gets a filter
@@ -97,25 +97,9 @@ def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
     yield Check(name, below, TOLERANCE, proved.computed_by)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fallback:
-    """The filter of the sensors that remain when some have failed."""
-
-    missing: tuple[str, ...]  # sensors and channels that are not read
-    gains: FloatArray  # (n, q) or (N, n, q): predictor gains, zero for what is missing
-
-
-@table_row
-class FailureRow:
-    """A loop in which some sensors have failed."""
-
-    missing: str = column("sensors that fail")
-    unseen_radius: float = column("radius, unseen", format=".6f")
-    zero_nm: float | None = nm_column("residual, zeros", unit="nm rms", format=".1f")
-    frozen_nm: float | None = nm_column("residual, frozen", unit="nm rms", format=".1f")
-    fallback_radius: float = column("radius, not read", format=".6f")
-    fallback_nm: float = nm_column("residual, not read", unit="nm rms", format=".1f")
-    must_switch: bool = column("must be seen")
+# predictor gains (n, q) or (N, n, q) of the filters of the sensors that remain, by the sensors and
+# channels that have failed; they are zero for these
+Fallbacks: TypeAlias = Mapping[tuple[str, ...], FloatArray]
 
 
 def failure_sets(units: tuple[str, ...]) -> list[tuple[str, ...]]:
@@ -142,9 +126,9 @@ class FilterDesign(Design):
     witness : Witness or None
         Disturbances that no measurement shows: the proof that no filter reaches
         ``gamma_infeasible``.
-    fallbacks : tuple of Fallback
-        Where the loop has other sensors beside its own: the filter of the remaining ones, for each
-        set of sensors and channels that may fail.
+    fallbacks : mapping of tuple of str to ndarray
+        Where the loop has other sensors beside its own: the predictor gains of the remaining ones,
+        for each set of sensors and channels that may fail.
 
     The gain is (N, n, q) where the sensors have a common period of N frames.
     """
@@ -174,11 +158,12 @@ class FilterDesign(Design):
         Column(name="period", heading="common period", unit="frames"),
     )
     is_estimator: ClassVar[bool] = True
+    knows_mirror: ClassVar[bool] = False
 
     problem: EstimationProblem
     gain_predictor: FloatArray
     witness: Witness | None = None
-    fallbacks: tuple[Fallback, ...] = ()
+    fallbacks: Fallbacks = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         gain = self.problem.checked_gain(self.gain_predictor, "gain_predictor")
@@ -189,14 +174,9 @@ class FilterDesign(Design):
         """Return the controller of the predictor gain."""
         return self.problem.controller(self.gain_predictor)
 
-    @property
-    def knows_mirror(self) -> bool:
-        """False: a filter counts on a mirror that settles."""
-        return False
-
-    def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
-        """System from w to the estimation error, of the design's own problem by default."""
-        return (problem or self.problem).error_system(self.gain_predictor)
+    def error_system(self) -> StateSpace:
+        """System from w to the estimation error."""
+        return self.problem.error_system(self.gain_predictor)
 
     def derived(self) -> dict[str, Any]:
         """Return residual and limit in the own model, or what holds with several sensors."""
@@ -208,8 +188,9 @@ class FilterDesign(Design):
     @property
     def controllers(self) -> dict[frozenset[str], Controller]:
         """The controller for each set of sensors and channels that are not read, none included."""
-        others = {f.missing: self.problem.controller(f.gains) for f in self.fallbacks}
-        return {frozenset(missing): k for missing, k in {(): self.controller, **others}.items()}
+        pairs = self.fallbacks.items()
+        others = {frozenset(missing): self.problem.controller(gains) for missing, gains in pairs}
+        return {frozenset(): self.controller, **others}
 
     def tables(self) -> tuple[RowTable, ...]:
         """Return what becomes of the loop when sensors fail."""
@@ -226,7 +207,7 @@ class FilterDesign(Design):
     def notes(self) -> list[str]:
         """Return which failures the loop has to see, of which none holds another."""
         fatal: list[tuple[str, ...]] = []
-        for missing in (fallback.missing for fallback in self.fallbacks):  # small ones first
+        for missing in self.fallbacks:  # small ones first
             loop = failed_loop(cast("TipTiltPlant", self.problem), self.gain_predictor, missing)
             if not any({*fewer} <= {*missing} for fewer in fatal) and not loop.is_stable:
                 fatal.append(missing)
@@ -286,18 +267,16 @@ def filter_design(
     return with_certificate(design, "Try the other route, or scale the states to similar sizes.")
 
 
-def make_fallbacks(problem: EstimationProblem) -> tuple[Fallback, ...]:
+def make_fallbacks(problem: EstimationProblem) -> Fallbacks:
     """Return the filter of the remaining sensors for every set that may fail.
 
     Without any reading the plant's model predicts alone; where the loop has its own sensor alone
     there is no fall-back.
     """
     if not reads_several(problem):
-        return ()
-    return tuple(
-        Fallback(missing=missing, gains=_fallback_gains(problem, missing))
-        for missing in failure_sets(problem.hardware.suite.units)
-    )
+        return {}
+    sets = failure_sets(problem.hardware.suite.units)
+    return {missing: _fallback_gains(problem, missing) for missing in sets}
 
 
 def reads_several(problem: EstimationProblem) -> TypeGuard[TipTiltPlant]:
@@ -320,81 +299,75 @@ def _fallback_gains(plant: TipTiltPlant, missing: tuple[str, ...]) -> FloatArray
     return kalman_riccati(plant.restricted(remaining)).gain_predictor
 
 
-def fallback_checks(problem: TipTiltPlant, fallbacks: tuple[Fallback, ...]) -> list[Check]:
+def fallback_checks(problem: TipTiltPlant, fallbacks: Fallbacks) -> list[Check]:
     """Check all fall-backs: the worst radius and the gains that are furthest from the least."""
     name = "spectral radius of any loop with sensors missing"
     radii = [
-        stability_check(name, failed_loop(problem, fallback.gains, fallback.missing))
-        for fallback in fallbacks
+        stability_check(name, failed_loop(problem, gains, missing))
+        for missing, gains in fallbacks.items()
     ]
     apart = [
         Check(
             "distance from the least-variance gains of any fall-back",
-            _fallback_distance(problem, fallback),
+            _fallback_distance(problem, missing, gains),
             TOLERANCE,
             "gains recomputed from the Lyapunov covariances",
         )
-        for fallback in fallbacks
+        for missing, gains in fallbacks.items()
     ]
     worst = [
         max(part, key=lambda check: (not check.passed, check.value)) for part in (radii, apart)
     ]
-    return [*worst, _set_check(problem, fallbacks)]
-
-
-def _set_check(problem: TipTiltPlant, fallbacks: tuple[Fallback, ...]) -> Check:
-    """Check that there is one fall-back for each set of sensors that may fail."""
     sets = failure_sets(problem.hardware.suite.units)
-    missing = [fallback.missing for fallback in fallbacks]
-    value = float(missing != sets)
-    return Check("sets of failed sensors without a fall-back", value, 0.5, "comparison")
+    value = float(list(fallbacks) != sets)
+    name = "sets of failed sensors without a fall-back"
+    return [*worst, Check(name, value, 0.5, "comparison")]
 
 
-def _fallback_distance(plant: TipTiltPlant, fallback: Fallback) -> float:
+def _fallback_distance(plant: TipTiltPlant, missing: tuple[str, ...], gains: FloatArray) -> float:
     """Return how far the gains of a fall-back are from those of least variance, relative."""
-    remaining = _remaining(plant, fallback.missing)
+    remaining = _remaining(plant, missing)
     if not np.any(plant.read & remaining):
-        return float(np.max(np.abs(fallback.gains), initial=0.0))
-    error = plant.error_system(fallback.gains)
+        return float(np.max(np.abs(gains), initial=0.0))
+    error = plant.error_system(gains)
     if not error.spectral_radius < 1:
         return float("inf")
-    return variance_distance(plant.restricted(remaining), fallback.gains, error.covariances())
+    return variance_distance(plant.restricted(remaining), gains, error.covariances())
 
 
-def failure_rows(
-    plant: TipTiltPlant, gains: FloatArray, fallbacks: tuple[Fallback, ...]
-) -> tuple[FailureRow, ...]:
+def failure_rows(plant: TipTiltPlant, gains: FloatArray, fallbacks: Fallbacks) -> list[Facts]:
     """Return stability and residual of the loop for every set of sensors that fail.
 
     The residual is the exact one of the loop where the plant's model is the truth. A frozen reading
     is that of a frame in which all sensors are read, and stays for ever.
     """
-    n, rows = plant.hardware.modes, []
+    n, rows, rms = plant.hardware.modes, [], {"unit": "nm rms", "format": ".1f"}
+    radius = {"format": ".6f"}
     readings = model_covariances(failed_loop(plant, gains, ()), plant)[0, n:, n:]
 
     def left_nm(loop: ClosedLoop) -> float:
         covariances = model_covariances(loop, plant)[:, :n, :n]
         return float(np.sqrt(np.trace(covariances.mean(axis=0))))
 
-    for fallback in fallbacks:
-        unseen = failed_loop(plant, gains, fallback.missing)
+    for missing, fallback_gains in fallbacks.items():
+        unseen = failed_loop(plant, gains, missing)
         zero_nm = frozen_nm = None
         if unseen.is_stable:
             zero_nm = left_nm(unseen)
             frozen_nm = float(np.hypot(zero_nm, _offset_nm(unseen, readings)))
-        switched = failed_loop(plant, fallback.gains, fallback.missing)
+        switched = failed_loop(plant, fallback_gains, missing)
         rows.append(
-            FailureRow(
-                missing=" + ".join(fallback.missing),
-                unseen_radius=unseen.spectral_radius,
-                zero_nm=zero_nm,
-                frozen_nm=frozen_nm,
-                fallback_radius=switched.spectral_radius,
-                fallback_nm=left_nm(switched),
-                must_switch=not unseen.is_stable,
+            facts(
+                missing=fact(" + ".join(missing), "sensors that fail"),
+                unseen_radius=fact(unseen.spectral_radius, "radius, unseen", **radius),
+                zero_nm=fact(zero_nm, "residual, zeros", **rms),
+                frozen_nm=fact(frozen_nm, "residual, frozen", **rms),
+                fallback_radius=fact(switched.spectral_radius, "radius, not read", **radius),
+                fallback_nm=fact(left_nm(switched), "residual, not read", **rms),
+                must_switch=fact(not unseen.is_stable, "must be seen"),
             )
         )
-    return tuple(rows)
+    return rows
 
 
 def _offset_nm(loop: ClosedLoop, readings: FloatArray) -> float:

@@ -124,7 +124,14 @@ def _design(
     gamma_ratio: float | None,
 ) -> FilterDesign:
     """Find the least gamma by one route, and the filter of the level asked for."""
-    lower, upper = _kalman_bracket(problem, start)
+    if not np.any(problem.L @ start.P @ problem.L.T > 0):
+        raise ProblemError(
+            "z = L x must have an estimation error; got one that is known exactly. "
+            "Drive it with noise (B), or choose another L."
+        )
+    # the deviation of the Kalman error, and its norm
+    lower = error_scale(problem, start.P)
+    upper = hinf_norm(problem.error_system(start.gain_predictor)).upper
     if route == "lmi":
         from lbt_synth.linear.lmi.filters import least_gamma_lmi
 
@@ -136,8 +143,15 @@ def _design(
     requested = gamma if gamma is not None else least * (gamma_ratio or 1)
     require_reachable(requested, least)
     if requested > least * (1 + AT_LEAST):
-        gains = _central(problem, start, requested)
-    design = filter_design(
+        central = gamma_riccati(problem, requested, start=start)
+        if central is None:
+            raise InfeasibleError(
+                "the gamma-Riccati equation has no stabilising solution at gamma = "
+                f"{requested:.9g}. Try a larger gamma.",
+                gamma=requested,
+            )
+        gains = central
+    return filter_design(
         problem,
         gains.gain_predictor,
         method="hinf",
@@ -147,21 +161,6 @@ def _design(
         gamma_infeasible=infeasible,
         witness=witness,
     )
-    if design.gamma < infeasible * (1 - AT_LEAST):
-        raise _contradiction_error(infeasible, design.gamma)
-    return design
-
-
-def _central(problem: EstimationProblem, start: FilterRiccati, gamma: float) -> FilterRiccati:
-    """Return the filter of a level by the gamma-Riccati equation."""
-    solution = gamma_riccati(problem, gamma, start=start)
-    if solution is None:
-        raise InfeasibleError(
-            f"the gamma-Riccati equation has no stabilising solution at gamma = {gamma:.9g}. "
-            "Try a larger gamma.",
-            gamma=gamma,
-        )
-    return solution
 
 
 def require_reachable(gamma: float, least: float) -> None:
@@ -189,24 +188,9 @@ def _verified_bracket(
     least = hinf_norm(error).upper
     infeasible = infeasible_level(problem, witness, start.P)
     if infeasible > least * (1 + AT_LEAST):
-        raise _contradiction_error(infeasible, least)
-    return least, min(infeasible, least)
-
-
-def _contradiction_error(infeasible: float, achieved: float) -> NumericalError:
-    return NumericalError(
-        f"no filter should have a norm below {infeasible:.9g}, yet one achieves {achieved:.9g}. "
-        "Try the other route, or scale the states to similar sizes.",
-        status="contradiction",
-    )
-
-
-def _kalman_bracket(problem: EstimationProblem, start: FilterRiccati) -> tuple[float, float]:
-    """Bounds of the least gamma: the deviation of the Kalman error, and its norm."""
-    if not np.any(problem.L @ start.P @ problem.L.T > 0):
-        raise ProblemError(
-            "z = L x must have an estimation error; got one that is known exactly. "
-            "Drive it with noise (B), or choose another L."
+        raise NumericalError(
+            f"no filter should have a norm below {infeasible:.9g}, yet one achieves {least:.9g}. "
+            "Try the other route, or scale the states to similar sizes.",
+            status="contradiction",
         )
-    upper = hinf_norm(problem.error_system(start.gain_predictor)).upper
-    return error_scale(problem, start.P), upper
+    return least, min(infeasible, least)

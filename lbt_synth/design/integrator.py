@@ -88,11 +88,6 @@ class IntegratorLaw:
         check_fields(self)
 
     @property
-    def is_pure(self) -> bool:
-        """Whether it is one integrator without leak or zero."""
-        return (self.leak, self.integrators, self.zero_hz) == (1.0, 1, None)
-
-    @property
     def demands(self) -> dict[str, float]:
         """The margins that are demanded, by the name of their field."""
         named = {name: getattr(self, name) for name in ("phase_margin_deg", "modulus_margin")}
@@ -190,7 +185,8 @@ class IntegratorDesign(Design):
     @property
     def integrator_gain(self) -> float | None:
         """The gain, if there is neither leak nor zero nor a second integrator."""
-        return self.gain if self.law.is_pure else None
+        is_pure = self.claims.keys().isdisjoint(("leak", "integrators", "zero_hz"))
+        return self.gain if is_pure else None
 
     def make_controller(self) -> Controller:
         """Return the controller of the law and its gain."""
@@ -336,10 +332,7 @@ def integrator_gain_limit(hardware: LoopHardware, law: IntegratorLaw = PURE) -> 
 
 
 def _allowed_gains(hardware: LoopHardware, law: IntegratorLaw, trials: FloatArray) -> FloatArray:
-    """Return logarithms of gains that keep the demands of a law: the trials and both ends.
-
-    Of several intervals it is the one with the largest gains.
-    """
+    """Return logarithms of the largest gains that keep a law's demands: trials and both ends."""
 
     def excess(log_gain: float) -> float:
         """Return the least margin over its demand, less 1 and what rounding may take."""
@@ -433,10 +426,7 @@ def _least_residual(
 def _least_between(
     values: Callable[[FloatArray], FloatArray], low: float, high: float
 ) -> tuple[float, float]:
-    """Return where values are least between two points, and the value.
-
-    It is the vertex of their Chebyshev polynomial, on an interval where that has converged.
-    """
+    """Return where values are least between two points, and the value, by Chebyshev polynomials."""
     for _ in range(_ROUNDS):
         points = (low + high) / 2 + (high - low) / 2 * _NODES
         there = values(points)

@@ -25,7 +25,7 @@ from lbt_synth.loop import close_loop
 from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware, Spectrum, TipTiltPlant, Vibration
 from lbt_synth.models.resonance_spectrum import WIDE_DAMPING
-from lbt_synth.storage.rows import Column, column, nm_column, table_row
+from lbt_synth.storage.rows import Column, fact, facts
 from lbt_synth.validation import (
     ComplexArray,
     FloatArray,
@@ -116,7 +116,13 @@ def shape(
     size = integer(functions, "functions", at_least=1, at_most=400)
     common = number(pole, "pole", at_least=0, below=1)
     tolerance = number(loss, "loss", at_least=0)
-    require_separable(hardware)
+    for name in ("sensor", "influence"):
+        response, n = getattr(hardware, name), hardware.modes
+        if (rank := np.linalg.matrix_rank(response)) < n:
+            raise DimensionError(
+                f"{name}_matrix must have rank {n}, one for each mode, for a loop that is shaped "
+                f"mode by mode; got {response.shape} of rank {rank}."
+            )
     single = hardware.single_mode()
     stored = single.mirror_system.whole.n_states
     order = None if states is None else integer(states, "states", at_least=stored + 1) - stored
@@ -158,42 +164,20 @@ def _check_objective(evidence: Evidence, claimed: tuple[float, ...]) -> Iterator
         how, name = "closed loops in state space", f"{prefix}objective"
         yield Check(f"{name} found over the one claimed, less 1", above, TOLERANCE, how)
         yield Check(f"{name} claimed over the one found, less 1", below, ORIGIN_TOLERANCE, how)
-    yield _decoupling_check(design)
+    f = np.linspace(0, 0.4, 5) * design.problem.frame_rate_hz
+    joint = close_loop(design.problem, design.controller).sensitivity(f)
+    single = np.zeros_like(joint)
+    for mode, parameter in enumerate(design.parameters):
+        closed = mode_loop(design.problem, parameter).at(1.0)
+        single[:, mode, mode] = closed.sensitivity(f)[:, 0, 0]
+    apart = float(np.max(np.abs(joint - single)))
+    how = f"sensitivity at {f.size} frequencies"
+    yield Check("whole loop against its modes", apart, TOLERANCE, how)
 
 
 def _excess(value: float, other: float) -> float:
     """Return by how much a value is above another, in parts of it; 0 where both are nothing."""
     return value / other - 1 if other > 0 else (np.inf if value > 0 else 0.0)
-
-
-def _decoupling_check(design: ShapedDesign) -> Check:
-    """Check that the whole loop rejects what the loops of the single modes reject."""
-    f = np.linspace(0, 0.4, 5) * design.problem.frame_rate_hz
-    whole = close_loop(design.problem, design.controller).sensitivity(f)
-    single = np.zeros_like(whole)
-    for mode, parameter in enumerate(design.parameters):
-        loop = mode_loop(design.problem, parameter).at(1.0)
-        single[:, mode, mode] = loop.sensitivity(f)[:, 0, 0]
-    apart = float(np.max(np.abs(whole - single)))
-    how = f"sensitivity at {f.size} frequencies"
-    return Check("whole loop against its modes", apart, TOLERANCE, how)
-
-
-@table_row
-class DemandRow:
-    """A demand on a mode."""
-
-    demand: str = column("demand")
-    mode: int = column("mode")
-
-
-@table_row
-class TermRow:
-    """What a term of the objective leaves in the real loop."""
-
-    term: str = column("term")
-    mode: int = column("mode")
-    rms_nm: float = nm_column("residual", unit="nm rms")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -229,7 +213,11 @@ class ShapedDesign(Design):
 
     def make_controller(self) -> Controller:
         """Return the controller of the parameters of all modes."""
-        return controller_from_parameters(self.problem, self.parameters)
+        hardware = self.problem
+        back, out = np.linalg.pinv(hardware.sensor), hardware.projector
+        A, B, C, D = (block_diag(*(getattr(p, name) for p in self.parameters)) for name in "ABCD")
+        joint = Controller(A=A, B=B @ back, C=out @ C, D=out @ D @ back, dt_s=hardware.dt_s)
+        return youla_controller(hardware, joint)
 
     @property
     def objective_nm(self) -> tuple[float, ...]:
@@ -301,12 +289,17 @@ class ShapedDesign(Design):
     def tables(self) -> tuple[RowTable, ...]:
         """Return the demands, and the residual of each term."""
         demands = [
-            DemandRow(demand=demand.label, mode=mode)
+            facts(demand=fact(demand.label, "demand"), mode=fact(mode, "mode"))
             for mode, spec in enumerate(self.specifications, 1)
             for demand in spec.demands
         ]
         terms = [
-            TermRow(term=text, mode=mode + 1, rms_nm=rms) for mode, text, rms in self.terms_nm()
+            facts(
+                term=fact(label, "term"),
+                mode=fact(mode + 1, "mode"),
+                rms_nm=fact(rms_nm, "residual", unit="nm rms", format=".1f"),
+            )
+            for mode, label, rms_nm in self.terms_nm()
         ]
         return (
             RowTable(key="demands", title="Demands", rows=demands),
@@ -335,29 +328,6 @@ class ShapedDesign(Design):
                 demands = self.specifications[mode].checks(loop)
                 checks += [replace(check, name=prefix + check.name) for check in demands]
         return Evidence(design=self, certificate=replace(UNCERTIFIED, checks=tuple(checks)))
-
-
-def require_separable(hardware: LoopHardware) -> None:
-    """Refuse a loop whose modes cannot be controlled one by one."""
-    n = hardware.modes
-    named = {"sensor_matrix": hardware.sensor, "influence_matrix": hardware.influence}
-    for name, response in named.items():
-        rank = np.linalg.matrix_rank(response)
-        if rank < n:
-            raise DimensionError(
-                f"{name} must have rank {n}, one for each mode, for a loop that is shaped mode by "
-                f"mode; got {response.shape} of rank {rank}."
-            )
-
-
-def controller_from_parameters(
-    hardware: LoopHardware, parameters: tuple[Controller, ...]
-) -> Controller:
-    """Join the Youla parameters of all modes in the controller of the whole loop."""
-    back, out = np.linalg.pinv(hardware.sensor), hardware.projector
-    A, B, C, D = (block_diag(*(getattr(p, name) for p in parameters)) for name in "ABCD")
-    whole = Controller(A=A, B=B @ back, C=out @ C, D=out @ D @ back, dt_s=hardware.dt_s)
-    return youla_controller(hardware, whole)
 
 
 def noise_per_mode(hardware: LoopHardware, covariance: FloatArray) -> FloatArray:
@@ -457,20 +427,21 @@ def robust(
         raise ProblemError("moving_gain needs the interval in which it moves; give sensor_gain.")
     if late or (low, high) != (1, 1):
         fixed.append(LoopErrors(low=low, high=high, delay_frames=late, moving=moving_gain))
-    deviations = noise_per_mode(plant.hardware, plant.R)
-    by_mode: dict[object, Specification] = {}
+    deviations = noise_per_mode(plant.hardware, plant.R).tolist()
+    # modes that differ by rounding are equal, and solved once
+    deviations = [next(d for d in deviations if abs(d - nm) <= 1e-9 * nm) for nm in deviations]
     specifications = []
-    each = zip(deviations.tolist(), plant.turbulence, lines, strict=True)
+    each = zip(deviations, plant.turbulence, lines, strict=True)
     for mode, (noise_nm, model, own) in enumerate(each):
         spectrum, wide = model if turbulence is None else turbulence, _uncovered(plant, mode, own)
-        # equal modes share one specification, and are solved once
-        key = f"{noise_nm:.9g}", id(spectrum), own, wide
-        if key not in by_mode:
-            air = ResidualVariance(turbulence=spectrum, noise_nm=noise_nm)
-            terms: tuple[Term, ...] = (air, *_resonance_terms(plant, wide), *own)
-            terms = tuple(replace(term, sensor_gain=g) for g in gains for term in terms)
-            by_mode[key] = Specification(terms=terms, demands=(*fixed, *further))
-        specifications.append(by_mode[key])
+        air = ResidualVariance(turbulence=spectrum, noise_nm=noise_nm)
+        # the spectrum of a resonance is known as that of turbulence is
+        rate_hz = plant.hardware.frame_rate_hz
+        models = (line.ar_model(rate_hz) for line in wide)
+        resonances = (ResidualVariance(turbulence=model, noise_nm=0.0) for model in models)
+        terms: tuple[Term, ...] = (air, *resonances, *own)
+        terms = tuple(replace(term, sensor_gain=g) for g in gains for term in terms)
+        specifications.append(Specification(terms=terms, demands=(*fixed, *further)))
     path = plant.hardware
     return shape(path, specifications, functions=functions, pole=pole, states=states, loss=loss)
 
@@ -489,15 +460,6 @@ def _uncovered(
             for band in bands
         )
     )
-
-
-def _resonance_terms(
-    plant: TipTiltPlant, resonances: tuple[Vibration, ...]
-) -> Iterator[ResidualVariance]:
-    """Yield the residual of each resonance, whose spectrum is known as that of turbulence is."""
-    for line in resonances:
-        process = line.ar_model(plant.hardware.frame_rate_hz)
-        yield ResidualVariance(turbulence=process, noise_nm=0.0)
 
 
 def _bands_per_mode(

@@ -40,8 +40,8 @@ from lbt_synth.design.result import (
     model_limits,
     with_certificate,
 )
-from lbt_synth.errors import DimensionError, ProblemError
-from lbt_synth.linear import Controller, EstimationProblem, StateSpace, solve_dare
+from lbt_synth.errors import DimensionError
+from lbt_synth.linear import Controller, StateSpace, solve_dare
 from lbt_synth.linear.lyapunov import output_variances, stationary_covariance, stationary_root
 from lbt_synth.linear.riccati.filtering import kalman_riccati
 from lbt_synth.loop import close_loop
@@ -155,11 +155,6 @@ class LqgDesign(Design):
         return dict(model_limits(self))
 
     @property
-    def knows_mirror(self) -> bool:
-        """Whether the mirror has dynamics: with a settled one the law is that of a filter."""
-        return self.problem.hardware.mirror is not None
-
-    @property
     def estimation(self) -> TipTiltPlant:
         """The plant of the filter, whose state holds the phase while the next command holds."""
         return estimation_plant(self.problem)
@@ -172,40 +167,26 @@ class LqgDesign(Design):
         of_filter = self.estimation.error_system(self.gain_predictor).poles
         return np.concatenate([of_filter, np.linalg.eigvals(closed).astype(np.complex128)])
 
-    def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
-        """System from w to the residual of the loop: states are estimation error, estimate, mirror.
-
-        The other problem is a TipTiltPlant of as many states, or a ProblemError.
-        """
-        own = self.estimation
-        real = own
-        if problem is not None:
-            plant = require_instance(problem, TipTiltPlant, "problem")
-            real = estimation_plant(replace(plant, hardware=self.problem.hardware))
-            if real.A.shape != own.A.shape:
-                raise ProblemError(
-                    f"the other plant must have {own.n_states} states to be estimated; got "
-                    f"{real.n_states}."
-                )
-        core, K, modes = mirror_core(self.problem), self.gain_predictor, len(own.L)
-        pieces = _pieces(replace(real, hardware=self.problem.hardware))
-        n, each = own.n_states, np.eye(modes)
+    def error_system(self) -> StateSpace:
+        """System from w to the residual; its states are estimation error, estimate and mirror."""
+        model, K = self.estimation, self.gain_predictor
+        core, pieces, modes = mirror_core(self.problem), _pieces(self.problem), len(model.L)
+        n, each = model.n_states, np.eye(modes)
         size = 2 * n + core.n_states * modes
         e, x, m = slice(0, n), slice(n, 2 * n), slice(2 * n, size)
-        A, B = np.zeros((size, size)), np.zeros((size, own.B.shape[1]))
-        A[e, e] = real.A - K @ real.C
-        A[e, x] = real.A - own.A - K @ (real.C - own.C)
-        A[x, e], A[x, x] = K @ real.C, own.A + K @ (real.C - own.C)
+        A, B = np.zeros((size, size)), np.zeros((size, model.B.shape[1]))
+        A[e, e] = model.A - K @ model.C
+        A[x, e], A[x, x] = K @ model.C, model.A
         A[m, x] = np.kron(core.B[:, None], self.gain_state)
         A[m, m] = np.kron(core.A - np.outer(core.B, self.gain_mirror), each)
-        B[e], B[x] = real.B - K @ real.D, K @ real.D
+        B[e], B[x] = model.B - K @ model.D, K @ model.D
         C = np.zeros((len(pieces.D), modes, size))
         C[..., e] = pieces.L
         C[..., x] = pieces.L - pieces.D[:, None, None] * self.gain_state
         seen = pieces.C - np.outer(pieces.D, self.gain_mirror)
         C[..., m] = -np.stack([np.kron(row, each) for row in seen])
         D = np.zeros((len(pieces.D) * modes, B.shape[1]))
-        return StateSpace(A=A, B=B, C=C.reshape(-1, size), D=D, dt_s=own.dt_s)
+        return StateSpace(A=A, B=B, C=C.reshape(-1, size), D=D, dt_s=model.dt_s)
 
     def examine(self) -> Evidence:
         """Compute the norms of the residual, and check the filter's gain."""
@@ -289,15 +270,6 @@ def loop_variances(plant: TipTiltPlant, controller: Controller) -> tuple[float, 
     return float(power), float(np.sum(commands))
 
 
-class Regulator(NamedTuple):
-    """Commands ``N u = gain_state x - gain_mirror m``, with what their Riccati equation says."""
-
-    gain_state: FloatArray
-    gain_mirror: FloatArray
-    weight: float  # ``d^2 + rho + G'XG``
-    status: str
-
-
 def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
     """Design the controller of least residual in the image, for a mirror that moves.
 
@@ -355,25 +327,21 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
     estimation = estimation_plant(plant)
     solution = kalman_riccati(estimation)
     pieces = _pieces(plant)
-    regulator = _regulator(mirror_core(plant), pieces, estimation.A, rho)
+    gains, gain_mirror, weight, route = _regulator(mirror_core(plant), pieces, estimation.A, rho)
     innovation = estimation.R + estimation.C @ solution.P @ estimation.C.T
     drive = solution.gain_predictor @ innovation @ solution.gain_predictor.T
-    gains = regulator.gain_state
     L = pieces.L.reshape(-1, estimation.n_states)
-    rest = L.T @ L - regulator.weight * gains.T @ gains
+    rest = L.T @ L - weight * gains.T @ gains
     cost = np.trace(L @ solution.P @ L.T)
     if np.any(np.abs(rest) > 1e-14 * np.max(np.abs(estimation.L)) ** 2):
         cost += np.trace(stationary_covariance(estimation.A.T, rest) @ drive)
     design = LqgDesign(
         method="lqg",
-        solver=SolverReport(
-            route="riccati",
-            status=f"{solution.status}; mirror: {regulator.status}",
-        ),
+        solver=SolverReport(route="riccati", status=f"{solution.status}; mirror: {route}"),
         problem=plant,
         gain_predictor=solution.gain_predictor,
         gain_state=frozen_copy(gains),
-        gain_mirror=frozen_copy(regulator.gain_mirror),
+        gain_mirror=frozen_copy(gain_mirror),
         claims={"command_weight": rho, "objective_nm": float(np.sqrt(max(float(cost), 0.0)))},
     )
     return with_certificate(
@@ -381,13 +349,15 @@ def lqg(plant: TipTiltPlant, *, command_weight: float = 0.0) -> LqgDesign:
     )
 
 
-def _regulator(core: Response, pieces: Pieces, A: FloatArray, rho: float) -> Regulator:
-    """Regulator of one mirror for all modes, whose targets are those of the pieces."""
+def _regulator(
+    core: Response, pieces: Pieces, A: FloatArray, rho: float
+) -> tuple[FloatArray, FloatArray, float, str]:
+    """Return the gains of one mirror for all modes, ``d^2 + rho + G'XG``, and the route."""
     F, G, (L, h, d) = core.A, core.B, pieces
     weight = float(d @ d) + rho
     if core.n_states == 0:
         gain_state = np.einsum("g,gan->an", d, L) / weight
-        return Regulator(gain_state, np.zeros(0), weight, "settled")
+        return gain_state, np.zeros(0), weight, "settled"
     solved = solve_dare(F, G[:, None], h.T @ h, [[weight]], (d @ h)[:, None])
     X = solved.X
     total = float(weight + G @ X @ G)
@@ -399,4 +369,4 @@ def _regulator(core: Response, pieces: Pieces, A: FloatArray, rho: float) -> Reg
     stein = np.eye(len(drives)) - np.kron(closed.T, A.T)
     crossed = np.linalg.solve(stein, drives).T.reshape(-1, *map(len, (F, A)))
     gain_state = (np.einsum("g,gan->an", d, L) - np.einsum("i,aij,jk->ak", G, crossed, A)) / total
-    return Regulator(gain_state, gain_mirror, total, solved.route)
+    return gain_state, gain_mirror, total, solved.route

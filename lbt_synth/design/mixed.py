@@ -6,7 +6,6 @@ It completes a central H-infinity filter, chosen by the norm that it achieves.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
@@ -18,7 +17,6 @@ from lbt_synth.design.kalman import kalman
 from lbt_synth.design.result import SolverReport
 from lbt_synth.errors import NumericalError, ProblemError
 from lbt_synth.linear import EstimationProblem, StateSpace, hinf_norm
-from lbt_synth.linear.infeasibility_proof import Witness
 from lbt_synth.linear.norms import spectral_norms
 from lbt_synth.linear.riccati.filtering import FilterRiccati, gamma_riccati, kalman_riccati
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number, require_instance
@@ -107,7 +105,20 @@ def mixed(
     if not problem.reads_all:  # no impulse response: the least variance among central filters
         return _central_design(base, least, method="mixed", bound=bound)
     taps_of_base, solver = _complete_base(problem, base, length, bound)
-    return _mixed_design(problem, base, taps_of_base, least, solver=solver, gamma_requested=bound)
+    extended, witness = problem.with_memory(taps_of_base), least.witness
+    if witness is not None:  # the further states are zero
+        padding = (0, extended.n_states - problem.n_states), (0, 0)
+        witness = replace(witness, states=frozen_copy(np.pad(witness.states, padding)))
+    return filter_design(
+        extended,
+        _extend_gain(base.gain_predictor, length),
+        method="mixed",
+        solver=solver,
+        gamma_least=least.gamma_least,
+        gamma_infeasible=min(least.gamma_infeasible, proved_level(extended, witness)),
+        gamma_requested=bound,
+        witness=witness,
+    )
 
 
 def require_taps(taps: int) -> int:
@@ -121,10 +132,7 @@ def _complete_base(
     length: int,
     bound: float,
 ) -> tuple[FloatArray, SolverReport]:
-    """Find the taps on the innovations of a base filter, and say how.
-
-    Frequencies are added until the norm holds between them, too.
-    """
+    """Find the taps on the innovations of a base filter, and say how."""
     from lbt_synth.linear.lmi.mixed import InnovationProgramme
 
     programme = InnovationProgramme.from_predictor(problem, base.gain_predictor, taps=length)
@@ -150,36 +158,6 @@ def _complete_base(
         status="frequencies",
         residual=excess,
     )
-
-
-def _mixed_design(
-    problem: EstimationProblem,
-    base: FilterDesign | FilterRiccati,
-    taps: FloatArray,
-    least: FilterDesign,
-    **claims: Any,
-) -> FilterDesign:
-    """Make the design of a completed base and certify it."""
-    extended = problem.with_memory(taps)
-    size, q = taps.shape[1], base.gain_predictor.shape[1]
-    gain = _extend_gain(base.gain_predictor, size // q)
-    witness = least.witness and _padded(least.witness, size)
-    proved = proved_level(extended, witness)
-    return filter_design(
-        extended,
-        gain,
-        method="mixed",
-        gamma_least=least.gamma_least,
-        gamma_infeasible=min(least.gamma_infeasible, proved),
-        witness=witness,
-        **claims,
-    )
-
-
-def _padded(witness: Witness, size: int) -> Witness:
-    """Return a witness of a problem with further states, which are zero."""
-    padding = np.zeros((size, witness.states.shape[1]))
-    return replace(witness, states=frozen_copy(np.vstack([witness.states, padding])))
 
 
 def _extend_gain(gain_predictor: FloatArray, length: int) -> FloatArray:
@@ -226,10 +204,7 @@ def _central_design(
 def _central_member(
     problem: EstimationProblem, least: FilterDesign, bound: float
 ) -> FilterDesign | FilterRiccati:
-    """Return the central filter whose norm just meets a bound.
-
-    The central filters go from that of the least gamma to the Kalman filter, and their norms rise.
-    """
+    """Return the central filter whose norm just meets a bound; norms rise to that of Kalman."""
     start = kalman_riccati(problem)
     filters: dict[float, FilterDesign | FilterRiccati] = {0.0: least}
     excesses = {0.0: least.gamma - bound}

@@ -45,6 +45,7 @@ from lbt_synth.linear.output_feedback.two_riccati import (
 )
 from lbt_synth.validation import integer, number
 
+_certify_loop = partial(certify_error, stability="spectral radius of the closed loop")
 # a controller in the units of the plant as given, and the checks of its loop
 _CheckedLoop: TypeAlias = tuple[StateSpace, Certificate]
 
@@ -76,8 +77,7 @@ def _check_infeasible(evidence: Evidence, level: float) -> Iterator[Check]:
     """Check that the witness proves the level."""
     design = evidence.design
     scaled = scaled_plant(design.problem)
-    proved = infeasible_control_level(scaled.plant, design.witness) / scaled.unit
-    above = level / max(proved, 1e-300) - 1
+    above = level / max(_proved(scaled, design.witness), 1e-300) - 1
     how = "pairs that no measurement shows and no control moves"
     name = "infeasible level over the level proved, less 1"
     yield Check(name, above, INFEASIBLE_TOLERANCE, how)
@@ -175,11 +175,7 @@ def _design_h2(scaled: ScaledPlant, equations: TwoRiccati, share: float) -> Cont
 
 
 def _least_rms(equations: TwoRiccati) -> float:
-    """Return the least standard deviation of z.
-
-    ``|z|^2`` is the cost with known state and disturbance, plus that of the distance of the
-    control from ``F x + F0 w``, of which the measurements leave an error.
-    """
+    """Return the least standard deviation of z: with known state, and of the control's error."""
     P, control, estimation = equations.plant, equations.control, equations.estimation
     F, F0, Y = control.feedback, control.feedforward, estimation.least
     seen = F @ Y @ P.C2.T + F0 @ P.D21.T
@@ -294,8 +290,11 @@ class _Bracket(NamedTuple):
         proofs = [max(((_proved(scaled, x), x) for x in candidates), key=lambda proof: proof[0])]
         level, closed = proofs[0]
         if level < least * (1 - _LOOSE) and size <= LARGEST_LMI:
+            from lbt_synth.linear.lmi.output_feedback import least_level_lmi
+
             with suppress(NumericalError):
-                proofs.append(_inequality_proof(scaled, solution.gamma))
+                _, dual = least_level_lmi(scaled.plant, solution.gamma)
+                proofs.append((_proved(scaled, dual), dual))
         proved, witness = max(proofs, key=lambda proof: proof[0])
         if level > _LESS * least:  # an inequality gives no reason in words
             witness = replace(witness, reason=closed.reason)
@@ -322,14 +321,6 @@ class _Bracket(NamedTuple):
 def _proved(scaled: ScaledPlant, witness: ControlWitness) -> float:
     """Return the level of the plant that a witness proves infeasible."""
     return infeasible_control_level(scaled.plant, witness) / scaled.unit
-
-
-def _inequality_proof(scaled: ScaledPlant, level: float) -> tuple[float, ControlWitness]:
-    """Return the level that the dual of the matrix inequalities proves, and the proof."""
-    from lbt_synth.linear.lmi.output_feedback import least_level_lmi
-
-    _, witness = least_level_lmi(scaled.plant, level)
-    return _proved(scaled, witness), witness
 
 
 def _least_controller(
@@ -455,10 +446,6 @@ def _quietest(scaled: ScaledPlant, equations: TwoRiccati, gamma: float, taps: in
     return controller
 
 
-def _certify_loop(loop: StateSpace) -> Certificate:
-    return certify_error(loop, stability="spectral radius of the closed loop")
-
-
 def _checked_loop(scaled: ScaledPlant, controller: StateSpace) -> _CheckedLoop:
     """Return a controller of the scaled plant in the given units, and the checks of its loop."""
     K, loop = scaled.closed_loop(controller)
@@ -474,12 +461,9 @@ def _first_certified(
     plant: GeneralizedPlant,
     synthesise: Callable[[ScaledPlant, TwoRiccati, float], ControllerDesign],
 ) -> ControllerDesign:
-    """Return the design of the first equations that lead to one, the plant's own or next to it.
-
-    Equations are singular where a control costs nothing or a measurement has no noise. Where
-    perfect control leaves rounding alone, no norm can be certified either. What was added may be
-    what is left: a smaller share is taken where it leaves less.
-    """
+    """Return the design of the first equations that lead to one, the plant's own or next to it."""
+    # equations are singular where a control costs nothing or a measurement has no noise; what was
+    # added may be what is left: a smaller share is taken where it leaves less
     scaled = scaled_plant(plant)
     refusal: ValueError | SynthesisError
     for share in _SHARES:

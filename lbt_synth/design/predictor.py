@@ -31,7 +31,7 @@ from lbt_synth.linear.lyapunov import output_variances, stationary_root
 from lbt_synth.loop import close_loop
 from lbt_synth.loop.closed_loop import youla_controller
 from lbt_synth.models import LoopHardware
-from lbt_synth.storage.rows import Column, column, table_row
+from lbt_synth.storage.rows import Column, fact, facts
 from lbt_synth.validation import FloatArray, frozen_copy
 
 _ORDERS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # of reduced filters, by about a third
@@ -45,15 +45,6 @@ def _check_noise(evidence: Evidence, claimed: tuple[float, ...]) -> Iterator[Che
     apart = np.abs(np.array(command_rms(evidence.design.parameters)) / np.array(claimed) - 1)
     how = "adjoint Lyapunov equation"
     yield Check("command of white readings, against the one claimed", apart.max(), TOLERANCE, how)
-
-
-@table_row
-class NoiseRow:
-    """What white noise of one reading becomes in the command."""
-
-    reading: str = column("reading")
-    unit: str = column("unit of the noise")
-    command_rms: float = column("command over it, rms", format=".4g")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,7 +77,9 @@ class PredictorDesign(Design):
     def _controller(self, chosen: int) -> Controller:
         """Return the controller of one filter; all of them have the same states."""
         readings, read = self.problem.n_readings, self.parameters[chosen].B.shape[1]
-        parts = [(p.A, _padded(p.B[:, :read], readings), p.C) for p in self.parameters]
+        inputs = [p.B[:, :read] for p in self.parameters]  # zero for what a filter does not take
+        inputs = [np.pad(B, ((0, 0), (0, readings - B.shape[1]))) for B in inputs]
+        parts = [(p.A, B, p.C) for p, B in zip(self.parameters, inputs, strict=True)]
         A, B = block_diag(*(A for A, *_ in parts)), np.vstack([B for _, B, _ in parts])
         outputs = [C if i == chosen else 0 * C for i, (*_, C) in enumerate(parts)]
         C, D = np.hstack(outputs), np.zeros((len(outputs[0]), readings))
@@ -96,10 +89,10 @@ class PredictorDesign(Design):
     @property
     def controllers(self) -> dict[frozenset[str], Controller]:
         """The controller of all sensors, and that of the loop's own alone."""
-        alone = {frozenset(self.problem.suite.units[1:]): i for i in range(1, len(self.parameters))}
-        return {frozenset(): self.controller} | {
-            missing: self._controller(place) for missing, place in alone.items()
-        }
+        controllers = {frozenset[str](): self.controller}
+        if len(self.parameters) > 1:
+            controllers[frozenset(self.problem.suite.units[1:])] = self._controller(1)
+        return controllers
 
     @property
     def expected_residual_nm(self) -> float | None:
@@ -116,7 +109,11 @@ class PredictorDesign(Design):
         names = [*(f"wavefront {i + 1}" for i in range(q)), *suite.channels]
         units = ["nm"] * q + ["m/s^2"] * len(suite.channels)
         rows = [
-            NoiseRow(reading=name, unit=unit, command_rms=gain)
+            facts(
+                reading=fact(name, "reading"),
+                unit=fact(unit, "unit of the noise"),
+                command_rms=fact(gain, "command over it, rms", format=".4g"),
+            )
             for name, unit, gain in zip(names, units, self.claims["command_rms"], strict=False)
         ]
         return (RowTable(key="noise", title="Command of white noise of a reading", rows=rows),)
@@ -143,11 +140,6 @@ class PredictorDesign(Design):
                 loop = close_loop(self.problem, controller)
                 checks.append(stability_check("spectral radius of the fall-back's loop", loop))
         return Evidence(design=self, certificate=replace(UNCERTIFIED, checks=tuple(checks)))
-
-
-def _padded(B: FloatArray, inputs: int) -> FloatArray:
-    """Return an input matrix with zeros for readings that a filter does not take."""
-    return np.hstack([B, np.zeros((len(B), inputs - B.shape[1]))])
 
 
 def command_rms(parameters: Sequence[Controller]) -> tuple[float, ...]:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from lbt_synth.design.certificate import Certificate
-from lbt_synth.design.filter_design import Fallback
 from lbt_synth.design.plain import from_plain, to_plain
 from lbt_synth.design.result import Design, SolverReport
 from lbt_synth.linear import Controller, EstimationProblem
@@ -75,18 +74,14 @@ class DesignRecord:
         kind = _PROBLEMS[self.meta["problem"]]
         if kind is LoopHardware:
             return self.hardware()
-        if kind is not EstimationProblem:
-            return self._assembled_plant()
-        fields: dict[str, Any] = {name: self.arrays[f"PLANT_{name}"] for name in "ABCDL"}
-        return EstimationProblem(**fields, dt_s=self.meta["dt_s"])
-
-    def _assembled_plant(self) -> TipTiltPlant:
-        """Return the plant of loop, turbulence, vibrations and noise, with a filter's memory."""
+        if kind is EstimationProblem:
+            fields: dict[str, Any] = {name: self.arrays[f"PLANT_{name}"] for name in "ABCDL"}
+            return EstimationProblem(**fields, dt_s=self.meta["dt_s"])
         models = {name: from_plain(self.meta[name]) for name in _PLANT_MODELS}
         noise_factor = self.arrays["NOISE"]
         parts = PlantParts(hardware=self.hardware(), noise_factor=noise_factor, **models)
         plant = assemble(parts)
-        memory = self.arrays["PLANT_L"][:, plant.n_states :]
+        memory = self.arrays["PLANT_L"][:, plant.n_states :]  # of a mixed filter
         return plant.with_memory(memory) if memory.size else plant
 
 
@@ -111,10 +106,9 @@ def _pack(name: str, value: Any) -> DesignRecord:
             places = enumerate(value, 1)
             arrays = {f"YOULA{i}_{key}": getattr(one, key) for i, one in places for key in "ABC"}
             return DesignRecord(arrays)
-        case (Fallback(), *_):
-            gains = np.stack([fallback.gains for fallback in value])
-            missing = [list(fallback.missing) for fallback in value]
-            return DesignRecord({name.upper(): gains}, {name: missing})
+        case dict():  # of fall-backs
+            gains = {name.upper(): np.stack([*value.values()])} if value else {}
+            return DesignRecord(gains, {name: list(map(list, value))})
         case _:
             return DesignRecord(meta={name: to_plain(value)})
 
@@ -133,24 +127,21 @@ def _unpack(name: str, kind: str, record: DesignRecord) -> Any:
             return Witness(states=arrays["WITNESS_X"], disturbances=arrays["WITNESS_W"])
         case "tuple[Controller, ...]":
             count = sum(key.startswith("YOULA") and key.endswith("_A") for key in arrays)
-            return tuple(_parameter(f"YOULA{place + 1}_", record) for place in range(count))
-        case "tuple[Fallback, ...]":
+            parameters = []
+            for place in range(1, count + 1):
+                A, B, C = (arrays[f"YOULA{place}_{key}"] for key in "ABC")
+                D = np.zeros((len(C), B.shape[1]))
+                parameters.append(Controller(A=A, B=B, C=C, D=D, dt_s=meta["dt_s"]))
+            return tuple(parameters)
+        case "Fallbacks":
             gains = arrays[name.upper()] if meta[name] else ()
             if len(gains) != len(meta[name]):
                 raise ValueError(f"{name.upper()} must be {len(meta[name])} filters")
-            pairs = zip(meta[name], gains, strict=True)
-            return tuple(Fallback(missing=tuple(m), gains=frozen_copy(g)) for m, g in pairs)
+            return dict(zip(map(tuple, meta[name]), map(frozen_copy, gains), strict=True))
         case "tuple[float, ...]":
             return tuple(number(value, name, above=0) for value in meta[name])
         case _:
             return from_plain(meta[name])
-
-
-def _parameter(prefix: str, record: DesignRecord) -> Controller:
-    """Return a parameter without feedthrough."""
-    shape = len(record.arrays[f"{prefix}C"]), record.arrays[f"{prefix}B"].shape[1]
-    arrays = {key: record.arrays[f"{prefix}{key}"] for key in "ABC"}
-    return Controller(**arrays, D=np.zeros(shape), dt_s=record.meta["dt_s"])
 
 
 def _own_fields(kind: type[Design]) -> dict[str, str]:
@@ -181,13 +172,21 @@ def record_design(design: Design) -> DesignRecord:
     }
     record = DesignRecord(arrays, meta)
     if design.hardware is not None:
-        record |= record_hardware(design.hardware)
+        record |= _record_hardware(design.hardware)
     for name in _own_fields(type(design)):
         record |= _pack(name, getattr(design, name))
-    return record | record_problem(design.problem)
+    problem = design.problem
+    names = {kind: name for name, kind in _PROBLEMS.items()}
+    record |= DesignRecord(meta={"problem": names[type(problem)]})
+    if not isinstance(problem, LoopHardware):
+        record |= DesignRecord({f"PLANT_{name}": getattr(problem, name) for name in "ABCDL"})
+    if isinstance(problem, TipTiltPlant):
+        models = {name: to_plain(getattr(problem, name)) for name in _PLANT_MODELS}
+        record |= DesignRecord({"NOISE": problem.own_noise_factor}, models)
+    return record
 
 
-def record_hardware(hardware: LoopHardware) -> DesignRecord:
+def _record_hardware(hardware: LoopHardware) -> DesignRecord:
     """Record a loop."""
     taps = hardware.mirror_taps
     meta: Meta = {
@@ -204,19 +203,6 @@ def record_hardware(hardware: LoopHardware) -> DesignRecord:
     if hardware.mirror is not None:
         meta["mirror"] = to_plain(hardware.mirror)
     return DesignRecord({"SENSOR": hardware.sensor, "INFLUENCE": hardware.influence}, meta)
-
-
-def record_problem(problem: EstimationProblem | LoopHardware) -> DesignRecord:
-    """Record an estimation problem, with the models that a plant is made of; or a loop alone."""
-    meta: Meta = {"problem": next(k for k, kind in _PROBLEMS.items() if type(problem) is kind)}
-    if problem is getattr(problem, "hardware", None):
-        return DesignRecord(meta=meta)
-    arrays: Arrays = {f"PLANT_{name}": getattr(problem, name) for name in "ABCDL"}
-    plant = problem if isinstance(problem, TipTiltPlant) else None
-    if plant is not None:
-        meta |= {name: to_plain(getattr(plant, name)) for name in _PLANT_MODELS}
-        arrays["NOISE"] = plant.own_noise_factor
-    return DesignRecord(arrays, meta)
 
 
 def certificate_record(certificate: Certificate) -> list[Meta]:

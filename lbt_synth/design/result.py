@@ -11,7 +11,7 @@ import numpy as np
 
 from lbt_synth.design.certificate import Certificate, Claim, Evidence, stability_check
 from lbt_synth.errors import ProblemError
-from lbt_synth.linear import Controller, EstimationProblem, StateSpace
+from lbt_synth.linear import Controller, StateSpace
 from lbt_synth.loop import (
     ClosedLoop,
     close_loop,
@@ -31,7 +31,6 @@ from lbt_synth.validation import ComplexArray, FloatArray, set_fields
 if TYPE_CHECKING:
     from lbt_synth.design.shaping import Specification
 
-LIMIT_HEADING = "least residual of any linear controller in it"  # below the residual
 _WHAT = (
     Column(name="method", heading="method"),
     Column(name="route", heading="route"),
@@ -50,7 +49,7 @@ SENSOR_FACTS = (
 )
 MODEL_LIMITS = (
     Column(name="residual_nm", heading="residual in its model, rms", unit="nm"),
-    Column(name="limit_nm", heading=LIMIT_HEADING, unit="nm"),
+    Column(name="limit_nm", heading="least residual of any linear controller in it", unit="nm"),
     Column(name="above_limit_percent", heading="residual above it", unit="%", format=".5f"),
 )
 
@@ -112,6 +111,7 @@ class Design(Summarised, ABC):
     CLAIMS: ClassVar[tuple[Claim, ...]] = ()  # what a design of this kind may claim
     DERIVED: ClassVar[tuple[Column, ...]] = ()  # numbers that follow, printed below the claims
     is_estimator: ClassVar[bool] = False  # whether it has an estimation error
+    knows_mirror: ClassVar[bool] = True  # whether it counts on dynamics of the mirror
 
     method: str
     problem: Any
@@ -179,11 +179,6 @@ class Design(Summarised, ABC):
         return {frozenset(): self.controller}
 
     @property
-    def knows_mirror(self) -> bool:
-        """Whether the design counts on the mirror's dynamics, not on a mirror that settles."""
-        return True
-
-    @property
     def expected_residual_nm(self) -> float | None:
         """Residual that the design expects, rms of all modes; None if it was made for none."""
         return None if self.hardware is None or np.isnan(self.rms) else self.rms
@@ -207,11 +202,8 @@ class Design(Summarised, ABC):
         """Return the demands on the design that a controller violates; None if it has none."""
         return None
 
-    def error_system(self, problem: EstimationProblem | None = None) -> StateSpace:
-        """System from w to the estimation error, of the design's own problem by default.
-
-        A design that is no estimator raises a ProblemError.
-        """
+    def error_system(self) -> StateSpace:
+        """System from w to the estimation error; ProblemError for a design that is no estimator."""
         raise ProblemError(f"a design of {self.method} has no estimation error.")
 
     def derived(self) -> Mapping[str, Any]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lbt_synth.errors import FileError, LbtSynthError
+from lbt_synth.errors import FileError
 from lbt_synth.storage.array_file import (
     Cards,
     digest,
@@ -93,16 +93,7 @@ class FileKind:
             yield
         except FileError:
             raise
-        except (
-            LbtSynthError,
-            ValueError,
-            LookupError,
-            TypeError,
-            AttributeError,
-            ArithmeticError,
-            RecursionError,
-            MemoryError,
-        ) as error:
+        except Exception as error:  # foreign content fails in whatever way
             raise self.error(
                 f"{source} is inconsistent: {error_reason(error)}. {self.again}", path=source
             ) from error

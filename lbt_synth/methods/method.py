@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict, model_validator
 from pydantic_core import PydanticCustomError
@@ -14,7 +14,7 @@ from lbt_synth.errors import suggest_word
 
 if TYPE_CHECKING:
     from lbt_synth.design.result import Design
-    from lbt_synth.models import Atmosphere, LoopHardware, TipTiltPlant, Truth
+    from lbt_synth.models import Atmosphere, TipTiltPlant, Truth
 
 
 class Section(BaseModel):
@@ -41,41 +41,19 @@ class Section(BaseModel):
         return self.model_dump()
 
 
-class DesignInputs(Protocol):
-    """What a method designs for: a configuration, or a plant alone."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DesignInputs:
+    """What a method designs for: a plant, and what a configuration or a record says beside it."""
 
-    @property
-    def plant(self) -> TipTiltPlant:
-        """Plant of the design, with all sensors of the loop."""
-
-    @property
-    def hardware(self) -> LoopHardware:
-        """The loop."""
-
-    @property
-    def truth(self) -> Truth:
-        """What the loop really meets."""
-
-    @property
-    def atmosphere(self) -> Atmosphere | None:
-        """Turbulence and telescope, where they are known."""
-
-    @property
-    def sensor_gain(self) -> float:
-        """Sensor gain that the design assumes; real gains are given beside it."""
-
-    @property
-    def design_defaults(self) -> Mapping[str, Any]:
-        """Options of any method that the configuration gives, by name."""
-
-    def method_section(self, name: str) -> Any:
-        """Return the section ``design.<name>``, None where the configuration has none."""
-
-    def size_nm(self, entry: Any, key: str) -> float:
-        """Return the size of an entry with ``rms_nm`` or ``rms_mas`` [nm rms wavefront]."""
-
-    def record_design(self) -> Design:
-        """Return the design that a record shows beyond its model; refuse what has no record."""
+    plant: TipTiltPlant  # with all sensors of the loop
+    truth: Truth | None = None  # what the loop really meets, where it is known
+    atmosphere: Atmosphere | None = None
+    sensor_gain: float = 1.0  # that the design assumes; real gains are given beside it
+    # the section ``design`` of a configuration: options of any method, and sections by method
+    defaults: Mapping[str, Any] = field(default_factory=dict)
+    # from an entry with a size and its key to the size [nm rms wavefront]
+    size_nm: Callable[[Any, str], float] = lambda entry, key: float(entry.rms_nm)
+    predict: Callable[[], Design] | None = None  # the design of the record, where there is one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -128,7 +128,7 @@ def _build_lqg(inputs: DesignInputs, options: LqgOptions) -> Design:
 def _build_integrator(inputs: DesignInputs, options: IntegratorOptions) -> IntegratorDesign:
     from lbt_synth.design.integrator import IntegratorLaw, integrator
 
-    section: IntegratorOptions | None = inputs.method_section(INTEGRATOR.name)
+    section: IntegratorOptions | None = inputs.defaults.get(INTEGRATOR.name)
     chosen = options.model_dump(exclude_unset=True)
     usual = {} if section is None else section.model_dump(exclude_unset=True)
     if chosen.keys() & _SIZES:
@@ -136,11 +136,17 @@ def _build_integrator(inputs: DesignInputs, options: IntegratorOptions) -> Integ
     values = usual | chosen
     gain = values.pop("gain", None)
     truth = inputs.truth if gain is None else None
-    return integrator(inputs.hardware, gain=gain, truth=truth, law=IntegratorLaw(**values))
+    return integrator(inputs.plant.hardware, gain=gain, truth=truth, law=IntegratorLaw(**values))
 
 
 def _build_predictor(inputs: DesignInputs, options: Section) -> Design:
-    return inputs.record_design()
+    if inputs.predict is None:
+        raise ProblemError(
+            "the method predictor is made of a record; got a plant or a configuration alone.",
+            in_python="Try design_from_record(record, method='predictor').",
+            at_terminal="Try lbt-synth auto RECORD --method predictor.",
+        )
+    return inputs.predict()
 
 
 KALMAN = Method(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NoReturn
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
@@ -14,7 +14,7 @@ from lbt_synth.methods.registry import METHODS, method_named
 
 if TYPE_CHECKING:
     from lbt_synth.design.result import Design
-    from lbt_synth.models import LoopHardware, TipTiltPlant, Truth
+    from lbt_synth.models import TipTiltPlant
 
 _SHORT_WORDS = {
     "greater than or equal to": "at least",
@@ -41,9 +41,9 @@ class DesignRequest:
 
     def build(self, inputs: DesignInputs) -> Design:
         """Design a controller; the inputs give defaults of options that are not given."""
-        defaults = inputs.design_defaults
-        missing = (self.method.configurable & defaults.keys()) - self.given.keys()
-        options = self.options.model_copy(update={name: defaults[name] for name in missing})
+        missing = (self.method.configurable & inputs.defaults.keys()) - self.given.keys()
+        update = {name: inputs.defaults[name] for name in missing}
+        options = self.options.model_copy(update=update)
         return self.method.build(inputs, options)
 
 
@@ -64,23 +64,9 @@ def design_request(name: str, given: Mapping[str, Any]) -> DesignRequest:
     return DesignRequest(method=method, given=dict(given), options=options)
 
 
-def refuse_without_record() -> NoReturn:
-    """Raise ProblemError: the method predictor is made of a record."""
-    raise ProblemError(
-        "the method predictor is made of a record; got a plant or a configuration alone.",
-        in_python="Try design_from_record(record, method='predictor').",
-        at_terminal="Try lbt-synth auto RECORD --method predictor.",
-    )
-
-
-def option_owners(option: str) -> list[str]:
-    """Return the names of the methods that take an option."""
-    return [m.name for m in METHODS.values() if option in m.options.model_fields]
-
-
 def _describe_stranger(option: str, method: Method) -> str:
     """Describe an option that a method does not have."""
-    if owners := option_owners(option):
+    if owners := [m.name for m in METHODS.values() if option in m.options.model_fields]:
         return f"{option} goes with method {' or '.join(owners)}; got method {method.name}."
     suggestion = suggest_word(option, sorted(method.options.model_fields))
     return f"{option} is no option of method {method.name}; {suggestion}"
@@ -107,50 +93,12 @@ def _describe_error(error: ValidationError, method: Method) -> str:
     return f"{name} must be {limit}; got {shown}. {hint}".rstrip()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlantInputs:
-    """A plant whose truth is not known, with defaults of the options."""
-
-    plant: TipTiltPlant
-    design_defaults: Mapping[str, Any] = field(default_factory=dict)
-    atmosphere: None = None
-    sensor_gain: float = 1.0
-    predict: Callable[[], Design] | None = None  # the design of the record, where there is one
-
-    @property
-    def hardware(self) -> LoopHardware:
-        """The loop."""
-        return self.plant.hardware
-
-    @property
-    def truth(self) -> Truth:
-        """Raise ProblemError: a plant is a model."""
-        raise ProblemError("this method needs a truth; got a plant alone. Try a configuration.")
-
-    def method_section(self, name: str) -> Any:
-        """Return the section that a method makes of a plant, None if it makes none."""
-        make = method_named(name).plant_section
-        return None if make is None else make(self.plant)
-
-    def record_design(self) -> Design:
-        """Return the design of the record that the plant was identified from."""
-        if self.predict is None:
-            refuse_without_record()
-        return self.predict()
-
-    def size_nm(self, entry: Any, key: str) -> float:
-        """Return the size of an entry, which must give it in nm."""
-        if entry.rms_nm is None:
-            raise ProblemError(f"{key}: expected rms_nm, as a plant knows no telescope.")
-        return float(entry.rms_nm)
-
-
 def reference_design(name: str, plant: TipTiltPlant, options: Mapping[str, Any]) -> Design:
     """Design a method for a plant as studies do that compare with it; it takes what it knows."""
     method = method_named(name)
     own = {key: value for key, value in options.items() if key in method.options.model_fields}
     request = design_request(name, {**method.reference_options, **own})
-    return request.build(PlantInputs(plant=plant))
+    return request.build(DesignInputs(plant=plant))
 
 
 def fixed_design(controller: Design | DesignRequest) -> Design | None:

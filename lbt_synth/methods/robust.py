@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from lbt_synth.design.loop_shaping import ShapedDesign
     from lbt_synth.design.shaping import VibrationBand
     from lbt_synth.design.shaping.demands import Demand
-    from lbt_synth.models import Spectrum, TipTiltPlant, Vibration
+    from lbt_synth.models import Spectrum, TipTiltPlant
 
 Axis: TypeAlias = Literal["tip", "tilt", "both"]
 _KEY = "design.robust"
@@ -129,7 +129,9 @@ def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
     """Design the controller; the section's sensor gains are real, the design's are relative."""
     from lbt_synth.design.loop_shaping import robust
 
-    section: RobustSection | None = inputs.method_section(ROBUST.name)
+    section: RobustSection | None = inputs.defaults.get(ROBUST.name)
+    if not inputs.defaults:  # there is no configuration
+        section = _plant_section(inputs.plant)
     if section is None:
         raise ConfigError(
             f"the key {_KEY} is missing: the robust design needs its bands at least. "
@@ -148,8 +150,14 @@ def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
         arguments["sensor_gain"] = (low / assumed, high / assumed)
     if section.scenarios is not None:
         arguments["scenarios"] = tuple(gain / assumed for gain in section.scenarios)
+    spectrum = None if section.turbulence == "model" else inputs.atmosphere
+    if section.turbulence == "frozen_flow" and spectrum is None:
+        raise ConfigError(
+            f"the key atmosphere is missing: {_KEY}.turbulence: frozen_flow is its spectrum. Give "
+            f"it, or {_KEY}.turbulence: model.",
+            path="atmosphere",
+        )
     with name_key(_KEY):
-        spectrum = _choose_spectrum(inputs, section)
         return robust(
             inputs.plant.own_sensor_alone(),
             bands=_build_bands(inputs, section),
@@ -159,24 +167,11 @@ def _build(inputs: DesignInputs, _: Section) -> ShapedDesign:
         )
 
 
-def _choose_spectrum(inputs: DesignInputs, section: RobustSection) -> Spectrum | None:
-    """Return the spectrum of the turbulence, None for that of the model."""
-    if section.turbulence == "model" or (section.turbulence is None and inputs.atmosphere is None):
-        return None
-    if inputs.atmosphere is None:
-        raise ConfigError(
-            f"the key atmosphere is missing: {_KEY}.turbulence: frozen_flow is its spectrum. Give "
-            f"it, or {_KEY}.turbulence: model.",
-            path="atmosphere",
-        )
-    return inputs.atmosphere
-
-
 def _build_bands(inputs: DesignInputs, section: RobustSection) -> list[list[VibrationBand]]:
     """Return the bands, one list per mode."""
     from lbt_synth.design.shaping import VibrationBand
 
-    modes = inputs.hardware.modes
+    modes = inputs.plant.hardware.modes
     bands: list[list[VibrationBand]] = [[] for _ in range(modes)]
     for i, band in enumerate(section.bands):
         key = f"{_KEY}.bands[{i}]"
@@ -187,20 +182,15 @@ def _build_bands(inputs: DesignInputs, section: RobustSection) -> list[list[Vibr
             )
         ends = {"low_hz": band.low_hz, "high_hz": band.high_hz}
         for mode in range(modes) if axis is None else (axis,):
-            damping = _model_damping(inputs, band, mode) if band.damping is None else band.damping
+            dampings = (  # of the model's vibrations in the band
+                line.damping
+                for line in inputs.plant.vibrations
+                if band.low_hz <= line.frequency_hz <= band.high_hz and line.direction[mode]
+            )
+            damping = max(dampings, default=0.0) if band.damping is None else band.damping
             with name_key(key):
                 bands[mode].append(VibrationBand(**ends, rms_nm=rms_nm, damping=damping))
     return bands
-
-
-def _model_damping(inputs: DesignInputs, band: BandSection, mode: int) -> float:
-    """Return the largest damping of the model's vibrations of a mode in a band, 0 without one."""
-    dampings = (
-        line.damping
-        for line in inputs.plant.vibrations
-        if band.low_hz <= line.frequency_hz <= band.high_hz and line.direction[mode]
-    )
-    return max(dampings, default=0.0)
 
 
 def _list_demands(
@@ -217,7 +207,7 @@ def _list_demands(
         with name_key(f"{_KEY}.bounds[{i}]"):
             demands.append(Bound(**{**bound.model_dump(), "sensor_gain": gain}))
     if section.stroke_ratio is not None:
-        influence = inputs.hardware.influence
+        influence = inputs.plant.hardware.influence
         if np.any(np.count_nonzero(influence, axis=1) != 1) or np.diff(influence.shape):
             raise ConfigError(
                 f"{_KEY}.stroke_ratio: each command must move one axis alone, as a clipped one "
@@ -237,7 +227,8 @@ def _list_demands(
                 "out, or give one model.",
                 path=_KEY,
             )
-        noise_nm = float(max(noise_per_mode(inputs.hardware, inputs.plant.own_sensor_alone().R)))
+        alone = inputs.plant.own_sensor_alone()
+        noise_nm = float(max(noise_per_mode(alone.hardware, alone.R)))
         turbulence = models[0] if spectrum is None else spectrum
         demands.append(
             CommandRms(at_most_nm=at_most_nm, rate=rate, turbulence=turbulence, noise_nm=noise_nm)
@@ -246,10 +237,8 @@ def _list_demands(
 
 
 def _plant_section(plant: TipTiltPlant) -> RobustSection:
-    """Return bands around the strongest lines of a plant, those that overlap as one.
-
-    Wide resonances need no band, and would swallow those of the lines.
-    """
+    """Return bands around the strongest lines of a plant, those that overlap as one."""
+    # wide resonances need no band, and would swallow those of the lines
     narrow = [line for line in plant.vibrations if line.damping <= WIDE_DAMPING]
     lines = sorted(narrow or plant.vibrations, key=lambda line: -line.rms_nm)
     nyquist_hz = plant.hardware.frame_rate_hz / 2
@@ -257,7 +246,10 @@ def _plant_section(plant: TipTiltPlant) -> RobustSection:
     for line in sorted(lines[:_MOST_BANDS], key=lambda line: line.frequency_hz):
         half = max(_BAND * line.frequency_hz, line.damping * line.frequency_hz)
         low, high = max(line.frequency_hz - half, 0.0), min(line.frequency_hz + half, nyquist_hz)
-        axis, rms_nm, damping = _axis(line), line.rms_nm, line.damping
+        axes = line.direction if len(line.direction) == 2 else (1.0, 1.0)
+        shaken = [name for name, mode in _AXES.items() if axes[mode]]
+        axis: Axis = shaken[0] if len(shaken) == 1 else "both"
+        rms_nm, damping = line.rms_nm, line.damping
         last = bands[-1] if bands else None
         if last is not None and low <= last.high_hz:
             bands.pop()
@@ -271,14 +263,6 @@ def _plant_section(plant: TipTiltPlant) -> RobustSection:
     if not bands:
         raise ProblemError("a robust controller is for vibrations; the plant has none.")
     return RobustSection(bands=bands, functions=_PLANT_FUNCTIONS, states=None)
-
-
-def _axis(line: Vibration) -> Axis:
-    """Return the axis that a line of two axes shakes."""
-    if len(line.direction) != 2:
-        return "both"
-    shaken = [name for name, mode in _AXES.items() if line.direction[mode]]
-    return shaken[0] if len(shaken) == 1 else "both"
 
 
 ROBUST = Method(

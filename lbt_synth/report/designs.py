@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +14,6 @@ from lbt_synth.config import Config
 from lbt_synth.design import Check, Design
 from lbt_synth.errors import LbtSynthError, ProblemError
 from lbt_synth.interop.c.export import frame_cost
-from lbt_synth.linear import Controller
 from lbt_synth.loop import ClosedLoop, loop_margins, residual_budget, stable_sensor_gains
 from lbt_synth.loop.band_limit import BandLimit
 from lbt_synth.loop.budget import ResidualBudget
@@ -39,7 +38,7 @@ from lbt_synth.storage.rows import Facts, columns, fact, facts, row_table
 from lbt_synth.storage.tables import Table
 from lbt_synth.storage.words import count_text, listing_text
 from lbt_synth.studies import robustness_map
-from lbt_synth.studies.limits import LimitRow, LimitStudy, compare_in_truth, say_residual
+from lbt_synth.studies.limits import LimitStudy, compare_in_truth, say_residual
 from lbt_synth.studies.robustness import RobustnessMap
 from lbt_synth.validation import FloatArray, frozen_copy, require_instance
 
@@ -50,7 +49,7 @@ class DesignAssessment:
 
     design: Design
     loop: ClosedLoop  # with the real sensor gain
-    limits: LimitRow  # name, residual, Strehl ratio, and how far they are from the limits
+    limits: Facts  # name, residual, Strehl ratio, and how far they are from the limits
     # None where the loop is unstable: the exact residual, and, None for several sensors, too, the
     # margins at the real sensor gain
     budget: ResidualBudget | None
@@ -67,7 +66,7 @@ class DesignAssessment:
     @property
     def name(self) -> str:
         """Its name in the report."""
-        return self.limits.design
+        return str(self.limits.design)
 
     @property
     def stable(self) -> bool:
@@ -86,7 +85,7 @@ class DesignAssessment:
 
 
 def assess_design(
-    design: Design, limits: LimitRow, config: Config, errors_hz: FloatArray
+    design: Design, limits: Facts, config: Config, errors_hz: FloatArray
 ) -> DesignAssessment:
     """Assess a design in the loop of a configuration, over frequency errors (e,)."""
     hardware, truth = config.hardware, config.truth
@@ -106,7 +105,8 @@ def assess_design(
         starts += image.sensor_gains[image.stable[0]].tolist()
         image = replace(image, sensor_gains=frozen_copy(gains))  # the real ones again
         worst_strehl = float(image.strehl[0, int(np.searchsorted(gains, real_gain))].min())
-    low, high = stable_interval(hardware, design.controller, starts)
+    intervals = (stable_sensor_gains(hardware, design.controller, nominal=g) for g in starts)
+    low, high = next((ends for ends in intervals if not np.isnan(ends[0])), (np.nan, np.nan))
     return DesignAssessment(
         design=design,
         loop=loop,
@@ -144,14 +144,6 @@ def require_compatible(name: str, design: Design, hardware: LoopHardware) -> Non
             f"{name} must run at the configuration's {hardware.frame_rate_hz:g} Hz; got a design "
             f"for {made_for.frame_rate_hz:g} Hz. Design it for this frame rate."
         )
-
-
-def stable_interval(
-    hardware: LoopHardware, controller: Controller, starts: Iterable[float]
-) -> tuple[float, float]:
-    """Return the interval of stable sensor gains around the first stable one of some, or nan."""
-    intervals = (stable_sensor_gains(hardware, controller, nominal=start) for start in starts)
-    return next((ends for ends in intervals if not np.isnan(ends[0])), (np.nan, np.nan))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -292,10 +284,7 @@ def _certificate_word(one: DesignAssessment) -> str:
 
 
 def verdict(report: DesignReport) -> str:
-    """Return at most three sentences: which design leaves least, which is robust, what is proved.
-
-    The table of the report has all.
-    """
+    """Return three sentences at most: which design leaves least, which is robust, the proofs."""
     sentences = []
     if report.stable:
         best = min((one.limits for one in report.stable), key=lambda row: row.residual_nm)
@@ -407,12 +396,14 @@ def report_page(
     heading = f"Controllers for {source.name}" if title is None else title.strip()
     if not heading:
         raise ProblemError("title must hold at least one letter; got an empty text.")
+    several = {one.name: one.design.tables()[0] for one in report.assessments if not one.alone}
+    failures = [row_table(f"{name}: {table.title}", table.rows) for name, table in several.items()]
     return new_page(
         heading,
         f"{count_text(len(report.assessments), 'design')}: {listing_text(report.names)}",
         {
             "Summary": _summary_blocks(report),
-            "When sensors fail": _failure_blocks(report),
+            "When sensors fail": failures,
             "Transfer functions": _transfer_blocks(report),
             "Robustness": _robustness_blocks(report),
             "Certificates": _certificate_blocks(report),
@@ -459,12 +450,6 @@ def _summary_blocks(report: DesignReport) -> list[Block]:
             differences = loop_differences(one.design.hardware, config.hardware)
             notes += [f"{one.name} was {text}" for text in differences]
     return [*blocks, *(Notice(text=note) for note in notes)]
-
-
-def _failure_blocks(report: DesignReport) -> list[Block]:
-    """Return what designs of several sensors leave while some fail."""
-    tables = {one.name: one.design.tables()[0] for one in report.assessments if not one.alone}
-    return [row_table(f"{name}: {table.title}", table.rows) for name, table in tables.items()]
 
 
 def _transfer_blocks(report: DesignReport) -> list[Block]:

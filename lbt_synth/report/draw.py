@@ -97,14 +97,9 @@ def house_style() -> Iterator[None]:
         yield
 
 
-def require_figure_name(path: str | os.PathLike[str]) -> Path:
-    """Refuse a file name that is not that of a figure."""
-    return require_ending(path, "a figure", FIGURE_ENDINGS)
-
-
 def save_figure(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure, whole or not at all."""
-    target = require_figure_name(path)
+    target = require_ending(path, "a figure", FIGURE_ENDINGS)
     ending = target.suffix.lower()
     buffer = io.BytesIO()
     # without a date, the same figure is the same file
@@ -265,8 +260,3 @@ def shorten(text: str, most: int) -> str:
     if len(text) <= most:
         return text
     return f"{text[: most // 2]}…{text[len(text) - (most - 1) // 2 :]}"
-
-
-def count_columns(panels: int) -> int:
-    """Return how many panels stand side by side: three, but two if there are four."""
-    return 2 if panels == 4 else min(panels, 3)

@@ -113,6 +113,14 @@ def study_page(
     }
     values = {name: np.asarray(columns[name], float) for name in statistics.parameters}
     varying = sum(np.ptp(column) > 0 for column in values.values())
+    dependence: list[Block] = [Notice(text=paragraph("no-index"))]
+    if statistics.ranked:
+        dependence = [sensitivity_table(statistics), *_map_charts(statistics, samples, values)]
+    origin = (
+        ("samples with results", f"{statistics.samples} of {study.samples}"),
+        ("digest of the study", study.digest),
+        ("computing time, of all processes together", duration_text(computing_s)),
+    )
     return new_page(
         f"Robustness study {study.source.name}",
         f"{statistics.samples} samples of {varying} parameters, "
@@ -121,12 +129,12 @@ def study_page(
             "Summary": _summary_blocks(study, statistics, samples),
             "What was sampled": _samples_blocks(study, values),
             "Controllers": _controllers_blocks(study, statistics, failures),
-            "What the Strehl ratio depends on": _dependence_blocks(statistics, samples, values),
+            "What the Strehl ratio depends on": dependence,
             "Worst samples": _worst_blocks(study, statistics, columns, os.fspath(folder)),
             "How to read the figures": [paragraph(name) for name in ("intervals", "indices")],
         },
         sources=list(zip_longest(study.inputs, ("study", "configuration"), fillvalue="gain file")),
-        facts=[_origin_table(study, statistics, computing_s)],
+        facts=[Table(caption="Study", headings=("what", "value"), rows=origin, words=(1,))],
     )
 
 
@@ -151,10 +159,7 @@ def _summary_blocks(
 
 
 def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, LoopMargins]:
-    """Return the margins of the designs of a study in the loops that they were made for.
-
-    A controller that is designed for each sample has none, nor has one of several sensors.
-    """
+    """Return the margins of designs for the whole study, of one sensor, in their own loops."""
     loops = {
         name: close_loop(design.hardware, design)
         for name in (controller.controller for controller in statistics.controllers)
@@ -167,10 +172,7 @@ def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, Loop
 
 
 def study_verdict(statistics: StudyStatistics) -> list[str]:
-    """Say which controllers are unstable, which leads by each measure, and what it depends on.
-
-    The reader decides which measure counts.
-    """
+    """Say which controllers are unstable, which leads by each measure, and what it depends on."""
     with_data = [one for one in statistics.controllers if one.samples]
     if not with_data:
         return ["No controller was evaluated on any sample."]
@@ -241,20 +243,6 @@ def _controllers_blocks(
     return blocks
 
 
-def _dependence_blocks(
-    statistics: StudyStatistics,
-    samples: Mapping[str, Samples],
-    values: Mapping[str, FloatArray],
-) -> list[Block]:
-    """Show what the Strehl ratio depends on."""
-    if not statistics.ranked:
-        return [Notice(text=paragraph("no-index"))]
-    return [
-        sensitivity_table(statistics),
-        *_map_charts(statistics, samples, values),
-    ]
-
-
 def _worst_blocks(
     study: Study,
     statistics: StudyStatistics,
@@ -274,15 +262,6 @@ def _worst_blocks(
     caption = "Commands that replay the first of each table; any other row likewise"
     opening = paragraph("worst", count=_PARAMETERS)
     return [opening, *tables, (caption, "\n".join(dict.fromkeys(commands)))]
-
-
-def _origin_table(study: Study, statistics: StudyStatistics, computing_s: float) -> Table:
-    rows = (
-        ("samples with results", f"{statistics.samples} of {study.samples}"),
-        ("digest of the study", study.digest),
-        ("computing time, of all processes together", duration_text(computing_s)),
-    )
-    return Table(caption="Study", headings=("what", "value"), rows=rows, words=(1,))
 
 
 def _distribution_chart(samples: Mapping[str, Samples]) -> list[Chart]:

@@ -11,10 +11,6 @@ from itertools import zip_longest
 from textwrap import wrap
 from typing import Any
 
-from lbt_synth.errors import DimensionError
-from lbt_synth.validation import choice, set_fields
-
-TONES = ("plain", "good", "bad", "note")
 _LONGEST_NUMBER = 20  # letters; a longer word may be broken
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")  # how the cells begin that spreadsheets compute
 
@@ -24,10 +20,7 @@ class Cell:
     """A cell of a table with a tone beside its text."""
 
     text: str
-    tone: str = "plain"  # one of TONES; the text must say the same
-
-    def __post_init__(self) -> None:
-        choice(self.tone, "tone", TONES)
+    tone: str = "plain"  # or good, bad, note; the text must say the same
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,15 +31,6 @@ class Table:
     headings: tuple[str, ...]  # one per column, the first over the headings of the rows
     rows: tuple[tuple[str | Cell, ...], ...]  # a single cell is a heading of the rows below
     words: tuple[int, ...] = ()  # columns set flush left, besides the first
-
-    def __post_init__(self) -> None:
-        set_fields(self, headings=tuple(self.headings), rows=tuple(map(tuple, self.rows)))
-        for row in self.rows:
-            if len(row) not in (1, len(self.headings)):
-                raise DimensionError(
-                    f"a row of {self.caption!r} must have 1 or {len(self.headings)} cells; got "
-                    f"{len(row)}."
-                )
 
     def cells(self) -> Iterator[tuple[Cell, ...]]:
         """Rows with every text as a cell."""

@@ -152,7 +152,10 @@ class Sweep:
         Without an executor the parts run here. Each is written as it comes.
         """
         folder, count = make_directory(self.folder, parents=False), progress or (lambda rows: None)
-        in_flight = _in_flight(executor, workers)
+        in_flight = 1
+        if executor is not None:  # two a worker, so that none waits
+            pool_size = getattr(executor, "_max_workers", None) or os.cpu_count() or 1
+            in_flight = 2 * (workers or pool_size)
         # more parts than are in flight, so that no worker waits long for the last
         share = -(-self.rows // (2 * in_flight + 2))
         with exclusive_lock(folder, "computation"):
@@ -178,13 +181,6 @@ class Sweep:
         failures = [failure for part in parts for failure in part.failures]
         results = np.concatenate([part.results for part in parts])
         return Part(results, failures, sum(part.seconds for part in parts)), computed
-
-
-def _in_flight(executor: futures.Executor | None, workers: int | None) -> int:
-    """Return how many tasks an executor has at once: two a worker, so that none waits."""
-    if executor is None:
-        return 1
-    return 2 * (workers or getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
 
 
 def _compute(
@@ -244,21 +240,23 @@ def _explain_failure(rows: Rows) -> Iterator[None]:
         ) from error
 
 
+@contextlib.contextmanager
 def choose_engine(
     jobs: int, dask: str | None = None
-) -> contextlib.AbstractContextManager[tuple[futures.Executor | None, int | None]]:
-    """Provide the executor of a Dask scheduler or of processes with its workers; None for one."""
+) -> Iterator[tuple[futures.Executor | None, int | None]]:
+    """Provide the executor of a Dask scheduler or of processes with its workers; None for one.
+
+    The processes have one thread each, and end at once if the block fails.
+    """
     if dask is not None:
-        return connect_cluster(dask)
-    return contextlib.nullcontext((None, None)) if jobs == 1 else _start_processes(jobs)
-
-
-@contextlib.contextmanager
-def _start_processes(jobs: int) -> Iterator[tuple[futures.Executor, int]]:
-    """Provide processes with one thread each, which end at once if the block fails."""
-    integer(jobs, "--jobs", at_least=1, at_most=8 * (os.cpu_count() or 1))
-    with limit_threads(), WorkerPool(jobs) as pool:
-        yield pool, jobs
+        with connect_cluster(dask) as cluster:
+            yield cluster
+    elif jobs == 1:
+        yield None, None
+    else:
+        integer(jobs, "--jobs", at_least=1, at_most=8 * (os.cpu_count() or 1))
+        with limit_threads(), WorkerPool(jobs) as pool:
+            yield pool, jobs
 
 
 @contextlib.contextmanager
@@ -289,16 +287,12 @@ def connect_cluster(address: str) -> Iterator[tuple[futures.Executor, int]]:
             raise ProblemError(
                 f"the scheduler at {address} has no workers; start some with dask worker {address}."
             ) from error
-        _require_versions(address, client)
+        hosts = client.get_versions(packages=["lbt_synth"])["workers"]
+        versions = {host["packages"].get("lbt_synth") or "none" for host in hosts.values()}
+        if versions != {lbt_synth.__version__}:
+            raise ProblemError(
+                f"all workers must have lbt_synth {lbt_synth.__version__}, as here; those of "
+                f"{address} have {', '.join(sorted(versions))}. Start them from the same "
+                "environment."
+            )
         yield client.get_executor(pure=False), sum(client.ncores().values())
-
-
-def _require_versions(address: str, client: Any) -> None:
-    """Refuse workers without this version, whose results would be others."""
-    hosts = client.get_versions(packages=["lbt_synth"])["workers"]
-    versions = {host["packages"].get("lbt_synth") or "none" for host in hosts.values()}
-    if versions != {lbt_synth.__version__}:
-        raise ProblemError(
-            f"all workers must have lbt_synth {lbt_synth.__version__}, as here; those of {address} "
-            f"have {', '.join(sorted(versions))}. Start them from the same environment."
-        )

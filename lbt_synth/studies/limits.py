@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from types import SimpleNamespace
 
 import numpy as np
 
@@ -13,30 +12,15 @@ from lbt_synth.config import Config
 from lbt_synth.config.samples import at_frame_rate
 from lbt_synth.design import Design
 from lbt_synth.errors import LbtSynthError, ProblemError, refuse_config
-from lbt_synth.loop import ClosedLoop, Imaging, least_residual, residual_budget, strehl
+from lbt_synth.loop import Imaging, least_residual, residual_budget, strehl
 from lbt_synth.loop.band_limit import BandLimit, least_worst_residual
 from lbt_synth.loop.least_residual import ResidualLimit, above_percent, limit_or_none
 from lbt_synth.loop.margins import phase_margin_deg
 from lbt_synth.methods.registry import INTEGRATOR, KALMAN, design_label, reference_methods
-from lbt_synth.models import (
-    LoopHardware,
-    SinusoidalVibration,
-    Truth,
-)
+from lbt_synth.models import LoopHardware, SinusoidalVibration, Truth
 from lbt_synth.models.vibration import stationary_vibrations
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import (
-    NM,
-    PERCENT,
-    Facts,
-    column,
-    fact,
-    facts,
-    fill_row,
-    nm_column,
-    percent_column,
-    table_row,
-)
+from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts
 from lbt_synth.studies.grid import loop_columns
 from lbt_synth.validation import FloatArray, frozen_copy, number
 
@@ -47,48 +31,15 @@ _CLEAR = 0.01  # of the residual's variance by which a reference has to be bette
 _SURPRISING = 1.5
 
 
-@table_row
-class LimitRow:
-    """One design beside the limits; what an unstable loop does not have is nan."""
-
-    design: str = column("design", help="Its name")
-    method: str = column(help="How it was made")
-    residual_nm: float = nm_column(
-        "residual", format=".2f", missing="unstable", help="Residual under the truth, rms"
-    )
-    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
-    above_limit_percent: float = column(
-        "above the limit",
-        unit="%",
-        format=".2f",
-        help="Residual over the limit, less 1; nan where there is no limit, it is 0, or the design "
-        "reads other sensors, which the limit does not",
-    )
-    worst_nm: float = nm_column(
-        "worst residual",
-        format=".2f",
-        help="Largest residual with all true vibrations moved within the range of errors, rms",
-    )
-    above_band_limit_percent: float = column(
-        "above the band limit",
-        unit="%",
-        format=".2f",
-        help="The same over the limit for the band, less 1; nan likewise",
-    )
-    phase_margin_deg: float = column(
-        "phase margin",
-        unit="deg",
-        format=".1f",
-        help="Least phase margin of the loop in the truth, each measurement broken in turn",
-    )
-    stable: bool = column(help="Whether the loop is stable with the real sensor gain")
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LimitStudy:
     """Designs beside the limits, over the true frequency of the vibrations."""
 
-    rows: tuple[LimitRow, ...]  # one per design
+    # one per design: its residual and Strehl ratio in the truth; the residual over the limit, less
+    # 1, and the largest one with all true vibrations moved within the range of errors, over the
+    # limit for the band; the phase margin. What there is not is nan: of an unstable loop, of a
+    # limit of 0, of a design that reads other sensors than the limits do
+    rows: tuple[Facts, ...]
     # the least residual of any linear controller; None where the modes do not decouple
     limit: ResidualLimit | None
     # the least worst residual with the sinusoid anywhere in the range of errors; None unless the
@@ -126,7 +77,11 @@ def limits(
     if not errors:
         raise ProblemError("errors_hz must hold at least one error; got none.")
     vibrations = stationary_vibrations(truth.vibrations)
-    shifts = _frequency_shifts(truth, errors)
+    shifts = np.zeros(0)  # the range of errors, the errors and 0 among them
+    if vibrations:
+        zero = [0.0] if min(errors) <= 0 <= max(errors) else []
+        grid = np.linspace(min(errors), max(errors), _GRID)
+        shifts = np.unique(np.concatenate([grid, errors, zero]) + 0.0)
     alone = hardware.own_sensor_alone()
     limit = limit_or_none(lambda: least_residual(alone, truth))
     band = band_hz = None
@@ -160,50 +115,38 @@ def _limit_row(
     met: tuple[LoopHardware, Truth, Imaging],
     shifts: FloatArray,
     bounds_nm: tuple[float, ...],
-) -> tuple[LimitRow, FloatArray]:
+) -> tuple[Facts, FloatArray]:
     """Return the row of a design beside the two limits, and its residual at each shift, (s,)."""
     hardware, truth, imaging = met
     loop = design.close(hardware, sensor_gain=truth.sensor_gain)
     numbers = loop_columns(loop, truth, imaging)
     residual_nm = numbers["residual_nm"]
-    curve = _residual_curve(loop, truth, shifts, residual_nm)
+    curve = np.full(shifts.size, residual_nm)
+    if loop.is_stable and np.any(shifts):  # only vibrations move
+        still = replace(truth, turbulence=None, noise_nm=0.0)
+        moved = [still.with_frequency_error(float(shift)) for shift in (0.0, *shifts)]
+        first, *others = (np.trace(residual_budget(loop, shaken).total_nm2) for shaken in moved)
+        curve = np.sqrt(residual_nm**2 - first + np.array(others))
     worst_nm = float(np.max(curve)) if shifts.size else residual_nm
     margin_deg, (limit_nm, band_nm) = np.nan, bounds_nm
     if loop.reads_others:  # the limits are those of the loop's own sensor
         limit_nm = band_nm = np.nan
     elif loop.is_stable:
         margin_deg = phase_margin_deg(loop)
-    row = {
-        "design": name,
-        "above_limit_percent": above_percent(residual_nm, limit_nm),
-        "worst_nm": worst_nm,
-        "above_band_limit_percent": above_percent(worst_nm, band_nm),
-        "phase_margin_deg": margin_deg,
-        "stable": loop.is_stable,
-    }
-    return fill_row(LimitRow, SimpleNamespace(**numbers), design, **row), curve
-
-
-def _frequency_shifts(truth: Truth, errors_hz: Sequence[float]) -> FloatArray:
-    """Return the shifts over the range of errors, the errors and 0 among them."""
-    if not truth.vibrations:
-        return np.zeros(0)
-    moved = np.array(errors_hz)
-    grid = np.linspace(moved.min(), moved.max(), _GRID)
-    inside = [0.0] if moved.min() <= 0 <= moved.max() else []
-    return np.asarray(np.unique(np.concatenate([grid, moved, inside]) + 0.0))
-
-
-def _residual_curve(
-    loop: ClosedLoop, truth: Truth, shifts: FloatArray, residual_nm: float
-) -> FloatArray:
-    """Return the residual at each shift [nm rms], (s,), of which only vibrations move."""
-    if not (loop.is_stable and np.any(shifts)):
-        return np.full(shifts.size, residual_nm)
-    still = replace(truth, turbulence=None, noise_nm=0.0)
-    moved = [still.with_frequency_error(float(shift)) for shift in (0.0, *shifts)]
-    first, *others = (np.trace(residual_budget(loop, shaken).total_nm2) for shaken in moved)
-    return np.asarray(np.sqrt(residual_nm**2 - first + np.array(others)))
+    above, above_band = above_percent(residual_nm, limit_nm), above_percent(worst_nm, band_nm)
+    rms, over = {"unit": "nm", "format": ".2f"}, {"unit": "%", "format": ".2f"}
+    row = facts(
+        design=fact(name, "design"),
+        method=fact(design.method),
+        residual_nm=fact(residual_nm, "residual", missing="unstable", **rms),
+        strehl=fact(numbers["strehl"], "Strehl", **PERCENT),
+        above_limit_percent=fact(above, "above the limit", **over),
+        worst_nm=fact(worst_nm, "worst residual", **rms),
+        above_band_limit_percent=fact(above_band, "above the band limit", **over),
+        phase_margin_deg=fact(margin_deg, "phase margin", unit="deg", format=".1f"),
+        stable=fact(loop.is_stable),
+    )
+    return row, curve
 
 
 def limits_at_rate(config: Config, frame_rate_hz: float) -> Facts:
@@ -275,7 +218,7 @@ def compare_in_truth(
 
 
 def _warnings(
-    design: Design, row: LimitRow, config: Config, others: Mapping[str, tuple[Design, float]]
+    design: Design, row: Facts, config: Config, others: Mapping[str, tuple[Design, float]]
 ) -> Iterator[str]:
     """Yield what is wrong with a design in the truth of a configuration."""
     if not row.stable:
@@ -306,7 +249,7 @@ def _warnings(
             )
 
 
-def say_residual(name: str, row: LimitRow, limit: ResidualLimit | None) -> str:
+def say_residual(name: str, row: Facts, limit: ResidualLimit | None) -> str:
     """Return the sentence on what a stable design leaves in the truth."""
     said = f"{name} leaves {nm_text(row.residual_nm, '.1f')} rms in the truth (Strehl ratio "
     said += f"{100 * row.strehl:.1f} %)"

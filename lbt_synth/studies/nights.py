@@ -26,8 +26,9 @@ from lbt_synth.identification.auto import (
 from lbt_synth.identification.prediction.regression import noisier
 from lbt_synth.identification.records.record import LoopRecord
 from lbt_synth.loop import residual_budget
+from lbt_synth.methods.method import DesignInputs
 from lbt_synth.methods.registry import default_method, method_named, record_methods
-from lbt_synth.methods.request import PlantInputs, design_request
+from lbt_synth.methods.request import design_request
 from lbt_synth.models import TipTiltPlant, Vibration
 from lbt_synth.models.plant.assembly import PlantParts
 from lbt_synth.models.plant.tip_tilt import assemble
@@ -178,7 +179,7 @@ def design_from_nights(
 
     def build(noise: float) -> Design:
         plants = [noisier(recorded.model, noise).plant() for recorded in made.values()]
-        return design_request(chosen, {}).build(PlantInputs(plant=mean_plant(plants, weights)))
+        return design_request(chosen, {}).build(DesignInputs(plant=mean_plant(plants, weights)))
 
     try:
         design, _, note = design_for_gains(
@@ -247,10 +248,7 @@ def mean_plant(plants: Sequence[TipTiltPlant], weights: Sequence[float]) -> TipT
 
 
 def _merge(lines: Sequence[Vibration]) -> list[Vibration]:
-    """Return lines, with one for those that nearly are.
-
-    They have one direction, none is twice as wide, and they are nearer than its half width.
-    """
+    """Return lines, with one for those of a direction that are nearer than their half widths."""
     merged = list[Vibration]()
     for line in sorted(lines, key=lambda one: (one.direction, one.sections, one.frequency_hz)):
         last = merged[-1] if merged else line

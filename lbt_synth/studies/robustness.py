@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,9 +62,6 @@ from lbt_synth.validation import (
     require_instance,
 )
 
-_Loop: TypeAlias = tuple[Design, LoopHardware, Truth, Imaging]
-# true vibrations, each with its frequencies [Hz] under e errors, (e,)
-_MovedLines: TypeAlias = Sequence[tuple[Vibration | SinusoidalVibration, FloatArray]]
 FAMILIES = (MIXED.name, "central")
 _CROWDING = 1.5  # above 1, points are denser near the least norm
 
@@ -308,9 +305,10 @@ def robustness_map(
     )
 
 
-def _moved_lines(truth: Truth, errors_hz: FloatArray, hardware: LoopHardware) -> _MovedLines:
-    """Return the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
-    moved: list[tuple[Vibration | SinusoidalVibration, FloatArray]] = []
+def _moved_lines(
+    truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
+) -> Iterator[tuple[Vibration | SinusoidalVibration, FloatArray]]:
+    """Yield the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
     nyquist_hz, shares = hardware.frame_rate_hz / 2, truth.frequency_shifts_hz(1.0)
     for line, share in zip(stationary_vibrations(truth.vibrations), shares, strict=True):
         checked_direction(line, hardware)
@@ -322,8 +320,7 @@ def _moved_lines(truth: Truth, errors_hz: FloatArray, hardware: LoopHardware) ->
                 f"error of {errors_hz[wrong][0]:.6g} Hz, which moves the one at "
                 f"{line.frequency_hz:.6g} Hz to {frequencies[wrong][0]:.6g} Hz."
             )
-        moved.append((line, frequencies))
-    return moved
+        yield line, frequencies
 
 
 def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
@@ -359,24 +356,18 @@ def mirror_rows(
         "kalman, real positions": kalman(plant),
         regulated.method: regulated,
     }
-    return tuple(
-        _mirror_row(name, (design, hardware, truth, imaging)) for name, design in designs.items()
-    )
-
-
-def _mirror_row(name: str, loop: _Loop) -> Facts:
-    """Return what a design leaves on a moving mirror."""
-    design, hardware, truth, imaging = loop
-    closed = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-    numbers = loop_columns(closed, truth, imaging)
-    return facts(
-        design=fact(name, "design"),
-        stable=fact(closed.is_stable),
-        residual_nm=fact(
-            numbers["residual_nm"], "residual", missing="unstable", unit="nm", format=".2f"
-        ),
-        strehl=fact(numbers["strehl"], "Strehl", **PERCENT),
-    )
+    rows, rms = [], {"unit": "nm", "format": ".2f", "missing": "unstable"}
+    for name, design in designs.items():
+        closed = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
+        numbers = loop_columns(closed, truth, imaging)
+        row = facts(
+            design=fact(name, "design"),
+            stable=fact(closed.is_stable),
+            residual_nm=fact(numbers["residual_nm"], "residual", **rms),
+            strehl=fact(numbers["strehl"], "Strehl", **PERCENT),
+        )
+        rows.append(row)
+    return tuple(rows)
 
 
 def tradeoff(
@@ -436,31 +427,27 @@ def tradeoff(
     spread = max(best.gamma / least.gamma_least, 1.0)
     levels = least.gamma_least * spread ** (np.linspace(0, 1, count) ** _CROWDING)
     ends: dict[int, FilterDesign] = {0: least, count - 1: best}
+    size = {"unit": "nm", "format": ".2f"}
     for i, level in enumerate(levels.tolist()):
         for family in FAMILIES:
             if (design := ends.get(i)) is None and family == MIXED.name:
                 design = mixed(problem, gamma=level, taps=length)
             elif design is None:
                 design = central_filter(problem, gamma=level)
-            yield _front_point(family, design, least.gamma_least)
-
-
-def _front_point(family: str, design: FilterDesign, gamma_least: float) -> Facts:
-    """Examine the loop of a filter of a family."""
-    margins: Any = SimpleNamespace(gain_low=np.nan, gain_high=np.nan, modulus=np.nan)
-    if design.hardware is not None:
-        margins = loop_margins(close_loop(design.hardware, design.controller))
-    size, ratio = {"unit": "nm", "format": ".2f"}, design.gamma / gamma_least
-    return facts(
-        family=fact(family, "filter"),
-        gamma=fact(design.gamma, "norm", **size),
-        gamma_ratio=fact(max(ratio, 1.0), "norm / least", format=".4f"),
-        rms=fact(design.rms, "rms", **size),
-        gain_low=fact(margins.gain_low, "gain from", format=".3f"),
-        gain_high=fact(margins.gain_high, "gain to", format=".3f"),
-        modulus=fact(margins.modulus, "modulus margin", format=".3f"),
-        design=fact(design),
-    )
+            margins: Any = SimpleNamespace(gain_low=np.nan, gain_high=np.nan, modulus=np.nan)
+            if design.hardware is not None:
+                margins = loop_margins(close_loop(design.hardware, design.controller))
+            ratio = max(design.gamma / least.gamma_least, 1.0)
+            yield facts(
+                family=fact(family, "filter"),
+                gamma=fact(design.gamma, "norm", **size),
+                gamma_ratio=fact(ratio, "norm / least", format=".4f"),
+                rms=fact(design.rms, "rms", **size),
+                gain_low=fact(margins.gain_low, "gain from", format=".3f"),
+                gain_high=fact(margins.gain_high, "gain to", format=".3f"),
+                modulus=fact(margins.modulus, "modulus margin", format=".3f"),
+                design=fact(design),
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -500,9 +487,11 @@ class ModalStudy:
 def compare_modes(config: Config, modes: int) -> ModalStudy:
     """Compare integrators of the best gains with Kalman filters, for the first modes of a loop."""
     hardware, sensor_gain = config.hardware, config.settings.model.sensor_gain
-    reason = "the turbulence of hundreds of modes is computed from it"
+    if config.atmosphere is None:
+        reason = "the turbulence of hundreds of modes is computed from it"
+        config.refuse_key("atmosphere", f"is missing: {reason}")
     rate_hz = hardware.frame_rate_hz
-    air = modal_turbulence(config.require_atmosphere(reason), modes=modes, frame_rate_hz=rate_hz)
+    air = modal_turbulence(config.atmosphere, modes=modes, frame_rate_hz=rate_hz)
     for key, value in (("sensor.noise_nm", config.noise_nm), ("model.sensor_gain", sensor_gain)):
         if np.ndim(value):
             config.refuse_key(key, "must be one number for hundreds of modes; got one per axis")

@@ -74,25 +74,26 @@ def test_a_certified_filter(kalman):
     assert len(kalman.fallbacks) == len(kalman.controllers) - 1 == 15
     assert np.abs(kalman.poles).max() < 1
     marked = plant.hardware.suite.marked(("m1", "truth"), plant.hardware)
-    fallback = next(some for some in kalman.fallbacks if some.missing == ("truth", "m1"))
-    assert not fallback.gains[:, :, marked].any()
+    assert not kalman.fallbacks["truth", "m1"][:, :, marked].any()
     alone = lbt.kalman(plant.own_sensor_alone())
-    assert (alone.fallbacks, alone.other_sensors, alone.tables()) == ((), (), ())
+    assert (alone.fallbacks, alone.other_sensors, alone.tables()) == ({}, (), ())
     assert kalman.rms < lbt.kalman(example_plant((FAST,))).rms < alone.rms  # each sensor helps
 
 
 def test_gains_and_fallbacks_that_are_wrong(kalman):
     triple = failed(kalman, gain_predictor=3 * kalman.gain_predictor)
     assert "spectral radius of the filter over a period" in triple
-    first, *others = kalman.fallbacks
-    for gains in (1.001 * first.gains, kalman.gain_predictor):
-        names = failed(kalman, fallbacks=(replace(first, gains=gains), *others))
+    fallbacks = kalman.fallbacks
+    first, *_, last = fallbacks
+    for gains in (1.001 * fallbacks[first], kalman.gain_predictor):
+        names = failed(kalman, fallbacks={**fallbacks, first: gains})
         assert names == {"distance from the least-variance gains of any fall-back"}
-    last = replace(kalman.fallbacks[-1], gains=1e-3 * kalman.gain_predictor)
-    assert failed(kalman, fallbacks=(*kalman.fallbacks[:-1], last))
-    for some in (kalman.fallbacks[1:], kalman.fallbacks[::-1]):
-        assert failed(kalman, fallbacks=some) == {"sets of failed sensors without a fall-back"}
-    diverging = (replace(first, gains=20 * first.gains), *others)
+    assert failed(kalman, fallbacks={**fallbacks, last: 1e-3 * kalman.gain_predictor})
+    pairs = list(fallbacks.items())
+    for some in (pairs[1:], pairs[::-1]):
+        names = failed(kalman, fallbacks=dict(some))
+        assert names == {"sets of failed sensors without a fall-back"}
+    diverging = {**fallbacks, first: 20 * fallbacks[first]}
     assert "spectral radius of any loop with sensors missing" in failed(kalman, fallbacks=diverging)
 
 
@@ -187,20 +188,20 @@ def test_rows_are_what_runs_leave():
     plant, gains, fallbacks = designed((FAST, SLOW))
     rows = failure_rows(plant, gains, fallbacks)
     assert " ".join(row.missing for row in rows[:5]) == "wavefront truth m1 m2 wavefront + truth"
-    for row, fallback in zip(rows[:2], fallbacks, strict=False):
-        pairs = [(fallback.gains, row.fallback_nm)]
+    for row, (missing, remaining) in zip(rows[:2], fallbacks.items(), strict=False):
+        pairs = [(remaining, row.fallback_nm)]
         if not row.must_switch:
             pairs.append((gains, row.zero_nm))
         for used, residual_nm in pairs:
-            left = simulated_covariances(plant, plant.controller(used), blind=fallback.missing)
+            left = simulated_covariances(plant, plant.controller(used), blind=missing)
             assert residual_nm == pytest.approx(np.sqrt(np.trace(sum(left))), rel=1e-7)
             assert row.fallback_nm <= residual_nm * (1 + 1e-9)
     # a reading that stays leaves an offset: a run for each independent part of the readings
     readings = model_covariances(failed_loop(plant, gains, ()), plant)[0, 2:, 2:]
     stuck = np.linalg.cholesky(readings).T
     still = np.zeros((400, len(stuck), 2)), np.zeros((400, *stuck.shape))
-    for row, fallback in zip(rows[:3], fallbacks, strict=False):
-        known = {"blind": fallback.missing, "stuck": stuck}
+    for row, missing in zip(rows[:3], fallbacks, strict=False):
+        known = {"blind": missing, "stuck": stuck}
         left = run_loop(plant, plant.controller(gains), *still, **known)[-4:]
         expected = np.sqrt(row.zero_nm**2 + np.sum(left**2) / 4)
         assert row.frozen_nm == pytest.approx(expected, rel=1e-6)
@@ -226,11 +227,12 @@ def test_readings_are_residual_and_noise():
 
 def test_without_any_reading_the_mirror_stays():
     plant, _, fallbacks = designed((SLOW,))
-    gains, units = fallbacks[-1].gains, plant.hardware.suite.units
-    assert fallbacks[-1].missing == units
+    units = plant.hardware.suite.units
+    assert list(fallbacks)[-1] == units
+    gains = fallbacks[units]
     assert not gains.any()
     assert failed_loop(plant, gains, units).is_stable
-    row = failure_rows(plant, gains, fallbacks[-1:])[0]
+    row = failure_rows(plant, gains, {units: gains})[0]
     powers = [model.rms_nm**2 for model in (*plant.vibrations, *plant.turbulence)]
     assert row.fallback_nm == pytest.approx(np.sqrt(sum(powers)), rel=1e-6)
 

@@ -110,8 +110,9 @@ def test_wrong_solver_answers_do_not_leave_the_library(monkeypatch, axis_plant):
         "distance from its Riccati filter",
     )
     module = sys.modules["lbt_synth.design.hinf"]
-    central, unstable = module._central, {"gain_predictor": np.full((4, 1), 5.0)}
-    monkeypatch.setattr(module, "_central", lambda *parts: replace(central(*parts), **unstable))
+    central = module.gamma_riccati(axis_plant, 1e3, start=right)
+    unstable = replace(central, gain_predictor=np.full((4, 1), 5.0))
+    monkeypatch.setattr(module, "gamma_riccati", lambda *_, **__: unstable)
     with pytest.raises(CertificateError, match="spectral radius of the filter"):
         lbt.hinf(axis_plant, gamma_ratio=1.2, route="riccati")
 

@@ -10,8 +10,9 @@ from support.robust_config import SMALL, robust_writer
 import lbt_synth as lbt
 from lbt_synth.design.shaping import VibrationBand
 from lbt_synth.errors import ConfigError, ProblemError
-from lbt_synth.methods.registry import reference_methods
-from lbt_synth.methods.request import PlantInputs, design_request
+from lbt_synth.methods.method import DesignInputs
+from lbt_synth.methods.registry import method_named, reference_methods
+from lbt_synth.methods.request import design_request
 from lbt_synth.models import ARModel, TipTiltPlant
 
 
@@ -128,18 +129,18 @@ def a_plant_with_lines(*lines, more=()):
 
 def test_a_plant_alone_has_a_band_around_each_line():
     plant = a_plant_with_lines((20, 80.0), (50, 30.0), (50.5, 40.0))
-    section = PlantInputs(plant=plant).method_section("robust")
+    section = method_named("robust").plant_section(plant)
     edges = [(band.low_hz, band.high_hz, band.rms_nm) for band in section.bands]
     assert np.array(edges) == pytest.approx(np.array([(19.6, 20.4, 80.0), (49.0, 51.51, 50.0)]))
-    design = design_request("robust", {}).build(PlantInputs(plant=plant))
+    design = design_request("robust", {}).build(DesignInputs(plant=plant))
     assert design.certificate.passed
     lines = lbt.close_loop(plant.hardware, design.controller).path("phase", "residual")
     assert abs(lines.frequency_response([20.0])[0, 0, 0]) < 0.2
     many = a_plant_with_lines(*((10.0 * k, 10.0 + k) for k in range(1, 10)))
-    section = PlantInputs(plant=many).method_section("robust")  # of the strongest
+    section = method_named("robust").plant_section(many)  # of the strongest
     assert [round(band.rms_nm) for band in section.bands] == [14, 15, 16, 17, 18, 19]
     with pytest.raises(ProblemError, match="the plant has none"):
-        design_request("robust", {}).build(PlantInputs(plant=a_plant_with_lines()))
+        design_request("robust", {}).build(DesignInputs(plant=a_plant_with_lines()))
 
 
 def a_plant_with_a_wide_resonance() -> TipTiltPlant:
@@ -150,8 +151,8 @@ def a_plant_with_a_wide_resonance() -> TipTiltPlant:
 def test_a_wide_resonance_has_no_band_and_is_a_disturbance():
     """Its band swallowed those of the lines: the design left 1.6 times the residual."""
     plant = a_plant_with_a_wide_resonance()
-    inputs = PlantInputs(plant=plant)
-    bands = inputs.method_section("robust").bands
+    inputs = DesignInputs(plant=plant)
+    bands = method_named("robust").plant_section(plant).bands
     assert [(band.rms_nm, band.damping) for band in bands] == [(80.0, 0.01), (30.0, 0.01)]
     design = design_request("robust", {}).build(inputs)
     (spec,) = design.specifications
@@ -194,7 +195,7 @@ def worst_in_bands(config, design):
     """Return the worst variance with the resonances of the truth anywhere in their bands [nm^2]."""
     loop = lbt.close_loop(config.hardware, design.controller)
     total = lbt.residual_budget(loop, replace(config.truth, vibrations=())).rms_nm ** 2
-    bands = config.method_section("robust").bands
+    bands = config.settings.design.robust.bands
     for line, band in zip(config.truth.vibrations, bands, strict=True):
         lines = (
             replace(line, frequency_hz=float(f)) for f in np.linspace(band.low_hz, band.high_hz, 9)

@@ -42,7 +42,7 @@ class LeakyDesign(Design):
 
 def build(inputs, options):
     """Design it."""
-    claims = {"problem": inputs.hardware, "claims": options.model_dump()}
+    claims = {"problem": inputs.plant.hardware, "claims": options.model_dump()}
     solver = SolverReport(route="closed form", status="given")
     return with_certificate(LeakyDesign(method="leaky", solver=solver, **claims), "Lower the gain.")
 

@@ -261,10 +261,7 @@ def modal_gains_from_telemetry(
 def _spectra_per_mode(
     spectra: ARModel | Sequence[Spectrum], path: LoopHardware
 ) -> tuple[Density, int, list[FloatArray]]:
-    """Return the function from frequencies (f,) to spectra of means (n, f), n, edges of panels.
-
-    The edges are where spectra have peaks or kinks, over the Nyquist frequency.
-    """
+    """Return spectra of means (n, f) as a function, n, and edges of panels over the Nyquist one."""
     if isinstance(spectra, ARModel):
         require_loop_rate(spectra.frame_rate_hz, path)
         return ARModel.stack(spectra).psd, spectra.count, [_model_edges(spectra)]
@@ -311,19 +308,14 @@ def _checked_spectra(
 def _find_gains(
     path: LoopHardware,
     density: Density,
-    edges: FloatArray,
+    edges: FloatArray,  # of panels, over the Nyquist frequency
     *,
     noise_nm: FloatArray,
-    gain: FloatArray,
+    gain: FloatArray,  # (n,): of the sensor
     margin: float,
-    differenced: bool = False,
+    differenced: bool = False,  # whether spectra are those of differences of two means
 ) -> ModalGains:
-    """Find the gains on finer and finer panels, until residuals and gains no longer change.
-
-    The spectra are those of means over frames, or of their differences of two frames; they have
-    edges of panels, over the Nyquist frequency. The path is that of one mode, the gain (n,) the
-    sensor's.
-    """
+    """Find the gains on finer and finer panels, until residuals and gains no longer change."""
     least, most = TRIED_GAINS
     rate, limit = path.frame_rate_hz, integrator_gain_limit(path)
     noise_nm2 = (noise_nm / gain) ** 2

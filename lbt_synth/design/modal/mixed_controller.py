@@ -90,7 +90,12 @@ class MixedController:
         modes = np.zeros(0, dtype=np.intp)
         self._running, self._banks = None, ()
         if self.filter is not None:
-            modes = _mode_indices(self.filtered, n)
+            listed = [integer(i, "filtered", at_least=0, at_most=n - 1) for i in self.filtered]
+            if not listed or len(set(listed)) != len(listed):
+                raise ProblemError(
+                    f"filtered must be different mode numbers, at least one; got {listed}."
+                )
+            modes = np.array(listed, dtype=np.intp)
             self._banks, self._running = _filter_parts(self.filter, modes)
         self.filtered = tuple(modes.tolist())
         others = np.setdiff1d(np.arange(n), modes)
@@ -178,11 +183,3 @@ def _filter_parts(
             f"{D.shape[-1]} measurements and {D.shape[-2]} commands."
         )
     return (_Bank(modes[None], A[None], B[None], C[None], D[None]),), None
-
-
-def _mode_indices(indices: Any, n: int) -> np.ndarray:
-    """Return different mode numbers from 0 to n - 1 as an integer array."""
-    listed = [integer(index, "filtered", at_least=0, at_most=n - 1) for index in indices]
-    if not listed or len(set(listed)) != len(listed):
-        raise ProblemError(f"filtered must be different mode numbers, at least one; got {listed}.")
-    return np.array(listed, dtype=np.intp)

@@ -206,10 +206,8 @@ def held_fraction(hardware: LoopHardware) -> float:
 
 
 def _held_system(loop: ClosedLoop, late: float) -> StateSpace:
-    """Return the loop of one mode whose residual is that of the hold which ends in the frame.
-
-    Its further states are the phase of the frame before, and the commands since the one that held.
-    """
+    """Return the loop of one mode whose residual is that of the hold which ends in the frame."""
+    # further states are the phase of the frame before, and the commands since the one that held
     s, n, count = loop.system, loop.system.n_states, loop.hardware.mirror_system.lead + 1
     A, B = np.zeros((n + 1 + count, n + 1 + count)), np.zeros((n + 1 + count, s.B.shape[1]))
     A[:n, :n], B[:n] = s.A, s.B

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -44,10 +44,6 @@ class Grid:
         """Points of a band, with its ends and some more."""
         inside = self.points_hz[(self.points_hz > low_hz) & (self.points_hz < high_hz)]
         return np.unique(np.concatenate([inside, np.linspace(low_hz, high_hz, _BAND_POINTS)]))
-
-    def with_points(self, frequency_hz: FloatArray) -> Grid:
-        """Return the grid with further points."""
-        return replace(self, points_hz=np.unique(np.concatenate([self.points_hz, frequency_hz])))
 
 
 def first_grid(

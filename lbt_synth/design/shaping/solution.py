@@ -94,17 +94,12 @@ def _minimise(programme: _Programme, start: FloatArray | None) -> tuple[FloatArr
     # the steps need coefficients whose loops are stable at all sensor gains
     if not convex and start is not None and programme.is_stable(start):
         return _lower_objective(programme, start, [])
-    c = _minimize_at_unit_gain(programme, convex=convex)
-    values = [total_value(programme.function, c)]
-    return (c, values) if convex else _lower_objective(programme, c, values)
-
-
-def _minimize_at_unit_gain(programme: _Programme, *, convex: bool) -> FloatArray:
-    """Minimise the objective at unit gain, until all demands hold, or the loop is stable."""
-    while True:
+    while True:  # at unit gain, until all demands hold, or the loop is stable
         c = programme.solve(without_denominators(programme.function))
         if not programme.refine(c) or (not convex and programme.is_stable(c)):
-            return c
+            break
+    values = [total_value(programme.function, c)]
+    return (c, values) if convex else _lower_objective(programme, c, values)
 
 
 def _lower_objective(
@@ -174,7 +169,7 @@ class _Programme:
         """Add the frequencies at which coefficients exceed bounds; return whether there are any."""
         self._excess = self._find_excess(c)
         if self._excess.size:
-            self.grid = self.grid.with_points(self._excess)
+            self.grid = replace(self.grid, points_hz=np.union1d(self.grid.points_hz, self._excess))
             self.function, self.groups = self.specification.compile(self.channel, self.grid)
         return self._excess.size > 0
 

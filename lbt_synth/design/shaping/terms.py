@@ -123,34 +123,29 @@ class Skirts:
     The resonance is sampled: at high frequencies it has more power than one in continuous time.
     """
 
-    low_hz: float
-    high_hz: float
-    rms_nm: float
-    damping: float
+    band: VibrationBand
     frame_rate_hz: float
 
     @property
     def breakpoints_hz(self) -> FloatArray:
         """Ends of the band, and frequencies from which the skirts fall [Hz]."""
-        steps = self.damping * np.array([0.0, 1.0, 3.0, 9.0, 27.0])
-        return np.concatenate([self.low_hz * (1 - steps), self.high_hz * (1 + steps)])
+        steps = self.band.damping * np.array([0.0, 1.0, 3.0, 9.0, 27.0])
+        return np.concatenate([self.band.low_hz * (1 - steps), self.band.high_hz * (1 + steps)])
 
     @cached_property
     def _models(self) -> tuple[ARModel, ...]:
         """Resonances in the band."""
-        places = np.linspace(
-            self.low_hz, self.high_hz, _PLACES if self.low_hz < self.high_hz else 1
-        )
+        low, high, rms_nm = self.band.low_hz, self.band.high_hz, self.band.rms_nm
         lines = (
-            Vibration(frequency_hz=f, damping=self.damping, rms_nm=self.rms_nm)
-            for f in places.tolist()
+            Vibration(frequency_hz=f, damping=self.band.damping, rms_nm=rms_nm)
+            for f in np.linspace(low, high, _PLACES).tolist()
         )
         return tuple(line.ar_model(self.frame_rate_hz) for line in lines)
 
     def psd(self, frequency_hz: ArrayLike) -> FloatArray:
         """Return the spectrum at frequencies [Hz], zero inside the band [nm^2/Hz]."""
         f = real_array(frequency_hz, "frequency_hz")
-        outside = (f < self.low_hz) | (f > self.high_hz)
+        outside = (f < self.band.low_hz) | (f > self.band.high_hz)
         largest = np.max([model.psd(f) for model in self._models], axis=0)
         return np.asarray(np.where(outside, largest, 0.0))
 
@@ -202,10 +197,7 @@ class VibrationBand:
 
     def skirts(self, frame_rate_hz: float) -> Skirts | None:
         """Return what a resonance has outside the band; None for a sinusoid."""
-        if not self.damping:
-            return None
-        ends = {"low_hz": self.low_hz, "high_hz": self.high_hz}
-        return Skirts(**ends, rms_nm=self.rms_nm, damping=self.damping, frame_rate_hz=frame_rate_hz)
+        return Skirts(band=self, frame_rate_hz=frame_rate_hz) if self.damping else None
 
     def function(self, channel: Channel, grid: Grid) -> Function:
         """Return the worst variance over a grid as a function of the coefficients [nm^2]."""

@@ -28,8 +28,9 @@ from lbt_synth.identification.records.record import LoopRecord, Stretches, split
 from lbt_synth.linear import Controller
 from lbt_synth.loop import Imaging, close_loop, residual_budget, strehl
 from lbt_synth.loop.least_residual import least_residual
+from lbt_synth.methods.method import DesignInputs
 from lbt_synth.methods.registry import method_named
-from lbt_synth.methods.request import PlantInputs, design_request
+from lbt_synth.methods.request import design_request
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.rows import column, nm_column, table_row
 from lbt_synth.validation import FloatArray, frozen_copy, matrix, require_instance
@@ -227,9 +228,9 @@ def design_inputs(
     channels: Channels | None = None,
     noise: float = 1.0,
     penalty: float | None = None,
-) -> PlantInputs:
+) -> DesignInputs:
     """Return what a method makes a design of: a model with more noise, its record and channels."""
-    return PlantInputs(
+    return DesignInputs(
         plant=noisier(model, noise).plant(),
         predict=lambda: regress(record, model, channels=channels, noise=noise).design(penalty),
     )

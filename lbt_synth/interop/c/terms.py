@@ -170,7 +170,7 @@ def _filter_terms(design: Any) -> SourceTerms:
     transition[:, :, :s], transition[:, :, s:] = full.A, full.B_known
     predicted = np.zeros((plant.period, plant.n_measurements, s + m))
     predicted[:, :, :s], predicted[:, :, s:] = full.C, full.D_known
-    filters = {(): design.gain_predictor} | {f.missing: f.gains for f in design.fallbacks}
+    filters = {(): design.gain_predictor, **design.fallbacks}
     states = design.controller.stacks()[2][0]
     return SourceTerms(
         transition=transition,

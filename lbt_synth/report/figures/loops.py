@@ -183,8 +183,10 @@ def sigma_curves(
         grid, error = frequency_grid(1 / design.controller.dt_s, lines_hz), None
         rejection = noise = None
         if design.is_estimator:
-            problem = design.problem
-            system = design.error_system(problem.with_unit_weights() if unit_weights else problem)
+            system = design.error_system()
+            if unit_weights:
+                gain = design.arrays()["gain_predictor"]
+                system = design.problem.with_unit_weights().error_system(gain)
             error = spectral_norms(system.frequency_response(grid))
         if name in loops and loops[name].is_stable:
             S, N = (
@@ -352,7 +354,8 @@ def draw_bode(loops: Loops, *, axes: OwnAxes = None) -> Figure:
 def _draw_nyquist(loops: Loops, *, axes: OwnAxes = None) -> Figure:
     """Draw broken loops in the complex plane, with the disks that they keep out of."""
     columns = min(2, len(loops))
-    with drawing([square_in(columns)] * len(loops), columns=columns, axes=axes) as panels:
+    square_in = min(7.0 / columns - 0.75, 5.0)  # height of square axes, so many side by side
+    with drawing([square_in] * len(loops), columns=columns, axes=axes) as panels:
         for panel, (name, loop) in zip(panels, loops.items(), strict=True):
             margins = loop_margins(loop) if loop.is_stable else None
             title = f"{name}: unstable"
@@ -452,8 +455,3 @@ DRAWN: Mapping[str, Callable[..., Figure]] = {
     "nichols": _draw_nichols,
     "step": draw_steps,
 }
-
-
-def square_in(columns: int) -> float:
-    """Return the height of square axes, so many side by side [inch]."""
-    return min(7.0 / columns - 0.75, 5.0)

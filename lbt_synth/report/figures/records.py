@@ -12,7 +12,7 @@ from scipy.stats import kstwobign
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import IdentifiedModel
-from lbt_synth.identification.fit.identified_model import IdentifiedAxis, IdentifiedLine
+from lbt_synth.identification.fit.identified_model import IdentifiedAxis
 from lbt_synth.linear import Controller
 from lbt_synth.linear.controller import as_controller
 from lbt_synth.loop import ClosedLoop, close_loop
@@ -166,7 +166,7 @@ def identification_figure(
     with drawing(heights, columns=n, axes=axes) as panels:
         for i, axis in enumerate(model.axes):
             name = f"{_NAMES[i]}: " if n == len(_NAMES) else ""
-            _draw_spectrum(panels[i], axis, name + _noise_text(axis))
+            _draw_spectrum(panels[i], axis, name)
             densities = {name: each[i] for name, each in residuals.items()}
             _draw_cumulative(panels[n + i], axis, densities)
             _draw_innovations(panels[2 * n + i], axis)
@@ -216,15 +216,12 @@ def _noise_density(axis: IdentifiedAxis) -> float:
     return 2 / axis.data.frame_rate_hz * (axis.noise_nm / axis.sensor_gain) ** 2
 
 
-def _noise_text(axis: IdentifiedAxis) -> str:
+def _draw_spectrum(axes: Axes, axis: IdentifiedAxis, name: str) -> None:
+    """Draw the periodogram with its fit, and leave room for the names of lines."""
     gain = f"{axis.sensor_gain:.3g}"
     if axis.sensor_gain_error is not None:
         gain = f"{axis.sensor_gain:.3f} ± {axis.sensor_gain_error:.3f}"
-    return f"noise {nm_text(axis.noise_nm)}, gain {gain}"
-
-
-def _draw_spectrum(axes: Axes, axis: IdentifiedAxis, title: str) -> None:
-    """Draw the periodogram with its fit, and leave room for the names of lines."""
+    title = f"{name}noise {nm_text(axis.noise_nm)}, gain {gain}"
     f, density = axis.frequency_hz, ("density", "nm²/Hz")
     _, factor = name_axes(axes, FREQUENCY, density, title, xscale="log", yscale="log")
     centres, smooth, least, most = _average_bands(f, axis.density_nm2_hz)
@@ -259,8 +256,9 @@ def _draw_flags(axes: Axes, axis: IdentifiedAxis) -> None:
     places = spread_labels(across, _FLAG_IN / width_in)
     tie = {"arrowstyle": "-", "color": "0.6", "linewidth": 0.5, "relpos": (0.5, 0.0)}
     for line, point, place in zip(axis.lines, zip(x, y, strict=True), places, strict=True):
+        label = f"{line.frequency_hz:.2f} Hz, {nm_text(line.rms_nm)}"
         axes.annotate(
-            _line_text(line),
+            label + ("" if line.direction is None else f", {line.direction_deg:.0f}°"),
             xy=point,
             xytext=(float(place), 0.985),
             textcoords="axes fraction",
@@ -296,12 +294,6 @@ def _average_bands(
         np.minimum.reduceat(density, edges),
         np.maximum.reduceat(density, edges),
     )
-
-
-def _line_text(line: IdentifiedLine) -> str:
-    """Return frequency and rms of a line on its axis, and the direction if both axes share it."""
-    along = "" if line.direction is None else f", {line.direction_deg:.0f}°"
-    return f"{line.frequency_hz:.2f} Hz, {nm_text(line.rms_nm)}{along}"
 
 
 def _draw_cumulative(axes: Axes, axis: IdentifiedAxis, residuals: dict[str, FloatArray]) -> None:

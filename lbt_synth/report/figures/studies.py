@@ -20,7 +20,6 @@ from lbt_synth.report.draw import (
     Figure,
     OwnAxes,
     colour,
-    count_columns,
     dot_style,
     draw_map,
     drawing,
@@ -112,7 +111,7 @@ def robustness_map_figure(
                 f"the maps must have the same delay errors {delays.tolist()}; got "
                 f"{grid.delay_errors_frames.tolist()} for {name}."
             )
-    columns = min(len(maps), 3) if len(delays) > 1 else count_columns(len(maps))
+    columns = 2 if (len(maps), len(delays)) == (4, 1) else min(len(maps), 3)
     # the long name of the axis does not fit three columns
     x_axis = FREQUENCY_ERROR if columns < 3 else SHORT_FREQUENCY_ERROR
     heights = [2.3] * (len(delays) * len(maps))

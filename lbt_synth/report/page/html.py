@@ -32,9 +32,8 @@ from lbt_synth.report.draw import Figure, Series, figure_series, house_style
 from lbt_synth.storage.atomic_files import require_ending, require_writable, write_together
 from lbt_synth.storage.input_files import read_bytes
 from lbt_synth.storage.rows import cell_text
-from lbt_synth.storage.tables import TONES, Table
+from lbt_synth.storage.tables import Table
 from lbt_synth.storage.warning_filters import ignore_warnings
-from lbt_synth.validation import choice
 
 _PROGRAMS = ("numpy", "scipy", "matplotlib", "cvxpy", "clarabel")
 _LISTED = ("configuration", "study")  # what is a text for people
@@ -47,9 +46,6 @@ class Notice:
     text: str
     # "bad" for what is wrong, "note" for what has to be known, "good" for what was proved
     tone: str = "note"
-
-    def __post_init__(self) -> None:
-        choice(self.tone, "tone", TONES)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,8 +146,12 @@ def new_page(
         rows=tuple(rows),
         words=(1, 2),
     )
+    ours = ("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())
     programs = Table(
-        caption="Made with", headings=("program", "version"), rows=program_versions(), words=(1,)
+        caption="Made with",
+        headings=("program", "version"),
+        rows=(*ours, *((name, version(name)) for name in _PROGRAMS)),
+        words=(1,),
     )
     files: list[Block] = [*facts, *([read] if rows else []), programs, *listings]
     kept: Sections = {**sections, "Files and versions": files}
@@ -179,12 +179,6 @@ def creation_time() -> str:
 def creator_name() -> str:
     """Return the name and version of this program."""
     return f"lbt_synth {lbt_synth.__version__}"
-
-
-def program_versions() -> tuple[tuple[str, str], ...]:
-    """Return name and version of the programs that make a page."""
-    ours = ("lbt_synth", lbt_synth.__version__), ("Python", platform.python_version())
-    return (*ours, *((name, version(name)) for name in _PROGRAMS))
 
 
 _COLUMNS = 6  # that fit a sheet of paper beside the first one of a table

@@ -40,7 +40,6 @@ from lbt_synth.studies.study.study import (
     NOISE_FACTOR,
     Sample,
     Study,
-    close_sample_loop,
     design_for_sample,
     make_sample,
 )
@@ -111,11 +110,20 @@ def _evaluate_groups(
         return
     design = fixed_design(controller)
     keys = array_keys(study.config.settings) - ({_DELAY} if design is None else set())
-    for rows in _find_groups(study, values, keys):
+    places = enumerate(study.places.values())
+    apart = [i for i, numbers in places if not keys.issuperset(numbers)]
+    _, which, counts = np.unique(values[:, apart], axis=0, return_inverse=True, return_counts=True)
+    for group in np.flatnonzero(counts >= min(2, len(values))):
+        rows = np.flatnonzero(which.reshape(-1) == group)  # that differ by these keys only
         with suppress(*EXPECTED_ERRORS):
             yield rows, _evaluate_group(study, design, values[rows], keys)
             continue
-        accepted = _accepted_rows(study, values, rows)  # without the one that fails
+        made = []  # without the one that fails
+        for row in rows.tolist():
+            with suppress(*EXPECTED_ERRORS):
+                make_sample(study, values[row])
+                made.append(row)
+        accepted = np.array(made, dtype=np.intp)
         with suppress(*EXPECTED_ERRORS, IndexError):  # none may make a sample
             yield accepted, _evaluate_group(study, design, values[accepted], keys)
 
@@ -142,16 +150,6 @@ def _evaluate_group(
     return residual_columns(residuals, config.imaging)
 
 
-def _accepted_rows(study: Study, values: FloatArray, group: IntArray) -> IntArray:
-    """Return the rows of a group that make a sample."""
-    accepted = []
-    for row in group.tolist():
-        with suppress(*EXPECTED_ERRORS):
-            make_sample(study, values[row])
-            accepted.append(row)
-    return np.array(accepted, dtype=np.intp)
-
-
 def _kalman_matrices(plants: list[TipTiltPlant]) -> tuple[FloatArray, ...]:
     """Design a Kalman filter for each plant, all at once; A, B, C, D in textbook form."""
     A, C, Q, R = (np.stack([getattr(plant, name) for plant in plants]) for name in "ACQR")
@@ -159,15 +157,6 @@ def _kalman_matrices(plants: list[TipTiltPlant]) -> tuple[FloatArray, ...]:
     filters = [plant.controller(gain) for plant, gain in zip(plants, gains, strict=True)]
     systems = [controller.to_statespace() for controller in filters]
     return tuple(np.stack([getattr(system, name) for system in systems]) for name in "ABCD")
-
-
-def _find_groups(study: Study, values: FloatArray, keys: set[Keys]) -> Iterator[IntArray]:
-    """Yield the indices of samples that differ by numbers of some keys only."""
-    places = enumerate(study.places.values())
-    apart = [i for i, numbers in places if not keys.issuperset(numbers)]
-    _, which, counts = np.unique(values[:, apart], axis=0, return_inverse=True, return_counts=True)
-    for group in np.flatnonzero(counts >= min(2, len(values))):
-        yield np.flatnonzero(which.reshape(-1) == group)
 
 
 def _require_agreement(
@@ -196,10 +185,11 @@ def evaluate_row(
     failures: list[Failure] = []
     results: dict[str, float] = {}
     with note_failure(failures, row, study.controllers):
-        sample = config, _, truth = make_sample(study, values)
+        sample = config, hardware, truth = make_sample(study, values)
         for name, controller in study.controllers.items():
             with note_failure(failures, row, [name]):
-                loop = close_sample_loop(sample, design_for_sample(controller, sample))
+                design = design_for_sample(controller, sample)
+                loop = design.close(hardware, sensor_gain=truth.sensor_gain)
                 columns = loop_columns(loop, truth, config.imaging)
                 results |= {f"{name}.{column}": value for column, value in columns.items()}
     return results, failures

@@ -24,6 +24,7 @@ _CONSTANT = 1e-12  # scatter of a Strehl ratio that is rounding
 _FEW_GROUPS, _MANY_SAMPLES = 8, 4096
 _MOST_VALUES = 32  # a parameter with more distinct values is continuous
 
+_INDEX = ("index", "index_error")
 Samples = dict[str, Any]  # columns (n,) of one controller
 _Row = tuple[str | Cell, ...]  # a label and a cell for each controller, or a heading alone
 
@@ -67,8 +68,8 @@ class ControllerStatistics:
 
     def index(self, name: str) -> tuple[float, float]:
         """Return the index of a parameter and its standard error."""
-        row = self.sensitivity[name]
-        return row["index"], row["index_error"]
+        index, error = (self.sensitivity[name][key] for key in _INDEX)
+        return index, error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -128,13 +129,7 @@ def _controller_statistics(
         residual_nm=percentiles(samples["residual_nm"][places], PERCENTS),
         worst=tuple(worst.tolist()),
         sensitivity={
-            name: dict(
-                zip(
-                    ("index", "index_error"),
-                    first_order_index(numbers[places], strehl),
-                    strict=True,
-                )
-            )
+            name: dict(zip(_INDEX, first_order_index(numbers[places], strehl), strict=True))
             for name, numbers in values.items()
         },
     )
@@ -164,21 +159,12 @@ def percentiles(values: FloatArray, percents: Sequence[float]) -> dict[float, In
     if len(values) == 0:
         return dict.fromkeys(percents, _NONE)
     ordered, intervals = np.sort(values), {}
-    for percent in percents:
+    places = np.array(percents) / 100 * (len(ordered) - 1)
+    quantiles = np.interp(places, np.arange(len(ordered)), ordered)  # some may be infinite
+    for percent, value in zip(percents, quantiles.tolist(), strict=True):
         ends: Any = quantile_test(ordered, q=0, p=percent / 100).confidence_interval(CONFIDENCE)
-        value = _interpolate(ordered, percent / 100)
         intervals[percent] = Interval(value=value, low=float(ends.low), high=float(ends.high))
     return intervals
-
-
-def _interpolate(ordered: FloatArray, fraction: float) -> float:
-    """Return a quantile by linear interpolation between order statistics; some may be inf."""
-    at = fraction * (len(ordered) - 1)
-    below = int(at)
-    low, weight = float(ordered[below]), at - below
-    if weight == 0 or low == ordered[below + 1]:
-        return low
-    return low + weight * (float(ordered[below + 1]) - low)
 
 
 def share(where: BoolArray) -> Interval:

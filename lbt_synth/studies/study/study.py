@@ -29,7 +29,6 @@ from lbt_synth.errors import (
     refuse_config,
 )
 from lbt_synth.files.gain_file.store import load_with_digest
-from lbt_synth.loop import ClosedLoop
 from lbt_synth.methods.method import Section
 from lbt_synth.methods.registry import method_named
 from lbt_synth.methods.request import DesignRequest, design_request, fixed_design
@@ -323,12 +322,6 @@ def design_for_sample(controller: Design | DesignRequest, sample: Sample) -> Des
     return sample[0].design(cast("DesignRequest", controller)) if design is None else design
 
 
-def close_sample_loop(sample: Sample, design: Design) -> ClosedLoop:
-    """Close the real loop of a sample with a design."""
-    _, hardware, truth = sample
-    return design.close(hardware, sensor_gain=truth.sensor_gain)
-
-
 def load_study(path: str | os.PathLike[str]) -> Study:
     """Read a study file, check it, and design the controllers that are for the whole study.
 
@@ -404,9 +397,9 @@ def load_study(path: str | os.PathLike[str]) -> Study:
     )
     for name, controller in study.controllers.items():
         if (design := fixed_design(controller)) is not None:
-            for where, sample in samples:
+            for where, (_, hardware, truth) in samples:
                 with refuse_config(f"{source}: controllers.{name}, {where}"):
-                    close_sample_loop(sample, design)
+                    design.close(hardware, sensor_gain=truth.sensor_gain)
     return study
 
 

@@ -1,5 +1,7 @@
 """Demands in the programme, against the real loop and against loops that differ."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.shaping import (
@@ -39,7 +41,7 @@ DEMANDS = [
 @pytest.mark.parametrize("demand", DEMANDS, ids=lambda d: d.label)
 def test_a_demand_holds_in_the_programme_where_it_holds_in_the_loop(demand):
     mode = channel()
-    grid = spec(demand).grid(mode).with_points(np.linspace(0, 400, 4001))
+    grid = replace(spec(demand).grid(mode), points_hz=np.linspace(0, 400, 4001))
     constraints = demand.constraints(mode, grid)
     for size, seed in ((s, i) for s in (0.02, 0.1, 0.3, 1.0, 3.0) for i in range(3)):
         c = random_coefficients(12, seed) * size
