@@ -14,16 +14,16 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3271,
+    "cli": 3169,
     "config": 1622,
     "design": 5971,
     "files": 1252,
     "identification": 8845,
     "interop": 3687,
-    "linear": 4844,
-    "loop": 4132,
+    "linear": 4748,
+    "loop": 3945,
     "methods": 784,
-    "models": 3858,
+    "models": 3752,
     "report": 3263,
     "storage": 1060,
     "studies": 3238,

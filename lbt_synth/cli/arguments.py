@@ -84,7 +84,8 @@ _SHARED = """
 """
 _TABLE = """
   init | init | Write a commented configuration to begin with, and its schema.
-    --telescope | @telescopes | published numbers and their sources (default generic: assumed ones)
+    --telescope | @telescopes =generic | published numbers and their sources (default generic:
+        assumed ones)
     --examples | switch | write the examples of the documentation instead (folder)
     --force | switch | replace files that are there
     -o --output | | file to write (default: the telescope, .yaml)
@@ -269,6 +270,7 @@ _WORDS: Mapping[str, dict[str, Any]] = {  # how an argument is read, and what ar
     "int": {"type": int},
     "float": {"type": float},
     "switch": {"action": "store_true"},
+    "repeat": {"action": "append", "default": []},
     "required": {"required": True},
 }
 # how scripts of shtab complete names of files
@@ -306,8 +308,6 @@ def _keywords(how: str, text: str) -> dict[str, Any]:
         key, _, value = word.partition(":")
         if word in _WORDS:
             keywords |= _WORDS[word]
-        elif word == "repeat":
-            keywords |= {"action": "append", "default": []}
         elif word.startswith("="):
             default = word[1:]
         elif word.startswith("@"):
@@ -334,14 +334,17 @@ def _keywords(how: str, text: str) -> dict[str, Any]:
     return keywords
 
 
-def option_name(argument: str) -> str:
-    """Return an option as people write it, by the name of its argument."""
-    return f"--{argument.replace('_', '-')}"
-
-
 def given_options(arguments: Namespace, *names: str) -> dict[str, Any]:
     """Return the options of those names that the command line gives."""
     return {name: value for name in names if (value := getattr(arguments, name)) is not None}
+
+
+def input_files(arguments: Namespace) -> tuple[str, ...]:
+    """Return the files that the command line gives to be read, which no output may replace."""
+    names = ("config", "file", "gain", "commands", "accelerometers")
+    alone = [getattr(arguments, name, None) for name in names]
+    several = [*getattr(arguments, "gains", ()), *getattr(arguments, "files", ())]
+    return tuple(path for path in (*alone, *several) if isinstance(path, str))  # --gain is none
 
 
 def _add_method_options(parser: ArgumentParser) -> None:
@@ -360,9 +363,8 @@ def _add_method_options(parser: ArgumentParser) -> None:
                     help_text += f" (default {usual}{option.default})"
                 owners.setdefault(help_text, []).append(method.name)
         help_text = "; ".join(f"{', '.join(names)}: {said}" for said, names in owners.items())
-        parser.add_argument(
-            option_name(name), type=_option_value, help=help_text.replace("%", "%%")
-        )
+        flag, help_text = f"--{name.replace('_', '-')}", help_text.replace("%", "%%")
+        parser.add_argument(flag, type=_option_value, help=help_text)
 
 
 def _option_value(word: str) -> int | float | str:
@@ -381,8 +383,8 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: error: {printable(message)} (see {self.prog} --help)\n")
 
 
-def build_parser(*named: str) -> argparse.ArgumentParser:
-    """Build the parser of all commands, with the arguments of those that are named."""
+def build_parser(named: str | None = None) -> argparse.ArgumentParser:
+    """Build the parser of all commands, with the arguments of one, or of all for completions."""
     parser = Parser(
         prog="lbt-synth",
         description="Design, certify and analyse tip/tilt controllers that reject vibrations.",
@@ -396,28 +398,22 @@ def build_parser(*named: str) -> argparse.ArgumentParser:
     )
     for name, command in COMMANDS.items():
         # completions have the commands with a help; the groups list them for everybody else
-        listed: dict[str, Any] = {"help": command.text} if len(named) > 1 else {}
+        listed: dict[str, Any] = {"help": command.text} if named is None else {}
         added = commands.add_parser(name, description=command.text, **listed)
         added.add_argument("--json", action="store_true", help="print one JSON object instead")
         added.add_argument("--verbose", action="store_true", help="print all tables and notes")
-        if name in named:
+        if named in (None, name):
             _add_arguments(added, command.arguments)
     return parser
 
 
 def _list_commands() -> str:
-    """Return the commands in their groups, each with its help."""
     lines = list[str]()
     for name, command in COMMANDS.items():
         lines += ["", _GROUPS[name]] if name in _GROUPS else []
         first, rest = f"  {name:14}", " " * 16
         lines += wrap(command.text.rstrip("."), 80, initial_indent=first, subsequent_indent=rest)
     return "\n".join(lines[1:])
-
-
-def full_parser() -> argparse.ArgumentParser:
-    """Build the parser of all commands with their arguments, of which shtab makes completions."""
-    return build_parser(*COMMANDS)
 
 
 def refuse_options(arguments: Namespace, names: Iterable[str], why: str) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from lbt_synth import studies
 from lbt_synth.cli import loop_inputs
-from lbt_synth.cli.loop_inputs import load_designs, load_shown, named_difference_notes
+from lbt_synth.cli.loop_inputs import difference_notes, load_designs, load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import track_progress
 from lbt_synth.config import Config
@@ -26,12 +26,7 @@ from lbt_synth.report.figures import studies as figures
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
-from lbt_synth.studies.limits import (
-    LimitStudy,
-    limits,
-    limits_at_rate,
-    say_residual,
-)
+from lbt_synth.studies.limits import LimitStudy, limits, limits_at_rate, say_residual
 from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, compare_modes, compare_on_mirror
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
@@ -54,7 +49,7 @@ def run_compare(arguments: Namespace) -> Report:
         )
     caption = f"In the truth of {config.source.name}; {config.imaging.label}"
     report.add_rows("designs", caption, rows, figure=partial(figures.limits_figure, study))
-    report.notes += named_difference_notes(config, designs)
+    report.notes += difference_notes(config, designs)
     return report
 
 
@@ -129,7 +124,7 @@ def run_limits(arguments: Namespace) -> Report:
             "note: the limit of this loop cannot be computed; its modes have to decouple, with "
             "vibrations along principal axes of the sensor's noise."
         )
-    report.notes += named_difference_notes(config, designs)
+    report.notes += difference_notes(config, designs)
     return report
 
 
@@ -176,16 +171,12 @@ def _limits_over_rates(config: Config, arguments: Namespace) -> Report:
 
 def run_tradeoff(arguments: Namespace) -> Report:
     """Design filters from the least norm to the least variance, and compare them."""
-    count = integer(arguments.points, "--points", at_least=2)
-    taps = integer(arguments.taps, "--taps", at_least=1)
     config = load_shown(arguments)
-    points = list(
-        track_progress(
-            studies.tradeoff(config.plant.own_sensor_alone(), points=count, taps=taps),
-            total=count * len(FAMILIES),
-            what="filters",
-        )
+    filters = studies.tradeoff(
+        config.plant.own_sensor_alone(), points=arguments.points, taps=arguments.taps
     )
+    total = arguments.points * len(FAMILIES)
+    points = list(track_progress(filters, total=total, what="filters"))
     mixed = [point for point in points if point.family == FAMILIES[0]]
     first, last, least = mixed[0], mixed[-1], points[0].design
     caption = "Trade-off of variance, norm and sensor gain"
@@ -274,7 +265,7 @@ def run_robustness(arguments: Namespace) -> Report:
     report = Report(
         verdict=_say_maps(maps, real, where),
         tables=[row_table(caption, lines)],
-        notes=named_difference_notes(config, designs),
+        notes=difference_notes(config, designs),
         rows=[point for name, grid in maps.items() for point in grid.points(name)],
         figure=lambda: robustness_map_figure(maps),
     )

@@ -8,8 +8,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from lbt_synth.cli.arguments import given_options
-from lbt_synth.cli.loop_inputs import add_truth, choose_design_unit, load_shown, say_accelerometers
+from lbt_synth.cli.arguments import given_options, input_files
+from lbt_synth.cli.loop_inputs import (
+    add_certificate,
+    add_truth,
+    choose_design_unit,
+    load_shown,
+    say_accelerometers,
+)
 from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.config.load import config_from_text
 from lbt_synth.design import Design
@@ -30,7 +36,7 @@ def run_design(arguments: Namespace) -> Report:
     """Design a controller and write its gain file."""
     options = given_options(arguments, *option_names())
     request = design_request(arguments.method, options)
-    require_writable(require_gain_name(arguments.output), inputs=[arguments.config])
+    require_writable(require_gain_name(arguments.output), inputs=input_files(arguments))
     config = load_shown(arguments)
     design = config.design(request)
     path = save_gain(arguments.output, design)
@@ -53,7 +59,6 @@ def describe_design(report: Report, design: Design) -> None:
         "solver": asdict(design.solver),
         "poles": [complex(p) for p in design.poles],
         "controller_spectral_radius": alone,
-        "assumptions": design.assumptions,
     }
     records: list[Any] = [design.facts()]
     margins = []
@@ -68,13 +73,12 @@ def describe_design(report: Report, design: Design) -> None:
     fragile = [f"{text[0].upper()}{text[1:]}" for one in margins for text in one.fragilities]
     report.verdict = [*fragile, *(report.verdict or [_say_model(design)])]
     report.verdict += [f"It {one.survival}" for one in margins if not one.fragilities]
-    report.verdict.append(say_checks(design.certificate.checks))
+    add_certificate(report, design)
     report.add_records(*records)
     printed = fact_table("Design", *records, *margins)
     report.tables.append(without_units(printed) if design.hardware is None else printed)
     report.notes += _loop_notes(design, alone)
     report.notes += design.notes()
-    report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
     report.add_rows("checks", "Certificate", design.certificate.checks)
 
 

@@ -21,14 +21,13 @@ from lbt_synth.storage.atomic_files import (
 )
 
 _SCHEMA = "lbt-synth.schema.json"
-_USUAL = "generic"  # the telescope of which nothing is known
 
 
-def run(arguments: Namespace) -> Report:
+def run_init(arguments: Namespace) -> Report:
     """Write a configuration of a telescope with its schema, or all examples."""
-    telescope = arguments.telescope or _USUAL
+    report, telescope = Report(), arguments.telescope
     if arguments.examples:
-        folder = Path(arguments.output or "examples")
+        folder = make_directory(arguments.output or "examples")
         contents = {folder / name: text for name, text in sorted(example_files().items())}
     else:
         output = arguments.output or f"{telescope}.yaml"
@@ -39,17 +38,13 @@ def run(arguments: Namespace) -> Report:
             file: f"# yaml-language-server: $schema={_SCHEMA}\n{telescope_template(telescope)}",
             schema: json.dumps(config_schema(), indent=1) + "\n",
         }
-    _refuse_taken(contents, force=arguments.force)
-    report = Report()
-    if arguments.examples:
-        make_directory(folder)
-    else:
         method = default_method()
         report.verdict.append(
             f"Next, put in your own numbers; then lbt-synth design {file} --method {method} "
             f"-o {file.with_name(f'{file.stem}_{method}.fits')} makes a controller."
         )
-    report.note_files(write_together({at: text.encode() for at, text in contents.items()}))
+    _refuse_taken(contents, force=arguments.force)
+    report.note_written(*write_together({at: text.encode() for at, text in contents.items()}))
     return report
 
 

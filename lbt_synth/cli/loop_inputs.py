@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.output import Report
+from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.cli.streams import printable
 from lbt_synth.config import Config, load_config
 from lbt_synth.config.load import config_from_text
@@ -123,23 +123,27 @@ def say_accelerometers(design: Design) -> str:
     return f"{nm_text(with_nm)} with the accelerometers, {nm_text(without_nm)} without them"
 
 
-def loop_difference_notes(config: Config, design: Design) -> list[str]:
-    """Say where a design was made for another loop than the configuration's."""
+def difference_notes(config: Config, designs: Mapping[str, Design]) -> list[str]:
+    """Say which designs were made for another loop than the configuration's, and for which."""
     notes = []
-    if design.hardware is not None:
-        notes = loop_differences(design.hardware, config.hardware)
+    for name, design in designs.items():
+        if design.hardware is None:
+            continue
+        differences = loop_differences(design.hardware, config.hardware)
         if design.other_sensors and not config.hardware.suite.is_same(design.hardware.suite):
-            notes.append(
+            differences.append(
                 "runs with the sensors of the gain file beside the loop's own, not with those of "
                 "the configuration."
             )
-    return [f"note: {text}" for text in notes]
+        notes += [f"note: {difference[:-1]} ({name})." for difference in differences]
+    return notes
 
 
-def named_difference_notes(config: Config, designs: Mapping[str, Design]) -> list[str]:
-    """Say so of designs by their names."""
-    notes = {name: loop_difference_notes(config, design) for name, design in designs.items()}
-    return [f"{note[:-1]} ({name})." for name, those in notes.items() for note in those]
+def add_certificate(report: Report, design: Design) -> None:
+    """Add whether a design passed its certificate, and what it assumes."""
+    report.verdict.append(say_checks(design.certificate.checks))
+    report.data |= {"certificate": design.certificate.passed, "assumptions": design.assumptions}
+    report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
 
 
 def say_limit(limit: ResidualLimit, config: Config) -> str:
@@ -190,16 +194,12 @@ def add_truth(
 
 def margin_columns(margins: LoopMargins | None) -> dict[str, tuple[Any, Column]]:
     """Return the facts of what a loop survives, alone; None where it is unstable."""
-    late, early, modulus, gains = (
-        getattr(margins, name, None)
-        for name in ("delay_frames", "early_frames", "modulus", "gain_errors_db")
-    )
-    less, more = gains or (None, None)
+    less, more = getattr(margins, "gain_errors_db", (None, None))
     frames, decibels = ({"unit": u, "format": f} for u, f in (("frames", ".2f"), ("dB", ".1f")))
     return {
-        "delay_frames": fact(late, "late by", **frames),
-        "early_frames": fact(early, "early by", **frames),
+        "delay_frames": fact(getattr(margins, "delay_frames", None), "late by", **frames),
+        "early_frames": fact(getattr(margins, "early_frames", None), "early by", **frames),
         "gain_less_db": fact(less, "gain down", **decibels),
         "gain_more_db": fact(more, "gain up", **decibels),
-        "modulus": fact(modulus, "modulus margin", format=".3f"),
+        "modulus": fact(getattr(margins, "modulus", None), "modulus margin", format=".3f"),
     }

@@ -16,18 +16,15 @@ import signal
 import sys
 import threading
 from argparse import Namespace
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import Any
 
 from lbt_synth.cli.arguments import COMMANDS, build_parser, command_options
 from lbt_synth.cli.streams import discard, print_error, show_progress
 from lbt_synth.errors import ConfigError, LbtSynthError, SynthesisError
 from lbt_synth.storage.display_unit import own_display_unit
 from lbt_synth.storage.thread_limits import limit_threads
-
-if TYPE_CHECKING:  # slow to import for --help
-    from lbt_synth.cli.output import Report
 
 DONE, FAILED, WRONG = 0, 1, 2
 INTERRUPTED, BROKEN_PIPE, TERMINATED = 130, 141, 143  # as shells count signals
@@ -70,16 +67,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     return DONE if report.passed else FAILED
 
 
-def _find_command(command: str) -> Callable[[Namespace], Report]:
+def _find_command(command: str) -> Any:
     """Return what runs a command, from its module."""
     module = importlib.import_module(f"lbt_synth.cli.{COMMANDS[command].module}")
-    named = f"run_{command.replace('-', '_')}"
-    run: Callable[[Namespace], Report] = getattr(module, named, None) or module.run
-    return run
+    return getattr(module, f"run_{command.replace('-', '_')}")
 
 
 def _fail(error: LbtSynthError, message: str, arguments: Namespace) -> int:
-    """Print what failed, and return the exit status."""
     if arguments.json:
         print(json.dumps({"error": type(error).__name__, "message": message}))
     print_error(f"error: {message}")

@@ -1,4 +1,4 @@
-"""What a command prints and writes: the point first, one table, JSON, figures, telemetry."""
+"""What a command prints and writes: the point first, one table, JSON, rows and figures."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from argparse import Namespace
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from lbt_synth.cli.arguments import input_files
 from lbt_synth.cli.streams import printable
-from lbt_synth.errors import ProblemError
 from lbt_synth.report.draw import FIGURE_ENDINGS, save_figure
-from lbt_synth.storage.atomic_files import require_writable, write_atomically
+from lbt_synth.storage.atomic_files import require_ending, require_writable, write_atomically
 from lbt_synth.storage.rows import (
     cell_text,
     csv_rows,
@@ -28,9 +28,6 @@ from lbt_synth.storage.rows import (
     row_table,
 )
 from lbt_synth.storage.tables import Table, text_lines
-
-if TYPE_CHECKING:  # which few commands need
-    from lbt_synth.files import Telemetry
 
 _WIDTH = 200  # columns of --verbose where the output is no terminal
 _BRIEF_WIDTH, _BRIEF_LINES, BRIEF_ROWS = 100, 25, 12  # without --verbose: a screen
@@ -50,7 +47,6 @@ class Report:
     verdict: list[str] = field(default_factory=list)  # sentences, what matters most first
     tables: list[Table] = field(default_factory=list)  # the first is printed without --verbose
     notes: list[str] = field(default_factory=list)  # lines below the tables
-    text: str = ""  # a script or a schema, printed as it is instead
     passed: bool = True  # False makes the exit status 1
     # what -o writes: rows of a .csv, but for some of their fields, and a figure
     rows: Sequence[Any] = ()
@@ -102,24 +98,16 @@ class Report:
         if units := self.data.get("units", {}) | json_units(row):
             self.data["units"] = units
 
-    def note_written(self, path: str | os.PathLike[str], key: str = "file") -> None:
-        """Add a file that was written to the data, and a line about it to the notes."""
-        self.data[key] = str(path)
-        self.notes.append(f"{_WRITTEN}{path}")
-
-    def note_files(self, paths: Iterable[str | os.PathLike[str]]) -> None:
+    def note_written(self, *paths: str | os.PathLike[str]) -> None:
         """Add files that were written to the data, and a line about each to the notes."""
-        self.data["files"] = [str(path) for path in paths]
-        self.notes += [f"{_WRITTEN}{path}" for path in self.data["files"]]
+        self.data["files"] = [*self.data.get("files", ()), *map(str, paths)]
+        self.notes += [f"{_WRITTEN}{path}" for path in paths]
 
     def print(self, *, as_json: bool = False, verbose: bool = False) -> None:
         """Print to standard output."""
         if as_json:
             said = {"verdict": self.verdict} if self.verdict else {}
             print(json.dumps(json_value(said | self.data), allow_nan=False))
-            return
-        if self.text:
-            print(self.text)
             return
         room = shutil.get_terminal_size().columns if sys.stdout.isatty() else _WIDTH
         lacks_line = "─".encode(sys.stdout.encoding or "utf-8", "replace") == b"?"
@@ -215,33 +203,16 @@ def run_with_outputs(run: Callable[[Namespace], Report], arguments: Namespace) -
     if not isinstance(outputs, list):  # of a command that writes something else
         return run(arguments)
     for output in outputs:
-        if not output.lower().endswith((".csv", *FIGURE_ENDINGS)):
-            raise ProblemError(
-                f"an output must end in .csv, {', '.join(FIGURE_ENDINGS)}; got {output!r}."
-            )
-    one = [getattr(arguments, name, None) for name in ("config", "gain", "file")]
-    inputs = [*one, *getattr(arguments, "gains", ())]
-    require_writable(*outputs, inputs=[path for path in inputs if path])
+        require_ending(output, "an output", (".csv", *FIGURE_ENDINGS))
+    require_writable(*outputs, inputs=input_files(arguments))
     report = run(arguments)
     if (figure := report.figure) is not None:
-        report.note_files(
-            write_atomically(output, csv_rows(report.rows, without=report.without))
-            if output.lower().endswith(".csv")
-            else save_figure(figure(), output)
-            for output in outputs
+        report.note_written(
+            *(
+                write_atomically(output, csv_rows(report.rows, without=report.without))
+                if output.lower().endswith(".csv")
+                else save_figure(figure(), output)
+                for output in outputs
+            )
         )
     return report
-
-
-def write_telemetry(report: Report, output: str, telemetry: Telemetry, *, key: str) -> None:
-    """Write telemetry, and note in the report the file and what its format leaves out."""
-    from lbt_synth.files import save_telemetry  # which few commands need
-    from lbt_synth.files.telemetry.aot import lost_fields
-    from lbt_synth.files.telemetry.store import require_telemetry_name
-
-    path = save_telemetry(output, telemetry)
-    lost = lost_fields(telemetry) if require_telemetry_name(output) == "aot" else ()
-    report.note_written(path, key)
-    report.data["lost"] = list(lost)
-    if lost:
-        report.notes.append(f"note: the AOT standard has no place for {', '.join(lost)}.")

@@ -9,12 +9,13 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
+from lbt_synth.cli.arguments import input_files
 from lbt_synth.cli.loop_inputs import (
     choose_design_unit,
+    difference_notes,
     load_designs,
     load_shown,
     margin_columns,
-    named_difference_notes,
 )
 from lbt_synth.cli.output import Report
 from lbt_synth.design import Design
@@ -53,9 +54,10 @@ def run_plot(arguments: Namespace) -> Report:
             f"no loop is stable at {gain:g} times the sensor gain that its design assumes, and "
             "there is nothing to draw; lbt-synth show prints the factors that are stable."
         )
-    names = ("panel", "curve", "heading", "x", "y")
     report.rows = [
-        facts(**dict(zip(names, map(fact, (c.panel, c.name, c.heading, x, y)), strict=True)))
+        facts(
+            panel=fact(c.panel), curve=fact(c.name), heading=fact(c.heading), x=fact(x), y=fact(y)
+        )
         for c in curves
         for x, y in zip(c.x, c.y.tolist(), strict=True)
     ]
@@ -64,7 +66,6 @@ def run_plot(arguments: Namespace) -> Report:
 
 
 def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: float) -> None:
-    """Add the margins of designs, a line for each."""
     lines = []
     report.data |= {"gain_factor": gain_factor, "designs": {}}
     for name, design in designs.items():
@@ -91,7 +92,6 @@ def _add_margins(report: Report, designs: Mapping[str, Design], gain_factor: flo
 
 
 def _add_step_facts(report: Report, designs: Mapping[str, Design], gain_factor: float) -> None:
-    """Add how the loops follow a step."""
     steps = design_steps(closed_loops(designs, gain_factor), frames=_SETTLING_FRAMES)
     percent = {"unit": "%", "format": ".1f"}
     ms = {"unit": "ms", "scale": 1e3, "format": ".2f"}
@@ -109,8 +109,7 @@ def _add_step_facts(report: Report, designs: Mapping[str, Design], gain_factor: 
 
 def run_report(arguments: Namespace) -> Report:
     """Assess designs in the loop of a configuration, and write the page."""
-    inputs = (arguments.config, *arguments.gains)
-    require_page_names(arguments.output, arguments.pdf, inputs=inputs)
+    require_page_names(arguments.output, arguments.pdf, inputs=input_files(arguments))
     if arguments.title is not None and not arguments.title.strip():
         raise ProblemError("--title must hold at least one letter; got an empty text.")
     config = load_shown(arguments)
@@ -118,7 +117,6 @@ def run_report(arguments: Namespace) -> Report:
     files = dict(zip(designs, arguments.gains, strict=True))
     assessed = design_report(config, designs)
     page = report_page(assessed, files, arguments.title)
-    written = write_page(page, arguments.output, pdf=arguments.pdf)
     rows = [design_facts(assessed, one) for one in assessed.assessments]
     limit = assessed.limits.limit
     report = Report(
@@ -140,9 +138,9 @@ def run_report(arguments: Namespace) -> Report:
         },
         verdict=[verdict(assessed)],
         tables=[row_table(f"Designs in the loop of {config.source.name}", rows)],
-        notes=named_difference_notes(config, designs),
+        notes=difference_notes(config, designs),
     )
-    report.note_files(written)
+    report.note_written(*write_page(page, arguments.output, pdf=arguments.pdf))
     return report
 
 
@@ -169,5 +167,5 @@ def run_explore(arguments: Namespace) -> Report:
         print(f"Open {url} in a browser. Ctrl-C ends.", *said, sep="\n", file=stream, flush=True)
 
     place = {"host": arguments.host, "port": arguments.port, "origins": arguments.origin}
-    report.note_files(serve(config, designs, folder, **place, announce=announce))
+    report.note_written(*serve(config, designs, folder, **place, announce=announce))
     return report

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from argparse import Namespace
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.arguments import given_options, option_name
+from lbt_synth.cli.arguments import given_options, input_files
 from lbt_synth.cli.loop_inputs import choose_unit, load_designs, load_shown
 from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import count_progress, track_progress
@@ -28,17 +27,7 @@ from lbt_synth.report.figures import studies as figures
 from lbt_synth.storage.atomic_files import make_directory, refuse_replacing, write_atomically
 from lbt_synth.storage.display_unit import nm_text, own_display_unit
 from lbt_synth.storage.input_files import file_sha256
-from lbt_synth.storage.rows import (
-    PERCENT,
-    Facts,
-    csv_rows,
-    fact,
-    facts,
-    fill_row,
-    json_record,
-    json_units,
-    row_table,
-)
+from lbt_synth.storage.rows import PERCENT, Facts, csv_rows, fact, facts, fill_row
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import paper as published
@@ -54,44 +43,48 @@ def run_paper(arguments: Namespace) -> Report:
     rows = [(row, published.modal_row(row)) for row in plan]
     tables = {
         number: [published.table_entry(*pair) for pair in rows if pair[0].table == number]
-        for number in ("II", "III")
+        for number in ("III", "II")
     }
-    columns = published.rms_differences(tables["III"], "ours", "paper")
-    filters = published.paper_filters()
+    points = published.rms_differences(tables["III"], "ours", "paper")
+    report = _report_tables(folder, tables, points, "", "the paper")
+    filters, headings = published.paper_filters(), ("parameter", "value", "origin")
     with own_display_unit():  # JSON and CSV stay in nm
         parameters = published.parameter_rows()
-    report = Report(
-        data={
-            **{f"table_{n.lower()}": [json_record(e) for e in tables[n]] for n in tables},
-            "table_iii_rms_points": columns,
-            "hinf_gamma_ratio": filters[1].gamma_requested / filters[1].gamma_least,
-            "parameters": [
-                dict(zip(("name", "value", "origin"), row, strict=True)) for row in parameters
-            ],
-        },
-        verdict=[
-            f"Table III, {design_title(method)}: {points:.2f} points rms from the paper."
-            for method, points in columns.items()
-        ],
-        tables=[
-            row_table(f"Table {number}: Strehl ratio [%] at 2.2 um", tables[number])
-            for number in ("III", "II")
-        ],
-    )
-    headings = ("parameter", "value", "origin")
+    report.data |= {
+        "hinf_gamma_ratio": filters[1].gamma_requested / filters[1].gamma_least,
+        "parameters": [dict(zip(headings, row, strict=True)) for row in parameters],
+    }
     report.add_table("Parameters", headings, published.parameter_rows())
-    contents = {f"table_{n.lower()}.csv": csv_rows(entries) for n, entries in tables.items()}
-    contents["parameters.csv"] = csv_bytes(headings, parameters)
-    files = [write_atomically(folder / name, content) for name, content in contents.items()]
+    content = csv_bytes(headings, parameters)
+    report.note_written(write_atomically(folder / "parameters.csv", content))
     modal = [modal for row, modal in rows if row.table == "III"]
-    report.note_files([*files, *_draw_paper(folder, modal, filters)])
+    report.note_written(*_draw_paper(folder, modal, filters))
+    return report
+
+
+def _report_tables(
+    folder: Path,
+    tables: Mapping[str, Sequence[Facts]],
+    points: Mapping[str, float],
+    how: str,
+    reference: str,
+) -> Report:
+    """Write tables of the paper, and say how far columns of Table III are from a reference."""
+    report = Report(data={"table_iii_rms_points": points})
+    report.verdict = [
+        f"Table III, {design_title(method)}{how}: {rms:.2f} points rms from {reference}."
+        for method, rms in points.items()
+    ]
+    for number, entries in tables.items():
+        name = f"table_{number.lower()}"
+        report.add_rows(name, f"Table {number}{how}: Strehl ratio [%] at 2.2 um", entries)
+        report.note_written(write_atomically(folder / f"{name}.csv", csv_rows(entries)))
     return report
 
 
 def _draw_paper(
     folder: Path, rows: list[Facts], filters: tuple[FilterDesign, FilterDesign]
 ) -> list[Path]:
-    """Write figures and gain files of the comparison."""
     points = {
         design.method: [
             (entry.error_hz, getattr(entry, design.method))
@@ -127,7 +120,7 @@ def run_end_to_end(arguments: Namespace) -> Report:
         )
     (gain,) = arguments.gains
     outputs = [Path(arguments.output) / name for name in _FILES]
-    refuse_replacing(outputs, [arguments.config, gain])
+    refuse_replacing(outputs, input_files(arguments))
     setup = _load_setup(arguments)
     design = load_gain(gain)
     mix_controller(setup, design)  # refuses a filter of another loop before any work
@@ -156,12 +149,9 @@ def run_end_to_end(arguments: Namespace) -> Report:
             "note: the pyramid is the only wavefront sensor of the simulation: the fall-back "
             f"filter of the gain file runs, without {listing_text(unread)}."
         )
-    recorded = _telemetry(loop_run, design, gain)
-    report.note_files(
-        [
-            save_figure(figures.end_to_end_figure(loop_run), figure_file),
-            save_telemetry(telemetry_file, recorded),
-        ]
+    report.note_written(
+        save_figure(figures.end_to_end_figure(loop_run), figure_file),
+        save_telemetry(telemetry_file, _telemetry(loop_run, design, gain)),
     )
     return report
 
@@ -169,24 +159,25 @@ def run_end_to_end(arguments: Namespace) -> Report:
 def _run_facts(loop_run: EndToEndRun, design: Design, calibration: Calibration, gain: str) -> Facts:
     """Return the main numbers of a run, and what it ran."""
     numbers, rms = loop_run.summary(), {"unit": "nm rms", "format": ".1f"}
-    headings: dict[str, tuple[str, Mapping[str, Any]]] = {
-        "strehl": ("Strehl ratio", PERCENT),
-        "strehl_error": ("  standard error", {**PERCENT, "unit": "points"}),
-        "other_modes_strehl": ("  without tip and tilt", PERCENT),
-        "tip_rms_nm": ("tip", rms),
-        "tilt_rms_nm": ("tilt", rms),
-        "other_modes_rms_nm": ("all other modes", rms),
-        "tip_tilt_gain": ("optical gain of tip and tilt", {"format": ".3f"}),
-        "tip_tilt_gain_error": ("  standard error", {"format": ".3f"}),
-        "tip_tilt_noise_nm": ("what it leaves of their measurements", rms),
-    }
+    points = {**PERCENT, "unit": "points"}
     condition = float(np.linalg.cond(calibration.reconstructor))
+    ratio, error = numbers["tip_tilt_gain"], numbers["tip_tilt_gain_error"]
     return facts(
         gain=fact(gain),
         method=fact(design.method),
         specula=fact(specula_version()),
         **{name: fact(getattr(loop_run.setup, name)) for name in _SETTINGS},
-        **{name: fact(numbers[name], text, **how) for name, (text, how) in headings.items()},
+        strehl=fact(numbers["strehl"], "Strehl ratio", **PERCENT),
+        strehl_error=fact(numbers["strehl_error"], "  standard error", **points),
+        other_modes_strehl=fact(numbers["other_modes_strehl"], "  without tip and tilt", **PERCENT),
+        tip_rms_nm=fact(numbers["tip_rms_nm"], "tip", **rms),
+        tilt_rms_nm=fact(numbers["tilt_rms_nm"], "tilt", **rms),
+        other_modes_rms_nm=fact(numbers["other_modes_rms_nm"], "all other modes", **rms),
+        tip_tilt_gain=fact(ratio, "optical gain of tip and tilt", format=".3f"),
+        tip_tilt_gain_error=fact(error, "  standard error", format=".3f"),
+        tip_tilt_noise_nm=fact(
+            numbers["tip_tilt_noise_nm"], "what it leaves of their measurements", **rms
+        ),
         condition_number=fact(condition, "condition of the reconstructor", format=".1f"),
     )
 
@@ -207,7 +198,7 @@ def _require_seen(loop_run: EndToEndRun) -> None:
 def _load_setup(arguments: Namespace) -> EndToEndSetup:
     """Load the end-to-end setup of a configuration, with the changes of the command line."""
     setup = load_shown(arguments, all_modes=True).end_to_end
-    return replace(setup, **given_options(arguments, "pixels", "frames", "settle_frames", "seed"))
+    return replace(setup, **given_options(arguments, *_SETTINGS))
 
 
 def _telemetry(loop_run: EndToEndRun, design: Design, gain: str) -> Telemetry:
@@ -239,11 +230,11 @@ def _run_tables(arguments: Namespace) -> Report:
     """Run Tables II and III of the paper end to end, resuming what was interrupted."""
     folder = Path(arguments.output)
     written = [folder / name for number in arguments.tables for name in _TABLE_FILES[number]]
-    refuse_replacing(written, [arguments.config, *arguments.gains])
+    refuse_replacing(written, input_files(arguments))
     setup = _load_setup(arguments)
     designs = load_designs(arguments.gains)
-    for count in ("seeds", "row_seeds", "jobs"):
-        integer(getattr(arguments, count), option_name(count), at_least=1)
+    for count in ("seeds", "row_seeds"):
+        integer(getattr(arguments, count), count, at_least=1)
     specula_version()
     planned = published.plan_cases(
         setup,
@@ -253,31 +244,15 @@ def _run_tables(arguments: Namespace) -> Report:
         tables=arguments.tables,
     )
     total = len(published.all_cases(planned))
-    make_directory(folder)
     case_folder = folder / "cases"
     with run_in_parts(arguments, case_folder, total=total, what="runs") as engine:
         table = published.end_to_end_tables(setup, planned, case_folder, **engine)
-    printed = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
-    files = [write_atomically(folder / _TABLE_FILES[n][0], csv_rows(printed[n])) for n in printed]
-    if "III" in printed:
+    tables = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
+    points = published.rms_differences(tables.get("III", []), "strehl", "modal")
+    report = _report_tables(folder, tables, points, " end to end", "the modal analysis")
+    report.data["runs"] = total
+    if "III" in tables:
         figure = figures.end_to_end_table_figure(table)
-        files += [save_figure(figure, folder / name) for name in _TABLE_FILES["III"][1:]]
-    differences = published.rms_differences(printed.get("III", []), "strehl", "modal")
-    report = Report(
-        data={
-            "entries": [json_record(entry) for entry in table],
-            "units": json_units(table[0]),
-            "modal_distance_points": differences,
-            "runs": total,
-        },
-        tables=[
-            row_table(f"Table {n} end to end: Strehl ratio [%] at 2.2 um", entries)
-            for n, entries in printed.items()
-        ],
-        verdict=[
-            f"Table III, {method}: end to end less modal {points:.1f} points rms."
-            for method, points in differences.items()
-        ],
-    )
-    report.note_files(files)
+        names = _TABLE_FILES["III"][1:]
+        report.note_written(*(save_figure(figure, folder / name) for name in names))
     return report

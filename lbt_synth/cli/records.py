@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lbt_synth import identification, studies
-from lbt_synth.cli.arguments import given_options, refuse_options
-from lbt_synth.cli.loop_inputs import choose_unit, load_designs, say_accelerometers
-from lbt_synth.cli.output import Report, say_checks
+from lbt_synth.cli.arguments import input_files, refuse_options
+from lbt_synth.cli.loop_inputs import add_certificate, choose_unit, load_designs, say_accelerometers
+from lbt_synth.cli.output import Report
 from lbt_synth.cli.streams import count_progress, printable
 from lbt_synth.cli.telemetry import load_series, record_imaging, record_telescope, require_series
 from lbt_synth.config.write import RAISED, config_text, identified_config, require_writable_facts
@@ -25,7 +26,7 @@ from lbt_synth.identification.accelerometers.transfers import (
 )
 from lbt_synth.identification.commands.verdict import explain_commands
 from lbt_synth.identification.fit.identified_model import IdentifiedAxis, model_tables, say_count
-from lbt_synth.identification.records.record import LEAST_SECONDS, require_length
+from lbt_synth.identification.records.record import require_length
 from lbt_synth.loop import Imaging, loop_margins
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures import identification_figure
@@ -41,21 +42,20 @@ if TYPE_CHECKING:  # they load the methods of synthesis, which identify does not
 
 
 _STEPS = 3  # that diagnose and auto count
-_EXAMINES = "diagnose examines"
+_EXAMINES, _TESTED = "diagnose examines", "auto tests its design on"  # recorded series
 
 
 def run_identify(arguments: Namespace) -> Report:
     """Identify a loop from its record; write a configuration and, by default, a figure."""
     places = find_places(arguments)
-    record = read_record(arguments)
+    record = load_series(arguments)
+    if isinstance(record, LoopRecord):
+        record = record.bridged()
+        require_length(record)
     choose_unit(arguments, record.diameter_m)
     readings = read_accelerations(arguments, record)
     options = identification_options(arguments, record)
-    doubts: tuple[str, ...] = ()
-    if isinstance(record, SpectrumRecord):  # it does not hold the timing of the loop
-        options |= {name: getattr(arguments, name) for name in ("frame_rate_hz", "delay_frames")}
-    else:
-        doubts = judge_record(arguments, record)
+    doubts = judge_record(arguments, record)
     model = identification.identify(record, **options)
     report = Report(data={"source": str(arguments.file)})
     add_model(report, model)
@@ -94,13 +94,11 @@ def _say_model(report: Report, model: IdentifiedModel, record: LoopRecord | Spec
 
 def run_auto(arguments: Namespace) -> Report:
     """Identify a loop, design its controller, test it on unseen data, write its gain file."""
-    from lbt_synth.identification.auto import LEAST_SECONDS  # with it come the methods
-
     gain, arguments.file = require_gain_name(arguments.output), arguments.files[0]
     if len(arguments.files) > 1:
         return _run_nights(arguments, gain)
     places = find_places(arguments, gain=gain)
-    record = require_series(read_record(arguments, LEAST_SECONDS), "auto tests its design on")
+    record = require_series(load_series(arguments), _TESTED).bridged()
     choose_unit(arguments, record.diameter_m)
     channels, values, notes = read_accelerations(arguments, record) or (None, None, ())
     imaging = record_imaging(arguments, record)
@@ -133,13 +131,10 @@ def run_auto(arguments: Namespace) -> Report:
         title = "Accelerometers: residual on the second half of the record"
         report.add_rows("accelerometers", title, list(made.channels))
     loop = design.close(made.model.hardware)
-    report.verdict += [
-        say_checks(design.certificate.checks),
-        f"The loop has a modulus margin of {loop_margins(loop).modulus:.3f}.",
-    ]
-    report.data |= {"certificate": design.certificate.passed, "assumptions": design.assumptions}
-    report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
-    write_files(report, places, arguments, record, made.model, made)
+    add_certificate(report, design)
+    report.verdict.append(f"The loop has a modulus margin of {loop_margins(loop).modulus:.3f}.")
+    report.note_written(save_gain(gain, design))
+    write_files(report, places, arguments, record, made.model, designs={made.name: design})
     return report
 
 
@@ -155,11 +150,11 @@ def _run_nights(arguments: Namespace, gain: Path) -> Report:
     names = [printable(Path(path).name) for path in arguments.files]
     if len(set(names)) != len(names):
         raise ProblemError(f"each record must have a name of its own; got {', '.join(names)}.")
-    require_writable(gain, inputs=arguments.files)
+    require_writable(gain, inputs=input_files(arguments))
     nights = dict[str, LoopRecord]()
     for name, path in zip(names, arguments.files, strict=True):
         series = load_series(Namespace(**vars(arguments) | {"file": path}))
-        nights[name] = require_series(series, "auto tests its design on").bridged()
+        nights[name] = require_series(series, _TESTED).bridged()
     with count_progress(total=_STEPS * len(names), what="identifying and designing") as count:
         made = studies.design_from_nights(
             nights,
@@ -174,7 +169,7 @@ def _run_nights(arguments: Namespace, gain: Path) -> Report:
     design = _with_repairs(made.design, *nights.values())
     report = Report(
         data={"sources": arguments.files, "written": made.name, "method": design.method},
-        verdict=[*made.verdict, say_checks(design.certificate.checks)],
+        verdict=list(made.verdict),
         notes=[marked_note(note) for note in made.notes],
     )
     words = {"unit": "nm", "format": ".1f", "missing": "unstable"}
@@ -187,8 +182,7 @@ def _run_nights(arguments: Namespace, gain: Path) -> Report:
         for name, residual_nm in made.residual_nm.items()
     ]
     report.add_rows("nights", "Residual by the model of each night", rows)
-    report.data |= {"certificate": design.certificate.passed, "assumptions": design.assumptions}
-    report.notes += [f"assumes: {assumption}." for assumption in design.assumptions]
+    add_certificate(report, design)
     report.note_written(save_gain(gain, design))
     return report
 
@@ -235,8 +229,7 @@ def run_diagnose(arguments: Namespace) -> Report:
     from lbt_synth.report.pages import diagnosis_page, diagnosis_rows
 
     if arguments.output is not None:
-        paths = given_options(arguments, "file", "gain", "commands")
-        require_page_names(arguments.output, arguments.pdf, inputs=tuple(paths.values()))
+        require_page_names(arguments.output, arguments.pdf, inputs=input_files(arguments))
     elif arguments.pdf is not None:
         raise ProblemError("--pdf is the page of -o on paper; give -o, too.")
     designs = {} if arguments.gain is None else load_designs([arguments.gain])
@@ -274,26 +267,14 @@ def run_diagnose(arguments: Namespace) -> Report:
         report.add_rows(key, caption, rows)
     report.tables += [] if model is None else model_tables(model)[1:]
     if arguments.output is not None:
-        files = (arguments.file, *([arguments.gain] if arguments.gain else []))
-        page = diagnosis_page(diagnosis, files)
-        report.note_files(write_page(page, arguments.output, pdf=arguments.pdf))
+        page = diagnosis_page(diagnosis, input_files(arguments))
+        report.note_written(*write_page(page, arguments.output, pdf=arguments.pdf))
     return report
 
 
-def read_record(
-    arguments: Namespace, least_seconds: float = LEAST_SECONDS
-) -> LoopRecord | SpectrumRecord:
-    """Load the record of the command line, with its short gaps bridged; refuse a short one."""
-    record = load_series(arguments)
-    if isinstance(record, LoopRecord):
-        record = record.bridged()
-        require_length(record, seconds=least_seconds)
-    return record
-
-
-def judge_record(arguments: Namespace, record: LoopRecord) -> tuple[str, ...]:
+def judge_record(arguments: Namespace, record: LoopRecord | SpectrumRecord) -> tuple[str, ...]:
     """Refuse a record whose commands do not reach its measurements; return notes on others."""
-    if record.commands is None:
+    if isinstance(record, SpectrumRecord) or record.commands is None:
         return ()
     verdict = explain_commands(record, sensor_gain=record.stated_gain or None)
     if not arguments.accept_record:
@@ -311,8 +292,9 @@ def identification_options(
     telescope = record_telescope(arguments, record)
     if telescope["obstruction"] is not None and record.diameter_m is None:
         raise ProblemError("--obstruction is a fraction of the diameter; give --diameter-m.")
-    loop = record if isinstance(record, LoopRecord) else arguments
-    require_writable_facts(record.axes, loop.frame_rate_hz, loop.delay_frames, **telescope)
+    loop = record if isinstance(record, LoopRecord) else arguments  # a spectrum has no timing
+    timing = {name: getattr(loop, name) for name in ("frame_rate_hz", "delay_frames")}
+    require_writable_facts(record.axes, **timing, **telescope)
     options: dict[str, Any] = {
         "lowest_line_hz": arguments.lowest_line_hz,
         "most_lines": arguments.most_lines,
@@ -320,7 +302,7 @@ def identification_options(
     if isinstance(record, SpectrumRecord):
         if arguments.sensor_gain is not None:
             raise ProblemError("a spectrum is of the phase: it has no sensor gain to be given.")
-        return options | {"noise_nm": arguments.noise_nm}
+        return options | timing | {"noise_nm": arguments.noise_nm}
     if arguments.noise_nm is not None:
         raise ProblemError("--noise-nm is for spectra; the noise of a series is found in it.")
     return options | {"sensor_gain": record.stated_gain or None}
@@ -355,14 +337,13 @@ def add_accelerometers(report: Report, transfers: AccelerometerTransfers) -> Non
 
 
 def find_places(arguments: Namespace, **gain: Path) -> dict[str, Path]:
-    """Return where model, figure and gain file go, beside each other; refuse bad places."""
+    """Return where model and figure go, beside a gain file if there is one; refuse bad places."""
     output = Path(arguments.output)
     model = output.with_suffix(".yaml") if gain else output
     places = {**gain, "model": require_ending(model, "a model", (".yaml", ".yml"))}
     if not arguments.no_figure:
         places["figure"] = output.with_suffix(".png")
-    inputs = given_options(arguments, "file", "commands", "accelerometers")
-    require_writable(*places.values(), inputs=inputs.values())
+    require_writable(*places.values(), inputs=input_files(arguments))
     return places
 
 
@@ -372,14 +353,11 @@ def write_files(
     arguments: Namespace,
     record: LoopRecord | SpectrumRecord,
     model: IdentifiedModel,
-    made: RecordedDesign | None = None,
+    *,
+    designs: Mapping[str, Design] | None = None,
     accelerometers: AccelerometerTransfers | None = None,
 ) -> None:
-    """Write gain file, model and figure, one after the other: what is ready is not lost."""
-    designs = None
-    if made is not None:
-        designs = {made.name: made.design}
-        report.note_written(save_gain(places["gain"], made.design))
+    """Write model and figure, one after the other: what is ready is not lost."""
     source = ascii(Path(arguments.file).name)[1:-1]
     settings, comments = identified_config(
         model,
@@ -388,20 +366,17 @@ def write_files(
         accelerometers=accelerometers,
     )
     text = config_text(settings, comments).encode()
-    report.note_written(write_atomically(places["model"], text), "model")
+    report.note_written(write_atomically(places["model"], text))
     report.notes += [f"note: {key} is {why}." for key, why in comments.items() if RAISED in why]
     if "figure" in places:
         figure = identification_figure(model, designs=designs)
-        report.note_written(save_figure(figure, places["figure"]), "figure")
+        report.note_written(save_figure(figure, places["figure"]))
 
 
 def add_record(report: Report, record: LoopRecord | SpectrumRecord) -> None:
     """Add what a record holds, and what was found wrong with it."""
     report.data["record"] = record_data(record)
-    if isinstance(record, SpectrumRecord):
-        report.notes += [f"note: {note}" for note in record.notes]
-        return
-    if record.findings:
+    if isinstance(record, LoopRecord) and record.findings:
         caption = f"Record of {record.duration_s:.4g} s: {record.summary()}"
         report.tables.append(row_table(caption, record.findings))
     report.notes += [f"note: {note}" for note in record.notes]

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.arguments import given_options, refuse_options
-from lbt_synth.cli.loop_inputs import load_designs, load_shown, loop_difference_notes
-from lbt_synth.cli.output import Report, write_telemetry
+from lbt_synth.cli.arguments import given_options, input_files, refuse_options
+from lbt_synth.cli.loop_inputs import difference_notes, load_designs, load_shown
+from lbt_synth.cli.output import Report
+from lbt_synth.cli.telemetry import write_telemetry
 from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import GainFileError, ProblemError, UnstableLoopError
@@ -51,14 +52,14 @@ def parse_drop(text: str) -> Drop:
     return Drop(unit=unit, **ends, reading=reading or READINGS[0])
 
 
-def run(arguments: Namespace) -> Report:
+def run_simulate(arguments: Namespace) -> Report:
     """Close the loop in the time domain, beside the exact answer; sensors may fail on the way."""
     if arguments.telemetry is not None:
         require_telemetry_name(arguments.telemetry)
-        require_writable(arguments.telemetry, inputs=[arguments.config, *arguments.gains])
     if arguments.spectrum is not None:
         require_ending(arguments.spectrum, "a spectrum", [".fits"])
-        require_writable(arguments.spectrum, inputs=[arguments.config, *arguments.gains])
+    outputs = given_options(arguments, "telemetry", "spectrum").values()
+    require_writable(*outputs, inputs=input_files(arguments))
     if (count := len(arguments.gains)) > 1:
         single = ("output", "telemetry", "spectrum", "drop")
         refuse_options(arguments, single, f"goes with one gain file; got {count}")
@@ -91,9 +92,9 @@ def run(arguments: Namespace) -> Report:
                 **noise,
             },
         )
-        write_telemetry(report, arguments.telemetry, recorded, key="telemetry")
+        write_telemetry(report, arguments.telemetry, recorded)
     if arguments.spectrum is not None:
-        report.note_written(write_atomically(arguments.spectrum, spectrum), "spectrum")
+        report.note_written(write_atomically(arguments.spectrum, spectrum))
     return report
 
 
@@ -111,9 +112,8 @@ def tiptop_spectrum(loop: ClosedLoop, truth: Truth) -> bytes:
 def _run(
     arguments: Namespace, name: str, design: Design, truth: Truth, config: Config
 ) -> DesignRun:
-    """Run the loop of a gain file."""
     drops = _parse_drops(arguments, name, design)
-    differences = loop_difference_notes(config, design)
+    differences = difference_notes(config, {name: design})
     how: dict[str, Any] = _choose_sizes(arguments, config, drops)
     how |= {"drops": drops, "stroke": arguments.stroke}
     how["estimates"] = arguments.form == "estimator"
@@ -155,7 +155,6 @@ def _describe_runs(runs: Sequence[DesignRun], truth: Truth, config: Config) -> R
 
 
 def _draw(design: Design, simulation: Simulation, segments: Sequence[tuple[Segment, Facts]]) -> Any:
-    """Return the figure of a run."""
     if not design.other_sensors:
         title = f"{design.method}: the first second, and spectra of all runs"
         return simulation_figure(simulation, title=title)

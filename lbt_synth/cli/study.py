@@ -22,15 +22,13 @@ from lbt_synth.studies.grid import choose_engine
 from lbt_synth.studies.study.run import PAGE, PRINT, output_paths, replay_row
 from lbt_synth.studies.study.statistics import study_statistics, summary_tables, worst_table
 from lbt_synth.studies.study.study import Study
-from lbt_synth.validation import integer
 
 _FAILURE = ("row", "controller", "error")
 _WORST = 3  # rows of each controller that are printed; the page has more
 
 
-def run(arguments: Namespace) -> Report:
+def run_study(arguments: Namespace) -> Report:
     """Run a study, say what it would cost, or replay one of its rows."""
-    integer(arguments.jobs, "--jobs", at_least=1)
     folder = Path(arguments.output)
     if arguments.pdf:
         require_weasyprint()
@@ -69,14 +67,13 @@ def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
             f"{duration_text(run.seconds)}, {duration_text(run.computing_s)} of all processes."
         )
     count = len(run.failures)
-    return Report(
+    report = Report(
         data={
             "samples": loaded.samples,
             "computed": run.computed,
             "failures": count,
             "seconds": run.seconds,
             "computing_seconds": run.computing_s,
-            "files": [str(path) for path in files],
             "statistics": asdict(statistics),
         },
         verdict=study_verdict(statistics),
@@ -87,9 +84,11 @@ def _run_study(loaded: Study, folder: Path, arguments: Namespace) -> Report:
         notes=[
             f"note: {done}",
             *([f"note: {count} results failed, see {run.failed}."] if count else []),
-            *(f"{'written' if now else 'unchanged'}: {path}" for path, now in files.items()),
+            *(f"unchanged: {path}" for path, now in files.items() if not now),
         ],
     )
+    report.note_written(*(path for path, now in files.items() if now))
+    return report
 
 
 def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
@@ -108,7 +107,7 @@ def _replay(loaded: Study, folder: Path, arguments: Namespace) -> Report:
     )
     results = [(name, stored.get(name), fresh.get(name)) for name in loaded.result_columns]
     report.add_table(f"Results of row {row}", ("result", "stored", "now"), results)
-    report.note_files(replay.files)
+    report.note_written(*replay.files)
     return report
 
 

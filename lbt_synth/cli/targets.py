@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from argparse import Namespace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from lbt_synth.cli.arguments import given_options, option_name
-from lbt_synth.cli.loop_inputs import choose_unit, load_design
+from lbt_synth.cli.arguments import given_options, input_files, refuse_options
+from lbt_synth.cli.loop_inputs import choose_unit, load_designs
 from lbt_synth.cli.output import Report, say_checks
 from lbt_synth.cli.telemetry import load_series, record_imaging, require_series
-from lbt_synth.errors import GainFileError, ProblemError
+from lbt_synth.errors import GainFileError
 from lbt_synth.files import load_gain
 from lbt_synth.identification.records.record import require_length
 from lbt_synth.interop import export
@@ -26,23 +27,20 @@ from lbt_synth.storage.rows import fact, facts
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies.runs import rehearse_record
 
-_OPTIONS = ("form", "precision", "name", "order", "modes", "other_gain", "steps")
 _FEWEST = 256  # frames of a record: a loop needs some to settle, and some to compare
 
 
 def run_export(arguments: Namespace) -> Report:
     """Write the controller of a gain file for another program."""
-    target = target_named(arguments.target)
-    options = given_options(arguments, *_OPTIONS)
+    accepted = {name: target_named(name).options for name in target_names()}
+    options = given_options(arguments, *chain(*accepted.values()))
     for option in options:
-        if option not in target.options:
-            *some, last = (n for n in target_names() if option in target_named(n).options)
-            fitting = f"{', '.join(some)} or {last}" if some else last
-            raise ProblemError(
-                f"{option_name(option)} goes with --for {fitting}; got --for {arguments.target}."
-            )
-    output = Path(arguments.output)
-    require_writable(*target.places(output), inputs=[arguments.gain])
+        fitting = [name for name in accepted if option in accepted[name]]
+        if arguments.target not in fitting:
+            why = f"goes with --for {' or '.join(fitting)}; got --for {arguments.target}"
+            refuse_options(arguments, [option], why)
+    output, target = Path(arguments.output), target_named(arguments.target)
+    require_writable(*target.places(output), inputs=input_files(arguments))
     design = load_gain(arguments.gain)
     digest = file_sha256(arguments.gain, GainFileError)
     written = export(output, design, arguments.target, gain_digest=digest, **options)
@@ -68,13 +66,13 @@ def run_export(arguments: Namespace) -> Report:
     if written.checks:
         report.add_rows("checks", "Checks in the arithmetic of the target", written.checks)
     report.notes += [f"note: {note}." for note in written.notes]
-    report.note_files(written.files)
+    report.note_written(*written.files)
     return report
 
 
 def run_rehearse(arguments: Namespace) -> Report:
     """Run the loop of a record in the arithmetic of a target, beside the design and what ran."""
-    target, design = arguments.target, load_design(arguments.gain)
+    target, (design,) = arguments.target, load_designs([arguments.gain]).values()
     record = require_series(load_series(arguments), "a rehearsal runs on").bridged()
     require_length(record, frames=_FEWEST, seconds=0)
     choose_unit(arguments, record.diameter_m)

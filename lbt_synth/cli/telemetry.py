@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from lbt_synth.cli.arguments import given_options
+from lbt_synth.cli.arguments import command_options, input_files
 from lbt_synth.cli.loop_inputs import choose_unit
-from lbt_synth.cli.output import Report, write_telemetry
+from lbt_synth.cli.output import Report
 from lbt_synth.errors import ProblemError
-from lbt_synth.files import Telemetry, load_telemetry
+from lbt_synth.files import Telemetry, load_telemetry, save_telemetry
+from lbt_synth.files.telemetry.aot import lost_fields
 from lbt_synth.files.telemetry.store import require_telemetry_name
 from lbt_synth.files.telemetry.telemetry import FACTS, LAYERS
 from lbt_synth.identification import LoopRecord, SpectrumRecord, load_record
@@ -22,7 +23,7 @@ from lbt_synth.identification.records.from_file import is_telemetry, telemetry_o
 from lbt_synth.loop import Imaging
 from lbt_synth.storage.atomic_files import require_writable
 from lbt_synth.storage.display_unit import shown_unit
-from lbt_synth.storage.rows import fact, fact_table, facts, json_record, json_units
+from lbt_synth.storage.rows import fact, facts
 from lbt_synth.storage.words import count_text
 from lbt_synth.validation import FloatArray
 
@@ -30,11 +31,7 @@ _FACTS = (  # that a file may not hold
     *("frame_rate_hz", "delay_frames", "unit", "command_unit", "diameter_m", "obstruction"),
     *("axes", "averages", "commands"),
 )
-_READING = (  # options that say how a record is read
-    *_FACTS,
-    *("columns", "sensor_gain", "command_increments", "swap_axes"),
-    *("command_shift_frames", "command_sign", "command_matrix", "command_scale"),
-)
+_NOT_READING = ("loop", "show_unit", "output", "json", "verbose")  # of telemetry's options
 
 
 def require_series(record: LoopRecord | SpectrumRecord, what: str) -> LoopRecord:
@@ -87,10 +84,8 @@ def record_imaging(arguments: Namespace, record: LoopRecord) -> Imaging:
 
 def record_telescope(arguments: Namespace, record: LoopRecord | SpectrumRecord) -> dict[str, Any]:
     """Return diameter, obstruction and wavelength: of the command line, else of the record."""
-    if isinstance(record, LoopRecord):
-        obstruction, wavelength_um = record.obstruction, record.imaging_wavelength_um
-    else:
-        obstruction, wavelength_um = arguments.obstruction, None
+    obstruction = getattr(record, "obstruction", arguments.obstruction)  # a spectrum has none
+    wavelength_um = getattr(record, "imaging_wavelength_um", None)
     if arguments.wavelength_um is not None:
         wavelength_um = arguments.wavelength_um
     camera = Imaging() if wavelength_um is None else Imaging(wavelength_um=wavelength_um)
@@ -118,15 +113,18 @@ def _parse_columns(pairs: Sequence[str] | None) -> dict[str, list[str | int]] | 
     return out
 
 
-def run(arguments: Namespace) -> Report:
+def run_telemetry(arguments: Namespace) -> Report:
     """Show telemetry, or a record as telemetry, and write it."""
     output = arguments.output
     if output is not None:
         require_telemetry_name(output)
-        named = given_options(arguments, "file", "commands")
-        require_writable(output, inputs=list(named.values()))
+        require_writable(output, inputs=input_files(arguments))
     notes: list[str] = []
-    anew = any(getattr(arguments, name) not in (None, False, 0) for name in _READING)
+    anew = any(
+        getattr(arguments, name) != usual
+        for name, (_, usual) in command_options("telemetry").items()
+        if name not in _NOT_READING
+    )
     if is_telemetry(arguments.file) and not anew:
         telemetry = load_telemetry(arguments.file, loop=arguments.loop)
     else:
@@ -143,8 +141,17 @@ def run(arguments: Namespace) -> Report:
     if "timing" not in telemetry.metadata:  # of another program
         report.notes.append(telemetry.convention)
     if output is not None:
-        write_telemetry(report, output, telemetry, key="output")
+        write_telemetry(report, output, telemetry)
     return report
+
+
+def write_telemetry(report: Report, output: str, telemetry: Telemetry) -> None:
+    """Write telemetry, and note in the report the file and what its format leaves out."""
+    report.note_written(save_telemetry(output, telemetry))
+    lost = lost_fields(telemetry) if require_telemetry_name(output) == "aot" else ()
+    report.data["lost"] = list(lost)
+    if lost:
+        report.notes.append(f"note: the AOT standard has no place for {', '.join(lost)}.")
 
 
 def _describe_telemetry(telemetry: Telemetry) -> Report:
@@ -158,25 +165,16 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
         name: _rms(array) for name, array, layer in arrays if layer.is_series and name != "times_s"
     }
     units = {name: layer.unit_in(telemetry) for name, _, layer in arrays}
-    mirror = telemetry.mirror
-    what = facts(
-        **{
-            name: fact(getattr(telemetry, name), text, unit=unit)
-            for name, (_, unit, text) in FACTS.items()
-            if not name.endswith("_unit")
-        }
-    )
-    mirror_record = None if mirror is None else asdict(mirror)
+    mirror = None if telemetry.mirror is None else asdict(telemetry.mirror)
     report = Report(
         data={
-            **json_record(what),
             "frames": telemetry.frames,
             "modes": telemetry.modes,
             "arrays": {name: list(array.shape) for name, array, _ in arrays},
-            "units": json_units(what) | units,
+            "units": units,
             "rms": rms,
             "metadata": dict(telemetry.metadata),
-            "mirror": mirror_record,
+            "mirror": mirror,
             "mirror_taps": telemetry.mirror_taps,
             "convention": telemetry.convention,
         }
@@ -200,8 +198,13 @@ def _describe_telemetry(telemetry: Telemetry) -> Report:
             for name, array, layer in arrays
         ],
     )
-    report.tables.append(fact_table("Loop", what))
-    more = {f"mirror, {name}": value for name, value in (mirror_record or {}).items()}
+    loop = {
+        name: fact(getattr(telemetry, name), text, unit=unit)
+        for name, (_, unit, text) in FACTS.items()
+        if not name.endswith("_unit")
+    }
+    report.add_facts("Loop", facts(**loop))
+    more = {f"mirror, {name}": value for name, value in (mirror or {}).items()}
     more |= telemetry.metadata
     if more:
         report.add_table("What else the file says", ("name", "value"), more.items())

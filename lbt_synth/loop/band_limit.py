@@ -134,7 +134,7 @@ class _Band:
         noise = self.mode.noise_nm2
         values = np.log1p((self.base - noise + added) / noise)
         inside = (self.quadrature * values) @ self.mode.cosines(self.x)
-        return Prediction.of(self.outside + inside, self.mode.target)
+        return self.mode.predicted(self.outside + inside)
 
     def bounds(
         self, prediction: Prediction, added: FloatArray, worst: float

@@ -58,12 +58,6 @@ from lbt_synth.validation import (
 _NODES = 6  # of a panel of a spectrum, whose power they have to 1e-6
 _TOGETHER = 2048  # loops with the same frequencies: as many as repay their panels
 _COVARIANCES = ("turbulence_nm2", "noise_nm2", "random_vibration_nm2", "within_nm2")
-_ORIGINS = {
-    "turbulence": "turbulence",
-    "vibration": "vibrations",
-    "noise": "noise",
-    "within": "within frames",
-}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,8 +82,12 @@ class ResidualBudget(Summarised):
         return f"{nm_text(self.rms_nm, '.4g')} rms, {modes} modes"
 
     def _summarise(self) -> Summary:
-        headings = {"rms_nm": "residual"} | {
-            f"{name}_nm": f"  {heading}" for name, heading in _ORIGINS.items()
+        headings = {
+            "rms_nm": "residual",
+            "turbulence_nm": "  turbulence",
+            "vibration_nm": "  vibrations",
+            "noise_nm": "  noise",
+            "within_nm": "  within frames",
         }
         nm = {"unit": "nm rms", "format": ".1f"}
         named = {name: fact(getattr(self, name), text, **nm) for name, text in headings.items()}
@@ -446,7 +444,7 @@ def _of_seen(
     """Return what a line leaves that channels read, too, (2, n, n)."""
     process, entry = _shaken(loop, line, motion)
     n, rate = loop.hardware.modes, loop.hardware.frame_rate_hz
-    driven = _driven(rows, process, entry)
+    driven = rows.driven(*_phases_of(rows, process), entry[None])
     hold, along = rows.hold or STILL, entry[:n, :1]
     out = np.zeros((2, n, n))
     if rows.hold is None:
@@ -480,11 +478,6 @@ def _of_seen(
     return out + adaptive_integral(density, graded_edges(roots) * rate / 2)
 
 
-def _driven(rows: Evaluator, process: StateSpace, entry: FloatArray) -> Evaluator:
-    """Return a loop from the drives of a process, whose phases are those of the loop."""
-    return rows.driven(*_phases_of(rows, process), entry[None])
-
-
 def _phases_of(rows: Evaluator, process: StateSpace) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return A, B and C of a process at each phase of a loop."""
     A, B, C, _ = (stack[np.arange(rows.phases) % process.period] for stack in process.stacks())
@@ -493,8 +486,6 @@ def _phases_of(rows: Evaluator, process: StateSpace) -> tuple[FloatArray, FloatA
 
 def _moved_rows(loop: ClosedLoop, motion: Mapping[str, Motion]) -> list[tuple[int, str]]:
     """Return the inputs of a loop at which channels read a line, and the channels, in order."""
-    if not loop.reads_others:
-        return []
     rows, n = loop.hardware.suite.rows(loop.hardware), loop.hardware.modes
     return [(n + rows[name].start, name) for name in loop.hardware.suite.channels if name in motion]
 

@@ -32,26 +32,13 @@ class ClosedLoop(Summarised):
 
     Made by :func:`close_loop`. The measurements are those that the controller reads: of the loop's
     own sensor, or of all.
-
-    Attributes
-    ----------
-    system : StateSpace
-        The loop.
-    hardware : LoopHardware
-        Sensor, mirror and delay.
-    controller : Controller
-        The controller.
-    sensor_gain : float
-        Real gain of the loop's own sensor relative to its matrix.
-    blind : tuple of str
-        Sensors and channels whose readings are zero, or frozen.
     """
 
     system: StateSpace
-    hardware: LoopHardware
+    hardware: LoopHardware  # sensor, mirror and delay
     controller: Controller
-    sensor_gain: float
-    blind: tuple[str, ...] = ()
+    sensor_gain: float  # real gain of the loop's own sensor relative to its matrix
+    blind: tuple[str, ...] = ()  # sensors and channels whose readings are zero, or frozen
 
     def _brief(self) -> str:
         return f"{self.hardware._brief()}, sensor gain {self.sensor_gain:.4g}"

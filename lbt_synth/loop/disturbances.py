@@ -18,7 +18,7 @@ from lbt_synth.models.plant.seen_vibration import SeenVibration, seen_vibration
 from lbt_synth.models.sensor_suite import Accelerometer, Motion, checked_motions, period_frames
 from lbt_synth.models.spectra import breakpoints_below
 from lbt_synth.models.vibration import checked_direction
-from lbt_synth.validation import FloatArray, float_array, number
+from lbt_synth.validation import FloatArray, float_array, number, set_fields
 
 # A spectrum is drawn over this many times the wanted frames, which hides the series' period.
 _PERIODS = 4
@@ -78,8 +78,7 @@ class Disturbance:
                 f"{phase.shape} and {noise.shape}."
             )
         number(self.sensor_gain, "sensor_gain", above=0)
-        object.__setattr__(self, "phase_nm", phase)
-        object.__setattr__(self, "noise", None if self.noise is None else noise)
+        set_fields(self, phase_nm=phase, noise=None if self.noise is None else noise)
 
     @property
     def frames(self) -> int:

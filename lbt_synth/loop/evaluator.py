@@ -279,12 +279,8 @@ class Evaluator:
 
 def _power(phases: ComplexArray) -> FloatArray:
     """Powers (n, n, f, k) of residuals (n, w, f, k), summed over the columns."""
-    x, y = phases.real, phases.imag
-    out = x[:, None, 0] * x[:, 0]
-    out += y[:, None, 0] * y[:, 0]
-    for i in range(1, phases.shape[1]):
-        out += x[:, None, i] * x[:, i] + y[:, None, i] * y[:, i]
-    return np.asarray(out)
+    x = np.concatenate([phases.real, phases.imag], axis=1)
+    return np.asarray(np.einsum("iwfk,jwfk->ijfk", x, x))
 
 
 def process_poles(coefficients: FloatArray) -> ComplexArray:

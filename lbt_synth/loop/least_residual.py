@@ -88,11 +88,6 @@ class Prediction:
     coefficients: FloatArray  # ``1, f_1, ...`` of ``F = sigma (1 + f_1 z^-1 + ...)``
     target: Interpolation | None  # what is predicted, where it is not one sample
 
-    @staticmethod
-    def of(moments: FloatArray, target: Interpolation | None) -> Prediction:
-        """Predict from the integrals of the logarithm times cosines."""
-        return Prediction(float(moments[0]), _exponential(moments), target)
-
     def variance(self, noise: float) -> float:
         """Least variance of the residual, for a noise of variance R."""
         sigma2 = np.exp(self.mean_log)
@@ -160,6 +155,10 @@ class ModeSpectrum:
         """Weights (f, k) of the logarithm at frequencies x, in units of Nyquist."""
         count = self.frames if self.target is None else 2 * POINTS
         return np.asarray(np.cos(np.pi * np.arange(count) * x[:, None]))
+
+    def predicted(self, moments: FloatArray) -> Prediction:
+        """Return the best prediction, by the integrals of the logarithm times the cosines."""
+        return Prediction(float(moments[0]), _exponential(moments), self.target)
 
     def within_frames_nm2(self) -> float:
         """Power that moves within frames, which no command follows [nm^2]."""
@@ -417,7 +416,7 @@ def mode_limit(mode: ModeSpectrum) -> float:
     if not mode.parts:
         return 0.0
     moments = mode.log_moments().integrals.sum(axis=0)
-    return Prediction.of(moments, mode.target).variance(mode.noise_nm2)
+    return mode.predicted(moments).variance(mode.noise_nm2)
 
 
 def above_percent(rms_nm: float, limit_nm: float) -> float:

@@ -176,16 +176,20 @@ def simulate(
         require_instance(disturbance, Disturbance, "disturbance")
     limit = np.inf if stroke is None else number(stroke, "stroke", above=0)
     running, path, loop = _started(controller, hardware, disturbance.sensor_gain)
-    settle = 0
+    settle = integer(settle_frames or 0, "settle_frames", at_least=0)
     if isinstance(disturbance, Truth):
-        settle = settling_frames(loop.radius_per_frame) if loop else _DEFAULT_SETTLING
-    if settle_frames is not None:
-        settle = integer(settle_frames, "settle_frames", at_least=0)
-    if isinstance(disturbance, Truth):
+        if settle_frames is None:
+            settle = settling_frames(loop.radius_per_frame) if loop else _DEFAULT_SETTLING
         kept = integer(frames, "frames", at_least=1)
         cases = integer(cases, "cases", at_least=1)
         seed = integer(seed, "seed", at_least=0)
-        _require_memory(path, frames=kept, cases=cases, settle=settle)
+        channels = (2 + len(path.mirror_system.hold.D)) * path.modes
+        channels += 2 * path.n_readings + path.n_commands
+        if (gigabytes := 8e-9 * (settle + kept) * cases * channels) > _MOST_GIGABYTES:
+            raise ProblemError(
+                f"frames x cases must fit into {_MOST_GIGABYTES:g} GB; got {kept} x {cases}, which "
+                f"need {gigabytes:.3g} GB. Run fewer cases at once, with different seeds."
+            )
         disturbance = draw_disturbance(
             disturbance,
             path,
@@ -237,18 +241,6 @@ def _started(
     loop = close_loop(path, plain, sensor_gain=sensor_gain)
     loop.require_stable()
     return plain.start(getattr(controller, "controllers", None)), path, loop
-
-
-def _require_memory(hardware: LoopHardware, *, frames: int, cases: int, settle: int) -> None:
-    """Refuse a run that does not fit into the memory."""
-    pieces = 2 + len(hardware.mirror_system.hold.D)
-    channels = pieces * hardware.modes + 2 * hardware.n_readings + hardware.n_commands
-    gigabytes = 8e-9 * (settle + frames) * cases * channels
-    if gigabytes > _MOST_GIGABYTES:
-        raise ProblemError(
-            f"frames x cases must fit into {_MOST_GIGABYTES:g} GB; got {frames} x {cases}, which "
-            f"need {gigabytes:.3g} GB. Run fewer cases at once, with different seeds."
-        )
 
 
 def _held_squares(
@@ -370,12 +362,8 @@ def _events(
     drops: Sequence[Drop], hardware: LoopHardware, settle: int, frames: int
 ) -> dict[int, Segment]:
     """Return what fails from which frame on."""
-    units, rate = hardware.suite.units, hardware.frame_rate_hz
-    for drop in drops:
-        if drop.unit not in units:
-            raise ProblemError(
-                f"a sensor that fails must be one of {', '.join(units)}; got {drop.unit!r}."
-            )
+    hardware.suite.marked(tuple(drop.unit for drop in drops), hardware)  # refuses other names
+    rate = hardware.frame_rate_hz
     segments = run_segments(drops, (frames - settle) / rate) if drops else ()
     return {settle + int(np.ceil(s.start_s * rate - 1e-6)): s for s in segments}
 

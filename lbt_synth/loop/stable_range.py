@@ -233,11 +233,7 @@ def _last_stable(
     *,
     rounds: int,
 ) -> float | None:
-    """Return the last stable number before the first that is not, None if all are stable.
-
-    Each of the steps begins with a stable number. The one in which one is unstable is divided again
-    and again.
-    """
+    """Return the last stable number before one that is not, None without; steps begin stable."""
     for numbers in steps:
         unstable = np.flatnonzero(~are_stable(numbers[1:]))
         for _ in range(rounds if unstable.size else 0):
@@ -267,9 +263,7 @@ def delay_margin_frames(loop: ClosedLoop, *, sign: int) -> float:
 
     # at a whole delay, an exposure sees one command alone, and the loop gain has a peak
     peaks = np.asarray(sign * (np.arange(1, _LONGEST + 1) - d), dtype=np.float64)
-    ends = [0.0, min(1.0, longest)]
-    while ends[-1] < longest:
-        ends.append(min(2 * ends[-1], longest))
+    ends = np.unique(np.minimum([0.0, *2.0 ** np.arange(np.log2(_LONGEST) + 1)], longest))
     steps = (
         np.union1d(np.linspace(low, high, _DIVISION + 1), peaks[(peaks > low) & (peaks < high)])
         for low, high in pairwise(ends)
@@ -314,9 +308,7 @@ def moving_gain(loop: ClosedLoop) -> MovingGain:
     loop.require_stable()
     nominal = loop.sensor_gain
     constant = stable_sensor_gains(loop.hardware, loop.controller, nominal=nominal)
-    ends = np.array(
-        [max(constant[0], nominal / _WIDEST_MOVING), min(constant[1], nominal * _WIDEST_MOVING)]
-    )
+    ends = np.clip(constant, nominal / _WIDEST_MOVING, nominal * _WIDEST_MOVING)
 
     def interval(share: float) -> tuple[float, float]:
         low, high = nominal * (ends / nominal) ** share

@@ -9,7 +9,7 @@ import pytest
 import shtab
 from support.commands import run
 
-from lbt_synth.cli.arguments import COMMANDS, full_parser
+from lbt_synth.cli.arguments import COMMANDS, build_parser
 
 
 def test_what_can_be_left_out_is_not_called_required(capsys):
@@ -31,7 +31,7 @@ def test_the_help_lists_every_command_once_in_groups(capsys):
 
 def script_of(shell):
     """The script with which a shell completes commands."""
-    return shtab.complete(full_parser(), shell=shell)
+    return shtab.complete(build_parser(), shell=shell)
 
 
 @pytest.mark.e2e

@@ -38,7 +38,7 @@ def test_rows_and_facts_of_a_report(capsys):
     report = Report(data={"seed": 1})
     report.add_rows("loops", "All loops", ROWS)
     report.add_facts("One loop", ROWS[0], key="first")
-    report.note_files(["a.png", "b.csv"])
+    report.note_written("a.png", "b.csv")
     report.print(as_json=True)
     data = json.loads(capsys.readouterr().out)
     assert data["loops"][1] == {"name": "long", "method": "hinf", "residual_nm": None}
@@ -103,6 +103,9 @@ CASES = {
     "design": ("config.yaml", "config.yaml --method integrator -o OUT.fits"),
     "export": ("gain.fits", "gain.fits --for c -o other.c", "other.h"),
     "rehearse": ("series.fits", "series.fits gain.fits --for dao -o OUT.pdf"),
+    "rehearse commands": (
+        *("config.yaml", "series.fits gain.fits --for c --commands config.yaml -o OUT.csv"),
+    ),
     "plot": ("gain.fits", "nyquist gain.fits -o a.csv -o OUT.png"),
     "simulate": ("gain.fits", "config.yaml gain.fits -o OUT.png"),
     "simulate telemetry": ("gain.fits", "config.yaml gain.fits --frames 50 --telemetry OUT.fits"),
@@ -223,7 +226,7 @@ def test_what_is_printed_is_cut_to_a_screen(capsys):
     report = Report(verdict=["The point.", f"A sentence of {' many words' * 20}."])
     report.add_table("Table", ("row", "value"), [(f"r{i}", i) for i in range(40)])
     report.notes = ["remark", *(f"note: {i}" for i in range(30)), "warning: look"]
-    report.note_files(["a.png", "b.csv"])
+    report.note_written("a.png", "b.csv")
     report.print()
     lines = capsys.readouterr().out.splitlines()
     assert (len(lines), max(map(len, lines)) <= 100) == (25, True)

@@ -206,7 +206,7 @@ def test_a_table_that_was_killed_goes_on(tmp_path):
     assert len(list(out.glob("cases/*.npz"))) == 6
     for name, content in kept.items():
         assert (out / "cases" / name).read_bytes() == content
-    assert {(e["row"], e["method"]) for e in data["entries"]} == {
+    assert {(e["row"], e["method"]) for e in data["table_ii"]} == {
         (row, method)
         for row in ("no vibration", "vibration")
         for method in ("classical", "kalman", "hinf")

@@ -133,7 +133,8 @@ def test_auto_tests_its_design_on_unseen_data(tmp_path, capsys, recorded_night, 
     assert data["axes"][1]["over_fewer"] is None  # without a component
     assert data["units"]["data_error_nm"] == "nm"
     assert lbt.load_gain(out).certificate.passed
-    assert lbt.load_config(data["model"]).plant.vibrations
+    assert data["files"] == [str(out.with_suffix(ending)) for ending in (".fits", ".yaml", ".png")]
+    assert lbt.load_config(data["files"][1]).plant.vibrations
     assert out.with_suffix(".png").is_file()
 
 

@@ -40,7 +40,7 @@ def test_the_spectrum_is_what_tiptop_reads(tmp_path, capsys, gains):
     out = tmp_path / "residual.fits"
     words = ("simulate", CONFIG, gains["kalman"], "--frames", 50, "--spectrum", out)
     data = run_json(capsys, *words)
-    assert data["spectrum"] == str(out)
+    assert data["files"] == [str(out)]
     residual_nm = data["designs"][0]["residual_exact_nm"]
     with fits.open(out, checksum=True) as units:
         rows = units[0].data

@@ -22,7 +22,7 @@ def test_simulate_writes_its_first_case(tmp_path, capsys, gains):
     out, gain = tmp_path / "t.npz", gains["integrator"]
     options = ("--frames", 300, "--cases", 2, "--seed", 3, "--sensor-gain", 0.7)
     data = run_json(capsys, "simulate", LBT_YAML, gain, *options, "--telemetry", out)
-    assert data["telemetry"] == str(out)
+    assert data["files"] == [str(out)]
     seen = lbt.files.load_telemetry(out)
     assert seen.commands.shape == (300, 2)
     rms = np.sqrt(np.sum(np.mean(seen.residual_nm**2, axis=0)))

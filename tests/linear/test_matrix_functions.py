@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
 from lbt_synth.linear import matrix_functions
-from lbt_synth.linear.matrix_functions import component_labels, is_stable, semidefinite_root
+from lbt_synth.linear.matrix_functions import component_labels, semidefinite_root
 
 
 def test_root_of_a_matrix_of_rank_one():
@@ -17,11 +17,6 @@ def test_root_of_a_matrix_of_rank_one():
     root = semidefinite_root(v @ v.T)
     assert root @ root.T == pytest.approx(v @ v.T)
     assert np.isfinite(root).all()
-
-
-def test_rotation_is_stable_inside_the_circle():
-    turn = np.array([[np.cos(1.0), -np.sin(1.0)], [np.sin(1.0), np.cos(1.0)]])
-    assert [is_stable(radius * turn) for radius in (0.999, 1.0, 1.001)] == [True, False, False]
 
 
 @pytest.mark.parametrize("fails", [False, True])

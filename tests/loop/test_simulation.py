@@ -162,7 +162,11 @@ def test_wrong_drops(sensors_design, sensors_config):
         (lambda: fail(start_s=2, end_s=1), ProblemError, "must be back after it fails"),
         (lambda: fail(start_s=0, reading="odd"), ProblemError, "missing, zero, frozen"),
         (lambda: fail(start_s=-1), ProblemError, "at least 0"),
-        (lambda: fail(start_s=0, unit="m3"), ProblemError, "wavefront, slow, m1, m2; got 'm3'"),
+        (
+            lambda: fail(start_s=0, unit="m3"),
+            ProblemError,
+            "called 'm3'; there are wavefront, slow, m1",
+        ),
     ]
     require_refusals(rows)
 

@@ -78,26 +78,13 @@ class TipTiltPlant(EstimationProblem):
     Made by :func:`tip_tilt_plant`. The measurement of this problem is
     ``ybar(k) = y(k) + sensor_matrix N u(k-d)``, without the known input; that of each sensor, where
     the loop has several. Its period is that of all sensors.
-
-    Parameters
-    ----------
-    hardware : LoopHardware
-        The loop, with the sensor gain that the design assumes in its sensor matrix.
-    turbulence : tuple of ARModel
-        One model per mode.
-    vibrations : tuple of Vibration
-        The vibrations, possibly none.
-    motions : tuple of mapping
-        For each vibration, the :class:`Motion` of each channel that it moves.
-    memory : int
-        Number of states that hold past innovations, of a mixed filter.
     """
 
-    hardware: LoopHardware
-    turbulence: tuple[ARModel, ...]
+    hardware: LoopHardware  # with the sensor gain that the design assumes in its sensor matrix
+    turbulence: tuple[ARModel, ...]  # one model per mode
     vibrations: tuple[Vibration, ...]
-    motions: Motions = ()
-    memory: int = 0
+    motions: Motions = ()  # of each channel that a vibration moves, for each vibration
+    memory: int = 0  # states that hold past innovations, of a mixed filter
 
     def _brief(self) -> str:
         counts = [(self.n_states, "state"), (len(self.vibrations), "vibration")]
