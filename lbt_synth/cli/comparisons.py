@@ -105,13 +105,13 @@ def run_limits(arguments: Namespace) -> Report:
         hidden=() if study.shift_hz.size else ("worst_nm",),
         figure=partial(figures.limits_figure, study),
     )
-    if study.band is not None and study.band_hz is not None:
+    if study.band is not None and study.frequency_hz is not None:
+        low, high = (study.frequency_hz + study.shift_hz[[0, -1]]).tolist()
         report.data |= {
-            "band_hz": study.band_hz,
+            "band_hz": (low, high),
             "band_limit_nm": study.band.rms_nm,
             "band_achieved_nm": study.band.achieved_nm,
         }
-        low, high = study.band_hz
         report.verdict.append(
             f"With the vibration anywhere from {low:g} to {high:g} Hz, the least worst residual is "
             f"{nm_text(study.band.rms_nm, '.6g', unit='nm rms')} (a filter of infinite order "
@@ -323,7 +323,7 @@ def run_modal(arguments: Namespace) -> Report:
     report.add_rows(
         "rows",
         "By radial order, residuals over its modes",
-        study.by_radial_order(),
+        list(study.by_radial_order()),
         figure=lambda: figures.modal_figure(study.residual_nm, **shown),
     )
     return report

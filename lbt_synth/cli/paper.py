@@ -42,7 +42,7 @@ def run_paper(arguments: Namespace) -> Report:
     plan = track_progress(published.plan_rows(), total=total, what="tables")
     rows = [(row, published.modal_row(row)) for row in plan]
     tables = {
-        number: [published.table_entry(*pair) for pair in rows if pair[0].table == number]
+        number: [published.table_entry(*pair) for pair in rows if pair[0].line.table == number]
         for number in ("III", "II")
     }
     points = published.rms_differences(tables["III"], "ours", "paper")
@@ -57,7 +57,7 @@ def run_paper(arguments: Namespace) -> Report:
     report.add_table("Parameters", headings, published.parameter_rows())
     content = csv_bytes(headings, parameters)
     report.note_written(write_atomically(folder / "parameters.csv", content))
-    modal = [modal for row, modal in rows if row.table == "III"]
+    modal = [modal for row, modal in rows if row.line.table == "III"]
     report.note_written(*_draw_paper(folder, modal, filters))
     return report
 

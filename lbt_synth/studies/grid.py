@@ -218,7 +218,6 @@ def refuse(path: Path, why: str, cause: Exception | None = None) -> NoReturn:
 
 
 def _timed(function: Callable[..., Result], *arguments: Any) -> tuple[Result, float]:
-    """Call a function, and return its result and its seconds."""
     before = time.perf_counter()
     result = function(*arguments)
     return result, time.perf_counter() - before

@@ -45,7 +45,6 @@ class LimitStudy:
     # the least worst residual with the sinusoid anywhere in the range of errors; None unless the
     # truth has exactly one vibration, a sinusoid, and there is a range
     band: BandLimit | None
-    band_hz: tuple[float, float] | None  # that range [Hz]
     # (s,): true frequency less that of the truth [Hz], of the vibration that moves most; empty
     # without vibrations
     shift_hz: FloatArray
@@ -84,7 +83,7 @@ def limits(
         shifts = np.unique(np.concatenate([grid, errors, zero]) + 0.0)
     alone = hardware.own_sensor_alone()
     limit = limit_or_none(lambda: least_residual(alone, truth))
-    band = band_hz = None
+    band = None
     if len(vibrations) == 1 and isinstance(vibrations[0], SinusoidalVibration) and shifts.size > 1:
         line = vibrations[0]
         band_hz = line.frequency_hz + float(shifts[0]), line.frequency_hz + float(shifts[-1])
@@ -102,7 +101,6 @@ def limits(
         rows=rows,
         limit=limit,
         band=band,
-        band_hz=band_hz,
         shift_hz=frozen_copy(shifts),
         residual_nm=frozen_copy(curves),
         frequency_hz=truth.lines_hz[0] if len(truth.lines_hz) == 1 else None,

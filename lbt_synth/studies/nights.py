@@ -36,13 +36,7 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.validation import choice
 
 ALL = "all nights"  # the design for all of them
-_FACTS = {  # of one loop
-    "axes": "number of axes",
-    "frame_rate_hz": "frame rate [Hz]",
-    "delay_frames": "delay [frames]",
-    "diameter_m": "telescope diameter [m]",
-    "mirror": "mirror",
-}
+_LOOP = ("axes", "frame_rate_hz", "delay_frames", "diameter_m", "mirror")  # facts of one loop
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,7 +84,6 @@ class NightsDesign:
         return first, f"{second}: worse{worse} than that of {self.name} alone, which is written."
 
     def _say(self, name: str) -> str:
-        """Say what a design does on its worst night."""
         ratio, night = self.worst(name)
         if ratio == np.inf:
             return f"is unstable on {night}"
@@ -271,9 +264,9 @@ def require_one_loop(nights: Mapping[str, LoopRecord]) -> None:
             f"nights must be at least two; got {len(nights)}. Try design_from_record for one."
         )
     (first, record), *others = nights.items()
-    for (name, other), fact in product(others, _FACTS):
+    for (name, other), fact in product(others, _LOOP):
         if (got := getattr(other, fact)) != (expected := getattr(record, fact)):
             raise ProblemError(
-                f"{name} has the {_FACTS[fact]} {got}, and {first} {expected}: one design is for "
-                f"the nights of one loop. Say what is right, or leave {name} out."
+                f"{name} has {fact}={got}, and {first} {fact}={expected}: one design is for the "
+                f"nights of one loop. Say what is right, or leave {name} out."
             )

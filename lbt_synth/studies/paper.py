@@ -216,11 +216,9 @@ def paper_filters() -> tuple[FilterDesign, FilterDesign]:
 class PaperRow:
     """One row of a table for one controller."""
 
-    table: str  # "II" or "III"
-    label: str
+    line: PublishedRow
     method: str
     name: str  # that no other design with another vibration has
-    error_hz: float | None  # true frequency less the model's; None without vibration
     paper: float  # the paper's Strehl ratio [%], or nan
     hardware: LoopHardware
     design: Design  # of tip and tilt
@@ -260,11 +258,9 @@ def plan_rows(
         for name, method, design, shakes_hz, paper in plans:
             shake = SinusoidalVibration(frequency_hz=shakes_hz, rms_nm=VIBRATION_NM)
             yield PaperRow(
-                table=line.table,
-                label=line.label,
+                line=line,
                 method=method,
                 name=f"{name}-vibration-{f'{shakes_hz:g}hz' if line.vibration else 'none'}",
-                error_hz=line.error_hz,
                 paper=paper,
                 hardware=hardware,
                 design=design,
@@ -278,14 +274,14 @@ def modal_row(
     """Return what the modal analysis says of a row, at a real sensor gain."""
     loop = close_loop(row.hardware, row.design.controller, sensor_gain=sensor_gain)
     truth = replace(row.truth, sensor_gain=sensor_gain)
-    return loop_row(row.method, row.error_hz or 0.0, loop, truth, camera, frame_means=True)
+    return loop_row(row.method, row.line.error_hz or 0.0, loop, truth, camera, frame_means=True)
 
 
 def table_entry(row: PaperRow, modal: Facts) -> Facts:
     """Put the Strehl ratio of the modal analysis of a row beside the paper's [%]."""
     ours = 100 * modal.strehl
     return facts(
-        label=fact(row.label, "row", key="row"),
+        label=fact(row.line.label, "row", key="row"),
         method=fact(row.method, "method"),
         ours=fact(ours, "ours", format=".1f", key="strehl_percent"),
         paper=fact(row.paper, "paper", format=".1f", key="paper_strehl_percent"),
@@ -322,7 +318,7 @@ def plan_cases(
     planned = []
     for row in plan_rows(hardware, END_TO_END_GAINS, designs, tables):
         shaken = replace(setup, vibrations=row.truth.vibrations, motions=())
-        several = row.table == "II" or row.error_hz == 0
+        several = row.line.table == "II" or row.line.error_hz == 0
         runs = {
             f"{row.name}-seed-{seed}": {
                 "setup": replace(shaken, seed=seed),
@@ -373,13 +369,12 @@ def end_to_end_tables(
         name: dict(zip(_NUMBERS, row, strict=True))
         for name, row in zip(cases, runs.results.tolist(), strict=True)
     }
-    return make_entries(planned, results, setup)
+    return list(make_entries(planned, results, setup))
 
 
 def _run_cases(
     cases: Sequence[Mapping[str, Any]], calibration: Calibration
 ) -> tuple[dict[str, FloatArray], list[Any]]:
-    """Return the main numbers of some runs."""
     runs = [run_end_to_end(**case, calibration=calibration).summary() for case in cases]
     return {name: np.array([run[name] for run in runs]) for name in _NUMBERS}, []
 
@@ -398,20 +393,20 @@ def all_cases(planned: Planned) -> dict[str, dict[str, Any]]:
 
 def make_entries(
     planned: Planned, results: Mapping[str, Mapping[str, Any]], setup: EndToEndSetup
-) -> list[Facts]:
-    """Make the entries of the tables from the results of their runs."""
-    entries, percent, rms = [], {"format": ".1f"}, {"unit": "nm", "format": ".0f"}
+) -> Iterator[Facts]:
+    """Yield the entries of the tables from the results of their runs."""
+    percent, rms = {"format": ".1f"}, {"unit": "nm", "format": ".0f"}
     for row, cases in planned:
         runs = [results[name] for name in cases]
         strehls, gain, tip, tilt, others = (np.array([run[n] for run in runs]) for n in _NUMBERS)
         scatter = 100 * float(np.std(strehls, ddof=1)) if strehls.size > 1 else np.nan
         modal = float(np.mean([_predict_strehl(row, run, setup) for run in runs]))
         other_modes = {"unit": "%", "key": "other_modes_strehl_percent", **percent}
-        entry = facts(
-            table=fact(row.table),
-            label=fact(row.label, "row", key="row"),
+        yield facts(
+            table=fact(row.line.table),
+            label=fact(row.line.label, "row", key="row"),
             method=fact(row.method, "method"),
-            error_hz=fact(row.error_hz, unit="Hz"),
+            error_hz=fact(row.line.error_hz, unit="Hz"),
             strehl=fact(
                 100 * float(np.mean(strehls)), "end to end", key="strehl_percent", **percent
             ),
@@ -424,8 +419,6 @@ def make_entries(
             tilt_rms_nm=fact(float(np.mean(tilt**2) ** 0.5), "tilt", **rms),
             other_modes=fact(100 * float(np.mean(others)), "other modes", **other_modes),
         )
-        entries.append(entry)
-    return entries
 
 
 def _predict_strehl(row: PaperRow, run: Mapping[str, Any], setup: EndToEndSetup) -> float:

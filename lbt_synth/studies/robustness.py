@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,7 +26,6 @@ from lbt_synth.methods.registry import MIXED, record_methods, reference_methods
 from lbt_synth.methods.request import reference_design
 from lbt_synth.models import (
     LoopHardware,
-    SinusoidalVibration,
     TipTiltPlant,
     Truth,
     Vibration,
@@ -266,6 +264,10 @@ def robustness_map(
         raise ProblemError(
             "a frequency error needs a vibration in the truth; got a truth without any."
         )
+    for line in stationary_vibrations(truth.vibrations):
+        checked_direction(line, hardware)
+    moved = [truth.with_frequency_error(error).vibrations for error in errors.tolist()]
+    moved_hz = np.array([[line.frequency_hz for line in lines] for lines in moved])  # (e, lines)
     require_matching_controller(hardware.own_sensor_alone(), as_controller(design))
     size = delays.size, gains.size, errors.size
     delay, gain, place = (axis.ravel() for axis in np.indices(size))
@@ -276,7 +278,7 @@ def robustness_map(
         turbulence=truth.turbulence,
         vibrations=tuple(
             replace(ensemble_vibration(line), frequency_hz=frequencies[place])
-            for line, frequencies in _moved_lines(truth, errors, hardware)
+            for line, frequencies in zip(truth.vibrations, moved_hz.T, strict=True)
         ),
     )
     matrices = textbook_matrices([as_controller(design)])
@@ -292,24 +294,6 @@ def robustness_map(
         residual_nm=residual_nm,
         stable=read_only(stable[..., 0] == 1),
     )
-
-
-def _moved_lines(
-    truth: Truth, errors_hz: FloatArray, hardware: LoopHardware
-) -> Iterator[tuple[Vibration | SinusoidalVibration, FloatArray]]:
-    """Yield the true vibrations, each with its frequencies [Hz] under e errors, (e,)."""
-    nyquist_hz, shares = hardware.frame_rate_hz / 2, truth.frequency_shifts_hz(1.0)
-    for line, share in zip(stationary_vibrations(truth.vibrations), shares, strict=True):
-        checked_direction(line, hardware)
-        frequencies = line.frequency_hz + share * errors_hz
-        wrong = ~((frequencies > 0) & (frequencies < nyquist_hz))
-        if np.any(wrong):
-            raise ProblemError(
-                f"errors_hz must leave each vibration between 0 and {nyquist_hz:.6g} Hz; got an "
-                f"error of {errors_hz[wrong][0]:.6g} Hz, which moves the one at "
-                f"{line.frequency_hz:.6g} Hz to {frequencies[wrong][0]:.6g} Hz."
-            )
-        yield line, frequencies
 
 
 def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
@@ -411,18 +395,20 @@ def tradeoff(
                 design = mixed(problem, gamma=level, taps=length)
             elif design is None:
                 design = central_filter(problem, gamma=level)
-            margins: Any = SimpleNamespace(gain_low=np.nan, gain_high=np.nan, modulus=np.nan)
+            margins = None
             if design.hardware is not None:
                 margins = loop_margins(close_loop(design.hardware, design.controller))
+            names = ("gain_low", "gain_high", "modulus")
+            gain_low, gain_high, modulus = (getattr(margins, name, np.nan) for name in names)
             ratio = max(design.gamma / least.gamma_least, 1.0)
             yield facts(
                 family=fact(family, "filter"),
                 gamma=fact(design.gamma, "norm", **size),
                 gamma_ratio=fact(ratio, "norm / least", format=".4f"),
                 rms=fact(design.rms, "rms", **size),
-                gain_low=fact(margins.gain_low, "gain from", format=".3f"),
-                gain_high=fact(margins.gain_high, "gain to", format=".3f"),
-                modulus=fact(margins.modulus, "modulus margin", format=".3f"),
+                gain_low=fact(gain_low, "gain from", format=".3f"),
+                gain_high=fact(gain_high, "gain to", format=".3f"),
+                modulus=fact(modulus, "modulus margin", format=".3f"),
                 design=fact(design),
             )
 
@@ -436,10 +422,9 @@ class ModalStudy:
     gains: FloatArray  # (n,): of the integrators
     residual_nm: Mapping[str, FloatArray]  # of integrators and of filters, (n,) [nm rms]
 
-    def by_radial_order(self) -> list[Facts]:
-        """Return a row for each radial order: root sums of squares over its modes."""
+    def by_radial_order(self) -> Iterator[Facts]:
+        """Yield a row for each radial order: root sums of squares over its modes."""
         radial = radial_orders(self.noise_nm.size)
-        rows = []
         for order in np.unique(radial):
             which = radial == order
             turbulence_nm, optimised_nm, kalman_nm = (
@@ -447,18 +432,15 @@ class ModalStudy:
                 for series in (self.turbulence_nm, *self.residual_nm.values())
             )
             noise_nm = float(self.noise_nm[which][0])
-            rows.append(
-                facts(
-                    radial_order=fact(int(order), "radial order"),
-                    modes=fact(int(which.sum()), "modes"),
-                    turbulence_nm=fact(turbulence_nm, "turbulence", **NM),
-                    noise_nm=fact(noise_nm, "noise per mode", unit="nm", format=".2f"),
-                    gain=fact(float(self.gains[which].mean()), "mean gain", format=".3f"),
-                    optimised_nm=fact(optimised_nm, "optimised gains", **NM),
-                    kalman_nm=fact(kalman_nm, "Kalman", **NM),
-                )
+            yield facts(
+                radial_order=fact(int(order), "radial order"),
+                modes=fact(int(which.sum()), "modes"),
+                turbulence_nm=fact(turbulence_nm, "turbulence", **NM),
+                noise_nm=fact(noise_nm, "noise per mode", unit="nm", format=".2f"),
+                gain=fact(float(self.gains[which].mean()), "mean gain", format=".3f"),
+                optimised_nm=fact(optimised_nm, "optimised gains", **NM),
+                kalman_nm=fact(kalman_nm, "Kalman", **NM),
             )
-        return rows
 
 
 def compare_modes(config: Config, modes: int) -> ModalStudy:

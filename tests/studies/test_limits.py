@@ -14,7 +14,7 @@ from lbt_synth.studies.limits import compare_in_truth, limits, limits_at_rate
 def test_study(config, lbt_designs):
     designs = {name: lbt_designs[name] for name in ("kalman", "hinf")}
     study = limits(designs, config.hardware, config.truth, config.imaging, errors_hz=[-3.5, 0, 3.5])
-    assert study.band_hz == (16.5, 23.5)
+    assert (study.frequency_hz, *study.shift_hz[[0, -1]]) == (20.0, -3.5, 3.5)
     assert study.residual_nm.shape == (2, study.shift_hz.size)
     for row, curve in zip(study.rows, study.residual_nm, strict=True):
         assert row.stable

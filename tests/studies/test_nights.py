@@ -213,9 +213,12 @@ def test_nights_of_which_no_design_holds_all_are_refused(monkeypatch) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"frame_rate_hz": 500.0}, r"b has the frame rate \[Hz\] 500.0, and a 1000.0: one design"),
-        ({"delay_frames": 3.0}, r"b has the delay \[frames\] 3.0, and a 2"),
-        ({"diameter_m": 8.0}, r"b has the telescope diameter \[m\] 8.0, and a None"),
+        (
+            {"frame_rate_hz": 500.0},
+            "b has frame_rate_hz=500.0, and a frame_rate_hz=1000.0: one design",
+        ),
+        ({"delay_frames": 3.0}, "b has delay_frames=3.0, and a delay_frames=2"),
+        ({"diameter_m": 8.0}, "b has diameter_m=8.0, and a diameter_m=None"),
     ],
 )
 def test_nights_of_different_loops_are_refused(changes, words) -> None:
@@ -233,7 +236,7 @@ def test_bad_nights_are_refused_by_name() -> None:
     two = lbt.identification.loop_record(
         np.hstack([one.measurements] * 2), frame_rate_hz=RATE, delay_frames=2, unit="nm"
     )
-    with pytest.raises(ProblemError, match="b has the number of axes 2, and a 1"):
+    with pytest.raises(ProblemError, match="b has axes=2, and a axes=1"):
         design_from_nights({"a": one, "b": two})
     short = night(0, *NIGHTS["a"], frames=2000)
     with pytest.raises(ProblemError, match="^short: the record needs 4000 usable frames"):

@@ -51,15 +51,15 @@ def test_the_tables_of_the_paper(rows):
     assert len(second) == 6
     assert max(abs(entry.difference) for entry in second) < 1.0
     for method in ("kalman", "hinf"):
-        third = [row for row, _ in rows if (row.table, row.method) == ("III", method)]
+        third = [row for row, _ in rows if (row.line.table, row.method) == ("III", method)]
         assert len(third) == 15
         entries = [given.table_entry(row, given.modal_row(row)) for row in third]
         assert rms_differences(entries, "ours", "paper")[method] < 1.0
 
 
 def test_the_tables_as_planned(rows):
-    second = [row for row, _ in rows if row.table == "II"]
-    third = [row for row, _ in rows if row.table == "III"]
+    second = [row for row, _ in rows if row.line.table == "II"]
+    third = [row for row, _ in rows if row.line.table == "III"]
     assert [(r.method, r.paper) for r in second[:3]] == [
         ("classical", 84.1),
         ("kalman", 80.7),
@@ -79,7 +79,7 @@ def test_the_tables_as_planned(rows):
     assert frequencies("kal") == {20.0}
     for row, cases in rows:
         seeds = [case["setup"].seed for case in cases.values()]
-        expected = [0, 1] if row.table == "II" or row.error_hz == 0 else [0]
+        expected = [0, 1] if row.line.table == "II" or row.line.error_hz == 0 else [0]
         assert seeds == expected
 
 
@@ -95,11 +95,11 @@ def entries_of(rows, setup, gain):
         }
         for name, case in all_cases(rows).items()
     }
-    return make_entries(rows, runs, setup)
+    return list(make_entries(rows, runs, setup))
 
 
 def test_entries_are_means_over_seeds_beside_the_modal_analysis(setup, rows, air):
-    ends = [pair for pair in rows if pair[0].error_hz in (None, -3.5, 0.0, 3.5)]
+    ends = [pair for pair in rows if pair[0].line.error_hz in (None, -3.5, 0.0, 3.5)]
     table = entries_of(ends, setup, 0.6)
     first = table[0]
     assert first.strehl == pytest.approx(70.5)

@@ -153,7 +153,7 @@ def test_wrong_maps_are_refused(config, lbt_designs, axis_plant):
         (mapped(errors_hz=[]), ProblemError, "at least one number"),
         (mapped(errors_hz=[1, 1]), ProblemError, "each value once"),
         (mapped(errors_hz=[-20]), ProblemError, "moves the one at 20 Hz to 0 Hz"),
-        (mapped(errors_hz=[380]), ProblemError, "between 0 and 400 Hz"),
+        (mapped(errors_hz=[380]), ProblemError, "below the Nyquist frequency 400 Hz"),
         (mapped(sensor_gains=[0.5, 0]), ProblemError, "sensor_gains must be above 0"),
         (mapped(delay_errors_frames=[-1.5]), ProblemError, "delay_errors_frames must be at least"),
         (mapped(delay_errors_frames=[99]), ProblemError, "together must lie between 1 and 20"),

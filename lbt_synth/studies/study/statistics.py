@@ -112,7 +112,6 @@ def _controller_statistics(
     rows: FloatArray,
     values: Mapping[str, FloatArray],
 ) -> ControllerStatistics:
-    """Return the statistics of one controller."""
     places = np.flatnonzero(samples["evaluated"])
     strehl, unstable = samples["strehl"][places], samples["unstable"][places]
     n = len(strehl)
@@ -302,14 +301,12 @@ def percent(value: float, digits: int = 1) -> str:
 
 
 def _ordinal(percentile: float) -> str:
-    """Return the name of one of the percentiles."""
     return f"{percentile:g}{'st' if percentile == 1 else 'th'} percentile"
 
 
 def _table_by_controller(
     caption: str, heading: str, statistics: StudyStatistics, rows: Sequence[_Row]
 ) -> Table:
-    """Return a table with a column per controller."""
     headings = (heading, *(controller.controller for controller in statistics.controllers))
     return Table(caption=caption, headings=headings, rows=tuple(rows))
 
