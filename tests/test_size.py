@@ -26,7 +26,7 @@ LINES = {
     "models": 3752,
     "report": 3263,
     "storage": 1060,
-    "studies": 3196,
+    "studies": 3190,
     "errors, validation": 554,
 }
 COUNTS = {

@@ -125,8 +125,7 @@ def robustness(
         raise ProblemError(
             "a frequency error needs a vibration in the model; got a plant without any."
         )
-    reference = [method.name for method in reference_methods(estimators_only=True)]
-    names = reference if methods is None else methods
+    names = methods or [method.name for method in reference_methods(estimators_only=True)]
     for name in names:
         choice(name, "method", record_methods())
     for error_hz in [number(error, "errors_hz") for error in errors_hz]:
@@ -449,8 +448,7 @@ def compare_modes(config: Config, modes: int) -> ModalStudy:
     if config.atmosphere is None:
         reason = "the turbulence of hundreds of modes is computed from it"
         config.refuse_key("atmosphere", f"is missing: {reason}")
-    rate_hz = hardware.frame_rate_hz
-    air = modal_turbulence(config.atmosphere, modes=modes, frame_rate_hz=rate_hz)
+    air = modal_turbulence(config.atmosphere, modes=modes, frame_rate_hz=hardware.frame_rate_hz)
     for key, value in (("sensor.noise_nm", config.noise_nm), ("model.sensor_gain", sensor_gain)):
         if np.ndim(value):
             config.refuse_key(key, "must be one number for hundreds of modes; got one per axis")

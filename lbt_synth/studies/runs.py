@@ -123,10 +123,7 @@ def _segment_row(
     segment: Segment,
     imaging: Imaging,
 ) -> Facts:
-    """Return what a loop leaves while some sensors fail, in a run and exactly.
-
-    The exact one is nan where the loop is unstable, a reading is frozen, or a vibration drifts.
-    """
+    """Return what a loop leaves while some sensors fail, in a run and, where it can be, exactly."""
     closed = close_loop(
         loop.hardware,
         design.controllers[frozenset(segment.missing)],

@@ -68,8 +68,7 @@ class ControllerStatistics:
 
     def index(self, name: str) -> tuple[float, float]:
         """Return the index of a parameter and its standard error."""
-        index, error = (self.sensitivity[name][key] for key in _INDEX)
-        return index, error
+        return self.sensitivity[name]["index"], self.sensitivity[name]["index_error"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
