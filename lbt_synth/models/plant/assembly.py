@@ -79,10 +79,11 @@ def held_frames(hardware: LoopHardware) -> int:
 def sensor_memory(hardware: LoopHardware, *, own: bool = False, ahead: int = 0) -> Memory:
     """Return the system from a signal s(k) (n,) to the readings in frame k, of s before k.
 
-    They are those of the other wavefront sensors, older by some frames, and before them those of
-    the loop's own. An exposure ends in frame e with the mean of the frames since the last end; the
-    sum of a period that has begun and the readings that wait are its states. Where an exposure ends
-    within a frame, that frame counts for both exposures, in part.
+    They are those of the other wavefront sensors, as old as they are with so many more frames
+    ``ahead``, after those of the loop's ``own`` sensor if it counts. An exposure ends in frame e
+    with the mean of the frames since the last end; the sum of a period that has begun and the
+    readings that wait are its states. Where an exposure ends within a frame, that frame counts for
+    both exposures, in part.
     """
     modes, period = hardware.modes, hardware.period
     blocks = [(np.zeros((period, 0, 0)), np.zeros((period, 0, modes)), np.zeros((period, 0, 0)))]
