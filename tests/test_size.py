@@ -23,7 +23,7 @@ LINES = {
     "linear": 4748,
     "loop": 3945,
     "methods": 789,
-    "models": 3752,
+    "models": 3749,
     "report": 3264,
     "storage": 1060,
     "studies": 3313,
