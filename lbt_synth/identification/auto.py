@@ -176,17 +176,17 @@ def design_from_record(
         record = keep_frames(record, beside.good)
     _require_able(record, method)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
-    step = progress or (lambda _: None)
-    options |= {"sensor_gain": sensor_gain}
+    step, options = progress or (lambda _: None), options | {"sensor_gain": sensor_gain}
     half = identify(split_halves(record)[0], **options)
-    finds_gain = record.commands is not None and sensor_gain is None
-    assumptions += _judge_gains(half, accept_record) if finds_gain else ()
+    if finds_gain := record.commands is not None and sensor_gain is None:
+        assumptions += _judge_gains(half, accept_record)
     step(1)
     names = quick_methods() if method is None else [method]
     requests = {name: {} if method else method_named(name).reference_options for name in names}
     inputs: dict[str, Any] = {"channels": beside}
-    camera = imaging or Imaging()
-    held_out, designs = compare_designs(record, half, requests, imaging=camera, **inputs)
+    held_out, designs = compare_designs(
+        record, half, requests, imaging=imaging or Imaging(), **inputs
+    )
     if not designs:
         raise NumericalError(f"no design holds the loop: {'; '.join(held_out.notes)}.")
     if method is None:
@@ -200,11 +200,9 @@ def design_from_record(
         inputs["penalty"] = regress(record, model, channels=beside).penalty
     made_of = partial(design_inputs, record, model, **inputs)
     allowed = allowed_gains(record, model) if finds_gain else None
+    design_of = lambda noise: request.build(made_of(noise=noise))  # noqa: E731
     made, noise, price = design_for_gains(
-        model,
-        lambda noise: request.build(made_of(noise=noise)),
-        allowed,
-        command_scale_known=command_scale_known,
+        model, design_of, allowed, command_scale_known=command_scale_known
     )
     known = np.repeat(np.array(model.sensor_gains)[:, None], 2, axis=1)
     title, tested = request.method.title, held_out
