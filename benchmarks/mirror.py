@@ -13,7 +13,7 @@ import lbt_synth as lbt
 from lbt_synth.loop.least_residual import least_residual
 from lbt_synth.report.draw import save_figure
 from lbt_synth.report.figures.studies import mirror_figure
-from lbt_synth.studies.robustness import mirror_rows
+from lbt_synth.studies.robustness import compare_on_mirror
 
 CONFIG = lbt.load_config("examples/lbt.yaml")
 SHELL = {"natural_frequency_hz": 20.0, "damping": 0.5}
@@ -37,7 +37,7 @@ def study(plant: lbt.models.TipTiltPlant) -> None:
     for name, mirror in MIRRORS.items():
         here = moving(plant, mirror)
         settling = 0.0 if mirror is None else 1e3 * mirror.step_response().settling_s
-        rows = mirror_rows(here, CONFIG.truth, CONFIG.imaging)
+        rows = compare_on_mirror(here, CONFIG.truth, CONFIG.imaging).rows
         cells = [
             f"{r.residual_nm:8.2f} {100 * r.strehl:6.2f}" if r.stable else "unstable" for r in rows
         ]

@@ -19,7 +19,7 @@ from lbt_synth.studies.paper import paper_filters
 
 ERRORS = np.arange(-7, 8) / 2
 GAINS = [1.0, 0.7, 0.5, 0.358]
-CAMERA = replace(paper.imaging(), other_modes=0.841)
+CAMERA = replace(paper.IMAGING, other_modes=0.841)
 TRUTH = replace(paper.PAPER_TRUTH, sensor_gain=1.0)
 AR2 = lbt.models.ar2_turbulence(
     paper.ATMOSPHERE, frame_rate_hz=paper.FRAME_RATE_HZ, noise_nm=paper.NOISE_NM

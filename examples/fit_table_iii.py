@@ -14,11 +14,11 @@ from scipy.optimize import minimize
 import lbt_synth as lbt
 from lbt_synth.linear.riccati.filtering import gamma_riccati
 from lbt_synth.studies.paper import (
+    IMAGING,
     KALMAN_DAMPING,
     PAPER_TRUTH,
     TABLE_III,
     TRUTH_SENSOR_GAIN,
-    imaging,
     turbulence_model,
 )
 
@@ -76,7 +76,7 @@ def column(parameters: np.ndarray) -> np.ndarray:
         budget = lbt.residual_budget(loop, shaken, frame_means=True)
         tilt = budget.turbulence_nm2[0, 0] + budget.noise_nm2[0, 0]  # the axis without vibration
         lines = np.array([[budget.line_amplitudes_nm[0, 0], 0]])
-        out[i] = 100 * lbt.strehl(np.diag([tilt, tilt]), imaging(), line_amplitudes_nm=lines)
+        out[i] = 100 * lbt.strehl(np.diag([tilt, tilt]), IMAGING, line_amplitudes_nm=lines)
     return out
 
 

@@ -14,7 +14,7 @@ PACKAGE = ROOT / "lbt_synth"
 GENERATED = {"_build", "generated", "rooms", "gallery"}
 GROWTH = 1.05  # of a number, before it is too much
 LINES = {
-    "cli": 3178,
+    "cli": 3169,
     "config": 1622,
     "design": 5971,
     "files": 1252,
@@ -22,11 +22,11 @@ LINES = {
     "interop": 3687,
     "linear": 4748,
     "loop": 3945,
-    "methods": 789,
+    "methods": 784,
     "models": 3749,
-    "report": 3264,
+    "report": 3263,
     "storage": 1060,
-    "studies": 3313,
+    "studies": 3238,
     "errors, validation": 554,
 }
 COUNTS = {

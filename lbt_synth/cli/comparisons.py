@@ -18,8 +18,7 @@ from lbt_synth.config import Config
 from lbt_synth.design import Design
 from lbt_synth.errors import ProblemError
 from lbt_synth.interop.c.export import frame_cost
-from lbt_synth.loop import least_residual, loop_margins
-from lbt_synth.loop.least_residual import limit_or_none
+from lbt_synth.loop import loop_margins
 from lbt_synth.methods.registry import INTEGRATOR, KALMAN, design_title, reference_methods
 from lbt_synth.report.designs import refine_values, require_compatible
 from lbt_synth.report.figures import robustness_map_figure
@@ -28,7 +27,7 @@ from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts, row_table
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies.limits import LimitStudy, limits, limits_at_rate, say_residual
-from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, compare_modes, mirror_rows
+from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, compare_modes, compare_on_mirror
 from lbt_synth.validation import FloatArray, frozen_copy, integer, number
 
 _RATES = 34  # frame rates of a comparison, of which a table without --verbose has every third
@@ -205,12 +204,9 @@ def run_mirror(arguments: Namespace) -> Report:
         why = "is missing: without it the mirror settles at once. lbt_slow_mirror.yaml of"
         config.refuse_key("mirror.local_loop", f"{why} lbt-synth init --examples has it")
     hardware, step = plant.hardware, shell.step_response(arguments.tolerance)
-    rows = mirror_rows(
+    rows = compare_on_mirror(
         plant, config.truth, config.imaging, command_weight=config.settings.design.command_weight
-    )
-    limit = limit_or_none(lambda: least_residual(hardware, config.truth))
-    limit_nm = np.nan if limit is None else limit.rms_nm
-    least = "least residual of any linear controller in the truth"
+    ).rows
     ms = {"unit": "ms", "scale": 1e3}
     frames = step.settling_s / hardware.dt_s
     best = min((row for row in rows if row.stable), key=lambda row: float(row.residual_nm))
@@ -225,6 +221,7 @@ def run_mirror(arguments: Namespace) -> Report:
         "rows",
         f"Designs on this mirror; {config.imaging.label}",
         rows,
+        hidden=("method", "above_limit_percent", "worst_nm", "above_band_limit_percent"),
         figure=lambda: figures.mirror_figure(shell, hardware, tolerance=arguments.tolerance),
     )
     report.add_facts(
@@ -233,7 +230,6 @@ def run_mirror(arguments: Namespace) -> Report:
             settling_s=fact(step.settling_s, "settling time", **ms),
             settling_frames=fact(frames, "  in frames", unit="frames"),
             frame_s=fact(hardware.dt_s, "one frame", **ms),
-            limit_nm=fact(limit_nm, least, unit="nm rms", format=".2f"),
         ),
     )
     return report

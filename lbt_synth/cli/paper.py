@@ -6,7 +6,6 @@ from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -32,7 +31,6 @@ from lbt_synth.storage.rows import PERCENT, Facts, csv_rows, fact, facts, fill_r
 from lbt_synth.storage.tables import csv_bytes
 from lbt_synth.storage.words import listing_text
 from lbt_synth.studies import paper as published
-from lbt_synth.studies.robustness import RobustnessRow
 from lbt_synth.validation import integer
 
 
@@ -47,10 +45,7 @@ def run_paper(arguments: Namespace) -> Report:
         number: [published.table_entry(*pair) for pair in rows if pair[0].table == number]
         for number in ("III", "II")
     }
-    points = {
-        method: published.rms_difference([e for e in tables["III"] if e.method == method])
-        for method in dict.fromkeys(entry.method for entry in tables["III"])
-    }
+    points = published.rms_differences(tables["III"], "ours", "paper")
     report = _report_tables(folder, tables, points, "", "the paper")
     filters, headings = published.paper_filters(), ("parameter", "value", "origin")
     with own_display_unit():  # JSON and CSV stay in nm
@@ -88,7 +83,7 @@ def _report_tables(
 
 
 def _draw_paper(
-    folder: Path, rows: list[RobustnessRow], filters: tuple[FilterDesign, FilterDesign]
+    folder: Path, rows: list[Facts], filters: tuple[FilterDesign, FilterDesign]
 ) -> list[Path]:
     points = {
         design.method: [
@@ -241,20 +236,19 @@ def _run_tables(arguments: Namespace) -> Report:
     for count in ("seeds", "row_seeds"):
         integer(getattr(arguments, count), count, at_least=1)
     specula_version()
-    plan: dict[str, Any] = {
-        "seeds": range(setup.seed, setup.seed + arguments.seeds),
-        "row_seeds": range(setup.seed, setup.seed + arguments.row_seeds),
-        "tables": arguments.tables,
-    }
-    total = len(published.all_cases(published.plan_cases(setup, designs, **plan)))
+    planned = published.plan_cases(
+        setup,
+        designs,
+        seeds=range(setup.seed, setup.seed + arguments.seeds),
+        row_seeds=range(setup.seed, setup.seed + arguments.row_seeds),
+        tables=arguments.tables,
+    )
+    total = len(published.all_cases(planned))
     case_folder = folder / "cases"
     with run_in_parts(arguments, case_folder, total=total, what="runs") as engine:
-        table = published.end_to_end_tables(setup, case_folder, designs, **plan, **engine)
+        table = published.end_to_end_tables(setup, planned, case_folder, **engine)
     tables = {n: [entry for entry in table if entry.table == n] for n in arguments.tables}
-    points = {
-        method: published.rms_modal_difference(table, method)
-        for method in dict.fromkeys(entry.method for entry in tables.get("III", ()))
-    }
+    points = published.rms_differences(tables.get("III", []), "strehl", "modal")
     report = _report_tables(folder, tables, points, " end to end", "the modal analysis")
     report.data["runs"] = total
     if "III" in tables:

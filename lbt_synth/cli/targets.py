@@ -77,10 +77,12 @@ def run_rehearse(arguments: Namespace) -> Report:
     require_length(record, frames=_FEWEST, seconds=0)
     choose_unit(arguments, record.diameter_m)
     imaging = record_imaging(arguments, record)
-    rehearsal, rows, hardware, frames = rehearse_record(
+    rehearsal, rows, hardware = rehearse_record(
         design, record, target, imaging, stroke=arguments.stroke
     )
     leaves = [f"{nm_text(row.residual_nm, '.1f')} rms ({row.name})" for row in rows]
+    apart_nm = rehearsal.differences
+    frames = rehearsal.settle_frames + len(apart_nm)
     source = f"{frames} frames of {Path(arguments.file).name}"
     report = Report(data={"gain": arguments.gain, "target": target})
     report.verdict = [f"On {source}: {listing_text(leaves)}.", say_checks(rehearsal.checks)]
@@ -91,7 +93,6 @@ def run_rehearse(arguments: Namespace) -> Report:
         rows,
         figure=lambda: simulation_figure(rehearsal.target, title=title),
     )
-    apart_nm = rehearsal.differences
     differences = facts(
         difference_rms_nm=fact(
             float(np.sqrt(np.mean(np.sum(apart_nm**2, axis=1)))),

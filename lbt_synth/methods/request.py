@@ -99,8 +99,3 @@ def reference_design(name: str, plant: TipTiltPlant, options: Mapping[str, Any])
     own = {key: value for key, value in options.items() if key in method.options.model_fields}
     request = design_request(name, {**method.reference_options, **own})
     return request.build(DesignInputs(plant=plant))
-
-
-def fixed_design(controller: Design | DesignRequest) -> Design | None:
-    """Return a design that is there; None for one that is asked for."""
-    return None if isinstance(controller, DesignRequest) else controller

@@ -15,12 +15,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lbt_synth.design import Design
 from lbt_synth.identification.diagnosis import Diagnosis, law_facts
 from lbt_synth.identification.fit.identified_model import model_tables
 from lbt_synth.identification.records.record import NOT_KNOWN
 from lbt_synth.loop import close_loop, loop_margins
 from lbt_synth.loop.margins import LoopMargins
-from lbt_synth.methods.request import fixed_design
 from lbt_synth.report.draw import GUIDE, PANEL_IN, draw_map, drawing, line_style, name_axes
 from lbt_synth.report.figures import identification_figure
 from lbt_synth.report.figures.studies import STREHL
@@ -163,8 +163,7 @@ def _design_margins(study: Study, statistics: StudyStatistics) -> dict[str, Loop
     loops = {
         name: close_loop(design.hardware, design)
         for name in (controller.controller for controller in statistics.controllers)
-        if name in study.controllers
-        and (design := fixed_design(study.controllers[name])) is not None
+        if isinstance(design := study.controllers.get(name), Design)
         and design.hardware is not None
         and not design.other_sensors
     }

@@ -14,7 +14,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache, partial
@@ -46,9 +46,9 @@ from lbt_synth.models import (
 )
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.storage.display_unit import nm_text
-from lbt_synth.storage.rows import Facts, fact, facts, fill_row
-from lbt_synth.studies.grid import Sweep, loop_columns
-from lbt_synth.studies.robustness import RobustnessRow
+from lbt_synth.storage.rows import Facts, fact, facts
+from lbt_synth.studies.grid import Sweep
+from lbt_synth.studies.robustness import loop_row
 from lbt_synth.validation import FloatArray, choice
 
 VIBRATION_HZ = 20.0
@@ -131,21 +131,17 @@ PAPER_TRUTH = Truth(
     noise_nm=NOISE_NM,
     sensor_gain=TRUTH_SENSOR_GAIN,
 )
+IMAGING = Imaging(
+    diameter_m=DIAMETER_M,
+    obstruction=OBSTRUCTION,
+    wavelength_um=WAVELENGTH_UM,
+    other_modes=OTHER_MODES_STREHL,
+)
 
 
 def turbulence_model() -> ARModel:
     """AR1 model of the turbulence: pole and variance of the paper's Table I."""
     return ar1_turbulence(ATMOSPHERE, frame_rate_hz=FRAME_RATE_HZ)
-
-
-def imaging() -> Imaging:
-    """Camera at 2.2 um behind the 8.22 m pupil."""
-    return Imaging(
-        diameter_m=DIAMETER_M,
-        obstruction=OBSTRUCTION,
-        wavelength_um=WAVELENGTH_UM,
-        other_modes=OTHER_MODES_STREHL,
-    )
 
 
 # the H-infinity filters' own weights, in units of the measurement noise
@@ -251,45 +247,41 @@ def plan_rows(
         best = integrator(hardware, truth=replace(PAPER_TRUTH, vibrations=()))
         gains = best.gain, CLASSICAL_EFFECTIVE_GAIN / TRUTH_SENSOR_GAIN
     for line in (line for line in (*TABLE_II, *TABLE_III) if line.table in tables):
-        moved_hz = None if line.error_hz is None else VIBRATION_HZ + line.error_hz
-        true_hz = None if line.error_hz is None else VIBRATION_HZ
-        plans: list[tuple[str, str, Design, float | None, float]] = []
+        moved_hz = VIBRATION_HZ + (line.error_hz or 0.0)
+        plans: list[tuple[str, str, Design, float, float]] = []
         if line.table == "II":
             classical = integrator(hardware, gain=gains[line.vibration])
             plans.append(("classical", "classical", classical, moved_hz, line.classical))
         for method, (plant, bound) in problems.items():
             plant = retuned_plant(plant, line.model_hz - VIBRATION_HZ, hold="driving")
             design, name = reference_design(method, plant, bound), f"{method}-{line.model_hz:g}hz"
-            plans.append((name, method, design, true_hz, getattr(line, method)))
+            plans.append((name, method, design, VIBRATION_HZ, getattr(line, method)))
         plans += [(name, name, d, moved_hz, math.nan) for name, d in (designs or {}).items()]
         for name, method, design, shakes_hz, paper in plans:
-            shake = SinusoidalVibration(frequency_hz=shakes_hz or 1.0, rms_nm=VIBRATION_NM)
+            shake = SinusoidalVibration(frequency_hz=shakes_hz, rms_nm=VIBRATION_NM)
             yield PaperRow(
                 table=line.table,
                 label=line.label,
                 method=method,
-                name=f"{name}-vibration-{'none' if shakes_hz is None else f'{shakes_hz:g}hz'}",
+                name=f"{name}-vibration-{f'{shakes_hz:g}hz' if line.vibration else 'none'}",
                 error_hz=line.error_hz,
                 paper=paper,
                 hardware=hardware,
                 design=design,
-                truth=replace(PAPER_TRUTH, vibrations=() if shakes_hz is None else (shake,)),
+                truth=replace(PAPER_TRUTH, vibrations=(shake,) * line.vibration),
             )
 
 
 def modal_row(
-    row: PaperRow, camera: Imaging | None = None, sensor_gain: float = TRUTH_SENSOR_GAIN
-) -> RobustnessRow:
+    row: PaperRow, camera: Imaging = IMAGING, sensor_gain: float = TRUTH_SENSOR_GAIN
+) -> Facts:
     """Return what the modal analysis says of a row, at a real sensor gain."""
     loop = close_loop(row.hardware, row.design.controller, sensor_gain=sensor_gain)
     truth = replace(row.truth, sensor_gain=sensor_gain)
-    numbers = loop_columns(loop, truth, camera or imaging(), frame_means=True)
-    named = {"method": row.method, "error_hz": row.error_hz or 0.0, "stable": loop.is_stable}
-    named["gamma"] = getattr(row.design, "gamma", math.nan)
-    return fill_row(RobustnessRow, **numbers | named)
+    return loop_row(row.method, row.error_hz or 0.0, loop, truth, camera, frame_means=True)
 
 
-def table_entry(row: PaperRow, modal: RobustnessRow) -> Facts:
+def table_entry(row: PaperRow, modal: Facts) -> Facts:
     """Put the Strehl ratio of the modal analysis of a row beside the paper's [%]."""
     ours = 100 * modal.strehl
     return facts(
@@ -301,11 +293,7 @@ def table_entry(row: PaperRow, modal: RobustnessRow) -> Facts:
     )
 
 
-def rms_difference(entries: Sequence[Facts]) -> float:
-    """Root mean square of the differences [points]."""
-    return float(np.sqrt(np.mean([entry.difference**2 for entry in entries])))
-
-
+Planned = list[tuple[PaperRow, dict[str, dict[str, Any]]]]  # rows, and their runs by name
 _NUMBERS = ("strehl", "tip_tilt_gain", "tip_rms_nm", "tilt_rms_nm", "other_modes_strehl")
 
 
@@ -316,8 +304,11 @@ def plan_cases(
     seeds: Sequence[int] = (0, 1, 2),
     row_seeds: Sequence[int] = (0,),
     tables: Sequence[str] = ("II", "III"),
-) -> list[tuple[PaperRow, dict[str, dict[str, Any]]]]:
-    """Plan the rows of both tables for a system, each with its runs by name, one for each seed."""
+) -> Planned:
+    """Plan the rows of both tables for a system, each with its runs by name, one for each seed.
+
+    The seeds are those of Table II and of the row at 20 Hz, and those of the other rows.
+    """
     hardware = setup.hardware
     if (hardware.frame_rate_hz, hardware.delay_frames) != (FRAME_RATE_HZ, DELAY_FRAMES):
         raise ProblemError(
@@ -345,25 +336,20 @@ def plan_cases(
 
 def end_to_end_tables(
     setup: EndToEndSetup,
+    planned: Planned,
     directory: str | os.PathLike[str],
-    designs: Mapping[str, Design] | None = None,
     *,
-    seeds: Sequence[int] = (0, 1, 2),
-    row_seeds: Sequence[int] = (0,),
-    tables: Sequence[str] = ("II", "III"),
     executor: Executor | None = None,
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> list[Facts]:
-    """Run Tables II and III of Agapito et al. 2008 end to end, or what is missing of them.
+    """Run planned rows of Agapito et al. 2008 end to end, or what is missing of them.
 
     Each run has a file of its own in an existing directory: started again with the same arguments,
     only the missing ones run. All controllers of a row meet the same air, vibrations and noise.
-    The seeds are those of Table II and of the row at 20 Hz, and those of the other rows. Each row
-    and controller has the mean and the scatter over seeds of its Strehl ratio [points], beside that
-    of the paper and of the modal analysis with what was measured [%].
+    Each row and controller has the mean and the scatter over seeds of its Strehl ratio [points],
+    beside that of the paper and of the modal analysis with what was measured [%].
     """
-    planned = plan_cases(setup, designs, seeds=seeds, row_seeds=row_seeds, tables=tables)
     cases = all_cases(planned)
     calibrated = lru_cache(partial(calibrate, setup))  # once for all processes
     versions = {"lbt-synth": lbt_synth.__version__, "specula": specula_version()}
@@ -405,10 +391,7 @@ def _plain(value: Any) -> Any:
     return value.tolist()
 
 
-Planned = Iterable[tuple[PaperRow, Mapping[str, Mapping[str, Any]]]]
-
-
-def all_cases(planned: Planned) -> dict[str, Mapping[str, Any]]:
+def all_cases(planned: Planned) -> dict[str, dict[str, Any]]:
     """Return the runs of all rows, each once."""
     return {name: case for _, cases in planned for name, case in cases.items()}
 
@@ -459,7 +442,10 @@ def _predict_strehl(row: PaperRow, run: Mapping[str, Any], setup: EndToEndSetup)
     return 100 * modal.strehl if modal.stable else 0.0
 
 
-def rms_modal_difference(table: Iterable[Facts], method: str) -> float:
-    """Return the rms of end-to-end less modal over Table III, for one controller [points]."""
-    differences = [e.strehl - e.modal for e in table if e.table == "III" and e.method == method]
-    return float(np.sqrt(np.mean(np.square(differences))))
+def rms_differences(table: Sequence[Facts], column: str, reference: str) -> dict[str, float]:
+    """Return the rms of one column less another over a table, by controller [points]."""
+    differences: dict[str, list[float]] = {}
+    for entry in table:
+        difference = getattr(entry, column) - getattr(entry, reference)
+        differences.setdefault(entry.method, []).append(difference)
+    return {method: float(np.sqrt(np.mean(np.square(d)))) for method, d in differences.items()}

@@ -18,7 +18,7 @@ from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.linear import EstimationProblem
 from lbt_synth.linear.controller import as_controller
-from lbt_synth.loop import Imaging, close_loop, loop_margins
+from lbt_synth.loop import ClosedLoop, Imaging, close_loop, loop_margins
 from lbt_synth.loop.budget import ensemble_residuals
 from lbt_synth.loop.closed_loop import require_matching_controller
 from lbt_synth.loop.ensemble import LoopEnsemble, ensemble_vibration
@@ -38,19 +38,9 @@ from lbt_synth.models.loop_hardware import LONGEST_DELAY
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.models.turbulence.ar_models import radial_orders
 from lbt_synth.models.vibration import checked_direction, stationary_vibrations
-from lbt_synth.storage.rows import (
-    NM,
-    PERCENT,
-    Facts,
-    column,
-    fact,
-    facts,
-    fill_row,
-    nm_column,
-    percent_column,
-    table_row,
-)
+from lbt_synth.storage.rows import NM, PERCENT, Facts, fact, facts
 from lbt_synth.studies.grid import loop_columns, residual_columns
+from lbt_synth.studies.limits import LimitStudy, limits
 from lbt_synth.validation import (
     BoolArray,
     FloatArray,
@@ -66,22 +56,20 @@ FAMILIES = (MIXED.name, "central")
 _CROWDING = 1.5  # above 1, points are denser near the least norm
 
 
-@table_row
-class RobustnessRow:
-    """One design at one frequency error; what an unstable loop does not have is nan."""
-
-    error_hz: float = column(
-        "error", unit="Hz", format="+.2f", help="True frequency less that of the model"
-    )
-    method: str = column("method", help="Method of synthesis")
-    strehl: float = percent_column("Strehl", help="Strehl ratio in [0, 1]")
-    residual_nm: float = nm_column("residual", help="Residual of tip and tilt, rms")
-    vibration_nm: float = nm_column("vibration", help="Its part of vibrations, rms")
-    turbulence_nm: float = nm_column("turbulence", help="Its part of turbulence, rms")
-    noise_nm: float = nm_column("noise", help="Its part of noise, rms")
-    within_nm: float = nm_column("within frames", help="Its part that moves within frames, rms")
-    stable: bool = column("stable", help="Whether the loop is stable with the real sensor gain")
-    gamma: float = column(unit="nm", help="H-infinity norm that the design achieves")
+def loop_row(
+    method: str,
+    error_hz: float,
+    loop: ClosedLoop,
+    truth: Truth,
+    imaging: Imaging,
+    *,
+    frame_means: bool = False,
+) -> Facts:
+    """Return what the loop of a design leaves at a frequency error; nan where it is unstable."""
+    numbers: dict[str, Any] = {"error_hz": error_hz, "method": method}
+    numbers |= loop_columns(loop, truth, imaging, frame_means=frame_means)
+    numbers["stable"] = loop.is_stable
+    return facts(**{name: fact(value) for name, value in numbers.items()})
 
 
 def robustness(
@@ -92,7 +80,7 @@ def robustness(
     errors_hz: Sequence[float],
     methods: Sequence[str] | None = None,
     gamma_ratio: float = 1.2,
-) -> Iterator[RobustnessRow]:
+) -> Iterator[Facts]:
     """Design at each frequency error and evaluate exactly against the same truth.
 
     Parameters
@@ -114,8 +102,10 @@ def robustness(
 
     Yields
     ------
-    RobustnessRow
-        In the order of errors, then methods.
+    Facts
+        In the order of errors, then methods: ``error_hz`` and ``method``, ``strehl`` (a ratio in
+        [0, 1]), ``residual_nm`` and its parts ``turbulence_nm``, ``vibration_nm``, ``noise_nm`` and
+        ``within_nm``, of motion within frames [nm rms], and ``stable``; nan where it is not.
 
     Raises
     ------
@@ -149,8 +139,7 @@ def robustness(
         for name in names:
             design = reference_design(name, moved, {"gamma_ratio": gamma_ratio})
             closed = design.close(plant.hardware, sensor_gain=truth.sensor_gain)
-            numbers = loop_columns(closed, truth, imaging) | {"stable": closed.is_stable}
-            yield fill_row(RobustnessRow, design, error_hz=error_hz, **numbers)
+            yield loop_row(name, error_hz, closed, truth, imaging)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -333,41 +322,29 @@ def _checked_axis(values: ArrayLike, name: str, **bounds: Any) -> FloatArray:
     return read_only(np.array([number(value, name, **bounds) for value in axis]))
 
 
-def mirror_rows(
+def compare_on_mirror(
     plant: TipTiltPlant,
     truth: Truth,
     imaging: Imaging,
     *,
     command_weight: float = 0.0,
-) -> tuple[Facts, ...]:
+) -> LimitStudy:
     """Compare designs on a plant's moving mirror: what it costs to ignore its dynamics.
 
     They are the integrator with the best gain on this mirror, the Kalman filter for a mirror
     that settles at once, the same filter with the real positions taken out of its measurements,
-    and the LQG, which also commands for the dynamics; nan is where a loop is unstable.
+    and the LQG, which also commands for the dynamics.
     """
     require_instance(plant, TipTiltPlant, "plant")
     hardware = plant.hardware
-    settled = replace(plant, hardware=replace(hardware, mirror=None))
     regulated = lqg(plant, command_weight=command_weight)
     designs: dict[str, Design] = {
         "integrator, best gain": integrator(hardware, truth=truth),
-        "kalman, settled mirror": kalman(settled),
+        "kalman, settled mirror": kalman(replace(plant, hardware=replace(hardware, mirror=None))),
         "kalman, real positions": kalman(plant),
         regulated.method: regulated,
     }
-    rows, rms = [], {"unit": "nm", "format": ".2f", "missing": "unstable"}
-    for name, design in designs.items():
-        closed = close_loop(hardware, design.controller, sensor_gain=truth.sensor_gain)
-        numbers = loop_columns(closed, truth, imaging)
-        row = facts(
-            design=fact(name, "design"),
-            stable=fact(closed.is_stable),
-            residual_nm=fact(numbers["residual_nm"], "residual", **rms),
-            strehl=fact(numbers["strehl"], "Strehl", **PERCENT),
-        )
-        rows.append(row)
-    return tuple(rows)
+    return limits(designs, hardware, truth, imaging)
 
 
 def tradeoff(

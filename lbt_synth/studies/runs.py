@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from lbt_synth.config import Config
 from lbt_synth.design import Design
-from lbt_synth.design.result import require_hardware
 from lbt_synth.errors import ProblemError
 from lbt_synth.identification import LoopRecord
 from lbt_synth.interop.pipeline import Rehearsal, rehearse
 from lbt_synth.linear import estimator_form
-from lbt_synth.loop import Imaging, close_loop, residual_budget, simulate, strehl
+from lbt_synth.loop import ClosedLoop, Imaging, close_loop, residual_budget, simulate, strehl
 from lbt_synth.loop.budget import ResidualBudget
 from lbt_synth.loop.disturbances import Disturbance
 from lbt_synth.loop.simulation import Drop, Segment, Simulation, run_segments, settling_frames
@@ -43,7 +42,9 @@ def run_design(
     drops: Sequence[Drop] = (),
     estimates: bool = False,
     stroke: float | None = None,
-    **size: int,
+    frames: int,
+    cases: int,
+    seed: int,
 ) -> DesignRun:
     """Run the loop of a configuration for some frames and cases; sensors may fail on the way.
 
@@ -52,20 +53,30 @@ def run_design(
     loop = design.close(config.hardware, sensor_gain=truth.sensor_gain)
     loop.require_stable()
     usual, notes = config.settings.simulation.settle_frames, list[str]()
+    # the same settling for all controllers, so that one seed is one weather
+    settle = max(usual, settling_frames(loop.radius_per_frame))
+    simulation = simulate(
+        estimator_form(design) if estimates else design,
+        truth,
+        hardware=loop.hardware,
+        frames=frames,
+        cases=cases,
+        seed=seed,
+        settle_frames=settle,
+        stroke=stroke,
+        drops=drops,
+    )
     segments: list[tuple[Segment, Facts]] = []
     if design.other_sensors:
-        simulation, segments = run_failures(design, config, truth, drops, **size)
+        for segment in run_segments(drops, frames / loop.hardware.frame_rate_hz):
+            row = _segment_row(design, loop, truth, simulation, segment, config.imaging)
+            segments.append((segment, row))
         notes.append("the exact answer is with all sensors.")
-    else:  # the same settling for all controllers, so that one seed is one weather
-        settle = max(usual, settling_frames(loop.radius_per_frame))
-        form = estimator_form(design) if estimates else design.controller
-        options: dict[str, Any] = {**size, "settle_frames": settle, "stroke": stroke}
-        simulation = simulate(form, truth, hardware=config.hardware, **options)
-        if settle > usual:
-            notes.append(
-                f"this loop settles for {settle} frames, not {usual}; its random series are not "
-                "those of a faster loop with the same seed. Raise simulation.settle_frames."
-            )
+    if settle > usual:
+        notes.append(
+            f"this loop settles for {settle} frames, not {usual}; its random series are not "
+            "those of a faster loop with the same seed. Raise simulation.settle_frames."
+        )
     clipped = None
     if stroke is not None:
         clipped = float(np.mean(np.any(np.abs(simulation.commands) >= stroke, axis=2)))
@@ -104,52 +115,27 @@ def _run_row(
     )
 
 
-def run_failures(
-    design: Design,
-    config: Config,
-    truth: Truth,
-    drops: Sequence[Drop],
-    *,
-    frames: int,
-    cases: int,
-    seed: int,
-) -> tuple[Simulation, list[tuple[Segment, Facts]]]:
-    """Run the loop of a configuration in which sensors fail, none after the end of the run.
-
-    Between failures and returns there is a segment, with a row that has its exact residual, too:
-    nan where the loop is unstable, a reading is frozen, or a vibration drifts.
-    """
-    rate = config.hardware.frame_rate_hz
-    hardware = replace(config.hardware, suite=require_hardware(design, "a run").suite)
-    simulation = simulate(
-        design,
-        truth,
-        hardware=hardware,
-        frames=frames,
-        cases=cases,
-        seed=seed,
-        settle_frames=config.settings.simulation.settle_frames,
-        drops=drops,
-    )
-    segments = run_segments(drops, frames / rate)
-    loop = design, hardware, truth, config.imaging
-    return simulation, [(segment, _segment_row(loop, simulation, segment)) for segment in segments]
-
-
 def _segment_row(
-    loop: tuple[Design, LoopHardware, Truth, Imaging], simulation: Simulation, segment: Segment
+    design: Design,
+    loop: ClosedLoop,
+    truth: Truth,
+    simulation: Simulation,
+    segment: Segment,
+    imaging: Imaging,
 ) -> Facts:
-    """Return what a loop leaves while some sensors fail, in a run and exactly."""
-    design, hardware, truth, imaging = loop
+    """Return what a loop leaves while some sensors fail, in a run and exactly.
+
+    The exact one is nan where the loop is unstable, a reading is frozen, or a vibration drifts.
+    """
     closed = close_loop(
-        hardware,
+        loop.hardware,
         design.controllers[frozenset(segment.missing)],
         sensor_gain=truth.sensor_gain,
         blind=(*segment.missing, *segment.wrong),
     )
     # a frozen reading adds an offset of its own
     exact = closed.is_stable and not truth.drifts and "frozen" not in segment.wrong.values()
-    rate = hardware.frame_rate_hz
+    rate = loop.hardware.frame_rate_hz
     first, last = (int(np.ceil(t * rate - 1e-6)) for t in (segment.start_s, segment.end_s))
     run = simulation.part(first, last)
     exact_nm = residual_budget(closed, truth).rms_nm if exact else np.nan
@@ -166,15 +152,6 @@ def _segment_row(
     )
 
 
-class RecordRehearsal(NamedTuple):
-    """The loop of a record in the arithmetic of a target, beside the design and what ran."""
-
-    rehearsal: Rehearsal
-    rows: list[Facts]  # one a loop
-    hardware: LoopHardware  # of the record, with the sensor gains that are assumed
-    frames: int  # of the stretch that was run
-
-
 def rehearse_record(
     design: Design,
     record: LoopRecord,
@@ -182,8 +159,12 @@ def rehearse_record(
     imaging: Imaging,
     *,
     stroke: float | None = None,
-) -> RecordRehearsal:
-    """Rehearse a design on the longest stretch of a record that has no gap."""
+) -> tuple[Rehearsal, list[Facts], LoopHardware]:
+    """Rehearse a design on the longest stretch of a record that has no gap.
+
+    A row for the target, the design and what ran comes with it, and the loop of the record with the
+    sensor gains that are assumed.
+    """
     gains = _assumed_gains(design, record)
     start, stop = max(record.stretches(), key=lambda pair: pair[1] - pair[0])
     phase_nm = record.pseudo_open_loop(gains)[start:stop]
@@ -198,7 +179,7 @@ def rehearse_record(
         settled = slice(start + rehearsal.settle_frames, stop)
         residual_nm, commands = record.measurements[settled] / gains, record.commands[settled]
         rows.append(_loop_row("what ran", residual_nm, residual_nm**2, commands, imaging, None))
-    return RecordRehearsal(rehearsal, rows, hardware, stop - start)
+    return rehearsal, rows, hardware
 
 
 def _loop_row(

@@ -17,7 +17,7 @@ from lbt_synth.design.shaping import LoopErrors, ResidualVariance
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop.least_residual import least_residual
 from lbt_synth.models import ARModel
-from lbt_synth.studies.robustness import mirror_rows
+from lbt_synth.studies.robustness import compare_on_mirror
 
 
 def model_rms(plant, controller):
@@ -161,7 +161,7 @@ def test_refusals():
             (lambda: lbt.lqg(settled), ProblemError, need),
             (lambda: lbt.lqg(plant, command_weight=-1.0), ProblemError, weight),
             (lambda: lbt.lqg(flat), DimensionError, "must have rank 2"),
-            (lambda: mirror_rows(path, *rows), ProblemError, need),
+            (lambda: compare_on_mirror(path, *rows), ProblemError, need),
             (lambda: replace(design, controller=design.controller), ValueError, "controller"),
         ]
     )

@@ -15,7 +15,7 @@ from lbt_synth.models import SinusoidalVibration
 from lbt_synth.models.plant.tip_tilt import retuned_plant
 from lbt_synth.report.figures.studies import tradeoff_figure
 from lbt_synth.studies import robustness, robustness_map
-from lbt_synth.studies.robustness import mirror_rows
+from lbt_synth.studies.robustness import compare_on_mirror
 
 
 def test_robustness_rows(config):
@@ -184,6 +184,6 @@ def test_the_front_of_the_lbt(axis_plant):
 def test_a_slow_mirror_needs_a_design_that_knows_it():
     plant = slow_plant(2.0, shell())
     truth = lbt.Truth(turbulence=plant.turbulence, vibrations=plant.vibrations, noise_nm=15.5)
-    rows = {row.design: row for row in mirror_rows(plant, truth, CAMERA)}
+    rows = {row.design: row for row in compare_on_mirror(plant, truth, CAMERA).rows}
     assert not rows["kalman, settled mirror"].stable
     assert rows["lqg"].residual_nm < 0.7 * rows["kalman, real positions"].residual_nm

@@ -30,7 +30,7 @@ from lbt_synth.report.figures.loops import draw_design
 from lbt_synth.storage.display_unit import nm_text
 from lbt_synth.storage.rows import Facts
 from lbt_synth.studies.limits import LimitStudy
-from lbt_synth.studies.robustness import FAMILIES, RobustnessMap, RobustnessRow
+from lbt_synth.studies.robustness import FAMILIES, RobustnessMap
 from lbt_synth.validation import FloatArray
 
 FREQUENCY_ERROR = ("frequency error, truth less design", "Hz")
@@ -41,7 +41,7 @@ _RINGS: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "marke
 
 
 def robustness_figure(
-    rows: Sequence[RobustnessRow], published: Mapping[str, Sequence[tuple[float, float]]]
+    rows: Sequence[Facts], published: Mapping[str, Sequence[tuple[float, float]]]
 ) -> Figure:
     """Draw the Strehl ratio over the frequency error, and the pairs that were published.
 

@@ -9,7 +9,6 @@ from concurrent.futures import Executor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from lbt_synth.linear import solve_dare
 from lbt_synth.linear.matrix_functions import transpose
 from lbt_synth.loop.budget import ensemble_residuals
 from lbt_synth.loop.evaluator import textbook_matrices
-from lbt_synth.methods.request import DesignRequest, fixed_design
+from lbt_synth.methods.request import DesignRequest
 from lbt_synth.models import TipTiltPlant
 from lbt_synth.storage.atomic_files import (
     UNFINISHED,
@@ -60,9 +59,7 @@ _AGREEMENT = 1e-5  # of a sample evaluated both ways, relative and absolute
 Evaluate = Callable[[Study, FloatArray, int], Result]
 
 
-def evaluate_samples(
-    study: Study, values: FloatArray, start: int, *, together: bool = True
-) -> Result:
+def evaluate_samples(study: Study, values: FloatArray, start: int) -> Result:
     """Evaluate consecutive rows of ``Study.values`` from a start; nan is where there is no result.
 
     Samples whose configurations differ by numbers that its builders take as arrays are evaluated
@@ -73,7 +70,7 @@ def evaluate_samples(
     failures: list[Failure] = []
     remaining: dict[int, list[str]] = {}  # controllers to evaluate one by one, by sample
     for name, controller in study.controllers.items():
-        for rows, results in _evaluate_groups(study, controller, values) if together else ():
+        for rows, results in _evaluate_groups(study, controller, values):
             for column, numbers in results.items():
                 columns[f"{name}.{column}"][rows] = numbers
             i = int(rows[rows.size // 2])
@@ -94,11 +91,10 @@ def evaluate_samples(
 
 def are_evaluated_together(study: Study, controller: Design | DesignRequest) -> bool:
     """Whether many samples of a controller can be evaluated at once."""
-    if (design := fixed_design(controller)) is not None:
-        return not design.other_sensors
+    if isinstance(controller, Design):
+        return not controller.other_sensors
     # a Kalman filter without options, designed for each sample
-    request = cast("DesignRequest", controller)
-    plain = request.method.batched and not request.given
+    plain = controller.method.batched and not controller.given
     return plain and not study.config.hardware.suite.sensors
 
 
@@ -108,15 +104,16 @@ def _evaluate_groups(
     """Yield what could be evaluated together: rows, and their columns."""
     if not are_evaluated_together(study, controller):
         return
-    design = fixed_design(controller)
-    keys = array_keys(study.config.settings) - ({_DELAY} if design is None else set())
+    keys = array_keys(study.config.settings)
+    if isinstance(controller, DesignRequest):
+        keys -= {_DELAY}
     places = enumerate(study.places.values())
     apart = [i for i, numbers in places if not keys.issuperset(numbers)]
     _, which, counts = np.unique(values[:, apart], axis=0, return_inverse=True, return_counts=True)
     for group in np.flatnonzero(counts >= min(2, len(values))):
         rows = np.flatnonzero(which.reshape(-1) == group)  # that differ by these keys only
         with suppress(*EXPECTED_ERRORS):
-            yield rows, _evaluate_group(study, design, values[rows], keys)
+            yield rows, _evaluate_group(study, controller, values[rows], keys)
             continue
         made = []  # without the one that fails
         for row in rows.tolist():
@@ -125,21 +122,21 @@ def _evaluate_groups(
                 made.append(row)
         accepted = np.array(made, dtype=np.intp)
         with suppress(*EXPECTED_ERRORS, IndexError):  # none may make a sample
-            yield accepted, _evaluate_group(study, design, values[accepted], keys)
+            yield accepted, _evaluate_group(study, controller, values[accepted], keys)
 
 
 def _evaluate_group(
-    study: Study, design: Design | None, values: FloatArray, keys: set[Keys]
+    study: Study, controller: Design | DesignRequest, values: FloatArray, keys: set[Keys]
 ) -> dict[str, FloatArray]:
     """Return the columns of samples that differ by numbers of some keys only."""
     config, hardware, _ = make_sample(study, values[0])
     by_name = dict(zip(study.parameter_names, values.T, strict=True))
     places = [(place, by_name[name]) for name, keys_of in study.places.items() for place in keys_of]
     with np.errstate(over="raise", divide="raise", invalid="raise"):
-        if design is None:
+        if isinstance(controller, DesignRequest):
             matrices = _kalman_matrices([make_sample(study, row)[0].plant for row in values])
         else:
-            matrices = textbook_matrices([design.controller])
+            matrices = textbook_matrices([controller.controller])
         loops = build_ensemble(
             config,
             {place: numbers for place, numbers in places if place in keys},
@@ -288,10 +285,11 @@ def run_study(
             if path.exists():
                 why = "is not of a study in this directory, and would be replaced. Name another"
                 refuse(path, f"{why} directory, or delete it.")
+    together = all(are_evaluated_together(study, one) for one in study.controllers.values())
     outcome, computed = sweep.run(
         evaluate,
         lambda rows: (study, study.values(*rows), rows[0]),
-        part_rows=part_rows(study),
+        part_rows=_ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE,
         executor=executor,
         workers=workers,
         progress=progress,
@@ -307,12 +305,6 @@ def run_study(
         new=_write_outputs(folder, study, table, outcome.failures),
         seconds=time.perf_counter() - began,
     )
-
-
-def part_rows(study: Study) -> int:
-    """Return how many rows a part of a study has, at most."""
-    together = all(are_evaluated_together(study, one) for one in study.controllers.values())
-    return _ROWS_TOGETHER if together else _ROWS_ONE_BY_ONE
 
 
 def study_sweep(folder: Path, study: Study) -> Sweep:
@@ -340,12 +332,9 @@ def _write_outputs(folder: Path, study: Study, table: FloatArray, failures: list
         write_atomically(failed, csv_bytes(("row", "controller", "error"), failures))
     if not results.exists():
         formats = [_PARAMETER] * len(study.parameter_names) + [_RESULT] * len(study.result_columns)
-        line = ",".join(["%d", *formats]) + "\n"
+        heading, style = ",".join(study.columns), {"delimiter": ",", "comments": ""}
         with open_atomically(results) as stream:
-            stream.write((",".join(study.columns) + "\n").encode())
-            for start in range(0, len(table), _ROWS_TOGETHER):
-                rows = table[start : start + _ROWS_TOGETHER].tolist()
-                stream.write("".join([line % tuple(row) for row in rows]).encode())
+            np.savetxt(stream, table, ["%d", *formats], header=heading, **style)
     return new
 
 
@@ -382,7 +371,7 @@ def replay_row(study: Study, directory: str | os.PathLike[str], row: int) -> Rep
     designs = {
         folder / f"row_{row}_{name}.fits": controller
         for name, controller in study.controllers.items()
-        if fixed_design(controller) is None
+        if isinstance(controller, DesignRequest)
     }
     refuse_replacing([path, *designs], study.inputs)
     files = []

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field, model_validator
@@ -31,7 +31,7 @@ from lbt_synth.errors import (
 from lbt_synth.files.gain_file.store import load_with_digest
 from lbt_synth.methods.method import Section
 from lbt_synth.methods.registry import method_named
-from lbt_synth.methods.request import DesignRequest, design_request, fixed_design
+from lbt_synth.methods.request import DesignRequest, design_request
 from lbt_synth.models import LoopHardware, Truth
 from lbt_synth.studies.grid import RESIDUALS
 from lbt_synth.validation import FloatArray, integer
@@ -139,12 +139,6 @@ class ParameterSection(Section):
         low, high = np.where(np.isfinite(ends), ends, inside).tolist()
         return low, high
 
-    def median(self) -> float:
-        """Return the median; the middle one of a list."""
-        if self.values:
-            return sorted(self.values)[len(self.values) // 2]
-        return float(self.quantile(np.array([0.5]))[0])
-
 
 class ControllerSection(Section):
     """A controller: a gain file, or a design with the options of ``lbt-synth design``."""
@@ -227,10 +221,9 @@ class Study:
     def designed(self) -> dict[str, Design]:
         """The controllers that the study designs once, for all samples."""
         return {
-            name: design
+            name: controller
             for name, controller in self.controllers.items()
-            if self.settings.controllers[name].file is None
-            and (design := fixed_design(controller)) is not None
+            if self.settings.controllers[name].file is None and isinstance(controller, Design)
         }
 
     @property
@@ -318,8 +311,7 @@ def make_sample(study: Study, values: Sequence[float] | FloatArray) -> Sample:
 
 def design_for_sample(controller: Design | DesignRequest, sample: Sample) -> Design:
     """Return a controller's design, made for the sample if it has none for all."""
-    design = fixed_design(controller)
-    return sample[0].design(cast("DesignRequest", controller)) if design is None else design
+    return controller if isinstance(controller, Design) else sample[0].design(controller)
 
 
 def load_study(path: str | os.PathLike[str]) -> Study:
@@ -327,7 +319,7 @@ def load_study(path: str | os.PathLike[str]) -> Study:
 
     It checks the file, the configuration and the gain files, that every parameter is a number of
     the configuration, and that the configuration accepts the ends of each parameter, with the
-    others at their medians.
+    others in the middle of their distributions or lists.
 
     Parameters
     ----------
@@ -396,10 +388,10 @@ def load_study(path: str | os.PathLike[str]) -> Study:
         },
     )
     for name, controller in study.controllers.items():
-        if (design := fixed_design(controller)) is not None:
+        if isinstance(controller, Design):
             for where, (_, hardware, truth) in samples:
                 with refuse_config(f"{source}: controllers.{name}, {where}"):
-                    design.close(hardware, sensor_gain=truth.sensor_gain)
+                    controller.close(hardware, sensor_gain=truth.sensor_gain)
     return study
 
 
@@ -475,9 +467,9 @@ def _require_places(settings: StudySection, config: Config, source: Path) -> Non
 
 
 def _corners(study: Study) -> Iterator[tuple[str, list[float]]]:
-    """Yield the medians, then the ends of each parameter with the others at their medians."""
+    """Yield the middles, then the ends of each parameter with the others in the middle."""
     parameters = study.settings.parameters
-    centre = [section.median() for section in parameters.values()]
+    centre = [float(section.quantile(np.array([0.5]))[0]) for section in parameters.values()]
     yield "parameters in the middle", centre
     for i, (name, section) in enumerate(parameters.items()):
         for end in section.extremes(study.samples) if section.varies else ():
