@@ -16,14 +16,14 @@ GROWTH = 1.05  # of a number, before it is too much
 LINES = {
     "cli": 3169,
     "config": 1622,
-    "design": 5971,
+    "design": 5984,
     "files": 1252,
-    "identification": 8845,
+    "identification": 8844,
     "interop": 3687,
     "linear": 4748,
     "loop": 3945,
     "methods": 784,
-    "models": 3752,
+    "models": 3749,
     "report": 3263,
     "storage": 1060,
     "studies": 3190,
@@ -33,9 +33,9 @@ COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 498,
-    "lines of tests": 29139,
+    "lines of tests": 29202,
     "lines of benchmarks": 4018,
-    "words of docs": 62270,
+    "words of docs": 62412,
 }
 
 

@@ -176,11 +176,10 @@ def design_from_record(
         record = keep_frames(record, beside.good)
     _require_able(record, method)
     notes, assumptions = _judge_commands(record, sensor_gain, accept_record)
-    step = progress or (lambda _: None)
-    options |= {"sensor_gain": sensor_gain}
+    step, options = progress or (lambda _: None), options | {"sensor_gain": sensor_gain}
     half = identify(split_halves(record)[0], **options)
-    finds_gain = record.commands is not None and sensor_gain is None
-    assumptions += _judge_gains(half, accept_record) if finds_gain else ()
+    if finds_gain := record.commands is not None and sensor_gain is None:
+        assumptions += _judge_gains(half, accept_record)
     step(1)
     names = quick_methods() if method is None else [method]
     requests = {name: {} if method else method_named(name).reference_options for name in names}

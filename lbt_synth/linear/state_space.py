@@ -270,20 +270,20 @@ class StateSpace(LinearSystem):
             return self.frequency_response(frequency_hz)[:, None]
         frequency = np.atleast_1d(real_array(frequency_hz, "frequency_hz"))
         z = np.exp(2j * np.pi * frequency * self.dt_s)
-        (p, m), n, N, whole = self.D.shape[-2:], self.n_states, self.period, self.lifted()
-        T, U = complex_schur(whole.A)
-        B = (U.conj().T @ whole.B).reshape(n, N, m)
-        D, step = whole.D.reshape(N * p, N, m), max(1, _CHUNK // max(p, n, 1))
+        (p, m), n, N, lifted = self.D.shape[-2:], self.n_states, self.period, self.lifted()
+        T, U = complex_schur(lifted.A)
+        B = (U.conj().T @ lifted.B).reshape(n, N, m)
+        D, step = lifted.D.reshape(N * p, N, m), max(1, _CHUNK // max(p, n, 1))
         out = np.empty((z.size, N, p, m), dtype=np.complex128)
         for start in range(0, z.size, step):
-            part = slice(start, start + step)
-            turns = z[part, None] ** np.arange(N)  # of the input of a period, and of its output
+            rows = slice(start, start + step)
+            turns = z[rows, None] ** np.arange(N)  # of the input of a period, and of its output
             for j in range(m):
                 x = turns @ B[:, :, j].T  # the state at phase 0 repeats as z^N: solve for it
                 for i in range(n - 1, -1, -1):
-                    x[:, i] = (x[:, i] + x[:, i + 1 :] @ T[i, i + 1 :]) / (z[part] ** N - T[i, i])
-                y = (x @ U.T) @ whole.C.T + turns @ D[:, :, j].T
-                out[part, :, :, j] = y.reshape(-1, N, p) / turns[:, :, None]
+                    x[:, i] = (x[:, i] + x[:, i + 1 :] @ T[i, i + 1 :]) / (z[rows] ** N - T[i, i])
+                y = (x @ U.T) @ lifted.C.T + turns @ D[:, :, j].T
+                out[rows, :, :, j] = y.reshape(-1, N, p) / turns[:, :, None]
         return out
 
     def frequency_response(self, frequency_hz: ArrayLike) -> ComplexArray:

@@ -220,8 +220,8 @@ def residual_budget(
     means = {name: getattr(budget, name).mean(axis=0) for name in _COVARIANCES}
     means["random_vibration_nm2"] += seen[0]
     means["within_nm2"] += seen[1]
-    whole = {name: read_only(covariance) for name, covariance in means.items()}
-    return ResidualBudget(**whole, line_amplitudes_nm=read_only(amplitudes.reshape(-1, n)))
+    covariances = {name: read_only(covariance) for name, covariance in means.items()}
+    return ResidualBudget(**covariances, line_amplitudes_nm=read_only(amplitudes.reshape(-1, n)))
 
 
 def random_density(

@@ -274,10 +274,10 @@ def _noise_on_modes(hardware: LoopHardware, noise_nm2: FloatArray) -> FloatArray
     """Covariance (n, n) of the best unbiased estimate of the modes from one measurement."""
     n = hardware.modes
     rows = ("sensor", "see", hardware.sensor), ("mirror", "reach", hardware.influence)
-    for part, verb, matrix in rows:
+    for device, verb, matrix in rows:
         if (rank := np.linalg.matrix_rank(matrix)) < n:
             raise ProblemError(
-                f"the {part} must {verb} every mode; got a matrix of rank {rank} for {n} modes. "
+                f"the {device} must {verb} every mode; got a matrix of rank {rank} for {n} modes. "
                 f"Leave out the modes that it does not {verb}."
             )
     size = float(np.max(np.abs(noise_nm2))) or 1.0

@@ -110,8 +110,8 @@ def broken_loops(loop: ClosedLoop) -> tuple[BrokenLoop, ...]:
     sensitivities = _own_sensitivities(loop)
     grid, responses = _refine_turns(broken, np.union1d(nodes, uniform))
     near = partial(np.allclose, rtol=_SAME, atol=_SAME)
-    seen = 1 / (1 + responses.T)  # sensitivities, by which two loops are equal
-    alike = [next(i for i, one in enumerate(seen) if near(one, own)) for own in seen]
+    curves = 1 / (1 + responses.T)  # sensitivities, by which two loops are equal
+    alike = [next(i for i, one in enumerate(curves) if near(one, curve)) for curve in curves]
     return tuple(
         BrokenLoop(
             measurements=tuple(i for i, first in enumerate(alike) if first == index),

@@ -11,6 +11,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from support.refusals import require_refusals
 
 import lbt_synth as lbt
+from lbt_synth.models.spectra import spectrum_groups
 
 
 def test_sum_of_spectra():
@@ -77,3 +78,12 @@ def test_processes_that_are_not_stationary_are_refused():
     ):
         with pytest.raises(lbt.errors.ProblemError, match=words):
             lbt.models.ARModel(coefficients=[a1, a2], driving_rms_nm=1, frame_rate_hz=500)
+
+
+def test_modes_are_grouped_by_all_numbers_of_their_models():
+    slow = {"coefficients": [0.9], "driving_rms_nm": 1.0, "frame_rate_hz": 800}
+    changes = ({}, {"driving_rms_nm": 2.0}, {}, {"frame_rate_hz": 500}, {"coefficients": [0.8]})
+    models = [lbt.models.ARModel(**(slow | change)) for change in changes]
+    table = lbt.models.TabulatedSpectrum(frequency_hz=[1, 2], density_nm2_hz=[1, 1])
+    groups = spectrum_groups([*models, None, table, table])
+    assert [modes for _, modes in groups] == [[0, 2], [1], [3], [4], [6, 7]]

@@ -193,14 +193,14 @@ def _state(
     """
     linear, roots, n = np.zeros(programme.size), [], origin.size
     level = iter(np.eye(programme.size)[n:])
-    for part in function:
-        if part.worst:
-            values, slopes, _ = _expand(part, origin)
+    for fractions in function:
+        if fractions.worst:
+            values, slopes, _ = _expand(fractions, origin)
             unit, bound = 1 / np.sqrt(scale), next(level)
             _bound_norms(programme, values * unit, slopes * unit, bound, 0.0)
             roots.append(bound[None])
         else:
-            gradient, hessian = _second_order(part, origin)
+            gradient, hessian = _second_order(fractions, origin)
             linear[:n] += gradient / scale
             root = semidefinite_root(hessian / scale).T
             roots.append(np.pad(root, ((0, 0), (0, programme.size - n))))

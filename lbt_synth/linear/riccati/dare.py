@@ -239,7 +239,7 @@ def _refuse(index: int, lead: tuple[int, ...], best: Solutions) -> None:
     raise NumericalError(
         f"{_prefix(index, lead)}the Riccati equation was not solved: "
         f"doubling and the Schur form gave {outcome}; expected a stable closed loop, "
-        f" a residual below {RESIDUAL_LIMIT:g} and an estimated error below "
+        f"a residual below {RESIDUAL_LIMIT:g} and an estimated error below "
         f"{ERROR_LIMIT:g}, and a pole further from the unit circle than rounding can move it. "
         "There may be no stabilising solution; look for modes near the unit circle that are barely "
         "driven or seen.",

@@ -79,10 +79,11 @@ def held_frames(hardware: LoopHardware) -> int:
 def sensor_memory(hardware: LoopHardware, *, own: bool = False, ahead: int = 0) -> Memory:
     """Return the system from a signal s(k) (n,) to the readings in frame k, of s before k.
 
-    They are those of the other wavefront sensors, older by some frames, and before them those of
-    the loop's own. An exposure ends in frame e with the mean of the frames since the last end; the
-    sum of a period that has begun and the readings that wait are its states. Where an exposure ends
-    within a frame, that frame counts for both exposures, in part.
+    They are those of the other wavefront sensors, as old as they are with so many more frames
+    ``ahead``, after those of the loop's ``own`` sensor if it counts. An exposure ends in frame e
+    with the mean of the frames since the last end; the sum of a period that has begun and the
+    readings that wait are its states. Where an exposure ends within a frame, that frame counts for
+    both exposures, in part.
     """
     modes, period = hardware.modes, hardware.period
     blocks = [(np.zeros((period, 0, 0)), np.zeros((period, 0, modes)), np.zeros((period, 0, 0)))]
@@ -226,16 +227,14 @@ def _with_other_sensors(alone: PlantMatrices, parts: PlantParts) -> PlantMatrice
     total = own_A[newest : newest + hardware.modes]  # total(k) from x(k): it is held in x(k+1)
     n, w = len(B_s), A_w.shape[1]
     to_own = np.hstack([to_own, np.zeros((len(to_own), w))])
-    A = np.zeros((period, n + w, n + w))
-    A[:, :n, :n], A[:, n:, n:] = A_s, A_w
+    A = block_diag(A_s, A_w)
     A[:, n:] += B_w @ (total @ to_own)
     q0, q1, q2 = len(own_C), C_w.shape[1], len(C_s)
     C = np.zeros((period, q0 + q1 + q2, n + w))
     C[:, :q0], C[:, q0 : q0 + q1, n:], C[:, q0 + q1 :, :n] = own_C @ to_own, C_w, C_s
     noise = hardware.suite.noise_factor(parts.noise_factor, hardware.modes)
-    drives = B_s.shape[1]
-    B, D = np.zeros((n + w, drives + len(noise))), np.zeros((len(noise), drives + len(noise)))
-    B[:n, :drives], D[:, drives:] = B_s, noise
+    B = np.pad(B_s, ((0, w), (0, len(noise))))
+    D = np.pad(noise, ((0, 0), (B_s.shape[1], 0)))
     return A, B, C, D, own_L @ to_own
 
 
@@ -250,27 +249,25 @@ def _shaken_plant(
     hardware, motions, suite = parts.hardware, parts.motions, parts.hardware.suite
     (own_A, own_B, own_C, _, _), period = alone, hardware.period
     seen = [j for j, motion in enumerate(motions) if motion]
-    lines = [
-        seen_vibration(parts.vibrations[j], motions[j], suite.accelerometers, hardware, ahead=ahead)
-        for j in seen
+    accelerometers = suite.accelerometers
+    stacks = [
+        seen_vibration(line, motion, accelerometers, hardware, ahead=ahead).stacks()
+        for line, motion in zip(parts.vibrations, motions, strict=True)
+        if motion
     ]
     kept = np.delete(np.arange(len(own_A)), [*seen, *(parts.sections + j for j in seen)])
     drives = np.delete(np.arange(own_B.shape[1] - len(own_C)), seen)
-    size, width = len(kept) + sum(s.n_states for s in lines), len(drives)
-    to_own, C = np.zeros((len(own_A), size)), np.zeros((len(suite.channels), size))
+    transitions = (A[np.arange(period) % len(A)] for A, *_ in stacks)
+    A = block_diag(np.zeros((period, len(kept), len(kept))), *transitions)
+    B = block_diag(own_B[np.ix_(kept, drives)], *(B[0] for _, B, *_ in stacks))
+    to_own, C = np.zeros((len(own_A), len(B))), np.zeros((len(suite.channels), len(B)))
     to_own[kept, : len(kept)] = np.eye(len(kept))
-    A = np.zeros((period, size, size))
-    B = np.zeros((size, width + sum(s.B.shape[-1] for s in lines)))
-    B[: len(kept), :width] = own_B[np.ix_(kept, drives)]
     row = len(kept)
-    for j, line in zip(seen, lines, strict=True):
-        line_A, line_B, line_C, _ = line.stacks()
-        states, moved = slice(row, row + line.n_states), line.B.shape[-1]
-        A[:, states, states] = line_A[np.arange(period) % line.period]
-        B[states, width : width + moved] = line_B[0]
-        to_own[j, states] = line_C[0, 0]
+    for j, (_, _, outputs, _) in zip(seen, stacks, strict=True):
+        states = slice(row, row + outputs.shape[-1])
+        to_own[j, states] = outputs[0, 0]
         channels = [i for i, name in enumerate(suite.channels) if name in motions[j]]
-        C[channels, states] = line_C[0, 1:]
-        row, width = states.stop, width + moved
+        C[channels, states] = outputs[0, 1:]
+        row = states.stop
     A[:, : len(kept)] = own_A[kept] @ to_own
     return A, B, C, to_own

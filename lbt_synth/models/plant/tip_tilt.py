@@ -63,8 +63,8 @@ class FullForm:
         The past command u(k-1) is ``to_command x_hat(k | k-1)`` and needs no state of its own. The
         known input has no error, so that the gain is over the reduced state, (r, q).
         """
-        known = self.n_states - gain_predictor.shape[-2]
-        gain = np.pad(gain_predictor, [(0, 0)] * (gain_predictor.ndim - 2) + [(0, known), (0, 0)])
+        past = self.n_states - gain_predictor.shape[-2]
+        gain = np.pad(gain_predictor, [(0, 0)] * (gain_predictor.ndim - 2) + [(0, past), (0, 0)])
         applied = self.B_known - gain @ self.D_known
         A = self.A - gain @ self.C + applied @ to_command
         D = np.zeros((len(to_command), gain.shape[-1]))

@@ -167,7 +167,7 @@ def _unpack(p: FloatArray, rate: float) -> tuple[float, float]:
 def radial_orders(modes: int) -> IntArray:
     """Radial orders (modes,) of the first Zernike modes after piston, in Noll's order."""
     count = integer(modes, "modes", at_least=1)
-    orders = np.arange(1, int(np.sqrt(2 * count)) + 2)  # of which n has n + 1 modes
+    orders = np.arange(1, int(np.sqrt(2 * count)) + 1)  # of which n has n + 1 modes
     return read_only(np.repeat(orders, orders + 1)[:count])
 
 
