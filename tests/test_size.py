@@ -33,7 +33,7 @@ COUNTS = {
     "files of the package": 204,
     "public names": 147,
     "tuned constants": 498,
-    "lines of tests": 29202,
+    "lines of tests": 29205,
     "lines of benchmarks": 4018,
     "words of docs": 62412,
 }
