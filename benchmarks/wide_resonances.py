@@ -1,11 +1,10 @@
-"""Loops under wide resonances: is the sensor gain found, and what does the design of `auto` leave?
+"""Loops under wide resonances: is the sensor gain found?
 
-    python benchmarks/wide_resonances.py [--records 24] [--first 0] [--seconds 30] [--auto]
+    python benchmarks/wide_resonances.py [--records 24] [--first 0] [--seconds 30]
 
 Loops of two axes at 500 or 1000 Hz with a delay of 2 frames, an integrator of gain 0.2 to 0.6,
 sensor gain 0.4 to 1, noise 2 to 25 nm, frozen flow, 1 to 5 lines as in wrong_commands.py and two
-resonances of damping 0.05 to 0.2. ``--auto`` designs from each record and gives the residual in
-the true loop, over that of an integrator of gain 0.4 in the same loop.
+resonances of damping 0.05 to 0.2.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from harness import frozen_flow, log_uniform, record_options, run_integrator
 from wrong_commands import draw_lines
 
 import lbt_synth as lbt
-from lbt_synth.identification.auto import RecordedDesign
 
 
 def draw(seed: int, seconds: float) -> tuple[lbt.identification.LoopRecord, lbt.Truth]:
@@ -37,37 +35,25 @@ def draw(seed: int, seconds: float) -> tuple[lbt.identification.LoopRecord, lbt.
     return record, truth
 
 
-def residual_nm(design: lbt.Design, record: lbt.identification.LoopRecord, truth: lbt.Truth):
-    """Return what a design leaves in the true loop; infinite if that is unstable."""
-    path = lbt.LoopHardware(frame_rate_hz=record.frame_rate_hz)
-    loop = lbt.close_loop(path, design.controller, sensor_gain=truth.sensor_gain)
-    return lbt.residual_budget(loop, truth, frame_means=True).rms_nm if loop.is_stable else np.inf
-
-
 def main() -> None:
     """Print a line per record, and the summary."""
-    given = record_options(__doc__, records=24, seconds=30.0, auto=False)
+    given = record_options(__doc__, records=24, seconds=30.0)
     deviations = []
     for seed in range(given.first, given.first + given.records):
         record, truth = draw(seed, given.seconds)
-        start, words = time.process_time(), ""
+        start = time.process_time()
         try:
-            model = lbt.design_from_record(record) if given.auto else lbt.identify(record)
+            model = lbt.identify(record)
         except lbt.errors.LbtSynthError as error:
             print(f"{seed:3d}  refused: {error}", flush=True)
             continue
         seconds = time.process_time() - start
-        if isinstance(model, RecordedDesign):
-            usual = lbt.integrator(model.model.hardware, gain=0.4 / truth.sensor_gain)
-            left, its = (residual_nm(made, record, truth) for made in (model.design, usual))
-            words = f"  leaves {left:6.1f} nm, the integrator {its:6.1f}"
-            model = model.model
         gain, error = model.sensor_gains[0], model.axes[0].sensor_gain_error
         off = np.nan if error is None else (gain - truth.sensor_gain) / error
         deviations.append(off)
         print(
             f"{seed:3d}  gain {truth.sensor_gain:.3f}  found {gain:.3f}  off by {off:5.1f} errors"
-            f"{words}  {seconds:5.1f} s",
+            f"  {seconds:5.1f} s",
             flush=True,
         )
     z = np.array(deviations)
