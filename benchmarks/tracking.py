@@ -26,16 +26,10 @@ if __name__ == "__main__":
             )
             for window_s, update_s in TIMES
         }
+        size = {"frames": DRIFT_S * RATE_HZ, "settle_frames": SETTLE_S * RATE_HZ, "seed": 1}
         for name, controller in controllers.items():
             start_s = time.process_time()
-            run = lbt.simulate(
-                controller,
-                truth,
-                hardware=plant.hardware,
-                frames=DRIFT_S * RATE_HZ,
-                settle_frames=SETTLE_S * RATE_HZ,
-                seed=1,
-            )
+            run = lbt.simulate(controller, truth, hardware=plant.hardware, **size)
             strehl, took_s = run.strehl(CONFIG.imaging)[0], time.process_time() - start_s
             print(
                 f"{noise_nm:g} nm, {name}: {100 * strehl:.2f} ({run.rms_nm[0]:.1f}), "
