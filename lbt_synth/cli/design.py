@@ -112,6 +112,9 @@ def add_moving_gains(report: Report, design: Design) -> None:
         )
         caption = "Commands that are clipped; at most 10000 strokes are sought"
         report.add_facts(caption, clipped, key="clipped_commands")
+        report.verdict.append(
+            f"Its commands may ask for {plain:.3g} strokes in the plain form (proved)."
+        )
 
 
 def _loop_notes(design: Design, alone: float) -> list[str]:

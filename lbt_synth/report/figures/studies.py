@@ -120,6 +120,7 @@ def robustness_map_figure(
         for panel, (row, name, grid) in zip(panels, drawn, strict=True):
             late = f", delay error {delays[row]:+g} frames" if np.any(delays) else ""
             name_axes(panel, x_axis, SENSOR_GAIN, f"{name}{late}")
+            panel.locator_params(axis="y", nbins=4)  # whatever height the layout leaves
             across, up = np.argsort(grid.errors_hz), np.argsort(grid.sensor_gains)
             x, y = grid.errors_hz[across], grid.sensor_gains[up]
             grids.append((x, y, 100 * grid.strehl[row][np.ix_(up, across)]))
