@@ -400,14 +400,15 @@ def stacked_response(
     with np.errstate(all="ignore"):  # what is not finite fails the probes
         entries = solve_stack(vectors.astype(np.complex128), B.astype(np.complex128))
         residues = np.einsum("kms,ksq->kmqs", C @ vectors, entries)
+        residues = residues.reshape(len(A), D[0].size, A.shape[1])
 
     def respond(z: ComplexArray) -> ComplexArray:
-        planes = np.empty((*D.shape, z.size), dtype=np.complex128)
-        out = np.moveaxis(planes, (3, 0), (0, 1))
+        planes = np.empty((len(A), D[0].size, z.size), dtype=np.complex128)
+        out = np.moveaxis(planes.reshape(*D.shape, z.size), (3, 0), (0, 1))
         out[:] = D
         with np.errstate(all="ignore"):
             for plane, residue, pole in zip(planes, residues, poles, strict=True):
-                plane += np.tensordot(residue, 1 / (z - pole[:, None]), axes=1)
+                plane += residue @ (1 / (z - pole[:, None]))
         probes = np.linspace(0, z.size - 1, 5).astype(np.int64)
         pencils = z[probes, None, None, None] * np.eye(A.shape[1]) - A
         direct = C @ np.linalg.solve(pencils, B.astype(np.complex128)) + D
