@@ -24,12 +24,6 @@ def suite(*sensors):
     return SensorSuite(sensors=sensors)
 
 
-def test_the_high_pass_turns_and_weakens():
-    motion = Motion(size=2.0)
-    assert accelerometer(highpass_hz=20.0).factor(motion, 20.0) == pytest.approx(1 + 1j)
-    assert accelerometer().factor(motion, 20.0) == motion.factor == 2
-
-
 @pytest.mark.parametrize(
     ("delay", "sensor", "age"),
     [

@@ -51,9 +51,6 @@ def test_a_page_is_well_formed_and_whole(plain, reader):
         clips = re.findall(r"url\(#(.*?)\)", attributes.get("clip-path") or "")
         assert set(clips) <= set(ids)
     assert reader.named("a")[0]["href"] == "#_content"
-
-
-def test_tables_have_captions_and_scopes(plain):
     reader = Reader(re.sub("<details>.*?</details>", "", plain, flags=re.DOTALL))
     assert len(reader.named("table")) == len(reader.named("caption")) == 3  # the wide one is two
     assert {a.get("scope") for a in reader.named("th")} == {"col", "row", "rowgroup"}
