@@ -1,30 +1,49 @@
-"""A truth, its vibrations and spectra: their processes, their drift, and impossible values."""
+"""A truth, its vibrations and sensors: processes, drift, schedules, and impossible values."""
 
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.signal import hilbert
 from support.drifting import drifting
 from support.refusals import require_refusals
-from support.uneven_axes import SLOW
+from support.sensor_loops import FAST, SLOW
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.loop.disturbances import draw_disturbance
-from lbt_synth.models import ARModel, SinusoidalVibration, SumSpectrum, TabulatedSpectrum
+from lbt_synth.models import (
+    Accelerometer,
+    ARModel,
+    LoopHardware,
+    Motion,
+    SensorSuite,
+    SinusoidalVibration,
+    SumSpectrum,
+    TabulatedSpectrum,
+    WavefrontSensor,
+)
+from lbt_synth.models.sensor_suite import checked_motions, period_frames
 from lbt_synth.models.vibration import checked_direction
 
-PATH = lbt.LoopHardware(frame_rate_hz=800, modes=1)
+PATH = LoopHardware(frame_rate_hz=800, modes=1)
+LOOP = LoopHardware(frame_rate_hz=1000, delay_frames=2, modes=2)
+wavefront = partial(WavefrontSensor, name="truth", rate_hz=250, delay_frames=3, noise_nm=4.0)
+readings = {"rate_hz": 1000, "delay_frames": 2, "noise_m_s2": 2e-4}
+accelerometer = partial(Accelerometer, name="mirror", channels=("m1", "m2"), **readings)
+
+
+def suite(*sensors):
+    return SensorSuite(sensors=sensors)
 
 
 def test_a_frequency_error_moves_each_vibration_by_its_share():
     lines = tuple(SinusoidalVibration(frequency_hz=f, rms_nm=9) for f in (0.3, 20.0, 40.0))
     truth = lbt.Truth(turbulence=None, vibrations=lines)
-    stated, still = (
-        replace(truth, frequency_errors_hz=errors) for errors in ((0.0, 2.0, 1.0), (0, 0, 0))
-    )
+    stated, still = (replace(truth, frequency_errors_hz=e) for e in ((0.0, 2.0, 1.0), (0, 0, 0)))
     for shaken, error_hz, moved_hz in (
         (truth, 4.0, [0.33, 22.0, 44.0]),
         (stated, -2.0, [0.3, 18.0, 39.0]),
@@ -94,6 +113,43 @@ def test_a_direction_is_scaled_once():
     assert drifting(direction=(3, 4)).direction == pytest.approx((0.6, 0.8))
 
 
+@pytest.mark.parametrize(
+    ("delay", "sensor", "age"),
+    [
+        (2, wavefront(), 11),
+        (2.5, wavefront(delay_frames=1.5), 4.5),
+        (1, wavefront(rate_hz=1000, delay_frames=1), 1),
+        (2, accelerometer(), 1),
+        (2, accelerometer(delay_frames=1), 0),
+        (3, accelerometer(rate_hz=500, delay_frames=1.75), 1.5),
+        (3, accelerometer(rate_hz=500, delay_frames=1.5), 1),
+        (1.5, accelerometer(delay_frames=1), 0.5),
+    ],
+)
+def test_ages(delay, sensor, age):
+    assert sensor.age_frames(replace(LOOP, delay_frames=delay)) == pytest.approx(age)
+
+
+def test_the_schedule_of_rates_that_do_not_divide_each_other():
+    other = wavefront(name="other", rate_hz=100, sensor_matrix=[[1.0, 1.0]])
+    sensors = suite(accelerometer(rate_hz=1000 / 3), wavefront(rate_hz=50), other)
+    assert sensors.period(LOOP) == 60
+    names, ends = ("wavefront", "truth", "other", "m1", "m2"), (0, 2, 4, 5, 6, 7)
+    assert sensors.units == tuple(sensors.rows(LOOP)) == names
+    assert [(row.start, row.stop) for row in sensors.rows(LOOP).values()] == [*pairwise(ends)]
+    read = sensors.read(LOOP)
+    assert read.shape == (60, 7)
+    for column, period in ((0, 1), (2, 20), (5, 3)):
+        assert np.flatnonzero(read[:, column]).tolist() == [*range(0, 60, period)]
+    assert sensors.marked(("m2", "truth"), LOOP).tolist() == [0, 0, 1, 1, 0, 0, 1]
+
+
+def test_the_noise_of_all_sensors():
+    factor = suite(FAST, SLOW).noise_factor(np.diag([15.0, 15.0]), 2)
+    expected = block_diag(225 * np.eye(2), SLOW.noise_nm, FAST.noise_m_s2)
+    np.testing.assert_allclose(factor @ factor.T, expected)
+
+
 def test_impossible_values_are_refused():
     process = partial(ARModel, coefficients=[0.5], frame_rate_hz=1)
     for make, key in (
@@ -102,7 +158,7 @@ def test_impossible_values_are_refused():
         (lambda v: process(driving_rms_nm=v), "driving_rms_nm"),
         (lambda v: lbt.Truth(turbulence=None, noise_nm=v), "noise_nm"),
         (lambda v: lbt.Imaging(diameter_m=v), "diameter_m"),
-        (lambda v: lbt.LoopHardware(frame_rate_hz=1, delay_frames=v), "delay_frames"),
+        (lambda v: LoopHardware(frame_rate_hz=1, delay_frames=v), "delay_frames"),
         (lambda v: lbt.models.nm_per_mas(v), "diameter_m"),
         (lambda v: TabulatedSpectrum(frequency_hz=[0, v], density_nm2_hz=[1, 1]), "frequency_hz"),
     ):
@@ -110,6 +166,9 @@ def test_impossible_values_are_refused():
 
 
 def test_refusals():
+    late, moved = accelerometer(rate_hz=500, delay_frames=1.25), ({"m1": Motion(size=1)},)
+    odd = (wavefront(rate_hz=1000 / 7), accelerometer(rate_hz=1000 / 211))
+    strange = ({"m9": Motion(size=1)},)
     truth, still = lbt.Truth, partial(lbt.Truth, turbulence=None)
     line = partial(lbt.Vibration, frequency_hz=20, damping=0.1, rms_nm=1)
     table = partial(TabulatedSpectrum, density_nm2_hz=[1, 1])
@@ -118,7 +177,7 @@ def test_refusals():
     lines = {"vibrations": (SinusoidalVibration(frequency_hz=20, rms_nm=100),)}
     beyond = "below the Nyquist frequency 400 Hz; got 500 Hz"
     rows = [
-        (lambda: truth(turbulence=[SLOW, 3.0]), "one per mode; got float"),
+        (lambda: truth(turbulence=[process(coefficients=[0.9]), 3.0]), "one per mode; got float"),
         (lambda: truth(turbulence=3.0), "psd"),
         (lambda: truth(turbulence="slow"), "one per mode; got str"),
         (lambda: still(vibrations=("abc",)), "vibrations must be"),
@@ -145,6 +204,22 @@ def test_refusals():
         (lambda: process(coefficients=[1.972279, 0.996863]), "Check the signs"),
         # rounding leaves its poles inside the unit circle
         (lambda: process(coefficients=[1.9, -1.0]), "no finite variance"),
+        (lambda: wavefront(delay_frames=0.5), "delay_frames.* at least 1"),
+        (lambda: wavefront(noise_nm=0.0).noise_factor(2), "noise_nm.* positive|above 0"),
+        (lambda: accelerometer(channels=()), r"channels of mirror .* at least one; got \(\)"),
+        (lambda: accelerometer(channels=("m1", "m1")), "channels of mirror must be different"),
+        (lambda: wavefront(sensor_matrix=np.eye(3)).response(2), "must have 2 columns"),
+        (lambda: wavefront(delay_frames=1).age_frames(LOOP), "at least 1.25 of its frames.*got 1"),
+        (lambda: late.age_frames(replace(LOOP, delay_frames=3)), "1.5 of its frames.*got 1.25"),
+        (lambda: period_frames(wavefront(rate_hz=300), LOOP), "whole multiple .*got 300 Hz"),
+        (lambda: period_frames(wavefront(rate_hz=0.5), LOOP), "up to 1000"),
+        (lambda: suite(wavefront(name="wavefront")), "none of them 'wavefront'"),
+        (lambda: suite(accelerometer(), wavefront(name="m1")), "different names"),
+        (lambda: suite(*odd).period(LOOP), "at most 1000 frames; got 1477"),
+        (lambda: suite(wavefront()).marked(("m9",), LOOP), "'m9'; there are wavefront, truth"),
+        (lambda: checked_motions(strange, suite(FAST), 1), "'m9'; the channels are m1, m2"),
+        (lambda: checked_motions(moved, suite(SLOW), 1), "the channels are none"),
+        (lambda: checked_motions(({},), suite(FAST), 2), r"one mapping per vibration \(2\); got 1"),
     ]
     sizes = [
         (lambda: truth(turbulence=[]), "got an empty sequence"),

@@ -136,16 +136,13 @@ def legend(axes):
 
 
 def test_a_bode_plot_has_the_gain_and_the_phase_of_the_closed_form():
-    gain_margin_hz, crossover_hz = 800 / 6, 800 / np.pi * np.arcsin(0.25)
-    for axes, heading, margin, margin_hz, form, error in zip(
-        panels("bode"),
-        ("loop gain [dB]", "phase [deg]"),
-        ("gain margin", "phase margin"),
-        (gain_margin_hz, crossover_hz),
-        (lambda f: -20 * np.log10(4 * np.sin(np.pi * f / 800)), lambda f: -90 - 540 * f / 800),
-        (1e-6, 1e-3),
-        strict=True,
-    ):
+    forms = (lambda f: -20 * np.log10(4 * np.sin(np.pi * f / 800)), lambda f: -90 - 540 * f / 800)
+    rows = [
+        ("loop gain [dB]", "gain margin", 800 / 6, 1e-6),
+        ("phase [deg]", "phase margin", 800 / np.pi * np.arcsin(0.25), 1e-3),
+    ]
+    for axes, form, row in zip(panels("bode"), forms, rows, strict=True):
+        heading, margin, margin_hz, error = row
         assert (legend(axes), axes.get_ylabel()) == ([NAME, margin], heading)
         ((f, values),) = curves(axes, NAME)
         assert values == pytest.approx(form(f), abs=error)
@@ -187,18 +184,17 @@ def test_axes_that_differ_are_drawn_each(kind):
         assert sum("axis" in name for name in names) == count
 
 
-def test_an_unstable_loop_is_named_and_not_drawn():
-    designs = HALF | {"slow": lbt.integrator(PATH, gain=0.1)}
-    for kind in ("bode", "nichols", "step", "sigma"):
-        axes = panels(kind, designs, sensor_gain=2.5)[0]
-        assert legend(axes)[0] == "half: unstable"
-        assert [curve.size for curve in curves(axes, "half: unstable")] == [0]
-        slow = next(name for name in legend(axes) if name.startswith("slow"))
-        assert curves(axes, slow)[0].size > 100
-    assert "2.5 times the sensor gain" in axes.get_title(loc="left")
-    nyquist = panels("nyquist", designs, sensor_gain=2.5)[0]
-    assert nyquist.get_title(loc="left") == "half: unstable"
-    assert not curves(nyquist, "loop")
+def test_an_unstable_loop_is_named_and_not_drawn(lbt_designs):
+    for kind, place in (("bode", 0), ("nichols", 0), ("step", 0), ("sigma", 2), ("sigma", 1)):
+        axes = panels(kind, lbt_designs, sensor_gain=0.4)[place]
+        assert "hinf: unstable" in legend(axes)
+        assert [curve.size for curve in curves(axes, "hinf: unstable")] == [0]
+        kalman = next(name for name in legend(axes) if name.startswith("kalman"))
+        assert curves(axes, kalman)[0].size > 100
+    assert "0.4 times the sensor gain" in axes.get_title(loc="left")
+    (axes,) = panels("nyquist", sensor_gain=2.5)
+    assert axes.get_title(loc="left") == "half: unstable"
+    assert not curves(axes, "loop")
 
 
 def test_refusals():
