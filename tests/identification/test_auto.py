@@ -11,7 +11,6 @@ from support.control_laws import ordinary_loop
 from support.night import GAIN, night_record
 from support.recorded_loops import LINE, RATE, drifting_record, resonant_record, spliced_record
 from support.refusals import refused, require_refusals
-from support.wrong_commands import record
 
 import lbt_synth as lbt
 from lbt_synth.errors import CertificateError, ProblemError
@@ -173,7 +172,7 @@ def test_a_drift_over_frozen_flow_does_not_carry_the_gain_away() -> None:
 
 @pytest.mark.parametrize(
     ("make", "gain", "widest"),
-    [(lambda: record(*ordinary_loop()), 0.7, 2), (resonant_record, 0.9, 1.6)],
+    [(lambda: loop_record(*ordinary_loop(), **LOOP), 0.7, 2), (resonant_record, 0.9, 1.6)],
 )
 def test_the_true_gain_is_allowed(make, gain, widest) -> None:
     y, u = (getattr(make(), name)[:, 0] for name in SERIES)
@@ -291,7 +290,7 @@ def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain() -> None:
 def test_axes_of_different_gains_may_have_those_of_both() -> None:
     """Commands of one axis at twice their size gave a design that was unstable in the loop."""
     y, u = ordinary_loop()
-    made = record(y, u * [1.0, 2.0])
+    made = loop_record(y, u * [1.0, 2.0], **LOOP)
     model = lbt.identify(made)
     assert model.sensor_gains == pytest.approx((0.7, 0.35), rel=0.15)
     assert any("recorded at another size" in note for note in model.notes)

@@ -3,13 +3,16 @@
 Structure of a matrix between axes.
 """
 
+from functools import partial
+
 import numpy as np
 import pytest
 from support.control_laws import RATE, SteppedLaw, ordinary_loop, rotation, run_law
 from support.plants import lbt_axis_plant
-from support.refusals import refused
+from support.refusals import require_refusals
 
 import lbt_synth as lbt
+from lbt_synth.identification import LoopRecord
 from lbt_synth.identification.commands.control_law import (
     classify_matrix,
     fit_control_law,
@@ -23,11 +26,8 @@ SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
 def law_of(y, u, usable=None):
     """The law of a record whose frames are all good, unless it is said."""
     good = np.ones(len(y), dtype=bool) if usable is None else usable
-    return fit_control_law(
-        lbt.identification.LoopRecord(
-            frame_rate_hz=RATE, measurements=y, commands=u, measured=good, commanded=good
-        )
-    )
+    marks = {"measured": good, "commanded": good}
+    return fit_control_law(LoopRecord(frame_rate_hz=RATE, measurements=y, commands=u, **marks))
 
 
 @pytest.mark.parametrize(
@@ -61,11 +61,12 @@ def test_increments_in_place_of_positions():
 def test_commands_of_another_night_have_no_law():
     y, u = ordinary_loop()
     _, other = ordinary_loop(seed=2)
-    for law in (
-        law_of(y, other),
-        law_of(y[1000:], u[:-1000]),  # the same night, a second later
-        law_of(y, np.zeros_like(u)),
+    for measurements, commands in (
+        (y, other),
+        (y[1000:], u[:-1000]),  # the same night, a second later
+        (y, np.zeros_like(u)),
     ):
+        law = law_of(measurements, commands)
         assert law.kind == "none"
         assert np.mean(law.axis_coherence) < 0.02
         assert law.axes_kind == "zero"
@@ -91,12 +92,10 @@ def test_laws_of_low_order(controller, kind, poles, gain):
 def test_the_law_of_a_filter_is_that_of_its_design():
     plant = lbt_axis_plant()
     controller = lbt.kalman(plant).controller
-    truth = lbt.Truth(
-        turbulence=plant.turbulence, vibrations=plant.vibrations, noise_nm=15.5, sensor_gain=1.0
-    )
+    known = {"turbulence": plant.turbulence, "vibrations": plant.vibrations, "noise_nm": 15.5}
+    truth = lbt.Truth(**known, sensor_gain=1.0)
     law = law_of(*run_law(controller, truth=truth, hardware=plant.hardware))
-    assert (law.kind, law.lag_frames) == ("higher order", 0)
-    assert law.exact
+    assert (law.kind, law.lag_frames, law.exact) == ("higher order", 0, True)
     rate_hz = plant.hardware.frame_rate_hz
     frequencies_hz = rate_hz * np.array([0.001, 0.01, 0.025, 0.1, 0.3])
     again, exact = (
@@ -126,13 +125,13 @@ def test_a_loop_that_is_shaken_by_its_commands_is_not_read_backwards():
 
 
 def test_frames_that_follow_no_law():
-    y, u = (each.copy() for each in ordinary_loop())
+    y, u = ordinary_loop()
     usable = np.random.default_rng(0).random(len(y)) > 0.01
-    y[~usable], u[~usable] = 0.0, 1e5
-    holes = law_of(y, u, usable=usable)
-    y, u = (each.copy() for each in ordinary_loop())
-    y[::500] = 0.0  # spoilt, and not said
-    u[5000:] -= 4000.0  # an offload
+    marked = usable[:, None]
+    holes = law_of(np.where(marked, y, 0.0), np.where(marked, u, 1e5), usable=usable)
+    frame = np.arange(len(y))[:, None]
+    y = np.where(frame % 500 == 0, 0.0, y)  # spoilt, and not said
+    u = np.where(frame < 5000, u, u - 4000.0)  # an offload
     spoilt = law_of(np.delete(y, 7777, axis=0), np.delete(u, 7777, axis=0))
     for law in (holes, spoilt):
         assert law.kind == "integrator"
@@ -166,8 +165,10 @@ def test_records_without_a_law_and_laws_that_cannot_run():
     y, u = ordinary_loop()
     assert law_of(y[:300], u[:300]) is None
     assert law_of(y, None) is None
-    for law, words in (
-        (law_of(y, 0 * u), "a law that can run; got no law"),
-        (law_of(y[:-2], u[2:]), "can run; got .*, 2 frames early"),
-    ):
-        refused(lambda law=law: law_controller(law, RATE), lbt.errors.ProblemError, words)
+    require_refusals(
+        (partial(law_controller, law_of(*series), RATE), lbt.errors.ProblemError, words)
+        for series, words in (
+            ((y, 0 * u), "a law that can run; got no law"),
+            ((y[:-2], u[2:]), "can run; got .*, 2 frames early"),
+        )
+    )

@@ -9,21 +9,27 @@ import numpy as np
 import pytest
 from support.eris import ERIS_FILE
 from support.record_files import csv, hdus, image, write_csv
-from support.records import SHELL, ran
 from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.errors import ProblemError, TelemetryError
 
 RATE = 500.0
+AIR = lbt.models.ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=1000)
 load = partial(lbt.load_record, frame_rate_hz=RATE)
+
+
+def simulated(path, **truth):
+    """The run of an integrator, and its telemetry."""
+    law, air = lbt.integrator(path, gain=0.1).controller, lbt.Truth(turbulence=AIR, **truth)
+    run = lbt.simulate(law, air, hardware=path, frames=99)
+    return run, lbt.files.telemetry_from_simulation(run, path)
 
 
 @pytest.mark.parametrize("name", ["a.fits", "a.npz"])
 def test_telemetry_of_ours(tmp_path, name):
-    path = lbt.LoopHardware(frame_rate_hz=800, delay_frames=2.4)
-    run = ran(path, frames=99)
-    telemetry = lbt.files.telemetry_from_simulation(run, path)
+    path = lbt.LoopHardware(frame_rate_hz=1000, delay_frames=2.4)
+    run, telemetry = simulated(path)
     file = lbt.files.save_telemetry(tmp_path / name, telemetry)
     seen = lbt.load_record(file)
     assert np.array_equal(seen.measurements, run.measurements[0])
@@ -272,10 +278,12 @@ def test_telemetry_of_a_simulation_with_matrices():
         delay_frames=2.25,
         sensor_matrix=rng.standard_normal((3, 2)),
         influence_matrix=np.eye(2) + 0.1 * rng.standard_normal((2, 2)),
-        mirror=SHELL,
+        mirror=lbt.models.PositionLoop.from_bandwidth(
+            natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
+        ),
     )
-    run = ran(path, sensor_gain=0.7)
-    seen = lbt.load_record(lbt.files.telemetry_from_simulation(run, path))
+    run, seen = simulated(path, sensor_gain=0.7)
+    seen = lbt.load_record(seen)
     first = len(path.mirror_taps)
     z = seen.pseudo_open_loop(0.7)[first:]
     assert np.allclose(z, run.total_nm[0, first - 1 : -1], rtol=1e-9, atol=1e-8)
