@@ -1,7 +1,5 @@
 """A design from a record: the method that it asks for, the gains that it allows, and notes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache, partial
 
@@ -14,15 +12,7 @@ from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.errors import CertificateError, ProblemError
-from lbt_synth.identification import IdentifiedModel, LoopRecord, loop_record
-from lbt_synth.identification.auto import (
-    allowed_gains,
-    choose_method,
-    design_for_gains,
-    note_drift,
-    quick_methods,
-    unstable_gains,
-)
+from lbt_synth.identification import IdentifiedModel, LoopRecord, auto, loop_record
 from lbt_synth.identification.prediction.regression import noisier
 from lbt_synth.identification.prediction.residual import estimate_residual
 from lbt_synth.methods import registry
@@ -81,7 +71,7 @@ def test_what_a_filter_leaves_of_a_drift_is_noted():
     for offset_nm, speed_nm_s in ((10.0, 1.0), (3000.0, -200.0)):
         commands[:, 1] = offset_nm + speed_nm_s * (np.arange(5000) - 2500) / rate
         record = loop_record(noise, commands, **LOOP | {"frame_rate_hz": rate})
-        notes.append([*note_drift(record, plant, loop)])
+        notes.append([*auto.note_drift(record, plant, loop)])
     quiet, (note,) = notes
     assert quiet == []
     assert note.startswith("axis 1 of the record stands 3e+03 nm off zero and drifts by -200 nm/s.")
@@ -125,7 +115,7 @@ def test_the_default_stays_unless_another_wins_every_part(differences, error, ch
         above, its_error = usual.above(other)
         assert above == pytest.approx(difference)
         assert its_error == pytest.approx(error, rel=0.3) or difference >= 400
-    title, note = choose_method(compared)
+    title, note = auto.choose_method(compared)
     assert title == chosen
     if chosen == OTHER:
         _, error = compared[USUAL].above(compared[OTHER])
@@ -134,21 +124,21 @@ def test_the_default_stays_unless_another_wins_every_part(differences, error, ch
     else:
         assert "the Kalman filter stays" in note
     del compared[USUAL]  # without the default the best is chosen
-    assert choose_method(compared)[0] == OTHER
+    assert auto.choose_method(compared)[0] == OTHER
 
 
 def test_all_quick_methods_are_in_the_table_of_unseen_data(monkeypatch):
     made = lbt.design_from_record(night_record(), sensor_gain=GAIN, most_lines=1)
     names = [row.name for row in made.held_out.entries]
-    assert {method_named(name).title for name in quick_methods()} < set(names)
+    assert {method_named(name).title for name in auto.quick_methods()} < set(names)
     assert (made.name, made.design.method) == ("Kalman filter", "kalman")
     (note,) = made.notes
     assert note.startswith("the Kalman filter stays")
-    assert default_method() in quick_methods()
+    assert default_method() in auto.quick_methods()
     for slow in (False, True):
         newcomer = replace(method_named(default_method()), name="newcomer", slow=slow)
         monkeypatch.setitem(registry.METHODS, "newcomer", newcomer)
-        assert ("newcomer" in quick_methods()) is not slow
+        assert ("newcomer" in auto.quick_methods()) is not slow
 
 
 @pytest.mark.parametrize(
@@ -165,7 +155,7 @@ def test_the_true_gain_is_allowed(make, gain, widest) -> None:
     known = LOOP | {"frame_rate_hz": seen.frame_rate_hz}
     made = loop_record(seen.measurements[:, 0], seen.commands[:, 0], **known)
     model = lbt.identify(made)
-    low, high = allowed_gains(made, model).T
+    low, high = auto.allowed_gains(made, model).T
     assert np.all((low < gain) & (gain < high) & (high < widest * low))
     assert model.sensor_gains[0] == pytest.approx(gain, abs=3 * model.axes[0].sensor_gain_error)
 
@@ -185,20 +175,20 @@ def test_the_interval_is_what_the_fit_the_sensor_and_the_law_allow() -> None:
     odd = replace(axis, whiteness=replace(axis.whiteness, p_value=1e-9))
     spread = 1.5 * np.exp(3 * odd.sensor_gain_error / odd.sensor_gain)
     for changed, interval in [*cases, (odd, (odd.sensor_gain / spread, 1.25))]:
-        gains = allowed_gains(made, replace(model, axes=(changed,)))
+        gains = auto.allowed_gains(made, replace(model, axes=(changed,)))
         assert gains[0].tolist() == pytest.approx(interval)
 
 
 def test_gains_at_which_a_loop_is_unstable() -> None:
     """An integrator of gain g is stable below a sensor gain of 1 / g, and less where it is late."""
     design = lbt.integrator(lbt.LoopHardware(frame_rate_hz=1000), gain=0.5)
-    assert unstable_gains(design, np.array([[0.1, 1.8], [0.2, 1.8]])) is None
-    assert unstable_gains(design, np.array([[0.1, 1.0], [0.2, 2.01]]))[1] == 2.01
+    assert auto.unstable_gains(design, np.array([[0.1, 1.8], [0.2, 1.8]])) is None
+    assert auto.unstable_gains(design, np.array([[0.1, 1.0], [0.2, 2.01]]))[1] == 2.01
     late = replace(design.hardware, delay_frames=2.1)
     _, high = lbt.loop.stable_sensor_gains(late, design.controller)
     assert 1.9 < high < 2
     for gain, stable in ((0.999 * high, True), (1.001 * high, False)):
-        assert (unstable_gains(design, np.array([[gain, gain]] * 2)) is None) is stable
+        assert (auto.unstable_gains(design, np.array([[gain, gain]] * 2)) is None) is stable
 
 
 def noisy(model: IdentifiedModel, synthesis=lbt.kalman, **options):
@@ -210,9 +200,12 @@ def noisy(model: IdentifiedModel, synthesis=lbt.kalman, **options):
 careless = partial(noisy, synthesis=lbt.hinf, gamma_ratio=1.02, route="riccati")
 
 
-def narrow_line() -> IdentifiedModel:
-    """Return the model of a loop of sensor gain 0.9 under a strong narrow line."""
-    return strong_loop(((60.0, 0.004, 100.0),))[1]
+NARROW = ((60.0, 0.004, 100.0),)  # frequency [Hz], damping, rms [nm]
+
+
+def design_for(model, allowed, *, known=True, make=noisy):
+    """Return the design, what it multiplies the noise by, and a note."""
+    return auto.design_for_gains(model, make(model), allowed, command_scale_known=known)
 
 
 def beyond_its_margin(model: IdentifiedModel, factor: float = 1.1) -> np.ndarray:
@@ -223,49 +216,48 @@ def beyond_its_margin(model: IdentifiedModel, factor: float = 1.1) -> np.ndarray
 
 
 def test_gains_that_the_fit_shows_keep_the_design() -> None:
-    model, allowed = strong_loop()[1], np.array([[0.6, 1.2]])
-    design, noise, note = design_for_gains(model, noisy(model), allowed, command_scale_known=True)
+    model = strong_loop()[1]
+    design, noise, note = design_for(model, np.array([[0.6, 1.2]]))
     assert design.method == "kalman"
     (text,) = design.assumptions
     assert "the loop is stable at all of these" in text
     assert "at the size that was applied, as was stated" in text
     assert (noise, note) == (1.0, "")
-    free, *_ = design_for_gains(model, noisy(model), None, command_scale_known=False)
+    free, *_ = design_for(model, None, known=False)
     assert free.assumptions == ()
 
 
 def test_more_noise_is_assumed_where_the_fitted_design_is_unstable() -> None:
     """At the price that the note says: the least noise that is stable, to a tenth."""
-    model = narrow_line()
+    _, model = strong_loop(NARROW)
     allowed = beyond_its_margin(model)
     factors = list[float]()
 
-    def design(factor: float) -> lbt.Design:
-        factors.append(factor)
-        return noisy(model)(factor)
+    def recorded(model: IdentifiedModel):
+        return lambda factor: factors.append(factor) or noisy(model)(factor)
 
-    safe, noise, note = design_for_gains(model, design, allowed, command_scale_known=True)
-    assert unstable_gains(safe, allowed) is None
+    safe, noise, note = design_for(model, allowed, make=recorded)
+    assert auto.unstable_gains(safe, allowed) is None
     assert f"to be stable at sensor gains of {allowed[0, 0]:.3g} to" in note
     assert f"the design assumes {noise:.3g} times the noise" in note
-    loops = [lbt.close_loop(model.hardware, each.controller) for each in (design(1.0), safe)]
+    loops = [lbt.close_loop(model.hardware, each.controller) for each in (noisy(model)(1.0), safe)]
     least, paid = (lbt.residual_budget(loop, model.truth()).rms_nm for loop in loops)
     assert least < paid < 1.1 * least
-    stable = {f for f in factors if unstable_gains(noisy(model)(f), allowed) is None}
+    stable = {f for f in factors if auto.unstable_gains(noisy(model)(f), allowed) is None}
     assert min(stable) == noise < 1.15 * max(set(factors) - stable)
     # a gain that the record leaves open is asked for
     wide = beyond_its_margin(model, 1.5) * [0.5, 1.0]
-    *_, note = design_for_gains(model, noisy(model), wide, command_scale_known=True)
+    *_, note = design_for(model, wide)
     assert note.startswith("warning: to be stable")
     assert "Give --sensor-gain, which the record leaves open" in note
 
 
 def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain() -> None:
-    model, allowed = narrow_line(), np.array([[0.85, 0.95]])
-    best, *_ = design_for_gains(model, careless(model), allowed, command_scale_known=True)
-    assert unstable_gains(best, allowed * [0.5, 1.0]) is not None
-    safe, _, note = design_for_gains(model, careless(model), allowed, command_scale_known=False)
-    assert unstable_gains(safe, allowed * [0.5, 1.0]) is None
+    (_, model), allowed = strong_loop(NARROW), np.array([[0.85, 0.95]])
+    best, *_ = design_for(model, allowed, make=careless)
+    safe, _, note = design_for(model, allowed, make=careless, known=False)
+    assert auto.unstable_gains(best, allowed * [0.5, 1.0]) is not None
+    assert auto.unstable_gains(safe, allowed * [0.5, 1.0]) is None
     assert "at half of them" in safe.assumptions[0]
     assert "--command-scale 1" in note
 
@@ -277,18 +269,16 @@ def test_axes_of_different_gains_may_have_those_of_both() -> None:
     model = lbt.identify(made)
     assert model.sensor_gains == pytest.approx((0.7, 0.35), rel=0.15)
     assert any("recorded at another size" in note for note in model.notes)
-    allowed = allowed_gains(made, model)
-    design, *_ = design_for_gains(model, noisy(model), allowed, command_scale_known=False)
+    design, *_ = design_for(model, auto.allowed_gains(made, model), known=False)
     assert "each axis at those of both, because they differ" in design.assumptions[0]
     both = np.outer([1, 1], [min(model.sensor_gains), max(model.sensor_gains)])
-    assert unstable_gains(design, both) is None
+    assert auto.unstable_gains(design, both) is None
 
 
 def test_gains_at_which_nothing_is_stable_are_refused() -> None:
     model, wide = strong_loop()[1], np.array([[0.02, 0.9]])
     stubborn = careless(model)(1.0)
-    make = partial(design_for_gains, model, lambda _: stubborn, wide)
     for known in (True, False):
-        call = partial(make, command_scale_known=known)
+        call = partial(design_for, model, wide, known=known, make=lambda _: lambda _: stubborn)
         error = refused(call, CertificateError, r"the record allows 0.0\d to 0.9")
         assert ("Give --command-scale 1 if" in str(error)) is not known

@@ -155,7 +155,9 @@ def test_small_elements_count_as_zero():
 def test_it_repeats_the_commands():
     y, u = run_law(SteppedLaw([[0.3, 0.1], [0.0, 0.2]], leak=0.98))
     late = np.roll(u, 2, axis=0)
-    run = law_controller(law_of(y, late), RATE).start()
+    law = law_of(y, late)
+    assert law.lag_text == ", 2 frames late"
+    run = law_controller(law, RATE).start()
     replayed = np.array([run.step(row) for row in y])
     # what the command was before the record has decayed
     np.testing.assert_allclose(replayed[-500:], late[-500:], atol=1e-6)

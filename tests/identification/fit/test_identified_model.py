@@ -1,7 +1,5 @@
 """Whiteness, errors at a held gain, and the processes of turbulence and of a drift."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -10,15 +8,8 @@ import pytest
 from support.recorded_loops import RATE, expected_periodogram, identify_series, integrator_loop
 
 import lbt_synth as lbt
+from lbt_synth.identification.fit import identified_model
 from lbt_synth.identification.fit.fitting import Search, add_evidence, cost, fit
-from lbt_synth.identification.fit.identified_model import (
-    IdentifiedAxis,
-    IdentifiedModel,
-    describe_axis,
-    hold_gain,
-    say_count,
-    whiteness,
-)
 from lbt_synth.identification.fit.order_search import find_components
 from lbt_synth.identification.fit.periodogram import loop_periodogram
 from lbt_synth.models import ARModel, Spectrum, SumSpectrum
@@ -33,7 +24,7 @@ def test_whiteness_of_white_noise_in_segments() -> None:
         for k, white in enumerate(rng.standard_normal((120, 8192))):
             data = loop_periodogram(white, None, frame_rate_hz=RATE, stretches=pieces)
             model = np.full(data.frequency_hz.size, 2 / RATE)
-            p_values[k] = whiteness(data, data.power(1.0), model).p_value
+            p_values[k] = identified_model.whiteness(data, data.power(1.0), model).p_value
         # 120 trials: at most 6 below 1 %, and 16 below 5 %, with a probability of 0.999
         assert np.sum(p_values < 0.01) <= 6
         assert np.sum(p_values < 0.05) <= 16
@@ -45,11 +36,11 @@ def frozen_flow(wind_speed_m_s: float) -> lbt.Atmosphere:
     )
 
 
-def found_axis(spectrum: Spectrum, noise_nm: float = NOISE_NM) -> IdentifiedAxis:
+def found_axis(spectrum: Spectrum, noise_nm: float = NOISE_NM) -> identified_model.IdentifiedAxis:
     """Return what is found in periodograms without chance: only the model can shift the gain."""
     search = Search(data=expected_periodogram(spectrum, noise_nm, GAIN))
     model = add_evidence(search, find_components(search))
-    return describe_axis(search, model, float(np.sqrt(model.covariance[0, 0])), "")
+    return identified_model.describe_axis(search, model, float(np.sqrt(model.covariance[0, 0])), "")
 
 
 def test_frozen_flow_does_not_shift_the_gain() -> None:
@@ -85,7 +76,7 @@ def test_a_drift_over_frozen_flow_does_not_shift_the_gain(wind, noise_nm, pole, 
     (part,) = axis.parts
     assert part.kind == "turbulence"
     assert part.damping > 30
-    model = IdentifiedModel(axes=(axis,), frame_rate_hz=RATE, delay_frames=2.0)
+    model = identified_model.IdentifiedModel(axes=(axis,), frame_rate_hz=RATE, delay_frames=2.0)
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     truth = lbt.Truth(turbulence=total, noise_nm=noise_nm, sensor_gain=GAIN)
     loop = lbt.close_loop(path, lbt.kalman(model.plant()).controller, sensor_gain=GAIN)
@@ -104,7 +95,7 @@ def test_errors_at_a_held_gain_are_those_of_a_free_one() -> None:
     assert other.rms_error_nm == pytest.approx(one.rms_error_nm, rel=0.01)
     assert held.sensor_gain_error == pytest.approx(free.sensor_gain_error)
     model = free.fitted_model
-    wider = hold_gain(Search(data=free.data), model, [([0], 0.2)]).errors
+    wider = identified_model.hold_gain(Search(data=free.data), model, [([0], 0.2)]).errors
     assert wider.background.log_gain == pytest.approx(0.2, rel=1e-6)
     assert wider.components[1].log_power > model.errors.components[1].log_power
 
@@ -117,7 +108,7 @@ def test_white_noise_says_how_well_its_colour_shows() -> None:
 
 
 @cache
-def weakest_lines(seed: int) -> tuple[Search, IdentifiedAxis]:
+def weakest_lines(seed: int) -> tuple[Search, identified_model.IdentifiedAxis]:
     """Return an axis with lines of 30, 4 and some 2 nm, and what it was found by."""
     lines = ((25.0, 0.01, 30.0), (60.0, 0.02, 4.0), (120.0, 0.02, 2.0 + seed))
     y, c = integrator_loop(lines=lines, seed=seed)
@@ -140,7 +131,7 @@ def test_the_number_of_components_is_as_sure_as_other_fits_say(seed: int) -> Non
     assert 0 < axis.over_more < search.price
     # of a component that the model lacks the record does not tell
     lacking = add_evidence(search, fit(search, spectrum.exchange(3)))
-    assert describe_axis(search, lacking, None, "").over_more == 0.0
+    assert identified_model.describe_axis(search, lacking, None, "").over_more == 0.0
 
 
 def test_a_part_of_the_turbulence_without_power_is_none() -> None:
@@ -150,7 +141,9 @@ def test_a_part_of_the_turbulence_without_power_is_none() -> None:
     wider = {"information": np.pad(model.information, (0, 3)), "evidence": (*model.evidence, 0.0)}
     for power, slow in ((1e-12, []), (100.0, [1.0])):
         spectrum = model.spectrum.add(search.component("slow", 1.0, 0.5, power))
-        wide = describe_axis(search, replace(model, spectrum=spectrum, **wider), None, "")
+        wide = identified_model.describe_axis(
+            search, replace(model, spectrum=spectrum, **wider), None, ""
+        )
         frequencies = sorted(part.frequency_hz for part in wide.parts)
         assert frequencies == pytest.approx(sorted(places + slow))
 
@@ -158,10 +151,12 @@ def test_a_part_of_the_turbulence_without_power_is_none() -> None:
 def test_the_number_of_components_is_said_of_the_axis_that_tells_it_least() -> None:
     sure = replace(weakest_lines(0)[1], over_fewer=38.4, over_more=7.2)
     unsure = replace(sure, parts=(), over_fewer=np.inf, over_more=2.9)
-    both = IdentifiedModel(axes=(sure, unsure), frame_rate_hz=RATE, delay_frames=2.0)
-    assert say_count(both) == (
+    both = identified_model.IdentifiedModel(
+        axes=(sure, unsure), frame_rate_hz=RATE, delay_frames=2.0
+    )
+    assert identified_model.say_count(both) == (
         "The record tells 3 components from 2 by at most 38 and from 4 by about 3 units of the "
         "log-likelihood beyond the price."
     )
-    alone = say_count(replace(both, axes=(unsure,)))
+    alone = identified_model.say_count(replace(both, axes=(unsure,)))
     assert alone.startswith("The record tells 0 components from 1 by about 3 units")

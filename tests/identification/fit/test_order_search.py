@@ -1,7 +1,5 @@
 """The search for components: backgrounds, drifts, bumps and lines, and which of them are dropped."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Resonances of both axes: which are one, their shares, directions, errors, plant and truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Predictors of least squares, with and without accelerometers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Controllers replayed on recorded data, against runs under the truth, and which frames count."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Records from files and telemetry: facts, units, spectra, clocks, and what is refused."""
 
-from __future__ import annotations
-
 import hashlib
 from functools import partial
 
