@@ -5,7 +5,6 @@ from functools import cache, partial
 
 import numpy as np
 import pytest
-from support.control_laws import ordinary_loop
 from support.night import GAIN, night_record
 from support.recorded_loops import LINE, RATE, drifting_record, resonant_record, spliced_record
 from support.refusals import refused, require_refusals
@@ -81,7 +80,7 @@ def test_what_a_filter_leaves_of_a_drift_is_noted():
 
 def residuals(differences, error):
     """Return residuals of two methods, the other's below 1000 by differences on three parts."""
-    series = {USUAL: [], OTHER: []}
+    series = [], []
     for i, less in enumerate(differences):
         common, own = np.random.default_rng(i).standard_normal((2, 6000))
         common *= np.sqrt(1000 / np.mean(common**2))
@@ -89,13 +88,13 @@ def residuals(differences, error):
         # its product with the common part scatters
         size = 6000 * error**2 / 4000
         own *= np.sqrt(size / np.mean(own**2))
-        series[USUAL].append(common)
-        series[OTHER].append(np.sqrt(1 - (less + size) / 1000) * common + own)
+        series[0].append(common)
+        series[1].append(np.sqrt(1 - (less + size) / 1000) * common + own)
     zero = np.zeros((1, 1))
-    return {
-        name: estimate_residual(np.concatenate(parts)[:, None], ((5, 18_005),), zero, zero)
-        for name, parts in series.items()
-    }
+    return [
+        estimate_residual(np.concatenate(parts)[:, None], ((5, 18_005),), zero, zero)
+        for parts in series
+    ]
 
 
 @pytest.mark.parametrize(
@@ -109,22 +108,20 @@ def residuals(differences, error):
     ],
 )
 def test_the_default_stays_unless_another_wins_every_part(differences, error, chosen):
-    compared = residuals(differences, error)
-    pairs = zip(compared[USUAL].parts(3), compared[OTHER].parts(3), strict=True)
-    for (usual, other), difference in zip(pairs, differences, strict=True):
-        above, its_error = usual.above(other)
-        assert above == pytest.approx(difference)
-        assert its_error == pytest.approx(error, rel=0.3) or difference >= 400
-    title, note = auto.choose_method(compared)
+    usual, other = residuals(differences, error)
+    for row in zip(usual.parts(3), other.parts(3), differences, strict=True):
+        above, its_error = row[0].above(row[1])
+        assert above == pytest.approx(row[2])
+        assert its_error == pytest.approx(error, rel=0.3) or row[2] >= 400
+    title, note = auto.choose_method({USUAL: usual, OTHER: other})
     assert title == chosen
+    assert ("the Kalman filter stays" in note) == (chosen == USUAL)
     if chosen == OTHER:
-        _, error = compared[USUAL].above(compared[OTHER])
+        _, error = usual.above(other)
         assert "the H-infinity filter is chosen" in note
         assert note.endswith(f"less than the Kalman filter, in all by 40 +- {error:.2g} nm^2")
-    else:
-        assert "the Kalman filter stays" in note
-    del compared[USUAL]  # without the default the best is chosen
-    assert auto.choose_method(compared)[0] == OTHER
+    # without the default the best is chosen
+    assert auto.choose_method({OTHER: other})[0] == OTHER
 
 
 def test_all_quick_methods_are_in_the_table_of_unseen_data(monkeypatch):
@@ -144,7 +141,7 @@ def test_all_quick_methods_are_in_the_table_of_unseen_data(monkeypatch):
 @pytest.mark.parametrize(
     ("make", "gain", "widest"),
     [
-        (lambda: loop_record(*ordinary_loop(), **LOOP), 0.7, 2),
+        (night_record, GAIN, 2),
         (resonant_record, 0.9, 1.6),
         # a drift over frozen flow: what the loop leaves is coloured noise over a line, at no gain
         (lambda: drifting_record(337), 0.5859, 4),
@@ -264,8 +261,8 @@ def test_commands_of_unknown_scale_ask_for_stability_at_half_the_gain() -> None:
 
 def test_axes_of_different_gains_may_have_those_of_both() -> None:
     """Commands of one axis at twice their size gave a design that was unstable in the loop."""
-    y, u = ordinary_loop()
-    made = loop_record(y, u * [1.0, 2.0], **LOOP)
+    night = night_record()
+    made = replace(night, commands=night.commands * [1.0, 2.0])
     model = lbt.identify(made)
     assert model.sensor_gains == pytest.approx((0.7, 0.35), rel=0.15)
     assert any("recorded at another size" in note for note in model.notes)

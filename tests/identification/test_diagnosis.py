@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.control_laws import RATE, ordinary_loop
 from support.diagnoses import GAIN, given_design, line_diagnosis, line_record, short_record
-from support.recorded_loops import LINE, spliced_record
+from support.recorded_loops import LINE, RATE, spliced_record
 from support.refusals import refused
 
 import lbt_synth as lbt
@@ -79,8 +78,8 @@ def test_a_short_record_has_channels_and_a_law():
 
 
 def test_commands_of_another_time():
-    y, u = ordinary_loop()
-    found = diagnose(loop_record(y[:2500, :1], u[-2500:, :1], **LOOP))
+    y, u = line_record().measurements[:2500], line_record().commands[-2500:]
+    found = diagnose(loop_record(y, u, **LOOP))
     assert "nothing to do with" in found.doubt
     assert "find the commands" in found.commands.advice
     assert found.model is None

@@ -1,23 +1,28 @@
-"""The verdict on commands: faults are named with what repairs them, good records pass.
+"""Commands of records: their control law, faults and what repairs them, and the verdict.
 
 The coarse spectrum by which repairs are compared.
 """
 
 import re
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from support.control_laws import PATH, TRUTH, SteppedLaw, ordinary_loop, rotation, run_law
-from support.recorded_loops import LINE, RATE, resonant_record, spliced_record
+from support.plants import lbt_axis_plant
+from support.recorded_loops import LINE, RATE, resonant_record, slow, spliced_record
 from support.refusals import refused, require_refusals
 from support.structures import structure
 
 import lbt_synth as lbt
 from lbt_synth.identification import LoopRecord, loop_record
 from lbt_synth.identification.commands import coarse_spectrum
+from lbt_synth.identification.commands.control_law import (
+    classify_matrix,
+    fit_control_law,
+    law_controller,
+)
 from lbt_synth.identification.commands.repair import CommandRepair, repair_commands
 from lbt_synth.identification.commands.verdict import (
     AS_GIVEN,
@@ -28,11 +33,211 @@ from lbt_synth.identification.commands.verdict import (
 )
 from lbt_synth.identification.fit.periodogram import segment_transforms
 
+PATH = lbt.LoopHardware(frame_rate_hz=RATE)
+SHAKEN = lbt.Vibration(frequency_hz=31, damping=0.005, rms_nm=60, direction=(1.0, 0.5))
+TRUTH = lbt.Truth(turbulence=slow(), vibrations=(SHAKEN,), noise_nm=8.0, sensor_gain=0.7)
+
+
+class SteppedLaw:
+    """``v(k) = leak v(k-1) + gain y(k)`` of two axes, integrated again, clipped and disturbed."""
+
+    def __init__(
+        self, gain, *, leak=1.0, again=None, limit_nm=np.inf, wind_up=False, dither_nm=0.0
+    ):
+        self.gain = np.asarray(gain) if np.ndim(gain) else gain * np.eye(2)
+        self.leak, self.again = leak, again
+        self.limit_nm, self.wind_up, self.dither_nm = limit_nm, wind_up, dither_nm
+        self.reset()
+
+    def reset(self):
+        self.command, self.sum = np.zeros(2), np.zeros(2)
+        self.random = np.random.default_rng(5)
+
+    def step(self, y):
+        move = self.gain @ y + self.dither_nm * self.random.standard_normal(2)
+        if self.again is not None:
+            self.sum = self.sum + self.again * move
+            move = move + self.sum
+        command = self.leak * self.command + move
+        applied = np.clip(command, -self.limit_nm, self.limit_nm)
+        self.command = command if self.wind_up else applied
+        return applied.copy()
+
+
+def run_law(controller, *, frames=3000, seed=1, truth=TRUTH, hardware=PATH):
+    """Measurements and commands of a loop, (frames, 2) each."""
+    options = {"frames": frames, "seed": seed, "frame_means": True}
+    run = lbt.simulate(controller, truth, hardware=hardware, **options)
+    return run.measurements[0], run.commands[0]
+
+
+@cache
+def ordinary_loop(seed=1):
+    """Measurements and commands of an integrator with gains of 0.4 and 0.3."""
+    law = lbt.Controller(
+        A=np.eye(2), B=np.diag([0.4, 0.3]), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / RATE
+    )
+    return run_law(law, seed=seed, frames=10_000)
+
+
+def rotation(angle_deg):
+    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    return np.array([[c, -s], [s, c]])
+
+
+RAN = np.diag([0.4, 0.3])
+SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
+
+
+def law_of(y, u, usable=None):
+    """The law of a record whose frames are all good, unless it is said."""
+    good = np.ones(len(y), dtype=bool) if usable is None else usable
+    marks = {"measured": good, "commanded": good}
+    return fit_control_law(LoopRecord(frame_rate_hz=RATE, measurements=y, commands=u, **marks))
+
+
+@pytest.mark.parametrize(
+    ("change", "structure", "signs", "late"),
+    [
+        (np.eye(2), "diagonal", (1, 1), -1),
+        (-np.eye(2), "diagonal", (-1, -1), -4),
+        (-SWAP, "swapped", (-1, -1), 2),
+        (rotation(30), "general", (0, 0), 0),
+        (np.array([[1.0, 0.9], [0.3, 0.6]]), "general", (0, 0), 4),
+    ],
+)
+def test_commands_by_a_matrix_that_are_shifted(change, structure, signs, late):
+    y, u = ordinary_loop()
+    law = law_of(y[5:-5], np.roll(u @ change.T, late, axis=0)[5:-5])
+    assert (law.kind, law.lag_frames, law.order) == ("integrator", late, 1)
+    np.testing.assert_allclose(law.gain, change @ RAN, atol=1e-9 * np.abs(change).max())
+    assert classify_matrix(law.gain) == (structure, signs)
+    np.testing.assert_allclose(law.poles, 1.0, atol=1e-9)
+    assert law.exact
+    assert np.mean(law.axis_coherence) > 1 - 1e-6
+
+
+def test_increments_in_place_of_positions():
+    y, u = ordinary_loop()
+    law = law_of(y[1:], np.diff(u, axis=0))
+    assert (law.kind, law.order, law.lag_frames, law.poles.size) == ("proportional", 0, 0, 0)
+    np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
+
+
+def test_commands_of_another_night_have_no_law():
+    y, u = ordinary_loop()
+    _, other = ordinary_loop(seed=2)
+    for measurements, commands in (
+        (y, other),
+        (y[1000:], u[:-1000]),  # the same night, a second later
+        (y, np.zeros_like(u)),
+    ):
+        law = law_of(measurements, commands)
+        assert law.kind == "none"
+        assert np.mean(law.axis_coherence) < 0.02
+        assert law.axes_kind == "zero"
+        assert not law.exact
+
+
+@pytest.mark.parametrize(
+    ("controller", "kind", "poles", "gain"),
+    [
+        (SteppedLaw(0.4, leak=0.99), "integrator", [0.99], 0.4 * np.eye(2)),
+        (SteppedLaw(0.3, again=0.02), "double integrator", [1.0, 1.0], 0.006 * np.eye(2)),
+        (SteppedLaw(0.4, limit_nm=300, wind_up=True), "integrator", [1.0], 0.4 * np.eye(2)),
+    ],
+)
+def test_laws_of_low_order(controller, kind, poles, gain):
+    law = law_of(*run_law(controller))
+    assert (law.kind, law.lag_frames) == (kind, 0)
+    np.testing.assert_allclose(law.poles, [poles, poles], atol=1e-5)
+    np.testing.assert_allclose(law.gain, gain, atol=1e-6)
+    assert law.exact
+
+
+def test_the_law_of_a_filter_is_that_of_its_design():
+    plant = lbt_axis_plant()
+    controller = lbt.kalman(plant).controller
+    known = {"turbulence": plant.turbulence, "vibrations": plant.vibrations, "noise_nm": 15.5}
+    truth = lbt.Truth(**known, sensor_gain=1.0)
+    law = law_of(*run_law(controller, truth=truth, hardware=plant.hardware))
+    assert (law.kind, law.lag_frames, law.exact) == ("higher order", 0, True)
+    rate_hz = plant.hardware.frame_rate_hz
+    frequencies_hz = rate_hz * np.array([0.001, 0.01, 0.025, 0.1, 0.3])
+    again, exact = (
+        one.to_statespace().frequency_response(frequencies_hz)[:, 0, 0]
+        for one in (law_controller(law, rate_hz), controller)
+    )
+    np.testing.assert_allclose(again, exact, rtol=1e-4)
+
+
+def test_coarse_commands_and_those_in_single_precision():
+    y, u = ordinary_loop()
+    coarse = law_of(y, 3.0 * np.round(u / 3.0))
+    assert (coarse.kind, coarse.lag_frames, coarse.axes_kind) == ("integrator", 0, "diagonal")
+    np.testing.assert_allclose(coarse.gain, RAN, atol=0.005)
+    # two roundings of variance 9/12, of the increments' variance
+    rounding = np.mean(1.5 / np.var(np.diff(u, axis=0), axis=0))
+    assert coarse.residual == pytest.approx(rounding, rel=0.1)
+    single = law_of(y.astype(np.float32), (u + 1e4).astype(np.float32))
+    assert (single.kind, single.exact) == ("integrator", True)
+
+
+def test_a_loop_that_is_shaken_by_its_commands_is_not_read_backwards():
+    law = law_of(*run_law(SteppedLaw(0.4, dither_nm=20.0), frames=6000))
+    assert law.lag_frames == 0
+    assert law.residual > 0.5
+    np.testing.assert_allclose(law.gain, 0.4 * np.eye(2), atol=0.02)
+
+
+def test_frames_that_follow_no_law():
+    y, u = ordinary_loop()
+    usable = np.random.default_rng(0).random(len(y)) > 0.01
+    marked = usable[:, None]
+    holes = law_of(np.where(marked, y, 0.0), np.where(marked, u, 1e5), usable=usable)
+    frame = np.arange(len(y))[:, None]
+    y = np.where(frame % 500 == 0, 0.0, y)  # spoilt, and not said
+    u = np.where(frame < 5000, u, u - 4000.0)  # an offload
+    spoilt = law_of(np.delete(y, 7777, axis=0), np.delete(u, 7777, axis=0))
+    for law in (holes, spoilt):
+        assert law.kind == "integrator"
+        np.testing.assert_allclose(law.gain, RAN, atol=1e-9)
+
+
+def test_one_axis_without_a_law():
+    y, u = ordinary_loop()
+    law = law_of(y + [0, 100] * np.random.default_rng(0).standard_normal(y.shape), u)
+    assert law.lag_frames == 0
+    assert law.axis_coherence[0] > 0.999 > 0.1 > law.axis_coherence[1]
+    assert law.gain[0, 0] == pytest.approx(0.4)
+
+
+def test_small_elements_count_as_zero():
+    assert classify_matrix([[0.4, 0.03], [-0.03, 0.4]])[0] == "general"
+    assert classify_matrix([[0.4, 0.015], [-0.015, 0.4]])[0] == "diagonal"
+    assert classify_matrix(np.zeros((2, 2))) == ("zero", (0, 0))
+
+
+def test_it_repeats_the_commands():
+    y, u = run_law(SteppedLaw([[0.3, 0.1], [0.0, 0.2]], leak=0.98))
+    late = np.roll(u, 2, axis=0)
+    law = law_of(y, late)
+    assert law.lag_text == ", 2 frames late"
+    run = law_controller(law, RATE).start()
+    replayed = np.array([run.step(row) for row in y])
+    # what the command was before the record has decayed
+    np.testing.assert_allclose(replayed[-500:], late[-500:], atol=1e-6)
+
+
+def test_records_without_a_law():
+    y, u = ordinary_loop()
+    assert law_of(y[:300], u[:300]) is None
+    assert law_of(y, None) is None
+
+
 CROWDED = """59.77816 0.00922046 26.618522 3.03506  147.00317 0.00861081 59.089946 1.09802
     45.176974 0.00286793 79.169178 1.63632  113.71687 0.00354196 80.716156 1.005
     88.666623 0.00215286 97.423308 0.092637"""  # lines: Hz, damping, nm, direction
-
-
 record = partial(loop_record, frame_rate_hz=RATE, delay_frames=2.0, unit="nm")
 TURN = rotation(30)
 FAULTS = {  # measurements and commands of the wrong record, and its repair
@@ -326,6 +531,8 @@ def test_records_and_repairs_that_are_refused() -> None:
         (repair(one, matrix=(1.0, 0.0, 0.0, 1.0)), "must have 1 numbers"),
         (repair(open_loop, sign=(-1,)), "open loop"),
         (partial(explain_commands, open_loop), "no commands to explain"),
+        (partial(law_controller, law_of(y, 0 * u), RATE), "a law that can run; got no law"),
+        (partial(law_controller, law_of(y[:-2], u[2:]), RATE), "can run; got .*, 2 frames early"),
         (three, "sensor_gain must be one number"),
     ]
     require_refusals((call, lbt.errors.ProblemError, words) for call, words in rows)

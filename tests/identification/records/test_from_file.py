@@ -70,8 +70,6 @@ def test_gaps_times_and_counters(tmp_path):
     assert seen.frame_rate_hz == 500
     assert np.flatnonzero(~seen.usable).tolist() == [7, 8, 20, 30]
     assert [finding.kind for finding in seen.findings] == ["missing", "not finite"]
-    words = r"a\.csv: frame_rate_hz must be that of the times"
-    refused(lambda: lbt.load_record(path, frame_rate_hz=800), ProblemError, words)
 
 
 def test_delays_and_diameters_in_headers(tmp_path, series):
@@ -148,7 +146,6 @@ def test_amplitude_spectra_and_angles(tmp_path):
         ("x_nm y_nm", {}, r"got measurements \(x_nm, y_nm\)\. Choose by columns="),
         ("y_nm u_nm pol_nm", {}, r"got measurements \(y_nm\); commands .*Choose by col"),
         ("y_nm meas_nm u_nm u_nm", {}, "not each of an axis of its own"),
-        ("y0_nm y1_nm u0_nm t", {}, r"commands must match measurements \(60, 2\)"),
         ("y_nm u_nm t time", {}, "t, time are all named as times; choose by columns="),
         ("y_nm u_nm time_h b", {"columns": {"times": 9}}, "no column 9; the file has 4"),
         ("y_nm u_nm a b", {"columns": {"times": "q"}}, "no column 'q'; .*: y_nm, u_nm"),
@@ -308,7 +305,6 @@ def test_telemetry_that_is_refused():
         ({"command_unit": "V"}, {}, "the unit of mode 0 in 'V', mode 1 in 'V': give command_unit"),
         (three, {}, "3 commands of 2 modes, and no influence matrix"),
         ({"interaction_matrix": [[1.0, 1.0], [1.0, 1.0]]}, {}, "has no inverse"),
-        ({"delay_frames": 0.5}, {}, "delay_frames must be at least 1"),
     ]
     require_refusals(
         (partial(lbt.load_record, telemetry(**changes), **options), ProblemError, words)

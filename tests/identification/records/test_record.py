@@ -68,14 +68,6 @@ def test_gaps_of_every_kind():
     )
 
 
-def test_a_dead_axis_leaves_nothing():
-    seen = at_rate(np.random.default_rng(0).standard_normal((5000, 2)) * [1, 0])
-    assert not seen.usable.any()
-    assert kinds(seen) == {("stuck", "measurements", 1)}
-    words = r"got 0 \(0 s\), the longest stretch 0. 0 of 5000 frames"
-    refused(lambda: require_length(seen), ProblemError, words)
-
-
 def test_clipped_commands_spoil_their_corrections():
     y, commands = ran(frames=3000, noise_nm=5)
     u = np.clip(commands, -250, None)
@@ -84,13 +76,6 @@ def test_clipped_commands_spoil_their_corrections():
     clipped = np.any(commands < -250, axis=1) & np.all(u != 0, axis=1)
     assert clipped.sum() > 5
     assert np.array_equal(~seen.usable, np.append([True, True], clipped[:-2]))
-
-
-def test_an_open_loop_with_zero_commands():
-    y = np.random.default_rng(0).standard_normal((200, 2))
-    seen = at_rate(y, 0 * y, delay_frames=2)
-    assert seen.usable[2:].all()
-    assert np.array_equal(seen.pseudo_open_loop(), y)
 
 
 def test_a_scatter_that_changes_is_said():
@@ -394,6 +379,8 @@ def test_length():
     assert require_length(broken.bridged()) == 5999
     short = at_rate(y[1:200], frame_rate_hz=2000)
     coarse = at_rate(y[1:1000:2], frame_rate_hz=400)
+    dead = at_rate(np.column_stack([y[1:200], np.zeros(199)]))
+    assert kinds(dead) == {("stuck", "measurements", 1)}
     require_refusals(
         (partial(require_length, record, seconds=seconds), ProblemError, words)
         for record, seconds, words in (
@@ -401,6 +388,7 @@ def test_length():
             (broken.bridged(), 7, r"needs 7000 usable frames \(7 s at 1000 Hz\)"),
             (short, 2, "needs 4000 usable frames"),
             (coarse, 2, "needs 1024 usable frames"),
+            (dead, 2, r"got 0 \(0 s\), the longest stretch 0. 0 of 199 frames"),
         )
     )
 
