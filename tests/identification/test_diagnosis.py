@@ -36,9 +36,8 @@ def test_a_good_record(good):
     assert {INTEGRATOR, good.best, "robust controller", "mine"} < set(names)
     # the law that was found promises what the record shows
     assert abs(good.comparison[RAN].deviations) < 4
-    least = min(
-        good.comparison[name].replayed_nm for name in names if name not in (RAN, LIMIT, "mine")
-    )
+    designs = set(names) - {RAN, LIMIT, "mine"}
+    least = min(good.comparison[name].replayed_nm for name in designs)
     assert good.comparison[good.best].replayed_nm == pytest.approx(least, rel=0.05)
     assert lbt.close_loop(good.model.hardware, good.best_design.controller).is_stable
     # a design that was given

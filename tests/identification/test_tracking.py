@@ -105,11 +105,8 @@ def test_a_filter_that_fails_never_runs():
         "only filters of a TipTiltPlant": lambda p: lbt.integrator(p.hardware, gain=0.3),
     }
     plant, designs = axis(18), iter([lbt.kalman, *wrong.values()])
-
-    def design(problem):
-        return next(designs)(problem)
-
-    tracker = TrackingController(plant, window_s=0.75, update_s=0.25, design=design)
+    settings = {"window_s": 0.75, "update_s": 0.25}
+    tracker = TrackingController(plant, **settings, design=lambda problem: next(designs)(problem))
     series = disturbed(plant, frames=1000)
     tracked = run(tracker, plant, series)
     fixed = run(lbt.kalman(plant).controller.start(), plant, series)
@@ -137,9 +134,8 @@ def test_measurements_that_are_not_numbers_hold_the_command_and_spoil_a_window()
 
 
 def test_a_new_line_on_the_other_axis_is_found():
-    new = line(41, damping=0.01, direction=(0, 1))
+    lines = (*TWO_AXES.vibrations, line(41, damping=0.01, direction=(0, 1)))
     tracker = TrackingController(TWO_AXES, window_s=4.0, update_s=4.0)
-    lines = (*TWO_AXES.vibrations, new)
     shaken = lbt.Truth(turbulence=AIR, vibrations=lines, noise_nm=15.5)
     size = {"frames": 3200, "settle_frames": 0, "seed": 3}
     lbt.simulate(tracker, shaken, hardware=TWO_AXES.hardware, **size)

@@ -1,7 +1,4 @@
-"""Commands of records: their control law, faults and what repairs them, and the verdict.
-
-The coarse spectrum by which repairs are compared.
-"""
+"""Commands of records: their law, faults and repairs, coarse spectra, and the verdict."""
 
 import re
 from dataclasses import replace
@@ -80,12 +77,8 @@ def ordinary_loop(seed=1):
     return run_law(law, seed=seed, frames=10_000)
 
 
-def rotation(angle_deg):
-    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-    return np.array([[c, -s], [s, c]])
-
-
 RAN = np.diag([0.4, 0.3])
+TURN = np.array([[np.sqrt(3), -1], [1, np.sqrt(3)]]) / 2  # by 30 degrees
 SWAP = np.array([[0.0, 1.0], [1.0, 0.0]])
 
 
@@ -102,7 +95,7 @@ def law_of(y, u, usable=None):
         (np.eye(2), "diagonal", (1, 1), -1),
         (-np.eye(2), "diagonal", (-1, -1), -4),
         (-SWAP, "swapped", (-1, -1), 2),
-        (rotation(30), "general", (0, 0), 0),
+        (TURN, "general", (0, 0), 0),
         (np.array([[1.0, 0.9], [0.3, 0.6]]), "general", (0, 0), 4),
     ],
 )
@@ -137,6 +130,8 @@ def test_commands_of_another_night_have_no_law():
         assert np.mean(law.axis_coherence) < 0.02
         assert law.axes_kind == "zero"
         assert not law.exact
+    assert law_of(y[:300], u[:300]) is None  # it is too short
+    assert law_of(y, None) is None
 
 
 @pytest.mark.parametrize(
@@ -229,17 +224,10 @@ def test_it_repeats_the_commands():
     np.testing.assert_allclose(replayed[-500:], late[-500:], atol=1e-6)
 
 
-def test_records_without_a_law():
-    y, u = ordinary_loop()
-    assert law_of(y[:300], u[:300]) is None
-    assert law_of(y, None) is None
-
-
 CROWDED = """59.77816 0.00922046 26.618522 3.03506  147.00317 0.00861081 59.089946 1.09802
     45.176974 0.00286793 79.169178 1.63632  113.71687 0.00354196 80.716156 1.005
     88.666623 0.00215286 97.423308 0.092637"""  # lines: Hz, damping, nm, direction
 record = partial(loop_record, frame_rate_hz=RATE, delay_frames=2.0, unit="nm")
-TURN = rotation(30)
 FAULTS = {  # measurements and commands of the wrong record, and its repair
     "turned": (lambda y, u: (y, -u), CommandRepair(sign=(-1,))),
     "one turned": (lambda y, u: (y, u * [1, -1]), CommandRepair(sign=(1, -1))),
@@ -256,10 +244,8 @@ FAULTS = {  # measurements and commands of the wrong record, and its repair
         CommandRepair(increments=True),
     ),
 }
-QUIET = {  # one axis without lines
-    "truth": replace(TRUTH, vibrations=()),
-    "hardware": lbt.LoopHardware(frame_rate_hz=RATE, modes=1),
-}
+ONE_AXIS = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
+QUIET = {"truth": replace(TRUTH, vibrations=()), "hardware": ONE_AXIS}
 
 
 def wrong_record(fault: str) -> LoopRecord:
@@ -312,17 +298,14 @@ def test_records_that_are_accepted_with_a_note() -> None:
     slow = lbt.Controller(
         A=[[1.0, 0.3], [0.0, 0.0]], B=[[0.0], [1.0]], C=[[1.0, 0.0]], D=[[0.0]], dt_s=1 / RATE
     )
-    late, coupled = (
-        run_law(slow, frames=10_000, **QUIET),
-        run_law(SteppedLaw([[0.4, 0.1], [-0.1, 0.3]])),
-    )
+    coupled = SteppedLaw([[0.4, 0.1], [-0.1, 0.3]])
     open_delay = "delay open: 1 or 3 explain it as well as the 2 frames that are given and taken"
     delay = "1 frame earlier. If the real-time computer takes that long, the total delay .* is 3 fr"
     for seen, words in (
         (weak, open_delay),
-        (record(*late), delay),
+        (record(*run_law(slow, frames=10_000, **QUIET)), delay),
         (record(torn, u), "not tested"),
-        (record(*coupled), ""),
+        (record(*run_law(coupled)), ""),
     ):
         verdict = explain_commands(seen)
         assert verdict.accepted
@@ -414,7 +397,7 @@ def test_what_a_law_leaves_unexplained_is_said() -> None:
 
 def test_a_weak_loop_leaves_the_unit_of_its_commands_open():
     """Quick fits of plausible gains are nearly as likely as one of 7: it is said, not refused."""
-    law = lbt.integrator(QUIET["hardware"], gain=0.1).controller
+    law = lbt.integrator(ONE_AXIS, gain=0.1).controller
     y, u = run_law(law, frames=6000, **QUIET)
     verdicts = [explain_commands(record(y, factor * u)) for factor in (1.0, 0.1)]
     assert all(verdict.accepted for verdict in verdicts)

@@ -15,7 +15,7 @@ from support.recorded_loops import (
 )
 
 import lbt_synth as lbt
-from lbt_synth.identification import loop_record
+from lbt_synth.identification import IdentifiedModel, loop_record
 from lbt_synth.identification.fit import identified_model
 from lbt_synth.identification.fit.fitting import Search, add_evidence, cost, fit
 from lbt_synth.identification.fit.order_search import find_components
@@ -70,10 +70,7 @@ def test_frozen_flow_does_not_shift_the_gain() -> None:
     [(8.0, NOISE_NM, 0.999, 30.0), (20.0, 1.0, 0.999, 30.0), (8.0, NOISE_NM, 0.9995, 100.0)],
 )
 def test_a_drift_over_frozen_flow_does_not_shift_the_gain(wind, noise_nm, pole, drift_nm) -> None:
-    """Without a roll-off beside the drift it was 13 errors off, with two free poles a fifth.
-
-    A plant has the drift as an overdamped resonance.
-    """
+    """Without a roll-off it was 13 errors off; in a plant the drift is an overdamped resonance."""
     driving = drift_nm * float(np.sqrt(1 - pole**2))
     drift = ARModel(coefficients=[pole], driving_rms_nm=driving, frame_rate_hz=RATE)
     total = SumSpectrum(parts=[frozen_flow(wind), drift])
@@ -86,7 +83,7 @@ def test_a_drift_over_frozen_flow_does_not_shift_the_gain(wind, noise_nm, pole, 
     (part,) = axis.parts
     assert part.kind == "turbulence"
     assert part.damping > 30
-    model = identified_model.IdentifiedModel(axes=(axis,), frame_rate_hz=RATE, delay_frames=2.0)
+    model = IdentifiedModel(axes=(axis,), frame_rate_hz=RATE, delay_frames=2.0)
     path = lbt.LoopHardware(frame_rate_hz=RATE, modes=1)
     truth = lbt.Truth(turbulence=total, noise_nm=noise_nm, sensor_gain=GAIN)
     loop = lbt.close_loop(path, lbt.kalman(model.plant()).controller, sensor_gain=GAIN)
@@ -148,22 +145,19 @@ def test_a_part_of_the_turbulence_without_power_is_none() -> None:
     """A configuration refuses it, and a design has a state for it."""
     search, axis = weakest_lines(0)
     model, places = axis.fitted_model, [part.frequency_hz for part in axis.parts]
-    wider = {"information": np.pad(model.information, (0, 3)), "evidence": (*model.evidence, 0.0)}
+    known = {"information": np.pad(model.information, (0, 3)), "evidence": (*model.evidence, 0.0)}
     for power, extra in ((1e-12, []), (100.0, [1.0])):
         spectrum = model.spectrum.add(search.component("slow", 1.0, 0.5, power))
-        wide = identified_model.describe_axis(
-            search, replace(model, spectrum=spectrum, **wider), None, ""
-        )
-        frequencies = sorted(part.frequency_hz for part in wide.parts)
+        wider = replace(model, spectrum=spectrum, **known)
+        parts = identified_model.describe_axis(search, wider, None, "").parts
+        frequencies = sorted(part.frequency_hz for part in parts)
         assert frequencies == pytest.approx(sorted(places + extra))
 
 
 def test_the_number_of_components_is_said_of_the_axis_that_tells_it_least() -> None:
     sure = replace(weakest_lines(0)[1], over_fewer=38.4, over_more=7.2)
     unsure = replace(sure, parts=(), over_fewer=np.inf, over_more=2.9)
-    both = identified_model.IdentifiedModel(
-        axes=(sure, unsure), frame_rate_hz=RATE, delay_frames=2.0
-    )
+    both = IdentifiedModel(axes=(sure, unsure), frame_rate_hz=RATE, delay_frames=2.0)
     assert identified_model.say_count(both) == (
         "The record tells 3 components from 2 by at most 38 and from 4 by about 3 units of the "
         "log-likelihood beyond the price."
@@ -201,15 +195,21 @@ def test_a_neighbour_has_its_direction_first() -> None:
         assert line.direction_deg == pytest.approx(degrees, abs=4 * line.direction_error_deg)
 
 
-def test_twins_and_an_ellipse_stay_two_lines() -> None:
-    for lines in (
-        ((shaking(0), 0), (shaking(90), 0)),
-        ((shaking(45), 8),),  # an ellipse: a quarter of the period
-    ):
-        model = lbt.identify(open_record(lines))
-        assert not model.shared
-        places = [[round(line.frequency_hz) for line in axis.lines] for axis in model.axes]
-        assert places == [[31]] * 2
+@pytest.mark.parametrize(
+    ("lines", "places"),
+    [
+        (((shaking(0), 0), (TILT, 0)), [[31], [52]]),
+        (((shaking(0), 0), (shaking(90), 0)), [[31], [31]]),  # twins
+        (((shaking(45), 8),), [[31], [31]]),  # an ellipse: a quarter of the period
+    ],
+)
+def test_axes_that_share_nothing_are_those_that_were_found_alone(lines, places) -> None:
+    model = lbt.identify(record := open_record(lines, frames=8192))
+    assert not model.shared
+    assert [[round(line.frequency_hz) for line in axis.lines] for axis in model.axes] == places
+    for axis, y in zip(model.axes, record.measurements.T, strict=True):
+        alone = identify_series(y)
+        assert (axis.parts, axis.noise_nm) == (alone.parts, alone.noise_nm)
 
 
 def test_turbulence_of_both_axes() -> None:
@@ -223,17 +223,8 @@ def test_turbulence_of_both_axes() -> None:
     assert covariance[0, 1] / whole == pytest.approx(400**2 / (400**2 + 300**2), abs=0.1)
 
 
-def test_axes_that_share_nothing_are_those_that_were_found_alone() -> None:
-    model = lbt.identify(record := open_record(((shaking(0), 0), (TILT, 0)), frames=8000))
-    assert not model.shared
-    for axis, y in zip(model.axes, record.measurements.T, strict=True):
-        alone = identify_series(y)
-        assert axis.parts == alone.parts
-        assert axis.noise_nm == alone.noise_nm
-
-
 @pytest.fixture(scope="module")
-def model() -> lbt.identification.IdentifiedModel:
+def model() -> IdentifiedModel:
     return lbt.identify(open_record(((DIAGONAL, 0), (TILT, 0)), seed=1))
 
 

@@ -106,25 +106,20 @@ def test_noise_that_is_not_white_leaves_the_gain(
 
 def test_a_rough_gain_has_rivals() -> None:
     """Five seconds under a drift: the gains were 4 to 6 of their errors below the truth."""
-    rate, lines = 518.0, ((112.0, 0.005, 85.0), (87.4, 0.0026, 84.0), (42.3, 0.0029, 64.0))
-    parts = [
-        ARModel(coefficients=coefficients, driving_rms_nm=driving, frame_rate_hz=rate)
-        for coefficients, driving in (
-            ([1.99691631, -0.99694883], 0.13346734),
-            ([0.99984], 214 * np.sqrt(1 - 0.99984**2)),
-        )
-    ]
+    rate = {"frame_rate_hz": 518.0}
+    lines = ((112.0, 0.005, 85.0), (87.4, 0.0026, 84.0), (42.3, 0.0029, 64.0))
     vibrations = tuple(
-        lbt.Vibration(frequency_hz=f, damping=z, rms_nm=rms, direction=(1.0,))
-        for f, z, rms in lines
+        lbt.Vibration(frequency_hz=f, damping=z, rms_nm=r, direction=(1.0,)) for f, z, r in lines
     )
-    air = SumSpectrum(parts=parts)
-    truth = lbt.Truth(turbulence=air, vibrations=vibrations, noise_nm=7.73, sensor_gain=0.95)
-    path = lbt.LoopHardware(frame_rate_hz=rate, modes=1)
+    air = ARModel(coefficients=[1.99691631, -0.99694883], driving_rms_nm=0.13346734, **rate)
+    drift = ARModel(coefficients=[0.99984], driving_rms_nm=214 * np.sqrt(1 - 0.99984**2), **rate)
+    known = {"turbulence": SumSpectrum(parts=[air, drift]), "noise_nm": 7.73, "sensor_gain": 0.95}
+    path = lbt.LoopHardware(**rate, modes=1)
     size = {"hardware": path, "frames": 2590, "settle_frames": 2000, "frame_means": True}
-    run = lbt.simulate(lbt.integrator(path, gain=0.25).controller, truth, seed=8, **size)
-    y, u = run.measurements[0, :, 0], run.commands[0, :, 0]
-    found = identify_series(y[2:], u[:-2], frame_rate_hz=rate)
+    law = lbt.integrator(path, gain=0.25).controller
+    truth = lbt.Truth(**known, vibrations=vibrations)
+    run = lbt.simulate(law, truth, seed=8, **size)
+    found = identify_series(run.measurements[0, 2:, 0], run.commands[0, :-2, 0], **rate)
     assert found.sensor_gain == pytest.approx(0.95, abs=3 * found.sensor_gain_error)
 
 
@@ -156,6 +151,9 @@ def test_what_the_loop_does_not_show_is_said() -> None:
     ):
         assert axis.sensor_gain == pytest.approx(gain, rel=1e-12)
         assert axis.sensor_gain_note == note
+    quiet = spliced_record(lines=((40, 0.01, 30.0),), frames=4000, noise=1e-3)
+    (words,) = lbt.identify(quiet, sensor_gain=0.6).notes
+    assert "the noise of axis 0 is not seen under the rest of its spectrum" in words
 
 
 def test_neither_units_nor_a_start_move_the_fit() -> None:
@@ -309,6 +307,15 @@ def test_commands_in_other_units_and_of_part_size_are_doubted(factor: float, wor
     doubts = [*model.notes, axis.sensor_gain_note]
     assert any(words in doubt for doubt in doubts)
     assert bool(model.notes) == (factor in (0.5, 100.0))
+
+
+def test_a_wide_resonance_is_no_turbulence() -> None:
+    axis = lbt.identify(spliced_record((1,), lines=((60.0, 0.3, 30.0),), frames=12_000)).axes[0]
+    assert axis.turbulence_fit.frequency_hz < 3
+    assert axis.turbulence.rms_nm == pytest.approx(300, rel=0.3)
+    (part,) = axis.parts
+    assert part.kind == "broad"
+    assert part.frequency_hz == pytest.approx(60, rel=0.1)
 
 
 def test_the_limit_of_lines_is_kept_and_noted() -> None:

@@ -15,18 +15,10 @@ from lbt_synth.models.vibration import coefficient_rows, sampled_lines
 
 RATE = 1000.0
 NOISE = 30.0  # variance [nm^2]
-
-
-def empty_search() -> Search:
-    """Return the search in a periodogram of a minute without anything in it."""
-    f = np.arange(1, 30_000) / 60.0
-    zero, one = np.zeros_like(f), np.ones_like(f)
-    loop = {"measured": one, "crossed": zero, "corrected": zero, "count": one}
-    return Search(data=LoopPeriodogram(frequency_hz=f, frame_rate_hz=RATE, **loop), gain=1.0)
-
-
-SEARCH = empty_search()
-HERTZ = SEARCH.data.frequency_hz
+HERTZ = np.arange(1, 30_000) / 60.0  # of a minute
+ONE, ZERO = np.ones_like(HERTZ), np.zeros_like(HERTZ)
+EMPTY = {"measured": ONE, "crossed": ZERO, "corrected": ZERO, "count": ONE}
+SEARCH = Search(data=LoopPeriodogram(frequency_hz=HERTZ, frame_rate_hz=RATE, **EMPTY), gain=1.0)
 WHITE = SpectrumModel((Background(0.0, float(np.log(NOISE)), 0.0, 0.0),), ()).without_roll_off()
 
 

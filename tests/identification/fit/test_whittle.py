@@ -52,11 +52,8 @@ def test_smearing_is_the_integral_that_defines_it(width: float, distance: float)
 def test_derivatives_of_the_smearing(width: float, distance: float) -> None:
     d, h = np.array([-distance, distance]), 1e-6
     _, by_width, by_distance = whittle.log_smearing(width, d)
-    numeric = (
-        whittle.log_smearing(width * np.exp(h), d)[0]
-        - whittle.log_smearing(width * np.exp(-h), d)[0]
-    )
-    assert by_width == pytest.approx(numeric / (2 * h), abs=1e-4)
+    wider, narrower = (whittle.log_smearing(width * np.exp(step), d)[0] for step in (h, -h))
+    assert by_width == pytest.approx((wider - narrower) / (2 * h), abs=1e-4)
     numeric = whittle.log_smearing(width, d + h)[0] - whittle.log_smearing(width, d - h)[0]
     assert by_distance == pytest.approx(numeric / (2 * h), rel=1e-4, abs=1e-4)
     assert by_distance[0] == pytest.approx(-by_distance[1])
@@ -76,17 +73,6 @@ def test_periodogram_of_white_noise_is_its_density_and_leaks_nothing_of_turbulen
     walk_density = 2 * 4 / RATE / (4 * np.sin(np.pi * data.frequency_hz / RATE) ** 2)
     excess = leaking.power(1.0) / (level + walk_density)
     assert np.mean(excess[data.frequency_hz > 300]) == pytest.approx(1, rel=0.04)
-
-
-@given(gain=st.floats(0.1, 3), cut=st.integers(2000, 6000))
-@settings(max_examples=10, deadline=None)
-def test_periodogram_is_quadratic_in_the_gain(gain: float, cut: int) -> None:
-    y, c = np.random.default_rng(cut).standard_normal((2, 8000))
-    options = {"frame_rate_hz": RATE, "stretches": [(0, cut), (cut + 100, 8000)]}
-    whole = loop_periodogram(y + gain * c, None, **options).power(1.0)
-    assert loop_periodogram(y, c, **options).power(gain) == pytest.approx(
-        whole, rel=1e-9, abs=1e-12
-    )
 
 
 def test_a_gap_shortens_the_segments_and_keeps_most_frames() -> None:
@@ -304,9 +290,8 @@ def test_a_curved_valley_is_followed_to_its_end(start, bounds, minimum) -> None:
 
 @pytest.mark.parametrize(("bound", "hopeless"), [(6.9, True), (9.0, False)])
 def test_a_fit_without_hope_is_given_up(bound: float, hopeless: bool) -> None:
-    found = whittle.scoring_minimum(
-        partial(rosenbrock, above=7.0), np.array([-1.2, 1.0]), free(2), bound=bound
-    )
+    valley, start = partial(rosenbrock, above=7.0), np.array([-1.2, 1.0])
+    found = whittle.scoring_minimum(valley, start, free(2), bound=bound)
     assert (found is None) is hopeless
 
 

@@ -188,13 +188,10 @@ def test_scale_and_beginning(seed, scale, start, delay):
     known = {"noise_nm": 0.1 * scale, "stretches": [(start, 1200)]}
     other = replayed_residual(torn, new, path, **known)
     assert other.stretches == ((start + 400, 1200),)
-    for name, factor, rtol, atol in (
-        ("measured_nm", scale, 0, 1e-12),
-        ("covariance_nm2", scale**2, 1e-9, 1e-9),
-        ("total_error_nm2", scale**2, 1e-9, 0),
-    ):
-        expected = factor * getattr(one, name)
-        np.testing.assert_allclose(getattr(other, name), expected, rtol=rtol, atol=atol * factor)
+    square, check = scale**2, np.testing.assert_allclose
+    check(other.measured_nm, scale * one.measured_nm, rtol=0, atol=1e-12 * scale)
+    check(other.covariance_nm2, square * one.covariance_nm2, rtol=1e-9, atol=1e-9 * square)
+    assert other.total_error_nm2 == pytest.approx(square * one.total_error_nm2, rel=1e-9)
 
 
 def test_a_constant_needs_no_warming_up():
@@ -241,13 +238,11 @@ def replayed(series=GOOD, path=PATH, **options):
 
 
 def test_what_cannot_be_replayed_is_refused():
-    short = "at least 400 frames beyond the first 400 .* 50"
-    sizes = r"or one per measurement \(2\); got 3"
     later = replayed(test=[(500, 2000)])
     rows = [
         (partial(replayed, noise_error_nm=-0.1), "noise_error_nm must be at least 0"),
-        (partial(replayed, noise_error_nm=[1.0, 2.0, 3.0]), sizes),
-        (partial(replayed, test=[(1950, 2000)]), short),
+        (partial(replayed, noise_error_nm=[1, 2, 3]), r"or one per measurement \(2\); got 3"),
+        (partial(replayed, test=[(1950, 2000)]), "at least 400 frames beyond the first 400 .* 50"),
         (lambda: replayed().above(later), "on the same frames only"),
     ]
     require_refusals((call, ProblemError, words) for call, words in rows)
@@ -259,9 +254,8 @@ def test_the_league_of_designs_and_rivals(monkeypatch, capsys):
     entries = {name: league.ENTRIES[name] for name in names}
     monkeypatch.setattr(league, "ENTRIES", entries)
     night = line_record()
-    league.play(
-        {"night": night, "brief": replace(night, measured=np.arange(night.frames) < 600)}, 2
-    )
+    brief = replace(night, measured=np.arange(night.frames) < 600)
+    league.play({"night": night, "brief": brief}, 2)
     failure, _, heading, *rows = capsys.readouterr().out.splitlines()
     assert failure.startswith("brief is not in the table: ")
     assert heading.split()[-1] == "night"

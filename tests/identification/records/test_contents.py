@@ -1,7 +1,4 @@
-"""What files hold: every format, nulls, facts, damage, structures and groups.
-
-Columns chosen by their names, their axes, or the call.
-"""
+"""What files of every format hold, damage, and which columns make a record."""
 
 import gc
 import sys

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from support.eris import ERIS_FILE
+from support.predictions import SHELL
 from support.record_files import csv, hdus, image, write_csv
 from support.refusals import refused, require_refusals
 
@@ -273,9 +274,7 @@ def test_telemetry_of_a_simulation_with_matrices():
         delay_frames=2.25,
         sensor_matrix=rng.standard_normal((3, 2)),
         influence_matrix=np.eye(2) + 0.1 * rng.standard_normal((2, 2)),
-        mirror=lbt.models.PositionLoop.from_bandwidth(
-            natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
-        ),
+        mirror=SHELL,
     )
     run, seen = simulated(path, sensor_gain=0.7)
     seen = lbt.load_record(seen)

@@ -8,18 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
+from support.predictions import SHELL
 from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.errors import DimensionError, ProblemError
 from lbt_synth.identification import LoopRecord, loop_record
 from lbt_synth.identification.records.record import cut_stretches, require_length, split_halves
-from lbt_synth.models import ARModel, PositionLoop
+from lbt_synth.models import ARModel
 
 RATE = 1000.0
-SHELL = PositionLoop.from_bandwidth(
-    natural_frequency_hz=50, damping=0.5, bandwidth_hz=300, sampling_hz=24_000
-)
 SLOW = ARModel(coefficients=[0.99], driving_rms_nm=10.0, frame_rate_hz=RATE)
 LINE = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=300, direction=[0.6, 0.8])
 laid = partial(loop_record, unit="nm")  # by clocks, unless a rate is stated
