@@ -71,9 +71,7 @@ def run_law(controller, *, frames=3000, seed=1, truth=TRUTH, hardware=PATH):
 @cache
 def ordinary_loop(seed=1):
     """Measurements and commands of an integrator with gains of 0.4 and 0.3."""
-    law = lbt.Controller(
-        A=np.eye(2), B=np.diag([0.4, 0.3]), C=np.eye(2), D=np.zeros((2, 2)), dt_s=1 / RATE
-    )
+    law = lbt.Controller(A=np.eye(2), B=RAN, C=np.eye(2), D=0 * RAN, dt_s=1 / RATE)
     return run_law(law, seed=seed, frames=10_000)
 
 

@@ -208,7 +208,9 @@ def expected_data(data: LoopPeriodogram, spectrum: SpectrumModel) -> LoopPeriodo
 
 
 @pytest.mark.parametrize(
-    "case", [partial(one_axis, bump=True), partial(one_axis, drift=True, bump=True), two_axes]
+    "case",
+    [partial(one_axis, bump=True), partial(one_axis, drift=True, bump=True), two_axes],
+    ids=["one axis", "a drift", "two axes"],
 )
 def test_gradient_and_information_of_the_likelihood(case) -> None:
     """The row of the one gain is of exact second derivatives; those of two axes are held."""

@@ -212,7 +212,8 @@ def test_columns_say_which_record_a_file_holds(tmp_path, series):
     seen = load(both, columns={"open_loop": "pol_nm"})
     assert np.array_equal(seen.measurements, u[:, :1])
     assert "not used: y_nm, u_nm" in seen.notes
-    assert np.array_equal(load(both, columns={"commands": "u_nm"}).commands, y[:, 1:])
+    seen = load(both, columns={"commands": "u_nm"}, unit="nanometer")
+    assert np.array_equal(seen.commands, y[:, 1:])
     # x and y may be a clock and its series
     plain = csv(tmp_path / "x.csv", x_nm=y[:, 0], y_nm=y[:, 1])
     for chosen, axes in ((("x_nm", "y_nm"), [0, 1]), ("y_nm", [1])):

@@ -93,18 +93,10 @@ def test_delays_and_diameters_in_headers(tmp_path, series):
     assert load(unsure).delay_frames is None
 
 
-def test_units_of_series(tmp_path, series):
-    y = series[0][:, :1]
-    bare, named = (write_csv(tmp_path / f"{name}.csv", [name], [y]) for name in ("pol", "pol_nm"))
-    assert load(bare, unit="um").measurements == pytest.approx(1e3 * y)
-    assert np.array_equal(load(named, unit="nanometer").measurements, y)
-
-
 @pytest.mark.parametrize("form", ["csv", "fits"])
 def test_spectra(tmp_path, form):
-    f = np.linspace(5, 100, 300)
+    f, path = np.linspace(5, 100, 300), tmp_path / f"a.{form}"
     s = 90 / (1 + ((f[:, None] - [20, 45]) / 2) ** 2)
-    path = tmp_path / f"a.{form}"
     if form == "csv":
         write_csv(path, ["freq_hz", "psd_x [nm^2/Hz]", "psd_y [nm^2/Hz]"], [f, *s.T])
     else:
