@@ -76,14 +76,11 @@ def residuals(differences, error):
     """Return residuals of two methods, the other's below 1000 by differences on three parts."""
     series = [], []
     for i, less in enumerate(differences):
-        common, own = np.random.default_rng(i).standard_normal((2, 6000))
-        common *= np.sqrt(1000 / np.mean(common**2))
-        own -= common * (common @ own) / (common @ common)
-        # its product with the common part scatters
-        size = 6000 * error**2 / 4000
-        own *= np.sqrt(size / np.mean(own**2))
-        series[0].append(common)
-        series[1].append(np.sqrt(1 - (less + size) / 1000) * common + own)
+        white = np.random.default_rng(i).standard_normal((6000, 2))
+        common, own = np.sqrt(6000) * np.linalg.qr(white)[0].T
+        scatter = 6000 * error**2 / 4000  # of its product with the common part
+        series[0].append(np.sqrt(1000) * common)
+        series[1].append(np.sqrt(1000 - less - scatter) * common + np.sqrt(scatter) * own)
     zero = np.zeros((1, 1))
     return [
         estimate_residual(np.concatenate(parts)[:, None], ((5, 18_005),), zero, zero)

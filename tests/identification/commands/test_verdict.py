@@ -1,7 +1,7 @@
 """Commands of records: their law, faults and repairs, coarse spectra, and the verdict."""
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
@@ -35,23 +35,23 @@ SHAKEN = lbt.Vibration(frequency_hz=31, damping=0.005, rms_nm=60, direction=(1.0
 TRUTH = lbt.Truth(turbulence=slow(), vibrations=(SHAKEN,), noise_nm=8.0, sensor_gain=0.7)
 
 
+@dataclass
 class SteppedLaw:
     """``v(k) = leak v(k-1) + gain y(k)`` of two axes, integrated again, clipped and disturbed."""
 
-    def __init__(
-        self, gain, *, leak=1.0, again=None, limit_nm=np.inf, wind_up=False, dither_nm=0.0
-    ):
-        self.gain = np.asarray(gain) if np.ndim(gain) else gain * np.eye(2)
-        self.leak, self.again = leak, again
-        self.limit_nm, self.wind_up, self.dither_nm = limit_nm, wind_up, dither_nm
-        self.reset()
+    gain: object
+    leak: float = 1.0
+    again: float | None = None
+    limit_nm: float = np.inf
+    wind_up: bool = False
+    dither_nm: float = 0.0
 
     def reset(self):
         self.command, self.sum = np.zeros(2), np.zeros(2)
         self.random = np.random.default_rng(5)
 
     def step(self, y):
-        move = self.gain @ y + self.dither_nm * self.random.standard_normal(2)
+        move = np.dot(self.gain, y) + self.dither_nm * self.random.standard_normal(2)
         if self.again is not None:
             self.sum = self.sum + self.again * move
             move = move + self.sum
