@@ -101,8 +101,8 @@ def test_density_is_that_of_the_process_and_its_derivatives_are_right(frequency,
     s = 4 * np.sin(w / 2) ** 2
     a1, a2 = coefficient_rows(np.array(frequency), np.array(damping))
     # the direct formula loses digits to cancellation where the frequency is small
-    size = np.abs(1 - a1 * np.exp(-1j * w) - a2 * np.exp(-2j * w))
-    direct = np.log(drive_ratio(frequency, damping)) - 2 * np.log(size)
+    modulus = np.abs(1 - a1 * np.exp(-1j * w) - a2 * np.exp(-2j * w))
+    direct = np.log(drive_ratio(frequency, damping)) - 2 * np.log(modulus)
     close = 4e-15 / frequency**2 + 1e-8
     assert log_density(frequency, damping, s) == pytest.approx(direct, abs=close)
     require_slopes(frequency, damping, s)

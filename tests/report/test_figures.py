@@ -87,10 +87,10 @@ def test_a_figure_on_axes_of_the_user():
     assert [[name[:6] for name in both] for both in names] == [["firstx"] * 2, ["second"] * 2]
     assert not axes[0].figure.legends
     assert len(draw_two().legends[0].get_texts()) == 4
-    own = Figure()
-    with draw.drawing([2.0], axes=own.subplots()) as (panel,):
+    figure = Figure()
+    with draw.drawing([2.0], axes=figure.subplots()) as (panel,):
         draw.draw_map([panel], [(np.arange(2.0), np.arange(2.0), np.eye(2))], "ratio [%]")
-    assert own.axes[1].get_xlabel() == "ratio [%]"  # of the colour bar
+    assert figure.axes[1].get_xlabel() == "ratio [%]"  # of the colour bar
 
 
 def test_numbers_are_those_that_are_drawn_in_the_unit_that_is_shown():

@@ -28,16 +28,16 @@ def lag_covariances(A, B, C):
 
 
 @pytest.mark.parametrize(
-    ("frequency_hz", "damping", "part"), [(5, 1e-3, 0.25), (60, 0.05, 1.0), (390, 0.9, 0.25)]
+    ("frequency_hz", "damping", "share"), [(5, 1e-3, 0.25), (60, 0.05, 1.0), (390, 0.9, 0.25)]
 )
-def test_exact_sampling_has_the_covariances_of_256_kicks_a_frame(frequency_hz, damping, part):
+def test_exact_sampling_has_the_covariances_of_256_kicks_a_frame(frequency_hz, damping, share):
     line = shake(frequency_hz=frequency_hz, damping=damping)
     motion = {"a": Motion(size=1), "v": Motion(size=1, phase_deg=90)}
-    seen = seen_vibration(line, motion, (mirror(delay_frames=2 - part),), PATH)
+    seen = seen_vibration(line, motion, (mirror(delay_frames=2 - share),), PATH)
     w = 2 * np.pi * frequency_hz
     units = 1.0, -1e-9 * w**2, -1e-9 * w**2  # the readings are about -w^2 times positions
     sampled = lag_covariances(seen.A, seen.B, seen.C / np.array(units)[:, None])
-    A, B = KickedOscillator(w / RATE_HZ, damping, RMS_NM).chain(part, 2)
+    A, B = KickedOscillator(w / RATE_HZ, damping, RMS_NM).chain(share, 2)
     C = np.zeros((3, len(A)))
     C[0, 2] = 1.0
     C[1, [5, 7]] = np.array([-1, 1]) * RATE_HZ / w  # less the mean acceleration over w^2

@@ -153,9 +153,9 @@ def test_a_reading_is_the_mean_of_its_exposure(age, period, common):
 @pytest.mark.parametrize("delay", [1, 2.4])
 def test_channels_that_see_nothing_leave_the_filter_of_the_wavefront(delay):
     plant = example_plant((CHANNEL,), motions=({}, {}), delay_frames=delay)
-    own = plant.own_sensor_alone()
-    alone, solution = lbt.kalman(own), kalman_riccati(plant)
-    assert (plant.period, plant.n_states) == (2, own.n_states)
+    bare = plant.own_sensor_alone()
+    alone, solution = lbt.kalman(bare), kalman_riccati(plant)
+    assert (plant.period, plant.n_states) == (2, bare.n_states)
     for P, gains in zip(solution.P, solution.gain_predictor, strict=True):
         assert relative_distance(gains[:, :2], alone.gain_predictor) < 1e-9
         assert not gains[:, 2:].any()
@@ -168,19 +168,19 @@ def test_channels_that_see_nothing_leave_the_filter_of_the_wavefront(delay):
 
 def test_what_a_plant_of_several_sensors_holds():
     plant = example_plant()
-    own, suite = plant.own_sensor_alone(), plant.hardware.suite
-    assert (plant.period, own.period, plant.n_measurements) == (4, 1, 6)
+    bare, suite = plant.own_sensor_alone(), plant.hardware.suite
+    assert (plant.period, bare.period, plant.n_measurements) == (4, 1, 6)
     marked = suite.marked(("m2", "wavefront"), plant.hardware)
     assert marked.tolist() == [1, 1, 0, 0, 0, 1]
     # of a line three states for two, and two ends of exposures: of the first line, which channels
     # see at two phases, position and velocity; a sum and two readings that wait, of two modes
-    assert plant.n_states == own.n_states + (1 + 4) + (1 + 2) + 3 * 2
+    assert plant.n_states == bare.n_states + (1 + 4) + (1 + 2) + 3 * 2
     assert plant.full().n_states == plant.n_states + 2 + 3 * 2
     assert "4 sensors" in plant._brief()
-    assert plant.turbulence == own.turbulence == (AIR, AIR)
+    assert plant.turbulence == bare.turbulence == (AIR, AIR)
     np.testing.assert_allclose(plant.own_noise_factor, 75 * np.eye(2))
-    np.testing.assert_array_equal(own.with_sensors(suite, plant.motions).A, plant.A)
-    assert own.own_sensor_alone() is own
+    np.testing.assert_array_equal(bare.with_sensors(suite, plant.motions).A, plant.A)
+    assert bare.own_sensor_alone() is bare
     # lines that move keep their channels
     assert retuned_plant(plant, [5.0, -5.0]).motions == plant.motions
     spread = lbt.models.spread_plant(plant, half_width_hz=1.0, lines=3)
