@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.exports import relative
+from support.lqg import slow_plant
 from support.recorded_runs import recorded_run
+from support.refusals import refused, require_refusals
 
 import lbt_synth as lbt
 from lbt_synth.errors import NumericalError, ProblemError
@@ -36,6 +37,7 @@ BALANCE = 1e-13  # of a coefficient
 
 @pytest.mark.parametrize("name", ["kalman", "hinf", "integrator"])
 def test_the_matrix_holds_the_controller(tmp_path, designs, name):
+    """But for the rounding of its coefficients."""
     design = designs[name]
     written = lbt.interop.export(tmp_path / "K_mat.npy", design, "dao", modes=5)
     beside = json.loads(written.files[1].read_text())
@@ -44,57 +46,52 @@ def test_the_matrix_holds_the_controller(tmp_path, designs, name):
     assert (matrix.dtype, matrix.shape) == (np.float32, (41, 5))
     assert matrix.flags.c_contiguous
     assert not matrix[:, 2:].any()
+    assert written.error < 1e-4
     frequency = np.linspace(1, 399, 100)
     z = np.exp(2j * np.pi * frequency * design.controller.dt_s)
     powers = z[:, None] ** -np.arange(21)
-    expected = design.controller.to_statespace().frequency_response(frequency)
-    rounding = np.finfo(np.float32).eps / 2
-    for mode in range(2):
-        exact = expected[:, mode, mode]
-        bottom = 1 - powers[:, 1:] @ matrix[21:, mode].astype(float)
-        found = (powers @ matrix[:21, mode].astype(float)) / bottom
-        sums = [np.sum(np.abs(part)) for part in (matrix[:21, mode], matrix[21:, mode])]
-        allowed = rounding * (sums[0] + np.abs(exact) * sums[1]) / np.abs(bottom)
-        assert np.all(np.abs(found - exact) <= 1.001 * allowed + 1e-12 * np.abs(exact))
-        assert relative(found, exact) < 1e-3  # so little of the whole
-    assert written.error < 1e-4
+    b, a = np.split(matrix[:, :2].astype(float), [21])
+    bottom = 1 - powers[:, 1:] @ a
+    exact = design.controller.to_statespace().frequency_response(frequency)
+    exact = np.diagonal(exact, axis1=1, axis2=2)
+    sums = np.sum(np.abs(b), axis=0) + np.abs(exact) * np.sum(np.abs(a), axis=0)
+    rounding = np.finfo(np.float32).eps / 2 * sums / np.abs(bottom)
+    errors = np.abs(powers @ b / bottom - exact)
+    assert np.all(errors <= 1.001 * rounding + 1e-12 * np.abs(exact))
+    assert np.max(errors) < 1e-3 * np.max(np.abs(exact))  # so little of the whole
 
 
-def test_a_design_that_single_precision_breaks_is_refused_with_the_number(tmp_path, loaded):
-    lines = lbt.models.spread_plant(loaded.plant, half_width_hz=1.0, lines=3)
-    with pytest.raises(lbt.errors.NumericalError, match="spectral radius at sensor gains") as seen:
-        lbt.interop.export(tmp_path / "k.npy", lbt.kalman(lines), "dao")
-    assert seen.value.residual > 1
-    assert not list(tmp_path.iterdir())
+def written_radius(matrix, low, high):
+    """Largest spectral radius of the loop of two frames, from the polynomial of the numbers."""
+    order, largest = len(matrix) // 2, 0.0
+    for gain in np.geomspace(low, high, 400):
+        polynomial = np.concatenate([[1.0], -matrix[order + 1 :, 0].astype(float), [0.0, 0.0]])
+        polynomial[2:] += gain * matrix[: order + 1, 0]
+        largest = max(largest, np.max(np.abs(np.roots(polynomial))))
+    return largest
 
 
-@pytest.fixture(scope="module")
-def shaped_run(shaped):
-    """Disturbance, noise, and what the shaped design leaves of them."""
+def test_a_shaped_design_that_single_precision_breaks_is_made_again(tmp_path, shaped):
+    """In the arithmetic of the computer the loop leaves what the design leaves in double."""
+    written = lbt.interop.export(tmp_path / "k.npy", shaped, "dao", order=20)
+    matrix = np.load(written.files[0])
+    assert matrix.shape == (41, 1)
+    assert written_radius(matrix, 0.5, 1.2) < 1
+    beside = json.loads((tmp_path / "k.npy.certificate.json").read_text())
+    assert written.notes[0].startswith("made again for single precision")
+    assert beside["notes"] == list(written.notes)
     air, line, *_ = shaped.specifications[0].terms
     vibration = lbt.models.SinusoidalVibration(
         frequency_hz=20.0, rms_nm=line.rms_nm, direction=(1.0,)
     )
     truth = lbt.Truth(turbulence=air.turbulence, noise_nm=air.noise_nm, vibrations=[vibration])
     drawn = draw_disturbance(truth, shaped.hardware, frames=6000, seed=1)
-    total, noise = drawn.phase_nm, drawn.noise
-    own = recorded_run(shaped.controller.start(), shaped.hardware, total, noise)
-    return total, noise, own[0, 1000:, 0]
-
-
-def test_a_shaped_design_that_single_precision_breaks_is_made_again(tmp_path, shaped, shaped_run):
-    """In the arithmetic of the computer the loop leaves what the design leaves in double."""
-    written = lbt.interop.export(tmp_path / "k.npy", shaped, "dao", order=20)
-    matrix = np.load(written.files[0])
-    assert matrix.shape == (41, 1)
-    assert max(written_radius(matrix, gain) for gain in np.geomspace(0.5, 1.2, 40)) < 1
-    beside = json.loads((tmp_path / "k.npy.certificate.json").read_text())
-    assert written.notes[0].startswith("made again for single precision")
-    assert beside["notes"] == list(written.notes)
-    total, noise, own = shaped_run
-    found = recorded_run(InnerLoop(matrix), shaped.hardware, total, noise)[0, 1000:, 0]
-    assert np.std(found) == pytest.approx(np.std(own), rel=0.03)
-    assert np.std(found) < 0.3 * np.std(total)
+    exact, single = (
+        np.std(recorded_run(run, shaped.hardware, drawn.phase_nm, drawn.noise)[0, 1000:, 0])
+        for run in (shaped.controller.start(), InnerLoop(matrix))
+    )
+    assert single == pytest.approx(exact, rel=0.03)
+    assert single < 0.3 * np.std(drawn.phase_nm)
 
 
 def test_a_sensor_gain_is_in_what_is_made_again(shaped):
@@ -102,9 +99,9 @@ def test_a_sensor_gain_is_in_what_is_made_again(shaped):
     half = replace(shaped.hardware, sensor_matrix=np.array([[0.5]]))
     (spec,) = shaped.specifications
     design = lbt.design.shape(half, spec, functions=12, states=None)
-    exact = direct_form_rows(design.controller, 20)
-    plain = make_again(shaped, direct_form_rows(shaped.controller, 20))
-    made = make_again(design, exact)
+    plain, made = (
+        make_again(one, direct_form_rows(one.controller, 20)) for one in (shaped, design)
+    )
     # to what the programmes leave open, and what makes up for the rounding of other coefficients
     assert made[:21] == pytest.approx(2 * plain[:21], rel=2e-3, abs=2e-6)
     assert all(check.passed for check in prove_written(design, _as_computed(design, made)))
@@ -118,40 +115,64 @@ def test_the_robust_example_runs_in_single_precision(tmp_path):
     losses = [check.value for check in written.checks if "residual" in check.name]
     assert len(losses) == 4
     assert max(losses) < 0.01
-    matrix = np.load(written.files[0])
-    assert max(written_radius(matrix, gain) for gain in np.geomspace(0.25, 1.3, 400)) < 1
+    assert written_radius(np.load(written.files[0]), 0.25, 1.3) < 1
 
 
-def test_what_the_matrix_cannot_hold_is_refused(tmp_path, designs, loaded):
-    def refused(design, match, **options):
-        with pytest.raises(lbt.errors.ProblemError, match=match):
-            lbt.interop.export(tmp_path / "k.npy", design, "dao", **options)
-
-    refused(designs["kalman"], "order must be at least 4", order=3)
-    refused(designs["kalman"], "modes must be at least 2", modes=1)
-    turned = replace(loaded.hardware, sensor_matrix=[[1, 0.1], [0, 1]])
-    refused(lbt.integrator(turned, gain=0.3), "sensor_matrix must be diagonal")
+def test_what_the_matrix_cannot_hold_is_refused(tmp_path, config, designs):
+    """The order leaves out the states of the other mode, and a delay in both polynomials."""
     bare = lbt.kalman(lbt.EstimationProblem(A=0.5, B=[[1, 0]], C=1, D=[[0, 1]], L=1))
-    refused(bare, "needs the design of a loop")
+    turned = replace(config.hardware, sensor_matrix=[[1, 0.1], [0, 1]])
+    lines = lbt.models.spread_plant(config.plant, half_width_hz=1.0, lines=3)
+    slanted = lbt.Vibration(frequency_hz=20, damping=0.01, rms_nm=500, direction=(0.6, 0.8))
+    direct = lbt.Controller(A=[[0.0]], B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=[[1.0, 0.0], [0.5, 1.0]])
+    wide = lbt.Controller(A=[[0.5]], B=[[1.0, 2.0]], C=[[1.0]], D=[[0.0, 0.0]])
+    big = lbt.Controller(A=np.eye(2, k=1), B=[[0.0], [1e30]], C=[[1e30, 0.0]], D=[[0.0]])
+    with np.errstate(over="ignore"):
+        rows_of_big = direct_form_rows(big, 2).astype(np.float32)
+
+    def write(design, **options):
+        return lambda: lbt.interop.export(tmp_path / "k.npy", design, "dao", **options)
+
+    def split(controller):
+        return lambda: mode_polynomials(controller)
+
+    coupled = lbt.kalman(slow_plant(modes=2, vibrations=[slanted])).controller
+    words = "here measurement 2 moves command 1. Design with --method robust"
+    rows = [
+        (write(designs["kalman"], order=3), ProblemError, "order must be at least 4"),
+        (write(designs["kalman"], modes=1), ProblemError, "modes must be at least 2"),
+        (write(lbt.integrator(turned, gain=0.3)), ProblemError, "sensor_matrix must be diagonal"),
+        (write(bare), ProblemError, "needs the design of a loop"),
+        (split(coupled), ProblemError, words),
+        (split(direct), ProblemError, "here measurement 1 moves command 2"),
+        (split(wide), ProblemError, "got 1 commands and 2 measurements"),
+    ]
+    rows += [
+        (
+            lambda beyond=beyond: direct_form(np.array(beyond), 1.0),
+            NumericalError,
+            "beyond its range",
+        )
+        for beyond in (rows_of_big, [[np.inf], [0.0], [1.0]], [[np.nan], [0.0], [1.0]])
+    ]
+    require_refusals(rows)
+    error = refused(write(lbt.kalman(lines)), NumericalError, "spectral radius at sensor gains")
+    assert error.residual > 1
+    assert not list(tmp_path.iterdir())
 
 
-def written_radius(matrix, gain):
-    """Spectral radius of the loop of two frames, from the polynomial of the written numbers."""
-    order = len(matrix) // 2
-    own = np.concatenate([[1.0], -matrix[order + 1 :, 0].astype(float), [0.0, 0.0]])
-    own[2:] += gain * matrix[: order + 1, 0]
-    return np.max(np.abs(np.roots(own)))
-
-
-def difference_equation(rows, series):
-    """Commands of ``u(k) = sum b_j y(k-j) + sum a_i u(k-i)``, word for word."""
-    order = len(rows) // 2
-    y, u = (np.zeros((len(series) + order, rows.shape[1])) for _ in range(2))
-    y[order:] = series
-    for k in range(order, len(y)):
-        u[k] = sum(rows[j] * y[k - j] for j in range(order + 1))
-        u[k] += sum(rows[order + i] * u[k - i] for i in range(1, order + 1))
-    return u[order:]
+def difference_equation(rows, series, limit=np.inf):
+    """Commands of ``u(k) = sum b_j y(k-j) + sum a_i u(k-i)``, each operation in the type of rows."""
+    order, past, commands = len(rows) // 2, np.zeros_like(rows), []
+    for y in series:
+        past[: order + 1] = np.vstack([y, past[:order]])
+        u = rows[0] * past[0]
+        for row in range(1, len(rows)):
+            u = u + rows[row] * past[row]
+        u = np.clip(u, -limit, limit)
+        past[order + 1 :] = np.vstack([u, past[order + 1 : -1]])
+        commands.append(u)
+    return np.array(commands)
 
 
 @given(seed=st.integers(0, 2**32 - 1), orders=st.lists(st.integers(1, 5), min_size=1, max_size=3))
@@ -191,66 +212,6 @@ def test_coefficients_of_close_poles():
     assert num == pytest.approx([0.0] * (n - 1) + [1.0, 0.0], abs=BALANCE * max(exact))
 
 
-def test_states_of_the_other_mode_and_delays_in_both_are_left_out(designs):
-    controller = designs["kalman"].controller
-    for num, den in mode_polynomials(controller):
-        assert num.shape == den.shape == (5,)  # of ten states, five are the other mode's, one is z
-        own = np.linalg.eigvals(controller.A)
-        assert all(np.min(np.abs(own - pole)) < 1e-9 for pole in np.roots(den))
-
-
-def test_modes_that_do_not_decouple(loaded):
-    slanted = replace(loaded.plant.vibrations[0], direction=(0.6, 0.8))
-    plant = lbt.tip_tilt_plant(
-        frame_rate_hz=800,
-        turbulence=loaded.plant.turbulence,
-        vibrations=[slanted],
-        noise_nm=loaded.noise_nm,
-    )
-    with pytest.raises(
-        ProblemError, match="here measurement 2 moves command 1. Design with --method robust"
-    ):
-        mode_polynomials(lbt.kalman(plant).controller)
-    direct = lbt.Controller(A=[[0.0]], B=[[0.0, 0.0]], C=[[0.0], [0.0]], D=[[1.0, 0.0], [0.5, 1.0]])
-    with pytest.raises(ProblemError, match="here measurement 1 moves command 2"):
-        mode_polynomials(direct)
-    wide = lbt.Controller(A=[[0.5]], B=[[1.0, 2.0]], C=[[1.0]], D=[[0.0, 0.0]])
-    with pytest.raises(ProblemError, match="got 1 commands and 2 measurements"):
-        mode_polynomials(wide)
-
-
-def test_coefficients_beyond_the_range_are_refused():
-    big = lbt.Controller(A=np.eye(2, k=1), B=[[0.0], [1e30]], C=[[1e30, 0.0]], D=[[0.0]])
-    with np.errstate(over="ignore"):
-        rows = direct_form_rows(big, 2).astype(np.float32)
-    for beyond in (rows, [[np.inf], [0.0], [1.0]], [[np.nan], [0.0], [1.0]]):
-        with pytest.raises(NumericalError, match="beyond its range"):
-            direct_form(np.array(beyond), 1.0)
-
-
-def number_by_number(matrix, series, limit):
-    """Commands of the loop as its source is read, each operation rounded to single precision."""
-    rows, modes = matrix.shape
-    order = rows // 2
-    memory = [[np.float32(0)] * rows for _ in range(modes)]
-    out = []
-    for y in series:
-        u = np.zeros(modes, dtype=np.float32)
-        for mode in range(modes):
-            past = memory[mode]
-            past[: order + 1] = [np.float32(y[mode]), *past[:order]]
-            total = matrix[0, mode] * past[0]
-            for row in range(1, rows):
-                total = np.float32(total + np.float32(matrix[row, mode] * past[row]))
-            u[mode] = total
-        u = np.clip(u, -limit, limit)
-        for mode in range(modes):
-            past = memory[mode]
-            past[order + 1 :] = [u[mode], *past[order + 1 : -1]]
-        out.append(u)
-    return np.array(out)
-
-
 @pytest.mark.parametrize("limit", [np.float32(np.inf), np.float32(0.8)])
 def test_it_gives_the_commands_bit_for_bit(limit):
     rng = np.random.default_rng(1)
@@ -258,7 +219,7 @@ def test_it_gives_the_commands_bit_for_bit(limit):
     series = rng.standard_normal((200, 3)).astype(np.float32)
     loop = InnerLoop(matrix, limit=limit)
     found = np.array([loop.step(y) for y in series])
-    expected = number_by_number(matrix, series, limit)
+    expected = difference_equation(matrix, series, limit)
     assert np.array_equal(found, expected)
     assert np.any(np.abs(expected) > 0.9) != np.isfinite(limit)
     loop.reset()
@@ -276,27 +237,21 @@ def rounding_nm(loop, c):
     return np.sqrt(loop.residuals_nm(c, rounding=True) ** 2 - loop.residuals_nm(c) ** 2)
 
 
-def test_residuals_are_those_of_the_design(case, shaped):
+def test_residuals_and_radius_are_those_of_the_design(case, shaped):
     loop, c = case
-    (specification,) = shaped.specifications
+    air, line, *_ = shaped.specifications[0].terms
     expected = []
     for gain in loop.gains:
         around = lbt.close_loop(shaped.hardware, shaped.controller, sensor_gain=gain)
-        air, line, *_ = specification.terms
         truth = lbt.Truth(turbulence=air.turbulence, noise_nm=air.noise_nm, sensor_gain=gain)
         budget = lbt.residual_budget(around, truth, frame_means=True)
         peak = band_norm(around.path("phase", "residual"), line.low_hz, line.high_hz).upper
         expected.append(np.hypot(budget.rms_nm, line.rms_nm * peak))
-    assert loop.gains == (1.0, 0.6)
+    assert (*loop.gains, loop.low, loop.high) == (1.0, 0.6, 0.5, 1.2)
     assert loop.residuals_nm(c) == pytest.approx(expected, rel=2e-3)
-
-
-def test_radius_is_that_of_the_loop(case, shaped):
-    loop, c = case
     gains = np.append(np.geomspace(0.5, 1.2, 25), 1.0)
-    expected = np.max(affine_radii(parts_by_gain(shaped.hardware, shaped.controller), gains))
-    assert loop.radius(c) == pytest.approx(expected, rel=1e-6)
-    assert (loop.low, loop.high) == (0.5, 1.2)
+    radius = np.max(affine_radii(parts_by_gain(shaped.hardware, shaped.controller), gains))
+    assert loop.radius(c) == pytest.approx(radius, rel=1e-6)
 
 
 def test_sums_are_as_large_as_in_a_simulation(case):
@@ -336,16 +291,13 @@ def test_rounding_in_the_loop_is_that_of_the_lyapunov_equation(case, shaped):
     assert rounding_nm(loop, c)[0] == pytest.approx(np.sqrt(left[0]), rel=2e-3)
 
 
-def test_sections_give_back_the_coefficients(case):
-    wide = _widened(case[1])
-    assert dao._coefficients(dao._sections(wide)) == pytest.approx(wide, abs=1e-9)
-
-
 def test_a_common_factor_leaves_the_loop_as_it_is(case):
+    """Sections give back the coefficients."""
     loop, c = case
     wide = _widened(c)
     assert loop.residuals_nm(wide) == pytest.approx(loop.residuals_nm(c), rel=1e-6)
     assert rounding_nm(loop, wide)[0] < 0.2 * rounding_nm(loop, c)[0]
+    assert dao._coefficients(dao._sections(wide)) == pytest.approx(wide, abs=1e-9)
 
 
 def test_slopes_are_those_of_finite_differences(case):
